@@ -15,7 +15,7 @@ from webots_mcp.plugins.demo import conversation as demo
 from webots_mcp.setup.client_entries import can_be_started, is_ours, words_of
 
 TURNS = tuple(
-    turn for turn in demo.CONVERSATION if turn[1] in ("webots_get_parameters", "webots_plot")
+    turn for turn in demo.CONVERSATION if turn[1] in ("webots_list_commands", "webots_plot")
 )
 CLIENTS = (Path(__file__).parents[1] / "docs" / "clients.md").read_text("utf-8")
 

@@ -73,7 +73,7 @@ def test_a_list_is_set_with_more_or_fewer_entries(scene: Scene, values: list[flo
         ("BALL.children[0].geometry.subdivision", 1.5, "a whole number"),
         ("BALL.name", 5, "a text of at most"),
         ("BALL.physics", 5, "BALL.physics.name"),
-        ("BALL.children", [], "webots_add_node and webots_remove_node"),
+        ("BALL.children", [], "webots_edit_scene adds and removes them"),
         ("BALL", 5, "name the field to set, such as BALL.translation"),
         ("ROVER.controllerArgs", "x", "a list of at most 200"),
         ("ROVER.controller", "../../evil", "controller is a name, by which Webots finds"),

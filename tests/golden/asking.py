@@ -26,6 +26,8 @@ from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plotting.trials import compose_trials
 from webots_mcp.plugins.report.making import make_report
+from webots_mcp.questions import all_questions
+from webots_mcp.questions.merging import MergedQuestion
 from webots_mcp.server import create_server
 from webots_mcp.store.export import TrialTable, export, export_for_viewers
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
@@ -109,8 +111,8 @@ async def _ask_tools(kind: Kind, file: Path) -> Answers:
         tool, arguments = TOOLS[name]
         asked[f"{name} of a part"] = (tool, arguments | part)
     async with Client(create_server(file, file.parent, read_only=True)) as client:
-        listed = (await client.list_tools()).tools
-        known = {each.name: each.input_schema["properties"] for each in listed}
+        single = [each for each in all_questions() if not isinstance(each, MergedQuestion)]
+        known = {each.name: each.arguments.model_fields for each in single}
         for name, (tool, arguments) in asked.items():
             subject = {"robot": kind.robot, "run_id": kind.run_id, "where": _where(kind, arguments)}
             taken = {key: subject[key] for key in subject if key in known[tool] and subject[key]}

@@ -55,8 +55,8 @@ def connect(file: Path) -> Connect:
     """A client of a server on the test's database, which may not exist."""
 
     @asynccontextmanager
-    async def connected(*, read_only: bool = False, mode: Any = "auto") -> AsyncGenerator[Client]:
-        server = create_server(file, file.parent, read_only=read_only)
+    async def connected(*, mode: Any = "auto", **options: Any) -> AsyncGenerator[Client]:
+        server = create_server(file, file.parent, **options)
         async with Client(server, mode=mode) as client:
             yield client
 

@@ -16,6 +16,8 @@ from tests.recordings.long import build
 from tests.server.conftest import text_of
 from tests.server.story import client_on
 from webots_mcp.connection import connect
+from webots_mcp.questions import all_questions
+from webots_mcp.questions.merging import MergedQuestion
 
 pytestmark = pytest.mark.anyio
 
@@ -126,10 +128,11 @@ def _add_runs(connection: Any) -> None:
 
 async def test_every_default_answer_is_under_2000_tokens(big: Path) -> None:
     async with client_on(big) as client:
-        tools = {tool.name: tool for tool in (await client.list_tools()).tools}
         table: list[str] = []
+        single = [each for each in all_questions() if not isinstance(each, MergedQuestion)]
         for tool, arguments in DEFAULTS:
-            takes_run = "run_id" in tools[tool].input_schema["properties"]
+            (asks,) = (each for each in single if each.name == tool)
+            takes_run = "run_id" in asks.arguments.model_fields
             asked = arguments | ({"run_id": LONG_RUN} if takes_run else {})
             result = await client.call_tool(tool, asked)
             assert not result.is_error, (tool, text_of(result))

@@ -80,7 +80,7 @@ async def test_a_world_is_started_changed_and_ended(begin: Begin, project: Path)
         assert answer["result"]["world"] == str(project / "worlds" / "arena.wbt")
         family = _family(answer)
         text = await fail(client, "webots_launch_world", world="field.wbt")
-        assert "still runs arena.wbt: webots_load_world opens another world in it" in text
+        assert "still runs arena.wbt: action=load opens another world in it" in text
 
         loaded = await ask(client, "webots_load_world", world="field.wbt", timeout_s=60)
         assert (loaded["outcome"], loaded["route"]) == ("done", "bridge")
@@ -121,7 +121,7 @@ async def test_a_start_in_pause_says_how_to_go_on_also_beside_robots_of_the_past
         _two_robots_of_the_past(project / "mcp_data")
         start = {"world": "arena.wbt", "mode": "pause", "timeout_s": 2}
         alone = await ask(client, "webots_launch_world", **start)
-        assert "webots_quit and start it in another mode or with stream" in alone["hint"]
+        assert "quit it and start it in another mode or with stream" in alone["hint"]
         await ask(client, "webots_quit")
         answer = await ask(client, "webots_launch_world", **start, stream=True)
         assert answer["hint"].endswith('. webots_simulation_control("resume") plays it')

@@ -11,7 +11,8 @@ import pytest
 from mcp import Client, StdioServerParameters
 
 from tests.recordings.rows import Recorded
-from tests.server.conftest import Connect, ask
+from tests.server.conftest import Connect, ask, fail
+from tests.tool_list import counts_of
 
 pytestmark = pytest.mark.anyio
 
@@ -26,21 +27,14 @@ READING = {
     "webots_get_logs",
     "webots_monitor",
     "webots_list_commands",
-    "webots_get_parameters",
-    "webots_get_trials",
-    "webots_wait_for_command",
-    "webots_list_signals",
     "webots_query_history",
     "webots_get_trends",
     "webots_find_events",
-    "webots_get_timeline",
     "webots_list_runs",
     "webots_compare_runs",
     "webots_plot",
     "webots_query_sql",
-    "webots_list_breakpoints",
     "webots_get_scene",
-    "webots_get_field",
 }
 ACTING = {
     "webots_annotate_run",
@@ -55,13 +49,8 @@ ACTING = {
     "webots_reset_controller_state",
     "webots_send_command",
     "webots_breakpoint",
-    "webots_remove_breakpoint",
-    "webots_set_field",
-    "webots_add_node",
-    "webots_remove_node",
+    "webots_edit_scene",
     "webots_launch_world",
-    "webots_load_world",
-    "webots_quit",
 }
 SHARED = ("robot", "run_id", "last_s", "start_s", "end_s", "timeout_s", "cursor")
 
@@ -71,12 +60,109 @@ def serve(file: Path, *options: str) -> StdioServerParameters:
     return StdioServerParameters(command=sys.executable, args=arguments, env=dict(os.environ))
 
 
+def same(answer: Any) -> Any:
+    """An answer without what the clock moves on."""
+    return {name: value for name, value in answer.items() if name not in ("age_s", "why", "status")}
+
+
 @pytest.mark.parametrize(("read_only", "names"), [(False, READING | ACTING), (True, READING)])
 async def test_exactly_the_named_tools_are_there(
     connect: Connect, read_only: bool, names: set[str]
 ) -> None:
     async with connect(read_only=read_only) as client:
         assert {tool.name for tool in (await client.list_tools()).tools} == names
+
+
+@pytest.mark.parametrize(
+    ("core", "tools", "size", "tokens"), [(False, 32, 30_000, 7_000), (True, 17, 18_000, 4_000)]
+)
+async def test_the_list_is_short(
+    connect: Connect, core: bool, tools: int, size: int, tokens: int
+) -> None:
+    async with connect(core=core) as client:
+        listed = await client.list_tools()
+    counted = counts_of(listed.tools)
+    assert counted.tools <= tools
+    assert counted.bytes <= size
+    assert counted.tokens <= tokens
+    assert listed.ttl_ms
+
+
+async def test_a_tool_that_is_not_listed_answers_when_it_is_called(
+    connect: Connect, recorded: Recorded
+) -> None:
+    recorded.robot().state(1.0, {"x": 1})
+    async with connect(core=True, read_only=True) as client:
+        assert (await ask(client, "webots_get_sensors"))["hint"]
+        with pytest.raises(AssertionError, match="Unknown tool"):
+            await ask(client, "webots_world_reset")
+
+
+@pytest.mark.parametrize(
+    ("old", "merged", "arguments"),
+    [
+        ("webots_get_timeline", ("webots_find_events", "timeline"), {"limit": 3}),
+        ("webots_list_signals", ("webots_get_trends", "signals"), {"pattern": "x"}),
+        ("webots_get_trials", ("webots_list_runs", "trials"), {}),
+        ("webots_get_parameters", ("webots_list_commands", "parameters"), {}),
+        ("webots_list_breakpoints", ("webots_list_commands", "breakpoints"), {}),
+        ("webots_wait_for_command", ("webots_list_commands", "outcome"), {"command_id": 1}),
+        ("webots_get_field", ("webots_get_scene", "field"), {"path": "X"}),
+    ],
+)
+async def test_a_merged_tool_answers_as_the_one_that_it_took_in(
+    connect: Connect,
+    recorded: Recorded,
+    old: str,
+    merged: tuple[str, str],
+    arguments: dict[str, Any],
+) -> None:
+    recorded.robot().state(1.0, {"x": 1})
+    tool, what = merged
+    async with connect(read_only=True) as client:
+        first = await client.call_tool(old, arguments)
+        second = await client.call_tool(tool, arguments | {"what": what})
+    assert first.is_error == second.is_error
+    if not first.is_error:
+        assert same(first.structured_content) == same(second.structured_content)
+
+
+async def test_an_argument_of_another_part_of_a_merged_tool_is_refused_with_those_there_are(
+    connect: Connect, recorded: Recorded
+) -> None:
+    recorded.robot().state(1.0, {"x": 1})
+    async with connect() as client:
+        told = await fail(client, "webots_find_events", what="timeline", where="x > 1")
+        assert "where has no meaning with what='timeline': there is kinds, log_level" in told
+        assert "value" in await fail(client, "webots_edit_scene", action="set", path="X.y")
+        assert "action" in await fail(client, "webots_edit_scene", path="X.y")
+
+
+async def test_the_schemas_of_answers_are_listed_where_they_are_asked_for(
+    connect: Connect, recorded: Recorded
+) -> None:
+    recorded.robot().state(1.0, {"x": 1})
+    async with connect(output_schemas=True) as client:
+        tools = {tool.name: tool for tool in (await client.list_tools()).tools}
+        assert tools["webots_find_events"].output_schema
+        for what in ("events", "timeline"):
+            assert "verdicts" in await ask(client, "webots_find_events", what=what)
+
+
+async def test_what_a_tool_does_is_said_as_it_is(connect: Connect) -> None:
+    async with connect() as client:
+        notes = {tool.name: tool.annotations for tool in (await client.list_tools()).tools}
+    told = {name: note for name, note in notes.items() if note and not note.read_only_hint}
+    assert {name for name, note in told.items() if not note.destructive_hint} == {
+        "webots_annotate_run",
+        "webots_breakpoint",
+        "webots_set_parameters",
+        "webots_take_screenshot",
+    }
+    assert {name for name, note in told.items() if note.idempotent_hint} == {
+        "webots_annotate_run",
+        "webots_set_parameters",
+    }
 
 
 async def test_every_tool_says_what_it_is_and_whether_it_changes_anything(

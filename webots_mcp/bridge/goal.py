@@ -168,7 +168,8 @@ class Watch:
         if (watched := self._watched) is not None:
             raise CommandRefusedError(
                 f"command {watched.command_id} (run) is under way: wait for it with "
-                f"webots_wait_for_command (command_id {watched.command_id}), or pause to end it"
+                f'webots_list_commands(what="outcome", command_id={watched.command_id}), '
+                "or pause to end it"
             )
 
     def begin(self, command_id: int, goal: Goal, finish: Callable[[], object]) -> None:

@@ -122,7 +122,7 @@ def checked(path: str, type_name: str, value: object) -> Any:
     many, kind = type_name.startswith("MF"), _KINDS.get(type_name[2:])
     if kind is None:
         raise InvalidInputError(
-            f"{path} holds nodes ({type_name}): webots_add_node and webots_remove_node change it; "
+            f"{path} holds nodes ({type_name}): webots_edit_scene adds and removes them; "
             f"to set a field of a node in it, go on with the path, such as {path}"
             f"{'[0]' if many else ''}.name"
         )

@@ -27,6 +27,18 @@ if TYPE_CHECKING:
     argument(
         "--read-only", action="store_true", help="leave out the tools that change the simulation"
     ),
+    argument(
+        "--tools",
+        choices=("all", "core"),
+        default="all",
+        help="which tools to list: core are the 17 that answer most questions; the others are "
+        "there when they are called by name",
+    ),
+    argument(
+        "--output-schemas",
+        action="store_true",
+        help="list the schemas of the answers too, which need four times as much room as all else",
+    ),
     *LIMITS,
 )
 def serve(arguments: argparse.Namespace) -> None:
@@ -62,7 +74,14 @@ def serve(arguments: argparse.Namespace) -> None:
     with _keeping_what_is_made():
         from webots_mcp.server import create_server
 
-        server = create_server(database, data_dir, read_only=arguments.read_only, limits=limits)
+        server = create_server(
+            database,
+            data_dir,
+            read_only=arguments.read_only,
+            core=arguments.tools == "core",
+            output_schemas=arguments.output_schemas,
+            limits=limits,
+        )
     with ending_in_time(), _ending_with_the_client():
         server.run()
 

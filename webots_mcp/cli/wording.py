@@ -22,14 +22,14 @@ BY_TOOL: Final = {  # by tool
     "find_events": "events",
     "get_full_state": "tail",
     "get_logs": "logs",
-    "get_parameters": "parameters",
+    "list_commands parameters": "parameters",
+    "list_commands outcome": "wait",
+    "list_runs trials": "trials",
     "get_robot_state": "tail",
-    "get_timeline": "events",
     "get_trends": "trends",
     "list_commands": "status",
     "list_robots": "status",
     "list_runs": "runs",
-    "list_signals": "signals",
     "monitor": "tail",
     "plot": "plot",
     "query_history": "history",
@@ -39,10 +39,11 @@ BY_TOOL: Final = {  # by tool
     "send_command": "send",
     "set_parameters": "parameters",
     "simulation_control": "send",
-    "wait_for_command": "wait",
     "world_reset": "send reset",
 }
-_TOOL: Final = re.compile(r"webots_(\w+)(?:,? \(?command_id( \d+)\)?)?")
+_TOOL: Final = re.compile(
+    r"webots_(?P<tool>\w+)(?:\(what=.(?P<what>\w+).(?:, \w+=(?P<id>\d+))?\))?"
+)
 _running: ContextVar[tuple[Argument | Typed, ...]] = ContextVar("running", default=())
 
 
@@ -101,5 +102,7 @@ def as_typed(text: str) -> str:
 
 def _command_for(found: re.Match[str]) -> str:
     """The command that answers what a tool does; the tool itself where there is none."""
-    command = BY_TOOL.get(found[1])
-    return f"'webots-mcp {command}{found[2] or ''}'" if command else found[0]
+    tool, what, number = found["tool"], found["what"], found["id"]
+    command = BY_TOOL.get(f"{tool} {what}" if what else tool)
+    whole = f"{command} {number}" if number else command
+    return f"'webots-mcp {whole}'" if command else found[0]

@@ -34,7 +34,7 @@ Seconds = Annotated[float, AfterValidator(_as_seconds)]
 _Duration = Annotated[float, Field(gt=0), AfterValidator(_as_seconds)]
 RobotName = Annotated[
     Annotated[str, Field(max_length=LONGEST_NAME)] | None,
-    Field(description="If several are live."),
+    Field(description="If several."),
 ]
 RunId = Annotated[Id | None, Field(description="Else the current run.")]
 TrialSetId = Annotated[Id | None, Field(description="From webots_run_trials.")]
@@ -46,32 +46,30 @@ StartS = Annotated[Seconds | None, Field(description="From this simulation time.
 EndS = Annotated[Seconds | None, Field(description="Before this simulation time.")]
 TimeoutS = Annotated[
     float,
-    Field(ge=0.1, le=MAX_WAIT_S, description="Longest wait, wall seconds."),
+    Field(ge=0.1, le=MAX_WAIT_S, description="Wall seconds."),
 ]
-_CURSOR: Final = "From the last answer, to go on."
+_CURSOR: Final = "From the last answer."
 Cursor = Annotated[_Place | None, Field(description=_CURSOR)]
 TextCursor = Annotated[str, Field(max_length=2000, description=_CURSOR)]
 # A number is as good; one type that holds both is shorter than two.
 _WallTime = Annotated[float | str | None, WithJsonSchema({"type": "string"})]
-Since = Annotated[_WallTime, Field(description="From this wall time, ISO 8601 or Unix.")]
+Since = Annotated[_WallTime, Field(description="From this wall time, ISO 8601.")]
 Until = Annotated[_WallTime, Field(description="Before this wall time.")]
 Names = Annotated[
     list[str],
     Field(
         min_length=1,
         max_length=50,
-        description="Their names (webots_list_signals); 'pose' is all below it, '*' any text.",
+        description="Their names; 'pose' is all below it, '*' any text.",
     ),
 ]
 AnyNames = Annotated[
     list[str] | None,
-    Field(max_length=50, description="Only these; '*' is any text."),
+    Field(max_length=50, description="'*' is any text."),
 ]
-# Of a parameter. A whole number is a number as well, and stays one.
-Value = Annotated[
-    float | int | bool | str,
-    WithJsonSchema({"anyOf": [{"type": "number"}, {"type": "boolean"}, {"type": "string"}]}),
-]
+# Of a parameter. A whole number is a number as well, and stays one. What it may be is the
+# parameter's to say, and would take as much room as all else.
+Value = Annotated[float | int | bool | str, WithJsonSchema({})]
 MaxPoints = Annotated[
     int | None,
     Field(
@@ -82,10 +80,10 @@ MaxPoints = Annotated[
 ]
 ShownLimit = Annotated[
     int | None,
-    Field(ge=1, le=500, description="Most shown; few by default."),
+    Field(ge=1, le=500, description="Most shown."),
 ]
 LogLevel = Annotated[contract.LogLevel, Field(description="Of log lines: from this level.")]
-Limit = Annotated[int, Field(ge=1, le=500, description="The most to return.")]
+Limit = Annotated[int, Field(ge=1, le=500, description="Most shown.")]
 RunIds = Annotated[
     list[Id] | None,
     Field(max_length=10, description="From webots_list_runs."),

@@ -39,7 +39,7 @@ from webots_mcp.questions.budget import (
     shown,
     without_empty,
 )
-from webots_mcp.questions.declaring import CHANGES, READS, is_for_a_person, question
+from webots_mcp.questions.declaring import READS, SETS, is_for_a_person, question
 from webots_mcp.questions.history_answers import ComparisonAnswer, RunsAnswer
 from webots_mcp.questions.shortening import DETAIL_BUDGET, WHOLE, shorten
 from webots_mcp.store.analysis.spread import MATTERS_SD, Spread
@@ -84,7 +84,7 @@ _GOING_ON: Final = "going on"
 _TAKE_AWAY: Final = "-"
 
 
-@question("List the runs", READS, command="runs", options={"parameters": "--parameter"})
+@question("List the runs", READS, command="runs", options={"parameters": "--parameter"}, core=True)
 def webots_list_runs(
     recording: Recording,
     limit: Limit = 20,
@@ -93,7 +93,7 @@ def webots_list_runs(
         dict[str, Value] | None,
         Field(
             max_length=20,
-            description='Only runs in which they had these values at some time: {"kp": 3.0}.',
+            description='Only runs with these values: {"kp": 3.0}.',
         ),
     ] = None,
     robot: RobotName = None,
@@ -127,6 +127,7 @@ def webots_list_runs(
     command="compare",
     positional=("run_ids",),
     options={"run_ids": "RUN", "matters_sd": "--matters"},
+    core=True,
 )
 def webots_compare_runs(
     recording: Recording,
@@ -137,17 +138,16 @@ def webots_compare_runs(
     position: Position = None,
     mode: Mode = None,
     matters_sd: Annotated[
-        float, Field(gt=0, le=100, description="Matters: so many deviations between like runs.")
+        float, Field(gt=0, le=100, description="What matters, in deviations of like runs.")
     ] = MATTERS_SD,
     robot: RobotName = None,
 ) -> ComparisonAnswer:
     """Did my edit help? Runs beside each other; or how fast, how far and in which modes one ran.
 
-    Without run_ids: the runs before and after the last edit of the controller's file. Given ones
-    of one code and parameters are one group. Over the same stretch of each run: distance, mean
-    speed, share of time per mode, events per minute, and the signals that differ most.
-    `different`: true beyond the spread of like runs (4 of each or more), false where a difference
-    that matters is excluded, null: it cannot be told yet.
+    Without run_ids: the runs before and after the last edit of the controller's file. Runs of one
+    code and parameters are one group. Distance, mean speed, time per mode, events per minute, and
+    the signals that differ most. `different`: true beyond the spread of like runs (4 of each or
+    more), false where a difference that matters is excluded, null: it cannot be told yet.
     """
     if run_ids and trial_set:
         raise InvalidInputError("give run_ids or trial_set, not both")
@@ -169,7 +169,7 @@ def _first_run(recording: Recording, set_id: int) -> int:
 
 @question(
     "Annotate a run",
-    CHANGES,
+    SETS,
     command="label",
     positional=("run_id", "label"),
     options={"run_id": "RUN", "label": "TEXT"},
@@ -180,18 +180,16 @@ def webots_annotate_run(
         str,
         Field(
             max_length=100,
-            description="Short name to find it by; '-' takes it away, '' leaves it.",
+            description="Short name; '-' takes it away.",
         ),
     ] = "",
-    note: Annotated[
-        str, Field(max_length=4000, description="Any text; '-' takes it away, '' leaves it.")
-    ] = "",
+    note: Annotated[str, Field(max_length=4000, description="Any text, or '-'.")] = "",
     robot: RobotName = None,
     run_id: RunId = None,
 ) -> RunsAnswer:
     """Give a run a label or a note, by default the current one.
 
-    A run with either is kept for good: retention deletes nothing of it.
+    A run with either is kept for good.
     """
     with recording.view(robot, run_id) as view:
         run = view.require_run()

@@ -12,7 +12,7 @@ from webots_mcp.contract import MAX_STEPS
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
 from webots_mcp.questions.answers import CommandAnswer
 from webots_mcp.questions.argument_types import MAX_WAIT_S, RobotName, TimeoutS
-from webots_mcp.questions.declaring import CHANGES, DESTROYS, Caller, question
+from webots_mcp.questions.declaring import DESTROYS, Caller, question
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.steering.routes import Attempt
 from webots_mcp.steering.target import find_target
@@ -23,20 +23,20 @@ Port = Annotated[
     Annotated[int, Field(ge=1, le=65535)] | None,
     Field(description="Of a Webots of another project."),
 ]
-Force = Annotated[bool, Field(description="Press Webots' own keys where nothing else works.")]
+Force = Annotated[bool, Field(description="Press Webots' keys where nothing else works.")]
 
 _WAIT_S: Final = 10.0
 _RELOAD_WAIT_S: Final = 30.0
 
 
-@question("Control the simulation", DESTROYS)
+@question("Control the simulation", DESTROYS, core=True)
 async def webots_simulation_control(
     recording: Recording,
     command: Annotated[Order, Field(description="reset and reload begin a new run at time 0.")],
     caller: Caller,
     steps: Annotated[
         Annotated[int, Field(ge=1, le=MAX_STEPS)] | None,
-        Field(description="For step, by default 1: rounds of the controller's loop, then paused."),
+        Field(description="For step: rounds of the controller's loop."),
     ] = None,
     force: Force = False,
     port: Port = None,
@@ -46,17 +46,16 @@ async def webots_simulation_control(
         Field(
             ge=0.1,
             le=MAX_WAIT_S,
-            description="Longest wait; by default 10 s, for reload 30, for step up to 90.",
+            description="Wall seconds: 10, for reload 30, for step up to 90.",
         ),
     ] = None,
 ) -> CommandAnswer:
     """Pause, resume, run fast, step, reset or reload, and wait for the outcome.
 
-    By a controller that is a Supervisor, else by an observer in the world (webots-mcp init
-    --observer), else by Webots itself if it was started with --stream; `route` says which. The
-    whole simulation is steered, not one robot. `reload` restarts the controllers that Webots
-    starts, with their code as it is on disk now; an extern controller ends, and somebody has to
-    start it again by hand.
+    By a Supervisor, else an observer in the world (webots-mcp init --observer), else by Webots
+    itself if started with --stream; `route` says which. `reload`
+    restarts the controllers that Webots starts with their code as it is now; an extern controller
+    ends, and somebody has to start it by hand.
     """
     if steps is not None and command != "step":
         raise InvalidInputError(f"steps is for command='step', not for {command!r}: leave it out")
@@ -78,7 +77,7 @@ async def webots_world_reload(
     robot: RobotName = None,
     timeout_s: TimeoutS = _RELOAD_WAIT_S,
 ) -> CommandAnswer:
-    """Load world and code anew: webots_simulation_control("reload") by another name."""
+    """Load world and code anew, as webots_simulation_control("reload")."""
     dispatcher = Dispatcher(recording, caller.report)
     return await Attempt(recording, dispatcher, robot, timeout_s, "reload", {}, force).steer()
 
@@ -96,13 +95,13 @@ async def webots_world_reset(
     return await Attempt(recording, dispatcher, robot, timeout_s, "reset", {}, force).steer()
 
 
-@question("Reset the controller's state", CHANGES)
+@question("Reset the controller's state", DESTROYS)
 async def webots_reset_controller_state(
     recording: Recording, caller: Caller, robot: RobotName = None, timeout_s: TimeoutS = _WAIT_S
 ) -> CommandAnswer:
     """Put the controller's own variables back; world and time go on as they are.
 
-    Runs its own action reset_state, else the callbacks that it registered with bridge.on_reload().
+    Runs its action reset_state, else the callbacks of bridge.on_reload().
     """
     return await Dispatcher(recording, caller.report).ask(robot, "reset_state", timeout_s)
 

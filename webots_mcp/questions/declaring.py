@@ -262,8 +262,9 @@ def question(
 
 
 def questions_in(module: ModuleType) -> Iterator[Question]:
-    """What a module declares."""
-    return (each for each in tuple(vars(module).values()) if isinstance(each, Question))
+    """What a module declares, without what it imports."""
+    found = (each for each in tuple(vars(module).values()) if isinstance(each, Question))
+    return (each for each in found if each.function.__module__ == module.__name__)
 
 
 def is_for_a_person() -> bool:

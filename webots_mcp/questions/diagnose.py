@@ -15,12 +15,12 @@ _LONGEST_TEXT: Final = 320
 _BUDGET: Final = 5_000  # characters; the checks beyond it are told by name
 
 
-@question("Diagnose the set-up", READS)
+@question("Diagnose the set-up", READS, core=True)
 def webots_diagnose(recording: Recording) -> DiagnosisAnswer:
     """When nothing comes, or time stands still: each link from Webots and controller to here.
 
-    Checks data folder, database, who records, rows and commands that wait, why the simulation
-    stands, which Webots run, client files. `webots-mcp doctor` in a shell also starts a server.
+    Data folder, database, who records, what waits, why the simulation stands, which Webots run,
+    client files.
     """
     checked = diagnose(subject_of(recording, "how this server was started"))
     return DiagnosisAnswer(

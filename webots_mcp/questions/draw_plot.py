@@ -39,7 +39,7 @@ def webots_plot(
     scope: Scope,
     kind: Annotated[
         PlotKind,
-        Field(description="trajectory: the way, seen from above."),
+        Field(description="trajectory: the way from above."),
     ] = "signals",
     signals: AnyNames = None,
     run_ids: RunIds = None,
@@ -51,11 +51,11 @@ def webots_plot(
         int, Field(ge=LEAST_HEIGHT_PX, le=MOST_PX, description="Pixels.")
     ] = HEIGHT_PX,
 ) -> list[str | ShownPicture]:
-    """A picture of signals over time (mean line, min-max band, modes, events), way, or trials.
+    """A picture of signals over time (mean, min-max band, modes, events), way, or trials.
 
-    Without signals those that changed most; a trajectory finds the position, or takes
-    the two signals x and y. Several run_ids are laid over each other, each from its start.
-    trial_set: scores over one or two parameters, as signals.
+    Without signals those that changed most; a trajectory finds the position, or takes two signals.
+    Several run_ids are laid over each other. trial_set: scores over one or two parameters, as
+    signals.
     """
     if trial_set is not None:
         return _trials(recording, trial_set, signals or (), (width_px, height_px))

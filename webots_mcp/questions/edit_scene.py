@@ -28,7 +28,7 @@ _Start = Annotated[int, Field(ge=0)]
 async def webots_get_scene(
     recording: Recording,
     caller: Caller,
-    path: Annotated[str | None, Field(description="Only what is in this node.")] = None,
+    path: Annotated[str | None, Field(description="Only in this node.")] = None,
     depth: Annotated[_Count | None, Field(description="Levels; 2 unless types or names.")] = None,
     types: AnyNames = None,
     names: AnyNames = None,

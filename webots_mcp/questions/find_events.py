@@ -55,7 +55,7 @@ Kind = Annotated[
 Kinds = Annotated[
     list[Kind] | None,
     Field(
-        description="Only these; by default all but image. "
+        description="All but image by default. "
         f"{'; '.join(f'{kind.name}: {kind.means}' for kind in KINDS if kind.means)}."
     ),
 ]
@@ -85,7 +85,7 @@ def webots_find_events(
         str | None,
         Field(
             max_length=500,
-            description="A condition, as in webots_breakpoint: each stretch in which it held.",
+            description="Each stretch in which a condition held, as in webots_breakpoint.",
         ),
     ] = None,
     signals: AnyNames = None,
@@ -101,7 +101,7 @@ def webots_find_events(
         float, Field(gt=0, description="... within this many metres.")
     ] = EventOptions.stuck_m,
     silent_s: Annotated[
-        float, Field(gt=0, description="Silent: without a value for at least so long.")
+        float, Field(gt=0, description="Silent: no value for so long.")
     ] = EventOptions.silent_s,
     position: Position = None,
     mode: Mode = None,

@@ -28,7 +28,7 @@ _MOST_FRAMES: Final = 16
 _FAR_S: Final = 1.0  # from the time that was asked for
 
 
-@question("Get the camera picture", READS)
+@question("Get the camera picture", READS, core=True)
 async def webots_get_camera(
     recording: Recording,
     caller: Caller,
@@ -122,14 +122,11 @@ def _sheet(recording: Recording, found: list[StoredImage]) -> tuple[ShownPicture
 async def webots_take_screenshot(
     recording: Recording,
     caller: Caller,
-    quality: Annotated[int, Field(ge=1, le=100, description="Of the simulator's file.")] = 90,
+    quality: Annotated[int, Field(ge=1, le=100, description="Of the file.")] = 90,
     robot: RobotName = None,
     timeout_s: TimeoutS = _WAIT_S,
 ) -> list[str | ShownPicture]:
-    """The simulation's main view, now, within 1,000 pixels; needs a Supervisor.
-
-    The caption names the original file.
-    """
+    """The simulation's main view, now, within 1,000 pixels; needs a Supervisor."""
     dispatcher = Dispatcher(recording, caller.report)
     answer = await dispatcher.ask(robot, "screenshot", timeout_s, {"quality": quality})
     return await to_thread.run_sync(_show, recording, answer)

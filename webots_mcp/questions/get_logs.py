@@ -39,15 +39,13 @@ _NO_RUN_YET: Final = (
 )
 
 
-@question("Get log lines", READS)
+@question("Get log lines", READS, core=True)
 def webots_get_logs(
     recording: Recording,
     lines: Annotated[int, Field(ge=1, le=1000, description="The most lines.")] = 50,
-    filter_text: Annotated[
-        str, Field(max_length=200, description="Only lines that contain this text.")
-    ] = "",
-    level: Annotated[LogLevel | None, Field(description="This level and those above it.")] = None,
-    source: Annotated[LogSource | None, Field(description="Only lines of this one.")] = None,
+    filter_text: Annotated[str, Field(max_length=200, description="In the line.")] = "",
+    level: Annotated[LogLevel | None, Field(description="From this level.")] = None,
+    source: Annotated[LogSource | None, Field(description="Only its lines.")] = None,
     last_s: LastS = None,
     start_s: StartS = None,
     end_s: EndS = None,
@@ -57,10 +55,9 @@ def webots_get_logs(
 ) -> LogsAnswer:
     """The newest log lines, oldest first, each with its run.
 
-    Of all runs of the robot, so also from before a reset; with a run_id or a range of time of
-    that run, or the current one. A line begins with its source, unless that is the controller:
-    'bridge:', 'webots:' (Webots' own messages), 'console:' (printed by a controller, Webots does
-    not tell which); those of Python's logging with '[name of the logger]'.
+    Of all runs; with run_id or a range of time of that run, or the current one. A line begins with
+    its source, unless that is the controller: 'bridge:', 'webots:', 'console:' (printed by a
+    controller, Webots does not tell which), '[name of the logger]'.
     """
     scope = Scope(robot=robot, run_id=run_id, last_s=last_s, start_s=start_s, end_s=end_s)
     lowest = level or "debug"

@@ -26,7 +26,7 @@ _WAIT_S: Final = 30.0
 _LOOK_EVERY_S: Final = 0.2
 _LONGEST_LINE: Final = 200
 
-World = Annotated[str, Field(max_length=1000, description="A .wbt file of the project.")]
+World = Annotated[str, Field(max_length=1000, description="A .wbt file.")]
 
 
 @question("Launch Webots on a world", CHANGES)
@@ -37,13 +37,13 @@ async def webots_launch_world(
     mode: Annotated[Mode | None, Field(description="To begin with; else as it prefers.")] = None,
     headless: Annotated[bool, Field(description="Without its window and 3D view.")] = False,
     stream: Annotated[
-        bool, Field(description="Obey without a controller; opens the project's files to the net.")
+        bool, Field(description="Obey without a controller; opens the project to the net.")
     ] = False,
     timeout_s: TimeoutS = _STARTING_S,
 ) -> CommandAnswer:
     """Start Webots and wait until the first controller records, or say why none does.
 
-    It ends with this server, or by webots_quit. One at a time.
+    It ends with this server, or when it is quit. One at a time.
     """
     launcher = caller.companions.webots
     project = await to_thread.run_sync(project_of, recording)
@@ -134,7 +134,7 @@ def _then(launched: Launch) -> str:
     if launched.start.mode != "pause":
         return ""
     by_us = 'webots_simulation_control("resume") plays it'
-    alone = "press play in its window, or webots_quit and start it in another mode or with stream"
+    alone = "press play in its window, or quit it and start it in another mode or with stream"
     return f". {by_us if launched.start.streams else alone}"
 
 

@@ -25,11 +25,11 @@ from webots_mcp.store.signals.catalogue import SignalInfo, list_signals
 SIGNAL_COLUMNS: Final = ("signal", "kind", "unit", "last", "min", "max", "missing")
 
 
-@question("List the signals", READS, command="signals", positional=("pattern",), core=True)
+@question("List the signals", READS, command="signals", positional=("pattern",))
 def webots_list_signals(
     recording: Recording,
     pattern: Annotated[
-        str, Field(max_length=200, description="Only these names; '*' stands for any text.")
+        str, Field(max_length=200, description="Of signals; '*' is any text.")
     ] = "*",
     limit: Limit = 100,
     cursor: Cursor = None,

@@ -38,20 +38,17 @@ _ROWLESS: Final = EventOptions(kinds=("run", "command", "log", "noticed"))  # wi
 _WatchS = Annotated[float, Field(ge=1, le=MAX_WAIT_S)] | None
 
 
-@question("Watch the robot", READS)
+@question("Watch the robot", READS, core=True)
 async def webots_monitor(
     recording: Recording,
     caller: Caller,
-    duration_s: Annotated[
-        _WatchS, Field(description="How long to watch, wall seconds; by default 10.")
-    ] = None,
+    duration_s: Annotated[_WatchS, Field(description="Wall seconds to watch; 10.")] = None,
     lookback_s: Annotated[
         float | None,
         Field(
             gt=0,
             le=86_400,
-            description="Do not watch: report at once on this many wall seconds before the "
-            "newest row.",
+            description="Instead: the last wall seconds, at once.",
         ),
     ] = None,
     duration: SkipJsonSchema[_WatchS] = None,
@@ -59,8 +56,8 @@ async def webots_monitor(
 ) -> MonitorAnswer:
     """What does it do now? Watch it live for some seconds of wall time, then report.
 
-    Movement, trends and events of exactly the rows of that window. For longer ago, another run,
-    or chosen signals: webots_get_trends and webots_find_events, which take simulation time.
+    Movement, trends and events of that window. Of longer ago: webots_get_trends and
+    webots_find_events.
     """
     if sum(each is not None for each in (duration_s, lookback_s, duration)) > 1:
         raise InvalidInputError(

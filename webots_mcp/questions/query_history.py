@@ -58,21 +58,20 @@ _SIGNAL_CHARACTERS: Final = 200  # of a signal, beside its buckets
     command="history",
     positional=("signals",),
     options={"signals": "SIGNAL", "max_points": "--points"},
+    core=True,
 )
 def webots_query_history(
     recording: Recording,
     scope: Scope,
     signals: Names,
     max_points: MaxPoints = None,
-    raw: Annotated[
-        bool, Field(description="The rows as they are, exact, in pages, instead of buckets.")
-    ] = False,
+    raw: Annotated[bool, Field(description="Exact rows in pages, no buckets.")] = False,
     cursor: Cursor = None,
 ) -> HistoryAnswer:
     """The values of signals over time: min, max, mean, last per bucket, by default the whole run.
 
-    No extreme is averaged away; empty buckets are null, gaps are listed. Text and flags come as
-    the points at which they changed. webots_get_trends first: in words, which signals matter.
+    No extreme is averaged away; empty buckets are null. Text and flags come as the points at which
+    they changed. webots_get_trends first: in words, which signals matter.
     """
     if cursor is not None and not raw:
         raise InvalidInputError("cursor goes on with rows: give it together with raw=true")

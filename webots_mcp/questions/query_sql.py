@@ -40,13 +40,13 @@ async def webots_query_sql(
     sql: Annotated[str, Field(min_length=1, max_length=10_000, description="One SELECT.")],
     limit: ShownLimit = None,
 ) -> SqlAnswer:
-    """Read by SQL (SQLite) what the other tools do not cover; nothing but reading is allowed.
+    """Read by SQL (SQLite) what the other tools do not cover.
 
-    Tables: robot, session (a controller process), run(id, robot_id, session_id, rows, label,
+    Tables: robot, session, run(id, robot_id, session_id, rows, label,
     last_sim_time_s), state(run_id, sim_time_s, wall_time_s, data: JSON), signal(name, path),
     all_rollup(run_id, signal_id, bucket of 10 s, min, max, sum, present), change, log, event,
     command, image. Views: robot_now, robot_run, robot_trajectory, robot_period, robot_event,
-    robot_log, robot_command. Ask by run_id and sim_time_s: they are indexed. Values of a state:
+    robot_log, robot_command. Indexed by run_id and sim_time_s. Values:
     json_extract(data, '$.pose[0]'). All columns: the resource webots://schema.
     """
     budget = _BUDGET_BYTES if limit is None else _LARGE_BUDGET_BYTES
@@ -111,4 +111,4 @@ def _truncated(found: Result) -> str | None:
 
 
 def _none(rows: list[list[Cell]]) -> str | None:
-    return None if rows else "no row: webots_list_runs and webots_list_signals tell what there is"
+    return None if rows else "no row: webots_list_runs and webots_get_trends tell what there is"

@@ -44,7 +44,7 @@ Offset = Annotated[int, Field(ge=0, description="First item or character at the 
 PageSize = Annotated[int, Field(ge=1, le=2000, description="So many of them.")]
 
 
-@question("Get the robot's state", READS)
+@question("Get the robot's state", READS, core=True)
 def webots_get_robot_state(
     recording: Recording, robot: RobotName = None, run_id: RunId = None
 ) -> StateAnswer:
@@ -70,10 +70,7 @@ def webots_get_robot_state(
 def webots_get_sensors(
     recording: Recording, robot: RobotName = None, run_id: RunId = None
 ) -> SensorsAnswer:
-    """The newest sensor values: members of the state named after a sensor device or like one.
-
-    Values that JSON cannot hold (nan, inf) are named in their place and listed in `replaced`.
-    """
+    """The newest sensor values: members of the state named after a sensor device or like one."""
     with recording.view(robot, run_id) as view:
         if view.state is None:
             return SensorsAnswer(**view.header(), hint=_nothing_yet(view))
@@ -92,7 +89,7 @@ def webots_get_sensors(
         )
 
 
-@question("Get the full state", READS)
+@question("Get the full state", READS, core=True)
 def webots_get_full_state(
     recording: Recording,
     path: PagePath = "",
@@ -103,8 +100,7 @@ def webots_get_full_state(
 ) -> FullStateAnswer:
     """A part of the newest state, whole and exact, in pages: what webots_get_robot_state shortens.
 
-    Without a path all of it, the newest events and the recorder's health: rows waiting and
-    dropped, last error, version of the controller's code.
+    Without a path also the newest events and the recorder's health.
     """
     with recording.view(robot, run_id) as view:
         if view.state is None:

@@ -25,7 +25,7 @@ _PICTURE_WAIT_S: Final = 8.0
 _SAME_S: Final = 0.001  # times are told to the millisecond
 
 
-@question("Run until", DESTROYS)
+@question("Run until", DESTROYS, core=True)
 async def webots_run(
     recording: Recording,
     caller: Caller,
@@ -35,9 +35,7 @@ async def webots_run(
     ] = None,
     for_s: Annotated[
         float | None,
-        Field(
-            gt=0, le=MAX_RUN_S, description="For this many simulated seconds, or until, if before."
-        ),
+        Field(gt=0, le=MAX_RUN_S, description="Simulated seconds, or until, if before."),
     ] = None,
     reset: Annotated[
         bool, Field(description="Reset the world first; for_s counts from there.")
@@ -45,7 +43,7 @@ async def webots_run(
     pace: Annotated[Pace | None, Field(description="null: as it runs now.")] = "fast",
     parameters: Annotated[
         dict[str, Any] | None,
-        Field(description="Set these first, all or none; see webots_get_parameters."),
+        Field(description="Set these first, all or none."),
     ] = None,
     then: Annotated[Then, Field(description="At that step; go_on: at the old pace.")] = "pause",
     picture: Annotated[bool, Field(description="A screenshot of the end, too.")] = False,
@@ -55,8 +53,7 @@ async def webots_run(
     """Let the simulation run until a condition holds or a simulated time is over, then pause it.
 
     Says why it stopped, how far it came, the state at that step, and what happened meanwhile. Out
-    of wall time it goes on: webots_wait_for_command waits for the same answer. Needs a Supervisor.
-    To watch without steering: webots_monitor.
+    of wall time it goes on: webots_list_commands(what="outcome") waits. Needs a Supervisor.
     """
     await to_thread.run_sync(lambda: require_possible(recording, robot, until, for_s, reset=reset))
     params = {

@@ -91,8 +91,8 @@ async def webots_run_trials(
 ) -> TrialsAnswer:
     """Which parameters are best? Each trial resets the world, sets them, runs fast, is scored.
 
-    After timeout_s they go on: trial_set alone waits on, or resumes. A cancelled call stops them.
-    At the end parameters are set back.
+    After timeout_s they go on: trial_set alone waits on, or resumes. At the end parameters are set
+    back.
     """
     given = parameters is not None or score is not None
     if (trial_set is None) != given:

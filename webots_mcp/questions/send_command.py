@@ -11,7 +11,7 @@ from webots_mcp.contract import BUILT_IN_ACTIONS, CommandStatus
 from webots_mcp.questions.answers import CommandAnswer, CommandsAnswer
 from webots_mcp.questions.argument_types import Cursor, Id, RobotName, TimeoutS
 from webots_mcp.questions.budget import condensed
-from webots_mcp.questions.declaring import CHANGES, READS, Caller, question
+from webots_mcp.questions.declaring import DESTROYS, READS, Caller, question
 from webots_mcp.questions.shortening import DETAIL_BUDGET, cut_text, shorten
 from webots_mcp.queue import Command, list_commands
 from webots_mcp.steering.dispatch import Dispatcher, shown_result
@@ -25,7 +25,7 @@ _ACTIONS_BUDGET: Final = 2_400
 _LONGEST_TEXT: Final = 200
 
 
-@question("Send a command", CHANGES)
+@question("Send a command", DESTROYS, core=True)
 async def webots_send_command(
     recording: Recording,
     action: Annotated[
@@ -39,7 +39,7 @@ async def webots_send_command(
 ) -> CommandAnswer:
     """Have the controller run one of its own actions, at most once, and wait for its answer.
 
-    webots_list_commands lists the actions. Built-in actions have tools of their own.
+    webots_list_commands lists them.
     """
     dispatcher = Dispatcher(recording, caller.report)
     return await dispatcher.ask(robot, action, timeout_s, params)
@@ -56,13 +56,11 @@ async def webots_wait_for_command(
     return await Dispatcher(recording, caller.report).wait(command_id, timeout_s)
 
 
-@question("List the commands", READS)
+@question("List the commands", READS, core=True)
 def webots_list_commands(
     recording: Recording,
-    limit: Annotated[int, Field(ge=1, le=200, description="The most to return.")] = 10,
-    status: Annotated[
-        CommandStatus | None, Field(description="Only commands in this state.")
-    ] = None,
+    limit: Annotated[int, Field(ge=1, le=200, description="Most shown.")] = 10,
+    status: Annotated[CommandStatus | None, Field(description="Only those.")] = None,
     cursor: Cursor = None,
     robot: RobotName = None,
 ) -> CommandsAnswer:

@@ -13,7 +13,7 @@ from webots_mcp.parameter import MOST_PARAMETERS
 from webots_mcp.questions.answers import CommandAnswer, ParametersAnswer
 from webots_mcp.questions.argument_types import RobotName, RunId, TimeoutS, Value
 from webots_mcp.questions.budget import fitting, seconds, without_empty
-from webots_mcp.questions.declaring import CHANGES, READS, Caller, question
+from webots_mcp.questions.declaring import READS, SETS, Caller, question
 from webots_mcp.questions.shortening import DETAIL_BUDGET, WHOLE, shorten
 from webots_mcp.steering.tuning import SET_WAIT_S, When, set_parameters
 from webots_mcp.store.parameters import COLUMNS, described
@@ -36,7 +36,7 @@ def webots_get_parameters(
     recording: Recording,
     names: Annotated[
         list[str] | None,
-        Field(max_length=50, description="Only these, with '*' for any text; all if none."),
+        Field(max_length=50, description="Of parameters; '*' is any text."),
     ] = None,
     robot: RobotName = None,
     run_id: RunId = None,
@@ -58,21 +58,19 @@ def webots_get_parameters(
         )
 
 
-@question("Set parameters", CHANGES)
+@question("Set parameters", SETS, core=True)
 async def webots_set_parameters(
     recording: Recording,
     values: Values,
     caller: Caller,
-    when: Annotated[
-        When, Field(description="now, or from the next reset of the world on.")
-    ] = "now",
+    when: Annotated[When, Field(description="reset: from the next one on.")] = "now",
     robot: RobotName = None,
     timeout_s: TimeoutS = SET_WAIT_S,
 ) -> CommandAnswer:
     """Set parameters of a running controller, all or none, between two rounds of its loop.
 
-    The answer has each old and new value and the simulation time from which on it holds. A reset
-    keeps the values; a reload begins with those in the code.
+    Answers with old and new values and from which simulation time on. A reset keeps them; a reload
+    begins with those in the code.
     """
     return await set_parameters(
         recording, caller.report, values, when=when, robot=robot, timeout_s=timeout_s

@@ -29,12 +29,11 @@ _ROBOT_COLUMNS: Final = (
 )  # fmt: skip
 
 
-@question("List the robots", READS)
+@question("List the robots", READS, core=True)
 def webots_list_robots(recording: Recording) -> RobotsAnswer:
     """Every robot ever recorded: whether it is live, whether its time moves, its current run.
 
-    The header is that of the only live robot, if there is just one. `actions` counts the
-    robot's own commands; webots_list_commands describes them.
+    `actions` counts its own commands; webots_list_commands describes them.
     """
     with recording.reader() as connection:
         now_s = time.time()
@@ -57,8 +56,8 @@ def webots_get_world_info(
 ) -> WorldAnswer:
     """The world file, its time step, the run and its pace, the controller's code, other robots.
 
-    With an observer in the world (webots-mcp init --observer): all its robots and where they are.
-    Also where the database and the pictures lie.
+    With an observer (webots-mcp init --observer) where all robots are. Also where the recording
+    lies.
     """
     with recording.view(robot, run_id) as view:
         run = view.require_run()

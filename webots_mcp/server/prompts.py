@@ -70,7 +70,7 @@ def explain_stretch(
     stretch = f"start_s={start_s}, end_s={end_s}{run}{_too(robot)}"
     return (
         f"Explain what {_named(robot)} did from {start_s} to {end_s} s of simulation time.\n"
-        f"1. webots_get_timeline({stretch}): commands, changes of modes and flags, log lines.\n"
+        f'1. webots_find_events(what="timeline", {stretch}): commands, modes, log lines.\n'
         f"2. webots_find_events({stretch}): what nobody noted, such as standstills and jumps.\n"
         f"3. webots_get_trends({stretch}): what each signal did in words.\n"
         f'4. webots_plot(kind="trajectory", {stretch}): the path it took.\n'

@@ -16,14 +16,21 @@ import functools
 import inspect
 import json
 import logging
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Any, Final, cast
 
 from mcp import MCPError
+from mcp.server import MCPServer
 from mcp.server.mcpserver import Context, Image
 from mcp.server.mcpserver.exceptions import ToolError
 from mcp.server.mcpserver.tools import Tool
-from mcp.types import CallToolResult, ContentBlock, TextContent, ToolAnnotations
+from mcp.types import (
+    CallToolResult,
+    ContentBlock,
+    InputRequiredResult,
+    TextContent,
+    ToolAnnotations,
+)
 from pydantic import ValidationError
 
 from webots_mcp.errors import WebotsMCPError
@@ -37,7 +44,17 @@ from webots_mcp.store.recording import Recording
 _WRAPPER: Final = "params"
 _FORMAT: Final = "response_format"
 _FORMATS: Final = (None, "json", "markdown")
-_UNSAID: Final = ("title", "anyOf", "maxLength", "maxProperties")
+_UNSAID: Final = (
+    "title", "anyOf", "maxLength", "minLength", "maxProperties", "minProperties", "maxItems",
+)  # fmt: skip
+_USUAL: Final[Mapping[str, tuple[Any, ...]]] = {  # what a model takes for granted
+    "default": (None, "", False),  # and 0
+    "minimum": (0, 1),
+    "exclusiveMinimum": (0,),
+    "minItems": (1,),
+    "additionalProperties": (True, {}),
+}
+_NOBODY_ASKS_FOR: Final = 1_000
 _BAD_ENDS: Final = ("failed", "expired", "cancelled", "lost")
 _LONGEST_DEFECT: Final = 200
 _LONGEST_ERROR: Final = 4_000  # characters: it may repeat what the model itself has sent
@@ -60,8 +77,8 @@ def _tool(question: Question, output_schema: bool) -> Tool:
         description=inspect.getdoc(question.function),
         annotations=ToolAnnotations(
             read_only_hint=effect.reads,
-            destructive_hint=effect.destroys,
-            idempotent_hint=effect.repeats,
+            destructive_hint=None if effect.reads else effect.destroys,
+            idempotent_hint=None if effect.reads else effect.repeats or None,
             open_world_hint=False,
         ),
         structured_output=None if output_schema else False,
@@ -146,19 +163,51 @@ class CheckedTool(Tool):
             raise
 
 
+class ToolServer(MCPServer):
+    """A server that answers to more names than it lists: those of questions that were merged."""
+
+    def __init__(
+        self, *arguments: Any, unlisted: Mapping[str, Callable[[], Tool]], **options: Any
+    ) -> None:
+        super().__init__(*arguments, **options)
+        self._unlisted = unlisted
+
+    async def call_tool(
+        self, name: str, arguments: dict[str, Any], context: Context[Any, Any] | None = None
+    ) -> CallToolResult | InputRequiredResult:
+        """Call a tool, also one that is not listed.
+
+        Raises:
+            ToolError: There is no such tool, or it refused.
+        """
+        if self._tool_manager.get_tool(name) is None and (make := self._unlisted.get(name)):
+            context = context or Context(mcp_server=self)
+            return await make().run(arguments, context, convert_result=True)
+        return await super().call_tool(name, arguments, context)
+
+
 def _slim(schema: dict[str, Any]) -> dict[str, Any]:
     """A parameter's schema without what says nothing.
 
-    That is its name once more, null or an empty default for "may be left out", and the longest
-    text, which only an absurd one exceeds.
+    That is its name once more, null or an empty default for "may be left out", and bounds that only
+    an absurd value exceeds.
     """
     choices: list[dict[str, Any]]
     choices = [choice for choice in schema.get("anyOf", ()) if choice != {"type": "null"}]
     whole = schema | (choices[0] if len(choices) == 1 else {})
-    kept = {key: value for key, value in whole.items() if key not in _UNSAID}
-    if kept.get("default", ...) in (None, ""):
-        del kept["default"]
+    kept = {
+        key: value
+        for key, value in whole.items()
+        if key not in _UNSAID and value not in _USUAL.get(key, ()) and not _is_absurd(key, value)
+    }
+    if "items" in kept:
+        kept["items"] = _slim(kept["items"])
     return kept | ({"anyOf": choices} if len(choices) > 1 else {})
+
+
+def _is_absurd(key: str, value: Any) -> bool:
+    """Whether it is a bound beyond what anybody asks for."""
+    return key == "maximum" and value >= _NOBODY_ASKS_FOR
 
 
 def _unwrapped(

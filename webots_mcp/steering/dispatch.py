@@ -220,8 +220,8 @@ def _hint(view: View, command: Command) -> str | None:
         return _instructions(view, command.action)
     if command.status == "claimed":
         return (
-            "the controller is still busy with it: keep waiting with webots_wait_for_command, "
-            f"command_id {command.id}; do not send it again"
+            "the controller is still busy with it: keep waiting with "
+            f'webots_list_commands(what="outcome", command_id={command.id}); do not send it again'
         )
     if command.status == "lost":
         return _after_loss(view)

@@ -44,7 +44,7 @@ class Launcher:
             if self.running is not None:
                 raise CommandRefusedError(
                     f"the Webots that this server has started still runs {self.running.world.name}:"
-                    " webots_load_world opens another world in it, webots_quit ends it"
+                    " action=load opens another world in it, action=quit ends it"
                 )
             self.launched = Launch(self._recording, start, self._environment(), _overhear)
             return self.launched

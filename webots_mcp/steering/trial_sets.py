@@ -182,7 +182,7 @@ def require_ours(recording: Recording, set_id: int) -> None:
             why = f"has simulators of its own: {_goes_on(found)}"
             raise InvalidInputError(
                 f"trial set {set_id} {why if names_world(found.plan) else _FROM_ELSEWHERE}; "
-                f"webots_get_trials(trial_set={set_id}) tells of it"
+                f'webots_list_runs(what="trials", trial_set={set_id}) tells of it'
             )
 
 

@@ -130,8 +130,8 @@ class WorldRequest(Request):
             self.tried["websocket"] = str(error)
             raise CommandRefusedError(
                 f"no way to open {world.name} works. {self._told()}. Open it in Webots (File, Open "
-                "World); or end Webots and start it with that world (webots_quit and "
-                "webots_launch_world, with stream=true for the next time)"
+                "World); or end Webots and start it with that world (webots_launch_world "
+                "quits it, and launches one with stream=true for the next time)"
             ) from error
         return f"Webots said {reply.heard!r}"
 

@@ -115,6 +115,6 @@ async def test_empty_answers_say_why_and_what_to_try(story: Path) -> None:
         ("webots_get_trends", {"start_s": 500}, "leave the range out"),
         ("webots_query_history", {"signals": ["*"], "start_s": 500}, "leave the range out"),
         ("webots_get_trends", {"since": "2035-01-01"}, "webots_list_runs"),
-        ("webots_query_sql", {"sql": "SELECT 1 WHERE 0"}, "webots_list_signals"),
+        ("webots_query_sql", {"sql": "SELECT 1 WHERE 0"}, "webots_get_trends"),
     ):
         assert words in (await tell(story, tool, **arguments))["hint"], tool

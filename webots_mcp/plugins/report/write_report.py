@@ -12,7 +12,7 @@ from webots_mcp.plugins.report.making import make_report
 from webots_mcp.plugins.report.writing import file_name, require_free, write_report
 from webots_mcp.questions.argument_types import AnyNames, RobotName, RunIds
 from webots_mcp.questions.budget import notes_of
-from webots_mcp.questions.declaring import CHANGES, question
+from webots_mcp.questions.declaring import DESTROYS, question
 from webots_mcp.questions.history_answers import NotedAnswer
 from webots_mcp.store.recording import Recording
 
@@ -28,20 +28,18 @@ class ReportAnswer(NotedAnswer):
     not_in_it: list[str] | None = Field(default=None, description="What had no room, and why.")
 
 
-@question("Write a report", CHANGES)
+@question("Write a report", DESTROYS)
 def webots_report(
     recording: Recording,
     run_ids: RunIds = None,
-    file: Annotated[
-        str, Field(max_length=500, description="In the data folder; else reports/run-ID.html.")
-    ] = "",
+    file: Annotated[str, Field(max_length=500, description="In the data folder.")] = "",
     overwrite: Annotated[bool, Field(description="A file that is there.")] = False,
     signals: AnyNames = None,
     robot: RobotName = None,
 ) -> ReportAnswer:
     """Write a run, or two compared, as one HTML file for people, which opens offline.
 
-    Events, trends, plots, way, pictures, log. Answers with its path.
+    Events, trends, plots, pictures, log.
     """
     with recording.view(robot, run_ids[0] if run_ids else None) as view:
         chosen = run_ids or [view.require_run().id]

@@ -40,7 +40,7 @@ def _mode(event: Event) -> Hashable:
 
 STILL: Final = EventKind(
     "still",
-    "the robot stood still",
+    "stands",
     still_events,
     lasts=True,
     least_s=_least_s,
@@ -50,7 +50,7 @@ STILL: Final = EventKind(
 )
 STUCK: Final = EventKind(
     "stuck",
-    "stood still when it should have moved",
+    "stands when it should move",
     stuck_events,
     lasts=True,
     least_s=_least_s,

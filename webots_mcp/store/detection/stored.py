@@ -381,7 +381,7 @@ LOG: Final = EventKind(
 )
 NOTICED: Final = EventKind(
     "noticed",
-    "noticed by the bridge",
+    "by the bridge",
     noticed_events,
     stored=True,
     drawn=6,

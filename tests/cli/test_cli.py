@@ -105,19 +105,23 @@ def test_status_tells_what_runs_and_what_could_not_be_recorded(
     text = capsys.readouterr().out
     for words in (
         str(tmp_path / "webots.db"),
-        f"{rover.name} (Supervisor): running",
-        "simulation time 1.500 s",
-        "rows waiting 4 (in the controller's memory), dropped 1",
-        "last error: disk full",
+        f"{rover.name}, run {rover.run_id}, at 1.5 s, running",
+        "Supervisor",
+        "the controller's memory",
+        "disk full",
+        "states 1.00 GB (default)",
     ):
         assert words in text
+    (head,) = (line.split() for line in text.splitlines() if "rows_waiting" in line)
+    assert head[-4:] == ["rows_waiting", "waiting_in", "rows_dropped", "last_error"]
 
 
 def test_status_as_json_holds_the_same(
     rover: RecordedRobot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["status", "--json", "--database", str(tmp_path / "webots.db")]) == 0
-    robot = json.loads(capsys.readouterr().out)["robots"][0]
+    robots = json.loads(capsys.readouterr().out)["robots"]
+    robot = dict(zip(robots["columns"], robots["rows"][0], strict=True))
     assert (robot["robot"], robot["live"], robot["run_id"]) == (rover.name, True, rover.run_id)
     assert (robot["status"], robot["rows_dropped"]) == ("running", 1)
 

@@ -58,7 +58,7 @@ def test_an_export_is_whole_but_for_the_row_that_cannot_be_read(
     assert "data holds no valid JSON" in capsys.readouterr().err
 
 
-def test_what_was_left_out_is_said_on_stderr(
+def test_what_was_left_out_is_said_below_the_answer(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "webots.db"
@@ -68,4 +68,4 @@ def test_what_was_left_out_is_said_on_stderr(
     assert main(["status", "--database", str(file)]) == 0
     answer = capsys.readouterr()
     assert "rover" in answer.out
-    assert answer.err == "webots-mcp: left out: session 1: actions holds no valid JSON\n"
+    assert "note: left out: session 1: actions holds no valid JSON\n" in answer.out

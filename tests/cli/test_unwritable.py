@@ -99,7 +99,7 @@ def test_the_status_says_it_to_programs_as_well(artifact: Path) -> None:
     ended = run("-m", "webots_mcp", "status", "--json", "--database", str(artifact))
     facts = json.loads(ended.stdout)
     assert facts["storage"].startswith(SAID)
-    assert [robot["runs"] for robot in facts["robots"]] == [2]
+    assert [row[facts["robots"]["columns"].index("runs")] for row in facts["robots"]["rows"]] == [2]
 
 
 def test_what_waits_beside_it_is_said_not_to_be_in_it(recorded: Recorded) -> None:
@@ -161,7 +161,7 @@ def test_where_the_log_can_be_read_in_place_nothing_is_missing(recorded: Recorde
     with unprivileged.unwritable(recorded.database.parent):
         ended = run("-m", "webots_mcp", "status", "--json", "--database", str(recorded.database))
     facts = json.loads(ended.stdout)
-    assert [robot["runs"] for robot in facts["robots"]] == [2]
+    assert [row[facts["robots"]["columns"].index("runs")] for row in facts["robots"]["rows"]] == [2]
     assert "storage" not in facts
 
 

@@ -47,6 +47,7 @@ COMMANDS: Final[dict[str, Command]] = {
     "runs": Command(PAST, f"{_Q}.compare_runs", "webots_list_runs"),
     "signals": Command(PAST, f"{_Q}.list_signals", "webots_list_signals"),
     "sql": Command(PAST, f"{_Q}.query_sql", "webots_query_sql"),
+    "status": Command(NOW, f"{_Q}.world_info", "webots_list_robots"),
     "trends": Command(PAST, f"{_Q}.get_trends", "webots_get_trends"),
     "launch": Command(SETUP, "webots_mcp.cli.launching", "launch"),
 }

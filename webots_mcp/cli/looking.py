@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import argparse
-import json
 import select
 import sys
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from webots_mcp.cli.command import (
     DATA_DIR,
     DATABASE,
-    JSON,
     ROBOT,
     argument,
     count,
-    open_recording,
     question,
     reading,
 )
@@ -26,31 +23,6 @@ from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from webots_mcp.store.logs import Line
-    from webots_mcp.store.recording import View
-
-
-@question("status", DATA_DIR, DATABASE, JSON)
-def status(arguments: argparse.Namespace) -> None:
-    """Show the robots: whether they run, how old their data is, what could not be recorded."""
-    import webots_mcp.store.recording as recordings
-    from webots_mcp.store.retention.limits import described
-    from webots_mcp.store.retention.usage import file_sizes
-    from webots_mcp.store.robots import list_robots
-
-    recording = open_recording(arguments)
-    with recording.reader() as connection:
-        now_s = time.time()
-        views = [
-            recordings.view_of(connection, robot, now_s) for robot in list_robots(connection, now_s)
-        ]
-        facts = {
-            "database": str(recording.database),
-            **recordings.storage(connection),
-            "limits": described(connection),
-            "file": file_sizes(connection),
-            "robots": [_facts(view) for view in views],
-        }
-    print(json.dumps(facts, indent=2) if arguments.json else _as_text(facts))
 
 
 @question(
@@ -100,55 +72,6 @@ def wait(seconds: float) -> None:
     watch.register(output, 0)
     if watch.poll(seconds * 1000):
         raise BrokenPipeError
-
-
-def _facts(view: View) -> dict[str, Any]:
-    from webots_mcp.store.run_rows import count_runs
-    from webots_mcp.store.status import rows_waiting
-
-    session = view.session
-    return {
-        **view.header(),
-        "kind": view.robot.kind,
-        "live": view.robot.live,
-        "runs": count_runs(view.connection, view.robot.id),
-        "rows": view.run.rows if view.run else 0,
-        **rows_waiting(view.connection, session),
-        "rows_dropped": session.rows_dropped if session else 0,
-        "last_error": session.last_error if session else None,
-        "controller": session.controller if session else None,
-        "actions": session.actions if session else {},
-    }
-
-
-def _as_text(facts: dict[str, Any]) -> str:
-    robots = "\n".join(_robot_as_text(robot) for robot in facts["robots"])
-    where = "\n".join(facts[name] for name in ("database", "storage") if name in facts)
-    kept = ", ".join(f"{kind} {text}" for kind, text in facts["limits"].items())
-    sizes = ", ".join(_size_as_text(name, size) for name, size in facts["file"].items())
-    return f"{where}\n{sizes}\nkept: {kept}\n{robots or 'no robot was recorded yet'}"
-
-
-def _size_as_text(name: str, size_bytes: int) -> str:
-    from webots_mcp.store.retention.notation import size_text
-
-    return f"{name.removesuffix('_bytes').replace('_', ' ')} {size_text(size_bytes)}"
-
-
-def _robot_as_text(robot: dict[str, Any]) -> str:
-    time_text = "no data yet"
-    if robot["sim_time_s"] is not None:
-        time_text = f"simulation time {robot['sim_time_s']:.3f} s, {robot['age_s']:.1f} s old"
-    where = f" (in {robot['waiting_in']})" if "waiting_in" in robot else ""
-    lines = [
-        f"{robot['robot']} ({robot['kind']}): {robot['status']}",
-        f"  run {robot['run_id']} (recorded: {robot['runs']}), {robot['rows']} rows, {time_text}",
-        f"  rows waiting {robot['rows_waiting']}{where}, dropped {robot['rows_dropped']}",
-    ]
-    why, error = robot["why"], robot["last_error"]
-    lines += [f"  {why}"] if why else []
-    lines += [f"  last error: {error}"] if error and not (why and error.startswith(why)) else []
-    return "\n".join(map(printable, lines))
 
 
 def _print_lines(lines: Sequence[Line]) -> None:

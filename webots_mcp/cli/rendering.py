@@ -60,7 +60,7 @@ def answer_lines(
         value = answer.get(name)
         texts = cast("list[str]", value if isinstance(value, list) else [value] if value else [])
         for text in texts:
-            yield from note_lines(text, width)
+            yield from note_lines(f"left out: {text}" if name == "left_out" else text, width)
 
 
 def note_lines(text: str, width: int = _PARAGRAPH) -> list[str]:

@@ -138,7 +138,11 @@ class WorldAnswer(Answer):
 class RobotsAnswer(Answer):
     """All robots ever seen."""
 
-    robots: Table | None = None
+    robots: Table | None = Field(
+        default=None, description="rows_waiting, rows_dropped, last_error: where there are any."
+    )
+    database: str | None = None
+    retention: dict[str, Any] | None = None
 
 
 class DiagnosisAnswer(Answer):

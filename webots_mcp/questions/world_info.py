@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 import time
 from typing import Any, Final
 
@@ -9,7 +10,8 @@ from webots_mcp.errors import NothingRecordedError
 from webots_mcp.liveness import dead_sessions
 from webots_mcp.questions.answers import RobotsAnswer, Table, WorldAnswer
 from webots_mcp.questions.argument_types import RobotName, RunId
-from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.budget import cut_for_a_model
+from webots_mcp.questions.declaring import READS, is_for_a_person, question
 from webots_mcp.questions.shortening import cut_text, round_number
 from webots_mcp.store.recording import GETTING_STARTED, Recording, View, name_of, storage, view_of
 from webots_mcp.store.retention.limits import described, unheeded
@@ -17,6 +19,7 @@ from webots_mcp.store.retention.usage import file_sizes
 from webots_mcp.store.robots import WorldSeen, list_robots, world_seen
 from webots_mcp.store.run_rows import Run, count_runs, real_time_factor
 from webots_mcp.store.sessions import Session, companions, fetch_session
+from webots_mcp.store.status import rows_waiting
 
 _SHOWN_ROBOTS: Final = 50
 _SHOWN_IN_WORLD: Final = 40
@@ -24,29 +27,37 @@ _TOLD_IN_WORLD: Final = ("key", "type", "def", "name", "controller", "on_robot")
 _PLACE: Final = ("x_m", "y_m", "z_m", "heading_rad", "speed_mps")
 _SHOWN_DEVICES: Final = 60
 _LONGEST_NAME: Final = 100
+_RECORDER_COLUMNS: Final = (
+    "rows", "why", "rows_waiting", "waiting_in", "rows_dropped", "last_error",
+)  # fmt: skip
+_LONGEST_ERROR: Final = 300
 _ROBOT_COLUMNS: Final = (
     "robot", "kind", "live", "status", "run_id", "sim_time_s", "age_s", "runs", "actions",
 )  # fmt: skip
 
 
-@question("List the robots", READS, core=True)
+@question("List the robots", READS, command="status", core=True)
 def webots_list_robots(recording: Recording) -> RobotsAnswer:
     """Every robot ever recorded: whether it is live, whether its time moves, its current run.
 
     `actions` counts its own commands; webots_list_commands describes them.
     """
+    told = is_for_a_person()
     with recording.reader() as connection:
         now_s = time.time()
         robots = list_robots(connection, now_s)
-        if not robots:
-            raise NothingRecordedError(f"no robot has been recorded yet. {GETTING_STARTED}")
+        none = f"no robot has been recorded yet. {GETTING_STARTED}"
+        if not robots and not told:
+            raise NothingRecordedError(none)
         views = [view_of(connection, robot, now_s) for robot in _liveliest(robots)]
         live = [view for view in views if view.robot.live]
         hint = f"{len(robots)} robots in all, the latest {len(views)} are shown"
         return RobotsAnswer(
             **(live[0].header() if len(live) == 1 else storage(connection)),
-            robots=Table(columns=list(_ROBOT_COLUMNS), rows=[_row(view) for view in views]),
-            hint=hint if len(robots) > len(views) else None,
+            robots=_robots(views, told=told) if views else None,
+            database=name_of(recording.database) if told else None,
+            retention=_retention(recording, connection) if told else None,
+            hint=hint if len(robots) > len(views) else None if robots else none,
         )
 
 
@@ -75,9 +86,36 @@ def webots_get_world_info(
             devices=_devices(view.robot.devices),
             companions=_companions(view),
             database=name_of(recording.database),
-            retention=_retention(recording, view),
+            retention=_retention(recording, view.connection),
             data_dir=str(recording.data_dir),
         )
+
+
+def _robots(views: list[View], *, told: bool) -> Table:
+    """A row for each; what could not be recorded only where there is any, or for a person."""
+    columns, rows = [*_ROBOT_COLUMNS], [_row(view) for view in views]
+    recorders = [_recorder(view) for view in views]
+    for name in _RECORDER_COLUMNS:
+        values = [recorder[name] for recorder in recorders]
+        if any(values) and (told or name not in ("rows", "why")):
+            columns.append(name)
+            for row, value in zip(rows, values, strict=True):
+                row.append(value)
+    return Table(columns=columns, rows=rows)
+
+
+def _recorder(view: View) -> dict[str, Any]:
+    """What a robot's session has recorded of its run, and what it could not."""
+    session = view.session
+    error = session.last_error if session else None
+    return {
+        "rows": view.run.rows if view.run else 0,
+        "why": view.header().get("why"),
+        "waiting_in": None,
+        **rows_waiting(view.connection, session),
+        "rows_dropped": session.rows_dropped if session else 0,
+        "last_error": error and cut_for_a_model(error, _LONGEST_ERROR),
+    }
 
 
 def _seen(world: WorldSeen | None) -> dict[str, Any]:
@@ -112,12 +150,12 @@ def _in_world(body: dict[str, Any], columns: list[str]) -> list[Any]:
     ]
 
 
-def _retention(recording: Recording, view: View) -> dict[str, Any]:
+def _retention(recording: Recording, connection: sqlite3.Connection) -> dict[str, Any]:
     """What is kept of the recording, how large it is, and which limits of ours do not hold."""
-    notes = unheeded(view.connection, recording.limits)
+    notes = unheeded(connection, recording.limits)
     return {
-        "kept": described(view.connection),
-        **file_sizes(view.connection),
+        "kept": described(connection),
+        **file_sizes(connection),
         **({"not_in_force": notes} if notes else {}),
     }
 

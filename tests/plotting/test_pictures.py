@@ -336,7 +336,7 @@ def test_a_run_that_has_only_begun_is_drawn(record: Record, rows: int) -> None:
         ({"signals": ["sensor.frnt"]}, UnknownSignalError, "there is sensors.front"),
         ({"signals": ["pose"], "bands": "mod"}, UnknownSignalError, "mode"),
         ({"signals": ["pose"], "bands": "ir"}, InvalidInputError, "'ir' holds numbers"),
-        ({"signals": ["pose"], "bands": "sensors"}, InvalidInputError, "means 2 signals"),
+        ({"signals": ["pose"], "bands": "sensors"}, InvalidInputError, "matches 2 signals"),
         ({"run_ids": [77]}, UnknownRunError, "no run 77"),
         ({"start_s": 9, "end_s": 3}, InvalidRangeError, "reversed"),
         ({"start_s": 900}, NothingRecordedError, "begins after the newest row"),

@@ -267,7 +267,7 @@ def test_options_without_sense_are_refused(rover: sqlite3.Connection) -> None:
         EventOptions(stuck_s=0)
     with pytest.raises(UnknownSignalError):
         ask(rover, "stuck", mode="moood")
-    with pytest.raises(InvalidInputError, match="means 2 signals"):
+    with pytest.raises(InvalidInputError, match="matches 2 signals"):
         ask(rover, "stuck", position=("pose", "pose.1"))
     with pytest.raises(UnknownSignalError):
         ask(rover, "threshold", thresholds=(Threshold("nothing", above=1.0),))

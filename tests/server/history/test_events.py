@@ -74,7 +74,7 @@ async def test_a_condition_is_found_in_the_past_as_often_as_it_would_have_been_h
     (row,) = rows_of(answer["events"])
     assert (row["start_s"], row["name"]) == (43.0, where)
     assert row["details"]["sensors.bumper"] is True
-    assert any("between two rows" in note for note in answer["notes"])
+    assert any("what happened in between is not seen" in note for note in answer["notes"])
     assert "column 3" in await refuse(story, "webots_find_events", where="n = 3")
 
 

@@ -127,7 +127,7 @@ async def test_trends_say_in_one_line_what_a_person_would_notice(story: Path) ->
     (run,) = answer["runs"]
     says = {row["signal"]: row["says"] for row in rows_of(run["numbers"])}
     assert "rises from 0 to 12.78" in says["pose.0"]
-    assert "every 2 s" in says["heading"]
+    assert "period 2 s" in says["heading"]
     assert "1 spike, the largest 5 at 70 s" in says["ir"]
     assert "no value in 40 of 1150 rows" in says["sensors.front"]
     modes = {row["signal"]: row for row in rows_of(run["states"])}

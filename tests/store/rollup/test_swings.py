@@ -157,4 +157,4 @@ def test_slow_swings_are_looked_for_where_the_rows_are_read_else_the_answer_says
     monkeypatch.setattr(rows, "RAW_ROWS", 1000)
     asked = EventOptions(kinds=("oscillation",))
     (why,) = find_events(empty, find_range(empty, Scope()), asked).verdicts.gaps.values()
-    assert "not with a period of more than 5 s in so long a range: ask for less time" in why
+    assert "not with a period over 5 s in so long a range: ask for less time" in why

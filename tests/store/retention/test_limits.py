@@ -65,8 +65,9 @@ def test_retain_sets_a_limit_and_deletes_nothing(say: Say, recorded: Recorded) -
     assert "runs all (set by retain, " in status
     assert "logs 100.0 MB (default)" in say("status")
     shown = json.loads(say("status", "--json"))
-    assert shown["limits"]["states"].startswith("30rows (set by retain")
-    assert shown["file"]["file_bytes"] > shown["file"]["free_in_file_bytes"] >= 0
+    kept = shown["retention"]
+    assert kept["kept"]["states"].startswith("30rows (set by retain")
+    assert kept["file_bytes"] > kept["free_in_file_bytes"] >= 0
 
 
 def test_who_maintains_keeps_to_what_was_set(say: Say, recorded: Recorded) -> None:

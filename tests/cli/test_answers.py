@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import pytest
+
 from webots_mcp.cli.answers import answer_lines
+from webots_mcp.cli.rendering import table_lines
 
 HEAD = {"robot": "rover", "run_id": 3, "sim_time_s": 1.5, "age_s": 0.02, "status": "running"}
 
@@ -48,3 +51,14 @@ def test_each_of_several_objects_has_a_part_of_its_own() -> None:
         "runs: run_id 2, rows 6",
         "none []",
     ]
+
+
+@pytest.mark.parametrize("width", [20, 60, 80, 120])
+def test_no_word_of_a_table_is_lost_however_narrow_the_terminal_is(width: int) -> None:
+    columns = [f"column{number}" for number in range(6)]
+    rows = [
+        [f"2026-11-22T23:40:{row:02}Z", *(f"a{row} b c{n}" for n in range(5))] for row in (1, 2)
+    ]
+    lines = list(table_lines(columns, rows, width))
+    told = {word for line in lines for word in line.split()}
+    assert told == {*columns, *(word for row in rows for cell in row for word in cell.split())}

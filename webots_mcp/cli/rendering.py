@@ -21,6 +21,8 @@ _PARAGRAPH: Final = 100  # characters of a line of text, where the terminal has 
 _SHORT: Final = 48
 _INDENT: Final = "  "
 _ENDLESS: Final = 100_000
+_GAP: Final = 2  # between columns
+_LONGEST_WORD: Final = 24  # that no column folds, such as a time
 _HEAD: Final = {
     "robot": "{}",
     "run_id": "run {}",
@@ -93,21 +95,49 @@ def table_lines(
     from rich.text import Text
 
     kept = [i for i in range(len(columns)) if any(row[i] is not None for row in rows)]
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_edge=False)
+    headers = {index: printable(columns[index]) for index in kept}
+    words = {i: [word for row in rows for word in text_of(row[i]).split()] for i in kept}
+    if sum(_longest([headers[i], *words[i]]) + _GAP for i in kept) > width:
+        headers = {index: header.replace("_", "_\n") for index, header in headers.items()}
+    least = {i: _longest([*headers[i].split(), *words[i]]) for i in kept}
+    full = {i: max(len(headers[i]), *(len(text_of(row[i])) for row in rows), 1) for i in kept}
+    widths = _shared_out(width - _GAP * len(kept), least, full)
+    table = Table(box=None, pad_edge=False, padding=(0, _GAP, 0, 0), show_edge=False)
     for index in kept:
         numbers = all(isinstance(row[index], (int, float, type(None))) for row in rows)
         table.add_column(
-            Text(printable(columns[index])),
+            Text(headers[index]),
             justify="right" if numbers else "left",
             overflow="fold",
-            no_wrap=width >= _ENDLESS,
+            width=widths[index],
         )
     for row in rows:
         table.add_row(*(Text(text_of(row[index])) for index in kept))
-    console = Console(width=width, color_system=None, highlight=False, markup=False, emoji=False)
+    wide = sum(widths.values()) + _GAP * len(kept)
+    console = Console(width=wide, color_system=None, highlight=False, markup=False, emoji=False)
     with console.capture() as captured:
         console.print(table)
     return (line.rstrip() for line in captured.get().splitlines())
+
+
+def _shared_out(room: int, least: Mapping[int, int], full: Mapping[int, int]) -> dict[int, int]:
+    """The width of each column: what its words need, and what is left for those that want more.
+
+    Those that want little more come first. Words are never cut: where there is too little room,
+    lines are longer than the terminal is wide, and wrapped by it.
+    """
+    widths = dict(least)
+    spare = max(room - sum(least.values()), 0)
+    wanting = sorted(full, key=lambda index: full[index] - least[index])
+    for number, index in enumerate(wanting):
+        more = min(full[index] - least[index], spare // (len(wanting) - number))
+        widths[index] += max(more, 0)
+        spare -= max(more, 0)
+    return widths
+
+
+def _longest(words: Iterable[str]) -> int:
+    return min(max(map(len, words), default=1), _LONGEST_WORD)
 
 
 def text_of(value: Any) -> str:

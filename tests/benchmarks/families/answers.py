@@ -40,6 +40,7 @@ _ARGUMENTS: Final[dict[str, dict[str, Any]]] = {
     "webots_breakpoint": {"condition": "distance_m.left < 0", "action": "log"},
     "webots_remove_breakpoint": {"breakpoint_id": 1},
     "webots_set_parameters": {"values": {"speed": 6.0}},
+    "webots_edit_scene": {"action": "set", "path": "BALL.physics.mass", "value": 0.05},
     "webots_get_field": {"path": "ROVER"},
     "webots_set_field": {"path": "BALL.physics.mass", "value": 0.06},
     "webots_add_node": {"vrml": 'DEF PILL Solid { name "pill" }'},
@@ -88,8 +89,9 @@ async def _ask_all(bench: Bench) -> list[_Answer]:
     server = create_server(bench.folder / DATABASE_NAME, bench.folder)
     async with Client(server) as client:
         tools = sorted((await client.list_tools()).tools, key=_order)
-        there = [tool for tool in tools if tool.name not in _without()]
-        return [answer async for answer in _answers(bench, client, there)]
+        listed = [tool.name for tool in tools if tool.name not in _without()]
+        parts = [name for name in _ARGUMENTS if name not in listed]  # of merged tools, by name
+        return [answer async for answer in _answers(bench, client, [*listed, *parts])]
 
 
 def _without() -> tuple[str, ...]:
@@ -103,15 +105,15 @@ def _order(tool: Tool) -> tuple[bool, bool]:
     return tool.name in _LAST, not reads
 
 
-async def _answers(bench: Bench, client: Client, tools: list[Tool]) -> AsyncIterator[_Answer]:
+async def _answers(bench: Bench, client: Client, tools: list[str]) -> AsyncIterator[_Answer]:
     for tool in tools:
-        bench.say(tool.name)
-        result = await client.call_tool(tool.name, _ARGUMENTS.get(tool.name, {}))
-        assert not result.is_error, (tool.name, result.content)
+        bench.say(tool)
+        result = await client.call_tool(tool, _ARGUMENTS.get(tool, {}))
+        assert not result.is_error, (tool, result.content)
         text = "".join(block.text for block in result.content if isinstance(block, TextContent))
         pictures = (block.data for block in result.content if isinstance(block, ImageContent))
         picture = sum(len(b64decode(data)) for data in pictures)
-        yield _Answer(tool.name, text, picture, _recorded(bench.folder / DATABASE_NAME)[1])
+        yield _Answer(tool, text, picture, _recorded(bench.folder / DATABASE_NAME)[1])
 
 
 def _line(answer: _Answer) -> Line:

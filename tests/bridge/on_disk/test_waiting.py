@@ -258,6 +258,8 @@ def test_a_signals_handler_that_logs_in_the_middle_of_a_row_deadlocks_nothing(
 def test_the_status_tells_how_many_rows_wait_and_where(bridge: MCPBridge, file: Path) -> None:
     for n in range(3):
         bridge.publish({"n": n})
-    line = [sys.executable, "-m", "webots_mcp", "status", "--database", str(file)]
+    line = [sys.executable, "-m", "webots_mcp", "status", "--json", "--database", str(file)]
     done = subprocess.run(line, check=True, capture_output=True, text=True)
-    assert f"rows waiting 3 (in {waiting_file(bridge).name})" in done.stdout
+    robots = json.loads(done.stdout)["robots"]
+    told = dict(zip(robots["columns"], robots["rows"][0], strict=True))
+    assert (told["rows_waiting"], told["waiting_in"]) == (3, waiting_file(bridge).name)

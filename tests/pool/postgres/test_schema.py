@@ -155,5 +155,6 @@ def test_without_psycopg_the_extra_is_named() -> None:
     )
     ended = subprocess.run([sys.executable, "-c", without], capture_output=True, text=True)
     assert (ended.returncode, ended.stdout) == (2, "")
-    assert ended.stderr.startswith("webots-mcp: a pool in PostgreSQL needs psycopg: pip install")
+    assert ended.stderr.startswith("webots-mcp: a pool in PostgreSQL needs psycopg: ")
+    assert "-m pip install 'psycopg[binary]" in ended.stderr
     assert ended.stderr.count("\n") == 1

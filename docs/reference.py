@@ -12,10 +12,9 @@ import anyio
 
 import webots_mcp
 from webots_mcp import MemoryDatabase, pytest_plugin, testing
-from webots_mcp.cli import COMMANDS
+from webots_mcp.cli import registered
 from webots_mcp.cli.command import Argument
 from webots_mcp.cli.commands import described
-from webots_mcp.cli.wording import as_typed
 from webots_mcp.connection import connect
 from webots_mcp.schema import create_schema
 from webots_mcp.server import create_server
@@ -79,13 +78,13 @@ def commands(_page: str = "") -> str:
     """Each command with its arguments, as `--help` has them."""
     shown = {
         name: (
-            as_typed(each.text),
+            each.text,
             [[f"`{typed}`", said] for typed, said in each.arguments.items()],
         )
         for name, each in described().items()
     } | {
         each.name: (inspect.getdoc(each.run) or "", list(map(_argument, each.arguments)))
-        for each in COMMANDS
+        for each in registered()
     }
     return "## Reference\n\n" + "\n".join(
         f"### {name}\n\n{as_markdown(text)}\n\n{_table(['argument', 'meaning'], rows)}"

@@ -13,7 +13,7 @@ import pytest
 
 from tests.recordings.rows import Recorded
 from tests.server.story import write_story
-from webots_mcp.cli import COMMANDS, main
+from webots_mcp.cli import main, registered
 from webots_mcp.cli.tables import print_table, text_of
 
 Say = Callable[..., str]
@@ -176,7 +176,9 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert said.err.count("\n") == 1
 
 
-@pytest.mark.parametrize("name", [c.name for c in COMMANDS for a in c.arguments if "-n" in a.flags])
+@pytest.mark.parametrize(
+    "name", [c.name for c in registered() for a in c.arguments if "-n" in a.flags]
+)
 @pytest.mark.parametrize("number", ["-1", "1.5", "many"])
 def test_a_count_that_is_none_is_refused_by_every_command(
     capsys: pytest.CaptureFixture[str], name: str, number: str

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from tests.recordings.rows import Recorded
-from webots_mcp.cli import COMMANDS, main, names
-from webots_mcp.cli.wording import BY_TOOL, as_typed, speak_of, speak_of_command
+from webots_mcp.cli import main, names, registered
+from webots_mcp.cli.commands import app_for
+from webots_mcp.cli.wording import BY_TOOL, as_typed, speak_of
 
 
 @pytest.fixture
@@ -58,7 +59,7 @@ def test_a_hint_names_what_can_be_typed(data_dir: Path, capsys: pytest.CaptureFi
 
 
 def test_a_hint_names_commands_instead_of_tools() -> None:
-    (send,) = (command for command in COMMANDS if command.name == "send")
+    (send,) = (command for command in registered() if command.name == "send")
     speak_of(send.arguments)
     waits = 'webots_list_commands(what="outcome", command_id=7)'
     hint = f"wait for it with {waits}, or ask with a longer timeout_s"
@@ -71,7 +72,7 @@ def test_each_command_that_stands_for_a_tool_exists() -> None:
 
 
 def test_a_quoted_name_is_somebodys_data() -> None:
-    speak_of_command("trends")
+    app_for(["trends"])
     assert as_typed("no signal 'last_s'; last_s=3 is too much since the start") == (
         "no signal 'last_s'; --last 3 is too much since the start"
     )

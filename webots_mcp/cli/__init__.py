@@ -16,48 +16,17 @@ import sys
 from collections.abc import Sequence
 from typing import Any, Final
 
-from webots_mcp.cli import (
-    breakpoints,
-    contents,
-    data,
-    diagnosing,
-    history,
-    looking,
-    observing,
-    scene,
-    serving,
-    setting_up,
-    steering,
-    trials,
-    tuning,
-)
-from webots_mcp.cli.command import COMMANDS
 from webots_mcp.cli.ending import ended_by, ending_by_signals
 from webots_mcp.cli.terminal import spelling_out
-from webots_mcp.cli.wording import as_typed, speak_of, speak_of_command
+from webots_mcp.cli.wording import Typed, as_typed, speak_of
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.naming import spelled_out
-from webots_mcp.plugins import command_modules
 
-__all__ = ["COMMANDS", "main"]
-
-# Each registered its commands at import.
-FAMILIES: Final = (
-    serving,
-    setting_up,
-    observing,
-    looking,
-    diagnosing,
-    history,
-    contents,
-    data,
-    trials,
-    tuning,
-    steering,
-    scene,
-    breakpoints,
-    *command_modules(),
-)
+__all__ = ["main"]
+_FAMILIES: Final = (
+    "serving", "setting_up", "observing", "looking", "diagnosing", "history", "contents", "data",
+    "trials", "tuning", "steering", "scene", "breakpoints",
+)  # fmt: skip
 EXIT_SYSTEM: Final = 1
 EXIT_BAD_INPUT: Final = 2
 _DESCRIPTION: Final = (
@@ -67,11 +36,24 @@ _DESCRIPTION: Final = (
 _EPILOG: Final = "'webots-mcp COMMAND --help' explains a command. Try 'webots-mcp demo' first."
 
 
+def registered() -> list[Any]:
+    """The commands that register themselves."""
+    import importlib
+
+    from webots_mcp.cli.command import COMMANDS
+    from webots_mcp.plugins import command_modules
+
+    for name in _FAMILIES:
+        importlib.import_module(f"webots_mcp.cli.{name}")
+    list(command_modules())
+    return COMMANDS
+
+
 def names() -> list[str]:
     """Of all commands."""
     from webots_mcp.cli import commands
 
-    return sorted({*commands.COMMANDS, *(each.name for each in COMMANDS)})
+    return sorted({*commands.COMMANDS, *(each.name for each in registered())})
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -122,13 +104,16 @@ def _run(argv: Sequence[str]) -> tuple[int] | None:
 
     if not argv or argv[0] not in COMMANDS:
         return None
-    speak_of_command(argv[0])
+    app = app_for(argv)
+    speak_of(
+        Typed(each.field_info.name, each.names[0], each.field_info.name.upper())
+        for each in app[argv[0]].assemble_argument_collection()
+        if each.names
+    )
     is_help = not {"--help", "-h"}.isdisjoint(argv)  # nothing of a recording, and may have colours
     with ending_by_signals(), contextlib.nullcontext() if is_help else spelling_out():
         try:
-            code = app_for(argv)(
-                argv, exit_on_error=False, print_error=False, result_action="return_value"
-            )
+            code = app(argv, exit_on_error=False, print_error=False, result_action="return_value")
         except CycloptsError as error:
             raise InvalidInputError(str(error)) from error
         sys.stdout.flush()
@@ -167,13 +152,15 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     subparsers = parser.add_subparsers(
         metavar="COMMAND", required=True, parser_class=_AnyOrderParser
     )
-    if not given or given[0] not in {each.name for each in COMMANDS}:  # for the list of commands
+    if not given or given[0] not in {
+        each.name for each in registered()
+    }:  # for the list of commands
         from webots_mcp.cli.commands import COMMANDS as DECLARED
 
         for name, command in DECLARED.items():
             text = inspect.getdoc(command.load()) or ""
             subparsers.add_parser(name, help=text.partition("\n")[0].rstrip("."))
-    for name, run, arguments in sorted(COMMANDS):
+    for name, run, arguments in sorted(registered()):
         text = run.__doc__ or ""
         subparser = subparsers.add_parser(
             name,

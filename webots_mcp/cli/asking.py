@@ -7,23 +7,21 @@ from __future__ import annotations
 
 import inspect
 import json
-import re
-import sys
 import types
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Annotated, Any, Final, Literal, Union, cast, get_args, get_origin
 
 import anyio
-from cyclopts import Parameter, Token
+from cyclopts import Parameter
 from pydantic import ValidationError
 from pydantic.json_schema import SkipJsonSchema
 
+from webots_mcp.cli.progress import line_of_progress, show_progress
 from webots_mcp.cli.recordings import Json, Where, sum_up_first
 from webots_mcp.cli.rendering import print_answer
-from webots_mcp.cli.terminal import rewrite
-from webots_mcp.cli.values import settings_of, value_of
-from webots_mcp.cli.wording import as_typed
+from webots_mcp.cli.values import settings_of, value_of, whole_number
+from webots_mcp.cli.wording import Typed, as_typed, speak_of
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
 from webots_mcp.questions.declaring import Caller, Question, Reply
 from webots_mcp.questions.faults import faults_of
@@ -59,6 +57,10 @@ def command_of(question: Question) -> Callable[..., None]:
         reply = ask(question, given, recorded or Where())
         show(question, reply, as_json=json)
 
+    speak_of(
+        Typed(each.name, option_of(question, each.name), each.name.upper())
+        for each in question.parameters
+    )
     parameters = [_parameter(question, each) for each in question.parameters if _is_shown(each)]
     parameters.sort(key=lambda each: (each.kind, *_place(question, each.name)))
     keyword = inspect.Parameter.KEYWORD_ONLY
@@ -107,7 +109,7 @@ def ask(question: Question, given: Mapping[str, Any], where: Where) -> Reply:
     if not _OF_SIGNALS.isdisjoint(each.name for each in question.parameters):
         sum_up_first(recording)
     valid = _valid(question, given, recording)
-    with _line_of_progress(), _caller(question, recording) as caller:
+    with line_of_progress(), _caller(question, recording) as caller:
         return anyio.run(question.ask, recording, valid, caller)
 
 
@@ -122,7 +124,7 @@ def _caller(question: Question, recording: Recording) -> Generator[Caller | None
 
     companions = Companions(TrialWorkers(recording), Launcher(recording))
     try:
-        yield Caller("cli", _show_progress, companions)
+        yield Caller("cli", show_progress, companions)
     finally:
         companions.stop()
 
@@ -212,19 +214,19 @@ def _parameter(question: Question, declared: inspect.Parameter) -> inspect.Param
     place = inspect.Parameter.KEYWORD_ONLY
     if name in question.positional and _is_list(question, name):
         kind, default = get_args(_without_none(kind))[0], inspect.Parameter.empty
-        converter = _whole_number if kind is int else None
+        converter = whole_number if kind is int else None
         shown = Parameter(option, help=text, converter=converter)
         place = inspect.Parameter.VAR_POSITIONAL
     elif name in question.positional:
         shown = Parameter(
             option, help=text, negative=(), allow_leading_hyphen=True, validator=_refuse_options,
-            converter=_whole_number if _without_none(kind) is int else None,
+            converter=whole_number if _without_none(kind) is int else None,
         )  # fmt: skip
         place = inspect.Parameter.POSITIONAL_ONLY
     elif default is True:  # its option is the one that turns it off
         shown = Parameter(f"--{name.replace('_', '-')}", help=text, negative=option)
     else:
-        converter = _whole_number if _without_none(kind) is int else None
+        converter = whole_number if _without_none(kind) is int else None
         shown = Parameter(option, help=text, negative=(), converter=converter)
     return inspect.Parameter(name, place, default=default, annotation=Annotated[kind, shown])
 
@@ -232,14 +234,6 @@ def _parameter(question: Question, declared: inspect.Parameter) -> inspect.Param
 def _place(question: Question, argument: str) -> list[int]:
     """Where it stands among those without an option's name."""
     return [place for place, name in enumerate(question.positional) if name == argument]
-
-
-def _whole_number(_kind: Any, tokens: Sequence[Token]) -> int:
-    """Cyclopts by itself would round 1.5."""
-    text = tokens[0].value
-    if not re.fullmatch(r"[+-]?[0-9]+", text):
-        raise ValueError(f"{text!r} is no whole number")
-    return int(text)
 
 
 def _refuse_options(_kind: Any, value: Any) -> None:
@@ -291,16 +285,3 @@ def _is_json(kind: Any) -> bool:
     each = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
     kinds = [one for one in each if one is not type(None)]
     return kinds == [Any] or (len(kinds) > 1 and all(get_origin(k) is not Literal for k in kinds))
-
-
-@contextmanager
-def _line_of_progress() -> Generator[None]:
-    try:
-        yield
-    finally:
-        rewrite(sys.stderr)
-
-
-async def _show_progress(progress: float, total: float | None, text: str) -> None:
-    """On a terminal one line that changes; in a pipe nothing, as for all commands."""
-    rewrite(sys.stderr, text)

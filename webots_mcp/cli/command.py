@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import argparse
 import functools
-import json
 import sys
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
-from webots_mcp.errors import InvalidInputError, MalformedRowError, WebotsMCPError
+from webots_mcp.cli.recordings import past_invalid_rows as past_invalid_rows
+from webots_mcp.cli.recordings import past_wrong_values as past_wrong_values
+from webots_mcp.cli.values import settings_of as settings_of
+from webots_mcp.cli.values import value_of as value_of
 
 if TYPE_CHECKING:
     import sqlite3
@@ -55,8 +56,6 @@ class Command(NamedTuple):
 _Run = TypeVar("_Run", bound=Callable[[argparse.Namespace], int | None])
 COMMANDS: Final[list[Command]] = []
 _SUM_UP_S: Final = 300.0  # a million rows of 40 values take 100 s
-# Not owed to a value in a row: asking past invalid rows would not help.
-_OF_NO_VALUE: Final = (WebotsMCPError, OSError, ImportError)
 
 
 def argument(*flags: str, **options: Any) -> Argument:
@@ -124,26 +123,6 @@ def question(
     return register
 
 
-def past_wrong_values(run: Callable[[], None]) -> None:
-    """Run what only reads; where it fails over a value, again past invalid rows."""
-    try:
-        return run()
-    except Exception as error:
-        if isinstance(error, _OF_NO_VALUE) and not isinstance(error, MalformedRowError):
-            raise
-    past_invalid_rows(run)
-
-
-def past_invalid_rows(run: Callable[[], None]) -> None:
-    """Run what only reads past invalid rows, which are named on stderr."""
-    from webots_mcp.store import invalid_rows
-
-    with invalid_rows.past_invalid_rows() as invalid:
-        run()
-    for said in invalid.described():
-        print(f"webots-mcp: left out: {said}", file=sys.stderr)
-
-
 DATA_DIR: Final = argument(
     "--data-dir",
     metavar="DIR",
@@ -153,40 +132,6 @@ DATA_DIR: Final = argument(
 DATABASE: Final = argument("--database", metavar="FILE", help="the database file itself")
 ROBOT: Final = argument("--robot", metavar="NAME", help="only this robot")
 JSON: Final = argument("--json", action="store_true", help="print it as JSON")
-_NO_KINDS: Final[Mapping[str, str]] = MappingProxyType({})
-
-
-def settings_of(texts: Sequence[str], kinds: Mapping[str, str] = _NO_KINDS) -> dict[str, Any]:
-    """Values by name, of texts NAME=VALUE; a value that is no JSON is a text.
-
-    Args:
-        texts: As they were typed.
-        kinds: Of parameters, by name: the value of one of kind `str` is a text, also one that looks
-            like a number.
-
-    Raises:
-        InvalidInputError: One has no `=`.
-    """
-    values: dict[str, Any] = {}
-    for text in texts:
-        name, equals, value = text.partition("=")
-        if not equals:
-            raise InvalidInputError(f"{text!r} names no value: write {name}=VALUE")
-        values[name] = value if kinds.get(name) == "str" else value_of(value)
-    return values
-
-
-def value_of(text: str) -> Any:
-    """What was typed, as JSON; what is none is a text."""
-    try:
-        return json.loads(text, parse_constant=_no_constant)
-    except (ValueError, RecursionError):
-        return text
-
-
-def _no_constant(name: str) -> float:
-    """NaN and the infinities are Python's, and none of JSON."""
-    raise ValueError(name)
 
 
 @contextmanager

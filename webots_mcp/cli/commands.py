@@ -12,11 +12,12 @@ from typing import Any, Final, NamedTuple
 
 from cyclopts import App, Argument, Group, Parameter
 
+from webots_mcp.plugins import plugin_commands
 from webots_mcp.questions.declaring import Question
 
 
 class Command(NamedTuple):
-    """Where a command is found."""
+    """Where a command is found: a question, or a function whose parameters are its options."""
 
     group: str
     module: str
@@ -39,7 +40,7 @@ NOW, PAST, STEER, DATA, SETUP = (
 )  # fmt: skip
 GROUPS: Final = (SETUP, NOW, PAST, STEER, DATA)
 _Q: Final = "webots_mcp.questions"
-COMMANDS: Final[dict[str, Command]] = {
+_OF_THE_CORE: Final = {
     "events": Command(PAST, f"{_Q}.find_events", "webots_find_events"),
     "compare": Command(PAST, f"{_Q}.compare_runs", "webots_compare_runs"),
     "history": Command(PAST, f"{_Q}.query_history", "webots_query_history"),
@@ -50,6 +51,9 @@ COMMANDS: Final[dict[str, Command]] = {
     "status": Command(NOW, f"{_Q}.world_info", "webots_list_robots"),
     "trends": Command(PAST, f"{_Q}.get_trends", "webots_get_trends"),
     "launch": Command(SETUP, "webots_mcp.cli.launching", "launch"),
+}
+COMMANDS: Final[dict[str, Command]] = _OF_THE_CORE | {
+    each.name: Command(each.group, *each.function.split(":")) for each in plugin_commands()
 }
 _HELP: Final = """Flight recorder and remote control for Webots simulations.
 

@@ -34,3 +34,17 @@ def shown_progress(doing: str) -> Generator[Callable[[int, int], None]]:
         yield show
     finally:
         rewrite(sys.stderr)
+
+
+@contextmanager
+def line_of_progress() -> Generator[None]:
+    """Inside, `show_progress` has a line, which vanishes at the end."""
+    try:
+        yield
+    finally:
+        rewrite(sys.stderr)
+
+
+async def show_progress(progress: float, total: float | None, text: str) -> None:
+    """On a terminal one line that changes; in a pipe nothing, as for all commands."""
+    rewrite(sys.stderr, text)

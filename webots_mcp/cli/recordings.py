@@ -1,22 +1,33 @@
-"""Which recording a command is about, and how it is opened."""
+"""Which recording a command is about, which part of it, and how it is opened."""
 
 from __future__ import annotations
 
+import functools
 import sys
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Final, ParamSpec, TypeAlias
 
 from cyclopts import Parameter
+
+from webots_mcp.cli.values import Id
+from webots_mcp.errors import MalformedRowError, WebotsMCPError
 
 if TYPE_CHECKING:
     import sqlite3
 
+    from webots_mcp.store.reading.ranges import Scope, TimeRange
     from webots_mcp.store.recording import Recording
 
+_Given = ParamSpec("_Given")
+# Not owed to a value in a row: reading past invalid rows would not help.
+_OF_NO_VALUE: Final = (WebotsMCPError, OSError, ImportError)
+
 _SUM_UP_S: Final = 300.0  # a million rows of 40 values take 100 s
-Json: TypeAlias = Annotated[bool, Parameter("--json", help="Print JSON.")]
+Json: TypeAlias = Annotated[bool, Parameter("--json", negative=(), help="Print JSON.")]
+Robot: TypeAlias = Annotated[str | None, Parameter("--robot", help="Only this robot.")]
+RunId: TypeAlias = Annotated[Id | None, Parameter("--run", help="That run, not the newest one.")]
 
 
 @Parameter(name="*")
@@ -62,6 +73,73 @@ class Where:
             recording.create()
         with recording.writer() as connection:
             yield recording, connection
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Range:
+    """Which run of which robot, and which stretch of it: the options that commands share."""
+
+    robot: Robot = None
+    run_id: RunId = None
+    last_s: Annotated[
+        float | None, Parameter("--last", help="The last so many seconds of simulation time.")
+    ] = None
+    start_s: Annotated[float | None, Parameter("--start", help="From this simulation time on.")] = (
+        None
+    )
+    end_s: Annotated[
+        float | None, Parameter("--end", help="Up to, not including, this simulation time.")
+    ] = None
+    since: Annotated[
+        str | None,
+        Parameter("--since", help="From this wall time on (ISO 8601 or Unix seconds)."),
+    ] = None
+    until: Annotated[
+        str | None, Parameter("--until", help="Up to, not including, this wall time.")
+    ] = None
+
+    def scope(self) -> Scope:
+        """What is asked for."""
+        from webots_mcp.store.reading.ranges import Scope
+
+        return Scope(**vars(self))
+
+    def in_recording(self, connection: sqlite3.Connection) -> TimeRange:
+        """What the options mean in a recording."""
+        from webots_mcp.store.reading.ranges import find_range
+
+        return find_range(connection, self.scope())
+
+
+def only_reading(command: Callable[_Given, None]) -> Callable[_Given, None]:
+    """A command that fails over a value that no bridge has written reads again past such rows."""
+
+    @functools.wraps(command)
+    def read(*arguments: _Given.args, **options: _Given.kwargs) -> None:
+        past_wrong_values(functools.partial(command, *arguments, **options))
+
+    return read
+
+
+def past_wrong_values(run: Callable[[], None]) -> None:
+    """Run what only reads; where it fails over a value, again past invalid rows."""
+    try:
+        return run()
+    except Exception as error:
+        if isinstance(error, _OF_NO_VALUE) and not isinstance(error, MalformedRowError):
+            raise
+    past_invalid_rows(run)
+
+
+def past_invalid_rows(run: Callable[[], None]) -> None:
+    """Run what only reads past invalid rows, which are named on stderr."""
+    from webots_mcp.store import invalid_rows
+
+    with invalid_rows.past_invalid_rows() as invalid:
+        run()
+    for said in invalid.described():
+        print(f"webots-mcp: left out: {said}", file=sys.stderr)
 
 
 def sum_up_first(recording: Recording) -> None:

@@ -11,6 +11,7 @@ import math
 import shutil
 import sys
 import textwrap
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final, TextIO, cast
 
@@ -156,6 +157,27 @@ def printable(text: str) -> str:
     """A text in one line, with what a terminal would obey spelled out."""
     line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
     return spelled_out(line)
+
+
+def id_ranges(numbers: Sequence[int]) -> str | None:
+    """Numbers as a person lists them: 1 to 7, 9."""
+    parts: list[list[int]] = []
+    for number in sorted(numbers):
+        if parts and number == parts[-1][-1] + 1:
+            parts[-1][1:] = [number]
+        else:
+            parts.append([number])
+    return ", ".join(" to ".join(map(str, part)) for part in parts) or None
+
+
+def clock_text(wall_time_s: float) -> str:
+    """A wall time in local time."""
+    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(wall_time_s))
+
+
+def print_json(found: Any) -> None:
+    """Print an answer for programs; what is no JSON as its text."""
+    print(json.dumps(found, ensure_ascii=False, default=str))
 
 
 def terminal_width(stream: TextIO) -> int:

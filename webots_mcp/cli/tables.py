@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, is_dataclass
 from typing import TYPE_CHECKING, Any, Final, TextIO, cast
 
+from webots_mcp.cli.rendering import clock_text as clock_text
+from webots_mcp.cli.rendering import id_ranges as id_ranges
 from webots_mcp.cli.wording import as_typed
 
 if TYPE_CHECKING:
@@ -69,22 +70,6 @@ def _number_text(value: float) -> str:
     if not math.isfinite(value):
         return str(value)
     return f"{value:.3f}".rstrip("0").rstrip(".") if abs(value) >= 1 else f"{value:.4g}"
-
-
-def id_ranges(numbers: Sequence[int]) -> str | None:
-    """Numbers as a person lists them: 1 to 7, 9."""
-    parts: list[list[int]] = []
-    for number in sorted(numbers):
-        if parts and number == parts[-1][-1] + 1:
-            parts[-1][1:] = [number]
-        else:
-            parts.append([number])
-    return ", ".join(" to ".join(map(str, part)) for part in parts) or None
-
-
-def clock_text(wall_time_s: float) -> str:
-    """A wall time in local time."""
-    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(wall_time_s))
 
 
 def print_notes(notes: Sequence[str], file: TextIO | None = None) -> None:

@@ -3,13 +3,34 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Annotated, Any, Final, TypeAlias
+
+from cyclopts import Parameter, Token
+from cyclopts.validators import Number
 
 from webots_mcp.errors import InvalidInputError
 
 _NO_KINDS: Final[Mapping[str, str]] = MappingProxyType({})
+
+
+def whole_number(_kind: Any, tokens: Sequence[Token]) -> int:
+    """What was typed; cyclopts by itself would round 1.5.
+
+    Raises:
+        ValueError: It is no whole number.
+    """
+    text = tokens[0].value
+    if not re.fullmatch(r"[+-]?[0-9]+", text):
+        raise ValueError(f"{text!r} is no whole number")
+    return int(text)
+
+
+# Of a run, a command or another row: what SQLite could have given.
+Id: TypeAlias = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0, lt=2**63))]
+Count: TypeAlias = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=1))]
 
 
 def settings_of(texts: Sequence[str], kinds: Mapping[str, str] = _NO_KINDS) -> dict[str, Any]:

@@ -47,23 +47,9 @@ _TOOL: Final = re.compile(
 _running: ContextVar[tuple[Argument | Typed, ...]] = ContextVar("running", default=())
 
 
-def speak_of(arguments: Iterable[Argument]) -> None:
+def speak_of(arguments: Iterable[Argument | Typed]) -> None:
     """Let `as_typed` speak of these arguments: those of the command that runs."""
     _running.set(tuple(arguments))
-
-
-def speak_of_command(name: str) -> None:
-    """Let `as_typed` speak of the options of the question that a command asks."""
-    from webots_mcp.cli.commands import COMMANDS
-    from webots_mcp.questions.declaring import Question
-
-    found = COMMANDS[name].declared()
-    asked = found if isinstance(found, Question) else getattr(found, "question", None)
-    if asked is not None:
-        from webots_mcp.cli.asking import option_of
-
-        typed = {each.name: option_of(asked, each.name) for each in asked.parameters}
-        _running.set(tuple(Typed(each, typed[each], each.upper()) for each in typed))
 
 
 class Typed(NamedTuple):

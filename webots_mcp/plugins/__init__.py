@@ -38,6 +38,20 @@ class ExportFormat(NamedTuple):
     is_text: bool = False
 
 
+class PluginCommand(NamedTuple):
+    """A command of a plugin.
+
+    Attributes:
+        name: As it is typed.
+        group: Of the help: one of `cli.commands.GROUPS`.
+        function: Its parameters are the options, its docstring the help; or a question.
+    """
+
+    name: str
+    group: str
+    function: str
+
+
 class Cluster(NamedTuple):
     """Trials on other machines.
 
@@ -54,7 +68,8 @@ class Plugin(NamedTuple):
     """What a plugin adds to the core.
 
     Attributes:
-        commands: Modules that register commands (`cli.command`).
+        commands: For the command line.
+        command_modules: Modules that register commands (`cli.command`).
         questions: Modules that declare questions (`questions.declaring`), which are MCP tools.
         formats: Of exports.
         cluster: Where else trials can run.
@@ -62,7 +77,8 @@ class Plugin(NamedTuple):
             the exit code.
     """
 
-    commands: tuple[str, ...] = ()
+    commands: tuple[PluginCommand, ...] = ()
+    command_modules: tuple[str, ...] = ()
     questions: tuple[str, ...] = ()
     formats: tuple[ExportFormat, ...] = ()
     cluster: Cluster | None = None
@@ -81,9 +97,14 @@ def load(name: str) -> Any:
     return pkgutil.resolve_name(name)
 
 
+def plugin_commands() -> tuple[PluginCommand, ...]:
+    """The commands of all plugins."""
+    return tuple(each for plugin in plugins() for each in plugin.commands)
+
+
 def command_modules() -> Iterator[ModuleType]:
     """Import the plugins' commands, which registers them."""
-    return (import_module(name) for plugin in plugins() for name in plugin.commands)
+    return (import_module(name) for plugin in plugins() for name in plugin.command_modules)
 
 
 def question_modules() -> Iterator[ModuleType]:

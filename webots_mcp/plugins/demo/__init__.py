@@ -3,6 +3,6 @@
 from webots_mcp.plugins import Plugin
 
 PLUGIN = Plugin(
-    commands=(f"{__name__}.demo_command",),
+    command_modules=(f"{__name__}.demo_command",),
     stand_in="webots_mcp.standin.__main__:run_world",
 )

@@ -6,4 +6,4 @@ write; what a button does goes the way that the tools' commands go.
 
 from webots_mcp.plugins import Plugin
 
-PLUGIN = Plugin(commands=(f"{__name__}.view_command",))
+PLUGIN = Plugin(command_modules=(f"{__name__}.view_command",))

@@ -8,4 +8,4 @@ shipped, `target` what a pool can do; `engines` opens one of the two kinds, whic
 
 from webots_mcp.plugins import Plugin
 
-PLUGIN = Plugin(commands=(f"{__name__}.pool_commands", f"{__name__}.ship_command"))
+PLUGIN = Plugin(command_modules=(f"{__name__}.pool_commands", f"{__name__}.ship_command"))

@@ -5,4 +5,6 @@ Jinja2 and Bokeh are imported with the first report.
 
 from webots_mcp.plugins import Plugin
 
-PLUGIN = Plugin(commands=(f"{__name__}.report_command",), questions=(f"{__name__}.write_report",))
+PLUGIN = Plugin(
+    command_modules=(f"{__name__}.report_command",), questions=(f"{__name__}.write_report",)
+)

@@ -11,7 +11,8 @@ from typing import Any, Final
 
 from tests.detection.labelled import LabelledRun
 from tests.recordings.rover import WALL_PER_SIM, Recorder
-from webots_mcp.store.retention import Limit, Retention, prune
+from webots_mcp.store.retention.policy import Limit, Retention
+from webots_mcp.store.retention.purge import prune
 from webots_mcp.store.rollup.rolling import roll
 
 _INSERT: Final = (

@@ -25,7 +25,8 @@ from webots_mcp.contract import new_uuid
 from webots_mcp.schema import create_schema
 from webots_mcp.standin import InProcessRobot, InProcessSupervisor
 from webots_mcp.standin.in_process import InProcessSimulation
-from webots_mcp.store.retention import Limit, Retention, prune
+from webots_mcp.store.retention.policy import Limit, Retention
+from webots_mcp.store.retention.purge import prune
 from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.trials import Result, create_trial_set, finish_trial, trials_of
 

@@ -30,7 +30,8 @@ from webots_mcp.plugins.pool.engines import open_pool, open_target
 from webots_mcp.plugins.pool.key_order import in_order
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.questions.runs import run_info
-from webots_mcp.store.retention import Limit, Retention, prune
+from webots_mcp.store.retention.policy import Limit, Retention
+from webots_mcp.store.retention.purge import prune
 from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.trials import (
     find_trial_set,

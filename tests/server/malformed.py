@@ -23,8 +23,8 @@ from PIL import Image
 
 from tests.recordings.rows import Recorded, RecordedRobot, insert
 from webots_mcp.server import create_server
-from webots_mcp.store.retention import Limit
 from webots_mcp.store.retention.limits import set_limits
+from webots_mcp.store.retention.policy import Limit
 from webots_mcp.store.rollup.rolling import roll
 
 ROWS: Final = 60

@@ -12,7 +12,8 @@ from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect
 from tests.store.test_status import dead_pid
 from webots_mcp.server import create_server
-from webots_mcp.store.retention import Limit, Retention, prune
+from webots_mcp.store.retention.policy import Limit, Retention
+from webots_mcp.store.retention.purge import prune
 
 pytestmark = pytest.mark.anyio
 

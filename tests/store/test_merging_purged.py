@@ -21,7 +21,8 @@ from webots_mcp.schema import create_schema
 from webots_mcp.store.bundle import unpacked, write_bundle
 from webots_mcp.store.merging import merge
 from webots_mcp.store.questions.runs import run_info
-from webots_mcp.store.retention import Limit, Retention, prune
+from webots_mcp.store.retention.policy import Limit, Retention
+from webots_mcp.store.retention.purge import prune
 from webots_mcp.store.rollup.rolling import roll
 
 SIGNALS = (

@@ -32,7 +32,9 @@ from webots_mcp.plugins import export_formats
 
 if TYPE_CHECKING:
     from webots_mcp.store.recording import Recording
-    from webots_mcp.store.retention import Plan, Purged, Retention
+    from webots_mcp.store.retention.planning import Plan
+    from webots_mcp.store.retention.policy import Retention
+    from webots_mcp.store.retention.purge import Purged
 
 
 @command(
@@ -227,8 +229,8 @@ def prune(arguments: argparse.Namespace) -> None:
     age spares the newest rows, as many as the options tell. Robots may record meanwhile. The MCP
     server does the same every few seconds.
     """
-    from webots_mcp.store.retention import in_force, plan
-    from webots_mcp.store.retention.limits import set_limits
+    from webots_mcp.store.retention.limits import in_force, set_limits
+    from webots_mcp.store.retention.planning import plan
     from webots_mcp.store.retention.usage import file_sizes
 
     limits = limits_of(arguments)
@@ -260,8 +262,8 @@ def retain(arguments: argparse.Namespace) -> None:
     The limits belong to the database and hold at once, whoever maintains it; 'default' goes back
     to what holds where nothing is set. 'webots-mcp status' shows them.
     """
-    from webots_mcp.store.retention import mark_kept
     from webots_mcp.store.retention.limits import set_limits
+    from webots_mcp.store.retention.policy import mark_kept
 
     limits = limits_of(arguments)
     if not arguments.run_ids and not limits:
@@ -275,7 +277,7 @@ def _prune(recording: Recording, connection: sqlite3.Connection, retention: Rete
     """Purge, with somebody who keeps the log of the database short meanwhile."""
     from webots_mcp.connection import CHECKPOINT_TIMEOUT_MS
     from webots_mcp.maintenance import Maintainer
-    from webots_mcp.store.retention import prune as purge
+    from webots_mcp.store.retention.purge import prune as purge
     from webots_mcp.store.robots import list_robots
 
     assert isinstance(recording.database, Path)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 from webots_mcp.cli.command import argument
 
 if TYPE_CHECKING:
-    from webots_mcp.store.retention import Limit
+    from webots_mcp.store.retention.policy import Limit
 
 _BACK: Final = "default"
 _KINDS: Final = {
@@ -31,8 +31,8 @@ class _Default:
         self._name = name
 
     def __str__(self) -> str:
-        from webots_mcp.store.retention import DEFAULT, Limit
         from webots_mcp.store.retention.notation import limit_text
+        from webots_mcp.store.retention.policy import DEFAULT, Limit
 
         value = getattr(DEFAULT, self._name)
         if not isinstance(value, Limit):
@@ -93,8 +93,8 @@ def limits_of(arguments: argparse.Namespace) -> dict[str, Limit | float | None]:
     Raises:
         InvalidInputError: A text is not a limit, or a number is negative.
     """
-    from webots_mcp.store.retention import DEFAULT
     from webots_mcp.store.retention.notation import parse_limit
+    from webots_mcp.store.retention.policy import DEFAULT
 
     asked = {name: getattr(arguments, name) for name in (*_KINDS, _SIZE, "outlive")}
     given = {name: value for name, value in asked.items() if not isinstance(value, _Default)}

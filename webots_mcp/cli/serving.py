@@ -17,7 +17,7 @@ from webots_mcp.errors import InvalidInputError, WebotsMCPError
 
 if TYPE_CHECKING:
     from webots_mcp.contract import Database
-    from webots_mcp.store.retention import Asked
+    from webots_mcp.store.retention.limits import Asked
 
 
 @command(

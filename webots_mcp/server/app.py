@@ -25,8 +25,8 @@ from webots_mcp.server.tools import ToolServer, tool_of
 from webots_mcp.steering.launcher import Companions, Launcher
 from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.retention import Asked, Upkeep
-from webots_mcp.store.retention.limits import ask_where_unset
+from webots_mcp.store.retention.limits import Asked, ask_where_unset
+from webots_mcp.store.retention.upkeep import Upkeep
 from webots_mcp.store.rollup.rolling import roll
 
 INSTRUCTIONS: Final = (

@@ -23,7 +23,8 @@ from webots_mcp.schema import create_schema
 from webots_mcp.store.export import FORMATS, export_file
 from webots_mcp.store.json_folder import import_folder
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.retention import Limit, Purged, Retention, prune
+from webots_mcp.store.retention.policy import Limit, Retention
+from webots_mcp.store.retention.purge import Purged, prune
 
 _ROWS: Final = 100_000
 _ROBOT_STEPS: Final = 100  # of 8 ms, between two looks whether the purge is over

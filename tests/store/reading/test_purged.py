@@ -18,7 +18,8 @@ from webots_mcp.store.questions.series import RunHistory, query_history
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.coverage import less_time
 from webots_mcp.store.reading.ranges import Scope, Segment, find_range
-from webots_mcp.store.retention import Limit, Retention, prune
+from webots_mcp.store.retention.policy import Limit, Retention
+from webots_mcp.store.retention.purge import prune
 from webots_mcp.store.rollup.rolling import roll
 
 

@@ -14,7 +14,9 @@ from webots_mcp.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.questions.series import query_history
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.retention import Limit, Retention, plan, prune
+from webots_mcp.store.retention.planning import plan
+from webots_mcp.store.retention.policy import Limit, Retention
+from webots_mcp.store.retention.purge import prune
 
 NONE = Limit(rows=0)
 ALL = Limit()

@@ -19,8 +19,15 @@ from webots_mcp.cli import main
 from webots_mcp.connection import connect
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.schema import create_schema
-from webots_mcp.store.retention import DEFAULT, Limit, Upkeep, in_force
-from webots_mcp.store.retention.limits import ask_at_start, ask_where_unset, set_limits, unheeded
+from webots_mcp.store.retention.limits import (
+    ask_at_start,
+    ask_where_unset,
+    in_force,
+    set_limits,
+    unheeded,
+)
+from webots_mcp.store.retention.policy import DEFAULT, Limit
+from webots_mcp.store.retention.upkeep import Upkeep
 from webots_mcp.store.rollup.rolling import roll
 
 Say = Callable[..., str]

@@ -8,7 +8,7 @@ import pytest
 
 from tests.recordings.runs import Recorded, states
 from tests.store.retention.conftest import TABLES
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.rollup.buckets import buckets
 from webots_mcp.store.rollup.rolling import roll
 

@@ -16,8 +16,10 @@ from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
 from webots_mcp.schema import create_schema
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.retention import Limit, Retention, Upkeep, plan, prune
-from webots_mcp.store.retention.purge import purge
+from webots_mcp.store.retention.planning import plan
+from webots_mcp.store.retention.policy import Limit, Retention
+from webots_mcp.store.retention.purge import prune, purge
+from webots_mcp.store.retention.upkeep import Upkeep
 from webots_mcp.store.rollup.rolling import roll, watermark
 
 

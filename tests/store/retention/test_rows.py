@@ -16,7 +16,8 @@ from tests.recordings.runs import ROW_S, Recorded, states
 from tests.store.retention.conftest import TABLES
 from webots_mcp.errors import InvalidInputError, UnknownRunError
 from webots_mcp.liveness import end_session
-from webots_mcp.store.retention import Limit, Retention, mark_kept, plan
+from webots_mcp.store.retention.planning import plan
+from webots_mcp.store.retention.policy import Limit, Retention, mark_kept
 from webots_mcp.store.retention.purge import purge
 from webots_mcp.store.rollup.rolling import roll
 

@@ -11,7 +11,8 @@ import pytest
 from tests.recordings.runs import ROW_S, Recorded, states
 from webots_mcp.connection import connect
 from webots_mcp.schema import create_schema
-from webots_mcp.store.retention import Limit, Retention, plan
+from webots_mcp.store.retention.planning import plan
+from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.rollup.rolling import roll
 
 NO_LIMIT = Retention(Limit(), Limit(), Limit(), Limit(), Limit(), outlive=0)

@@ -13,8 +13,10 @@ from tests.recordings.runs import Recorded, states
 from webots_mcp.cli import main
 from webots_mcp.connection import connect
 from webots_mcp.schema import create_schema
-from webots_mcp.store.retention import Limit, Retention, Upkeep, plan
+from webots_mcp.store.retention.planning import plan
+from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.shipped import Shipped, write_shipped
+from webots_mcp.store.retention.upkeep import Upkeep
 from webots_mcp.store.rollup.rolling import roll
 
 MB = 1_000_000

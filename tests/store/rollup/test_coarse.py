@@ -21,7 +21,8 @@ from webots_mcp.store.analysis.summary import Summary, summarise
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.reading.rollups import Pieces, read_pieces
-from webots_mcp.store.retention import Limit, Retention, prune
+from webots_mcp.store.retention.policy import Limit, Retention
+from webots_mcp.store.retention.purge import prune
 from webots_mcp.store.rollup.buckets import COARSE, COARSE_BUCKETS, COARSE_S, FINE, by_grain
 from webots_mcp.store.rollup.rolling import forget, roll
 from webots_mcp.store.signals.registry import registered

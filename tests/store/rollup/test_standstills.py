@@ -17,7 +17,8 @@ from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading import rows
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.retention import Limit, Retention, prune
+from webots_mcp.store.retention.policy import Limit, Retention
+from webots_mcp.store.retention.purge import prune
 from webots_mcp.store.rollup import findings
 from webots_mcp.store.rollup.rolling import roll
 

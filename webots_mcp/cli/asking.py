@@ -106,9 +106,9 @@ def ask(question: Question, given: Mapping[str, Any], where: Where) -> Reply:
         WebotsMCPError: As the question says.
     """
     recording = where.recording(read_only=question.effect.reads)
+    valid = _valid(question, given, recording)
     if not _OF_SIGNALS.isdisjoint(each.name for each in question.parameters):
         sum_up_first(recording)
-    valid = _valid(question, given, recording)
     with line_of_progress(), _caller(question, recording) as caller:
         return anyio.run(question.ask, recording, valid, caller)
 

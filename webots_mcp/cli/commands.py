@@ -51,6 +51,8 @@ _OF_THE_CORE: Final = {
     "status": Command(NOW, f"{_Q}.world_info", "webots_list_robots"),
     "trends": Command(PAST, f"{_Q}.get_trends", "webots_get_trends"),
     "launch": Command(SETUP, "webots_mcp.cli.launching", "launch"),
+    "plot": Command(PAST, "webots_mcp.cli.looking", "plot"),
+    "tail": Command(NOW, "webots_mcp.cli.looking", "tail"),
 }
 COMMANDS: Final[dict[str, Command]] = _OF_THE_CORE | {
     each.name: Command(each.group, *each.function.split(":")) for each in plugin_commands()

@@ -75,6 +75,9 @@ class Where:
             yield recording, connection
 
 
+HERE: Final = Where()
+
+
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Range:

@@ -23,7 +23,7 @@ from webots_mcp.cli.command import (
     open_recording,
 )
 from webots_mcp.cli.ending import ending_by_event
-from webots_mcp.cli.history import write_picture
+from webots_mcp.cli.looking import write_picture
 from webots_mcp.cli.tables import print_notes, print_table, text_of
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 

@@ -28,8 +28,14 @@ def whole_number(_kind: Any, tokens: Sequence[Token]) -> int:
     return int(text)
 
 
-# Of a run, a command or another row: what SQLite could have given.
-Id: TypeAlias = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0, lt=2**63))]
+def _row_id(_kind: Any, tokens: Sequence[Token]) -> int:
+    text = tokens[0].value
+    if text.isascii() and text.isdecimal() and int(text) < 2**63:  # what SQLite could have given
+        return int(text)
+    raise ValueError(f"{text!r} is no id: it is a number from an answer")
+
+
+Id: TypeAlias = Annotated[int, Parameter(converter=_row_id)]
 Count: TypeAlias = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=1))]
 
 

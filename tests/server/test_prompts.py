@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
-from mcp import Client
+from mcp import Client, MCPError
 from mcp.types import TextContent
 
 from tests.server.story import WAYS, Way, client_on, write_story
@@ -86,3 +86,22 @@ async def test_the_calls_of_a_prompt_can_be_made_as_they_stand(story: Path) -> N
                     continue  # the story's controller was never edited
                 result = await client.call_tool(call.func.id, asked)
                 assert not result.is_error, (ast.unparse(call), result.content)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"start_s": "soon", "end_s": "2"}, "start_s must be a valid number"),
+        ({"start_s": "1"}, "end_s"),
+        ({"start_s": "1", "end_s": "2", "run_id": "1.5"}, "run_id must be a valid integer"),
+    ],
+)
+async def test_an_argument_that_a_prompt_cannot_use_is_refused_by_its_name(
+    story: Path, given: dict[str, str], said: str
+) -> None:
+    async with client_on(story) as client:
+        with pytest.raises(MCPError, match=said):
+            await client.get_prompt("explain_stretch", given)
+        assert "run_id" not in await read(
+            client, "explain_stretch", {"start_s": "1", "end_s": "2", "run_id": ""}
+        )

@@ -7,6 +7,8 @@ from typing import Annotated
 from mcp.server import MCPServer
 from pydantic import Field
 
+from webots_mcp.questions.argument_types import Id, Seconds
+
 Robot = Annotated[str, Field(description="Robot name; may be left out while only one is live.")]
 
 _TRUTH = (
@@ -60,16 +62,17 @@ def compare_last_edit(robot: Robot = "") -> str:
 
 
 def explain_stretch(
-    start_s: Annotated[str, Field(description="From this simulation time on, s.")],
-    end_s: Annotated[str, Field(description="Up to this simulation time, s.")],
-    run_id: Annotated[str, Field(description="That run instead of the current one.")] = "",
+    start_s: Annotated[Seconds, Field(description="From this simulation time on, s.")],
+    end_s: Annotated[Seconds, Field(description="Up to this simulation time, s.")],
+    run_id: Annotated[Id | None, Field(description="That run instead of the current one.")] = None,
     robot: Robot = "",
 ) -> str:
     """What happened from one simulation time to another, and what led to it."""
     run = f", run_id={run_id}" if run_id else ""
-    stretch = f"start_s={start_s}, end_s={end_s}{run}{_too(robot)}"
+    stretch = f"start_s={start_s:.12g}, end_s={end_s:.12g}{run}{_too(robot)}"
     return (
-        f"Explain what {_named(robot)} did from {start_s} to {end_s} s of simulation time.\n"
+        f"Explain what {_named(robot)} did from {start_s:.12g} to {end_s:.12g} s of simulation "
+        "time.\n"
         f'1. webots_find_events(what="timeline", {stretch}): commands, modes, log lines.\n'
         f"2. webots_find_events({stretch}): what nobody noted, such as standstills and jumps.\n"
         f"3. webots_get_trends({stretch}): what each signal did in words.\n"

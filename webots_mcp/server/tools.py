@@ -25,8 +25,10 @@ from mcp.server.mcpserver import Context, Image
 from mcp.server.mcpserver.exceptions import ToolError
 from mcp.server.mcpserver.tools import Tool
 from mcp.types import (
+    INVALID_PARAMS,
     CallToolResult,
     ContentBlock,
+    GetPromptResult,
     InputRequiredResult,
     TextContent,
     ToolAnnotations,
@@ -184,6 +186,25 @@ class ToolServer(MCPServer):
             context = context or Context(mcp_server=self)
             return await make().run(arguments, context, convert_result=True)
         return await super().call_tool(name, arguments, context)
+
+    async def get_prompt(
+        self,
+        name: str,
+        arguments: dict[str, Any] | None = None,
+        context: Context[Any, Any] | None = None,
+    ) -> GetPromptResult | InputRequiredResult:
+        """A prompt; clients give an optional argument that nobody filled in as an empty text.
+
+        Raises:
+            MCPError: There is no such prompt, or an argument is missing or invalid.
+        """
+        filled_in = {name: value for name, value in (arguments or {}).items() if value != ""}
+        try:
+            return await super().get_prompt(name, filled_in, context)
+        except ValueError as error:  # the SDK by itself answers "Internal server error"
+            cause = error.__cause__ and error.__cause__.__cause__
+            said = faults_of(cause) if isinstance(cause, ValidationError) else str(error)
+            raise MCPError(INVALID_PARAMS, said) from error
 
 
 def _slim(schema: dict[str, Any]) -> dict[str, Any]:

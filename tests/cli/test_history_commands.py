@@ -197,7 +197,7 @@ def test_a_count_that_is_none_is_refused_with_its_option_and_its_value(
     assert number in said
 
 
-@pytest.mark.parametrize("asked", ["report {}", "export --run {}", "wait {}"])
+@pytest.mark.parametrize("asked", ["report {}", "wait {}"])
 @pytest.mark.parametrize("number", [str(2**63), "1.5", "x"])
 def test_an_id_that_no_row_can_have_is_refused(
     capsys: pytest.CaptureFixture[str], asked: str, number: str

@@ -20,7 +20,7 @@ from pydantic.json_schema import SkipJsonSchema
 from webots_mcp.cli.progress import line_of_progress, show_progress
 from webots_mcp.cli.recordings import Json, Where, sum_up_first
 from webots_mcp.cli.rendering import print_answer
-from webots_mcp.cli.values import settings_of, value_of, whole_number
+from webots_mcp.cli.values import refuse_options, settings_of, value_of, whole_number
 from webots_mcp.cli.wording import Typed, as_typed, speak_of
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
 from webots_mcp.questions.declaring import Caller, Question, Reply
@@ -219,7 +219,7 @@ def _parameter(question: Question, declared: inspect.Parameter) -> inspect.Param
         place = inspect.Parameter.VAR_POSITIONAL
     elif name in question.positional:
         shown = Parameter(
-            option, help=text, negative=(), allow_leading_hyphen=True, validator=_refuse_options,
+            option, help=text, negative=(), allow_leading_hyphen=True, validator=refuse_options,
             converter=whole_number if _without_none(kind) is int else None,
         )  # fmt: skip
         place = inspect.Parameter.POSITIONAL_ONLY
@@ -234,12 +234,6 @@ def _parameter(question: Question, declared: inspect.Parameter) -> inspect.Param
 def _place(question: Question, argument: str) -> list[int]:
     """Where it stands among those without an option's name."""
     return [place for place, name in enumerate(question.positional) if name == argument]
-
-
-def _refuse_options(_kind: Any, value: Any) -> None:
-    """Of what begins with a hyphen only the hyphen itself is a value ("take it away")."""
-    if isinstance(value, str) and value.startswith("-") and value != "-":
-        raise ValueError(f"unknown option {value}")
 
 
 def _is_shown(declared: inspect.Parameter) -> bool:

@@ -50,6 +50,10 @@ _OF_THE_CORE: Final = {
     "sql": Command(PAST, f"{_Q}.query_sql", "webots_query_sql"),
     "status": Command(NOW, f"{_Q}.world_info", "webots_list_robots"),
     "trends": Command(PAST, f"{_Q}.get_trends", "webots_get_trends"),
+    "export": Command(DATA, "webots_mcp.cli.data", "export"),
+    "import": Command(DATA, "webots_mcp.cli.data", "import_"),
+    "prune": Command(DATA, "webots_mcp.cli.data", "prune"),
+    "retain": Command(DATA, "webots_mcp.cli.data", "retain"),
     "launch": Command(SETUP, "webots_mcp.cli.launching", "launch"),
     "plot": Command(PAST, "webots_mcp.cli.looking", "plot"),
     "tail": Command(NOW, "webots_mcp.cli.looking", "tail"),
@@ -113,5 +117,6 @@ def _typed(argument: Argument) -> str:
     names = argument.names
     if argument.hint is bool or not names[0].startswith("-"):
         return ", ".join(names)
-    value = names[-1].lstrip("-").replace("-", "_").upper()
+    called = argument.parameter.metavar or names[-1].lstrip("-").replace("-", "_").upper()
+    value = "|".join(argument.get_choices() or [called])
     return ", ".join(f"{name} {value}" for name in names)

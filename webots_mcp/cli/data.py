@@ -2,54 +2,84 @@
 
 from __future__ import annotations
 
-import argparse
-import functools
-import sqlite3
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple
 
-from webots_mcp.cli.command import (
-    DATA_DIR,
-    DATABASE,
-    argument,
-    command,
-    open_recording,
-    past_invalid_rows,
-    past_wrong_values,
-    reading,
-    row_id,
-    writing,
-)
-from webots_mcp.cli.limits import LIMITS, limits_of
+from cyclopts import Parameter
+
+from webots_mcp.cli.limits import Limits
 from webots_mcp.cli.progress import shown_progress
-from webots_mcp.cli.ranges import RANGE, range_of, scope_of
-from webots_mcp.cli.tables import id_ranges, print_notes, print_table
+from webots_mcp.cli.recordings import Json, Range, Where, past_invalid_rows, past_wrong_values
+from webots_mcp.cli.rendering import id_ranges, print_json, print_notes, print_table
 from webots_mcp.cli.terminal import binary_stdout
+from webots_mcp.cli.values import Id, refuse_options
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins import export_formats
 
 if TYPE_CHECKING:
+    import sqlite3
+
     from webots_mcp.store.recording import Recording
     from webots_mcp.store.retention.planning import Plan
     from webots_mcp.store.retention.policy import Retention
     from webots_mcp.store.retention.purge import Purged
 
+    _Format = str
+else:
+    _Format = Literal[("csv", "jsonl", *(each.name for each in export_formats()), "zip")]
 
-@command(
-    "export", DATA_DIR, DATABASE, *RANGE,
-    argument("-o", "--output", metavar="FILE",
-             help="a .csv, .jsonl, .parquet, .mcap, .rrd or .zip file (default: CSV to stdout)"),
-    argument("--format", choices=("csv", "jsonl", *(each.name for each in export_formats()), "zip"),
-             help="where the file's name does not tell it"),
-    argument("--safe-cells", action="store_true",
-             help="in CSV, an apostrophe before texts that a spreadsheet would run as a formula "
-             "(they begin with =, +, - or @)"),
-    argument("--trials", type=row_id, dest="trial_set", metavar="SET",
-             help="the trials of that set instead, one row each, with score, rank and spread"),
-)  # fmt: skip
-def export(arguments: argparse.Namespace) -> None:
+
+class _Written(NamedTuple):
+    """What came of an export; of a table on stdout only what there is to know about it."""
+
+    file: Path | None
+    text: str
+    data: dict[str, Any]
+    notes: tuple[str, ...] = ()
+
+
+_ANYWHERE: Final = Where()
+_ALL: Final = Range()
+_UNLIMITED: Final = Limits()
+
+
+def export(
+    *,
+    output: Annotated[
+        str | None,
+        Parameter(
+            ("--output", "-o"),
+            metavar="FILE",
+            allow_leading_hyphen=True,  # for stdout
+            validator=refuse_options,
+            help="A .csv, .jsonl, .parquet, .mcap, .rrd or .zip file; by default CSV to stdout.",
+        ),
+    ] = None,
+    form: Annotated[
+        _Format | None, Parameter("--format", help="Where the file's name does not tell it.")
+    ] = None,
+    safe_cells: Annotated[
+        bool,
+        Parameter(
+            "--safe-cells",
+            help="In CSV, an apostrophe before texts that a spreadsheet would run as a formula "
+            "(they begin with =, +, - or @).",
+        ),
+    ] = False,
+    trial_set: Annotated[
+        Id | None,
+        Parameter(
+            "--trials",
+            metavar="SET",
+            help="The trials of that set instead, one row each, with score, rank and spread.",
+        ),
+    ] = None,
+    part: Range = _ALL,
+    recorded: Where = _ANYWHERE,
+    json: Json = False,
+) -> None:
     """Write recorded states as a table, or all of a run for a viewer or for another recording.
 
     The newest run is written, or a range; --since 0 writes all runs of a robot. A table has one row
@@ -57,167 +87,214 @@ def export(arguments: argparse.Namespace) -> None:
     NaN and infinity are kept. A .mcap (Foxglove, Lichtblick, PlotJuggler) or .rrd file (Rerun) has
     states, poses, pictures, log lines, events and commands. A .zip file is a bundle: a run that is
     over, as a recording of its own with its pictures, which 'webots-mcp import' takes in. Parquet
-    needs pyarrow, MCAP mcap, and Rerun rerun-sdk; the line that installs them is printed.
+    needs pyarrow, MCAP mcap, and Rerun rerun-sdk; the line that installs them is printed. --json
+    tells what a file got.
     """
-    from webots_mcp.store.export import (
-        BUNDLE,
-        FOR_VIEWERS,
-        FORMATS,
-        TrialTable,
-        export_file,
-        format_of,
-    )
-    from webots_mcp.store.export import export as write
+    from webots_mcp.store.export import BUNDLE, FOR_VIEWERS, FORMATS, format_of
     from webots_mcp.store.reading.ranges import Scope
 
-    file = Path(arguments.output) if arguments.output not in (None, "-") else None
-    form = arguments.format or (format_of(file) if file else "csv")
-    if arguments.trial_set is not None and scope_of(arguments) != Scope():
+    file = Path(output) if output not in (None, "-") else None
+    form = form or (format_of(file) if file else "csv")
+    if trial_set is not None and part.scope() != Scope():
         raise InvalidInputError("give --trials or a range of states, not both")
-    recording = open_recording(arguments)
-    if file and isinstance(recording.database, Path) and file.resolve() == recording.database:
+    recording = recorded.recording()
+    if file is None:
+        _require_for_stdout(form, as_json=json)
+    elif isinstance(recording.database, Path) and file.resolve() == recording.database:
         raise InvalidInputError(f"{file} is the recording itself: choose another file")
-    if form in (*FOR_VIEWERS, BUNDLE):
-        return _export_whole(arguments, recording, file, form)
-    if file is None and not FORMATS[form].is_text and sys.stdout.isatty():
-        raise InvalidInputError(f"{form} is not for a terminal: give a file with -o")
+    if trial_set is not None and form not in FORMATS:
+        raise InvalidInputError(f"trials are a table: choose {' or '.join(FORMATS)}, not {form}")
+    if form == BUNDLE and file is not None:
+        return _show(_export_bundle(recorded, part, file), as_json=json)
 
     def run() -> None:
-        with reading(arguments) as connection, shown_progress("exporting") as progress:
-            safe = arguments.safe_cells
-            if arguments.trial_set is not None:
-                wanted = TrialTable.of(connection, arguments.trial_set)
-            else:
-                wanted = range_of(connection, arguments)
-            if file is None:
-                write(connection, wanted, form, binary_stdout(), progress, safe_cells=safe)
-            else:
-                rows = export_file(connection, wanted, form, file, progress, safe_cells=safe)
-                print(f"{file}: {rows} rows")
-        print_notes(wanted.notes, sys.stderr)  # stdout may be the table
+        if form in FOR_VIEWERS and file is not None:
+            written = _export_for_viewers(recorded, part, file, form)
+        else:
+            written = _export_table(recorded, part, trial_set, file, form, safe_cells=safe_cells)
+        _show(written, as_json=json)
 
     # What went to stdout cannot be taken back: there each row is looked at first.
     past_invalid_rows(run) if file is None else past_wrong_values(run)
 
 
-def _export_whole(
-    arguments: argparse.Namespace, recording: Recording, file: Path | None, form: str
-) -> None:
-    from webots_mcp.store.export import BUNDLE, FORMATS
+def _require_for_stdout(form: str, *, as_json: bool) -> None:
+    from webots_mcp.store.export import FORMATS
 
-    if file is None:
+    if form not in FORMATS:
         raise InvalidInputError(f"{form} is not for stdout: give a file with -o")
-    if arguments.trial_set is not None:
-        raise InvalidInputError(f"trials are a table: choose {' or '.join(FORMATS)}, not {form}")
-    if form == BUNDLE:
-        return _export_bundle(arguments, recording, file)
-    past_wrong_values(functools.partial(_export_for_viewers, arguments, recording, file, form))
+    if not FORMATS[form].is_text and sys.stdout.isatty():
+        raise InvalidInputError(f"{form} is not for a terminal: give a file with -o")
+    if as_json:
+        raise InvalidInputError(
+            "--json tells what a file got: give one with -o; --format jsonl writes states as JSON"
+        )
 
 
-def _export_for_viewers(
-    arguments: argparse.Namespace, recording: Recording, file: Path, form: str
-) -> None:
+def _export_table(
+    recorded: Where,
+    part: Range,
+    trial_set: int | None,
+    file: Path | None,
+    form: str,
+    *,
+    safe_cells: bool,
+) -> _Written:
+    from webots_mcp.store.export import TrialTable, export_file
+    from webots_mcp.store.export import export as write
+
+    with recorded.reader() as connection, shown_progress("exporting") as progress:
+        if trial_set is not None:
+            wanted = TrialTable.of(connection, trial_set)
+        else:
+            wanted = part.in_recording(connection)
+        if file is None:
+            write(connection, wanted, form, binary_stdout(), progress, safe_cells=safe_cells)
+            return _Written(None, "", {}, tuple(wanted.notes))
+        rows = export_file(connection, wanted, form, file, progress, safe_cells=safe_cells)
+    return _Written(file, f"{rows} rows", {"rows": rows}, tuple(wanted.notes))
+
+
+def _export_for_viewers(recorded: Where, part: Range, file: Path, form: str) -> _Written:
     from webots_mcp.store.export import export_for_viewers
 
-    with reading(arguments) as connection, shown_progress("exporting") as progress:
-        wanted = range_of(connection, arguments)
-        written = export_for_viewers(connection, recording.data_dir, wanted, form, file, progress)
-    told = ", ".join(f"{count} {kind}" for kind, count in written.counts.items() if count)
-    print(f"{file}: {told}{written.beside and f'; {written.beside}'}")
-    print_notes(wanted.notes, sys.stderr)
+    data_dir = recorded.recording().data_dir
+    with recorded.reader() as connection, shown_progress("exporting") as progress:
+        wanted = part.in_recording(connection)
+        written = export_for_viewers(connection, data_dir, wanted, form, file, progress)
+    counts = {kind: count for kind, count in written.counts.items() if count}
+    text = ", ".join(f"{count} {kind}" for kind, count in counts.items())
+    data: dict[str, Any] = {"counts": counts}
+    if written.beside:
+        text, data["beside"] = f"{text}; {written.beside}", written.beside
+    return _Written(file, text, data, tuple(wanted.notes))
 
 
-def _export_bundle(arguments: argparse.Namespace, recording: Recording, file: Path) -> None:
+def _export_bundle(recorded: Where, part: Range, file: Path) -> _Written:
     from webots_mcp.store.bundle import write_bundle
     from webots_mcp.store.export import placed
     from webots_mcp.store.reading.ranges import Scope
     from webots_mcp.store.reading.subject import find_subject
 
-    scope = scope_of(arguments)
+    scope, recording = part.scope(), recorded.recording()
     if scope != Scope(robot=scope.robot, run_id=scope.run_id):
         raise InvalidInputError("a bundle is a whole run: give --run or --robot, and no times")
     assert isinstance(recording.database, Path)
-    with reading(arguments) as connection, shown_progress("packing") as progress:
+    with recorded.reader() as connection, shown_progress("packing") as progress:
         run_id = find_subject(connection, scope.robot, scope.run_id).run_id
         place = (recording.database, recording.data_dir, run_id)
         with placed(file) as aside:
             write_bundle(connection, *place, aside, progress)
-    print(f"{file}: run {run_id}, {file.stat().st_size:,} bytes")
+    size = file.stat().st_size
+    data = {"run_id": run_id, "size_bytes": size}
+    return _Written(file, f"run {run_id}, {size:,} bytes", data)
 
 
-@command(
-    "import", DATA_DIR, DATABASE,
-    argument("source", metavar="SOURCE",
-             help="a folder with status.json, logs/, camera/, ...; a recording, a webots.db; or a "
-             "bundle, a .zip of 'webots-mcp export'"),
-    argument("--robot", default="imported", metavar="NAME",
-             help="the name to record under, which no robot may have yet (imported)"),
-)  # fmt: skip
-def import_(arguments: argparse.Namespace) -> None:
+def _show(written: _Written, *, as_json: bool) -> None:
+    if as_json:
+        return print_json({"file": str(written.file), **written.data, "notes": list(written.notes)})
+    if written.file is not None:
+        print(f"{written.file}: {written.text}")
+    print_notes(written.notes, sys.stderr)  # stdout may be the table
+
+
+def import_(
+    source: Annotated[
+        str,
+        Parameter(
+            "SOURCE",
+            help="A folder with status.json, logs/, camera/, ...; a recording, a webots.db; or a "
+            "bundle, a .zip of 'webots-mcp export'.",
+        ),
+    ],
+    /,
+    *,
+    robot: Annotated[
+        str,
+        Parameter(
+            "--robot",
+            metavar="NAME",
+            help="The name to record under, which no robot may have yet (imported).",
+        ),
+    ] = "imported",
+    recorded: Where = _ANYWHERE,
+    json: Json = False,
+) -> None:
     """Import another recording, or the data folder of a bridge that writes JSON files.
 
     A recording that is over comes with all of its runs and trial sets, a bundle with its run; what
     is there already is left as it is, so that it may be imported again.
 
-    Of such a folder status.json, logs/controller.log, camera/*.png, screenshots/*.png and
-    commands.json become one finished run; if a file is damaged, nothing does. It has no simulation
-    times: they are counted in seconds of wall time from its earliest entry.
+    Of such a folder status.json, logs/controller.log, commands.json and the .png files of camera/
+    and screenshots/ become one finished run; if a file is damaged, nothing does. It has no
+    simulation times: they are counted in seconds of wall time from its earliest entry.
     """
+    from webots_mcp.store.bundle import is_bundle, unpacked
+
+    place = Path(source)
+    if not place.is_file():
+        return _import_folder(recorded, place, robot, as_json=json)
+    if is_bundle(place):
+        with unpacked(place) as database:
+            found = _import_recording(recorded, database)
+    else:
+        found = _import_recording(recorded, place)
+    if json:
+        return print_json({"source": source, **found})
+    print(f"{source}: {_taken_in(found)}")
+
+
+def _import_folder(recorded: Where, folder: Path, robot: str, *, as_json: bool) -> None:
     from webots_mcp.store.json_folder import import_folder, read_folder
 
-    if (source := Path(arguments.source)).is_file():
-        return _import_file(arguments, source)
-    read_folder(source)  # first: no database is made for what cannot be imported
-    with writing(arguments, create=True) as (recording, connection):
+    read_folder(folder)  # first: no database is made for what cannot be imported
+    with recorded.writer(create=True) as (recording, connection):
         with shown_progress("importing") as progress:
-            made = import_folder(connection, source, recording.data_dir, arguments.robot, progress)
+            made = import_folder(connection, folder, recording.data_dir, robot, progress)
+        if as_json:
+            return print_json({"source": str(folder), **made._asdict()})
         print(
             f"run {made.run_id} of robot {made.robot!r}: states {made.states}, log lines "
             f"{made.lines}, pictures {made.pictures}, commands {made.commands}"
         )
 
 
-def _import_file(arguments: argparse.Namespace, file: Path) -> None:
-    from webots_mcp.store.bundle import is_bundle, unpacked
-
-    if not is_bundle(file):
-        return _import_recording(arguments, file, file)
-    with unpacked(file) as source:
-        _import_recording(arguments, source, file)
-
-
-def _import_recording(arguments: argparse.Namespace, source: Path, told: Path) -> None:
+def _import_recording(recorded: Where, source: Path) -> dict[str, Any]:
+    """What the import has brought, of the runs that are in both recordings now."""
     from webots_mcp.store.merging import merge, settled
 
     settled(source)  # first: no database is made for what is no recording
-    with writing(arguments, create=True) as (recording, connection):
+    with recorded.writer(create=True) as (recording, connection):
         if isinstance(recording.database, Path) and source.samefile(recording.database):
             raise InvalidInputError(f"{source} is the recording itself: choose another file")
         (newest,) = connection.execute("SELECT coalesce(max(id), 0) FROM run").fetchone()
         changes = connection.total_changes
-        runs = list(merge(connection, recording.data_dir, source).values())
-        is_changed = connection.total_changes > changes
-    print(f"{told}: {_taken_in(runs, newest, is_changed=is_changed)}")
+        runs = sorted(merge(connection, recording.data_dir, source).values())
+        return {
+            "new_run_ids": [run_id for run_id in runs if run_id > newest],
+            "known_run_ids": [run_id for run_id in runs if run_id <= newest],
+            "changed": connection.total_changes > changes,
+        }
 
 
-def _taken_in(runs: list[int], newest_before: int, *, is_changed: bool) -> str:
-    """What an import has brought, of the runs that are in both recordings now."""
-    new = [run_id for run_id in runs if run_id > newest_before]
-    before = [run_id for run_id in runs if run_id <= newest_before]
-    known = f"run {id_ranges(before)} was here already" if before else ""
+def _taken_in(found: dict[str, Any]) -> str:
+    new, before = id_ranges(found["new_run_ids"]), id_ranges(found["known_run_ids"])
+    known = f"run {before} was here already" if before else ""
+    beside = f"; {known}" if known else ""
     if new:
-        return f"new here: run {id_ranges(new)}" + (f"; {known}" if known else "")
-    if is_changed:
-        beside = f"; {known}" if known else ""
+        return f"new here: run {new}{beside}"
+    if found["changed"]:
         return f"no run is new, but sessions without runs, or trials, are{beside}"
     return f"nothing is new{': ' if known else ', it has no runs'}{known}"
 
 
-@command(
-    "prune", DATA_DIR, DATABASE,
-    argument("--dry-run", action="store_true", help="only tell what would go"), *LIMITS,
-)  # fmt: skip
-def prune(arguments: argparse.Namespace) -> None:
+def prune(
+    *,
+    dry_run: Annotated[bool, Parameter("--dry-run", help="Only tell what would go.")] = False,
+    limits: Limits = _UNLIMITED,
+    recorded: Where = _ANYWHERE,
+    json: Json = False,
+) -> None:
     """Delete what is beyond the limits, and give the space back to the disk.
 
     Rows go in the order in which they were recorded, whatever their run. Runs with a label (but
@@ -233,44 +310,56 @@ def prune(arguments: argparse.Namespace) -> None:
     from webots_mcp.store.retention.planning import plan
     from webots_mcp.store.retention.usage import file_sizes
 
-    limits = limits_of(arguments)
+    asked = limits.asked()
 
     def look() -> None:
-        with reading(arguments) as connection:
-            wanted, sizes = plan(connection, in_force(connection, limits)), file_sizes(connection)
+        with recorded.reader() as connection:
+            wanted, sizes = plan(connection, in_force(connection, asked)), file_sizes(connection)
+        disk = _on_disk(wanted, sizes)
+        if json:
+            return print_json({"dry_run": True, **_as_data(wanted), "disk_bytes": disk})
         _print_plan(wanted, "would go")
-        _print_disk(wanted, sizes)
+        _print_disk(disk)
 
-    if arguments.dry_run:
+    if dry_run:
         return past_wrong_values(look)
-    with writing(arguments) as (recording, connection):
-        set_limits(connection, limits, "prune")
+    with recorded.writer() as (recording, connection):
+        set_limits(connection, asked, "prune")
         retention = in_force(connection)
-        _print_plan(plan(connection, retention), "goes")
-        _print_purged(_prune(recording, connection, retention))
+        wanted = plan(connection, retention)
+        if not json:
+            _print_plan(wanted, "goes")
+        purged = _prune(recording, connection, retention)
+    if json:
+        done = {"freed_bytes": purged.freed_bytes, "notes": purged.problems}
+        return print_json({"dry_run": False, **_as_data(wanted), **done})
+    _print_purged(purged)
 
 
-@command(
-    "retain", DATA_DIR, DATABASE,
-    argument("run_ids", type=row_id, nargs="*", metavar="RUN",
-             help="as 'webots-mcp runs' lists them"),
-    argument("--release", action="store_true", help="let retention have them again"), *LIMITS,
-)  # fmt: skip
-def retain(arguments: argparse.Namespace) -> None:
+def retain(
+    *run_ids: Annotated[Id, Parameter("RUN", help="As 'webots-mcp runs' lists them.")],
+    release: Annotated[bool, Parameter("--release", help="Let retention have them again.")] = False,
+    limits: Limits = _UNLIMITED,
+    recorded: Where = _ANYWHERE,
+    json: Json = False,
+) -> None:
     """Mark runs that are never pruned, or set how much is kept of the others.
 
     The limits belong to the database and hold at once, whoever maintains it; 'default' goes back
     to what holds where nothing is set. 'webots-mcp status' shows them.
     """
-    from webots_mcp.store.retention.limits import set_limits
+    from webots_mcp.store.retention.limits import described, set_limits
     from webots_mcp.store.retention.policy import mark_kept
 
-    limits = limits_of(arguments)
-    if not arguments.run_ids and not limits:
+    asked = limits.asked()
+    if not run_ids and not asked:
         raise InvalidInputError("name runs to retain, or a limit to set: --keep-states 20GB")
-    with writing(arguments) as (_, connection):
-        mark_kept(connection, arguments.run_ids, keep=not arguments.release)
-        set_limits(connection, limits, "retain")
+    with recorded.writer() as (_, connection):
+        mark_kept(connection, run_ids, keep=not release)
+        set_limits(connection, asked, "retain")
+        if json:
+            done = {"run_ids": run_ids, "retained": not release} if run_ids else {}
+            print_json({**done, "limits": described(connection)})
 
 
 def _prune(recording: Recording, connection: sqlite3.Connection, retention: Retention) -> Purged:
@@ -290,6 +379,22 @@ def _prune(recording: Recording, connection: sqlite3.Connection, retention: Rete
             return purge(connection, recording.data_dir, retention, rest=live, progress=progress)
     finally:
         maintainer.stop()
+
+
+def _as_data(wanted: Plan) -> dict[str, Any]:
+    """What goes and what does not, for programs."""
+    return {
+        "goes": [
+            {
+                "table": table, "rows": rows, "size_bytes": wanted.size_of(table),
+                "run_ids": wanted.runs_of(table),
+            }
+            for table, rows in wanted.rows_by_table().items()
+        ],
+        "spared": [vars(each) for each in wanted.spared],
+        "unshipped": [vars(each) for each in wanted.unshipped],
+        "retained": {"run_ids": wanted.kept_run_ids, "size_bytes": wanted.kept_bytes},
+    }  # fmt: skip
 
 
 def _print_plan(wanted: Plan, going: str) -> None:
@@ -323,20 +428,25 @@ def _print_plan(wanted: Plan, going: str) -> None:
         print_notes([f"{why}: run {ids}, about {size}"])
 
 
-def _print_disk(wanted: Plan, sizes: dict[str, int]) -> None:
-    """What lies on the disk: limits are about the rows, not about summaries and free room."""
-    from webots_mcp.store.retention.notation import size_text
-
+def _on_disk(wanted: Plan, sizes: dict[str, int]) -> dict[str, Any]:
+    """What lies on the disk, bytes: limits are about rows, not about summaries and free room."""
     held = dict(wanted.held_bytes)
     beside = {"pictures": held.pop("image"), "log": sizes["log_beside_bytes"]}
     free = sizes["free_in_file_bytes"]
     rest = max(sizes["file_bytes"] - free - sum(held.values()), 0)
     inside = {**{f"{kind}s": size for kind, size in held.items()}, "free": free}
     inside["summaries, runs, commands"] = rest
-    parts = ", ".join(f"{name} {size_text(size)}" for name, size in inside.items())
-    others = ", ".join(f"{name} {size_text(size)}" for name, size in beside.items())
-    whole = size_text(sizes["file_bytes"])
-    print_notes([f"the file has {whole}, about: {parts}; beside it {others}"])
+    return {"file": sizes["file_bytes"], "in_file": inside, "beside": beside}
+
+
+def _print_disk(disk: dict[str, Any]) -> None:
+    from webots_mcp.store.retention.notation import size_text
+
+    def listed(sizes: dict[str, int]) -> str:
+        return ", ".join(f"{name} {size_text(size)}" for name, size in sizes.items())
+
+    parts, others = listed(disk["in_file"]), listed(disk["beside"])
+    print_notes([f"the file has {size_text(disk['file'])}, about: {parts}; beside it {others}"])
 
 
 def _print_purged(purged: Purged) -> None:

@@ -26,8 +26,12 @@ _OF_NO_VALUE: Final = (WebotsMCPError, OSError, ImportError)
 
 _SUM_UP_S: Final = 300.0  # a million rows of 40 values take 100 s
 Json: TypeAlias = Annotated[bool, Parameter("--json", negative=(), help="Print JSON.")]
-Robot: TypeAlias = Annotated[str | None, Parameter("--robot", help="Only this robot.")]
-RunId: TypeAlias = Annotated[Id | None, Parameter("--run", help="That run, not the newest one.")]
+Robot: TypeAlias = Annotated[
+    str | None, Parameter("--robot", metavar="NAME", help="Only this robot.")
+]
+RunId: TypeAlias = Annotated[
+    Id | None, Parameter("--run", metavar="ID", help="That run, not the newest one.")
+]
 
 
 @Parameter(name="*")
@@ -39,13 +43,14 @@ class Where:
         str | None,
         Parameter(
             "--data-dir",
+            metavar="DIR",
             help="The folder of the database and the pictures; by default mcp_data/ in the nearest "
             "Webots project, else ~/.webots-mcp/data; also WEBOTS_MCP_DATA_DIR.",
         ),
     ] = None
-    database: Annotated[str | None, Parameter("--database", help="The database file itself.")] = (
-        None
-    )
+    database: Annotated[
+        str | None, Parameter("--database", metavar="FILE", help="The database file itself.")
+    ] = None
 
     def recording(self, *, read_only: bool = True) -> Recording:
         """The recording; read-only it is never migrated."""
@@ -86,20 +91,25 @@ class Range:
     robot: Robot = None
     run_id: RunId = None
     last_s: Annotated[
-        float | None, Parameter("--last", help="The last so many seconds of simulation time.")
+        float | None,
+        Parameter("--last", metavar="S", help="The last so many seconds of simulation time."),
     ] = None
-    start_s: Annotated[float | None, Parameter("--start", help="From this simulation time on.")] = (
-        None
-    )
+    start_s: Annotated[
+        float | None, Parameter("--start", metavar="S", help="From this simulation time on.")
+    ] = None
     end_s: Annotated[
-        float | None, Parameter("--end", help="Up to, not including, this simulation time.")
+        float | None,
+        Parameter("--end", metavar="S", help="Up to, not including, this simulation time."),
     ] = None
     since: Annotated[
         str | None,
-        Parameter("--since", help="From this wall time on (ISO 8601 or Unix seconds)."),
+        Parameter(
+            "--since", metavar="TIME", help="From this wall time on (ISO 8601 or Unix seconds)."
+        ),
     ] = None
     until: Annotated[
-        str | None, Parameter("--until", help="Up to, not including, this wall time.")
+        str | None,
+        Parameter("--until", metavar="TIME", help="Up to, not including, this wall time."),
     ] = None
 
     def scope(self) -> Scope:

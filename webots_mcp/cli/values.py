@@ -28,6 +28,16 @@ def whole_number(_kind: Any, tokens: Sequence[Token]) -> int:
     return int(text)
 
 
+def refuse_options(_kind: Any, value: Any) -> None:
+    """Of what begins with a hyphen only the hyphen itself is a value.
+
+    Raises:
+        ValueError: It is an option, and nobody knows it.
+    """
+    if isinstance(value, str) and value.startswith("-") and value != "-":
+        raise ValueError(f"unknown option {value}")
+
+
 def _row_id(_kind: Any, tokens: Sequence[Token]) -> int:
     text = tokens[0].value
     if text.isascii() and text.isdecimal() and int(text) < 2**63:  # what SQLite could have given

@@ -50,3 +50,16 @@ def test_the_last_lines_connect_a_client(printed: str) -> None:
     assert shown is not None
     assert line == shown[0] + shlex.join(command)
     assert "webots-mcp init" in end.splitlines()[-1]
+
+
+def test_as_json_its_answers_are_one_object(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    demo.run(tmp_path, as_json=True, conversation=TURNS)
+    shown = capsys.readouterr()
+    told = json.loads(shown.out)
+    assert told["database"] == str(tmp_path / "webots.db")
+    assert [(each["tool"], bool(each["answer"])) for each in told["answers"]] == [
+        (tool, True) for _, tool, _ in TURNS
+    ]
+    assert "Connect an assistant" in shown.err

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from webots_mcp.cli.answers import answer_lines
-from webots_mcp.cli.rendering import table_lines
+from webots_mcp.cli.rendering import answer_lines, table_lines
 
 HEAD = {"robot": "rover", "run_id": 3, "sim_time_s": 1.5, "age_s": 0.02, "status": "running"}
 
@@ -28,7 +27,7 @@ def test_short_members_stand_together_and_objects_by_themselves() -> None:
 def test_a_table_has_aligned_columns_and_says_how_many_rows_are_not_shown() -> None:
     rows = [["speed", 5.0, None], ["near", 0.35, None]] * 5
     answer = {"parameters": {"columns": ["name", "value", "unit"], "rows": rows}, "total": 10}
-    assert list(answer_lines(answer)) == [
+    assert list(answer_lines(answer, most_rows=6)) == [
         "parameters:",
         "  name   value",
         *["  speed      5", "  near    0.35"] * 3,

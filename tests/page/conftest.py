@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -28,7 +29,8 @@ class Server:
     """`webots-mcp view` on a data folder."""
 
     def __init__(self, data_dir: Path, *options: str) -> None:
-        arguments = ["view", "--port", "0", "--no-browser", "--data-dir", str(data_dir), *options]
+        where = ["--data-dir", str(data_dir)]
+        arguments = ["view", "--port", "0", "--no-browser", "--json", *where, *options]
         self.data_dir = data_dir
         self.process = subprocess.Popen(
             [sys.executable, "-m", "webots_mcp", *arguments],
@@ -38,8 +40,8 @@ class Server:
         )
         assert self.process.stdout is not None
         said = self.process.stdout.readline()
-        assert "the page is at" in said, self.process.communicate(timeout=30)
-        self.url = said.split(" at ")[1].split()[0]
+        assert '"url"' in said, self.process.communicate(timeout=30)
+        self.url: str = json.loads(said)["url"]
         self.path = "/" + self.url.split("/", 3)[3]
         self.port = int(self.url.split(":")[2].partition("/")[0])
 

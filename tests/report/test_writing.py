@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -45,8 +46,10 @@ def test_the_command_writes_a_file_says_what_it_holds_and_never_overwrites_unask
     assert main(line) == 2
     assert "is there already" in capsys.readouterr().err
     assert report.read_text() == "mine"
-    assert main([*line, "--overwrite"]) == 0
-    assert b"Run 1 of rover" in report.read_bytes()
+    assert main([*line, "--overwrite", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["file"], told["holds"]["figures"]) == (str(report), 1)
+    assert told["size_bytes"] == report.stat().st_size
     assert sorted(each.name for each in tmp_path.iterdir()) == ["data", "run.html"]
 
 

@@ -230,7 +230,7 @@ class _Layout:
                 yield line
                 continue
             yield f"{name}:"
-            if name == _AS_READ:
+            if name == _AS_READ and "rows" in part:
                 part = part | {
                     "rows": [["NULL" if v is None else v for v in row] for row in part["rows"]]
                 }

@@ -1,8 +1,8 @@
 """The main job without Webots: `webots-mcp demo` and `webots-mcp launch --stand-in`."""
 
-from webots_mcp.plugins import Plugin
+from webots_mcp.plugins import Plugin, PluginCommand
 
 PLUGIN = Plugin(
-    command_modules=(f"{__name__}.demo_command",),
+    commands=(PluginCommand("demo", "Setting up and running", f"{__name__}.demo_command:demo"),),
     stand_in="webots_mcp.standin.__main__:run_world",
 )

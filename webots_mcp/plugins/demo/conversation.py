@@ -21,7 +21,7 @@ import anyio
 from mcp import Client, StdioServerParameters
 from mcp.types import CallToolResult, ImageContent, TextContent
 
-from webots_mcp.cli.answers import answer_lines
+from webots_mcp.cli.rendering import answer_lines, print_json
 from webots_mcp.cli.terminal import rewrite
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, whole_file
@@ -36,6 +36,7 @@ DEFAULT_DATA_DIR: Final = Path.home() / ".webots-mcp" / "demo"
 _ROBOT: Final = "rover"
 _START_TIMEOUT_S: Final = 30.0
 _ANSWER_LINES: Final = 24
+_ROWS: Final = 6  # of a table
 
 Turn = tuple[str, str, dict[str, Any]]
 # What a person would say, and the tool call that an assistant makes of it.
@@ -75,6 +76,7 @@ def run(
     data_dir: Path = DEFAULT_DATA_DIR,
     *,
     keep: bool = False,
+    as_json: bool = False,
     conversation: tuple[Turn, ...] = CONVERSATION,
 ) -> None:
     """Run the demo; prints each question with its answer.
@@ -82,6 +84,7 @@ def run(
     Args:
         data_dir: Where the database and the pictures go.
         keep: Leave the robot running until Ctrl-C, so that another client can connect.
+        as_json: Print this to stderr, and to stdout one JSON object of the answers.
         conversation: What is asked.
 
     Raises:
@@ -90,13 +93,17 @@ def run(
         WebotsMCPError: The server answered with an error.
     """
     Recording(data_dir / DATABASE_NAME, data_dir).create()  # a robot only waits for a bad folder
-    _say(f"Starting {DEFAULT_WORLD.name} on the stand-in simulator (this is not Webots) ...")
+    shown = contextlib.redirect_stdout(sys.stderr if as_json else sys.stdout)
+    with shown:
+        _say(f"Starting {DEFAULT_WORLD.name} on the stand-in simulator (this is not Webots) ...")
     with Simulation(DEFAULT_WORLD, environment={DATA_DIR_VARIABLE: str(data_dir)}) as simulation:
         _wait_for_rows(simulation, data_dir)
-        if not anyio.run(converse, data_dir, conversation):
-            raise WebotsMCPError("the demo's server answered with an error, see above")
-        _tell_where(data_dir)
-        _tell_how_to_connect(data_dir, keep=keep)
+        with shown:
+            answers = anyio.run(converse, data_dir, conversation)
+            _tell_where(data_dir)
+            _tell_how_to_connect(data_dir, keep=keep)
+        if as_json:
+            print_json({"database": str(data_dir / DATABASE_NAME), "answers": answers})
         if keep:
             _keep(simulation)
 
@@ -120,8 +127,13 @@ def _newest_image(data_dir: Path) -> int:
         return int(connection.execute(sql).fetchone()[0]) if tables else 0
 
 
-async def converse(data_dir: Path, conversation: tuple[Turn, ...]) -> bool:
-    """Ask everything; False at the first answer that is an error."""
+async def converse(data_dir: Path, conversation: tuple[Turn, ...]) -> list[dict[str, Any]]:
+    """Ask everything, and print it; returns each question with its call and its answer.
+
+    Raises:
+        WebotsMCPError: An answer is an error.
+    """
+    answers: list[dict[str, Any]] = []
     async with _client(data_dir) as client:
         for question, tool, arguments in conversation:
             given = ", ".join(f"{name}={_as_json(arguments[name])}" for name in arguments)
@@ -130,12 +142,22 @@ async def converse(data_dir: Path, conversation: tuple[Turn, ...]) -> bool:
             result = await client.call_tool(tool, arguments, progress_callback=_show_progress)
             _clear_progress()
             _show(result)
-            _say(f"  ({time.monotonic() - started_s:.2f} s)")
+            took_s = time.monotonic() - started_s
+            _say(f"  ({took_s:.2f} s)")
             if result.is_error:
-                return False
+                raise WebotsMCPError("the demo's server answered with an error, see above")
+            answers.append(
+                {
+                    "question": question,
+                    "tool": tool,
+                    "arguments": arguments,
+                    "answer": _data_of(result) or "\n".join(_texts_of(result)),
+                    "took_s": round(took_s, 3),
+                }
+            )
             if tool == "webots_plot":
                 _save_plot(result, data_dir / f"{arguments.get('kind', 'signals')}.png")
-    return True
+    return answers
 
 
 @contextlib.asynccontextmanager
@@ -160,21 +182,30 @@ def _clear_progress() -> None:
 
 def _show(result: CallToolResult) -> None:
     """The answer as a person reads it; the assistant gets the same as JSON."""
-    if result.structured_content is not None and not result.is_error:
-        _show_answer(result.structured_content)
-        return
+    if data := _data_of(result):
+        return _show_answer(data)
+    for text in _texts_of(result):
+        _say(f"  {text}")
     for block in result.content:
-        if isinstance(block, TextContent) and not result.is_error and block.text.startswith("{"):
-            _show_answer(json.loads(block.text))
-        elif isinstance(block, TextContent):
-            _say(f"  {block.text}")
-        elif isinstance(block, ImageContent):
+        if isinstance(block, ImageContent):
             _say(f"  a picture for the assistant ({block.mime_type}, {len(_bytes(block))} bytes)")
+
+
+def _data_of(result: CallToolResult) -> dict[str, Any] | None:
+    """What it answers as data; None where it is pictures with captions, or an error."""
+    if result.is_error or result.structured_content is not None:
+        return None if result.is_error else result.structured_content
+    found = (json.loads(text) for text in _texts_of(result) if text.startswith("{"))
+    return next(found, None)
+
+
+def _texts_of(result: CallToolResult) -> list[str]:
+    return [block.text for block in result.content if isinstance(block, TextContent)]
 
 
 def _show_answer(answer: Mapping[str, Any]) -> None:
     """Its first lines, and how many more there are."""
-    lines = list(answer_lines(answer))
+    lines = list(answer_lines(answer, most_rows=_ROWS))
     for line in lines[:_ANSWER_LINES]:
         _say(f"    {line}")
     if len(lines) > _ANSWER_LINES:

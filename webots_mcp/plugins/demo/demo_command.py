@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
-import argparse
+from typing import Annotated
 
-from webots_mcp.cli.command import argument, command
+from cyclopts import Parameter
+
+from webots_mcp.cli.recordings import Json
 
 
-@command(
-    "demo",
-    argument("--data-dir", metavar="DIR", help="where to record (default: ~/.webots-mcp/demo)"),
-    argument("--keep", action="store_true", help="leave the robot running until Ctrl-C"),
-)
-def demo(arguments: argparse.Namespace) -> None:
-    """Run a robot on the stand-in simulator and talk to it: no Webots needed, under 30 s."""
+def demo(
+    *,
+    data_dir: Annotated[
+        str | None, Parameter("--data-dir", help="Where to record (~/.webots-mcp/demo).")
+    ] = None,
+    keep: Annotated[
+        bool, Parameter("--keep", help="Leave the robot running until Ctrl-C.")
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Run a robot on the stand-in simulator and talk to it: no Webots needed, under 30 s.
+
+    With --json the conversation appears on stderr, and then its answers as one object on stdout.
+    """
     from webots_mcp.contract import full_path
     from webots_mcp.plugins.demo.conversation import DEFAULT_DATA_DIR, run
 
-    chosen = full_path(arguments.data_dir) if arguments.data_dir else None
-    run(chosen or DEFAULT_DATA_DIR, keep=arguments.keep)
+    chosen = full_path(data_dir) if data_dir else None
+    run(chosen or DEFAULT_DATA_DIR, keep=keep, as_json=as_json)

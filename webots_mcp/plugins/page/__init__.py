@@ -4,6 +4,8 @@ A Bokeh server on loopback. It asks the same questions as the tools, on connecti
 write; what a button does goes the way that the tools' commands go.
 """
 
-from webots_mcp.plugins import Plugin
+from webots_mcp.plugins import Plugin, PluginCommand
 
-PLUGIN = Plugin(command_modules=(f"{__name__}.view_command",))
+PLUGIN = Plugin(
+    commands=(PluginCommand("view", "What is recorded now", f"{__name__}.view_command:view"),)
+)

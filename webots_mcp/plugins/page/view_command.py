@@ -2,51 +2,67 @@
 
 from __future__ import annotations
 
-import argparse
+import sys
+from typing import Annotated, Final
 
-from webots_mcp.cli.command import DATA_DIR, DATABASE, argument, command, count
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
 from webots_mcp.cli.ending import ending_in_time
-from webots_mcp.errors import InvalidInputError
+from webots_mcp.cli.launching import MAX_PORT
+from webots_mcp.cli.recordings import HERE, Json, Where
+from webots_mcp.cli.rendering import print_json
+from webots_mcp.cli.values import whole_number
 
-_LAST_PORT = 65535
+_PORT: Final = 5006
 
 
-@command(
-    "view",
-    DATA_DIR,
-    DATABASE,
-    count("--port", "of 127.0.0.1; 0 for any that is free", default=5006, least=0, dest="port"),
-    argument("--no-browser", action="store_true", help="only say the address of the page"),
-    argument(
-        "--read-only", action="store_true", help="without buttons and inputs that steer the robot"
-    ),
-)
-def view(arguments: argparse.Namespace) -> None:
+def view(
+    *,
+    port: Annotated[
+        int,
+        Parameter(
+            "--port",
+            converter=whole_number,
+            validator=Number(gte=0, lte=MAX_PORT),
+            help=f"Of 127.0.0.1; 0 for any that is free ({_PORT}).",
+        ),
+    ] = _PORT,
+    no_browser: Annotated[
+        bool, Parameter("--no-browser", help="Only say the address of the page.")
+    ] = False,
+    read_only: Annotated[
+        bool,
+        Parameter("--read-only", help="Without buttons and inputs that steer the robot."),
+    ] = False,
+    as_json: Json = False,
+    recorded: Where = HERE,
+) -> None:
     """Show a recording as a page in the browser, live: signals, the way, pictures, the log.
 
     The page is for this computer only (127.0.0.1) and needs no network. Its buttons pause, resume,
     step and reset the simulation and set parameters, as the commands of the same names do. Ctrl-C
-    ends it, and the robots do not notice.
+    ends it, and the robots do not notice. With --json its address is printed as {"url": ...}.
     """
     import webbrowser
     from contextlib import suppress
+    from dataclasses import replace
 
-    from webots_mcp.contract import resolve_database
     from webots_mcp.errors import NoDatabaseError
     from webots_mcp.plugins.page.server import create_page_server
-    from webots_mcp.store.recording import Recording
 
-    if arguments.port > _LAST_PORT:
-        raise InvalidInputError(f"--port {arguments.port}: the last port is {_LAST_PORT}")
-    where = resolve_database(arguments.database, arguments.data_dir)
-    recording = Recording(*where, read_only=True, asker="page")
+    recording = replace(recorded.recording(), asker="page")
     with suppress(NoDatabaseError), recording.reader():  # one that is refused will not be shown
         pass
-    server = create_page_server(recording, arguments.port, read_only=arguments.read_only)
+    server = create_page_server(recording, port, read_only=read_only)
 
     def ready(url: str) -> None:
-        print(f"webots-mcp: the page is at {url} (Ctrl-C ends it)", flush=True)
-        if not arguments.no_browser:
+        if as_json:
+            print_json({"url": url})
+        else:
+            print(f"webots-mcp: the page is at {url} (Ctrl-C ends it)")
+        sys.stdout.flush()
+        if not no_browser:
             webbrowser.open(url)
 
     with ending_in_time():

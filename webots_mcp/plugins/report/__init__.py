@@ -3,8 +3,9 @@
 Jinja2 and Bokeh are imported with the first report.
 """
 
-from webots_mcp.plugins import Plugin
+from webots_mcp.plugins import Plugin, PluginCommand
 
 PLUGIN = Plugin(
-    command_modules=(f"{__name__}.report_command",), questions=(f"{__name__}.write_report",)
+    commands=(PluginCommand("report", "The past", f"{__name__}.report_command:report"),),
+    questions=(f"{__name__}.write_report",),
 )

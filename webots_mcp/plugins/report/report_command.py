@@ -1,37 +1,44 @@
-"""The command that writes a report."""
+"""The command that writes a report, to any file; an assistant's question is in `write_report`."""
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
+from typing import Annotated
 
-from webots_mcp.cli.command import (
-    DATA_DIR,
-    DATABASE,
-    ROBOT,
-    argument,
-    open_recording,
-    question,
-    reading_long,
-    row_id,
-)
+from cyclopts import Parameter
+
 from webots_mcp.cli.progress import shown_progress
-from webots_mcp.cli.tables import print_notes, printable
+from webots_mcp.cli.recordings import HERE, Json, Robot, Where, only_reading, sum_up_first
+from webots_mcp.cli.rendering import print_json, print_notes, printable
+from webots_mcp.cli.values import Id
 
 
-@question(
-    "report", DATA_DIR, DATABASE, ROBOT,
-    argument("run_ids", type=row_id, nargs="*", metavar="RUN",
-             help="one run, or two beside each other; none: the newest"),
-    argument("-o", "--output", metavar="FILE",
-             help="a .html file (default: run-RUN.html in this folder)"),
-    argument("--overwrite", action="store_true", help="also if it is there already"),
-    argument("--signal", action="append", metavar="NAME", default=[],
-             help="draw this signal, with '*'; may be repeated (default: those that changed most)"),
-    argument("--max-mb", type=float, default=10.0, metavar="MB",
-             help="how large the file may become, 2 to 100 (10)"),
-)  # fmt: skip
-def report(arguments: argparse.Namespace) -> None:
+@only_reading
+def report(
+    *run_ids: Annotated[
+        Id, Parameter("RUN", help="One run, or two beside each other; none: the newest.")
+    ],
+    output: Annotated[
+        str | None,
+        Parameter(("--output", "-o"), help="A .html file; else run-RUN.html in this folder."),
+    ] = None,
+    overwrite: Annotated[
+        bool, Parameter("--overwrite", help="Also if it is there already.")
+    ] = False,
+    signals: Annotated[
+        list[str] | None,
+        Parameter(
+            "--signal",
+            help="Draw this signal, with '*'; may be repeated. Else those that changed most.",
+        ),
+    ] = None,
+    max_mb: Annotated[
+        float, Parameter("--max-mb", help="How large the file may become, 2 to 100 (10).")
+    ] = 10.0,
+    robot: Robot = None,
+    as_json: Json = False,
+    recorded: Where = HERE,
+) -> None:
     """Write a run, or two beside each other, as one HTML file to read and to send.
 
     What ran (code, commit, parameters, world), what happened (events with the seconds around them,
@@ -48,18 +55,28 @@ def report(arguments: argparse.Namespace) -> None:
     )
     from webots_mcp.store.reading.subject import find_subject
 
-    data_dir = open_recording(arguments).data_dir
-    with reading_long(arguments) as connection, shown_progress("reporting") as progress:
-        run_ids = arguments.run_ids or [find_subject(connection, arguments.robot).run_id]
-        file = Path(arguments.output or file_name(run_ids))
-        require_free(file, overwrite=arguments.overwrite)
+    recording = recorded.recording()
+    sum_up_first(recording)
+    with recorded.reader() as connection, shown_progress("reporting") as progress:
+        chosen = run_ids or [find_subject(connection, robot).run_id]
+        file = Path(output or file_name(chosen))
+        require_free(file, overwrite=overwrite)
         require_folder(file)
         made = make_report(
-            connection, run_ids, data_dir, names=arguments.signal, max_mb=arguments.max_mb,
+            connection, chosen, recording.data_dir, names=signals or (), max_mb=max_mb,
             progress=progress,
         )  # fmt: skip
-        write_report(file, made.html, overwrite=arguments.overwrite)
-    held = ", ".join(f"{name} {count}" for name, count in made.holds.items())
-    holds = f"; {held}" if held else ""
-    print(f"{file}: {printable(made.title)}, {size(len(made.html))}{holds}")
+        write_report(file, made.html, overwrite=overwrite)
+    if as_json:
+        return print_json(
+            {
+                "file": str(file),
+                "title": made.title,
+                "size_bytes": len(made.html),
+                "holds": made.holds,
+                "left_out": made.left_out,
+            }
+        )
+    held = "".join(f", {name} {count}" for name, count in made.holds.items()).replace(",", ";", 1)
+    print(f"{file}: {printable(made.title)}, {size(len(made.html))}{held}")
     print_notes([f"left out: {each}" for each in made.left_out])

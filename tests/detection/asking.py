@@ -97,7 +97,7 @@ def ask_since(
     connection: sqlite3.Connection, measures: Sequence[Measure], since_wall_s: float
 ) -> Answer:
     """What happened in all runs since a wall time."""
-    return _asked(connection, measures, since=since_wall_s)
+    return _asked(connection, measures, since_wall_time=since_wall_s)
 
 
 def _asked(

@@ -347,7 +347,7 @@ def test_a_run_that_has_only_begun_is_drawn(record: Record, rows: int) -> None:
         ({"kind": "pie"}, InvalidInputError, "there is signals, trajectory"),
         ({"kind": "trajectory", "signals": ["pose.0"]}, InvalidInputError, "takes two signals"),
         ({"kind": "trajectory", "signals": ["mode", "pose.0"]}, InvalidInputError, "no numbers"),
-        ({"run_ids": [], "since": 0, "robot": "rovr"}, InvalidInputError, "'rover'"),
+        ({"run_ids": [], "since_wall_time": 0, "robot": "rovr"}, InvalidInputError, "'rover'"),
     ],
 )  # fmt: skip
 def test_a_question_that_makes_no_sense_is_answered_with_what_there_is(

@@ -42,7 +42,7 @@ HUGE = 2**63
             "level must be 'debug', 'info', 'warning', 'error' or 'critical', not",
         ),
         ("query_sql", {"sql": "x" * 10**6}, "sql must have at most"),
-        ("get_trends", {"since": [1]}, "since must be a valid number, not [1]"),
+        ("get_trends", {"since_wall_time": [1]}, "since_wall_time must be a valid number, not [1]"),
         ("get_logs", {"lines": 1e308}, "lines must be a smaller number, not 1e+308"),
         ("get_logs", {"n" * 10**5: 1}, "no parameter 'nnn"),
         ("get_trends", {"signal": ["x"]}, "no parameter 'signal': there is signals, "),
@@ -74,7 +74,11 @@ async def test_the_answer_names_the_parameter_what_it_takes_and_what_came(
             {"cursor": "x"},
             ": 'x' is not a cursor: give the `cursor` of",
         ),
-        ("get_trends", {"since": "n" * 10**5}, "nnn' is no time: give Unix seconds or ISO 8601"),
+        (
+            "get_trends",
+            {"since_wall_time": "n" * 10**5},
+            "nnn' is no time: give Unix seconds or ISO 8601",
+        ),
         ("get_trends", {"signals": ["n" * 10**5]}, "no signal 'nnn"),
     ],
 )

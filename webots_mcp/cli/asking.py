@@ -36,6 +36,8 @@ OPTIONS: Final[Mapping[str, str]] = types.MappingProxyType(
         "end_s": "--end",
         "for_s": "--for",
         "timeout_s": "--timeout",
+        "since_wall_time": "--since",
+        "until_wall_time": "--until",
         "kinds": "--kind",
         "signals": "--signal",
         "limit": "-n",

@@ -36,8 +36,18 @@ SIMULATION_TIMES: Final[tuple[Argument, ...]] = (
 )
 TIMES: Final[tuple[Argument, ...]] = (
     *SIMULATION_TIMES,
-    argument("--since", metavar="TIME", help="from this wall time on (ISO 8601 or Unix seconds)"),
-    argument("--until", metavar="TIME", help="up to, not including, this wall time"),
+    argument(
+        "--since",
+        dest="since_wall_time",
+        metavar="TIME",
+        help="from this wall time on (ISO 8601 or Unix seconds)",
+    ),
+    argument(
+        "--until",
+        dest="until_wall_time",
+        metavar="TIME",
+        help="up to, not including, this wall time",
+    ),
 )
 RANGE: Final = (ROBOT, RUN, *TIMES)
 

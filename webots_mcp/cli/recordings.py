@@ -101,13 +101,13 @@ class Range:
         float | None,
         Parameter("--end", metavar="S", help="Up to, not including, this simulation time."),
     ] = None
-    since: Annotated[
+    since_wall_time: Annotated[
         str | None,
         Parameter(
             "--since", metavar="TIME", help="From this wall time on (ISO 8601 or Unix seconds)."
         ),
     ] = None
-    until: Annotated[
+    until_wall_time: Annotated[
         str | None,
         Parameter("--until", metavar="TIME", help="Up to, not including, this wall time."),
     ] = None

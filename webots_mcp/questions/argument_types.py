@@ -53,8 +53,8 @@ Cursor = Annotated[_Place | None, Field(description=_CURSOR)]
 TextCursor = Annotated[str, Field(max_length=2000, description=_CURSOR)]
 # A number is as good; one type that holds both is shorter than two.
 _WallTime = Annotated[float | str | None, WithJsonSchema({"type": "string"})]
-Since = Annotated[_WallTime, Field(description="From this wall time, ISO 8601.")]
-Until = Annotated[_WallTime, Field(description="Before this wall time.")]
+Since = Annotated[_WallTime, Field(description="From, ISO 8601.")]
+Until = Annotated[_WallTime, Field(description="Before.")]
 Names = Annotated[
     list[str],
     Field(
@@ -101,8 +101,8 @@ SCOPE: Final = {
     "last_s": LastS,
     "start_s": StartS,
     "end_s": EndS,
-    "since": Since,
-    "until": Until,
+    "since_wall_time": Since,
+    "until_wall_time": Until,
     "robot": RobotName,
     "run_id": RunId,
 }

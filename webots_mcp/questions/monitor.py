@@ -157,7 +157,8 @@ def _hint(recorded: bool, left_out: bool, wall_start_s: float, view: View) -> st
         return _why_nothing(view)
     if not left_out:
         return None
-    return f"more events: webots_find_events(since={wall_start_s:.3f}) shows what is left out"
+    call = f"webots_find_events(since_wall_time={wall_start_s:.3f})"
+    return f"more events: {call} shows what is left out"
 
 
 def _why_nothing(view: View) -> str:

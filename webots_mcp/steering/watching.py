@@ -40,7 +40,7 @@ class Window:
 
 def window_from(view: View, wall_start_s: float) -> Window:
     """The window of a robot from that wall time (Unix) on."""
-    found = find_range(view.connection, Scope(since=wall_start_s), view.subject)
+    found = find_range(view.connection, Scope(since_wall_time=wall_start_s), view.subject)
     found = newest_runs(found if found.segments else replace(found, notes=()))
     around = [
         replace(segment, start_s=_from_row_before(view.connection, segment))

@@ -155,7 +155,7 @@ async def test_what_is_left_out_of_several_runs_is_named_by_run_because_each_has
             robot.state(3.0 * step / run, {"n": step})
             robot.log(3.0 * step / run, f"it slips {step}", "warning")
     async with connect(read_only=True) as client:
-        asked: dict[str, Any] = {"kinds": ["log"], "since": 0, "group": False}
+        asked: dict[str, Any] = {"kinds": ["log"], "since_wall_time": 0, "group": False}
         both = await ask(client, "webots_find_events", limit=1, **asked)
         one = await ask(client, "webots_find_events", kinds=["log"], group=False, limit=1)
     assert both["not_shown"] == {"log": "7 from 3.0 s of run 1 to 4.5 s of run 2"}

@@ -52,8 +52,12 @@ async def test_the_schema_of_a_refused_recording_is_refused_by_name(tmp_path: Pa
         ("webots_get_trends", {"start_s": 9, "end_s": 3}, "reversed"),
         ("webots_find_events", {"start_s": 3, "end_s": 3}, "empty"),
         ("webots_get_trends", {"start_s": 3, "last_s": 3}, "two ways"),
-        ("webots_get_trends", {"since": "yesterday"}, "ISO 8601"),
-        ("webots_get_trends", {"since": 1700000100, "until": 1.7e9}, "until=1700000000"),
+        ("webots_get_trends", {"since_wall_time": "yesterday"}, "ISO 8601"),
+        (
+            "webots_get_trends",
+            {"since_wall_time": 1700000100, "until_wall_time": 1.7e9},
+            "until_wall_time=1700000000",
+        ),
         ("webots_query_history", {"signals": ["mode"], "max_points": 10**9}, "less than or equal"),
         ("webots_find_events", {"kinds": ["threshold"]}, "above or below"),
         ("webots_find_events", {"kinds": ["explosion"]}, "must be one of 'run', 'gap'"),
@@ -114,7 +118,7 @@ async def test_empty_answers_say_why_and_what_to_try(story: Path) -> None:
     for tool, arguments, words in (
         ("webots_get_trends", {"start_s": 500}, "leave the range out"),
         ("webots_query_history", {"signals": ["*"], "start_s": 500}, "leave the range out"),
-        ("webots_get_trends", {"since": "2035-01-01"}, "webots_list_runs"),
+        ("webots_get_trends", {"since_wall_time": "2035-01-01"}, "webots_list_runs"),
         ("webots_query_sql", {"sql": "SELECT 1 WHERE 0"}, "webots_get_trends"),
     ):
         assert words in (await tell(story, tool, **arguments))["hint"], tool

@@ -113,11 +113,11 @@ async def test_a_wall_time_range_reaches_over_runs(story: Path) -> None:
         story,
         "webots_query_history",
         signals=["pose.0"],
-        since=WALL_START_S,
-        until=WALL_START_S + 70,
+        since_wall_time=WALL_START_S,
+        until_wall_time=WALL_START_S + 70,
     )
     assert [run["run_id"] for run in answer["runs"]] == [1, 2]
-    iso = {"since": "2023-11-14T22:13:20Z", "until": "2023-11-14T22:14:30Z"}
+    iso = {"since_wall_time": "2023-11-14T22:13:20Z", "until_wall_time": "2023-11-14T22:14:30Z"}
     same = await tell(story, "webots_query_history", signals=["pose.0"], **iso)
     assert same["runs"] == answer["runs"]
 

@@ -281,7 +281,7 @@ def test_a_range_holds_its_start_and_not_its_end(reader: sqlite3.Connection) -> 
 
 
 def test_a_range_in_wall_time_goes_through_several_runs(reader: sqlite3.Connection) -> None:
-    lines = json_lines(reader, since=0)
+    lines = json_lines(reader, since_wall_time=0)
     assert {line["run_id"] for line in lines} == {1, 2}
     assert len(lines) == 857
 

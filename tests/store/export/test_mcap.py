@@ -271,7 +271,7 @@ def test_several_runs_lie_over_each_other_on_topics_of_their_own(
     recorded: Recorded, tmp_path: Path
 ) -> None:
     runs = [recorded.add_run(rows) for rows in (5, 3)]
-    read = exported(recorded, tmp_path, since=0)
+    read = exported(recorded, tmp_path, since_wall_time=0)
     assert [len(read.messages[f"/run_{run_id}/rover/state"]) for run_id in runs] == [5, 3]
     assert [read.messages[f"/run_{run_id}/rover/state"][0].log_time for run_id in runs] == [0, 0]
 

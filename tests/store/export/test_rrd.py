@@ -176,7 +176,7 @@ def test_a_pose_is_a_transform_in_the_world_in_metres(recorder: Recorder, tmp_pa
 
 def test_several_runs_have_branches_of_their_own(recorded: Recorded, tmp_path: Path) -> None:
     runs = [recorded.add_run(rows) for rows in (5, 3)]
-    read = exported(recorded, tmp_path, since=0)
+    read = exported(recorded, tmp_path, since_wall_time=0)
     assert [len(read.scalars(f"/run_{run_id}/rover/state/x")) for run_id in runs] == [5, 3]
 
 

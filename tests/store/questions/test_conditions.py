@@ -60,7 +60,7 @@ def test_what_began_before_the_range_is_remembered(rover: sqlite3.Connection) ->
 
 
 def test_several_runs_are_several_pasts(rover: sqlite3.Connection) -> None:
-    everything = {"since": 0.0, "until": 2e9}
+    everything = {"since_wall_time": 0.0, "until_wall_time": 2e9}
     found = ask(rover, "not missing(target) for 25", **everything)
 
     assert [event.run_id for event in found.events] == [1, 2, 3]
@@ -110,7 +110,7 @@ def test_what_never_had_a_value_was_not_looked_for(
 def test_of_several_runs_all_rows_are_counted_and_the_same_is_said_once(
     rover: sqlite3.Connection,
 ) -> None:
-    found = ask(rover, "target > 1e6", since=0.0, until=2e9)
+    found = ask(rover, "target > 1e6", since_wall_time=0.0, until_wall_time=2e9)
 
     assert found.verdicts.absent["condition"] == "true in none of 2050 rows"
     dropped, others = (note for note in found.notes if "row" in note)

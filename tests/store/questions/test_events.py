@@ -136,7 +136,7 @@ def test_commands_logs_and_notices_are_on_the_same_clock(rover: sqlite3.Connecti
 
 
 def test_runs_begin_and_end_in_wall_time(rover: sqlite3.Connection) -> None:
-    whole = {"since": WALL_START_S - 1, "until": WALL_START_S + 1000}
+    whole = {"since_wall_time": WALL_START_S - 1, "until_wall_time": WALL_START_S + 1000}
     events = ask(rover, "run", bounds=whole).events
     told = [(e.run_id, e.details["what"], e.details["reason"]) for e in events]
     assert told == [
@@ -290,7 +290,7 @@ def test_a_wall_range_over_several_runs_knows_the_signals_of_each(
         for step in range(30):
             recorder.publish(step * 0.1, {name: float(step >= 20)})
     above = tuple(Threshold(name, above=0.5) for name in ("alt_m", "depth_m", "temp_c"))
-    found = ask(empty, "threshold", bounds={"since": WALL_START_S}, thresholds=above)
+    found = ask(empty, "threshold", bounds={"since_wall_time": WALL_START_S}, thresholds=above)
     assert [(e.run_id, e.name, e.start_s) for e in found.events] == [
         (1, "alt_m", 2.0), (2, "depth_m", 2.0), (3, "temp_c", 2.0),
     ]  # fmt: skip

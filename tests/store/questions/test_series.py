@@ -123,7 +123,9 @@ def test_rows_and_rollups_give_the_same_whole(rover: sqlite3.Connection, tier: s
 
 
 def test_a_wall_range_gives_each_run_its_part(rover: sqlite3.Connection) -> None:
-    found = find_range(rover, Scope(since=1_700_000_050.0, until=1_700_000_070.0))
+    found = find_range(
+        rover, Scope(since_wall_time=1_700_000_050.0, until_wall_time=1_700_000_070.0)
+    )
     answer = query_history(rover, found, ["battery_v"], max_points=20)
     assert [run.run_id for run in answer.runs] == [1, 2]
     assert sum(len(run.sim_time_s) for run in answer.runs) <= 20

@@ -26,7 +26,9 @@ def test_the_timeline_merges_all_sources_in_order(rover: sqlite3.Connection) -> 
 
 @pytest.mark.parametrize("limit", [1, 3, 7])
 def test_pages_hold_every_event_once(rover: sqlite3.Connection, limit: int) -> None:
-    span = find_range(rover, Scope(since=WALL_START_S, until=WALL_START_S + 1000))
+    span = find_range(
+        rover, Scope(since_wall_time=WALL_START_S, until_wall_time=WALL_START_S + 1000)
+    )
     whole = timeline(rover, span).events
     found: list[Event] = []
     cursor = None

@@ -113,7 +113,7 @@ def test_a_range_that_begins_before_the_first_row_left_says_so(
 def test_wall_time_reaches_into_what_was_purged(rover: sqlite3.Connection, tmp_path: Path) -> None:
     keep_rows(rover, tmp_path, 1500)
     start, end = WALL_START_S + 10, WALL_START_S + 40
-    found = find_range(rover, Scope(run_id=1, since=start, until=end))
+    found = find_range(rover, Scope(run_id=1, since_wall_time=start, until_wall_time=end))
     (segment,) = found.segments
     assert (segment.start_s, segment.end_s) == (
         pytest.approx(20, abs=0.2), pytest.approx(80, abs=0.2),
@@ -127,11 +127,13 @@ def test_a_run_of_which_only_rollups_are_left_is_found_by_wall_time(
     rover: sqlite3.Connection, tmp_path: Path
 ) -> None:
     keep_rows(rover, tmp_path, 900)
-    found = find_range(rover, Scope(since=WALL_START_S, until=WALL_START_S + 30))
+    found = find_range(
+        rover, Scope(since_wall_time=WALL_START_S, until_wall_time=WALL_START_S + 30)
+    )
     assert [segment.run_id for segment in found.segments] == [1]
     assert found.segments[0].end_s == pytest.approx(60, abs=0.2)
     assert "the rows of run 1 were purged" in found.notes[0]
-    whole = find_range(rover, Scope(run_id=1, since=WALL_START_S - 9))
+    whole = find_range(rover, Scope(run_id=1, since_wall_time=WALL_START_S - 9))
     (run,) = query_history(rover, whole, ["pose.0"]).runs
     assert run.rows == 1150
 

@@ -86,12 +86,12 @@ def test_more_seconds_back_than_a_run_has_lasted_name_the_run_before(
         ({"start_s": 5.0, "end_s": 5.0}, "empty"),
         ({"start_s": 5.0, "end_s": 1.0}, "reversed"),
         ({"start_s": 0.0, "last_s": 1.0}, "two ways"),
-        ({"last_s": 1.0, "since": 5.0}, "two ways"),
+        ({"last_s": 1.0, "since_wall_time": 5.0}, "two ways"),
         ({"last_s": 0.0}, "above 0"),
         ({"start_s": math.nan}, "finite"),
-        ({"since": "yesterday"}, "ISO 8601"),
-        ({"since": "inf"}, "finite"),
-        ({"since": 5.0, "until": 2.0}, "reversed"),
+        ({"since_wall_time": "yesterday"}, "ISO 8601"),
+        ({"since_wall_time": "inf"}, "finite"),
+        ({"since_wall_time": 5.0, "until_wall_time": 2.0}, "reversed"),
     ],
 )
 def test_a_range_without_sense_is_refused_with_the_reason(
@@ -103,7 +103,7 @@ def test_a_range_without_sense_is_refused_with_the_reason(
 
 def test_wall_time_reaches_across_runs(rover: sqlite3.Connection) -> None:
     start, end = WALL_START_S + 50, WALL_START_S + 65
-    found = find_range(rover, Scope(since=start, until=end))
+    found = find_range(rover, Scope(since_wall_time=start, until_wall_time=end))
     assert [segment.run_id for segment in found.segments] == [1, 2]
     first, second = found.segments
     assert first.start_s == pytest.approx(100.0)
@@ -120,7 +120,7 @@ def test_a_wall_range_holds_exactly_its_rows(
     paused: sqlite3.Connection, start: float, length: float
 ) -> None:
     walls = (WALL_START_S + start, WALL_START_S + start + length)
-    found = find_range(paused, Scope(since=walls[0], until=walls[1]))
+    found = find_range(paused, Scope(since_wall_time=walls[0], until_wall_time=walls[1]))
     rows = [row for segment in found.segments for row in rows_in(paused, segment)]
     expected = paused.execute(
         "SELECT id FROM state WHERE wall_time_s >= ? AND wall_time_s < ?", walls
@@ -176,7 +176,7 @@ def test_a_wall_range_over_very_many_runs_takes_the_newest(empty: sqlite3.Connec
     for _ in range(60):
         recorder.run(session_id, robot_id)
         recorder.publish(1.0, {"x": 1})
-    found = find_range(empty, Scope(since=0.0))
+    found = find_range(empty, Scope(since_wall_time=0.0))
     assert [segment.run_id for segment in found.segments] == list(range(11, 61))
     assert "newest 50 runs" in found.notes[0]
 
@@ -185,5 +185,5 @@ def test_a_range_within_a_recording_gap_says_what_is_missing(rover: sqlite3.Conn
     (note,) = find_range(rover, Scope(run_id=1, start_s=91.0, end_s=93.0)).notes
     assert note == "no row: nothing was recorded between 89.9 and 95 s of run 1"
     start, end = WALL_START_S + 45.5, WALL_START_S + 46.5
-    found = find_range(rover, Scope(run_id=1, since=start, until=end))
+    found = find_range(rover, Scope(run_id=1, since_wall_time=start, until_wall_time=end))
     assert (found.segments, found.notes) == ((), ("no row of robot 'rover' in that wall time",))

@@ -140,14 +140,14 @@ class Scope:
     start_s: float | None = None
     end_s: float | None = None
     last_s: float | None = None
-    since: float | str | None = None
-    until: float | str | None = None
+    since_wall_time: float | str | None = None
+    until_wall_time: float | str | None = None
 
     def __post_init__(self) -> None:
         if (self.in_simulation_time + self.in_wall_time + (self.last_s is not None)) > 1:
             raise InvalidRangeError(
                 "the range is given in two ways: use start_s and end_s (simulation time), or "
-                "last_s, or since and until (wall time)"
+                "last_s, or since_wall_time and until_wall_time"
             )
         if self.last_s is not None and not 0 < self.last_s < math.inf:
             raise InvalidRangeError(f"last_s={self.last_s} must be a number of seconds above 0")
@@ -165,7 +165,7 @@ class Scope:
     @property
     def in_wall_time(self) -> bool:
         """Whether it begins or ends at a wall time."""
-        return self.since is not None or self.until is not None
+        return self.since_wall_time is not None or self.until_wall_time is not None
 
     @property
     def in_one_run(self) -> bool:
@@ -191,8 +191,11 @@ def find_range(
     if not scope.in_wall_time:
         subject = subject or find_subject(connection, scope.robot, scope.run_id)
         return _in_simulation_time(connection, subject, scope)
-    walls = (parse_wall_time(scope.since, -math.inf), parse_wall_time(scope.until, math.inf))
-    _require_order(*walls, "since", "until")
+    walls = (
+        parse_wall_time(scope.since_wall_time, -math.inf),
+        parse_wall_time(scope.until_wall_time, math.inf),
+    )
+    _require_order(*walls, "since_wall_time", "until_wall_time")
     subject = subject or find_subject(connection, scope.robot, scope.run_id)
     return _in_wall_time(connection, subject, scope.run_id, *walls)
 

@@ -26,8 +26,21 @@ def test_retired_names_are_in_no_module_of_the_bridge() -> None:
         assert not retired & _names(module), module.name
 
 
+def test_words_without_a_technical_meaning_are_in_no_plain_package() -> None:
+    packages, _, words = _GLOSSARY.partition("Words that are in no name")[2].partition(":")
+    any_word = "|".join(re.findall(r"`(\w+)`", words))
+    retired = re.compile(rf"\b({any_word})\b", re.IGNORECASE)
+    assert retired.search("The journal is told.")
+    for package in re.findall(r"`(\w+)`", packages):
+        modules = list((_ROOT / "webots_mcp" / package).rglob("*.py"))
+        assert modules, package
+        for module in modules:
+            assert not retired.findall(module.read_text("utf-8")), module
+
+
 def _retired() -> set[str]:
-    return set(re.findall(r"`(\w+)`", _GLOSSARY.partition("Names that the bridge")[2]))
+    names = _GLOSSARY.partition("Names that the bridge")[2].partition("\n\n")[0]
+    return set(re.findall(r"`(\w+)`", names))
 
 
 def _names(file: Path) -> set[str]:

@@ -256,5 +256,5 @@ def _shown(value: object) -> str:
     try:
         text = repr(value)[:_SHOWN]
     except Exception as error:  # noqa: BLE001  (an object of the user's, or an integer too long)
-        text = f"(without words: its repr() raised {type(error).__name__})"
+        text = f"(no text: its repr() raised {type(error).__name__})"
     return f"{text} ({type(value).__name__})"

@@ -59,8 +59,8 @@ def assert_bounded(encoded: Encoded) -> None:
     assert is_valid(encoded.text)
     assert len(encoded.text.encode()) <= MAX_ROW_BYTES
     assert count_values(json.loads(encoded.text)) <= MOST_LOOKED_AT + 1
-    assert len(encoded.odd) <= MAX_NAMED + 1
-    assert len(encoded.odd_text or "") <= 200_000
+    assert len(encoded.replaced) <= MAX_NAMED + 1
+    assert len(encoded.replaced_text or "") <= 200_000
 
 
 @pytest.mark.usefixtures("encoder")
@@ -75,7 +75,7 @@ def test_what_is_too_much_is_cut_and_named_and_the_rest_of_the_row_is_kept(
     asked = Lazy.asked + Endless.asked + EndlessList.asked + EndlessDict.asked
     assert asked <= 2 * MOST_LOOKED_AT
     if not asked or Lazy.asked:
-        assert any(path == "monster" or path.startswith("monster.") for path in encoded.odd)
+        assert any(path == "monster" or path.startswith("monster.") for path in encoded.replaced)
 
 
 @pytest.mark.usefixtures("encoder")
@@ -149,7 +149,7 @@ def test_twenty_levels_are_kept_with_and_without_odd_values(depth: int) -> None:
     for _ in range(depth - 1):
         value = [value]
     for gap in ({}, {"gap": math.nan}):
-        odd = encoding.encode({"a": value, **gap}).odd
+        odd = encoding.encode({"a": value, **gap}).replaced
         assert ("too deep" in odd.values()) == (depth > 20)
 
 
@@ -228,9 +228,11 @@ def test_whatever_is_published_sqlite_can_read_it_and_it_is_bounded_and_what_is_
         again = encoding.encode(stored)
     assert_bounded(encoded)
     assert Lazy.asked <= 2 * MOST_LOOKED_AT
-    if not any(kind.startswith(("array[", "dict", "too deep")) for kind in encoded.odd.values()):
+    if not any(
+        kind.startswith(("array[", "dict", "too deep")) for kind in encoded.replaced.values()
+    ):
         assert json.loads(again.text) == stored
-        assert again.odd == {}
+        assert again.replaced == {}
 
 
 class Unending(Mapping[str, object]):
@@ -279,8 +281,8 @@ def test_objects_that_take_too_long_cost_themselves_only(monkeypatch: pytest.Mon
         monkeypatch.setattr(module, "LONGEST_S", -1.0)
     encoded = encoding.encode({"a": [Decimal(1), Decimal(2)], "b": {"c": 2.5}, "d": math.nan})
     assert json.loads(encoded.text)["b"] == {"c": 2.5}
-    assert encoded.odd["a.1"] == "type Decimal: no time left"
-    assert encoded.odd["d"] == "nan"
+    assert encoded.replaced["a.1"] == "type Decimal: no time left"
+    assert encoded.replaced["d"] == "nan"
 
 
 class Counted:
@@ -305,13 +307,15 @@ def test_arrays_that_there_is_no_room_for_are_not_read() -> None:
     Counted.read = 0
     encoded = encoding.encode({"a": [Counted(15_000, 120_000) for _ in range(500)]})
     assert Counted.read <= 4
-    assert encoded.odd["a.499"] == "array[15000]"
+    assert encoded.replaced["a.499"] == "array[15000]"
 
 
 @pytest.mark.usefixtures("encoder")
 def test_an_array_of_few_but_long_items_is_not_read() -> None:
     Counted.read = 0
-    assert encoding.encode({"a": Counted(10, 40_000_000)}).odd == {"a": "array of 40000000 bytes"}
+    assert encoding.encode({"a": Counted(10, 40_000_000)}).replaced == {
+        "a": "array of 40000000 bytes"
+    }
     assert Counted.read == 0
 
 

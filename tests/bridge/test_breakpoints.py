@@ -257,7 +257,7 @@ def test_what_cannot_be_set_is_refused_where_it_is_set(bridge: MCPBridge) -> Non
         bridge.breakpoint("n = 3")
     with pytest.raises(InvalidInputError, match="'pause' or 'log'"):
         bridge.breakpoint("n == 3", "stop")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(InvalidInputError, match="from 1 on"):
+    with pytest.raises(InvalidInputError, match="at least 1: 0"):
         bridge.breakpoint("n == 3", after_hits=0)
     for number in range(MAX_BREAKPOINTS):
         bridge.breakpoint(f"n == {number}")

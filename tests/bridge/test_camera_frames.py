@@ -231,7 +231,7 @@ def test_a_disabled_camera_is_counted_and_told_once_until_it_is_enabled(
 
     assert missed == pytest.approx(100 * STEP_S / INTERVAL_S, abs=2)
     (told,) = recording.rows(WARNINGS)
-    assert "camera 'camera' is disabled: call its enable() first" in told
+    assert "camera 'camera' is disabled: call its enable(time_step)" in told
     assert len(recording.rows(FRAMES)) == pytest.approx(100 * STEP_S / INTERVAL_S, abs=2)
     assert capfd.readouterr().err == ""
 
@@ -337,8 +337,8 @@ def test_pictures_are_their_owners_alone_and_a_full_disk_leaves_no_halves(
     [
         (None, 5.0, "a Camera is needed, and NoneType has no getName"),
         ("lidar", 5.0, "a Camera is needed, and Lidar has no getWidth, getHeight, getImage"),
-        ("camera", 0, "frames_per_s is above 0 and up to 100, not 0"),
-        ("camera", float("nan"), "not nan"),
+        ("camera", 0, "frames_per_s must be above 0 and at most 100: 0"),
+        ("camera", float("nan"), "at most 100: nan"),
     ],
 )
 def test_what_is_not_a_camera_is_said_once_and_raises_nothing(

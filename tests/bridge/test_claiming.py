@@ -58,7 +58,7 @@ def test_a_command_that_was_judged_lost_stays_lost(
     sent = recording.send("dance")
     eager(bridge)
     assert recording.fate(sent)[0] == "lost"
-    assert "was judged lost before it was done" in capsys.readouterr().err
+    assert "was declared lost before it was done" in capsys.readouterr().err
     bridge.close()
 
 
@@ -88,7 +88,7 @@ def test_an_interrupt_between_claim_and_start_leaves_no_command_claimed(
     later = recording.send("dance")
     eager(bridge)
     assert recording.fate(sent)[0] == "failed"
-    assert "did not run" in (recording.fate(sent)[2] or "")
+    assert "it was not run" in (recording.fate(sent)[2] or "")
     assert recording.fate(later)[0] == "done"
 
 

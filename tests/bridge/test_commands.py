@@ -82,7 +82,7 @@ class SpeechlessError(Exception):
 @pytest.mark.parametrize(
     ("error", "said"),
     [
-        (SpeechlessError(), "SpeechlessError: (without words: its str() raised RuntimeError)"),
+        (SpeechlessError(), "SpeechlessError: (no text: its str() raised RuntimeError)"),
         (FileNotFoundError("/data/\udcff.txt"), "FileNotFoundError: /data/?.txt"),
     ],
 )
@@ -160,10 +160,10 @@ def test_an_unknown_action_is_refused_with_the_known_ones(
     eager(bridge)
     status, _, error = recording.fate(sent)
     assert status == "failed"
-    assert error is not None and "no action 'setspeed'; this robot knows set_speed, " in error
+    assert error is not None and "no action 'setspeed'; this robot has set_speed, " in error
     sent = recording.send("stop")
     eager(bridge)
-    assert "no action 'stop'; this robot knows pause, " in (recording.fate(sent)[2] or "")
+    assert "no action 'stop'; this robot has pause, " in (recording.fate(sent)[2] or "")
 
 
 def test_a_loop_without_registered_actions_gets_every_command_and_none_of_them_looks_like_success(
@@ -176,7 +176,7 @@ def test_a_loop_without_registered_actions_gets_every_command_and_none_of_them_l
     status, _, error = recording.fate(sent)
     assert status == "failed"
     assert error is not None and "has registered none (bridge.register_command)" in error
-    assert "whether the loop did anything with it is not known" in error
+    assert "the bridge does not know whether the loop handled it" in error
 
 
 def test_an_expired_command_never_runs(bridge: MCPBridge, recording: Recording) -> None:
@@ -232,14 +232,14 @@ def test_an_action_that_is_no_text_is_refused_like_an_unknown_one(
     eager(bridge)
     status, _, error = recording.fate(sent)
     assert status == "failed"
-    assert error is not None and "no action 'mo\ufffdve'; this robot knows move" in error
+    assert error is not None and "no action 'mo\ufffdve'; this robot has move" in error
 
 
 @pytest.mark.parametrize("name", [b"x", 5, None, ("a", "b")])
 def test_a_name_that_is_no_text_is_refused(
     bridge: MCPBridge, recording: Recording, name: Any
 ) -> None:
-    with pytest.raises(TypeError, match="the name of an action is a text, not"):
+    with pytest.raises(TypeError, match="the name of an action must be a text, not"):
         bridge.register_command(name, lambda _: None)
     bridge.register_command("wave", lambda _: None)
     assert recording.rows("SELECT actions FROM session") == ['{"wave": ""}']
@@ -308,7 +308,7 @@ def test_a_function_for_reset_state_is_run_in_place_of_the_callbacks_which_is_sa
     assert calls == ["reset_state"]
     assert recording.fate(sent) == ("done", None, None)
     (said,) = recording.rows("SELECT message FROM log")
-    assert "'reset_state'" in said and "in place of the callbacks" in said
+    assert "'reset_state'" in said and "instead of the callbacks" in said
 
 
 def test_a_coroutine_cannot_be_a_handler(bridge: MCPBridge) -> None:

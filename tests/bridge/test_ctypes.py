@@ -106,5 +106,5 @@ def test_a_null_pointer_is_named() -> None:
 
 def test_ctypes_is_not_imported_for_a_state_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "ctypes")
-    assert encoding.encode({"handle": object()}).odd == {"handle": "type object"}
+    assert encoding.encode({"handle": object()}).replaced == {"handle": "type object"}
     assert "ctypes" not in sys.modules

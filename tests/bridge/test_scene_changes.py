@@ -76,10 +76,10 @@ def test_a_list_is_set_with_more_or_fewer_entries(scene: Scene, values: list[flo
         ("BALL.children", [], "webots_edit_scene adds and removes them"),
         ("BALL", 5, "name the field to set, such as BALL.translation"),
         ("ROVER.controllerArgs", "x", "a list of at most 200"),
-        ("ROVER.controller", "../../evil", "controller is a name, by which Webots finds"),
-        ("ROVER.controller", "/tmp/evil", "and no path: '/tmp/evil'"),
-        ("ROVER.window", "..\\evil", "window is a name"),
-        ("ROVER.supervisor", False, "the bridge that would set it needs the right itself"),
+        ("ROVER.controller", "../../evil", "controller must be the name of a program"),
+        ("ROVER.controller", "/tmp/evil", "not a path: '/tmp/evil'"),
+        ("ROVER.window", "..\\evil", "window must be the name"),
+        ("ROVER.supervisor", False, "this bridge needs the permission of a Supervisor itself"),
     ],
 )
 def test_a_value_that_a_field_cannot_have_is_refused_with_one_that_it_can(
@@ -171,7 +171,7 @@ def test_a_node_is_added_with_a_path_that_leads_to_it_until_a_reset(scene: Scene
     assert scene.get(f"{second['path']}.name") == "second"
     assert [name for name, _ in scene.events("add_node")] == ["PILL", second["path"]]
     scene.reset()
-    assert "no node is called 'PILL'" in scene.fail("get_field", path="PILL")
+    assert "no node has the DEF name, name or type 'PILL'" in scene.fail("get_field", path="PILL")
     ((_, data),) = scene.events("put_back")
     assert json.loads(data) == {"by_webots": ["PILL (added)", f"{second['path']} (added)"]}
 
@@ -181,7 +181,7 @@ def test_a_field_that_is_null_takes_a_node(scene: Scene) -> None:
     assert answer["parent"] == "FLOOR.physics"
     assert scene.get("FLOOR.physics.mass") == 4.0
     said = scene.fail("add_node", path="FLOOR.physics", vrml="Physics { mass 4 }")
-    assert "FLOOR.physics holds a node (Physics): remove that one first" in said
+    assert "FLOOR.physics already has a node (Physics): remove that one first" in said
 
 
 @pytest.mark.parametrize(
@@ -193,14 +193,14 @@ def test_a_field_that_is_null_takes_a_node(scene: Scene) -> None:
         ({"vrml": "Solid { children [ }"}, "1 [ and 0 ]"),
         ({"vrml": ""}, "give vrml as one node"),
         ({"vrml": None}, "give vrml as one node"),
-        ({"vrml": 'Robot { controller # it\n "../evil" }'}, "and no path: '../evil'"),
+        ({"vrml": 'Robot { controller # it\n "../evil" }'}, "not a path: '../evil'"),
         (
             {"vrml": 'Group { children [ Robot { remoteControl"/evil" } ] }'},
-            "remoteControl is a name",
+            "remoteControl must be the name",
         ),
-        ({"vrml": PILL, "path": "ROVER.translation"}, "it takes no nodes"),
+        ({"vrml": PILL, "path": "ROVER.translation"}, "which cannot contain nodes"),
         ({"vrml": PILL, "path": "WorldInfo"}, "has no field children"),
-        ({"vrml": PILL, "path": "nowhere"}, "no node is called 'nowhere'"),
+        ({"vrml": PILL, "path": "nowhere"}, "no node has the DEF name, name or type 'nowhere'"),
     ],
 )
 def test_a_node_that_cannot_be_added_is_said_to_be_none(
@@ -231,7 +231,7 @@ def test_a_node_that_was_removed_is_brought_back_by_each_reset(scene: Scene) -> 
     assert whole is not None
     written = whole.exportString()
     assert scene.ask("remove_node", path="CRATE")["a_reset"] == "puts it back"
-    assert "no node is called 'CRATE'" in scene.fail("get_field", path="CRATE")
+    assert "no node has the DEF name, name or type 'CRATE'" in scene.fail("get_field", path="CRATE")
     for _ in range(2):
         scene.reset()
         again = scene.robot.getFromDef("CRATE")
@@ -260,7 +260,7 @@ def test_the_node_of_a_single_field_is_removed_and_brought_back(scene: Scene) ->
 @pytest.mark.parametrize(
     ("path", "said"),
     [
-        ("ROVER", "holds the robot 'rover', whose bridge would remove it: it stays"),
+        ("ROVER", "contains the robot 'rover' and cannot be removed"),
         ("root", "cannot be removed from a world"),
         ("WorldInfo", "cannot be removed from a world"),
         ("Viewpoint", "cannot be removed from a world"),
@@ -284,7 +284,7 @@ def test_more_changes_than_are_remembered_are_said_to_stay(scene: Scene) -> None
     last = ""
     for i in range(199):
         last = scene.ask("set_field", path=f"{path}[{i}]", value="y")["a_reset"]
-    assert last == "leaves it so: 200 changes are remembered, and no more"
+    assert last == "does not undo it: at most 200 changes are remembered"
 
 
 def test_the_command_that_made_a_change_stands_in_its_event(

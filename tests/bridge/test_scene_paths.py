@@ -75,23 +75,23 @@ def test_what_is_inside_a_proto_is_read_and_said_to_be_so(crowd: Scene) -> None:
 @pytest.mark.parametrize(
     ("path", "said"),
     [
-        ("ROVR.translation", "no node is called 'ROVR'"),
+        ("ROVR.translation", "no node has the DEF name, name or type 'ROVR'"),
         ("ROVR.translation", "(the nearest first): ROVER"),
         ("ROVER.tranlation", "no field 'tranlation'; it has (the nearest first): translation"),
         ("ROVER.children[7]", "no entry 7: it has 1: [0] HingeJoint"),
-        ("ROVER.children.name", "say which, such as ROVER.children[0]"),
-        ("ROVER.translation.x", "is of type SFVec3f: nothing is below it"),
+        ("ROVER.children.name", "give an index, such as ROVER.children[0]"),
+        ("ROVER.translation.x", "is of type SFVec3f: it has no fields"),
         ("ROVER.translation[0]", "one value of type SFVec3f"),
         ("ROVER.physics.mass", "ROVER.physics is NULL"),
         ("ROVER.controllerArgs[0]", "it has none"),
         ("ROVER[0]", "name one of its fields, such as ROVER.children[0]"),
         ("#99999.name", "there is no node #99999"),
         ("#-1", "there is no node #-1"),
-        ("", "is no path of the scene tree"),
-        (7, "7 is no path of the scene tree"),
-        ("ROVER..name", "from '..name' on"),
-        ("ROVER.name]", "from ']' on"),
-        ("x" * 1000, "is no path of the scene tree"),
+        ("", "is not a path of the scene tree"),
+        (7, "7 is not a path of the scene tree"),
+        ("ROVER..name", "'..name' is invalid"),
+        ("ROVER.name]", "']' is invalid"),
+        ("x" * 1000, "is not a path of the scene tree"),
     ],
 )
 def test_a_path_that_leads_nowhere_is_answered_with_what_there_is(
@@ -104,8 +104,8 @@ def test_a_name_that_several_nodes_have_is_answered_with_their_numbers(crowd: Sc
     for _ in range(2):
         crowd.ask("add_node", vrml='Solid { name "twin" }')
     said = crowd.fail("get_field", path="twin.name")
-    assert said.startswith("2 nodes are called 'twin': #")
-    assert "write the number of the one that is meant" in said
+    assert said.startswith("2 nodes have the name 'twin': #")
+    assert "give the number of one of them" in said
 
 
 def test_a_long_field_is_read_in_parts(crowd: Scene) -> None:
@@ -183,9 +183,9 @@ def test_a_scene_that_is_too_large_is_given_in_parts(crowd: Scene) -> None:
 @pytest.mark.parametrize(
     ("params", "said"),
     [
-        ({"depth": 0}, "depth is a whole number from 1"),
-        ({"types": "Robot"}, 'types is a list of texts, such as ["Robot"]'),
-        ({"fields": [1]}, "fields is a list of texts"),
+        ({"depth": 0}, "depth must be a whole number from 1"),
+        ({"types": "Robot"}, 'types must be a list of texts, such as ["Robot"]'),
+        ({"fields": [1]}, "fields must be a list of texts"),
         ({"names": ["x"] * 50}, "at most 20"),
         ({"path": "ROVER.translation"}, "is a field of type SFVec3f, not a node"),
     ],

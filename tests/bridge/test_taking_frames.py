@@ -103,7 +103,7 @@ def test_a_camera_that_has_no_image_yet_says_so(
     eager(bridge)
     eager(bridge)
     assert "has no image yet" in str(recording.fate(camera)[2])
-    assert "'lidar' has measured nothing yet" in str(recording.fate(lidar)[2])
+    assert "'lidar' has not measured anything yet" in str(recording.fate(lidar)[2])
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_what_has_no_pictures_is_named_with_what_has(
     eager(bridge)
     error = str(recording.fate(sent)[2])
     assert said in error
-    assert "pictures come from 'camera' (Camera), 'lidar' (Lidar)" in error
+    assert "devices with pictures: 'camera' (Camera), 'lidar' (Lidar)" in error
 
 
 # -- distances -----------------------------------------------------------------------------------

@@ -68,7 +68,7 @@ def test_send_pause_step_and_resume(
     assert main(["keep", *where, "7"]) == 0
     assert Recording(file).rows("SELECT reason FROM kept_stretch") == ["7"]
     assert main(["keep", *where, " "]) == 2
-    assert "reason is a text that says why" in capsys.readouterr().err
+    assert "reason must be a text that is not empty" in capsys.readouterr().err
     assert main(["send", *where, "break_down"]) == 2
     assert "the gear is gone" in capsys.readouterr().err
     assert set(Recording(file).rows("SELECT requested_by FROM command")) == {"cli"}
@@ -136,7 +136,7 @@ def test_an_action_that_nobody_registered_is_no_success(
     assert main(["send", "--database", str(file), "resett"]) == 2
     silent.stop()
     said = capsys.readouterr().err
-    assert "no action 'resett'; this robot knows reset, reset_state, " in said
+    assert "no action 'resett'; this robot has reset, reset_state, " in said
 
 
 def test_breakpoints_are_set_listed_hit_and_removed(

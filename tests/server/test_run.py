@@ -256,7 +256,7 @@ async def test_two_at_once_are_refused(connect: Connect, driver: Driver) -> None
     async with connect() as client:
         first = await ask(client, "webots_run", until="steps < 0", then="go_on", timeout_s=0.3)
         said = await fail(client, "webots_run", for_s=1)
-        assert f"command {first['command_id']} (run) is under way" in said
+        assert f"command {first['command_id']} (run) is still running" in said
         await paused(client)
         ended = await ask(client, "webots_wait_for_command", command_id=first["command_id"])
         assert ended["stopped"] == "interrupted"

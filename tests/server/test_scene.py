@@ -125,8 +125,10 @@ async def test_nodes_are_added_and_removed(connect: Connect) -> None:
         found = await ask(client, "webots_get_field", path="PILL.translation")
         assert found["result"]["value"] == [1.0, 1.0, 0.1]
         await ask(client, "webots_remove_node", path="PILL")
-        assert "no node is called 'PILL'" in await fail(client, "webots_get_field", path="PILL")
-        assert "it stays" in await fail(client, "webots_remove_node", path="ROVER")
+        assert "no node has the DEF name, name or type 'PILL'" in await fail(
+            client, "webots_get_field", path="PILL"
+        )
+        assert "cannot be removed" in await fail(client, "webots_remove_node", path="ROVER")
         assert "added nothing" in await fail(client, "webots_add_node", vrml="Hologram { }")
 
 

@@ -134,7 +134,7 @@ async def test_resume_and_reset_say_at_which_pace_it_goes_on_and_why(
         await ask(client, "webots_simulation_control", command="pause")
         reset = await ask(client, "webots_world_reset")
         assert reset["result"]["mode"] == "real_time"
-        assert "ended the pause; time goes on" in reset["result"]["why"]
+        assert "ended the pause; the simulation runs" in reset["result"]["why"]
         assert reset["status"] == "running"
     assert driver.is_alive()
 

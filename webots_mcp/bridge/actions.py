@@ -1,8 +1,8 @@
 """The built-in actions: for each in `contract.BUILT_IN_ACTIONS` the function of its name.
 
-Each gives a generator: it yields until its outcome is known (once a round of the user's loop, or of
-the pause), returns the command's result, or raises the command's error. What is refused before
-there is one interrupts no other.
+Each returns a generator, which yields until its outcome is known (once per round of the user's
+loop, or of the pause), returns the command's result, or raises the command's error. A command that
+is refused before its generator exists does not interrupt another one.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def begin(context: Context, command: ClaimedCommand) -> Progress:
     """The generator of a built-in action.
 
     Raises:
-        CommandRefusedError: It needs a Supervisor and this robot is none.
+        CommandRefusedError: It needs a Supervisor and this robot is not one.
     """
     if BUILT_IN_ACTIONS[command.action].needs_supervisor:
         context.simulation.require_supervisor(command.action)
@@ -58,8 +58,8 @@ def begin(context: Context, command: ClaimedCommand) -> Progress:
 
 
 def action_of(name: str) -> Action:
-    """The function of a built-in action; those of the scene are seldom asked for."""
-    if name not in _known:
+    """The function of a built-in action."""
+    if name not in _known:  # the scene's: seldom used, and not worth their import at every start
         from webots_mcp.bridge import scene_changing, scene_looking
 
         _known.update(
@@ -80,7 +80,10 @@ def _built_in(action: Action) -> Action:
 
 @_built_in
 def pause(context: Context, command: ClaimedCommand) -> Progress:
-    """Pause at once; or after one more round where the state of this one was throttled."""
+    """Pause at once, or after one more round where the state of this round was throttled.
+
+    A person looks at the newest recorded state of a paused robot, so it must be the current one.
+    """
     if context.throttle.stale and not context.pause.active:
         context.throttle.want()
         yield
@@ -90,19 +93,19 @@ def pause(context: Context, command: ClaimedCommand) -> Progress:
 
 @_built_in
 def resume(context: Context, command: ClaimedCommand) -> Progress:
-    """Go on in real time, whatever the mode was before."""
+    """Continue in real time, whatever the mode was before."""
     before = context.pause.running_mode
     context.pause.end(command, "real_time")
     why = "resume means real time"
     if before == "fast":
-        why += "; it ran fast before, and the command fast goes on so"
+        why += "; it ran fast before: the command fast continues in that mode"
     return {**_mode(context), "why": why}
     yield
 
 
 @_built_in
 def fast(context: Context, command: ClaimedCommand) -> Progress:
-    """Go on as fast as the computer can."""
+    """Continue as fast as the computer can."""
     context.pause.end(command, "fast")
     return _mode(context)
     yield
@@ -110,10 +113,11 @@ def fast(context: Context, command: ClaimedCommand) -> Progress:
 
 @_built_in
 def step(context: Context, command: ClaimedCommand) -> Progress:
-    """Let the user's loop come round `steps` times, each with its own step, then pause.
+    """Let the user's loop run `steps` rounds, each with its own step, then pause.
 
-    A loop that does not ask for commands in every round makes more; those made are told. A world
-    that does not wait for the robot goes on in real time meanwhile, so that it can be stopped.
+    A loop that does not ask for commands in every round makes more steps; the answer has the number
+    made. A world that does not wait for the robot (`synchronization` FALSE) runs in real time
+    meanwhile, so that it can be stopped in time.
     """
     return _step(context, command, _whole_number(command.params, "steps", 1, MAX_STEPS))
 
@@ -122,7 +126,7 @@ def _step(context: Context, command: ClaimedCommand, steps: int) -> Progress:
     clock, watch = context.clock, context.watch
     from_s, from_step = clock.sim_time_s, clock.steps_seen
     mode = None if context.simulation.waits_for_robot else "real_time"
-    context.pause.lend_mode(command, mode, stepping=True)
+    context.pause.change_mode_temporarily(command, mode, stepping=True)
     watch.stepping = command.id
     try:
         while (made := clock.steps_seen - from_step) < steps and not context.pause.active:
@@ -143,7 +147,7 @@ def _step(context: Context, command: ClaimedCommand, steps: int) -> Progress:
 
 @_built_in
 def run(context: Context, command: ClaimedCommand) -> Progress:
-    """Let the loop run until a condition holds or a time is over; then act on `then`."""
+    """Let the loop run until a condition holds or a time has passed; then act on `then`."""
     goal = read_goal(command.params)
     context.watch.require_free()
     return _run_until(context, command, goal)
@@ -151,20 +155,20 @@ def run(context: Context, command: ClaimedCommand) -> Progress:
 
 @_built_in
 def cancel_run(context: Context, command: ClaimedCommand) -> Progress:
-    """End the `run` command of that id, as its `then` says, or the `step`: nobody waits for it."""
+    """End the `run` command of that id, as its `then` says, or the `step`: its caller left."""
     return {"was_under_way": context.watch.cancel(command.params.get("command_id"))}
     yield
 
 
 @_built_in
 def reset(context: Context, command: ClaimedCommand) -> Progress:
-    """Ask for the reset; done when simulation time went back, which takes a physics step."""
+    """Ask for the reset; done when simulation time has gone back, which takes a physics step."""
     was_paused = context.pause.active
     context.queue.issue(command)
     context.pause.end(command)  # first: a paused simulation makes no physics step
     yield from _reset(context)
     why = "a reset takes a step, which ended the pause" if was_paused else "a reset keeps the mode"
-    return {"run_id": context.clock.run.id, **_mode(context), "why": f"{why}; time goes on"}
+    return {"run_id": context.clock.run.id, **_mode(context), "why": f"{why}; the simulation runs"}
 
 
 def _reset(context: Context) -> Generator[None]:
@@ -172,13 +176,13 @@ def _reset(context: Context) -> Generator[None]:
     clock.await_reset()
     context.simulation.robot.simulationReset()
     deadline_s = time.monotonic() + _RESET_TIMEOUT_S
-    with context.pause.awaiting_step():  # the state of the first one is of the new run
+    with context.pause.awaiting_step():  # the state published in the first step is of the new run
         while clock.run is run:
             if time.monotonic() > deadline_s:
                 clock.forget_reset()
                 raise CommandRefusedError(
                     "simulationReset() was called, but simulation time did not go back within "
-                    f"{_RESET_TIMEOUT_S:.0f} s"
+                    f"{_RESET_TIMEOUT_S:.0f} s; check that the loop still calls step()"
                 )
             yield
 
@@ -195,7 +199,7 @@ def reload(context: Context, command: ClaimedCommand) -> Progress:
         yield
     context.reloads.requested_by = None
     raise CommandRefusedError(
-        f"worldReload() was called, but the controller still runs after "
+        f"worldReload() was called, but Webots has not ended the controller after "
         f"{_RELOAD_TIMEOUT_S:.0f} s; {_DIALOG}"
     )
 
@@ -213,11 +217,15 @@ def _load(context: Context, command: ClaimedCommand, world: Path) -> Progress:
 
 
 def _world_of_project(context: Context, world: object) -> Path:
-    """A world of the present one's project, whoever asks: it starts controllers."""
+    """A world of the current one's project.
+
+    This is checked here, so that every client is bound by it: loading a world starts its
+    controllers, and so runs their code.
+    """
     try:
         file = full_path(world) if isinstance(world, str) else Path()
         is_file = file.is_file()
-    except OSError:  # of the name: too long, a NUL, links in a circle
+    except OSError:  # the name is too long, has a NUL, or its links form a circle
         file, is_file = Path(), False
     if not is_file:
         raise InvalidInputError(f"world must be the full path of a world file, not {world!r:.200}")
@@ -240,7 +248,7 @@ def _quit(context: Context, command: ClaimedCommand, status: int) -> Progress:
 
 
 def _until_ended(asked: str) -> Progress:
-    """Done when the controller ends, which is what Webots does first."""
+    """Done when the controller ends, which Webots does before anything else."""
     deadline_s = time.monotonic() + _RELOAD_TIMEOUT_S
     try:
         while time.monotonic() < deadline_s:
@@ -248,14 +256,14 @@ def _until_ended(asked: str) -> Progress:
     except ControllerEndedError:
         return {"controller": "it has ended"}
     raise CommandRefusedError(
-        f"{asked}() was called, but the controller still runs after {_RELOAD_TIMEOUT_S:.0f} s; "
-        f"{_DIALOG}"
+        f"{asked}() was called, but Webots has not ended the controller after "
+        f"{_RELOAD_TIMEOUT_S:.0f} s; {_DIALOG}"
     )
 
 
 @_built_in
 def screenshot(context: Context, command: ClaimedCommand) -> Progress:
-    """Ask for the picture; the simulator writes the file some time later, or never."""
+    """Ask for the picture; Webots writes the file some time later, or never."""
     quality = _whole_number(command.params, "quality", 1, 100, default=100)
     path = f"{SCREENSHOT_FOLDER}/command-{command.id:06d}.png"
     file = context.album.make_room(path)
@@ -266,7 +274,7 @@ def screenshot(context: Context, command: ClaimedCommand) -> Progress:
 
 @_built_in
 def take_frame(context: Context, command: ClaimedCommand) -> Progress:
-    """Take a picture of what a camera, a range finder or a lidar sees now, as it measured last."""
+    """Take a picture of the newest measurement of a camera, a range finder or a lidar."""
     name = command.params.get("camera") or ""
     device = find_pictured(context.simulation.robot, str(name))
     picture, camera = take_picture(device), str(device.getName())
@@ -278,14 +286,17 @@ def take_frame(context: Context, command: ClaimedCommand) -> Progress:
 
 @_built_in
 def reset_state(context: Context, command: ClaimedCommand) -> Progress:
-    """Run what the controller registered with `on_reload`; not asked where it has its own."""
+    """Run the callbacks of `on_reload`; not called where the controller registered its own action.
+
+    See `Control._start`, where a registered function comes first.
+    """
     with context.pause.user_code():
         outcomes = context.reloads.call_back()
     if not outcomes:
         raise CommandRefusedError(
-            "nothing to reset: this controller registered no callback with bridge.on_reload() and "
-            "no function for 'reset_state'; only a loop that looks at what get_command() returned "
-            "can have done it"
+            "nothing was reset: this controller registered no callback with bridge.on_reload() and "
+            "no function for 'reset_state'; only a loop that handles the return value of "
+            "get_command() itself can have reset its state"
         )
     if errors := [describe(error) for error in outcomes if error is not None]:
         raise CommandRefusedError(
@@ -297,12 +308,12 @@ def reset_state(context: Context, command: ClaimedCommand) -> Progress:
 
 @_built_in
 def set_parameters(context: Context, command: ClaimedCommand) -> Progress:
-    """Set parameters, all or none: `when` "now", or "reset" for the next reset of the world."""
+    """Set all given parameters or none: `when` "now", or "reset" for the next reset."""
     params, clock, parameters = command.params, context.clock, context.parameters
     values, when = params.get("values"), params.get("when", "now")
     if not isinstance(values, dict) or not values or when not in ("now", "reset"):
         raise InvalidInputError(
-            'give values, such as {"kp": 3.0}, and when: "now" or "reset" (from the next on)'
+            'give values, such as {"kp": 3.0}, and when: "now" or "reset" (at the next reset)'
         )
     setter = _setter(command)
     given = cast("dict[str, object]", values)
@@ -318,7 +329,7 @@ def set_parameters(context: Context, command: ClaimedCommand) -> Progress:
 
 @_built_in
 def arm_breakpoints(context: Context, command: ClaimedCommand) -> Progress:
-    """Read the breakpoints anew: some were set or removed."""
+    """Read the stored breakpoints again, since some were set or removed."""
     while not context.breakpoints.load():
         yield
     return context.breakpoints.describe()
@@ -326,10 +337,10 @@ def arm_breakpoints(context: Context, command: ClaimedCommand) -> Progress:
 
 @_built_in
 def keep(context: Context, command: ClaimedCommand) -> Progress:
-    """Keep the last seconds and those to come at full rate, for a `reason`."""
+    """Keep the last seconds and the next ones at full rate, for a `reason`."""
     reason, sim_time_s = command.params.get("reason"), context.clock.sim_time_s
     if not isinstance(reason, str) or not reason.strip():
-        raise InvalidInputError(f"reason is a text that says why, not {reason!r:.80}")
+        raise InvalidInputError(f"reason must be a text that is not empty, not {reason!r:.80}")
     if not context.keeper.keep(reason):
         raise CommandRefusedError(context.keeper.why_not)
     return {"run_id": context.clock.run.id, "kept_around_s": sim_time_s}
@@ -337,13 +348,13 @@ def keep(context: Context, command: ClaimedCommand) -> Progress:
 
 
 def _run_until(context: Context, command: ClaimedCommand, goal: Goal) -> Progress:
-    """Set what the goal asks for, run until it is reached, and say how far it came."""
+    """Apply the goal's parameters, run until the goal is reached, and report how far it got."""
     watch, pause, finish = context.watch, context.pause, _finish_of(context, command, goal.then)
     _set_before_run(context, command, goal)
     watch.begin(command.id, goal, finish)
     pause.ask_before_steps(watch.before_step)
     try:
-        pause.lend_mode(command, goal.pace)
+        pause.change_mode_temporarily(command, goal.pace)
         if goal.reset:
             yield from _reset(context)
         while not watch.over():
@@ -358,7 +369,7 @@ def _run_until(context: Context, command: ClaimedCommand, goal: Goal) -> Progres
     except InterruptedCommandError as interruption:
         watch.interrupt("interrupted", str(interruption))
         return watch.describe()
-    except CommandRefusedError:  # the reset did not come
+    except CommandRefusedError:  # no reset happened: the loop must not stay in the goal's mode
         finish()
         raise
     finally:
@@ -374,19 +385,19 @@ def _set_before_run(context: Context, command: ClaimedCommand, goal: Goal) -> No
 
 
 def _setter(command: ClaimedCommand) -> Setter:
-    """As whom a command sets parameters: a trial's says so."""
+    """Who sets the parameters: the command itself, or the trial that sent it."""
     by = command.params.get("by")
     return Setter(by if by in SETTERS else "command", command.id)
 
 
 def _finish_of(context: Context, command: ClaimedCommand, then: Then) -> Callable[[], None]:
-    """What to do at the step that ends a run."""
+    """The function that is called at the step that ends a run."""
     pause = context.pause
     was_paused = pause.active
 
     def finish() -> None:
         if then == "go_on" or (then == "as_before" and not was_paused):
-            pause.give_mode_back()
+            pause.restore_mode()
         else:
             pause.begin(Cause(command.id))
 
@@ -403,7 +414,7 @@ def _wait_for_picture(file: Path) -> Generator[None, None, tuple[int, int, int]]
         if time.monotonic() > deadline_s:
             raise CommandRefusedError(
                 f"Webots wrote no complete picture to {file} within {_SCREENSHOT_TIMEOUT_S:.0f} s; "
-                "its console tells why"
+                "its console has the reason"
             )
         yield
     return size
@@ -414,5 +425,7 @@ def _whole_number(
 ) -> int:
     value = params.get(name, default)
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-        raise InvalidInputError(f"{name} must be a whole number from {least} to {most}: {value!r}")
+        raise InvalidInputError(
+            f"{name} must be a whole number from {least} to {most}, not {value!r}"
+        )
     return value

@@ -1,10 +1,10 @@
-"""What each step of an attached robot does besides: publish what the devices say, serve commands.
+"""What each step of an attached robot does in addition: publish the devices and serve commands.
 
-A round of the controller's loop lies between two steps. What the devices say is published when a
-step ends, so that it is recorded whatever the controller does next. Commands are served when the
-next step begins, as a call of `get_command()` at the end of the loop would: the controller has had
-its say by then. One that publishes by itself is left to it, and the same row has what the devices
-say.
+A round of the controller's loop lies between two steps. The devices' values are published when a
+step ends, so that they are recorded whatever the controller does next. Commands are served when the
+next step begins, as a call of `get_command()` at the end of the loop would: by then the controller
+has computed its reaction to the last step. Where the controller publishes by itself, the bridge
+does not publish a second time: the devices' values become part of the controller's own row.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ _WHAT: Final = "the attached step"
 
 
 class Attachment:
-    """Goes along with the steps of a robot, from `begin` to `end`. Nothing raises into them.
+    """Listens to the steps of a robot, from `begin` to `end`. Nothing raises into a step.
 
     Args:
-        session: What publishes, and where commands are looked for.
-        serve: Serves the commands that wait, as `get_command()` does.
-        errors: Told of what failed.
+        session: Publishes states.
+        serve: Serves the pending commands, as `get_command()` does.
+        errors: Receives each failure.
     """
 
     def __init__(
@@ -39,44 +39,44 @@ class Attachment:
         self._pause = session.context.pause
         self._clock = session.context.clock
         self._calls = self._throttle.calls  # of publish, up to the end of the last step
-        self._left_to_controller = False
-        self._unlooked: ClaimedCommand | None = None
+        self._left_to_controller = False  # the controller published in the last round
+        self._last_served: ClaimedCommand | None = None
 
     def begin(self) -> None:
-        """From now on each step is gone along with."""
-        self._session.control.handlers.loop_looks = False
+        """Listen to each step from now on."""
+        self._session.control.handlers.loop_polls = False
         self._clock.stepped_s = self._session.context.simulation.time_s
-        self._pause.go_along(self)
+        self._pause.listen_to_steps(self)
 
     def end(self) -> None:
-        """No step is, from now on."""
-        self._session.control.handlers.loop_looks = True
-        self._pause.go_along(None)
+        """Listen to no more steps."""
+        self._session.control.handlers.loop_polls = True
+        self._pause.listen_to_steps(None)
 
     def take_command(self) -> ClaimedCommand | None:
-        """The command that was served last, for a loop that asks for it by itself."""
-        self._session.control.handlers.loop_looks = True
-        command, self._unlooked = self._unlooked, None
+        """The command that was served last, for a loop that also calls `get_command()`."""
+        self._session.control.handlers.loop_polls = True
+        command, self._last_served = self._last_served, None
         if self._clock.sim_time_s > self._clock.stepped_s:
             self.look_for_unseen()
         return command
 
     def look_for_unseen(self) -> None:
-        """Say it once where time went on by steps that did not come by here."""
+        """Warn once where simulation time advanced by steps that the bridge did not see."""
         self._session.look_for_unseen(self._clock.stepped_s)
 
     def before(self, step: Step) -> None:
-        """The controller's round is over: publish what it did not, and serve commands."""
+        """The controller's round is over: publish its state if it did not, and serve commands."""
         if step.finishes or self._pause.in_user_code:
             return
         try:
             self.publish_missing()
-            self._unlooked = self._serve() or self._unlooked
+            self._last_served = self._serve() or self._last_served
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed(_WHAT, error)
 
     def after(self, step: Step, answer: int) -> None:
-        """Time has passed, or Webots wants the controller to end."""
+        """A step has ended, or Webots asks the controller to quit."""
         try:
             if answer == QUIT:
                 self._session.end()
@@ -86,7 +86,7 @@ class Attachment:
             self._errors.failed(_WHAT, error)
 
     def publish_missing(self) -> None:
-        """The controller published in the round before and did not in this one."""
+        """Publish the devices where the controller published a round ago, but not in this one."""
         over = self._session.context.simulation.over
         if self._left_to_controller and self._throttle.calls == self._calls and not over:
             self._publish()

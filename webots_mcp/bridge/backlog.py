@@ -1,4 +1,4 @@
-"""Writes that the database could not take yet: in a file beside it, else in memory."""
+"""Writes that the database could not take yet: in a file next to it, else in memory."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ class Row:
 
 
 class Backlog:
-    """What waits, oldest first: the entries of the file, then the rows in memory.
+    """The waiting rows, oldest first: the entries of the file, then the rows in memory.
 
-    A row stays in memory only where the file does not take it (a full disk, a database in memory),
-    or until the next call where another thread was writing. Any thread may `put`; the rest belongs
-    to who has the connection lock. An interrupt at any place leaves too much here, never too
-    little; what the database has already is known by its number.
+    A row stays in memory only where the file cannot take it (a full disk, a database in memory), or
+    until the next call where another thread was writing. Any thread may call `put`; all other
+    methods require the connection lock. The order of the statements matters: an interrupt at any
+    place may leave a row here that is already written, which its number shows, but never loses one.
 
     Args:
         file: Where rows survive the process; None for memory alone.
-        describe_run: The values of a run's own entry.
-        counts: Is told of rows that are dropped.
+        describe_run: Returns the values of a run's own entry.
+        counts: Counts dropped rows.
 
     Attributes:
-        why: Why rows wait.
+        why: The reason why rows wait.
     """
 
     def __init__(
@@ -65,21 +65,21 @@ class Backlog:
 
     @property
     def waits(self) -> bool:
-        """Whether there may be anything."""
+        """Whether rows may be waiting."""
         return bool(self._rows or self._in_file)
 
     @property
     def rows_in_memory(self) -> int:
-        """Those that a killed process would lose."""
+        """Waiting rows that a killed process would lose."""
         return len(self._rows)
 
     @property
     def rows(self) -> int:
-        """How many wait."""
+        """The number of waiting rows."""
         return len(self._rows) + self._in_file
 
     def put(self, row: Row) -> None:
-        """Keep the newest row."""
+        """Add the newest row, in memory."""
         self._rows.append(row)
         self._bytes += _weight(row)
 
@@ -95,18 +95,18 @@ class Backlog:
         """Move the rows in memory to the file, as far as it takes them."""
         while self._rows and self._file is not None:
             row = self._rows[0]
-            self._in_file += 1
+            self._in_file += 1  # first: an interrupt after `append` must not hide the file's rows
             try:
                 self._file.append(self._entries(row, self._described))
             except OSError:
                 self._in_file -= 1
-                return  # in memory it waits as well
+                return  # it waits in memory instead
             if row.run is not None:
                 self._described.add(row.run.uuid)
             self._remove_oldest()
 
     def next_entries(self) -> list[Entry]:
-        """The oldest entries; they stay until they are forgotten. None are left where empty."""
+        """The oldest entries, which stay until `forget`; an empty list where nothing waits."""
         if self._in_file and self._file is not None:
             self._read = self._read or self._file.read(self._offset)
             if self._read:
@@ -128,23 +128,24 @@ class Backlog:
             self._offset = done[-1][0]
             self._read = self._read[len(done) :]
             rows = sum(entry.kind != "run" for _, entry in done)
-            self._in_file = max(1, self._in_file - rows)  # 0 once the end was seen
+            # Only `next_entries` finds out that the file has ended, and sets 0.
+            self._in_file = max(1, self._in_file - rows)
         while self._rows and (self._rows[0].number or number + 1) <= number:
             self._remove_oldest()
 
     def rename_run(self, before: str, now: str) -> None:
-        """What waits in the file for a run belongs to its continuation in another database."""
+        """Assign the entries in the file to the run that continues theirs in another database."""
         self._names = {old: now if name == before else name for old, name in self._names.items()}
         self._names[before] = now
 
     def drop_rows_in_memory(self, why: str) -> None:
-        """Nothing will take them any more."""
+        """Drop the rows in memory, which nothing will write any more."""
         while self._rows:
             self._remove_oldest()
             self._counts.drop(1, why)
 
     def close(self) -> str | None:
-        """Close the file; where it holds entries, it stays, and is named."""
+        """Close the file; one that still has entries is not deleted, and its path is returned."""
         file, self._file = self._file, None
         if file is None:
             return None
@@ -152,7 +153,7 @@ class Backlog:
         return str(file.path) if self._in_file else None
 
     def abandon(self) -> None:
-        """In a forked child: what waits belongs to the parent."""
+        """In a forked child: forget the waiting rows, which belong to the parent."""
         if self._file is not None:
             self._file.close(remove=False)
             self._file = None
@@ -171,7 +172,7 @@ class Backlog:
 
     def _empty_file(self) -> None:
         assert self._file is not None
-        self._described.clear()  # first: described twice does no harm
+        self._described.clear()  # first: a run that is described twice does no harm
         self._offset, self._read = 0, []
         self._file.empty()
         self._in_file = 0
@@ -179,7 +180,7 @@ class Backlog:
     def _entries(self, row: Row, described: set[str]) -> list[Entry]:
         """The row's entry, after that of its run if it is not among those described."""
         if row.number is None:
-            self._last_number += 2  # one is for the run
+            self._last_number += 2  # two numbers: the run's own entry precedes that of the row
             row.number = self._last_number
         entry = Entry(row.number, row.kind, row.run.uuid if row.run else None, row.values)
         if row.run is None or row.run.uuid in described:
@@ -189,6 +190,6 @@ class Backlog:
 
 
 def _weight(row: Row) -> int:
-    """About the bytes that a waiting row holds: its texts."""
+    """The approximate memory of a waiting row, in bytes: its texts and a constant."""
     values = row.values if isinstance(row.values, tuple) else row.values.values()
     return 200 + sum(len(value) for value in values if isinstance(value, str))

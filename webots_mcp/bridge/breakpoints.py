@@ -1,4 +1,4 @@
-"""Breakpoints: conditions that are asked of every published state, recorded or not."""
+"""Breakpoints: conditions that are evaluated on every published state, recorded or not."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from webots_mcp.stored_breakpoints import ARMED, OF_CONTROLLER, SET
 if TYPE_CHECKING:
     from webots_mcp.conditions import Condition, Evaluator
 
-MOST_EVENTS: Final = 1000  # of one breakpoint in one run; a condition that flickers is no moment
-_UNPUBLISHED_S: Final = 1.0  # a signal that was not published for so long is told
+MOST_EVENTS: Final = 1000  # of one breakpoint in one run: a flickering condition fills no database
+_UNPUBLISHED_S: Final = 1.0  # a signal that was not published for so long is reported
 _MOST_ERROR_CHARACTERS: Final = 1000
 
 
 class Breakpoint:
-    """One that is armed.
+    """An armed breakpoint.
 
     Attributes:
         id: None where the database could not take it yet.
         of_code: The controller's own code has set it.
-        hits: How often it began to hold in this run.
-        holding: It held in the state before.
-        asked_since_s: The simulation time of the first state that it was asked of in this run.
-        unseen: Its signals that no state has held yet.
+        hits: How often its condition began to hold in this run.
+        holding: Its condition held in the previous state.
+        asked_since_s: The simulation time of the first state that it was evaluated on in this run.
+        unseen: Its signals that no state has contained yet.
     """
 
     def __init__(
@@ -63,16 +63,16 @@ class Breakpoint:
 
     @property
     def asks(self) -> tuple[str, str, int]:
-        """Its condition, action and hits, by which it is the same in another database."""
+        """Its condition, action and hits: what identifies it in another database."""
         return self.condition.text, self.action, self.after_hits
 
     def begin_run(self) -> None:
-        """It is armed again."""
+        """Arm it again for a new run."""
         self.evaluator.forget()
         self.hits, self.holding, self.asked_since_s = 0, False, None
 
     def begins(self, state: Any, sim_time_s: float) -> bool:
-        """Take in a state.
+        """Evaluate the condition on a state; True if it begins to hold with it.
 
         Raises:
             ConditionFailedError: See `Evaluator.holds`.
@@ -82,7 +82,7 @@ class Breakpoint:
 
 
 class Breakpoints:
-    """Those of this robot that are armed: the stored ones, and those of the controller's code."""
+    """This robot's armed breakpoints: the stored ones, and those of the controller's code."""
 
     def __init__(
         self,
@@ -99,25 +99,25 @@ class Breakpoints:
         self._journal = journal
         self._pause = pause
         self._keeper = keeper
-        self.run: Run | None = None  # in which the stored ones were read; None while that is owed
+        self.run: Run | None = None  # in which the stored ones were read; None: to be read again
         self._begun = clock.run
         self._registration: Registration | None = None  # in the database that was read last
         self._off: dict[int, str] = {}
         self.armed: list[Breakpoint] = []
-        recorder.session.standing.append(self._owe)
+        recorder.session.new_database_entries.append(self._read_later)
 
     # -- setting -------------------------------------------------------------------------------
 
     def begin(self) -> None:
-        """At the start of a session: what is stored, without what sessions before have set."""
+        """Arm what is stored, without what the code of earlier sessions has set."""
         self._recorder.record("breakpoints forgotten", None, {"by": OF_CONTROLLER})
         self.load()
 
     def load(self) -> bool:
-        """Arm what is stored now; what is armed already goes on, in a new run from its beginning.
+        """Arm what is stored now; breakpoints armed already keep their hits within a run.
 
         Returns:
-            False where it could not be read: all stays as it is, and the next state tries again.
+            False where it could not be read: nothing changes, and the next state tries again.
         """
         run, self.run = self._clock.run, None
         if run is not self._begun:
@@ -142,13 +142,13 @@ class Breakpoints:
         self.run = run
         return True
 
-    def _owe(self) -> tuple[()]:
-        """The next state reads the database that is begun now."""
+    def _read_later(self) -> tuple[()]:
+        """A new database was begun: read its breakpoints with the next state. Adds no entries."""
         self.run = None
         return ()
 
     def _move(self, stored: list[Breakpoint]) -> None:
-        """Into another database: those of the code go along, others stay behind with a word."""
+        """Move to another database: those of the code are stored there, others are reported off."""
         for each in self.armed:
             same = next((other for other in stored if other.asks == each.asks), None)
             if same is not None:
@@ -158,7 +158,7 @@ class Breakpoints:
                 each.id = self._store(*each.asks)
                 stored.append(each)
             else:
-                why = "it was set in a database that is gone; set it again"
+                why = "the database that it was set in is lost; set it again"
                 text = f"breakpoint {each.id} ({each.condition.text}) is off: {why}"
                 self._journal.log("warning", "bridge", text)
         self.armed = stored
@@ -178,7 +178,7 @@ class Breakpoints:
         """Arm one of the controller's code, for as long as its session lasts.
 
         Returns:
-            Its id; None while the database cannot take it, which keeps it from nothing else.
+            Its id; None while the database cannot take it: it is armed all the same.
 
         Raises:
             InvalidInputError: The condition is not of the language, there is no such action, or
@@ -207,34 +207,35 @@ class Breakpoints:
         return int(rows[0][0]) if rows else None
 
     def describe(self) -> dict[str, object]:
-        """What is armed and what is off, by id; and whether a pause is possible."""
-        told: dict[str, object] = {"armed": [each.id for each in self.armed if each.id is not None]}
+        """The armed ones and those that are off, by id; and why a pause is not possible."""
+        armed = [each.id for each in self.armed if each.id is not None]
+        answer: dict[str, object] = {"armed": armed}
         if self._off:
-            told["off"] = {str(number): why for number, why in self._off.items()}
+            answer["off"] = {str(number): why for number, why in self._off.items()}
         if not self._simulation.supervisor:
-            told["cannot_pause"] = _CANNOT_PAUSE
-        return told
+            answer["cannot_pause"] = _CANNOT_PAUSE
+        return answer
 
-    # -- asking --------------------------------------------------------------------------------
+    # -- evaluating ----------------------------------------------------------------------------
 
     def ask_states(self) -> bool:
-        """Whether the next state has to be looked at; what is owed of the stored ones is read."""
+        """Whether the next state has to be evaluated; reads the stored ones if that is due."""
         if self.run is not self._clock.run:
             self.load()
         return bool(self.armed)
 
     def look(self, state: Any) -> list[Breakpoint]:
-        """Those that begin to hold with a state, and whose action is due; usually none."""
+        """The breakpoints whose condition begins to hold and whose action is due; usually none."""
         clock, hit = self._clock, list[Breakpoint]()
         if self.run is not clock.run:
             self.load()
-        for each in tuple(self.armed):
+        for each in tuple(self.armed):  # a copy: a failing one is removed meanwhile
             try:
                 if each.begins(state, clock.sim_time_s):
                     self._count(each, hit)
             except ConditionFailedError as error:
                 self._disarm(each, str(error))
-            except Exception as error:  # noqa: BLE001  (whatever an object of the user's does)
+            except Exception as error:  # noqa: BLE001  (the user's objects may raise anything)
                 self._disarm(each, f"condition {each.condition.text!r}: {describe(error)}")
             if each.unseen:
                 self._look_for_signals(each, state)
@@ -248,18 +249,18 @@ class Breakpoints:
             hit.append(each)
 
     def act(self, hit: list[Breakpoint], state: Any) -> None:
-        """Record the hits, keep the seconds around them, and pause where one asks for it."""
+        """Record the hits, keep the seconds around them, and pause where one demands it."""
         for each in hit:
             if each.action in _KEEPING:
                 self._keeper.keep(f"breakpoint {each.id or ''}: {each.condition.text}")
             if each.hits - each.after_hits < MOST_EVENTS:
-                self._tell(each, state)
+                self._record_hit(each, state)
         pausing = [each for each in hit if each.action == "pause"]
         if pausing and self._simulation.supervisor:
             first = pausing[0]
             self._pause.begin(Cause(breakpoint_id=first.id, condition=first.condition.text))
 
-    def _tell(self, each: Breakpoint, state: Any) -> None:
+    def _record_hit(self, each: Breakpoint, state: Any) -> None:
         data: dict[str, object] = {
             "breakpoint_id": each.id,
             "action": each.action,
@@ -272,10 +273,10 @@ class Breakpoints:
             data["not_kept"] = self._keeper.why_not
         self._journal.event("breakpoint", data, each.condition.text)
 
-    # -- what is wrong with one ----------------------------------------------------------------
+    # -- failures ------------------------------------------------------------------------------
 
     def _disarm(self, each: Breakpoint, why: str) -> None:
-        """A condition that fails would fail with every state: it is reported and turned off."""
+        """Report a condition that fails and turn it off: it would fail on every state."""
         self.armed.remove(each)
         if each.id is not None:
             self._disable(each.id, why)
@@ -287,7 +288,7 @@ class Breakpoints:
         self._recorder.record("breakpoint failed", None, (text, number))
 
     def _look_for_signals(self, each: Breakpoint, state: Any) -> None:
-        """Tell once of signals that are never published: a name may be misspelt."""
+        """Warn once of signals that are never published: a name may be misspelt."""
         now_s = self._clock.sim_time_s
         if each.asked_since_s is None:
             each.asked_since_s = now_s
@@ -296,13 +297,13 @@ class Breakpoints:
         if each.unseen and now_s - each.asked_since_s >= _UNPUBLISHED_S:
             each.unseen = frozenset()
             known = each.evaluator.names_in(state)
-            for said in each.condition.describe_unknown(known):
-                self._journal.log("warning", "bridge", f"breakpoint {each.id or ''}: {said}")
+            for text in each.condition.describe_unknown(known):
+                self._journal.log("warning", "bridge", f"breakpoint {each.id or ''}: {text}")
 
 
-_KEEPING: Final = ("pause", "keep")  # who pauses wants to see what came before
+_KEEPING: Final = ("pause", "keep")  # a pause is for looking at what led to it
 _CANNOT_PAUSE: Final = (
-    "the robot is no Supervisor: set its field `supervisor` to TRUE in the world file"
+    "the robot is not a Supervisor: set its field `supervisor` to TRUE in the world file"
 )
 
 
@@ -316,6 +317,6 @@ def _armed(
 def _require_action(action: str, after_hits: object) -> None:
     if action not in BREAKPOINT_ACTIONS:
         names = " or ".join(map(repr, BREAKPOINT_ACTIONS))
-        raise InvalidInputError(f"the action of a breakpoint is {names}, not {action!r}")
+        raise InvalidInputError(f"the action of a breakpoint must be {names}, not {action!r}")
     if isinstance(after_hits, bool) or not isinstance(after_hits, int) or after_hits < 1:
-        raise InvalidInputError(f"after_hits is a whole number from 1 on, not {after_hits!r}")
+        raise InvalidInputError(f"after_hits must be a whole number of at least 1: {after_hits!r}")

@@ -19,7 +19,7 @@ TEXT_HEIGHT_PX: Final = 5 * _DOT_PX
 
 
 def colour(red: int, green: int, blue: int) -> int:
-    """A pixel as Webots has them: the bytes blue, green, red, alpha."""
+    """A pixel in the order of a Webots image: the bytes blue, green, red, alpha."""
     return int.from_bytes(bytes((blue, green, red, 255)), sys.byteorder)
 
 
@@ -29,7 +29,7 @@ WHITE: Final = colour(255, 255, 255)
 
 
 class Canvas:
-    """An image that is drawn into; what lies outside of it is left out."""
+    """An image to draw into; drawing outside of it has no effect."""
 
     def __init__(self, width: int, height: int, background: int = BLACK) -> None:
         self.width = width
@@ -42,7 +42,7 @@ class Canvas:
         return self._pixels.tobytes()
 
     def fill(self, x: int, y: int, width: int, height: int, colour: int) -> None:
-        """Fill a rectangle, of which the upper left corner is given."""
+        """Fill a rectangle, given its upper left corner."""
         left, right = max(0, x), min(self.width, x + width)
         row = array("I", [colour]) * max(0, right - left)
         for line in range(max(0, y), min(self.height, y + height)):
@@ -55,7 +55,7 @@ class Canvas:
         self._pixels[y * self.width : y * self.width + len(given)] = given
 
     def circle(self, x: float, y: float, radius: float, colour: int) -> None:
-        """Draw its line."""
+        """Draw the outline of a circle."""
         count = max(8, int(8 * radius))
         for number in range(count):
             angle = 2 * math.pi * number / count

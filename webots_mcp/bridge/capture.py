@@ -1,14 +1,14 @@
 """Recording what a controller prints: `capture_output=True`.
 
-The file descriptors 1 and 2 are led through pipes, so that prints of C code count too. What comes
-out is passed on to where it went before, in order, and its lines are recorded. A print of Python's
-does that itself before it returns; for what C code prints a thread does it, which never touches
-Webots' API. So a process that is killed loses what C code printed in its last milliseconds, and
-what was not flushed, as ever.
+The file descriptors 1 and 2 are redirected into pipes, so that the output of C code is recorded
+too. The data is forwarded to the original destination, in order, and its lines are recorded. A
+`print` in Python does that itself before it returns; for the output of C code a thread does it,
+which never calls Webots' API. So a process that is killed loses what C code printed in its last
+milliseconds, and what was never flushed.
 
-Where the old place takes no more, what is printed waits in the pipe (1 MB on Linux, 64 kB
-elsewhere); a print waits for it only when that is full too. It is recorded as any log line is,
-within milliseconds also where the database is locked.
+While the original destination accepts no data, the output waits in the pipe (1 MB on Linux, 64 kB
+elsewhere); a print blocks only when the pipe is full too. Lines are recorded as any log line is,
+within milliseconds also while the database is locked.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from webots_mcp.errors import warn
 
 _DESCRIPTORS: Final = {"stdout": 1, "stderr": 2}
 _PIPE_BYTES: Final = 1 << 20
-_CHUNK_BYTES: Final = 4096  # PIPE_BUF: a pipe that takes anything takes as many at once
-_MOST_UNPASSED_BYTES: Final = 1 << 16
-_MOST_SELECTABLE: Final = 1024
-_LAST_WAIT_S: Final = 1.0  # at the end, for an old place that takes no more
-_PATIENCE_S: Final = 0.02  # of a print, with the thread that records just now
-_POLLS: Final = os.name == "posix"  # Windows cannot ask whether a pipe has something
+_CHUNK_BYTES: Final = 4096  # PIPE_BUF: a writable pipe takes so many bytes without blocking
+_MOST_UNFORWARDED_BYTES: Final = 1 << 16  # beyond it, data is left in the pipe
+_MOST_SELECTABLE: Final = 1024  # FD_SETSIZE: select() cannot watch a higher descriptor
+_LAST_WAIT_S: Final = 1.0  # on closing, for a destination that accepts no data
+_PATIENCE_S: Final = 0.02  # how long a print waits for the thread that is recording
+_POLLS: Final = os.name == "posix"  # Windows has no select() for pipes
 
 Record = Callable[[str, Sequence[str]], object]
 
@@ -39,7 +39,7 @@ class Capture:
     """The output of this process, captured from `begin` to `close`.
 
     Args:
-        record: Takes the lines of `stdout` or `stderr`; called in any thread.
+        record: Receives the lines of `stdout` or `stderr`; called in any thread.
     """
 
     _current: Capture | None = None  # a process has one stdout
@@ -49,7 +49,7 @@ class Capture:
         self._channels: list[_Channel] = []
 
     def begin(self) -> None:
-        """Lead the output through here, unless another bridge of this process does already."""
+        """Capture the output, unless another bridge of this process does already."""
         if Capture._current is not None:
             warn("another bridge of this process records its output already: this one does not")
             return
@@ -64,11 +64,11 @@ class Capture:
             warn(f"{name} cannot be recorded: {error}")
 
     def close(self) -> None:
-        """Put back what was there before, and record the rest."""
+        """Restore the original streams, and record the rest."""
         self._end(_Channel.close)
 
     def abandon(self) -> None:
-        """In a forked child: what it prints goes where its parent's went before."""
+        """In a forked child: its output goes to the original destination, unrecorded."""
         self._end(_Channel.abandon)
 
     def _end(self, end: Callable[[_Channel], object]) -> None:
@@ -80,23 +80,24 @@ class Capture:
 
 
 class _Channel:
-    """`stdout` or `stderr`: the pipe that it is led through, and where it went before."""
+    """`stdout` or `stderr`: the pipe that it is redirected into, and its original destination."""
 
     def __init__(self, name: str, record: Record) -> None:
         self._name = name
         self._record = record
         self._descriptor = _DESCRIPTORS[name]
         self._lines = PrintedLines()
-        self._lock = threading.RLock()  # of what comes out and is passed on
+        # Two locks, so that forwarding goes on while lines are being recorded.
+        self._lock = threading.RLock()  # guards reading the pipe and forwarding
         self._recording = threading.Lock()
-        self._recorder: int | None = None  # the thread that has it
-        self._unpassed = bytearray()
-        self._place_gone = False
+        self._recorder: int | None = None  # the thread that holds `_recording`
+        self._unforwarded = bytearray()
+        self._destination_failed = False
         self._ended = False
         self._stream: Any = getattr(sys, name)
         self._tee: _Tee | None = None
-        self._passes = _writes_to(self._stream, self._descriptor)
-        self._lead_through_pipe()
+        self._reaches_descriptor = _writes_to(self._stream, self._descriptor)
+        self._redirect()
         self._thread = threading.Thread(target=self._follow, name=f"webots-mcp {name}", daemon=True)
         self._thread.start()
         if self._stream is not None:
@@ -104,28 +105,28 @@ class _Channel:
             setattr(sys, name, self._tee)
 
     def close(self) -> None:
-        """Put the old place back, pass on and record what is still here."""
+        """Restore the stream, forward and record what is still in the pipe."""
         _flush(self._stream)
-        _flush_c()
-        self._put_back()
+        _flush_c()  # before restoring: C's buffer must still go through the pipe
+        self._restore()
         deadline_s = time.monotonic() + _LAST_WAIT_S
-        while self._has_unpassed() and time.monotonic() < deadline_s:
+        while self._has_unforwarded() and time.monotonic() < deadline_s:
             self._thread.join(0.02)
         with self._lock:
             self._lines.end()
         self._record_lines(_PATIENCE_S)
 
     def abandon(self) -> None:
-        """In a forked child: locks and thread are the parent's, and so is what waits."""
-        self._put_back()
-        os.close(self._outlet)
-        os.close(self._old_place)
+        """In a forked child: locks, thread and unforwarded data belong to the parent."""
+        self._restore()
+        os.close(self._read_end)
+        os.close(self._destination)
 
-    # -- passing on ----------------------------------------------------------------------------
+    # -- forwarding ----------------------------------------------------------------------------
 
     def _printed(self, text: str) -> None:
-        """Python has printed something."""
-        if not self._passes:  # a stream of somebody's own, as the one of Webots on Windows
+        """Called when Python has printed something."""
+        if not self._reaches_descriptor:  # a replaced stream, as that of Webots on Windows
             with self._lock:
                 self._lines.take(text.encode("utf-8", "replace"))
         elif _POLLS:
@@ -133,79 +134,82 @@ class _Channel:
         self._record_lines(_PATIENCE_S)
 
     def _follow(self) -> None:
-        """The thread: for as long as anybody has the pipe, a child of this process too."""
-        while not (self._pump() if _POLLS else self._pass_on_waiting()):
+        """The thread's loop, until every writer has closed the pipe, child processes included."""
+        while not (self._pump() if _POLLS else self._forward_blocking()):
             self._record_in_thread()
             if _POLLS:
-                full = len(self._unpassed) >= _MOST_UNPASSED_BYTES
-                old_place = [self._old_place] if self._unpassed else []
-                _wait_for([] if full else [self._outlet], old_place)
+                full = len(self._unforwarded) >= _MOST_UNFORWARDED_BYTES
+                destination = [self._destination] if self._unforwarded else []
+                _wait_for([] if full else [self._read_end], destination)
         with self._lock:
             self._ended = True
-            os.close(self._outlet)
-            os.close(self._old_place)
+            os.close(self._read_end)
+            os.close(self._destination)
         self._record_in_thread()
 
-    def _has_unpassed(self) -> bool:
-        """Whether something that was printed has not reached the old place yet."""
+    def _has_unforwarded(self) -> bool:
+        """Whether some output has not reached the destination yet."""
         if not _POLLS:
             return self._thread.is_alive()
-        return not self._pump() and bool(self._unpassed)
+        return not self._pump() and bool(self._unforwarded)
 
     def _pump(self) -> bool:
-        """Pass on what has come, as far as that needs no waiting; True when no more can come."""
+        """Forward what has arrived, as far as that does not block; True at the end of the pipe."""
         with self._lock:
             while not self._ended:
-                self._pass_on()
-                if len(self._unpassed) >= _MOST_UNPASSED_BYTES:
+                self._forward()
+                if len(self._unforwarded) >= _MOST_UNFORWARDED_BYTES:
                     return False
                 try:
-                    data = os.read(self._outlet, _MOST_UNPASSED_BYTES)
+                    data = os.read(self._read_end, _MOST_UNFORWARDED_BYTES)
                 except BlockingIOError:
                     return False
-                self._unpassed += data
+                self._unforwarded += data
                 self._lines.take(data)
                 if not data:
-                    return not self._unpassed
+                    return not self._unforwarded
         return True
 
-    def _pass_on(self) -> None:
-        while self._unpassed and (not _POLLS or _wait_for([], [self._old_place], 0)):
+    def _forward(self) -> None:
+        while self._unforwarded and (not _POLLS or _wait_for([], [self._destination], 0)):
             try:
-                written = os.write(self._old_place, self._unpassed[:_CHUNK_BYTES])
+                written = os.write(self._destination, self._unforwarded[:_CHUNK_BYTES])
             except BlockingIOError:
                 return
             except OSError as error:
-                if not self._place_gone:
-                    self._place_gone = True
-                    self._lines.add_note(f"{self._name} leads nowhere any more: {error.strerror}")
-                written = len(self._unpassed)
-            del self._unpassed[:written]
+                if not self._destination_failed:
+                    self._destination_failed = True
+                    self._lines.add_note(
+                        f"{self._name} cannot be written any more: {error.strerror}"
+                    )
+                written = len(self._unforwarded)  # discarded: the lines are still recorded
+            del self._unforwarded[:written]
 
-    def _pass_on_waiting(self) -> bool:
-        """For a system that cannot be asked; the lock must not be held by who waits for data."""
-        data = os.read(self._outlet, _MOST_UNPASSED_BYTES)
+    def _forward_blocking(self) -> bool:
+        """Forward the next data, where a pipe cannot be polled."""
+        # Outside of the lock: this read blocks, and a print needs the lock meanwhile.
+        data = os.read(self._read_end, _MOST_UNFORWARDED_BYTES)
         with self._lock:
             self._lines.take(data)
-            self._unpassed += data
-            self._pass_on()
+            self._unforwarded += data
+            self._forward()
         return not data
 
     def _record_in_thread(self) -> None:
-        """Whatever becomes of the lines, what is printed has to be passed on."""
+        """Record in the thread, which must survive any error: it has to go on forwarding."""
         try:
             self._record_lines()
         except Exception as error:  # noqa: BLE001  (only strict mode raises)
             warn(f"{self._name} could not be recorded: {error}")
 
     def _record_lines(self, patience_s: float = 0) -> None:
-        """Record what waits; what the recording itself prints comes with the next line.
+        """Record the waiting lines; output of the recording itself follows with the next line.
 
         Args:
-            patience_s: How long to wait for another thread that is recording just now.
+            patience_s: How long to wait for another thread that is recording.
         """
         if self._recorder == threading.get_ident():
-            return
+            return  # a warning printed while recording must not record itself
         while self._recording.acquire(timeout=patience_s):
             try:
                 self._recorder = threading.get_ident()
@@ -217,35 +221,35 @@ class _Channel:
             if not self._lines.waiting:
                 return
 
-    # -- beginning and end ---------------------------------------------------------------------
+    # -- redirecting ---------------------------------------------------------------------------
 
-    def _lead_through_pipe(self) -> None:
+    def _redirect(self) -> None:
         _flush(self._stream)
-        self._old_place = os.dup(self._descriptor)
-        self._outlet, inlet = os.pipe()
-        if max(self._outlet, self._old_place) >= _MOST_SELECTABLE:
+        self._destination = os.dup(self._descriptor)
+        self._read_end, write_end = os.pipe()
+        if max(self._read_end, self._destination) >= _MOST_SELECTABLE:
             raise OSError("too many files are open")
-        _enlarge(inlet)
+        _enlarge(write_end)
         if _POLLS:
-            os.set_blocking(self._outlet, False)
-        os.dup2(inlet, self._descriptor)
-        self._pipe = os.fstat(inlet)
-        os.close(inlet)
+            os.set_blocking(self._read_end, False)
+        os.dup2(write_end, self._descriptor)
+        self._pipe = os.fstat(write_end)
+        os.close(write_end)
 
-    def _put_back(self) -> None:
-        """Unless somebody has led it elsewhere since."""
+    def _restore(self) -> None:
+        """Restore the stream and the descriptor, unless other code has redirected them since."""
         if getattr(sys, self._name) is self._tee:
             setattr(sys, self._name, self._stream)
         try:
-            leads_here = os.path.samestat(os.fstat(self._descriptor), self._pipe)
-        except OSError:  # somebody has closed it
+            is_ours = os.path.samestat(os.fstat(self._descriptor), self._pipe)
+        except OSError:  # other code has closed it
             return
-        if leads_here:
-            os.dup2(self._old_place, self._descriptor)
+        if is_ours:
+            os.dup2(self._destination, self._descriptor)
 
 
 class _Tee:
-    """A stream of Python's that passes on at once what is printed."""
+    """A Python stream that reports each write at once."""
 
     def __init__(self, stream: Any, printed: Callable[[str], object]) -> None:
         self._stream = stream
@@ -280,11 +284,11 @@ def _flush(stream: Any) -> None:
         if stream is not None:
             stream.flush()
     except (OSError, ValueError) as error:
-        warn(f"what was printed before could not be flushed: {error}")
+        warn(f"earlier output could not be flushed: {error}")
 
 
 def _flush_c() -> None:
-    """What C code printed waits in a buffer of its own until the process ends."""
+    """Flush the buffer of the C library, which else stays until the process ends."""
     if _POLLS and (ctypes := sys.modules.get("ctypes")) is not None:
         ctypes.CDLL(None).fflush(None)
 
@@ -296,11 +300,11 @@ def _wait_for(readable: list[int], writable: list[int], timeout_s: float | None 
 
 
 def _enlarge(pipe: int) -> None:
-    """Where the system lets one: Linux."""
+    """Enlarge a pipe where the system allows it: on Linux."""
     if sys.platform == "linux":
         import fcntl
 
         try:
             fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
-        except OSError:  # this user has many pipes: it stays as it is
+        except OSError:  # the user's limit for pipes is reached: the default size remains
             return

@@ -1,4 +1,4 @@
-"""Noticing when a text or a flag of the published state changes, while it happens."""
+"""Detecting when a text or a flag of the published state changes, as it happens."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Any, Final
 from webots_mcp.bridge.cleaning import MAX_KEY_CHARACTERS, key_text
 from webots_mcp.bridge.text import cut
 
-MOST_CHANGES: Final = 1000  # in one run; a text that changes in every row is no mode
-_MOST_KEYS: Final = 1000  # a state of more is no list of what a robot is at
-_LONGEST: Final = 1000  # characters; a longer text is no mode either
+MOST_CHANGES: Final = 1000  # in one run; a text that changes in every row is not a mode
+_MOST_KEYS: Final = 1000  # a larger state is data, not a list of modes and flags
+_LONGEST: Final = 1000  # characters; a longer text is not a mode either
 _UNSEEN: Final = object()
 
 
@@ -27,24 +27,24 @@ class Changes:
         self._count = 0
 
     def forget(self) -> None:
-        """A new run has begun: its first values are no changes."""
+        """A new run has begun: its first values are not changes."""
         self._last.clear()
         self._count = 0
 
     def look(self, state: Mapping[Any, Any]) -> Iterable[tuple[str, object, object]]:
-        """The (name, before, after) of what changed since the last look; usually nothing."""
+        """The (name, before, after) of each change since the last call; usually none."""
         changed: list[tuple[str, object, object]] = []
         last = self._last
         if len(state) > _MOST_KEYS:
             return changed
-        for key, value in islice(state.items(), _MOST_KEYS):  # not all mappings come to their end
+        for key, value in islice(state.items(), _MOST_KEYS):  # a user's mapping may be endless
             if type(value) is not bool and not (type(value) is str and len(value) <= _LONGEST):
                 continue
             before = last.get(key, _UNSEEN)
             if before is value or before == value:
                 continue
             if before is _UNSEEN and len(last) >= _MOST_KEYS:
-                continue  # keys that are never the same would fill the memory
+                continue  # keys that change all the time would fill the memory
             last[key] = value
             if before is not _UNSEEN and self._count < MOST_CHANGES:
                 self._count += 1

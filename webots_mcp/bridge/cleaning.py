@@ -1,7 +1,6 @@
-"""A copy of any value that JSON can hold, of bounded size.
+"""A copy of any value, of bounded size, that JSON can hold.
 
-What stands near the top comes first: where there is no room for everything, it is the depths that
-are cut.
+Values are copied breadth first: where there is no room for everything, the deepest levels are cut.
 """
 
 from __future__ import annotations
@@ -35,16 +34,16 @@ MAX_KEYS_BYTES: Final = 150_000  # of all keys of a row
 MAX_KEY_CHARACTERS: Final = 200
 MAX_NAMED: Final = 1000
 _TOP_KEYS: Final = 1000  # of a state that has more keys than there is room for
-_MOST_PATHS_CHARACTERS: Final = 50_000  # of all together
+_MOST_PATHS_CHARACTERS: Final = 50_000  # of all paths of a row
 _MOST_REASON_CHARACTERS: Final = 200
-_LONGEST_ESCAPE: Final = 6
+_LONGEST_ESCAPE: Final = 6  # bytes of JSON for one character, as in \u0000
 _MOST_KEY_BITS: Final = 1000  # the text of a longer integer takes long to make
-# For the objects of a row, which take their own time. The processor's, because by the wall clock
-# another process that runs in between would cost values.
+# For all objects of a row together, since converting them runs code of unknown cost. Processor
+# time: by the wall clock, another process that runs in between would cost values.
 LONGEST_S: Final = 0.01
 
 
-# Where a value stands: its path is put together only where it has to be named.
+# Where a value is: a linked list, since most places are never named and need no path text.
 Place: TypeAlias = "tuple[Place | None, str | int]"
 
 
@@ -59,15 +58,15 @@ class _Unfilled(NamedTuple):
 
 
 class Cleaner:
-    """Copies one value, and names in `odd` what it had to replace or to cut.
+    """Copies one value, and names in `replaced` what it had to replace or to cut.
 
     Attributes:
-        odd: Dotted path to kind.
-        unnamed: How many more there are that `odd` does not name.
+        replaced: Dotted path to kind.
+        unnamed: How many more there are that `replaced` does not name.
     """
 
     def __init__(self) -> None:
-        self.odd: dict[str, str] = {}
+        self.replaced: dict[str, str] = {}
         self.unnamed = 0
         self._room = MAX_ROOM
         self._texts_bytes = MAX_TEXTS_BYTES
@@ -77,28 +76,28 @@ class Cleaner:
         self._until_s = time.thread_time() + LONGEST_S
 
     def clean(self, state: object) -> object:
-        """The plain counterpart of any value; one that fails costs itself and no other."""
+        """The plain counterpart of any value; an item that fails is left out, and no other."""
         cleaned = self._value(state, (None, ""), 0)
         while self._unfilled:
             self._fill(self._unfilled.popleft())
         if self.unnamed:
-            named = self.odd.get("")
+            named = self.replaced.get("")
             more = f"{self.unnamed} more"
-            self.odd[""] = f"{named}; {more}" if named else more
+            self.replaced[""] = f"{named}; {more}" if named else more
         return cleaned
 
     def _value(self, value: Any, place: Place, depth: int) -> object:
         try:
             return self._plain(value, place, depth)
-        except Exception as error:  # noqa: BLE001  (any object may fail in its own way)
-            return self._replaced(place, failure(value, error))
+        except Exception as error:  # noqa: BLE001  (the user's objects may raise anything)
+            return self._replace(place, failure(value, error))
 
     def _plain(self, value: Any, place: Place, depth: int) -> object:
         kind = type(value)  # pyright: ignore[reportUnknownVariableType]
         if value is None or kind is bool:
             return value
         if kind is float:
-            return value if math.isfinite(value) else self._replaced(place, str(value))
+            return value if math.isfinite(value) else self._replace(place, str(value))
         if isinstance(value, int):
             return self._int(int(value), place)
         if isinstance(value, float):
@@ -106,7 +105,7 @@ class Cleaner:
         if isinstance(value, str):
             return self._text(str(value.value) if isinstance(value, enum.Enum) else value, place)
         if depth >= MAX_DEPTH:
-            return self._replaced(place, "too deep")
+            return self._replace(place, "too deep")
         if kind is dict:
             return self._mapping(cast("dict[object, object]", value), place, depth)
         if isinstance(value, (list, tuple, set, frozenset, deque)):
@@ -123,7 +122,7 @@ class Cleaner:
         try:
             return float(value)
         except OverflowError:
-            return self._replaced(place, "int")
+            return self._replace(place, "int")
 
     def _text(self, value: str, place: Place) -> str:
         most_bytes = min(MAX_TEXT_BYTES, self._texts_bytes)
@@ -139,10 +138,10 @@ class Cleaner:
     def _bytes(self, value: memoryview, place: Place) -> str | None:
         count = value.nbytes
         if count > MAX_BYTES:
-            return self._replaced(place, f"bytes[{count}]")
+            return self._replace(place, f"bytes[{count}]")
         text = base64.b64encode(value.tobytes()).decode("ascii")
         if len(text) > self._texts_bytes:
-            return self._replaced(place, f"bytes[{count}]")
+            return self._replace(place, f"bytes[{count}]")
         self._texts_bytes -= len(text)
         self._name(place, "bytes")
         return text
@@ -186,7 +185,7 @@ class Cleaner:
     def _key(self, key: object, place: Place) -> str:
         try:
             text = key_text(key)
-        except Exception:  # noqa: BLE001  (as with values: it costs itself)
+        except Exception:  # noqa: BLE001  (as with values: only this key is replaced)
             name, kind = f"<{kind_name(key)}>", "key"
         else:
             name, kind = _without_surrogates(text[:MAX_KEY_CHARACTERS]), "surrogate"
@@ -201,7 +200,7 @@ class Cleaner:
 
     def _items(self, value: Iterable[object], place: Place, depth: int) -> object:
         if (count := item_count(value)) > self._room:
-            return self._replaced(place, f"array[{count}]")
+            return self._replace(place, f"array[{count}]")
         items: list[Any] = list(islice(value, count))
         kinds = set(map(type, items))
         if _are_numbers(items, kinds):
@@ -209,14 +208,14 @@ class Cleaner:
             return self._numbers(_plain_numbers(items, kinds), place)
         count, room = _nested(items)
         if room > self._room:
-            return self._replaced(place, f"array[{count}]")
+            return self._replace(place, f"array[{count}]")
         self._take(ROOM_OF_A_VALUE * len(items))
         cleaned: list[object] = []
         self._unfilled.append(_Unfilled(cleaned, value, items, place, depth + 1))
         return cleaned
 
     def _numbers(self, items: list[Any], place: Place) -> list[Any]:
-        """What lidars and cameras give: thousands of numbers, without a call for each."""
+        """Copy an array of numbers: thousands of them (lidars), so without a call for each."""
         finite = list(map(math.isfinite, items))
         kinds = set(map(str, compress(items, map(not_, finite))))
         if not kinds:
@@ -234,9 +233,9 @@ class Cleaner:
         if isinstance(value, (bytes, bytearray, memoryview)):
             return self._bytes(memoryview(cast("bytes", value)), place)
         if time.thread_time() > self._until_s:
-            return self._replaced(place, f"type {kind_name(value)}: no time left")
+            return self._replace(place, f"type {kind_name(value)}: no time left")
         if (count := item_count(value)) > self._room:
-            return self._replaced(place, f"array[{count}]")
+            return self._replace(place, f"array[{count}]")
         return self._plain(convert(value), place, depth + 1)
 
     def _take(self, room: int) -> bool:
@@ -245,13 +244,16 @@ class Cleaner:
         self._room -= room
         return True
 
-    def _replaced(self, place: Place, kind: str) -> None:
+    def _replace(self, place: Place, kind: str) -> None:
         self._name(place, kind)
 
     def _name(self, place: Place, kind: str) -> None:
-        if len(self.odd) + self.unnamed < MAX_NAMED and len(path := _path(place)) <= self._paths:
+        if (
+            len(self.replaced) + self.unnamed < MAX_NAMED
+            and len(path := _path(place)) <= self._paths
+        ):
             self._paths -= len(path)
-            self.odd[path] = kind
+            self.replaced[path] = kind
         else:
             self.unnamed += 1
 
@@ -296,7 +298,7 @@ def _without_surrogates(text: str) -> str:
 
 
 def _are_numbers(items: list[Any], kinds: set[type]) -> bool:
-    """Whether all are, and none is an integer that has to be looked at."""
+    """Whether all are numbers, and no integer is beyond 64 bits."""
     if not kinds or not all(issubclass(kind, (float, int)) for kind in kinds):
         return False
     if not any(issubclass(kind, int) for kind in kinds):
@@ -305,7 +307,7 @@ def _are_numbers(items: list[Any], kinds: set[type]) -> bool:
 
 
 def _plain_numbers(items: list[Any], kinds: set[type]) -> list[Any]:
-    """Those of classes of their own (numpy's, enums) as Python's."""
+    """The numbers as Python's own types, where they are of a subclass (numpy's, enums)."""
     return items if kinds <= {float, int, bool} else [_plain_number(item) for item in items]
 
 
@@ -316,7 +318,7 @@ def _plain_number(item: Any) -> float:
 
 
 def _nested(items: list[Any]) -> tuple[int, int]:
-    """How many items a list of equal lists has, as its first ones show, and the room they take."""
+    """The number of items of a list of equal lists, judged by the first ones, and their room."""
     count, lists, inside = len(items), 0, items
     for _ in range(MAX_DEPTH):
         if not _are_equal_lists(inside):
@@ -342,8 +344,8 @@ def failure(value: object, error: Exception) -> str:
 
 
 def _reason(error: Exception) -> str:
-    """Its text, which may be long, or fail as well."""
+    """The text of an error, which may be long, or raise as well."""
     try:
         return str(error)[:_MOST_REASON_CHARACTERS]
-    except Exception:  # noqa: BLE001  (an exception of the user's own)
+    except Exception:  # noqa: BLE001  (the user's exception may raise in its __str__)
         return kind_name(error)

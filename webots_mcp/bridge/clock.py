@@ -1,4 +1,4 @@
-"""Simulation time as the controller sees it: when it moves, and when it goes back."""
+"""Simulation time as the controller sees it: when it advances, and when it goes back."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ _EPSILON_S: Final = 1e-9
 class Clock:
     """The newest simulation time, and the run that it belongs to.
 
-    Time going backwards is all the notice that a controller gets of a reset.
+    A controller is not notified of a reset: it only sees that time has gone back.
     """
 
     def __init__(self, simulation: Simulation) -> None:
         self._simulation = simulation
         self.sim_time_s = simulation.time_s
         self.moved_s: float | None = None  # by the monotonic clock
-        self.stepped_s = self.sim_time_s  # at the end of the newest step that was gone along with
-        self.steps_seen = 0  # looks at which time had gone forward, or the steps between them
-        self.step_s: float | None = None  # of a loop that does not make the steps itself
+        self.stepped_s = self.sim_time_s  # at the end of the newest step that the bridge saw
+        self.steps_seen = 0  # calls of `look` at which time had advanced, or the steps between them
+        self.step_s: float | None = None  # of a loop that only watches the steps of others
         self.run = Run("start", self.sim_time_s)
         self.ended_sim_time_s = self.sim_time_s  # of the run before this one
         self._reset_from_s: float | None = None
@@ -32,8 +32,8 @@ class Clock:
         """Read the time; True if it went back since the last look: a new run has begun.
 
         Args:
-            after_step: A step has just ended, which is the only proof that one was made where the
-                time is the same again.
+            after_step: A step has just ended. Where the time is the same as before, only this
+                proves that a step was made, and so that the awaited reset has happened.
         """
         before, now = self.sim_time_s, self._simulation.time_s
         self.sim_time_s = now
@@ -51,7 +51,7 @@ class Clock:
         return True
 
     def start_moving(self) -> None:
-        """From this moment on time moves; it counts as standing only after a while without."""
+        """Count time as moving from now on; it counts as standing still only after a while."""
         self.moved_s = time.monotonic()
 
     def newest_s(self, run: Run) -> float:
@@ -59,15 +59,16 @@ class Clock:
         return self.sim_time_s if run is self.run else self.ended_sim_time_s
 
     def await_reset(self) -> None:
-        """A reset was asked for. It comes with the end of the next physics step.
+        """A reset was asked for. It happens at the end of the next physics step.
 
-        Close to the start the first time after it is not below the last one before it: from 0
-        any time that follows, and else the same time again after a step, is that of the new run.
+        Close to the start of a run, the first time after the reset is not below the last one before
+        it. So where the last time was 0, any later time is taken for the new run's; else the same
+        time again after a step is.
         """
         self._reset_from_s = self.sim_time_s
 
     def forget_reset(self) -> None:
-        """The reset did not come."""
+        """No reset happened in time: do not wait for it any more."""
         self._reset_from_s = None
 
     def _is_awaited_reset(self, now_s: float, after_step: bool) -> bool:

@@ -1,6 +1,6 @@
-"""The controller's end of the command queue: what it claims, and the answers that it writes.
+"""The controller's side of the command queue: claiming commands and writing their answers.
 
-The statements and what they guarantee are those of `webots_mcp.queue`.
+The SQL statements and their guarantees are in `webots_mcp.queue`.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from webots_mcp.bridge.text import storable
 from webots_mcp.queue import CLAIM, CLAIMED_SINCE, PEEK, SUCCESSOR_PID
 
 Progress = Generator[None, None, object]
-"""A built-in action under way: it yields until its outcome is known, and returns the result."""
+"""A running built-in action: it yields until its outcome is known, and returns the result."""
 
 _MOST_NAMED: Final = 10
 
-_INTERRUPTED: Final = "the controller was interrupted before it began; it did not run"
+_INTERRUPTED: Final = "the controller was interrupted before the command began; it was not run"
 
 
 class ClaimedCommand:
@@ -44,12 +44,12 @@ class ClaimedCommand:
         self.requested_by = requested_by
 
     def as_dict(self) -> dict[str, Any]:
-        """What handlers get: the parameters as keys too, where the names are free."""
+        """What handlers receive; the parameters are keys too, except `id`, `action`, `params`."""
         return {**self.params, "id": self.id, "action": self.action, "params": self.params}
 
 
 class ClaimedCommands:
-    """Claims commands for this session and writes their fate."""
+    """Claims commands for this session and writes their outcome."""
 
     def __init__(self, recorder: Recorder) -> None:
         self._recorder = recorder
@@ -57,9 +57,9 @@ class ClaimedCommands:
         self._claiming = False
 
     def claim(self, sim_time_s: float) -> ClaimedCommand | None:
-        """The oldest command that waits for this robot, now ours; None costs no lock.
+        """Claim the oldest pending command of this robot; None, without a lock, where none is.
 
-        Call `begin` with it. One that an interrupt kept from that fails with the next call.
+        Call `begin` with it. Where an interrupt prevents that, the next call writes it as failed.
         """
         recorder, now = self._recorder, time.time()
         registration = recorder.session.registration
@@ -71,7 +71,7 @@ class ClaimedCommands:
         times = {"now": now, "sim_time": sim_time_s}
         self._claiming = True
         rows = recorder.fetch(CLAIM, {**ids, **times})
-        if rows is None:  # whether it was claimed is asked with the next call
+        if rows is None:  # the next call asks whether it was claimed
             return None
         command = self._read(rows[0], registration.session_id, sim_time_s) if rows else None
         if command is None:
@@ -80,7 +80,7 @@ class ClaimedCommands:
         return command
 
     def begin(self, command: ClaimedCommand) -> None:
-        """It is in the hands of who runs it: whatever happens now, its fate will be written."""
+        """The caller runs it from here on, and writes its outcome whatever happens."""
         self._last_begun = command.id
         self._claiming = False
 
@@ -98,8 +98,8 @@ class ClaimedCommands:
         for (pid,) in self._recorder.fetch(SUCCESSOR_PID, ids) or ():
             self._recorder.errors.warn(
                 "successor",
-                f"commands for robot {registration.robot_name!r} go to process {pid}, which began "
-                "later under the same name: end one of the two",
+                f"commands for robot {registration.robot_name!r} go to process {pid}, which "
+                "started later under the same name: end one of the two processes",
             )
 
     def _read(
@@ -113,7 +113,7 @@ class ClaimedCommands:
         command = ClaimedCommand(command_id, action.decode("utf-8", "replace"), {}, session_id, by)
         try:
             params = json.loads(text or b"")
-        except (ValueError, RecursionError):  # no JSON, no UTF-8, or nested beyond all sense
+        except (ValueError, RecursionError):  # not JSON, not UTF-8, or nested too deeply
             params = None
         if isinstance(params, dict):
             command.params = cast("dict[str, Any]", params)
@@ -123,17 +123,20 @@ class ClaimedCommands:
         return None
 
     def issue(self, command: ClaimedCommand) -> None:
-        """Note that Webots is about to be asked for what may end this process."""
+        """Record that Webots is about to be asked for a reset or reload, which may end the process.
+
+        This waits until it is in the database: the successor confirms only what it finds there.
+        """
         values = {"now": time.time(), "command": command.id}
         self._recorder.record("command issued", None, values)
-        deadline_s = time.monotonic() + 1  # the world stands still for a reload anyway
+        deadline_s = time.monotonic() + 1  # a wait is acceptable: the world stops for a reload
         while not self._recorder.flush() and time.monotonic() < deadline_s:
             time.sleep(0.002)
 
     def succeed(self, command: ClaimedCommand, result: object, sim_time_s: float) -> str | None:
-        """Write `done` with the result, and what of it had to be replaced, which is returned."""
+        """Write `done` with the result; returns (and writes) what had to be replaced in it."""
         encoded = encode(result)
-        replaced = _name_replaced(encoded.odd)
+        replaced = _name_replaced(encoded.replaced)
         self._finish(command, "done", encoded.text, replaced, sim_time_s)
         return replaced
 
@@ -150,18 +153,20 @@ class ClaimedCommands:
         at_s: float,
     ) -> None:
         times = {"now": time.time(), "sim_time": at_s}
-        fate = {"command": command.id, "status": status, "result": result, "error": error}
-        if self._recorder.record("command finished", None, {**fate, **times}) == 0:
+        outcome = {"command": command.id, "status": status, "result": result, "error": error}
+        # No row changed: another process has declared this session dead meanwhile.
+        if self._recorder.record("command finished", None, {**outcome, **times}) == 0:
             self._recorder.errors.warn(
                 f"command {command.id}",
-                f"command {command.id} ({command.action}) was judged lost before it was {status}",
+                f"command {command.id} ({command.action}) was declared lost before it was {status}",
             )
 
 
-def _name_replaced(odd: Mapping[str, str]) -> str | None:
+def _name_replaced(replaced: Mapping[str, str]) -> str | None:
     """The parts of a result that JSON cannot hold, by path and kind."""
-    if not odd:
+    if not replaced:
         return None
-    named = [f"{path or 'all of it'} ({kind})" for path, kind in list(odd.items())[:_MOST_NAMED]]
-    more = f" and {len(odd) - _MOST_NAMED} more" if len(odd) > _MOST_NAMED else ""
-    return f"replaced in the result, which JSON cannot hold as it was: {', '.join(named)}{more}"
+    first = list(replaced.items())[:_MOST_NAMED]
+    named = [f"{path or 'all of it'} ({kind})" for path, kind in first]
+    more = f" and {len(replaced) - len(first)} more" if len(replaced) > len(first) else ""
+    return f"values of the result that JSON cannot hold were replaced: {', '.join(named)}{more}"

@@ -1,4 +1,4 @@
-"""The lock on a recorder's connection: one call at a time, whatever interrupts it."""
+"""The lock on a recorder's connection: one call at a time, released even if interrupted."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ BETWEEN_TRIES_S: Final = 0.0 if sys.platform == "win32" else 0.0001
 
 
 class ConnectionLock:
-    """A lock that belongs to a call, and ends with it however it ends.
+    """A lock that belongs to a function call, and is free again when that call has ended.
 
-    A KeyboardInterrupt comes between any two instructions, so also between a lock's `acquire()`
-    and the `try` that would release it. Here taking and naming the holder is one instruction, and
-    a holder whose call is over holds nothing any more: its thread takes the lock over.
+    A KeyboardInterrupt may come between any two instructions, so also between a lock's `acquire()`
+    and the `try` that would release it: a `threading.Lock` would then stay locked for ever. Here
+    taking the lock and naming its holder is one instruction (`dict.setdefault`), and the lock of a
+    call that has ended is taken over by the next call of the same thread.
     """
 
     def __init__(self) -> None:
@@ -37,7 +38,7 @@ class ConnectionLock:
         return held is mine or self._acquire_later(held, mine, time.monotonic() + patience_s)
 
     def release(self) -> None:
-        """Another call may have it."""
+        """Free the lock for another call."""
         self._held.pop(_HOLDER, None)
 
     def _acquire_later(
@@ -46,7 +47,7 @@ class ConnectionLock:
         while held is not mine:
             if held[0] == mine[0]:
                 if _is_under_way(held[1]):
-                    return False  # this call was made from within that one: a signal's handler
+                    return False  # made from within the holder, by a signal handler: never wait
                 self._held.pop(_HOLDER)
             elif time.monotonic() >= until_s:
                 return False
@@ -57,7 +58,7 @@ class ConnectionLock:
 
 
 def _is_under_way(call: FrameType) -> bool:
-    """Python refuses to clear the frame of a call that is still executing."""
+    """Whether a call is still executing: Python refuses to clear the frame of one that is."""
     try:
         call.clear()
     except RuntimeError:

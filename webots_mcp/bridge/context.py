@@ -22,7 +22,7 @@ from webots_mcp.bridge.throttle import Throttle
 
 
 class Context(NamedTuple):
-    """What serving commands, and each built-in action, has to work with."""
+    """The parts that serving commands and each built-in action work with."""
 
     simulation: Simulation
     clock: Clock

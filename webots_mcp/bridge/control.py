@@ -27,42 +27,42 @@ class Control:
 
     Attributes:
         handlers: The controller's own actions.
-        why_ended: What commands that were under way are told when the process ends.
+        why_ended: The error of commands that are still running when the process ends.
     """
 
     def __init__(self, context: Context) -> None:
         self._context = context
         self.handlers = Handlers(context.recorder, context.journal, context.pause)
         self.why_ended = "the controller ended"
-        self._under_way: dict[ClaimedCommand, Progress] = {}
+        self._running: dict[ClaimedCommand, Progress] = {}
         self._reported = False
         self._next_poll_s = 0.0
         context.pause.serve = self._serve_pause
 
     def report_end(self, *, extern: bool) -> None:
-        """The process is about to end: say what no successor will say."""
-        for under_way in [c for c in self._under_way if c.action in (*LOOPING, *ENDING)]:
-            self._end(under_way, ControllerEndedError(self.why_ended))
+        """The process is about to end: answer the commands that no successor will answer."""
+        for running in [c for c in self._running if c.action in (*LOOPING, *ENDING)]:
+            self._end(running, ControllerEndedError(self.why_ended))
         command = self._context.reloads.requested_by
         if command is not None and extern and not self._reported:
             self._reported = True
-            self._under_way.pop(command, None)
+            self._running.pop(command, None)
             self._succeed(command, {"controller": f"it has ended; {EXTERN}"})
 
     def serve(self) -> ClaimedCommand | None:
-        """One round: what is under way, one new command, and the pause if there is one.
+        """One round: advance running actions, begin one new command, and stay in a pause.
 
         Returns:
             The command that was handled last in this call, if any.
         """
         now, handled = time.monotonic(), None
         due = now >= self._next_poll_s
-        if not (due or self._under_way or self._context.pause.active):
+        if not (due or self._running or self._context.pause.active):
             return None
         self._advance_all()
         if due:
             handled = self._serve_one()
-            # Commands seldom come alone: after one, the next round looks for another.
+            # Commands often come in groups: after one, the next round looks for another.
             self._next_poll_s = now + POLL_INTERVAL_S if handled is None else now
         return self._serve_pause() or handled
 
@@ -95,50 +95,54 @@ class Control:
                 progress = actions.begin(self._context, command)
                 if built_in.ends_steps:
                     self._interrupt(f"interrupted by command {command.id} ({command.action})")
-                self._under_way[command] = progress
+                self._running[command] = progress
         except BaseException as error:
             self._fail(command, error)  # whatever a handler raises is the answer
             if not isinstance(error, Exception):
-                raise
+                raise  # Ctrl-C and SystemExit still end the loop, but the command is answered first
         self._advance(command)
 
     def _advance_all(self) -> None:
-        for command in tuple(self._under_way):
+        for command in tuple(self._running):  # a copy: an advanced action leaves or changes it
             if self._context.simulation.over:
                 self._abandon(command)
             else:
                 self._advance(command)
 
     def _abandon(self, command: ClaimedCommand) -> None:
-        """Webots is not asked for anything any more; the successor confirms a reload."""
+        """Drop an action after Webots said quit; a reload is left for the successor to confirm."""
         if command.action == "reload":
-            del self._under_way[command]
+            del self._running[command]
         else:
             self._end(command, ControllerEndedError("Webots ended the controller"))
 
     def _advance(self, command: ClaimedCommand) -> None:
-        """Go on with a built-in action; a callback of the user's in it may come back to here."""
-        progress = self._under_way.pop(command, None)
+        """Advance a built-in action by one round.
+
+        It is taken out meanwhile: a callback of the user may call `get_command()` and so come back
+        to here, and a generator cannot be entered twice.
+        """
+        progress = self._running.pop(command, None)
         if progress is None:
             return
         try:
             next(progress)
-            self._under_way[command] = progress
+            self._running[command] = progress
         except StopIteration as end:
             self._succeed(command, end.value)
         except BaseException as error:
-            self._fail(command, error)  # whatever went wrong is the answer
+            self._fail(command, error)  # whatever the action raises is the answer
             if not isinstance(error, Exception):
                 raise
 
     def _interrupt(self, why: str) -> None:
-        """Something else decides from now on how the loop goes on."""
-        for command in [c for c in self._under_way if c.action in LOOPING]:
+        """Another command controls the loop from now on: end the ones that let it run."""
+        for command in [c for c in self._running if c.action in LOOPING]:
             self._end(command, InterruptedCommandError(why))
 
     def _end(self, command: ClaimedCommand, interruption: InterruptedCommandError) -> None:
-        """End a built-in action that is under way: it may say how far it came."""
-        progress = self._under_way.pop(command)
+        """End a running built-in action, which may answer how far it got."""
+        progress = self._running.pop(command)
         try:
             progress.throw(interruption)
         except StopIteration as end:

@@ -1,4 +1,4 @@
-"""The plain counterpart of a value that JSON does not know, as far as it has one."""
+"""Converting a value of a type that JSON does not know to its plain counterpart, if it has one."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ _UNKNOWN_LENGTH: Final = "pointer of unknown length"
 
 
 class NoCounterpartError(TypeError):
-    """The value cannot be stored; the text says what stood there."""
+    """The value cannot be stored; the text names what it was."""
 
 
 class Unreadable:
-    """Stands for a field that must not be read."""
+    """Placeholder of a field that must not be read."""
 
 
 def convert(value: Any) -> object:
-    """What a value is in JSON's terms; what that contains may have to be converted in its turn.
+    """The JSON counterpart of a value; its items may have to be converted in their turn.
 
     Raises:
         NoCounterpartError: It has no counterpart, or more items than a row takes.
-        Exception: Whatever the value raises while it is asked.
+        Exception: Whatever the value raises while it is read.
     """
     if isinstance(value, Unreadable):
         raise NoCounterpartError(_UNKNOWN_LENGTH)
@@ -52,12 +52,15 @@ def convert(value: Any) -> object:
 
 
 def kind_name(value: object) -> str:
-    """The name of its class, which may be anything."""
+    """The name of its class, cut: a class may have a name of any length."""
     return type(value).__name__[:_MOST_KIND_CHARACTERS]
 
 
 def item_count(value: Any) -> int:
-    """Of an array or a container; `size` would be a method or a tuple on some that are neither."""
+    """The number of items of an array or a container; 0 of anything else.
+
+    Numpy's `size` is not used: on classes that are neither it may be a method or a tuple.
+    """
     if isinstance(shape := getattr(value, "shape", None), tuple):
         return math.prod(cast("tuple[int, ...]", shape))
     return len(value) if hasattr(value, "__len__") else 0
@@ -83,7 +86,7 @@ def is_number_array(value: Any) -> bool:
 
 
 def _ctypes_of(value: object) -> Any:
-    """The module, if the value is one of its; Webots' package has imported it, other code may not.
+    """The ctypes module if the value is of one of its types, else None; it is never imported here.
 
     All data of ctypes derives from one class, which has no public name.
     """
@@ -95,7 +98,9 @@ def _ctypes_of(value: object) -> Any:
 
 
 def _read_c(ctypes: Any, value: Any) -> object:
-    """Numbers, arrays and structures; an address is never followed, not even to a C string.
+    """Read numbers, arrays and structures; a pointer is never followed, not even to a C string.
+
+    What it points to may be freed by now, and reading it would crash the controller.
 
     Raises:
         NoCounterpartError: It is a pointer, or an array of more items than a row takes.
@@ -124,15 +129,15 @@ def _c_fields(structure: Any) -> Iterator[tuple[str, object]]:
 
 
 def _is_followed(kind: Any) -> bool:
-    """Whether ctypes follows such an address by itself, as soon as the field is read."""
+    """Whether ctypes follows such a pointer by itself as soon as the field is read."""
     code = getattr(kind, "_type_", None)
     return isinstance(code, str) and code in _ADDRESSES
 
 
 # -- everything else ---------------------------------------------------------------------------
 
-# By what the object can do, not by its type: numpy, dataclasses, datetime and pathlib would cost
-# the controller their import.
+# By the object's attributes, not by its type: importing numpy, dataclasses, datetime and pathlib to
+# test types would slow down every controller's start.
 _CONVERSIONS: Final[tuple[tuple[str, Callable[[Any], object]], ...]] = (
     ("tolist", lambda array: _listed(array)),  # numpy scalars and arrays, array.array
     ("__dataclass_fields__", lambda data: {name: getattr(data, name) for name in _fields(data)}),
@@ -142,24 +147,24 @@ _CONVERSIONS: Final[tuple[tuple[str, Callable[[Any], object]], ...]] = (
     ("__fspath__", lambda path: path.__fspath__()),
     ("urn", str),  # UUID
     ("__float__", float),  # decimal, fraction
-    ("keys", lambda mapping: {key: mapping[key] for key in _as_many_as_said(mapping.keys())}),
-    ("isdisjoint", lambda items: list(_as_many_as_said(items))),  # set, frozenset
-    ("__reversed__", lambda items: list(_as_many_as_said(items))),  # deque, range, sequences
+    ("keys", lambda mapping: {key: mapping[key] for key in _bounded(mapping.keys())}),
+    ("isdisjoint", lambda items: list(_bounded(items))),  # set, frozenset
+    ("__reversed__", lambda items: list(_bounded(items))),  # deque, range, sequences
 )
 
 
 def _listed(array: Any) -> object:
-    """Numpy has no plain number for its long doubles."""
-    plain = array.tolist()
+    """A numpy array or scalar as plain values."""
+    plain = array.tolist()  # which returns a long double itself: there is no plain number for it
     return float(plain) if type(plain) is type(array) else plain
 
 
 def _fields(data: Any) -> Iterable[str]:
-    """Without those that belong to the class or only to its constructor."""
+    """A dataclass's fields, without ClassVar and InitVar ones."""
     fields: dict[str, Any] = data.__dataclass_fields__
     return (name for name, field in fields.items() if str(field._field_type) == "_FIELD")
 
 
-def _as_many_as_said(items: Iterable[Any]) -> Iterable[Any]:
-    """Also of an object that never comes to its end."""
+def _bounded(items: Iterable[Any]) -> Iterable[Any]:
+    """As many items as `len` says: an object's own iterator may be endless."""
     return islice(items, min(MOST_ITEMS, item_count(items) or MOST_ITEMS))

@@ -1,4 +1,4 @@
-"""Reading the devices for `auto_publish`, and how often the ring buffer may ask for it."""
+"""Reading the devices for `auto_publish`, and limiting how often it is done for the ring buffer."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.simulation import Simulation
 
-MOST_READING_US: Final = 100.0  # per call, on average, for rows that are only held
-_READINGS: Final = 9  # one of them that was interrupted does not decide
+MOST_READING_US: Final = 100.0  # per call, on average, for rows that go to the ring buffer only
+_READINGS: Final = 9  # their median counts, so that a single interrupted reading does not
 
 
 class DeviceReader:
-    """Reads a robot's devices, and measures what that takes.
+    """Reads a robot's devices, and measures how long that takes.
 
     Attributes:
-        ring_interval: One call of `auto_publish` in so many may be read only to be held: as many
-            as keep the mean of all calls below 100 us.
-        why: What it is for; empty while each call is read.
+        ring_interval: One call of `auto_publish` in this many reads the devices for the ring
+            buffer alone, which limits the mean time of all calls to 100 us.
+        why: The reason for an interval above 1; empty while the interval is 1.
     """
 
     def __init__(self, simulation: Simulation, journal: Journal, errors: ErrorReport) -> None:
@@ -31,12 +31,12 @@ class DeviceReader:
         self._journal = journal
         self._errors = errors
         self._durations_us: deque[float] = deque(maxlen=_READINGS)
-        self._told = 1
+        self._reported_interval = 1
         self.ring_interval = 1
         self.why = ""
 
     def read(self) -> dict[str, object]:
-        """What the devices say; without what cannot be read, which is counted."""
+        """The devices' values, without those that cannot be read; these are counted as failures."""
         if self._simulation.over:
             return {}
         started_s = time.perf_counter()
@@ -52,15 +52,15 @@ class DeviceReader:
         self._errors.failed(f"auto_publish of the device {name!r}", error)
 
     def _count(self, duration_us: float) -> None:
-        """The median of the last ones decides; a single slow one is not reported."""
+        """Set the interval by the median of the last durations; log it when it has doubled."""
         self._durations_us.append(duration_us)
         usual_us = statistics.median(self._durations_us)
         interval = max(1, math.ceil(usual_us / MOST_READING_US))
         if interval != self.ring_interval:
             self.ring_interval = interval
             self.why = _why(interval, usual_us) if interval > 1 else ""
-        if self.ring_interval > self._told and len(self._durations_us) == _READINGS:
-            self._told = 2 * self.ring_interval
+        if self.ring_interval > self._reported_interval and len(self._durations_us) == _READINGS:
+            self._reported_interval = 2 * self.ring_interval
             self._journal.log("info", "bridge", f"ring buffer: {self.why}")
 
 

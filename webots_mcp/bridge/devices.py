@@ -1,8 +1,8 @@
-"""Reading what a robot's enabled devices say, for `auto_publish`.
+"""Reading the values of a robot's enabled devices, for `auto_publish`.
 
-Nothing is enabled, changed or taken here: a sensor's sampling period and a receiver's packets
-belong to the user's code. What needs to be enabled is not read before, since Webots prints an error
-line at every such reading.
+Nothing is enabled, changed or consumed here: a sensor's sampling period and a receiver's packets
+belong to the user's code. A disabled sensor is not read, since Webots prints an error line at every
+such reading.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from operator import methodcaller
 from typing import Any, Final, NamedTuple, cast
 
 SECTORS: Final = 8
-MOST_OBJECTS: Final = 8  # of a camera or a radar that are told, the nearest first
-_MOST_LOOKED_AT: Final = 64
+MOST_OBJECTS: Final = 8  # of a camera or a radar that are published, the nearest first
+_MOST_READ: Final = 64  # objects of which the nearest are chosen: each is a call of the C library
 _WGS84: Final = 1  # GPS.WGS84: degrees, not metres
 
 Failed = Callable[[str, Exception], object]
@@ -25,9 +25,9 @@ class Rule(NamedTuple):
     """How the devices of a class are read.
 
     Attributes:
-        group: The key of the state under which they stand.
-        period_ms: The sampling period of what is read; 0 while it is disabled.
-        read: What they say.
+        group: The key of the state under which they are published.
+        period_ms: The sampling period in milliseconds; 0 while the device is disabled.
+        read: Reads the value.
     """
 
     group: str
@@ -40,7 +40,7 @@ def _sensor(read: Callable[[Any], object]) -> Rule:
 
 
 def _actuator(group: str, read: Callable[[Any], object]) -> Rule:
-    """What was commanded is known to the library, without enabling anything."""
+    """The rule of an actuator: its command can be read without enabling anything."""
     return Rule(group, _always, read)
 
 
@@ -49,11 +49,11 @@ def _always(_: Any) -> int:
 
 
 def read_devices(robot: Any, failed: Failed) -> dict[str, object]:
-    """The values of all enabled sensors, and what the actuators were commanded.
+    """The values of all enabled sensors, and the commands of the actuators.
 
     Args:
         robot: A Webots `Robot`.
-        failed: Told of each device that could not be read, by name; it is left out.
+        failed: Receives name and error of each device that could not be read; it is left out.
 
     Returns:
         `sensors`: device name to value, as `RULES` says;
@@ -70,7 +70,7 @@ def read_devices(robot: Any, failed: Failed) -> dict[str, object]:
         try:
             if rule is not None and rule.period_ms(device) > 0:
                 groups.setdefault(rule.group, {})[name] = rule.read(device)
-        except Exception as error:  # noqa: BLE001  (the other devices have something to say)
+        except Exception as error:  # noqa: BLE001  (the other devices are still read)
             failed(name, error)
     return {**_pose(devices, groups["sensors"]), **groups, **_battery(robot)}
 
@@ -90,20 +90,20 @@ def _battery(robot: Any) -> dict[str, object]:
 
 
 def _read_motor(motor: Any) -> dict[str, float]:
-    """Webots has one class for both kinds of motor."""
+    """The commands of a motor in its unit; Webots has one class for rotational and linear ones."""
     if motor.getType() == motor.LINEAR:
         unit, feedback, period_ms = "m", "force_feedback_n", motor.getForceFeedbackSamplingPeriod()
     else:
         unit, feedback = "rad", "torque_feedback_nm"
         period_ms = motor.getTorqueFeedbackSamplingPeriod()
-    said = {
+    values = {
         f"target_position_{unit}": motor.getTargetPosition(),
         f"target_velocity_{unit}_s": motor.getVelocity(),
     }
     if period_ms > 0:
         measured = motor.getForceFeedback() if unit == "m" else motor.getTorqueFeedback()
-        said[feedback] = measured
-    return said
+        values[feedback] = measured
+    return values
 
 
 def _read_connector(connector: Any) -> dict[str, object]:
@@ -115,7 +115,7 @@ def _read_vacuum_gripper(gripper: Any) -> dict[str, object]:
 
 
 def _presence(device: Any) -> dict[str, object]:
-    """Whether there is something to hold; its sensor is enabled on its own."""
+    """Whether an object is present to grip; the presence sensor is enabled separately."""
     enabled = device.getPresenceSamplingPeriod() > 0
     return {"presence": device.getPresence()} if enabled else {}
 
@@ -125,12 +125,12 @@ def _recognition_period(camera: Any) -> int:
 
 
 def _summarise_recognised(camera: Any) -> dict[str, object]:
-    """What a camera recognises: how many, and the nearest of them; positions as seen from it."""
+    """The objects that a camera recognises: count and nearest ones, in the camera's axes."""
     count = camera.getRecognitionNumberOfObjects()
     if not count:
-        return _nearest_of(0, [])  # a pointer to nothing cannot be read
-    seen: list[Any] = camera.getRecognitionObjects()[:_MOST_LOOKED_AT]
-    said = [
+        return _nearest_of(0, [])  # Webots returns a null pointer then, which must not be read
+    seen: list[Any] = camera.getRecognitionObjects()[:_MOST_READ]
+    objects = [
         {
             "model": each.getModel(),
             "id": each.getId(),
@@ -139,14 +139,14 @@ def _summarise_recognised(camera: Any) -> dict[str, object]:
         }
         for each in seen
     ]
-    return _nearest_of(count, said)
+    return _nearest_of(count, objects)
 
 
 def _summarise_targets(radar: Any) -> dict[str, object]:
-    """What a radar sees: how many, and the nearest of them."""
+    """The targets of a radar: count and nearest ones."""
     count = radar.getNumberOfTargets()
-    seen: list[Any] = radar.getTargets()[:_MOST_LOOKED_AT] if count else []
-    said = [
+    seen: list[Any] = radar.getTargets()[:_MOST_READ] if count else []
+    targets = [
         {
             "distance_m": each.distance,
             "speed_m_s": each.speed,
@@ -155,17 +155,17 @@ def _summarise_targets(radar: Any) -> dict[str, object]:
         }
         for each in seen
     ]
-    return _nearest_of(count, said)
+    return _nearest_of(count, targets)
 
 
-def _nearest_of(count: int, said: list[dict[str, Any]]) -> dict[str, object]:
-    said.sort(key=lambda each: each["distance_m"])
-    nearest_m = said[0]["distance_m"] if said else None
-    return {"count": count, "min_m": nearest_m, "nearest": said[:MOST_OBJECTS]}
+def _nearest_of(count: int, read: list[dict[str, Any]]) -> dict[str, object]:
+    read.sort(key=lambda each: each["distance_m"])
+    nearest_m = read[0]["distance_m"] if read else None
+    return {"count": count, "min_m": nearest_m, "nearest": read[:MOST_OBJECTS]}
 
 
 def _read_touch(device: Any) -> object:
-    """A force-3d sensor has a vector, the others a number."""
+    """A vector from a force-3d sensor, a number from the others."""
     if device.getType() != getattr(device, "FORCE3D", None):
         return device.getValue()
     force = device.getValues()  # in Webots a bare pointer to the three
@@ -173,19 +173,19 @@ def _read_touch(device: Any) -> object:
 
 
 def _summarise_lidar(device: Any) -> dict[str, object] | None:
-    """Its image is layer after layer, each from left to right."""
+    """A lidar's ranges; its image is layer after layer, each from left to right."""
     return _summarise_ranges(device, device.getHorizontalResolution())
 
 
 def _summarise_range_finder(device: Any) -> dict[str, object] | None:
-    """Its image is row after row, each from left to right."""
+    """A range finder's ranges; its image is row after row, each from left to right."""
     return _summarise_ranges(device, device.getWidth())
 
 
 def _summarise_ranges(device: Any, columns: int) -> dict[str, object] | None:
-    """The nearest distance and where, and the minimum of eight sectors; None before data.
+    """The smallest distance, its index, and the minimum of eight sectors; None before data.
 
-    Testing the raw pointer first matters: reading a null one can kill the interpreter.
+    The raw pointer is tested first: reading a null pointer can crash the interpreter.
     """
     if not device.range_image:
         return None
@@ -201,7 +201,7 @@ def _summarise_ranges(device: Any, columns: int) -> dict[str, object] | None:
 
 
 def _column_minima(ranges: list[float], columns: int) -> list[float]:
-    """The nearest distance in each direction, over all layers or rows."""
+    """The smallest distance in each direction, over all layers or rows."""
     if not 0 < columns < len(ranges):
         return ranges
     rows = [ranges[i : i + columns] for i in range(0, len(ranges), columns)]
@@ -209,15 +209,15 @@ def _column_minima(ranges: list[float], columns: int) -> list[float]:
 
 
 def _sector_minima(directions: list[float]) -> list[float]:
-    """From left to right; of fewer than eight directions each is a sector of its own."""
+    """The sectors' minima from left to right; with fewer than eight directions, one each."""
     count = min(SECTORS, len(directions))
     bounds = [len(directions) * i // count for i in range(count + 1)]
     return [min(directions[i:j]) for i, j in pairwise(bounds)]
 
 
 # By the names of the classes in Webots' `controller` package. Not here: `Brake`, `Display`,
-# `Emitter`, `Pen`, `Skin` and `Speaker`, which only take orders, and `Keyboard`, `Mouse` and
-# `Joystick`, which no device is and whose events a reading would take away.
+# `Emitter`, `Pen`, `Skin` and `Speaker`, which have nothing to read, and `Keyboard`, `Mouse` and
+# `Joystick`, which are not among the robot's devices, and whose events a reading would consume.
 RULES: Final[dict[str, Rule]] = {
     "Accelerometer": _sensor(methodcaller("getValues")),
     "Altimeter": _sensor(methodcaller("getValue")),

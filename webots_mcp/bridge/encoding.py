@@ -1,8 +1,8 @@
 """A published state as JSON text that SQLite can always read, of bounded size.
 
 JSON has no NaN, no infinity and no bytes, and SQLite before 3.42 fails on every row whose text
-holds a NaN. A row that grows without bounds stops the control loop. So what JSON cannot hold is
-replaced, what is too much is cut, and `odd` names the path and what stood there:
+contains a NaN. A row that grows without bounds stops the control loop. So what JSON cannot hold is
+replaced, what is too large is cut, and the column `odd` names the path and the original value:
 
     published value                    stored          odd
     NaN, infinity, -infinity           null            "nan", "inf", "-inf"
@@ -33,13 +33,13 @@ replaced, what is too much is cut, and `odd` names the path and what stood there
 A row has room for 20,000: an item of an array of numbers takes 1, any other value (a number, a
 text, an array, a dict, ...) takes 5. All texts of a row take at most 300,000 bytes of JSON, all
 keys 150,000. Where there is no room for everything, the levels near the top come first. `odd`
-names up to 1,000 places; how many more there are stands under the empty path: "4000 more". What a
-robot publishes is rarely a tenth of that. A state that contains itself is cut like any other.
+names up to 1,000 places; the empty path has the number of further ones: "4000 more". A robot rarely
+publishes a tenth of that. A state that contains itself is cut like any other nested too deeply.
 
 Numpy scalars and arrays, ctypes numbers, arrays and structures, Webots' lidar points and radar
 targets, dataclasses, enums, tuples, sets, ranges, deques, dates, paths, UUIDs, decimals and keys
-that are not text are stored as their plain JSON counterparts and are not odd. Neither are integers
-beyond 64 bits: they become the nearest float, as which SQLite reads them.
+that are not text are stored as their plain JSON counterparts and are not named in `odd`. Neither
+are integers beyond 64 bits: they become the nearest float, as SQLite would read them anyway.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ from webots_mcp.bridge.cleaning import (
 )
 from webots_mcp.bridge.conversions import convert, is_number_array, item_count
 
-# Codes of numpy; orjson writes shorter floats in its own way.
+# Numpy's type codes. Half and single floats are not here: orjson writes them with fewer digits.
 _ORDINARY_NUMBERS: Final = frozenset("?bBhHiIlLqQd")
 
 orjson: Any
@@ -73,17 +73,17 @@ except ImportError:
 
 MAX_ROW_BYTES: Final = 1_000_000
 MAX_PLAIN_VALUES: Final = MAX_ROOM // ROOM_OF_A_VALUE
-_CHARACTERS_OF_A_VALUE: Final = 16  # a text takes another value's room for each so many
+_CHARACTERS_OF_A_VALUE: Final = 16  # a text takes the room of one more value for each so many
 _SHORT_KEY_CHARACTERS: Final = 60
 _MOST_SHORT_KEYS: Final = 10_000
-# They take the room of one value, whatever they are, and are encoded as they are.
+# Types that take the room of one value and need no further check.
 _LEAVES: Final = frozenset((float, bool, type(None)))
 _SHORT_ARRAY: Final = 16
 _CONTAINERS: Final[tuple[Any, ...]] = (dict, list, tuple)
 _MANY: Final = (dict, list, tuple, set, frozenset, deque)
 _PLAIN_DICTS: Final = (OrderedDict, defaultdict, Counter)
 
-# Keys that were looked at once: the same come back with every row.
+# Keys that were checked before: every row has the same ones, so most checks are one set operation.
 _short_keys: set[object] = set()
 
 
@@ -94,29 +94,29 @@ class Encoded(NamedTuple):
     """JSON text, and what had to be replaced or cut in it: dotted path to kind.
 
     Attributes:
-        unnamed: How many more there are that `odd` does not name.
+        unnamed: How many more there are that `replaced` does not name.
     """
 
     text: str
-    odd: dict[str, str]
+    replaced: dict[str, str]
     unnamed: int = 0
 
     @property
-    def odd_text(self) -> str | None:
-        """`odd` as the database holds it: null where nothing was replaced."""
-        return _encode_plain(self.odd) if self.odd else None
+    def replaced_text(self) -> str | None:
+        """The value of the column `odd`: null where nothing was replaced."""
+        return _encode_plain(self.replaced) if self.replaced else None
 
 
 class _NotPlainError(Exception):
-    """The value is too large, or of a kind that has to be looked at more closely."""
+    """The value is too large, or of a type that only the slow path can encode."""
 
 
 class _Converted(dict[int, object]):
     """The plain counterpart of each object, by its id.
 
     Attributes:
-        began_s: When the first one was asked for.
-        others: Whether a value was looked at whose type is not one of JSON's own.
+        began_s: When the first one was converted, as processor time of the thread.
+        others: Whether a value was met whose type is not one of JSON's own.
     """
 
     began_s: float | None = None
@@ -132,7 +132,7 @@ class _Converted(dict[int, object]):
 
 def encode(state: object) -> Encoded:
     """Encode a state, as fast as its content allows; the state itself is never changed."""
-    return _after_look(state, _encode_ordinary)
+    return _when_plain(state, _encode_ordinary)
 
 
 def copy_or_encode(state: object) -> bytes | Encoded:
@@ -140,7 +140,7 @@ def copy_or_encode(state: object) -> bytes | Encoded:
 
     To copy costs less than to encode; only dicts of plain values are copied.
     """
-    return _after_look(state, _copy_or_encode)
+    return _when_plain(state, _copy_or_encode)
 
 
 def encode_copy(copy: bytes) -> Encoded:
@@ -166,41 +166,41 @@ def _is_small(value: object) -> bool:
 
 
 def text_of(value: object) -> str:
-    """A value as the text that a person reads; of a large one its JSON, which is bounded."""
+    """The text of a value for a person; for a large one its JSON, whose length is bounded."""
     if isinstance(value, str):
         return value
     is_large = issubclass(type(value), _MANY) and not _is_small(value)
     return encode(value).text if is_large else str(value)
 
 
-# -- the ordinary way --------------------------------------------------------------------------
+# -- the fast path: plain states ---------------------------------------------------------------
 
 
-def _after_look(state: object, take: Callable[[object, _Converted], _Taken]) -> _Taken | Encoded:
-    """Take an ordinary state in that way; the text of any other one names what is odd."""
+def _when_plain(state: object, take: Callable[[object, _Converted], _Taken]) -> _Taken | Encoded:
+    """Take a plain state on the fast path; any other one is encoded with replacements."""
     converted = _Converted()
     try:
         _look((state,), MAX_PLAIN_VALUES, 0, converted)
         return take(state, converted)
-    except Exception:  # noqa: BLE001  (something odd is inside: it is found and named below)
-        return _encode_odd(state)
+    except Exception:  # noqa: BLE001  (the slow path finds and names what cannot be encoded)
+        return _encode_replacing(state)
 
 
 def _look(values: Iterable[Any], left: int, depth: int, converted: _Converted) -> int:
-    """Count what is to be encoded before the encoder, which knows no bounds, begins with it.
+    """Check size and types before encoding, since the encoder has no bounds of its own.
 
     Args:
-        values: They stand side by side.
+        values: The items of one container.
         left: How many more values there may be.
         depth: How deep these are nested.
-        converted: Takes the plain counterpart of each object, by its id.
+        converted: Receives the plain counterpart of each object, by its id.
 
     Returns:
         How many more there may be after these.
 
     Raises:
-        _NotPlainError: There are too many, or one is of an unusual kind.
-        Exception: Whatever an object raises while it is asked.
+        _NotPlainError: There are too many, or one is of an unusual type.
+        Exception: Whatever an object raises while it is read.
     """
     if depth >= MAX_DEPTH:
         raise _NotPlainError
@@ -236,10 +236,13 @@ def _look(values: Iterable[Any], left: int, depth: int, converted: _Converted) -
 
 
 def _adds_up(items: Iterable[Any]) -> bool:
-    """The fastest look at many numbers; what is none, and adds up, the encoder refuses."""
+    """Whether all are numbers, in the fastest possible check.
+
+    Objects that are not numbers and can be added to one are refused by the encoder later.
+    """
     try:
         return type(sum(items)) is float
-    except Exception:  # noqa: BLE001  (whatever adding up some objects does)
+    except Exception:  # noqa: BLE001  (the user's objects may raise anything)
         return False
 
 
@@ -278,9 +281,9 @@ def _look_at_object(value: Any, left: int, depth: int, converted: _Converted) ->
 
 
 def _look_at_container(value: Any, left: int, depth: int, converted: _Converted) -> int:
-    """A subclass counts as what it derives from if it does not give out its items in its own way.
+    """Check a subclass of a container as its base class, if it does not override iteration.
 
-    The encoders ask some subclasses for their items, and not others.
+    The encoders call an overridden iteration for some subclasses and ignore it for others.
     """
     kind = cast("Any", type(value))
     base = next(base for base in _CONTAINERS if issubclass(kind, base))
@@ -316,9 +319,9 @@ def _copy_or_encode(state: object, converted: _Converted) -> bytes | Encoded:
 
 
 class _Copier(pickle.Pickler):
-    """Copies dicts, lists, tuples, texts, numbers and None, not what only derives from them.
+    """Copies dicts, lists, tuples, texts, numbers and None, but no subclasses of them.
 
-    The look does not see such subclasses among keys, and in long arrays; copies could differ.
+    The check before does not see subclasses among keys and in long arrays; copies could differ.
     """
 
     def reducer_override(self, obj: object) -> Any:
@@ -327,7 +330,7 @@ class _Copier(pickle.Pickler):
 
 
 class _Counterparts:
-    """What the encoder asks for a value that it does not know: only what was looked at."""
+    """Gives the encoder the counterpart of a value that it does not know."""
 
     def __init__(self, converted: dict[int, object]) -> None:
         self._converted = converted
@@ -341,13 +344,13 @@ def _encode_with_orjson(state: object, counterpart: Callable[[Any], object] | No
     """None where orjson cannot, or may have turned a NaN silently into null."""
     try:
         text = orjson.dumps(state, counterpart, _ORJSON_OPTIONS)
-    except Exception:  # noqa: BLE001  (whatever an object of the user's does: the other way names it)
+    except Exception:  # noqa: BLE001  (the user's objects may raise anything; `json` comes next)
         return None
     return None if b"null" in text else text.decode()
 
 
 def _encoder(counterpart: Callable[[Any], object] | None = None) -> Callable[[object], str]:
-    # Whether something contains itself was looked at; without the check it is 8 % faster.
+    # Nesting is bounded before, so nothing contains itself; without this check it is 8 % faster.
     return json.JSONEncoder(
         check_circular=False,
         allow_nan=False,
@@ -358,29 +361,29 @@ def _encoder(counterpart: Callable[[Any], object] | None = None) -> Callable[[ob
 
 
 _encode_plain: Final = _encoder()
-# A dataclass of orjson's own encoding would lose the fields that begin with an underscore.
+# orjson's own encoding of a dataclass would lose the fields that begin with an underscore.
 _ORJSON_OPTIONS: Final[int] = (
     orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_PASSTHROUGH_DATACLASS if orjson is not None else 0
 )
 
 
-# -- the way of everything else ----------------------------------------------------------------
+# -- the slow path: everything else ------------------------------------------------------------
 
 
-def _encode_odd(state: object) -> Encoded:
-    """Replace and cut what has to be; the last resort is a row that says why it is empty."""
+def _encode_replacing(state: object) -> Encoded:
+    """Encode with replacements and cuts; at worst, an empty row that names the reason."""
     cleaner = Cleaner()
     try:
         text = _encode_clean(cleaner.clean(state))
     except Exception as error:  # noqa: BLE001  (the row is there, and says why)
         return Encoded("{}", {"": failure(state, error)})
     if text == "null" and hasattr(state, "keys"):
-        return Encoded("{}", cleaner.odd)  # a dict that cannot be read
+        return Encoded("{}", cleaner.replaced)  # a mapping that cannot be read at all
     if len(text.encode()) > MAX_ROW_BYTES:
         return Encoded("{}", {"": f"row of {len(text)} characters"})
-    return Encoded(text, cleaner.odd, cleaner.unnamed)
+    return Encoded(text, cleaner.replaced, cleaner.unnamed)
 
 
 def _encode_clean(state: object) -> str:
-    """Of what a cleaner made: the faster way never meets anything odd."""
+    """Encode a cleaned value, where orjson cannot meet a NaN that it would turn into null."""
     return _encode_plain(state) if orjson is None else orjson.dumps(state).decode()

@@ -1,4 +1,4 @@
-"""What went wrong in a bridge: remembered, and warned of once."""
+"""The errors of a bridge: the newest is kept, and each kind is printed once."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ _MOST_CHARACTERS = 2000
 
 
 class ErrorReport:
-    """The newest thing that could not be done, and why.
+    """Counts failures, keeps the newest error, and prints one line per kind on stderr.
 
     Args:
-        strict: Raise it as well.
+        strict: Raise each error as well.
 
     Attributes:
         failures: Calls of the bridge's methods that failed.
@@ -25,7 +25,7 @@ class ErrorReport:
         self.failures = 0
 
     def warn(self, kind: str, text: str) -> None:
-        """Remember what went wrong; one line a kind on stderr; raise in strict mode."""
+        """Keep an error as the newest one; print the first of its kind; raise in strict mode."""
         text = text[:_MOST_CHARACTERS].encode("utf-8", "replace").decode()
         self.last_error = text
         if kind not in self._warned:

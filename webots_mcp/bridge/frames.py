@@ -1,4 +1,4 @@
-"""Small camera frames of the last seconds: taken now and then, held in bounded memory."""
+"""Small camera frames of the last seconds: taken at a low rate, held in bounded memory."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from webots_mcp.bridge.text import describe
 LONGEST_SIDE_PX: Final = 160
 MOST_FRAMES: Final = 78  # of all cameras together: 8 MB, were they square
 _MOST_FRAMES_PER_S: Final = 100.0
-_EARLY_S: Final = 1e-9  # steps add up to a little less
+_EARLY_S: Final = 1e-9  # tolerance: summed floating-point steps may fall a little short
 _METHODS: Final = ("getName", "getSamplingPeriod", "getWidth", "getHeight", "getImage")
 
 
 class Frame(NamedTuple):
-    """What a camera saw last at some moment, scaled down.
+    """A camera's newest image at some moment, scaled down.
 
     Attributes:
         bgra: Four bytes a pixel, rows from the top left.
@@ -34,11 +34,11 @@ class Frame(NamedTuple):
 
 
 class _Camera:
-    """A camera that is looked at now and then.
+    """A camera of which frames are taken.
 
     Attributes:
         due_s: Simulation time of its next frame.
-        missed: Frames that it could not give.
+        missed: Frames that could not be taken.
     """
 
     def __init__(self, device: Any, interval_s: float) -> None:
@@ -49,7 +49,7 @@ class _Camera:
         self.missed = 0
 
     def frame(self, now_s: float) -> Frame:
-        """Its newest image, scaled down; the next one is due when there is another."""
+        """Its newest image, scaled down; the next frame is due no sooner than its next image."""
         self.taken_s = now_s
         period_s = self.device.getSamplingPeriod() / 1000
         self.due_s = now_s + max(self.interval_s, period_s) - _EARLY_S
@@ -64,7 +64,7 @@ class CameraFrames:
         last_s: Seconds of simulation time that are held, in 78 frames at most.
 
     Attributes:
-        cameras: Those that are looked at.
+        cameras: The cameras of which frames are taken, by name.
         missed: Frames that could not be taken or written.
     """
 
@@ -80,7 +80,7 @@ class CameraFrames:
         """Take this many frames of a camera per second of simulation time.
 
         Raises:
-            TypeError: It has no pictures.
+            TypeError: It is not a camera.
             ValueError: The number is out of bounds.
         """
         lacking = [name for name in _METHODS if not callable(getattr(device, name, None))]
@@ -89,13 +89,13 @@ class CameraFrames:
             raise TypeError(f"a Camera is needed, and {kind} has no {', '.join(lacking)}")
         if not 0 < frames_per_s <= _MOST_FRAMES_PER_S:
             most = f"{_MOST_FRAMES_PER_S:g}"
-            raise ValueError(f"frames_per_s is above 0 and up to {most}, not {frames_per_s!r}")
+            raise ValueError(f"frames_per_s must be above 0 and at most {most}: {frames_per_s!r}")
         camera = _Camera(device, 1 / frames_per_s)
         self.cameras[camera.name] = camera
         self._due_s = -math.inf
 
     def is_due(self, now_s: float) -> bool:
-        """Whether a camera has to be looked at: its time has come, or time went back."""
+        """Whether a frame is due, or simulation time has gone back."""
         return not self._looked_s <= now_s < self._due_s
 
     def look(self, now_s: float, *, at_once: bool) -> list[Frame]:
@@ -112,19 +112,19 @@ class CameraFrames:
         return frames
 
     def add(self, frame: Frame) -> None:
-        """Hold the newest frame; those that are too old go."""
+        """Hold the newest frame, and forget those that are too old."""
         while self._held and self._held[0].sim_time_s < frame.sim_time_s - self._last_s:
             self._held.popleft()
         self._held.append(frame)
 
     def take(self, start_s: float) -> list[Frame]:
-        """Those that were taken since; none is held any more."""
+        """The frames taken since a simulation time; all held frames are forgotten."""
         frames = [frame for frame in self._held if frame.sim_time_s >= start_s]
         self._held.clear()
         return frames
 
     def _frame_of(self, camera: _Camera, now_s: float) -> Frame | None:
-        """None where there is none; the second time in a row of one camera is told."""
+        """A frame of a camera, or None where it has none; its second failure is logged."""
         try:
             return camera.frame(now_s)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
@@ -136,7 +136,7 @@ class CameraFrames:
 
 
 def scale_down(bgra: bytes, width: int, height: int) -> tuple[int, int, bytes]:
-    """Width, height and pixels of an image of which the longer side has up to 160: each n-th.
+    """Width, height and pixels of an image reduced to 160 pixels per side, by each n-th pixel.
 
     Raises:
         ValueError: The image does not have 4 * width * height bytes.

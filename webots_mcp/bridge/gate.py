@@ -1,8 +1,8 @@
-"""Robot's own `step`, however the controller comes to it.
+"""Intercepting `Robot.step`, from wherever the controller calls it.
 
-A loop calls the robot's method, or that of a subclass whose own `step` goes on by `super()`: so it
-is the method of Webots' class that asks the bridge first. It does so for robots that have a bridge
-with something to say; for any other call nothing changes.
+A loop calls the robot's method, or that of a subclass whose own `step` calls it by `super()`. So
+the method of Webots' class is replaced, and asks the robot's guard first. Robots without a guard
+step as before.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ _MARK: Final = "_webots_mcp_asks"  # of a method
 
 
 class Step(NamedTuple):
-    """A step that a controller asks for.
+    """A call of a step method by the controller.
 
     Attributes:
-        begins: It asks Webots for time to pass: `step(n)` and `stepBegin`, not `step(0)`.
-        ends: It waits until that has passed: `step(n)` and `stepEnd`.
-        make: Ask Webots, as it was meant.
+        begins: It lets simulation time advance: `step(n)` and `stepBegin`, not `step(0)`.
+        ends: It waits until the time has advanced: `step(n)` and `stepEnd`.
+        make: Makes the original call.
     """
 
     begins: bool
@@ -36,7 +36,7 @@ class Step(NamedTuple):
 
     @property
     def finishes(self) -> bool:
-        """It is the second half of a step that was begun before: `stepEnd`."""
+        """Whether it is the second half of a step that has begun: `stepEnd`."""
         return self.ends and not self.begins
 
 
@@ -44,7 +44,7 @@ Guard = Callable[[Step], int]
 
 
 class StepGate:
-    """The way of one robot's steps to Webots.
+    """Intercepts the steps of one robot while it is closed.
 
     Args:
         robot: A Webots `Robot`, or an instance of a subclass.
@@ -63,22 +63,22 @@ class StepGate:
         self._own_step: Method = owner.step.__wrapped__
 
     def exchange(self) -> int:
-        """Robot's own `step(0)`, which no guard is asked about: 0, or -1 if Webots says quit."""
+        """Call `step(0)` past the guard; returns 0, or -1 if Webots wants the controller to end."""
         return self._own_step(self._robot, 0)
 
     def close(self, guard: Guard) -> None:
-        """From now on the guard answers each step of the controller's."""
+        """Let the guard answer each step of the controller."""
         self._of_robot[_GUARD] = guard
 
     def open(self) -> None:
-        """Steps go to Webots again."""
+        """Let steps go to Webots directly again."""
         self._of_robot.pop(_GUARD, None)
 
 
 def _guarded(name: str, method: Method) -> Method:
     @functools.wraps(method)
     def ask_first(robot: Any, *args: Any, **kwargs: Any) -> int:
-        guard: Guard | None = robot._webots_mcp_guard  # by name: this is in every step's way
+        guard: Guard | None = robot._webots_mcp_guard  # faster than getattr: runs in every step
         if guard is None:
             return method(robot, *args, **kwargs)
         make = functools.partial(method, robot, *args, **kwargs)
@@ -91,7 +91,7 @@ def _guarded(name: str, method: Method) -> Method:
 
 
 def _vehicles(robot: Any) -> list[Any]:
-    """Webots' own classes whose `step` is a call in C that does not come by Robot's: `Driver`."""
+    """Webots' classes whose `step` calls the C library and not `Robot.step`: `vehicle.Driver`."""
     return [cls for cls in type(robot).__mro__ if cls.__module__.partition(".")[0] == _VEHICLE]
 
 

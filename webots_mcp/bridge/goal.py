@@ -1,4 +1,4 @@
-"""What a `run` command lets the loop run until: a condition, a simulation time."""
+"""The goal of a `run` command: until when it lets the loop run."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class Goal(NamedTuple):
 
     Attributes:
         until: Run until it holds; None for no condition.
-        prune: Where it holds before, going on would tell nothing; None for no condition.
-        for_s: Run for so much simulation time; None for no limit.
-        reset: Reset the world first; the time counts from there.
-        pace: The simulation mode to run in; None for the one that it ran in last.
-        parameters: To set before, at the reset where there is one.
+        prune: End as `pruned` where it holds first: the outcome is decided; None for no condition.
+        for_s: Run for so many seconds of simulation time; None for no limit.
+        reset: Reset the world first; `for_s` counts from there.
+        pace: The simulation mode to run in; None for the mode that it ran in last.
+        parameters: Values to set first, or at the reset where there is one.
         then: What to do when the run is over.
     """
 
@@ -42,17 +42,19 @@ class Goal(NamedTuple):
 
 
 def read_goal(params: dict[str, Any]) -> Goal:
-    """What the parameters of a command say.
+    """The goal that the parameters of a command describe.
 
     Raises:
-        InvalidInputError: One of them is wrong, or both `until` and `for_s` are missing.
+        InvalidInputError: One of them is invalid, or both `until` and `for_s` are missing.
     """
     for_s, parameters = params.get("for_s"), params.get("parameters")
     until, prune = _condition("until", params), _condition("prune", params)
     if until is None and for_s is None:
         raise InvalidInputError("give until (a condition), for_s (simulated seconds), or both")
     if parameters is not None and not isinstance(parameters, dict):
-        raise InvalidInputError(f"parameters are names and values, not {parameters!r:.80}")
+        raise InvalidInputError(
+            f'parameters must be an object such as {{"kp": 3.0}}, not {parameters!r:.80}'
+        )
     return Goal(
         until=until,
         prune=prune,
@@ -65,11 +67,13 @@ def read_goal(params: dict[str, Any]) -> Goal:
 
 
 def _condition(name: str, params: dict[str, Any]) -> Condition | None:
-    from webots_mcp.conditions import parse_condition  # only here: most controllers need none
+    from webots_mcp.conditions import parse_condition  # only here: most controllers never need it
 
     text = params.get(name)
     if text is not None and not isinstance(text, str):
-        raise InvalidInputError(f"{name} is a condition, such as 'front_m < 0.1', not {text!r:.80}")
+        raise InvalidInputError(
+            f"{name} must be a condition, such as 'front_m < 0.1', not {text!r:.80}"
+        )
     return None if text is None else parse_condition(text)
 
 
@@ -77,27 +81,27 @@ def _seconds(value: object) -> float:
     if isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value <= MAX_RUN_S:
         return float(value)
     raise InvalidInputError(
-        f"for_s is a number of simulated seconds above 0, up to {MAX_RUN_S:.0f}, not {value!r:.80}"
+        f"for_s must be simulated seconds above 0 and at most {MAX_RUN_S:.0f}, not {value!r:.80}"
     )
 
 
 def _one_of(name: str, value: Any, choices: tuple[Any, ...]) -> Any:
     if any(value is choice or (isinstance(value, str) and value == choice) for choice in choices):
         return value
-    told = ", ".join("null" if choice is None else repr(choice) for choice in choices)
-    raise InvalidInputError(f"{name} must be one of {told}, not {value!r:.80}")
+    listed = ", ".join("null" if choice is None else repr(choice) for choice in choices)
+    raise InvalidInputError(f"{name} must be one of {listed}, not {value!r:.80}")
 
 
 class Reached(NamedTuple):
-    """How a run of the loop ended.
+    """How a `run` command ended.
 
     Attributes:
-        end: In one word or two.
-        run: In which it ended.
-        sim_time_s: Of the very step.
-        monotonic_s: When that was.
-        why: What there is to say beside it.
-        values: Of the condition's signals.
+        end: The kind of end.
+        run: The run in which it ended.
+        sim_time_s: Simulation time of the step at which it ended.
+        monotonic_s: The monotonic clock at that step.
+        why: The reason, where `end` does not say it all.
+        values: The values of the condition's signals.
     """
 
     end: RunEnd
@@ -112,10 +116,10 @@ class _Watched:
     """A goal, from the command that set it until it is reached.
 
     Attributes:
-        run: In which it is watched; None before the reset that is waited for.
-        former: The run before that.
-        since_s: The simulation time from which on it runs, and the monotonic clock at that time.
-        published_s: Of the newest published state.
+        run: The run in which it is watched; None while the reset is awaited.
+        former: The run before the reset.
+        since_s: The simulation time at which it began, and the monotonic clock at that time.
+        published_s: The simulation time of the newest published state.
     """
 
     def __init__(self, command_id: int, goal: Goal, clock: Clock, finish: Callable[[], object]):
@@ -137,15 +141,15 @@ class _Watched:
 class Watch:
     """Watches whether the goal of a `run` command is reached, at each published state and step.
 
-    The simulation is stopped at the very step: in `get_command()` where the state of that step is
-    published by then, else before the loop's next step begins.
+    The simulation is stopped at the step that reaches the goal: in `get_command()` where the state
+    of that step is published by then, else before the loop's next step begins.
 
     Args:
-        clock: Tells time and run.
-        tolerance_s: A clock that adds up steps reaches a time by as much less.
+        clock: Has the simulation time and the run.
+        tolerance_s: Summed floating-point steps may fall short of a time by so much.
 
     Attributes:
-        stepping: The `step` command that is under way; None also once it was cancelled.
+        stepping: The id of the running `step` command; None also once it was cancelled.
     """
 
     def __init__(self, clock: Clock, tolerance_s: float) -> None:
@@ -156,18 +160,18 @@ class Watch:
 
     @property
     def asks_states(self) -> bool:
-        """Whether each state has to be looked at, recorded or not."""
+        """Whether each state has to be evaluated, recorded or not."""
         return self._watched is not None and self._watched.reached is None
 
     def require_free(self) -> None:
         """Refuse a second goal.
 
         Raises:
-            CommandRefusedError: With what can be done.
+            CommandRefusedError: Another `run` is active; the text says how to go on.
         """
         if (watched := self._watched) is not None:
             raise CommandRefusedError(
-                f"command {watched.command_id} (run) is under way: wait for it with "
+                f"command {watched.command_id} (run) is still running: wait for it with "
                 f'webots_list_commands(what="outcome", command_id={watched.command_id}), '
                 "or pause to end it"
             )
@@ -176,20 +180,20 @@ class Watch:
         """Watch from the next state on; where the goal asks for a reset, from the first after it.
 
         Args:
-            command_id: Of the `run` command.
-            goal: What it asks for.
-            finish: Called once, at the step at which it is reached.
+            command_id: The id of the `run` command.
+            goal: Its goal.
+            finish: Called once, at the step at which the goal is reached.
         """
         self._watched = _Watched(command_id, goal, self._clock, finish)
 
     def end(self) -> None:
-        """The command is settled."""
+        """Stop watching: the command is answered."""
         self._watched = None
 
     # -- from the loop -------------------------------------------------------------------------
 
     def look(self, state: Any) -> bool:
-        """Take in a published state; True if it is the one that reaches the goal."""
+        """Evaluate a published state; True if it is the one that reaches the goal."""
         watched = self._watched
         if watched is None or watched.reached is not None or not self._begun(watched):
             return False
@@ -198,7 +202,7 @@ class Watch:
         return watched.reached is not None and watched.reached.run is self._clock.run
 
     def before_step(self) -> None:
-        """The loop begins its next step: the last one is over."""
+        """Judge the goal before the loop's next step: the last step's state is complete now."""
         watched = self._watched
         if watched is None or not self._begun(watched):
             return
@@ -207,7 +211,11 @@ class Watch:
             self._finish(watched)
 
     def over(self) -> bool:
-        """In `get_command()`: whether the goal is reached and there is nothing more to wait for."""
+        """In `get_command()`: whether the goal is reached.
+
+        The time is judged here only where this step's state is published already: else its
+        condition, which may hold at the same step, would not be evaluated.
+        """
         watched = self._watched
         if watched is None or not self._begun(watched):
             return watched is None
@@ -220,13 +228,13 @@ class Watch:
         return watched.reached is not None
 
     def interrupt(self, end: RunEnd, why: str) -> None:
-        """Something else decides from now on what the loop does."""
+        """End the run because another command, or a pause, controls the loop from now on."""
         if (watched := self._watched) is not None:
             watched.reached = watched.reached or self._reached(end, why)
             watched.finished = True
 
     def cancel(self, command_id: object) -> bool:
-        """Have that `run` end now, as its `then` says, or `step`; False where there is none."""
+        """End that `run` now, as its `then` says, or that `step`; False if neither is running."""
         if command_id is not None and command_id == self.stepping:
             self.stepping = None
             return True
@@ -237,10 +245,10 @@ class Watch:
         return True
 
     def describe(self) -> dict[str, object]:
-        """How far it came, and why not farther.
+        """The result of the `run` command: how it ended, where, and how fast it ran.
 
         Raises:
-            CommandRefusedError: The condition could not be asked of what is published.
+            CommandRefusedError: The condition could not be evaluated on the published state.
         """
         assert self._watched is not None and self._watched.reached is not None, "ask over() first"
         reached, (since_s, since_monotonic_s) = self._watched.reached, self._watched.since_s
@@ -248,7 +256,7 @@ class Watch:
             raise CommandRefusedError(f"{reached.why}; it ended at {reached.sim_time_s:.6g} s")
         wall_s = reached.monotonic_s - since_monotonic_s
         advanced_s = round(reached.sim_time_s - since_s, 6)
-        told = {
+        facts = {
             "ended": reached.end,
             "why": reached.why,
             "run_id": reached.run.id,
@@ -259,12 +267,12 @@ class Watch:
             "factor": round(advanced_s / wall_s, 3) if wall_s > 0 else None,
             "values": reached.values,
         }
-        return {name: value for name, value in told.items() if value is not None}
+        return {name: value for name, value in facts.items() if value is not None}
 
     # -- inside --------------------------------------------------------------------------------
 
     def _begun(self, watched: _Watched) -> bool:
-        """Whether the run has begun in which it is watched."""
+        """Whether the run in which it is watched has begun: the awaited reset has happened."""
         if watched.run is None and self._clock.run is not watched.former:
             watched.run = self._clock.run
             if watched.reached is None:  # else it was ended before the reset came
@@ -279,10 +287,10 @@ class Watch:
     def _judge(self, watched: _Watched, state: Any) -> Reached | None:
         held: Reached | None = None
         try:
-            for end, evaluator in watched.evaluators:  # each of them takes in every state
+            for end, evaluator in watched.evaluators:  # no early exit: each needs every state
                 if evaluator.holds(state, self._clock.sim_time_s):
                     held = held or self._reached(end, values=evaluator.values(state))
-        except Exception as error:  # noqa: BLE001  (whatever an object of the user's does)
+        except Exception as error:  # noqa: BLE001  (the user's objects may raise anything)
             return self._reached("condition failed", describe(error))
         return held or self._judge_time(watched)
 

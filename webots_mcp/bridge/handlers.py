@@ -1,4 +1,4 @@
-"""The custom actions: functions of the controller that an assistant may have run."""
+"""The custom actions: functions of the controller that an assistant may call."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class Handlers:
     """The registered functions by the name of their action.
 
     Attributes:
-        running: A function is at work: this call comes from within it.
-        loop_looks: The loop asks for commands, and may do something with what it gets.
+        running: A function is being called: the present call comes from within it.
+        loop_polls: The loop itself calls `get_command()`, and may handle the command it returns.
     """
 
     def __init__(self, recorder: Recorder, journal: Journal, pause: Pause) -> None:
@@ -35,17 +35,17 @@ class Handlers:
         self._handlers: dict[str, Handler] = {}
         self._refused: set[str] = set()
         self.running = False
-        self.loop_looks = True
+        self.loop_polls = True
 
     def register(self, action: str, handler: Handler) -> None:
-        """Make a custom action known, here and in the session's row.
+        """Register a custom action, here and in the session's row.
 
-        A built-in action stays what it is, but that one which calls functions of the controller
-        anyway (`reset_state`) calls this one.
+        A built-in action cannot be replaced, except for `reset_state`, which calls functions of the
+        controller anyway.
 
         Raises:
-            ValueError: The name is empty, too long, or no text that can be sent.
-            TypeError: The name is no text, or the handler is not a plain function.
+            ValueError: The name is empty, too long, or not printable.
+            TypeError: The name is not a text, or the handler is not a plain function.
         """
         _require_name(action)
         built_in = BUILT_IN_ACTIONS.get(action)
@@ -56,21 +56,21 @@ class Handlers:
 
         if not callable(handler) or inspect.iscoroutinefunction(handler):
             raise TypeError(f"the handler of {action!r} must be a plain function, not {handler!r}")
-        written = getattr(handler, "__doc__", None)
-        doc = inspect.cleandoc(written) if isinstance(written, str) else ""
+        docstring = getattr(handler, "__doc__", None)
+        doc = inspect.cleandoc(docstring) if isinstance(docstring, str) else ""
         if built_in is not None and action not in self._handlers:
-            why = "its own function is run, in place of the callbacks of on_reload()"
+            why = "this function is called instead of the callbacks of on_reload()"
             self._journal.log("info", "bridge", f"the controller has registered {action!r}: {why}")
         self._handlers[action] = handler
         self._recorder.session.actions[action] = storable(cut(doc, _MOST_DOC_CHARACTERS))
         self._recorder.update_actions()
 
     def knows(self, action: str) -> bool:
-        """Whether the controller has registered a function for it that is run."""
+        """Whether the controller has registered a function for the action."""
         return action in self._handlers
 
     def run(self, command: ClaimedCommand) -> object:
-        """What the function of the command's action returns; whatever it raises is passed on.
+        """Call the function of the command's action; whatever it raises is passed on.
 
         Raises:
             CommandRefusedError: There is no function for this action.
@@ -81,30 +81,30 @@ class Handlers:
         return self._call(handler, command)
 
     def _refuse(self, action: str) -> None:
-        """Say once that the function is never called; a controller may register it in its loop."""
+        """Warn once that the function is never called; a loop may register it in every round."""
         if action in self._refused:
             return
         self._refused.add(action)
         why = (
-            f"action {action!r} is built in, and the bridge runs its own: the function registered "
-            f"for it is never called; choose another name, such as {'my_' + action!r}"
+            f"action {action!r} is built in and cannot be replaced: the function registered for it "
+            f"is never called; choose another name, such as {'my_' + action!r}"
         )
         self._journal.log("warning", "bridge", why)
         self._recorder.errors.failed(f"register_command({action!r})", ValueError(why))
 
     def _unknown(self, action: str) -> str:
-        """Nothing is known of a loop that looks at what get_command() returns by itself."""
+        """The error of a command whose action is neither built in nor registered."""
         known = nearest_first(action, (*self._handlers, *BUILT_IN_ACTIONS))
         known = list(dict.fromkeys((*same_in_meaning(action, known), *known)))
-        said = f"no action {action!r}; this robot knows {', '.join(known)}"
+        text = f"no action {action!r}; this robot has {', '.join(known)}"
         if self._handlers:
-            return said
-        said += ": its controller has registered none (bridge.register_command)"
-        if not self.loop_looks:
-            return said
+            return text
+        text += ": its controller has registered none (bridge.register_command)"
+        if not self.loop_polls:
+            return text
         return (
-            f"{said}. get_command() returned the command; whether the loop did anything with it "
-            "is not known"
+            f"{text}. get_command() returned the command to the loop; the bridge does not know "
+            "whether the loop handled it"
         )
 
     def _call(self, handler: Handler, command: ClaimedCommand) -> object:
@@ -118,7 +118,8 @@ class Handlers:
 
 def _require_name(action: object) -> None:
     if not isinstance(action, str):
-        raise TypeError(f"the name of an action is a text, not {type(action).__name__} {action!r}")
+        kind = type(action).__name__
+        raise TypeError(f"the name of an action must be a text, not {kind} {action!r}")
     if not 0 < len(action) <= _MOST_NAME_CHARACTERS or not action.isprintable():
         raise ValueError(
             f"action {action[:_MOST_NAME_CHARACTERS]!r} cannot be registered: choose a name of 1 "

@@ -1,4 +1,4 @@
-"""The sign of life that a controller's loop gives, by which others judge it."""
+"""The heartbeat of a controller's loop, by which other processes judge whether it is alive."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from webots_mcp.pauses import PAUSED
 
 
 class Heartbeat:
-    """Written a few times a second, and at once where a command pauses the loop or lets it go.
+    """Written twice a second, and at once where a command pauses the loop or lets it run.
 
     Attributes:
-        loop: What a command does to the loop now: `PAUSED`, `STEPPING`, or None.
+        loop: How a command controls the loop now: `PAUSED`, `STEPPING`, or None.
     """
 
     def __init__(self, recorder: Recorder, clock: Clock) -> None:
@@ -32,28 +32,28 @@ class Heartbeat:
         return self._last_poll_s is not None
 
     def poll(self) -> None:
-        """The loop asked for commands; beat if it is time to."""
+        """The loop asked for commands; beat if that is due."""
         self._last_poll_s = time.monotonic()
         self.beat_if_due()
 
     def beat_if_due(self) -> None:
-        """Beat if the last time is long enough ago."""
+        """Beat if the last heartbeat is old enough."""
         if time.monotonic() >= self._next_s:
             self.beat()
 
     def beat(self) -> None:
-        """Say now that the loop is alive, and what it can see of time."""
+        """Write a heartbeat now: the loop is alive, and when it last saw time advance."""
         self._next_s = time.monotonic() + HEARTBEAT_INTERVAL_S
         polled_s, moved_s = _wall_time_s(self._last_poll_s), _wall_time_s(self._clock.moved_s)
         pause = (self.loop, self._mode_before)
         self._recorder.beat(LoopStatus(self._clock.sim_time_s, polled_s, moved_s, *pause))
 
     def change_loop(self, loop: str | None, mode_before: str | None = None) -> None:
-        """Tell at once: whoever reads the command's answer must not see the old status.
+        """Write the new status at once: a reader of the command's answer must not see the old one.
 
         Args:
-            loop: As `loop` is from now on.
-            mode_before: The simulation mode to go back to, where it is paused.
+            loop: The new value of `loop`.
+            mode_before: The simulation mode to return to, where it is paused.
         """
         self.loop, self._mode_before = loop, mode_before
         if loop != PAUSED:
@@ -62,5 +62,5 @@ class Heartbeat:
 
 
 def _wall_time_s(monotonic_s: float | None) -> float | None:
-    """When that was by the wall clock as it is set now."""
+    """The wall time of a moment of the monotonic clock, as the wall clock is set now."""
     return None if monotonic_s is None else time.time() - (time.monotonic() - monotonic_s)

@@ -1,4 +1,4 @@
-"""Who is recording: the robot, the process, the controller's code. No call can raise here."""
+"""The identity of a recording process: robot, process, code. What is missing raises no error."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _THIS_HOST: Final = ("", "localhost", "127.0.0.1", "::1", host_name().lower())
 
 
 class Identity(NamedTuple):
-    """What is known of a controller process when its bridge starts."""
+    """The facts about a controller process when its bridge starts."""
 
     robot_name: str
     kind: str
@@ -38,7 +38,7 @@ class Identity(NamedTuple):
 def identify(
     robot: Any, supervisor: bool, version: str, throttle_interval: int, kind: str | None = None
 ) -> Identity:
-    """Collect the identity; what cannot be found out is None, never an error."""
+    """Collect the identity; what cannot be determined is None, never an error."""
     controller = controller_file()
     return Identity(
         robot_name=str(robot.getName() or os.environ.get("WEBOTS_ROBOT_NAME") or "robot"),
@@ -65,14 +65,14 @@ def identify(
 
 
 def controller_file() -> Path | None:
-    """The file that runs as the main program, if it is one."""
+    """The file of the main program; None where there is none, as at a prompt."""
     main = getattr(sys.modules.get("__main__"), "__file__", None) or sys.argv[0]
     path = Path(main).absolute() if main else None
     return path if path and path.is_file() else None
 
 
 def _plain_text(path: object) -> str:
-    """A path's bytes need not be text; what the database holds must be."""
+    """A path as valid text: file names may have any bytes, the database needs UTF-8."""
     return str(path).encode("utf-8", "replace").decode()
 
 
@@ -81,7 +81,7 @@ def _devices(robot: Any) -> dict[str, Any]:
 
 
 def _instance() -> str:
-    """Which Webots this is: host and port, as Webots gives them; else who started this process."""
+    """Identifies the Webots: its host and port, or else the process that started this one."""
     folder = os.environ.get("WEBOTS_INSTANCE_PATH", "").rstrip("/\\")
     url = os.environ.get("WEBOTS_CONTROLLER_URL", "")
     if folder and not _is_extern():
@@ -100,9 +100,9 @@ def _simulator_of(url: str) -> str:
 
 
 def _is_extern() -> bool:
-    """Whether somebody else than Webots started this process, and so nobody will start another.
+    """Whether Webots did not start this process, and so will not start its successor.
 
-    Webots' library looks for these variables in this order.
+    The variables are tested in the order in which Webots' library reads them.
     """
     intern = "WEBOTS_ROBOT_NAME" in os.environ and "WEBOTS_INSTANCE_PATH" in os.environ
     return not intern and "WEBOTS_CONTROLLER_URL" in os.environ
@@ -116,7 +116,7 @@ def _sha256(file: Path) -> str | None:
 
 
 def _sha256_of(data: bytes) -> str:
-    """By the interpreter's own module: hashlib brings OpenSSL in, for 5 ms and 4 MB more."""
+    """By the interpreter's own module: hashlib would load OpenSSL, for 5 ms and 4 MB more."""
     for name in ("_sha2", "_sha256"):  # since Python 3.12, and before it
         try:
             return __import__(name).sha256(data).hexdigest()
@@ -133,7 +133,7 @@ def _git_commit(folder: Path) -> str | None:
         for place in (folder, *folder.parents):
             if (place / ".git").exists():
                 return _head(_git_dir(place / ".git"))
-    except (OSError, ValueError):  # not to be read, or no text
+    except (OSError, ValueError):  # unreadable, or not text
         return None
     return None
 

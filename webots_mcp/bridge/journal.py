@@ -20,7 +20,7 @@ _LEVELS: Final = {"stdout": "info", "stderr": "warning"}
 
 
 class Journal:
-    """Stamps what is recorded with the run, simulation time and wall time of this moment."""
+    """Records rows with the run, simulation time and wall time of this moment."""
 
     def __init__(self, recorder: Recorder, clock: Clock) -> None:
         self._recorder = recorder
@@ -31,14 +31,14 @@ class Journal:
     def state(self, encoded: Encoded) -> None:
         """Record a published state."""
         clock = self._clock
-        row = (clock.sim_time_s, time.time(), encoded.text, encoded.odd_text)
+        row = (clock.sim_time_s, time.time(), encoded.text, encoded.replaced_text)
         self._recorder.record("state", clock.run, row)
-        if encoded.odd:
-            self.values_replaced += len(encoded.odd) - bool(encoded.unnamed) + encoded.unnamed
-            self._log_lost(encoded.odd)
+        if encoded.replaced:
+            self.values_replaced += len(encoded.replaced) - bool(encoded.unnamed) + encoded.unnamed
+            self._log_lost(encoded.replaced)
 
     def log(self, level: str, source: str, message: str, logger: str | None = None) -> None:
-        """Record a line, or its beginning."""
+        """Record a log line, cut to 10,000 characters."""
         text = storable(cut(message, MOST_LOG_CHARACTERS))
         name = None if logger is None else storable(cut(logger, _MOST_LOGGER_CHARACTERS))
         row = (self._clock.sim_time_s, time.time(), level, source, text, name)
@@ -54,14 +54,14 @@ class Journal:
     def event(
         self, kind: str, data: dict[str, object] | None = None, name: str | None = None
     ) -> None:
-        """Record something that was noticed now."""
+        """Record an event that happened now."""
         text = encode(data).text if data is not None else None
         row = (self._clock.sim_time_s, time.time(), kind, name, text)
         self._recorder.record("event", self._clock.run, row)
 
-    def _log_lost(self, odd: dict[str, str]) -> None:
-        """Named in `odd` all the same; a value that is not in the row is logged once a path."""
-        for path, kind in odd.items():
+    def _log_lost(self, replaced: dict[str, str]) -> None:
+        """Log each path whose value is not in the row, once; the row's column names all of them."""
+        for path, kind in replaced.items():
             if kind in _NOT_LOST or path in self._lost or len(self._lost) >= _MOST_LOST_PATHS:
                 continue
             self._lost.add(path)

@@ -1,10 +1,10 @@
 """Keeping the seconds around a moment at full rate: a ring buffer before it, each call after it.
 
-What the throttle drops goes into the ring. `keep` writes the ring to the table `kept_state`, in
-order and some rows with each call of the loop; for some seconds more each throttled call follows.
-Together with the recorded rows that is every call of a kept stretch, of which the table
-`kept_stretch` tells begin, end and reason. Small frames of the cameras that the controller names
-are held and kept with them, one file with each call.
+Throttled calls go into the ring. `keep` writes the ring to the table `kept_state`, in order and
+some rows with each call of the loop; each throttled call of the next seconds follows. Together with
+the recorded rows this is every call of a kept stretch, whose begin, end and reason are in the table
+`kept_stretch`. Small frames of the cameras that the controller names are held and kept with them,
+one file with each call.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.contract import KEEP_AFTER_S, new_uuid
 
 MOST_KEPT_S: Final = 600.0  # of one run; a condition that flickers would keep all of it
-_MOST_REASONS: Final = 10  # of one stretch that are told
+_MOST_REASONS: Final = 10  # of one stretch that are stored
 _MOST_REASON_CHARACTERS: Final = 200
-# A millisecond and a half, with their encoding. The processor's time: by the wall clock another
-# process that runs in between would make it fewer rows.
+# These limit a call to about 1.5 ms, encoding included. Processor time: by the wall clock, another
+# process that runs in between would leave fewer rows per call.
 _ROWS_AT_ONCE: Final = 100
 _ENCODING_AT_ONCE_S: Final = 0.0005
 _CHARACTERS_AT_ONCE: Final = 200_000
 
 
 class Stretch:
-    """A kept stretch of a run; `end_s` lies ahead while it goes on.
+    """A kept stretch of a run; `end_s` is in the future while it is being recorded.
 
     Attributes:
-        gaps: Why not each call is in it; None where each is.
+        gaps: Why calls are missing in it; None where none is.
     """
 
     def __init__(self, run: Run, start_s: float) -> None:
@@ -59,16 +59,16 @@ class Stretch:
         return "; ".join([*self.reasons, *filter(None, [self.gaps])])
 
     def add_reason(self, reason: str) -> None:
-        """Note why it is kept, once."""
+        """Add a reason for keeping it, if it is new."""
         text = storable(cut(reason, _MOST_REASON_CHARACTERS))
-        # An exception is also logged, as "error: " and the same.
-        told = any(f": {text}".endswith(f": {known}") for known in self.reasons)
-        if not told and len(self.reasons) < _MOST_REASONS:
+        # An exception is also logged, as "error: " and the same text.
+        is_known = any(f": {text}".endswith(f": {known}") for known in self.reasons)
+        if not is_known and len(self.reasons) < _MOST_REASONS:
             self.reasons.append(text)
 
 
 class Keeper:
-    """Holds the last seconds, and keeps them where it is asked to.
+    """Holds the last seconds in memory, and writes them to the database on request.
 
     Args:
         last_s: Seconds of simulation time before a moment that are kept; 0 keeps nothing.
@@ -77,6 +77,7 @@ class Keeper:
         frames: Takes and holds small frames of cameras.
         fills: Each throttled call has to be added.
         busy: `go_on` has to be called with each round of the loop.
+        enabled: Whether anything is held at all.
     """
 
     def __init__(
@@ -98,7 +99,9 @@ class Keeper:
         self._run = clock.run
         self._ring.begin(clock.sim_time_s)
         self._kept_s = 0.0
-        self._left_out: tuple[float, str] | None = None  # the last one of this run
+        self._left_out: tuple[float, str] | None = (
+            None  # the last call of this run that was not held
+        )
         self._stretch: Stretch | None = None
         self._going_on = False
         self._asked: deque[str] = deque(maxlen=_MOST_REASONS)
@@ -113,14 +116,14 @@ class Keeper:
     # -- the loop ------------------------------------------------------------------------------
 
     def add(self, state: object) -> None:
-        """Take in a call of `publish` that is not recorded."""
+        """Add a call of `publish` that is not recorded."""
         clock = self._clock
-        held, odd = copy_or_encode(state), None
+        held, replaced = copy_or_encode(state), None
         if not isinstance(held, bytes):
-            held, odd = held.text, held.odd_text
+            held, replaced = held.text, held.replaced_text
             if not held.startswith("{"):
-                return  # a call that is recorded says so
-        row = RingRow(self._throttle.calls, clock.sim_time_s, time.time(), held, odd)
+                return  # not a dict: the next recorded call reports that
+        row = RingRow(self._throttle.calls, clock.sim_time_s, time.time(), held, replaced)
         with self._lock:
             if clock.run is not self._run:
                 self._begin_run()
@@ -132,9 +135,9 @@ class Keeper:
                 self._ring.add(row)
 
     def look_at_cameras(self, *, at_once: bool) -> None:
-        """Take a small frame of each camera whose time has come, or at once of each."""
+        """Take a small frame of each camera whose frame is due; `at_once` of all cameras."""
         now_s = self._clock.sim_time_s
-        frames = self.frames.look(now_s, at_once=at_once)  # Webots may let that wait
+        frames = self.frames.look(now_s, at_once=at_once)  # without the lock: Webots may be slow
         with self._lock:
             if self._clock.run is not self._run:
                 self._begin_run()
@@ -148,7 +151,7 @@ class Keeper:
                     self.frames.add(frame)
 
     def leave_out(self, why: str) -> None:
-        """A call is neither recorded nor held; a stretch with it says why."""
+        """Note that a call is neither recorded nor held; its stretch then names the reason."""
         with self._lock:
             if self._clock.run is not self._run:
                 self._begin_run()
@@ -160,7 +163,7 @@ class Keeper:
                 self._record(stretch)
 
     def go_on(self) -> None:
-        """Keep what was asked for, write some rows, and end the stretch when it is over."""
+        """Begin the requested stretches, write some rows, and end the stretch when it is over."""
         with self._lock:
             if self._clock.run is not self._run:
                 self._begin_run()
@@ -174,13 +177,13 @@ class Keeper:
     # -- keeping -------------------------------------------------------------------------------
 
     def ask(self, reason: str) -> None:
-        """Keep with the next round of the loop; any thread may ask."""
+        """Request a stretch, which the next round of the loop begins; from any thread."""
         if self.enabled:
             self._asked.append(reason)
             self.busy = True
 
     def keep(self, reason: str) -> bool:
-        """Keep the last seconds and those to come; whether that is possible."""
+        """Keep the last seconds and the next ones; False where that is not possible."""
         with self._lock:
             if not self.enabled or not self._may_keep():
                 return False
@@ -206,18 +209,18 @@ class Keeper:
     def why_not(self) -> str:
         """Why nothing can be kept."""
         if not self.enabled:
-            return "the bridge holds nothing: keep_last_s is 0"
-        return f"{MOST_KEPT_S:g} s of this run are kept at full rate: no more will be"
+            return "the bridge holds nothing to keep: keep_last_s is 0"
+        return f"{MOST_KEPT_S:g} s of this run are kept at full rate already, which is the limit"
 
     def write_all(self) -> None:
-        """Keep what was asked for and write it now: the loop is about to stand still, or to end."""
+        """Write all requested stretches now: the loop is about to stop, so no call would follow."""
         with self._lock:
             self._keep_asked()
         while self._unwritten or self._unwritten_frames:
             self._write_some()
 
     def close(self) -> None:
-        """The session ends, and with it what was to be kept of the seconds to come."""
+        """The session ends: write everything, and end the stretch that is being recorded."""
         self.write_all()
         with self._lock:
             self._end_stretch(self._clock.sim_time_s)
@@ -238,12 +241,12 @@ class Keeper:
         if self._kept_s < MOST_KEPT_S:
             return True
         if self._kept_s < float("inf"):
-            self._kept_s = float("inf")
+            self._kept_s = float("inf")  # so that the warning is logged once per run
             self._journal.log("warning", "bridge", self.why_not)
         return False
 
     def _begin_run(self) -> None:
-        """Time went back: what the ring holds is of a run that is over."""
+        """A new run has begun: forget what the ring holds of the last one."""
         self._end_stretch(self._clock.ended_sim_time_s)
         self._run, self._stretch, self._kept_s = self._clock.run, None, 0.0
         self._left_out = None
@@ -251,7 +254,7 @@ class Keeper:
         self.frames.take(math.inf)
 
     def _end_stretch(self, at_s: float) -> None:
-        """It stays known: one that follows before its ring could have begun goes on with it."""
+        """End the stretch, but remember it: one that begins soon after continues it."""
         stretch = self._stretch
         if not self._going_on or stretch is None:
             return
@@ -274,7 +277,7 @@ class Keeper:
     def _keep_frame(self, stretch: Stretch, frame: Frame) -> None:
         if len(self._unwritten_frames) < 2 * MOST_FRAMES:
             self._unwritten_frames.append((stretch, frame))
-        else:  # more cameras than can be written
+        else:  # frames arrive faster than one file per call can be written
             self.frames.missed += 1
 
     def _write_some(self) -> None:
@@ -284,7 +287,7 @@ class Keeper:
                 self._write_frame(*self._unwritten_frames[0])
 
     def _write_frame(self, stretch: Stretch, frame: Frame) -> None:
-        """One file: to compress and write it takes about a millisecond."""
+        """Write one frame: to compress and write a file takes about a millisecond."""
         try:
             self._album.add_kept(stretch.run, stretch.uuid, frame)
         except OSError as error:
@@ -294,7 +297,10 @@ class Keeper:
             self._unwritten_frames.popleft()
 
     def _write_rows(self) -> None:
-        """Rows of one run, in one transaction. They are forgotten after it: twice does no harm."""
+        """Write some rows of one run, in one transaction.
+
+        They are forgotten after it: rows that an interrupt lets be written twice do no harm.
+        """
         rows = list[RingRow]()
         room, until_s = _CHARACTERS_AT_ONCE, time.thread_time() + _ENCODING_AT_ONCE_S
         for run, row in islice(self._unwritten, _ROWS_AT_ONCE):

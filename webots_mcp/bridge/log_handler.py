@@ -1,4 +1,4 @@
-"""The way from Python's `logging` into the record."""
+"""A handler of Python's `logging` that records the lines."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ class LogHandler(logging.Handler):
     """Records each line with its level and the name of its logger.
 
     Args:
-        record: Takes the text, the level's number and the logger's name; called in any thread.
-        level: This level and those above it.
+        record: Receives the text, the level's number and the logger's name; called in any thread.
+        level: Lines of this level and those above it are recorded.
     """
 
     def __init__(
@@ -23,7 +23,7 @@ class LogHandler(logging.Handler):
         self._inside = threading.local()
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Record a line; one that is logged while a line is being recorded is left out."""
+        """Record a line; one that is logged by the recording itself is ignored."""
         if getattr(self._inside, "busy", False):
             return
         self._inside.busy = True
@@ -35,7 +35,7 @@ class LogHandler(logging.Handler):
     def _text_of(self, record: logging.LogRecord) -> str:
         try:
             return self.format(record)
-        except Exception as error:  # noqa: BLE001  (whatever a message or its arguments do)
+        except Exception as error:  # noqa: BLE001  (a message's arguments may raise anything)
             return f"{_as_given(record.msg)} (not formatted: {type(error).__name__})"
 
 

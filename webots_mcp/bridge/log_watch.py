@@ -1,8 +1,8 @@
-"""Noticing that the write-ahead log was cut short under an open connection.
+"""Detecting that the write-ahead log was truncated under an open connection.
 
-SQLite keeps in shared memory how far the log goes, and reads and writes on beyond its end: what
-was cut off reads as zeros, and what is written afterwards is lost with the next opening. The log's
-format: sqlite.org/fileformat2.html, section 4.
+SQLite keeps the length of the log in shared memory, and continues to read and write beyond the end
+of a truncated file: the missing part reads as zeros, and what is written afterwards is lost when
+the database is opened next. The log's format: sqlite.org/fileformat2.html, section 4.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _MAGIC: Final = (b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x83")
 
 
 class _Log(NamedTuple):
-    """What was seen of a log: the salts of its generation, and its last frame."""
+    """A log as it was at one moment: the salts of its generation, and its last frame."""
 
     salts: bytes
     size: int
@@ -24,7 +24,7 @@ class _Log(NamedTuple):
 
 
 class LogWatch:
-    """Compares a log with what it was at the last look; a checkpoint that empties it is fine.
+    """Compares a log with its state at the last call; a checkpoint that empties it is no fault.
 
     Args:
         log: The file.
@@ -35,9 +35,9 @@ class LogWatch:
         self._seen: _Log | None = None
 
     def is_whole(self) -> bool:
-        """Whether nothing was cut off since the last look, as far as can be known.
+        """Whether the log was not truncated since the last call, as far as can be known.
 
-        One that is empty now tells nothing: the next look does, after something was written.
+        An empty log could be either; it is judged at the next call, when it has frames again.
         """
         before, self._seen = self._seen, None
         try:
@@ -60,6 +60,6 @@ class LogWatch:
                 frame_salts = file.read(8)
         except OSError:
             return True
-        if frame_salts == salts:  # else it is left over from the generation before
+        if frame_salts == salts:  # else the frame is left over from the previous generation
             self._seen = _Log(salts, size, frame, frame_salts)
         return True

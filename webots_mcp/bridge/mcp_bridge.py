@@ -1,4 +1,4 @@
-"""The public face of the bridge: what a controller calls."""
+"""The public interface of the bridge: what a controller calls."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ _KEEPING: Final = ("error", "critical")  # log levels
 class MCPBridge:
     """Records what a controller publishes, and runs the commands that are sent to it.
 
-    One line records what the robot's devices say and serves commands, at each step:
+    One line records the values of the robot's devices and serves commands, at each step:
 
         bridge = MCPBridge.attach(robot)
 
-    A loop that says for itself what is worth knowing:
+    A loop that publishes a state of its own:
 
         bridge = MCPBridge(robot)
         while robot.step(time_step) != -1:
@@ -64,8 +64,8 @@ class MCPBridge:
 
     After construction no method raises into the control loop (the environment variable
     `WEBOTS_MCP_STRICT=1` makes them raise) and none waits for a lock. What could not be recorded
-    is counted in `stats()` and said once on stderr. The methods belong to the loop's thread; only
-    `log` may be called from others too.
+    is counted in `stats()` and reported once on stderr. The methods must be called in the loop's
+    thread; only `log` may be called in others too.
 
     Args:
         robot: The controller's `Robot` or `Supervisor`, or an instance of a subclass.
@@ -74,23 +74,23 @@ class MCPBridge:
             variable `WEBOTS_MCP_THROTTLE_INTERVAL` overrides it.
         keep_last_s: Seconds of simulation time before a moment that are kept at full rate: every
             call of `publish`, also those that the throttle drops (see `keep`). They are held in
-            memory, up to 8 MB, of which the oldest go first. Five seconds hold what leads to a
-            crash or a hit, and cost a throttled call some microseconds, one of `auto_publish` up to
-            100 us on average for reading devices (see `stats().ring_interval`). 0 holds nothing;
+            memory, up to 8 MB; beyond that the oldest are forgotten. Five seconds show what led to
+            a crash or a hit, and cost a throttled call some microseconds, one of `auto_publish` up
+            to 100 us on average for reading devices (see `stats().ring_interval`). 0 holds nothing;
             the environment variable `WEBOTS_MCP_KEEP_LAST_S` overrides it.
-        capture_output: What the process prints on stdout and stderr is recorded too, as log lines
-            of the logger `stdout` or `stderr`, up to 500 a second of each; it appears where it
-            did before. C code and child processes count as well; a child that is to outlive the
-            controller needs a stdout of its own.
+        capture_output: Also record what the process prints on stdout and stderr, as log lines of
+            the logger `stdout` or `stderr`, up to 500 a second of each. The output still appears
+            where it did before. Output of C code and of child processes is included; a child that
+            is to outlive the controller needs a stdout of its own.
         database: A file, `":memory:"`, or a `MemoryDatabase` shared with a server; None for
             `webots.db` in the data folder.
 
     Raises:
-        TypeError: `robot` is no robot, or `database` is of another type.
+        TypeError: `robot` is not a robot, or `database` is of another type.
         ValueError: `throttle_interval` is less than 1, or `keep_last_s` not from 0 to 3600.
     """
 
-    _kind: str | None = None  # of its robot, where it is of a kind of its own
+    _kind: str | None = None  # the robot's kind, where a subclass sets one (the observer's)
 
     def __init__(
         self,
@@ -113,6 +113,8 @@ class MCPBridge:
         strict = os.environ.get(STRICT_VARIABLE, "").lower() not in _FALSE
         self._errors = ErrorReport(strict=strict)
         simulation = Simulation(robot)
+        # After the check of the robot, before the new session: a refused construction leaves the
+        # former bridge as it is, and two sessions of one robot never overlap.
         open_bridges.close_former(robot)
         where = (self.database, self.data_dir)
         self._session = Session(
@@ -127,34 +129,34 @@ class MCPBridge:
         open_bridges.enter(robot, OpenBridge(self, self.close, self._leave_to_parent))
         atexit.register(self._close_at_exit)
 
-    # -- without another line ------------------------------------------------------------------
+    # -- attaching -----------------------------------------------------------------------------
 
     @classmethod
     def attach(cls, robot: Any, **options: Any) -> MCPBridge:
-        """Record what the devices say, and serve commands, with each `step` of the robot.
+        """Record the devices' values and serve commands with each `step` of the robot.
 
             bridge = MCPBridge.attach(robot)
             while robot.step(time_step) != -1:
                 ...
 
         It does not matter where and how the controller steps: in a subclass with a `step` of its
-        own, in a function of another module, by `stepBegin` and `stepEnd`, or of a
-        `vehicle.Driver`; only a method that was stored before (`step = robot.step`) or put in its
-        place (`robot.step = mine`) is not seen, which is warned of. Each step that lets time pass
-        publishes once (see `auto_publish`), when it ends; commands are served when a step
-        begins, `step(0)` too. The step returns what Webots answers. After a -1 all is written,
-        and Webots is asked nothing any more.
+        own, in a function of another module, by `stepBegin` and `stepEnd`, or by a
+        `vehicle.Driver`. Only a method that was stored before (`step = robot.step`) or that
+        replaces it (`robot.step = mine`) is not seen; the bridge warns of that. Each step in which
+        simulation time advances publishes once (see `auto_publish`), when it ends; commands are
+        served when a step begins, `step(0)` included. The step returns what Webots answers. After a
+        -1 everything is written, and Webots is not called any more.
 
-        What the controller publishes itself is recorded together with what the devices say. One
-        that calls `get_command()` as well gets the command that was served last. The steps of a
-        handler are recorded, and no other command is served in them.
+        A state that the controller publishes is recorded together with the devices' values. A
+        controller that also calls `get_command()` receives the command that was served last. The
+        steps of a handler are recorded, and no other command is served in them.
 
         Args:
-            robot: As of `MCPBridge`. Its open bridge is attached, if it has one.
-            options: As of `MCPBridge`.
+            robot: As for `MCPBridge`. If it has an open bridge, that one is attached.
+            options: As for `MCPBridge`.
 
         Returns:
-            The robot's bridge; `detach()` lets its steps alone again.
+            The robot's bridge; `detach()` undoes the attachment.
 
         Raises:
             ValueError: Options are given and the robot has a bridge already.
@@ -164,8 +166,8 @@ class MCPBridge:
             bridge = cls(robot, **options)
         elif options:
             raise ValueError(
-                f"the robot has a bridge already: {', '.join(options)} cannot be set any more; "
-                "close() that bridge first, or attach(robot) without options"
+                f"the robot already has a bridge, so {', '.join(options)} cannot be set; close() "
+                "that bridge first, or call attach(robot) without options"
             )
         if bridge._attachment is None:
             bridge._attachment = Attachment(bridge._session, bridge._serve, bridge._errors)
@@ -173,7 +175,7 @@ class MCPBridge:
         return bridge
 
     def detach(self) -> None:
-        """Let the robot's steps alone; from now on the loop publishes and asks for commands."""
+        """Undo `attach`; from now on the loop itself publishes and calls `get_command()`."""
         if self._attachment is not None:
             self._attachment.end()
             self._attachment = None
@@ -183,13 +185,13 @@ class MCPBridge:
     def publish(self, state: Mapping[Any, Any], force: bool = False) -> None:
         """Record the robot's state: every `throttle_interval`-th call, or now with `force`.
 
-        Each call is recorded where a command pauses or makes single steps: what is shown of a
-        paused robot is its newest state.
+        While a command pauses the loop or makes single steps, each call is recorded, so that the
+        newest recorded state of a paused robot is its current one.
 
         Args:
-            state: Nested dicts, sequences, numbers, texts, numpy arrays, dataclasses, ... What
-                JSON cannot hold is replaced and named (see `webots_mcp.bridge.encoding`). It is
-                never changed. When the call returns, the row is in the database.
+            state: Nested dicts, sequences, numbers, texts, numpy arrays, dataclasses, ... Values
+                that JSON cannot hold are replaced and named (see `webots_mcp.bridge.encoding`). The
+                state itself is never changed. When the call returns, the row is in the database.
             force: Record this call whatever its number.
         """
         try:
@@ -201,7 +203,7 @@ class MCPBridge:
             self._errors.failed("publish", error)
 
     def get_command(self) -> dict[str, Any] | None:
-        """Run the commands that wait for this robot; call it once in every round of the loop.
+        """Run the pending commands of this robot; call it once in every round of the loop.
 
         While the simulation is paused by a command, the call lasts until it is resumed, stepped,
         reset or reloaded, by a command or by a person in Webots, or until Webots ends the
@@ -209,8 +211,8 @@ class MCPBridge:
 
         Returns:
             The command handled last in this call: `id`, `action`, `params`, and the parameters
-            as keys; None where there was none. One whose action nobody has registered is
-            returned too, and its answer is that it failed.
+            as keys; None where there was none. A command with an unknown action is returned too;
+            its recorded answer is an error.
         """
         try:
             command = self._serve()
@@ -225,18 +227,18 @@ class MCPBridge:
     def auto_publish(
         self, extra: Mapping[Any, Any] | None = None, include_time: bool = True
     ) -> dict[Any, Any]:
-        """Publish what all enabled devices say: `sensors`, `motors`, `actuators`, `pose`, ...
+        """Publish the values of all enabled devices: `sensors`, `motors`, `actuators`, `pose`, ...
 
         The rule for each class of devices is in `webots_mcp.bridge.devices`. Nothing is enabled or
-        changed, and no packet or key is taken.
+        changed, and no packet or key is consumed.
 
         Args:
-            extra: More keys; they win over those read from the devices.
+            extra: More keys, which replace equal ones of the devices.
             include_time: Add the simulation time as `time` (seconds).
 
         Returns:
-            The state; without the devices where this call was throttled and did not read them.
-            It has the simulation time as `sim_time`, too. Empty where publishing failed.
+            The state, without the devices where this call was throttled and did not read them. It
+            also has the simulation time as `sim_time` (seconds). Empty where publishing failed.
         """
         try:
             extra = extra or {}
@@ -252,14 +254,14 @@ class MCPBridge:
     def keep(self, reason: str) -> None:
         """Keep the last `keep_last_s` seconds at full rate, and the two that follow.
 
-        Every call of `publish` in them becomes a row, also those that the throttle drops. It is
-        done by itself where a breakpoint with the action `pause` or `keep` is hit, with a log
-        line of the level `error` or above, and where an exception ends the controller. What was
-        held is written with the calls that follow, a millisecond at a time. Stretches that
-        overlap become one; of a run up to 600 s are kept.
+        Every call of `publish` in them becomes a row, also those that the throttle drops. The
+        bridge does this by itself where a breakpoint with the action `pause` or `keep` is hit, with
+        a log line of the level `error` or above, and where an exception ends the controller. The
+        held calls are written with the calls that follow, about a millisecond at a time. Stretches
+        that overlap become one; at most 600 s of a run are kept.
 
         Args:
-            reason: Why, as it is told with the stretch.
+            reason: Why they are kept; it is stored with the stretch.
         """
         try:
             self._session.context.keeper.keep(text_of(reason))
@@ -267,21 +269,21 @@ class MCPBridge:
             self._errors.failed("keep", error)
 
     def keep_camera(self, camera: Any, frames_per_s: float = 5.0) -> None:
-        """Hold small frames of a camera with the last seconds, and keep them where those are kept.
+        """Hold small frames of a camera with the last seconds, and keep them with those.
 
             bridge.keep_camera(camera)
 
         With `publish` the camera's newest image is taken at that rate, scaled down to 160 pixels at
-        most (each n-th of a row, each n-th row), and held in memory: of all cameras the last 78
-        frames, up to 8 MB. One is taken at the very step of a breakpoint's hit. In a kept stretch
-        they become PNG files, one with each call (about a millisecond), that stay as long as the
-        stretch. A frame that the camera could not give is counted in `stats()`, and told in the
-        log where that happens again. Nothing is taken where `keep_last_s` is 0.
+        most (each n-th of a row, each n-th row), and held in memory: the last 78 frames of all
+        cameras, up to 8 MB. One is also taken at the step of a breakpoint's hit. In a kept stretch
+        they become PNG files, one with each call (about a millisecond), which exist as long as the
+        stretch. A frame that could not be taken is counted in `stats()`; a camera's second such
+        frame is logged. Nothing is taken where `keep_last_s` is 0.
 
         Args:
             camera: A Webots `Camera`; it may be enabled later.
-            frames_per_s: Frames per second of simulation time, up to 100, but not more than the
-                camera takes pictures. A later call for the same camera changes it.
+            frames_per_s: Frames per second of simulation time, up to 100, and at most as many as
+                the camera's sampling period allows. A later call for the same camera changes it.
         """
         try:
             keeper = self._session.context.keeper
@@ -291,10 +293,10 @@ class MCPBridge:
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("keep_camera", error)
 
-    # -- beside the state ----------------------------------------------------------------------
+    # -- logs and pictures ---------------------------------------------------------------------
 
     def log(self, message: object, level: str | int = "info") -> None:
-        """Record a line; its first 10,000 characters are kept.
+        """Record a log line; its first 10,000 characters are stored.
 
         Args:
             message: Its text.
@@ -312,7 +314,7 @@ class MCPBridge:
         cannot be formatted is recorded as it was given, with the reason; nothing raises.
 
         Args:
-            level: The handler passes on this level and those above it.
+            level: The handler records this level and those above it.
         """
         from webots_mcp.bridge.log_handler import LogHandler  # `logging` costs a tenth of a start
 
@@ -332,11 +334,11 @@ class MCPBridge:
             self._errors.failed("log", error)
 
     def save_camera_frame(self, camera: Any, max_frames: int = MOST_FRAMES) -> str | None:
-        """Save the camera's current image as PNG and enter it in the database.
+        """Save the camera's current image as PNG, with a row in the database.
 
         Args:
             camera: A Webots `Camera` that is enabled.
-            max_frames: How many frames of this camera are kept; older ones are deleted.
+            max_frames: How many frames of this camera are stored; older ones are deleted.
 
         Returns:
             The file's path relative to the data folder; None where there is no image yet.
@@ -352,18 +354,18 @@ class MCPBridge:
     def register_command(self, action: str, handler: Handler) -> None:
         """Let an assistant run `handler` as the custom action `action`.
 
-        Built-in actions stay the bridge's own: a handler for one is never called, which is said
-        once in the log. But that of `reset_state` is, in place of the callbacks of `on_reload`.
+        Built-in actions cannot be replaced: a handler for one is never called, which is logged
+        once. The exception is `reset_state`, whose handler replaces the callbacks of `on_reload`.
 
         Args:
-            action: Its name; the handler's docstring tells the assistant what it does.
+            action: Its name; the assistant reads the handler's docstring as its description.
             handler: Called inside `get_command()` with the command as one dict: `id`, `action`,
-                `params`, and the parameters as keys. What it returns is the command's result; an
-                exception is its error.
+                `params`, and the parameters as keys. Its return value is the command's result; an
+                exception is the command's error.
 
         Raises:
             ValueError: The name is empty, over 100 characters, or not printable.
-            TypeError: The name is no text, or the handler is not a plain function.
+            TypeError: The name is not a text, or the handler is not a plain function.
         """
         self._session.control.handlers.register(action, handler)
 
@@ -385,23 +387,23 @@ class MCPBridge:
                 motor.setVelocity(kp.value * error)
                 bridge.get_command()
 
-        It begins with what the environment variable `WEBOTS_MCP_PARAMETERS` says (a JSON object
+        It begins with its value in the environment variable `WEBOTS_MCP_PARAMETERS` (a JSON object
         of names and values), else with `default`. It changes only inside `get_command()` and when
         the world is reset; each value is recorded with its time. A reset keeps the values, a
-        reload begins with the first ones again. Declaring a name again brings it up to date; a
-        log line says what is other than before.
+        reload begins with the first ones again. Declaring a name again updates its declaration,
+        and a log line names the differences.
 
         Args:
             name: Up to 100 characters, without a space or `=`; `arm.kp` is fine.
             default: A float, int, bool or str, which decides the type.
-            low: The least value of a number; None without a bound.
-            high: The greatest value of a number; None without a bound.
+            low: The smallest value of a number; None without a bound.
+            high: The largest value of a number; None without a bound.
             choices: The only values that it may have.
-            doc: What it does, for the assistant.
-            unit: Of a number, such as `m/s`.
+            doc: A description for the assistant.
+            unit: The unit of a number, such as `m/s`.
 
         Raises:
-            TypeError: An argument is of a type that it cannot have.
+            TypeError: An argument has an invalid type.
             ValueError: One is out of bounds, they contradict each other, or there are 500
                 parameters already.
         """
@@ -417,22 +419,23 @@ class MCPBridge:
 
             bridge.breakpoint("front_m < 0.1 for 0.5", action="log")
 
-        It is asked of each published state, also of those that are not recorded, and armed again
-        after a reset. A hit is recorded as an event with the state's values, and the state is.
+        It is evaluated on each published state, also on those that are not recorded, and is armed
+        again after a reset. A hit is recorded as an event with the values of the condition's
+        signals, and its state is recorded too.
 
         Args:
             condition: In the language of docs/conditions.md.
-            action: `pause` pauses the simulation at that very step, which needs a Supervisor;
-                `keep` keeps the seconds around the hit at full rate (see `keep`), as `pause` does
-                too; `log` only records the hit.
+            action: `pause` pauses the simulation at that step, which needs a Supervisor; `keep`
+                keeps the seconds around the hit at full rate (see `keep`), as `pause` does too;
+                `log` only records the hit.
             after_hits: The action is taken from this hit of a run on.
 
         Returns:
             Its id; None while the database cannot be written.
 
         Raises:
-            InvalidInputError: The condition is not of the language, there is no such action, or
-                there are 32 breakpoints already.
+            InvalidInputError: The condition or the action is invalid, or there are 32 breakpoints
+                already.
         """
         return self._session.context.breakpoints.set(condition, action, after_hits)
 
@@ -440,7 +443,7 @@ class MCPBridge:
         """Call `callback` once for each reload or reset of the world, and on `reset_state`.
 
         A Supervisor's reset happens inside the same process (simulation time goes back); a reload
-        starts a new one, which finds its predecessor in the database.
+        starts a new process, which recognises its predecessor in the database.
         """
         self._session.context.reloads.add(callback)
 
@@ -463,11 +466,11 @@ class MCPBridge:
 
     @property
     def run_id(self) -> int | None:
-        """Id of the current run; None while nothing could be written yet."""
+        """Id of the current run; None while nothing has been written yet."""
         return self._session.context.clock.run.id
 
     def stats(self) -> BridgeStats:
-        """What was recorded so far, and what was not."""
+        """Counts of what was recorded so far and what was not, and the time that it took."""
         recorder, throttle = self._session.context.recorder, self._session.context.throttle
         return BridgeStats(
             rows_written=recorder.counts.written,
@@ -485,10 +488,10 @@ class MCPBridge:
         )
 
     def close(self, reason: str | None = None) -> None:
-        """Write what waits and end the session; what is published afterwards is dropped.
+        """Write the waiting rows and end the session; what is published afterwards is dropped.
 
-        Never needed for the data's sake: every row is written when its call returns. In a handler
-        of `register_command` it is done once the command's answer is written.
+        No data is lost without it: every row is written when its call returns. In a handler of
+        `register_command` the bridge closes once the command's answer is written.
 
         Args:
             reason: How the session ended; `finished`, or `reload` after a reload command.
@@ -496,7 +499,7 @@ class MCPBridge:
         if self._closed:
             return
         if reason is None and self._session.control.handlers.running:
-            self._close_after_answer = True  # else the command would never be answered
+            self._close_after_answer = True  # a closed bridge could not write the answer
             return
         try:
             if self._attachment is not None:
@@ -511,7 +514,7 @@ class MCPBridge:
         open_bridges.leave(self.robot)
         self._capture.close()
         self._session.close(reason)
-        self._closed = True  # last: an interrupted call is made up for at the exit
+        self._closed = True  # last: an interrupted call is repeated by `_close_at_exit`
         atexit.unregister(self._close_at_exit)
 
     def __enter__(self) -> MCPBridge:
@@ -519,7 +522,7 @@ class MCPBridge:
 
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         if error is not None:
-            self._tell_end(error)
+            self._record_exception(error)
         self.close("crashed" if error is not None else None)
 
     # -- inside --------------------------------------------------------------------------------
@@ -530,8 +533,11 @@ class MCPBridge:
             self.close()
         return command
 
-    def _tell_end(self, error: BaseException) -> None:
-        """Keep what came before an exception; one that is no interrupt is logged as well."""
+    def _record_exception(self, error: BaseException) -> None:
+        """Keep the seconds before an exception that ends the controller, and log it.
+
+        An interrupt (Ctrl-C, SystemExit) is not logged as an error.
+        """
         if self._closed:
             return
         why = f"{ENDED_BY} {describe(error)}"
@@ -547,7 +553,7 @@ class MCPBridge:
             self._errors.failed("capture_output", error)
 
     def _leave_to_parent(self) -> None:
-        """In a forked child: leave the session to the parent; what is published here is dropped."""
+        """In a forked child: leave the session to the parent; the child records nothing."""
         self._closed = True
         self.detach()
         self._capture.abandon()
@@ -555,10 +561,11 @@ class MCPBridge:
         self._session.context.keeper.abandon()
 
     def _close_at_exit(self) -> None:
-        """The interpreter keeps the exception that ends it; at a prompt it keeps others too."""
+        """Close when the interpreter ends, and find out whether an exception ended it."""
+        # `sys.last_value` is that exception, but at a prompt (ps1) it is the last one printed.
         error = None if hasattr(sys, "ps1") else getattr(sys, "last_value", None)
         if isinstance(error, BaseException):
-            self._tell_end(error)
+            self._record_exception(error)
         self.close("crashed" if isinstance(error, Exception) else None)
 
 

@@ -1,8 +1,8 @@
-"""Motors that turn without end, and turn on after a reset of the world.
+"""Restarting motors in velocity control (`setPosition(inf)`) after a reset of the world.
 
-With a reset each motor stays where it is. A controller that calls `setPosition(inf)` once, before
-its loop, would stand still from then on: it does not notice the reset. The library of Webots does
-not either, and goes on telling what the controller asked for last.
+A reset stops each motor at its position. A controller that calls `setPosition(inf)` once, before
+its loop, does not notice the reset, and its robot would stand still from then on. Webots' library
+does not notice it either: `getTargetPosition` still returns the last command, which is used here.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from webots_mcp.bridge.simulation import Simulation
 
 
 class Motors:
-    """Asks for endless turning again, where the controller has not done so by itself.
+    """Repeats `setPosition(inf)` and the velocity of motors after a reset.
 
     Args:
-        simulation: Whose robot has them.
-        journal: Is told which were asked.
-        failed: Is told of those that could not be.
+        simulation: Has the robot.
+        journal: Receives a log line that names the restarted motors.
+        failed: Receives name and error of each motor that could not be restarted.
     """
 
     def __init__(
@@ -32,25 +32,26 @@ class Motors:
         self._failed = failed
 
     def begin_run(self) -> None:
-        """The world was reset: what was to turn without end does so again, as fast as before."""
+        """The world was reset: restart the motors in velocity control, at their last velocity."""
         devices: dict[str, Any] = getattr(self._simulation.robot, "devices", None) or {}
         motors = [each for each in devices.items() if type(each[1]).__name__ == "Motor"]
-        asked = [told for name, motor in motors if (told := self._ask_again(name, motor))]
-        if asked:
-            what = "the reset stopped these motors; they were asked for setPosition(inf) again"
-            self._journal.log("info", "bridge", f"{what}, at their velocity: {', '.join(asked)}")
+        restarted = [text for name, motor in motors if (text := self._restart(name, motor))]
+        if restarted:
+            what = "the reset stopped these motors; the bridge called setPosition(inf) again"
+            listed = ", ".join(restarted)
+            self._journal.log("info", "bridge", f"{what}, with their last velocity: {listed}")
 
-    def _ask_again(self, name: str, motor: Any) -> str | None:
-        """Ask a motor to turn on, and tell how fast; None if it was not to turn without end."""
+    def _restart(self, name: str, motor: Any) -> str | None:
+        """Restart a motor; returns its name and velocity, or None where it was not in that mode."""
         try:
             target, velocity = motor.getTargetPosition(), motor.getVelocity()
             if not math.isinf(target):
                 return None
             if name.count("::") == 1 and motor.getMultiplier() != 1:
-                return None  # coupled: its sibling of multiplier 1 takes it along
+                return None  # coupled (`name::part`): the motor of multiplier 1 drives it too
             motor.setPosition(target)
-            motor.setVelocity(velocity)  # else it would turn as fast as it can
-        except Exception as error:  # noqa: BLE001  (the other motors are to turn on)
+            motor.setVelocity(velocity)  # else it would turn at its maximum velocity
+        except Exception as error:  # noqa: BLE001  (the other motors are still restarted)
             self._failed(f"setPosition(inf) after the reset, of the motor {name!r},", error)
             return None
         return f"{name} ({velocity:g})"

@@ -1,6 +1,6 @@
-"""The bridges that are open in this process: one a robot, and none of a parent that forked it.
+"""The open bridges of this process, one per robot; those of a parent that forked it are dropped.
 
-A second bridge on the same robot takes over from the first.
+A second bridge for the same robot closes the first.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 
 class OpenBridge(NamedTuple):
-    """What can be asked of a bridge here.
+    """A bridge, and how to close it.
 
     Attributes:
         bridge: The bridge itself.
-        close: End its session, for a reason.
-        abandon: In a forked child: leave the session to the parent.
+        close: Ends its session, for a reason.
+        abandon: In a forked child: leaves the session to the parent.
     """
 
     bridge: object
@@ -28,23 +28,23 @@ _bridges: dict[int, OpenBridge] = {}
 
 
 def enter(robot: object, bridge: OpenBridge) -> None:
-    """From now on this is the robot's bridge."""
+    """Register a robot's bridge."""
     _bridges[id(robot)] = bridge
 
 
 def find(robot: object) -> object | None:
-    """The robot's bridge, if it has one that is open."""
+    """The open bridge of a robot, or None."""
     open_bridge = _bridges.get(id(robot))
     return None if open_bridge is None else open_bridge.bridge
 
 
 def leave(robot: object) -> None:
-    """The robot's bridge is closed."""
+    """Remove a robot's closed bridge."""
     _bridges.pop(id(robot), None)
 
 
 def close_former(robot: object) -> None:
-    """Close the bridge that the robot had until now, if any."""
+    """Close the robot's previous bridge, if it has one."""
     former = _bridges.get(id(robot))
     if former is not None:
         former.close("replaced")

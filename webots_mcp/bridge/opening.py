@@ -1,4 +1,4 @@
-"""Opening the database of a controller: making it, bringing it forward, entering a session."""
+"""Opening the database of a controller: creating or migrating it, and entering a session."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from webots_mcp.waiting_file import adopt
 def open_session(
     database: Database, identity: Identity, session_uuid: str, actions: str, *, patient: bool
 ) -> tuple[sqlite3.Connection, Registration]:
-    """Open or make the database, and enter a session of this process.
+    """Open or create the database, and enter a session of this process.
 
     Args:
         database: Where to record.
-        identity: Who records.
-        session_uuid: The session's own; one that the database knows goes on.
+        identity: The robot and the process.
+        session_uuid: The session's UUID; a session that the database knows is continued.
         actions: The registered custom actions as JSON text.
         patient: Wait for locks and migrate an older schema: at the start, not in the loop.
 
@@ -37,7 +37,9 @@ def open_session(
     connection = connect(database, "loop", create=True, patient=patient)
     try:
         _prepare(connection, database, patient)
-        if patient and isinstance(database, Path):  # else the maintainer does
+        if patient and isinstance(
+            database, Path
+        ):  # in the loop it takes too long: the maintainer's
             adopt(connection, database)
         registration = register(connection, identity, session_uuid, actions)
         never_wait(connection)
@@ -57,7 +59,7 @@ def _prepare(connection: sqlite3.Connection, database: Database, patient: bool) 
 
 
 def _migrate(database: Database) -> None:
-    """Bring an older schema forward in a process of its own: Alembic takes a second to import."""
+    """Migrate an older schema in a process of its own: Alembic takes a second to import."""
     if isinstance(database, MemoryDatabase):
         return
     import subprocess  # only here: it would be a tenth of the bridge's import time
@@ -67,13 +69,13 @@ def _migrate(database: Database) -> None:
 
 
 def why_readers_block(connection: sqlite3.Connection) -> str | None:
-    """What is wrong with the place where the database lies; usually nothing."""
+    """Why readers block the writer at the database's location; None where they do not."""
     mode = journal_mode(connection)
     if mode in ("wal", "memory"):
         return None
     return (
-        f"lies where SQLite cannot share memory (journal mode {mode}: a network drive, or across "
-        "Windows and WSL): readers will make rows wait"
+        f"is on a drive where SQLite cannot share memory (journal mode {mode}: a network drive, or "
+        "across Windows and WSL): rows will wait while others read; use a local data folder"
     )
 
 
@@ -91,11 +93,11 @@ def move_aside(database: Path) -> None:
 
 
 def is_ours(database: Database, why: str) -> bool:
-    """Whether a broken file may be moved aside: it has our name, or a database's head.
+    """Whether a damaged file may be moved aside: it has our name, or the header of a database.
 
-    SQLite's own words tell of the head. Reading it here would drop the locks of this process on
-    the file, on which a maintainer's or another bridge's connection may depend (SQLite, How To
-    Corrupt, 2.2).
+    The header is judged by SQLite's error text. Closing a file that was read here would drop the
+    locks of this process on it, on which a maintainer's or another bridge's connection may depend
+    (SQLite, How To Corrupt, 2.2).
     """
     if isinstance(database, MemoryDatabase):
         return False

@@ -1,4 +1,4 @@
-"""The parameters of a controller: declared in it, set from outside between two computations."""
+"""The parameters of a controller: declared in its code, set from outside between two rounds."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ V = TypeVar("V", float, int, bool, str)
 
 
 class Parameter(Generic[V]):
-    """A value that an assistant may set; made by `MCPBridge.parameter`.
+    """A value that an assistant may set; created by `MCPBridge.parameter`.
 
     Attributes:
         name: Its name.
-        value: The value now. Reading it costs what any attribute does. It changes only inside
+        value: The current value. Reading it is a plain attribute access. It changes only inside
             `get_command()` and when the world is reset, never within a round of the loop.
     """
 
@@ -44,16 +44,16 @@ class Parameter(Generic[V]):
             object.__setattr__(self, attribute, held)
 
     def set(self, value: V) -> None:
-        """Set it from the controller's own code: with the next `get_command()`.
+        """Set it from the controller's own code, with effect from the next `get_command()`.
 
-        In a handler of `register_command` at once; there a value that is wrong is an error, which
-        becomes that of the command. Elsewhere it is warned of, and the value stays.
+        In a handler of `register_command` it is set at once; there an invalid value raises, which
+        becomes the command's error. Elsewhere an invalid value is warned of and ignored.
         """
         self._set(self.name, value)
 
     def __setattr__(self, attribute: str, value: object) -> None:
         raise AttributeError(
-            f"{attribute} of parameter {self.name!r} cannot be assigned to: call set(), which "
+            f"{attribute} of parameter {self.name!r} cannot be assigned: call its set(), which "
             "takes effect with the next get_command()"
         )
 
@@ -93,20 +93,20 @@ class _Held:
         return (self.declaration.name, value, int(is_default), *self.setter)
 
 
-SETTERS: Final = ("command", "trial")  # as which a command may set parameters
+SETTERS: Final = ("command", "trial")  # the kinds that a command may name
 CODE: Final = Setter("code")
 _ENVIRONMENT: Final = Setter("environment")
 
 
 class Parameters:
-    """Holds the declared parameters, changes them where that is allowed, and records them.
+    """Holds the declared parameters, changes their values, and records each change.
 
     Args:
-        clock: Tells the run and the time of each change.
-        recorder: Takes the rows.
-        journal: Is told of a name that is declared anew.
-        start_values: Those from the environment.
-        set_later: What `Parameter.set` calls, with the name and the value.
+        clock: Has the run and the time of each change.
+        recorder: Receives the rows.
+        journal: Receives a log line for each changed declaration.
+        start_values: The values from the environment.
+        set_later: Called by `Parameter.set` with the name and the value.
     """
 
     def __init__(
@@ -126,13 +126,13 @@ class Parameters:
         self._wanted: dict[str, Value] = {}
         self._from_reset: dict[str, tuple[Value, Setter]] = {}
         self._changes = 0
-        recorder.session.standing.append(self._standing)
+        recorder.session.new_database_entries.append(self._entries_for_new_database)
 
     def declare(self, declaration: Declaration) -> Parameter[Any]:
-        """The parameter of that name, made or brought up to what is declared now.
+        """The parameter of that name, created or updated to this declaration.
 
         Raises:
-            ValueError: It would be one more than a controller may have.
+            ValueError: There are 500 parameters already.
         """
         held = self._held.get(declaration.name)
         if held is None:
@@ -148,10 +148,10 @@ class Parameters:
     def set_now(
         self, values: Mapping[str, object], setter: Setter
     ) -> dict[str, tuple[Value, Value]]:
-        """Set several, all or none; each with its value before and now.
+        """Set several, all or none; returns the old and the new value of each.
 
         Raises:
-            InvalidInputError: A name is unknown or a value wrong; then none is set.
+            InvalidInputError: A name is unknown or a value is invalid; then none is set.
             CommandRefusedError: There were too many changes in this run.
         """
         checked = self._checked(values)
@@ -159,8 +159,8 @@ class Parameters:
         changed = [name for name, value in checked.items() if value != before[name]]
         if self._changes + len(changed) > MOST_CHANGES:
             raise CommandRefusedError(
-                f"{MOST_CHANGES} changes of parameters are recorded of one run: reset the world, "
-                "which begins the next"
+                f"at most {MOST_CHANGES} changes of parameters are recorded in one run: reset the "
+                "world, which begins a new run"
             )
         self._changes += len(changed)
         for name in changed:
@@ -171,7 +171,7 @@ class Parameters:
     def set_from_reset(
         self, values: Mapping[str, object], setter: Setter
     ) -> dict[str, tuple[Value, Value]]:
-        """Set several, all or none, when the world is reset next; each value now and then.
+        """Set several at the next reset, all or none; returns each value now and from then on.
 
         Raises:
             InvalidInputError: As `set_now`.
@@ -182,7 +182,7 @@ class Parameters:
         return {name: (self._held[name].value, value) for name, value in checked.items()}
 
     def want(self, name: str, value: object) -> None:
-        """Have the controller's code set one with the next `get_command()`.
+        """Let the controller's code set a parameter with the next `get_command()`.
 
         Raises:
             InvalidInputError: As `set_now`.
@@ -190,7 +190,7 @@ class Parameters:
         self._wanted |= self._checked({name: value})
 
     def take_wanted(self) -> None:
-        """Set what the controller's code asked for, now that values may change.
+        """Apply what the controller's code has set since the last `get_command()`.
 
         Raises:
             InvalidInputError, CommandRefusedError: As `set_now`.
@@ -202,7 +202,7 @@ class Parameters:
             self.set_now(wanted, CODE)
 
     def begin_run(self) -> None:
-        """The world was reset: what waited for that takes effect, and all values are recorded."""
+        """The world was reset: apply the values that waited for it, and record all values."""
         self._changes = 0
         waiting, self._from_reset = self._from_reset, {}
         for name, (value, setter) in waiting.items():
@@ -210,9 +210,9 @@ class Parameters:
         self._record_values(list(self._held.values()))
         self._record_next(dict.fromkeys(waiting))
 
-    def _standing(self) -> Iterable[tuple[Kind, bool, Values]]:
-        """What a database that knows nothing of this session must be given: kind, of the run?"""
-        held = tuple(self._held.values())
+    def _entries_for_new_database(self) -> Iterable[tuple[Kind, bool, Values]]:
+        """The entries that a new database needs: kind, whether it belongs to the run, values."""
+        held = tuple(self._held.values())  # a copy: the maintainer's thread may be the caller
         for each in held:
             yield "parameter", False, {**each.declaration.as_row(), "now": time.time()}
         if held:
@@ -223,8 +223,8 @@ class Parameters:
     def _enter(self, declaration: Declaration) -> _Held:
         if len(self._held) >= MOST_PARAMETERS:
             raise ValueError(
-                f"parameter {declaration.name!r} would be number {MOST_PARAMETERS + 1}: a "
-                f"controller has {MOST_PARAMETERS} at most; what is not a setting belongs in a file"
+                f"parameter {declaration.name!r} would be number {MOST_PARAMETERS + 1}, and a "
+                f"controller may have {MOST_PARAMETERS}; store other data in a file"
             )
         value, setter = declaration.default, CODE
         given = self._start_values.take(declaration)
@@ -235,7 +235,7 @@ class Parameters:
         return held
 
     def _redeclare(self, held: _Held, declaration: Declaration) -> None:
-        """A value from outside outlives a new declaration that allows it."""
+        """Update a declaration; a value set from outside is retained where it is still valid."""
         is_default = held.setter is CODE and held.value == held.declaration.default
         self._journal.log("warning", "bridge", _declared_anew(held.declaration, declaration))
         held.declaration = declaration
@@ -247,7 +247,7 @@ class Parameters:
         try:
             held.set(declaration.checked(held.value), held.setter)
         except WebotsMCPError as error:
-            why = f"{error}: the declaration was changed, its default counts"
+            why = f"{error}; the declaration was changed, so its default is used"
             held.set(declaration.default, CODE)
             self._recorder.errors.warn(f"parameter {declaration.name}", why)
 
@@ -269,12 +269,12 @@ class Parameters:
 
 
 def _declared_anew(before: Declaration, now: Declaration) -> str:
-    """That one name has two declarations, which may be meant as two parameters."""
+    """The log line of a changed declaration: two parameters may share a name by mistake."""
     pairs = zip(before._asdict().items(), now._asdict().values(), strict=True)
     changed = [f"{name} {new!r}, not {old!r}" for (name, old), new in pairs if new != old]
     return (
-        f"parameter {now.name!r} is declared again, with {', '.join(changed)}: what was declared "
-        "last counts, for both"
+        f"parameter {now.name!r} is declared again, with {', '.join(changed)}: the last "
+        "declaration is used for both"
     )
 
 

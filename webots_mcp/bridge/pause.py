@@ -1,4 +1,4 @@
-"""Pausing the simulation without locking out its own resume."""
+"""Pausing the simulation while still serving the command that resumes it."""
 
 from __future__ import annotations
 
@@ -25,35 +25,35 @@ from webots_mcp.pauses import (
 PUMP_INTERVAL_S: Final = 0.01
 
 
-class Companion(Protocol):
-    """What goes along with each step of the controller's."""
+class StepListener(Protocol):
+    """Called before and after each step of the controller."""
 
     def before(self, step: Step) -> None:
         """The controller asks for a step."""
         ...
 
     def after(self, step: Step, answer: int) -> None:
-        """It is answered; the controller hears of it next."""
+        """Webots has answered the step; the controller receives the answer next."""
         ...
 
 
 class Pause:
-    """Whether the bridge has paused the simulation, and the mode to go back to.
+    """Whether the bridge has paused the simulation, and the mode to return to.
 
-    A paused simulation blocks every `step(n > 0)`, so after a pause the bridge stays inside
-    `get_command()`, pumps `step(0)`, and goes on serving commands there. Code of the user's that
-    runs there (a handler, a callback) may step all the same: time passes for just that step.
+    A paused simulation blocks every `step(n > 0)`, so during a pause the bridge stays inside
+    `get_command()`, calls `step(0)` repeatedly, and serves commands there. Code of the user that
+    runs there (a handler, a callback) may step nevertheless: time advances for just that step.
 
     Args:
-        simulation: What is paused.
-        journal: Is told when the pause begins and ends.
-        heartbeat: Tells others of it.
-        stepped: Is told of each guarded step when it is over.
-        begins: Is told when the loop is about to stand still.
+        simulation: The simulation to pause.
+        journal: Receives an event when the pause begins and ends.
+        heartbeat: Publishes the pause to other processes.
+        stepped: Called after each guarded step.
+        begins: Called before the loop is stopped.
 
     Attributes:
-        active: The loop stays where it is.
-        cause: What the newest pause was begun for.
+        active: The loop is paused.
+        cause: Why the newest pause was begun.
         serve: Serves commands until the pause has ended: for a loop that steps during it.
     """
 
@@ -71,10 +71,10 @@ class Pause:
         self._stepped = stepped
         self._begins = begins
         self._mode_before: str | None = None  # a pause, a run's pace or steps; None where none is
-        self._user_code_depth = 0  # a handler may ask for commands itself
+        self._user_code_depth = 0  # a count: a handler may call get_command(), which runs another
         self._awaiting_step = False
         self._ask_before_steps: Callable[[], object] | None = None
-        self._companion: Companion | None = None
+        self._step_listener: StepListener | None = None
         self.active = False
         self.cause = Cause()
         self.serve: Callable[[], object] = self.pump
@@ -85,11 +85,11 @@ class Pause:
         return self._mode_before or self._simulation.mode_name
 
     def begin(self, cause: Cause) -> None:
-        """Pause the simulation and keep the loop from here on."""
+        """Pause the simulation and the loop."""
         if self.active:
             return
         self.cause = cause
-        self._begins()
+        self._begins()  # first: no call of the loop follows that could write what is left
         self._activate(self.running_mode)
         self._simulation.set_mode("pause")
         self._journal.event(PAUSE, cause.data)
@@ -98,7 +98,7 @@ class Pause:
     def end(
         self, command: ClaimedCommand, mode: str | None = None, *, stepping: bool = False
     ) -> None:
-        """Let the loop go on, in `mode` or in the one that it ran in before."""
+        """Let the loop continue, in `mode` or in the mode before the pause."""
         before, was_active = self.running_mode, self.active
         self._simulation.set_mode(mode or _running(before))
         self._deactivate()
@@ -106,21 +106,21 @@ class Pause:
             self._journal.event(RESUME, Cause(command.id).data)
         self._heartbeat.change_loop(STEPPING if stepping else None)
 
-    def lend_mode(
+    def change_mode_temporarily(
         self, command: ClaimedCommand, mode: str | None, *, stepping: bool = False
     ) -> None:
-        """Let the loop go on for a while, as `end` does: the mode to go back to stays."""
+        """Let the loop continue as `end` does, but remember the mode to return to."""
         before = self.running_mode
         self.end(command, mode, stepping=stepping)
         self._mode_before = before
 
-    def give_mode_back(self) -> None:
-        """That while is over: the loop goes on in the mode before it."""
+    def restore_mode(self) -> None:
+        """Return to the mode before `change_mode_temporarily`; the loop continues in it."""
         self._simulation.set_mode(self.running_mode)
         self._mode_before = None
 
     def take_over(self, mode_before: str) -> None:
-        """Go on with the pause of a bridge whose process is gone, if the simulation still stands.
+        """Continue the pause of a bridge whose process has ended, if Webots is still paused.
 
         Args:
             mode_before: The mode before that pause.
@@ -134,7 +134,7 @@ class Pause:
             self._heartbeat.change_loop(PAUSED, mode_before)
 
     def close(self) -> None:
-        """Nobody will serve commands any more: where it is paused, time goes on."""
+        """Resume a paused simulation: after closing, no command could resume it."""
         if self._mode_before is None or self._simulation.over:
             return
         self._simulation.set_mode(_running(self._mode_before))
@@ -142,30 +142,30 @@ class Pause:
             self._end_by(BRIDGE_CLOSED)
 
     def pump(self) -> None:
-        """Hear from Webots: it may want to quit, or a person may have pressed play."""
+        """Exchange messages with Webots: it may quit, or a person may have pressed play."""
         if not self._simulation.pump():
             self._deactivate()
         elif not self._simulation.paused:
             self._end_by(IN_WEBOTS)
 
     def ask_before_steps(self, ask: Callable[[], object] | None) -> None:
-        """Call it before each step that the loop begins: it may begin the pause. None: no more."""
+        """Call `ask` before each step that the loop begins; it may begin a pause. None: stop."""
         self._ask_before_steps = ask
         self._guard_steps()
 
-    def go_along(self, companion: Companion | None) -> None:
-        """Let it go along with each step from now on. None: nothing does any more."""
-        self._companion = companion
+    def listen_to_steps(self, listener: StepListener | None) -> None:
+        """Call the listener before and after each step from now on. None: stop."""
+        self._step_listener = listener
         self._guard_steps()
 
     @property
     def in_user_code(self) -> bool:
-        """A handler or a callback runs."""
+        """Whether a handler or a callback is running."""
         return self._user_code_depth > 0
 
     @contextmanager
     def awaiting_step(self) -> Generator[None]:
-        """While the end of a step is to bring something: it comes before the loop goes on."""
+        """Guard steps while a reset is awaited, so that its step is seen before the loop's code."""
         self._awaiting_step = True
         self._guard_steps()
         try:
@@ -176,7 +176,7 @@ class Pause:
 
     @contextmanager
     def user_code(self) -> Generator[None]:
-        """While a handler or a callback runs: its steps are made, also during the pause."""
+        """Make the steps of a handler or a callback that runs here, also during a pause."""
         self._user_code_depth += 1
         self._guard_steps()
         try:
@@ -185,9 +185,9 @@ class Pause:
             self._user_code_depth -= 1
             self._guard_steps()
 
-    def _end_by(self, whom: str) -> None:
+    def _end_by(self, actor: str) -> None:
         self._deactivate()
-        self._journal.event(RESUME, Cause(by=whom).data)
+        self._journal.event(RESUME, Cause(by=actor).data)
         self._heartbeat.change_loop(None)
 
     def _activate(self, mode_before: str) -> None:
@@ -201,19 +201,22 @@ class Pause:
         self._guard_steps()
 
     def _guard_steps(self) -> None:
-        """Outside a pause the steps of user code are only noted: they show that it is alive."""
-        asked = self._ask_before_steps is not None or self._companion is not None
+        """Guard the steps while anything needs them, and else let them go to Webots directly.
+
+        User code is guarded outside a pause too: its steps show that the loop is alive.
+        """
+        asked = self._ask_before_steps is not None or self._step_listener is not None
         needed = self.active or self.in_user_code or self._awaiting_step or asked
         self._simulation.guard_steps(self._on_step if needed else None)
 
     def _on_step(self, step: Step) -> int:
-        companion = self._companion
-        if companion is None:
+        listener = self._step_listener
+        if listener is None:
             return self._answer(step)
-        companion.before(step)
+        listener.before(step)
         answer = self._answer(step)
-        if self._companion is companion:  # it may have been told to go meanwhile
-            companion.after(step, answer)
+        if self._step_listener is listener:  # a handler in that step may have called detach()
+            listener.after(step, answer)
         return answer
 
     def _answer(self, step: Step) -> int:
@@ -235,7 +238,7 @@ class Pause:
         return answer
 
     def _leave_for(self, step: Step) -> int:
-        """Leave the pause for just this step."""
+        """Run the simulation for just this step, then pause it again."""
         if step.begins:
             self._simulation.set_mode(_running(self.running_mode))
         try:
@@ -249,5 +252,5 @@ class Pause:
 
 
 def _running(mode_before: str) -> str:
-    """The mode in which time goes on."""
+    """The mode in which time advances: the one before, or real time if that was a pause."""
     return "fast" if mode_before == "fast" else "real_time"

@@ -1,4 +1,4 @@
-"""Camera frames and screenshots as files of the data folder, each with a row."""
+"""Camera frames and screenshots as files in the data folder, each with a row."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Album:
     def add_frame(
         self, device: str, bgra: bytes, width: int, height: int, max_frames: int = MOST_FRAMES
     ) -> dict[str, object]:
-        """Write a picture of a device; returns what its command answers.
+        """Write a picture of a device; returns the result of its command.
 
         Raises:
             OSError: The file cannot be written.
@@ -64,7 +64,7 @@ class Album:
         return {"path": path, "width": width, "height": height, "bytes": size}
 
     def add_kept(self, run: Run, stretch_uuid: str, frame: Frame) -> None:
-        """Write a small frame of a kept stretch; it stays as long as the stretch.
+        """Write a small frame of a kept stretch, which exists as long as the stretch.
 
         Raises:
             OSError: The file cannot be written.
@@ -77,39 +77,39 @@ class Album:
         self._recorder.record("image", run, row)
 
     def make_room(self, path: str) -> Path:
-        """The file that a picture is to be written to: its folder exists, it does not."""
+        """The file to write a picture to: its folder is created, an old file is deleted."""
         file = self._data_dir / path
         make_folder(file.parent)
         file.unlink(missing_ok=True)
         return file
 
     def add_screenshot(self, path: str, width: int, height: int, size: int) -> dict[str, object]:
-        """Enter a picture that the simulator wrote; returns what its command answers."""
+        """Record a picture that Webots wrote; returns the result of its command."""
         clock = self._clock
         row = (clock.sim_time_s, time.time(), "screenshot", None, path, width, height, size)
         self._recorder.record("image", clock.run, row)
         return {"path": path, "width": width, "height": height, "bytes": size}
 
     def _name_of(self, device: str) -> str:
-        """What the files of a camera begin with."""
+        """The beginning of a camera's file names."""
         registration = self._recorder.session.registration
         robot = registration.robot_name if registration else "robot"
         return f"{_file_name(robot)}.{_file_name(device)}"
 
     def _kept_of(self, name: str) -> deque[str]:
-        """The frames of a device that are there, oldest first; the folder is listed once."""
+        """The existing frames of a device, oldest first; the folder is listed only once."""
         if name not in self._kept:
             self._kept[name] = self._left_before(name)
         return self._kept[name]
 
     def _left_before(self, name: str) -> deque[str]:
-        """What an earlier session of the robot left: listing costs 1 us a file of any camera."""
+        """The frames of the robot's earlier sessions; listing costs 1 us per file of any camera."""
         folder = self._data_dir / CAMERA_FOLDER
         files = sorted(file.name for file in folder.glob(f"{name}.[0-9]*.png"))
         return deque(f"{CAMERA_FOLDER}/{file}" for file in files)
 
     def _write(self, path: str, data: bytes) -> int:
-        """Written aside and renamed: a reader never sees half a picture."""
+        """Write a file under another name and rename it: a reader never sees half a picture."""
         with whole_file(self.make_room(path)) as aside:
             aside.write_bytes(data)
         return len(data)
@@ -127,7 +127,9 @@ def image_of(camera: Any) -> tuple[bytes, int, int]:
     """
     device, width, height = str(camera.getName()), camera.getWidth(), camera.getHeight()
     if camera.getSamplingPeriod() <= 0:
-        raise CommandRefusedError(f"camera {device!r} is disabled: call its enable() first")
+        raise CommandRefusedError(
+            f"camera {device!r} is disabled: call its enable(time_step) in the controller first"
+        )
     try:
         image = camera.getImage()
     except ValueError as error:
@@ -161,7 +163,7 @@ def _chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def complete_png_size(file: Path) -> tuple[int, int, int] | None:
-    """(width, height, bytes) of a PNG that was written to its end, else None."""
+    """(width, height, size in bytes) of a PNG that is written completely, else None."""
     try:
         data = file.read_bytes()
     except OSError:
@@ -173,7 +175,7 @@ def complete_png_size(file: Path) -> tuple[int, int, int] | None:
 
 
 def _file_name(text: str) -> str:
-    """A part of a file name, on every system; no two texts have the same."""
+    """A part of a file name that is valid on every system and differs for different texts."""
     name = "".join(c if c.isalnum() or c in "-_" else "_" for c in text)
     if name == text and 0 < len(name.encode()) <= _LONGEST_NAME_BYTES:
         return name

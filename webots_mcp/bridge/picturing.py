@@ -1,4 +1,4 @@
-"""A picture of what a device sees now, whatever the controller's code does with it."""
+"""A picture of a device's current measurement, independent of the controller's code."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ _MOST_NAMED: Final = 10
 
 
 class Picture(NamedTuple):
-    """What a device saw last.
+    """A picture of a device's newest measurement.
 
     Attributes:
         bgra: Four bytes a pixel, rows from the top left.
-        scale: What its colours or rings are in metres; None of a camera's picture.
+        scale: The meaning of its colours or rings in metres; None for a camera's picture.
     """
 
     bgra: bytes
@@ -30,7 +30,7 @@ def _of_camera(device: Any) -> Picture:
 
 
 def _of_range_finder(device: Any) -> Picture:
-    from webots_mcp.bridge.range_pictures import draw_depths  # only where one is asked for
+    from webots_mcp.bridge.range_pictures import draw_depths  # only here: seldom needed
 
     canvas, scale = draw_depths(device)
     return Picture(canvas.bgra, canvas.width, canvas.height, scale)
@@ -43,7 +43,7 @@ def _of_lidar(device: Any) -> Picture:
     return Picture(canvas.bgra, canvas.width, canvas.height, scale)
 
 
-# By the names of the classes in Webots' `controller` package, in the order in which one is chosen.
+# By class name in Webots' `controller` package; without a name asked for, the first kind is chosen.
 _PICTURES: Final[dict[str, Callable[[Any], Picture]]] = {
     "Camera": _of_camera,
     "RangeFinder": _of_range_finder,
@@ -64,7 +64,7 @@ def find_pictured(robot: Any, name: str) -> Any:
     """The enabled device of that name, or (for "") the first one: cameras come first.
 
     Raises:
-        InvalidInputError: There is no such device, or it has no pictures.
+        InvalidInputError: There is no such device, or it takes no pictures.
         CommandRefusedError: It is disabled, or all are.
     """
     devices: dict[str, Any] = getattr(robot, "devices", None) or {}
@@ -80,15 +80,15 @@ def find_pictured(robot: Any, name: str) -> Any:
         raise CommandRefusedError("this robot has no camera, range finder or lidar")
     shown = ", ".join(f"{each!r} ({_kind(pictured[each])})" for each in asked[:_MOST_NAMED])
     raise CommandRefusedError(
-        f"disabled: {shown}; the controller enables one with "
-        f"robot.getDevice({asked[0]!r}).enable(time_step), and the next step has its picture"
+        f"disabled: {shown}; call robot.getDevice({asked[0]!r}).enable(time_step) in the "
+        "controller, and ask again after its next step"
     )
 
 
 def _no_such(name: str, device: Any, pictured: dict[str, Any]) -> str:
     what = f"{name!r} is a {_kind(device)}" if device is not None else f"no device {name!r}"
     known = [f"{each!r} ({_kind(pictured[each])})" for each in pictured][:_MOST_NAMED]
-    return f"{what}; pictures come from {', '.join(known) or 'no device of this robot'}"
+    return f"{what}; devices with pictures: {', '.join(known) or 'none on this robot'}"
 
 
 def _kind(device: Any) -> str:

@@ -1,4 +1,4 @@
-"""The lines of what a process prints: as many as one can read, and how many more there were."""
+"""The lines that a process prints: up to 500 a second, and the number of further ones."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ _MOST_LINE_BYTES: Final = 40_000  # a log row has the first 10,000 characters
 
 
 class PrintedLines:
-    """Takes bytes as they come, gives whole lines; empty ones are left out.
+    """Splits a stream of bytes into whole lines, without the empty ones.
 
     Attributes:
-        waiting: Lines that nobody has removed yet: those of some seconds at most.
+        waiting: Lines that have not been removed yet: those of some seconds at most.
     """
 
     def __init__(self) -> None:
@@ -25,7 +25,7 @@ class PrintedLines:
         self._left_out = 0
 
     def take(self, data: bytes) -> None:
-        """Take in what was printed."""
+        """Add printed bytes."""
         *lines, rest = data.split(b"\n")
         for line in lines:
             self._add(bytes(self._unfinished) + line)
@@ -33,24 +33,24 @@ class PrintedLines:
         self._unfinished += rest[: _MOST_LINE_BYTES - len(self._unfinished)]
 
     def end(self) -> None:
-        """Nothing more comes: what has no newline is a line too."""
+        """Finish: the rest without a newline is a line too."""
         self.take(b"\n")
-        self._tell_left_out()
+        self._note_left_out()
 
     def remove(self) -> list[str]:
-        """The lines that wait."""
+        """Remove and return the waiting lines."""
         return [self.waiting.popleft() for _ in range(len(self.waiting))]
 
     def add_note(self, text: str) -> None:
-        """A line about the lines."""
+        """Add a note of the bridge, in parentheses."""
         self.waiting.append(f"({text})")
 
     def _add(self, line: bytes) -> None:
         second = int(time.monotonic())
         if second != self._second:
-            self._tell_left_out()
+            self._note_left_out()
             self._second, self._lines_in_second = second, 0
-        # What a terminal shows of a line that was written over, as by a progress bar.
+        # The text after the last carriage return: what a terminal shows of a progress bar.
         text = line.rstrip(b"\r").rpartition(b"\r")[2].decode("utf-8", "replace")
         if not text.strip():
             return
@@ -60,9 +60,10 @@ class PrintedLines:
         else:
             self.waiting.append(text)
 
-    def _tell_left_out(self) -> None:
+    def _note_left_out(self) -> None:
         if self._left_out:
             self.add_note(
-                f"{self._left_out} lines are not recorded: more than {MOST_LINES_PER_S} in a second"
+                f"{self._left_out} lines were not recorded: more than {MOST_LINES_PER_S} were "
+                "printed in a second"
             )
             self._left_out = 0

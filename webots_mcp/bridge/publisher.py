@@ -1,4 +1,4 @@
-"""What happens with a published state: admitted or throttled, encoded, recorded, compared."""
+"""Processing a published state: throttling, encoding, recording, and comparing it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from webots_mcp.bridge.stats import PublishCost
 
 
 class Publisher:
-    """Takes each call of `publish` and `auto_publish`.
+    """Handles each call of `publish` and `auto_publish`.
 
     Attributes:
         cost: How long the recorded calls took.
@@ -38,11 +38,12 @@ class Publisher:
         self.cost = PublishCost()
 
     def publish(self, state: Mapping[Any, Any], force: bool) -> None:
-        """Record the state if it is this call's turn, a breakpoint is hit or a goal is reached."""
+        """Record the state if this call is due, a breakpoint is hit or a goal is reached."""
         if self._clock.look():
             self._runs.begin()
         wanted, hit, keeper, breakpoints = force, None, self._keeper, self._breakpoints
-        if breakpoints.armed or breakpoints.run is not self._clock.run:  # a call would cost more
+        # Tested here, since even an empty call would slow down every `publish`.
+        if breakpoints.armed or breakpoints.run is not self._clock.run:
             hit = breakpoints.look(state)
         if self._watch.asks_states:
             wanted = self._watch.look(state) or wanted
@@ -53,17 +54,17 @@ class Publisher:
         if keeper.frames.cameras:
             self._look_at_cameras(at_once=bool(hit))
         if hit:
-            breakpoints.act(hit, state)
+            breakpoints.act(hit, state)  # after recording: a pause must show the state of the hit
         if keeper.busy:
             keeper.go_on()
 
     def publish_devices(
         self, extra: Mapping[Any, Any], include_time: bool, force: bool = False
     ) -> dict[Any, Any] | None:
-        """Record what the devices say; they are read if it is this call's turn.
+        """Record the devices' values; they are read if this call is due.
 
-        Where breakpoints are armed or a run has a goal, they are read in every call; where the
-        last seconds are held, as often as its bound on the time for it allows.
+        Where breakpoints are armed or a run has a goal, they are read in every call; for the ring
+        buffer as often as the limit on the time for reading allows.
 
         Returns:
             The state; None where the devices were not read.
@@ -93,7 +94,7 @@ class Publisher:
         return ({"time": self._clock.sim_time_s} if include_time else {}) | _finite(extra)
 
     def _look_at_cameras(self, *, at_once: bool) -> None:
-        """What the cameras see is held with the states; at a hit whatever the time."""
+        """Hold due camera frames with the states; at a hit take one of each camera."""
         keeper = self._keeper
         if at_once or keeper.frames.is_due(self._clock.sim_time_s):
             keeper.look_at_cameras(at_once=at_once)
@@ -122,9 +123,9 @@ class Publisher:
 
 
 def _finite(extra: Mapping[Any, Any]) -> dict[Any, Any]:
-    """As many items as it says; a mapping of the user's own may never come to its end."""
+    """A mapping as a dict of `len` items: the iterator of a user's own mapping may be endless."""
     if extra.__class__ is dict:
         return cast("dict[Any, Any]", extra)
     if not isinstance(extra, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise TypeError(f"a state is a dict, got {type(extra).__name__}")
+        raise TypeError(f"a state must be a dict, got {type(extra).__name__}")
     return dict(islice(extra.items(), len(extra)))

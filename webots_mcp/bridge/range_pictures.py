@@ -1,7 +1,7 @@
-"""Distances as pictures that a person reads, with their scale in metres.
+"""Distances as pictures for a person, with their scale in metres.
 
-A range finder's image is shown as it is, near red and far blue; a lidar's as a view from above,
-since its own image is often a single row.
+A range finder's image is coloured, near red and far blue; a lidar's points are drawn as seen from
+above, since its own image is often a single row.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from webots_mcp.bridge.canvas import (
 from webots_mcp.errors import CommandRefusedError
 
 _LONGEST_SIDE_PX: Final = 320
-_SHORTEST_WIDTH_PX: Final = 160  # two labels beside each other
+_SHORTEST_WIDTH_PX: Final = 160  # room for two labels next to each other
 _BAR_PX: Final = 10
 _TOP_VIEW_PX: Final = 360
 _MOST_RAYS: Final = 20_000
@@ -32,7 +32,7 @@ _RAMP: Final = ((220, 30, 30), (250, 220, 40), (40, 190, 80), (30, 60, 200))  # 
 
 
 def draw_depths(device: Any) -> tuple[Canvas, str]:
-    """A range finder's image in colours, above a bar that explains them; and this in words.
+    """A range finder's image in colours above a colour bar, and the scale in words.
 
     Raises:
         CommandRefusedError: It has no image yet.
@@ -56,7 +56,7 @@ def draw_depths(device: Any) -> tuple[Canvas, str]:
 
 
 def draw_from_above(device: Any) -> tuple[Canvas, str]:
-    """A lidar's points as seen from above, with rings; and what these are in words.
+    """A lidar's points as seen from above with distance rings, and the scale in words.
 
     Raises:
         CommandRefusedError: It has no scan yet.
@@ -82,14 +82,16 @@ def draw_from_above(device: Any) -> tuple[Canvas, str]:
 
 
 def _ranges_of(device: Any) -> Sequence[float]:
-    """Reading a null pointer can kill the interpreter, so it is tested first."""
+    """A device's ranges; a null pointer is tested first, since reading it can crash Python."""
     if not device.range_image:
-        raise CommandRefusedError(f"{device.getName()!r} has measured nothing yet")
+        raise CommandRefusedError(
+            f"{device.getName()!r} has not measured anything yet: ask again after a step"
+        )
     return device.getRangeImage()
 
 
 def _points(ranges: Sequence[float], lidar: Any) -> list[tuple[float, float]]:
-    """Metres ahead and to the left; layer after layer, each from left to right."""
+    """The points as metres ahead and to the left; layer after layer, each from left to right."""
     columns, layers = lidar.getHorizontalResolution(), lidar.getNumberOfLayers()
     fov_rad, vertical_rad = lidar.getFov(), lidar.getVerticalFov()
     points: list[tuple[float, float]] = []
@@ -106,7 +108,7 @@ def _points(ranges: Sequence[float], lidar: Any) -> list[tuple[float, float]]:
 
 
 def _draw_edges(canvas: Canvas, fov_rad: float) -> None:
-    """Where its view ends, unless it looks all around."""
+    """Draw the limits of the field of view, unless it is a full circle."""
     if fov_rad > 2 * math.pi - 0.1:
         return
     middle = canvas.width / 2
@@ -125,7 +127,7 @@ def _explain(canvas: Canvas, shades: list[int], y: int, near_m: float, far_m: fl
 
 
 def _shades() -> list[int]:
-    """From near to far."""
+    """The colours of distances from near to far."""
     parts = len(_RAMP) - 1
     shades: list[int] = []
     for number in range(_SHADES):
@@ -141,7 +143,7 @@ def _shade_of(shades: list[int], place: float) -> int:
 
 
 def _round_number(length_m: float) -> float:
-    """The 1, 2 or 5 of a power of ten that is next above."""
+    """The next larger 1, 2 or 5 times a power of ten."""
     power = 10 ** math.floor(math.log10(max(length_m, 1e-3)))
     return next(power * each for each in (1, 2, 5, 10) if power * each >= length_m * (1 - 1e-9))
 

@@ -1,17 +1,17 @@
-"""The write path: when `record` returns, the row survives the process, whatever ends it.
+"""The write path: when `record` returns, the row survives the process, however that ends.
 
 One recorded row is one statement and so one short transaction into the write-ahead log: a
-controller that is killed the next instant loses nothing. The control loop hardly waits: a row that
-meets another writer's lock for longer than a millisecond, a full disk, a read-only or a vanished
-database goes into a file of the session beside it, and into memory only where that fails too.
-What waits is written, in order, with the next call, or by whoever opens the database next. Beyond
-the limits of the backlog the oldest rows in memory are dropped, and so is a row that the database
-refuses whatever comes; dropped rows are counted, and told as an event as soon as one can be
-written.
+controller that is killed the next instant loses nothing. The control loop hardly waits: where
+another writer holds the lock for longer than a millisecond, the disk is full, or the database is
+read-only or missing, the row goes into a file of the session next to the database, and into memory
+only where that fails too. Waiting rows are written, in order, with the next call, or by the next
+process that opens the database. Beyond the limits of the backlog the oldest rows in memory are
+dropped, and so is a row that the database will never accept; dropped rows are counted, and reported
+as an event as soon as one can be written.
 
-A KeyboardInterrupt may come between any two lines. Nothing here hangs on what would have followed:
-a statement is written or not, a transaction is rolled back by the next call, what waits is known
-by its number, and the connection lock ends with the call that has it.
+A KeyboardInterrupt may come between any two lines, and nothing here relies on the lines after it: a
+statement is either written or not, the next call rolls back an open transaction, waiting rows are
+recognised by their number, and the connection lock is free when the call that took it has ended.
 """
 
 from __future__ import annotations
@@ -37,20 +37,21 @@ from webots_mcp.liveness import LoopStatus, RecordingStatus, write_heartbeat
 from webots_mcp.transactions import in_transaction
 from webots_mcp.waiting_file import WaitingFile, waiting_path
 
-_LOCK_PATIENCE_S: Final = 0.001  # with another thread of this process that catches up just now
+_LOCK_PATIENCE_S: Final = 0.001  # how long to wait for another thread of this process
 
 Result = TypeVar("Result")
 
 
 class Recorder:
-    """What a session writes and reads.
+    """All writes and reads of a session.
 
-    The loop's thread, the maintainer's and any that logs share the connection, one at a time.
+    The loop's thread, the maintainer's and all threads that log share the connection, one at a
+    time.
 
     Attributes:
         session: The connection, the session and the current run.
         counts: Rows that were written and dropped.
-        errors: What went wrong.
+        errors: Receives each failure.
     """
 
     def __init__(
@@ -85,10 +86,10 @@ class Recorder:
         Args:
             kind: What is written.
             run: The run that the row belongs to; its id may not be known yet.
-            values: As `entries.STATEMENTS` says.
+            values: The values of the statement, see `entries.STATEMENTS`.
 
         Returns:
-            How many rows the statement changed, or None where it was put off.
+            How many rows the statement changed, or None where it was deferred.
         """
         self.last_use_s = time.monotonic()
         if not self._lock.acquire(this_call(), _LOCK_PATIENCE_S):
@@ -98,7 +99,7 @@ class Recorder:
             return self._writer.write(kind, run, values)
         except BaseException:
             if run is not None:
-                run.counted = False
+                run.counted = False  # an interrupt may have come between the row and its count
             raise
         finally:
             self._lock.release()
@@ -116,17 +117,17 @@ class Recorder:
             self._lock.release()
 
     def fetch(self, statement: str, values: Values) -> Sequence[Any] | None:
-        """The rows that a statement reads or changes; None while that is not possible."""
+        """The rows that a statement reads or returns; None while that is not possible."""
         if self.session.connection is None:
             return None
         return self._locked(lambda: self._writer.fetch(statement, values))
 
     def flush(self) -> bool:
-        """Write what is waiting, as much as one call may; True if nothing waits any more."""
+        """Write waiting rows, for as long as one call may; True if none are left."""
         return self._locked(lambda: self._writer.catch_up(None)) is True
 
     def _locked(self, act: Callable[[], Result]) -> Result | None:
-        """None, and nothing done, while another thread writes or where it fails."""
+        """Call `act` with the connection lock; None where another thread has it, or it fails."""
         if not self._lock.acquire(this_call()):
             return None
         try:
@@ -140,7 +141,7 @@ class Recorder:
     # -- the session ---------------------------------------------------------------------------
 
     def beat(self, loop: LoopStatus) -> None:
-        """Say that the loop is alive. Skipped while rows wait: a late heartbeat has no worth."""
+        """Write a heartbeat. Skipped while rows wait: a late heartbeat would be misleading."""
         self._locked(lambda: self._beat(loop))
 
     def _beat(self, loop: LoopStatus) -> None:
@@ -158,26 +159,27 @@ class Recorder:
         )
 
     def update_actions(self) -> None:
-        """Publish the names and docstrings of the registered custom actions."""
+        """Store the names and docstrings of the registered custom actions."""
         if self.session.registration is not None:
             self.record("actions", None, {"actions": self.session.actions_text()})
 
     def end_run(self, reason: str, sim_time_s: float) -> None:
-        """The current run is over, as of the simulation time that was seen last."""
+        """End the current run, at the simulation time that was seen last."""
         run = self.session.run
+        # The count is given only where it is certain; else the statement counts the rows itself.
         rows = run.rows if run.counted and not self._backlog.waits else None
         values = {"reason": reason, "now": time.time(), "sim_time": sim_time_s, "rows": rows}
         self.record("run end", run, values)
 
     def end(self, reason: str, sim_time_s: float) -> None:
-        """Run and session are over; what is recorded until `close` still belongs to them."""
+        """End run and session; what is recorded until `close` still belongs to them."""
         self.end_run(reason, sim_time_s)
         times = {"now": time.time(), "monotonic": time.monotonic()}
         status = {"dropped": self.counts.dropped, "error": self.errors.last_error}
         self.record("session end", None, {"reason": reason, **times, **status})
 
     def close(self, reason: str, sim_time_s: float) -> None:
-        """Write what waits (trying for up to a second), end run and session, close the file."""
+        """End run and session, write the waiting rows (for up to a second), and disconnect."""
         if self._recovery.off is None:
             self.end(reason, sim_time_s)
         until_s = time.monotonic() + 1
@@ -192,23 +194,23 @@ class Recorder:
             self._lock.release()
 
     def abandon(self) -> None:
-        """In a forked child: connection and session belong to the parent, which goes on."""
+        """In a forked child: leave connection and session to the parent, which continues."""
         self.session.abandon()
         self._lock = ConnectionLock()  # the thread that may have had it was not forked
         self._backlog.abandon()
         self._recovery.off = "a forked process does not record for its parent"
 
-    # -- what waits ----------------------------------------------------------------------------
+    # -- waiting rows --------------------------------------------------------------------------
 
     def _waiting_file(self) -> WaitingFile | None:
-        """A database in memory ends with its process, and so may what waits for it."""
+        """The file for waiting rows; None for a database in memory, which no process outlives."""
         if not isinstance(self.session.database, Path):
             return None
         path = waiting_path(self.session.database, self.session.uuid)
         return WaitingFile(path, self.session.describe_session)
 
     def _leave_waiting(self) -> None:
-        """What waits in the file stays there; what waits in memory is dropped."""
+        """Leave the rows in the file for the next process; drop those that are only in memory."""
         why = self._backlog.why
         self._backlog.save()
         self._backlog.drop_rows_in_memory(why)
@@ -216,6 +218,6 @@ class Recorder:
         if (path := self._backlog.close()) is not None:
             self.errors.warn(
                 "waiting",
-                f"{rows} rows wait in {path}, because {why}; the next bridge or server that opens "
-                "the database takes them in",
+                f"{rows} rows are still in {path}, because {why}; the next bridge or server that "
+                "opens the database adds them to it",
             )

@@ -1,4 +1,4 @@
-"""How recording goes on after the database did not take a row: later, elsewhere, or not at all."""
+"""Recovery after a failed write: trying again, starting a new database, or giving up."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from webots_mcp.transactions import is_busy, is_damage, text_of
 
 _RETRY_INTERVAL_S: Final = 1.0
 
-# What no later try will change.
+# Errors that no later attempt can resolve.
 _FOR_GOOD: Final = (
     ForeignDatabaseError, ForkedProcessError, SchemaTooNewError, SchemaTooOldError,
 )  # fmt: skip
@@ -34,7 +34,7 @@ class Recovery:
     """Opens the database, and opens it again after a failure.
 
     Attributes:
-        off: Why nothing will be recorded any more; None while something may be.
+        off: Why recording has ended for good; None while it has not.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Recovery:
         self.off: str | None = None
 
     def open(self, *, patient: bool) -> bool:
-        """Open (or make) the database and enter a session; False, and warned of, where it fails."""
+        """Open (or create) the database and enter a session; False, with a warning, on failure."""
         if self.off is not None:
             return False
         try:
@@ -71,16 +71,16 @@ class Recovery:
         return self._session.connection is not None
 
     def is_connected(self) -> bool:
-        """Whether a write may be tried now; a closed database is opened for it, once a second."""
+        """Whether a write may be tried now; tries to open a closed database once a second."""
         if self.off is not None or time.monotonic() < self._retry_at_s:
             return False
         return self._session.connection is not None or self.open(patient=False)
 
     def put_off(self, error: Exception) -> None:
-        """Decide how a failed write goes on: at once, in a second, or with a new file."""
+        """Decide how to continue after a failed write: at once, in a second, or in a new file."""
         self._backlog.why = text = text_of(error)
         if is_busy(error):
-            return  # another writer, this instant: the next call tries again
+            return  # another writer has the lock for the moment: the next call tries again
         self._retry_at_s = time.monotonic() + _RETRY_INTERVAL_S
         if is_damage(error):
             self._replace_files(text)
@@ -90,7 +90,7 @@ class Recovery:
             self._errors.warn(text, f"not recorded yet, trying again each second: {text}")
 
     def look_after_files(self) -> None:
-        """Start over where the files under the open connection are not those of the database."""
+        """Start over where the files of the open connection were deleted, replaced or truncated."""
         if self._session.connection is None:
             return
         if (fault := self._session.find_fault()) is not None:
@@ -99,19 +99,20 @@ class Recovery:
             self._counts.confirm()
 
     def _replace_files(self, why: str) -> None:
-        """Keep a damaged database under another name; begin a new one."""
+        """Rename a damaged database, and begin a new one."""
         database = self._session.database
         assert isinstance(database, Path)
         self._session.close()
         try:
             move_aside(database)
         except OSError as error:
-            self._errors.warn("damaged", f"{database} is damaged and cannot be moved: {error}")
+            why = f"{database} is damaged and cannot be renamed: {error}; move it away by hand"
+            self._errors.warn("damaged", why)
             return
         self._start_over(f"{database} was damaged ({why}) and moved aside")
 
     def _start_over(self, why: str) -> None:
-        """Record into a database that knows nothing of this session yet."""
+        """Continue in a new database, which does not have this session yet."""
         self._session.close()
         self._retry_at_s = 0.0
         run = self._session.run
@@ -120,14 +121,14 @@ class Recovery:
         self._backlog.rename_run(before, run.uuid)
         moment = (self._clock.newest_s(run), time.time())
         self._backlog.keep(Row("event", run, (*moment, "storage", None, json.dumps({"why": why}))))
-        standing = [each for tell in self._session.standing for each in tell()]
-        for kind, of_run, values in standing:
+        entries = [each for make in self._session.new_database_entries for each in make()]
+        for kind, of_run, values in entries:
             self._backlog.keep(Row(kind, run if of_run else None, values))
         self._counts.drop_unconfirmed(why)
-        self._errors.warn("storage", f"{why}; recording goes on in a new database")
+        self._errors.warn("storage", f"{why}; recording continues in a new database")
 
     def _replace_damaged(self, why: str) -> bool:
-        """A damaged database, or a file of our name, is moved aside; any other file is not ours."""
+        """Move a damaged database aside; a file that is not ours is left alone."""
         if not is_ours(self._session.database, why):
             self._give_up(f"{why}; choose another file")
             return False
@@ -141,5 +142,5 @@ class Recovery:
 
 
 def _misses_rows(text: str) -> bool:
-    """Whether SQLite says that what a row refers to, or its table, is not there any more."""
+    """Whether SQLite's error says that a table, or a row that is referred to, is missing."""
     return "no such table" in text or "FOREIGN KEY" in text

@@ -1,4 +1,4 @@
-"""A controller process enters itself: robot, session, and what its predecessor left open."""
+"""Registering a controller process: its robot, its session, and the end of its predecessor's."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _OPEN_SESSIONS: Final = (
     "SELECT s.id, s.host, s.pid, s.process, s.last_seen_wall_time_s FROM session s "
     "JOIN robot r ON r.id = s.robot_id WHERE r.name = ? AND s.ended_wall_time_s IS NULL"
 )
-# A successor in the same Webots, soon after, means a reload; so does one after a reload that was
-# asked for. One that was killed counts only where Webots may have done it: it kills a controller
-# that does not end within a second, while any other was killed and started by somebody.
+# A successor in the same Webots within seconds means a reload; so does one after an issued reload
+# command. A predecessor that was killed counts only where Webots starts the controllers: Webots
+# kills one that does not end within a second, while an extern one was killed by a person.
 _RELOADED: Final = (
     "SELECT 1 FROM session WHERE id = (SELECT max(id) FROM session WHERE robot_id = :robot) "
     "AND instance = :instance AND coalesce(ended_wall_time_s, last_seen_wall_time_s) > :earliest "
@@ -28,8 +28,8 @@ _RELOADED: Final = (
     "UNION SELECT 1 FROM command WHERE robot_id = :robot "
     "AND status = 'claimed' AND action = 'reload' AND issued_wall_time_s IS NOT NULL"
 )
-# A controller that is no Supervisor cannot tell a reload from any other end that Webots asks for;
-# that Webots starts its successor shows which it was.
+# A controller that is not a Supervisor cannot distinguish a reload from another quit by Webots, so
+# it ended as `finished`. Its successor, which Webots started, shows that it was a reload.
 _RELOADED_SESSION: Final = (
     "UPDATE session SET end_reason = 'reload' WHERE end_reason = 'finished' "
     "AND id = (SELECT max(id) FROM session WHERE robot_id = ?)"
@@ -44,7 +44,7 @@ _PAUSED_MODE: Final = (
 )
 _LONGEST_RELOAD_S: Final = 10.0  # from the end of the old controller to the start of the new one
 
-# Sessions of this very process. A pid alone does not tell: in a container the same one comes back.
+# Sessions of this process. Its pid alone does not identify it: in a container pids repeat.
 _own_sessions: set[int] = set()
 
 
@@ -62,14 +62,15 @@ class Registration(NamedTuple):
 def register(
     connection: sqlite3.Connection, identity: Identity, session_uuid: str, actions: str
 ) -> Registration:
-    """Enter a session; several starters at once each get their own, with names of their own.
+    """Enter a session; processes that start at once each get their own, with different names.
 
-    What has to agree stands in one transaction that takes the write lock first: what the dead left
-    open is settled, an unfinished session of the same robot is ended as `replaced`, and where a
-    live process already has the name, `#2` (and so on) is appended.
+    Everything that depends on each other is in one transaction, which takes the write lock first:
+    sessions of dead processes are ended, an unfinished session of the same robot is ended as
+    `replaced`, and where a live process already has the name, `#2` (and so on) is appended.
     """
     now_s = time.time()
-    liveness.reap(connection, now_s)  # what takes long, outside of the transaction
+    # Before the transaction too: most of the work is then done without blocking other writers.
+    liveness.reap(connection, now_s)
     with transaction(connection):
         liveness.reap(connection, now_s)
         name = _free_name(connection, identity, now_s)
@@ -120,7 +121,7 @@ def _is_started_by_webots(identity: Identity) -> bool:
 
 
 def _paused_mode(connection: sqlite3.Connection, identity: Identity, robot_id: int) -> str | None:
-    """What the robot's last session left behind in this same Webots."""
+    """The mode before the pause that the robot's last session left, if in this same Webots."""
     values = (robot_id, identity.instance, PAUSED)
     row = connection.execute(_PAUSED_MODE, values).fetchone()
     return row[0] if row else None
@@ -136,13 +137,13 @@ def _is_living(
 
 
 def describe_robot(identity: Identity, name: str) -> dict[str, Any]:
-    """What the robot's row holds."""
+    """The values of the robot's row."""
     devices = json.dumps(identity.devices, ensure_ascii=False)
     return {"name": name, "kind": identity.kind, "devices": devices}
 
 
 def describe_session(identity: Identity, uuid: str, actions: str) -> dict[str, Any]:
-    """What the session's row holds at its start."""
+    """The values of the session's row at its start."""
     now_s = time.time()
     return {
         "uuid": uuid,

@@ -1,4 +1,4 @@
-"""Telling the controller's code of each reload and reset, once."""
+"""Notifying the controller's code of each reload and reset, once."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ Callback = Callable[[], object]
 
 
 class Reloads:
-    """What `on_reload` registered, and what `detect_reload` has not answered yet.
+    """The callbacks of `on_reload`, and the reload that `detect_reload` has not returned yet.
 
     Args:
-        failed: Told of a callback that raised; the next one still runs.
+        failed: Receives the error of a callback that raised; the next one still runs.
 
     Attributes:
-        requested_by: The command that asked Webots for a reload, while it has not come yet.
+        requested_by: The command that asked Webots for a reload, until it happens.
     """
 
     def __init__(self, failed: Callable[[str, Exception], None]) -> None:
@@ -27,7 +27,7 @@ class Reloads:
         self._unfired = False
 
     def add(self, callback: Callback) -> None:
-        """Call it with each reload from now on, and with one that nobody was called for yet."""
+        """Add a callback; one for a reload that happened before the first callback is still due."""
         self._callbacks.append(callback)
 
     def happened(self) -> None:
@@ -35,18 +35,18 @@ class Reloads:
         self._undetected = self._unfired = True
 
     def detect(self) -> bool:
-        """Whether it happened since the last call."""
+        """Whether a reload or reset happened since the last call."""
         detected, self._undetected = self._undetected, False
         return detected
 
     def fire(self) -> None:
-        """Run the callbacks if it happened and they have not run since."""
+        """Run the callbacks if a reload or reset happened and they have not run since."""
         if self._unfired and self._callbacks:
             self._unfired = False
             self.call_back()
 
     def call_back(self) -> list[Exception | None]:
-        """Run all callbacks; for each what it raised, or None."""
+        """Run all callbacks; returns the exception of each, or None."""
         return [self._outcome(callback) for callback in tuple(self._callbacks)]
 
     def _outcome(self, callback: Callback) -> Exception | None:

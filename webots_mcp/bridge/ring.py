@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 from webots_mcp.bridge.encoding import encode_copy
 
 MAX_RING_BYTES: Final = 8_000_000
-_ROW_BYTES: Final = 400  # of a row beside its state: a tuple, three numbers, its place
+_ROW_BYTES: Final = 400  # of a row in addition to its state: a tuple, three numbers, its place
 
 
 class RingRow(NamedTuple):
@@ -17,39 +17,40 @@ class RingRow(NamedTuple):
 
     Attributes:
         call: Its number in the session.
-        data: The text that would have been recorded, or the copy of the state that makes it.
-        odd: As in the column of that name, of a text.
+        data: The text that would have been recorded, or a copy of the state to encode later.
+        replaced: The value of the column `odd`, where `data` is a text.
     """
 
     call: int
     sim_time_s: float
     wall_time_s: float
     data: str | bytes
-    odd: str | None
+    replaced: str | None
 
     @property
     def size_bytes(self) -> int:
-        """About the memory that it takes."""
-        return _ROW_BYTES + sys.getsizeof(self.data) + (sys.getsizeof(self.odd) if self.odd else 0)
+        """The approximate memory that it takes."""
+        replaced_bytes = sys.getsizeof(self.replaced) if self.replaced else 0
+        return _ROW_BYTES + sys.getsizeof(self.data) + replaced_bytes
 
     def encode(self) -> RingRow:
         """The row as it would have been recorded."""
         if isinstance(self.data, str):
             return self
         encoded = encode_copy(self.data)
-        return RingRow(*self[:3], encoded.text, encoded.odd_text)
+        return RingRow(*self[:3], encoded.text, encoded.replaced_text)
 
 
 class Ring:
-    """Rows of one run, oldest first; the oldest go where they are too old or too many.
+    """Rows of one run, oldest first; the oldest are forgotten where they are too old or too many.
 
     Args:
-        last_s: So many seconds of simulation time are held.
-        most_bytes: And so many bytes at most: a row that is larger by itself is not held.
+        last_s: Seconds of simulation time that are held.
+        most_bytes: The limit of memory in bytes; a single larger row is not held.
 
     Attributes:
-        size_bytes: What the rows take.
-        starts_s: The simulation time from which on no row is missing.
+        size_bytes: The memory that the rows take.
+        starts_s: The simulation time since which no row is missing.
     """
 
     def __init__(self, last_s: float, most_bytes: int = MAX_RING_BYTES) -> None:
@@ -63,7 +64,7 @@ class Ring:
         return len(self._rows)
 
     def add(self, row: RingRow) -> None:
-        """Hold the newest row."""
+        """Add the newest row."""
         size_bytes = row.size_bytes
         self._rows.append((size_bytes, row))
         self.size_bytes += size_bytes
@@ -74,14 +75,14 @@ class Ring:
             self._forget_oldest()
 
     def take(self) -> list[RingRow]:
-        """All rows; none is left."""
+        """Remove and return all rows."""
         rows = [row for _, row in self._rows]
         self._rows.clear()
         self.size_bytes = 0
         return rows
 
     def begin(self, starts_s: float) -> None:
-        """Begin empty at that simulation time."""
+        """Empty the ring; rows are complete from that simulation time on."""
         self._rows.clear()
         self.size_bytes, self.starts_s = 0, starts_s
 

@@ -1,4 +1,4 @@
-"""Writing rows in order: what waits comes before what is new."""
+"""Writing rows in order: waiting rows come before new ones."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from webots_mcp.entries import STATEMENTS, Kind, Values, bind
 from webots_mcp.transactions import in_transaction, roll_back
 from webots_mcp.waiting_file import Taken, is_unfit, take_in
 
-_CATCH_UP_S: Final = 0.002  # a loop that catches up must not stall over it
+_CATCH_UP_S: Final = 0.002  # per call: writing waiting rows must not stall the loop
 
 
 class RowWriter:
-    """Writes a row, or keeps it where it waits. All calls come from who has the connection lock."""
+    """Writes a row, or lets it wait. The caller must have the connection lock."""
 
     def __init__(
         self,
@@ -37,7 +37,7 @@ class RowWriter:
         self._clock = clock
 
     def write(self, kind: Kind, run: Run | None, values: Values) -> int | None:
-        """How many rows the statement changed, or None where it was put off."""
+        """Write a row; returns how many rows the statement changed, or None if it was deferred."""
         session = self._session
         if self._is_behind(run) and not self.catch_up(run):
             self._keep(Row(kind, run, values))
@@ -68,30 +68,30 @@ class RowWriter:
                     connection, lambda: connection.executemany(STATEMENTS[kind], bound)
                 )
             )
-        except Exception:  # noqa: BLE001  (each tells by itself)
+        except Exception:  # noqa: BLE001  (written one by one, each row fails by itself)
             for values in rows:
                 self.write(kind, run, values)
             return
         self._counts.written += len(rows)
 
     def fetch(self, statement: str, values: Values) -> Sequence[Any] | None:
-        """The rows that a statement reads or changes; None while something else comes first."""
+        """The rows that a statement reads or returns; None while waiting rows come first."""
         if not self.is_ready(None):
             return None
         connection, _ = self._session.opened
-        # to the end: a RETURNING that is not read so far keeps the write lock
+        # All rows are fetched: an UPDATE ... RETURNING keeps the write lock until its last row.
         return connection.execute(statement, values).fetchall()
 
     def is_ready(self, run: Run | None) -> bool:
-        """Whether the database has all that comes before a row of that run, as of now."""
+        """Whether all rows that precede a new row of that run are written; tries to write them."""
         return not self._is_behind(run) or self.catch_up(run)
 
     def catch_up(self, run: Run | None) -> bool:
-        """Write what comes before; False where that is not possible now, or not all of it."""
+        """Write the waiting rows and the run's own row; False where some are still waiting."""
         if not self._recovery.is_connected():
             return False
         connection, _ = self._session.opened
-        roll_back(connection)  # what an interrupt left open
+        roll_back(connection)  # an interrupt may have left a transaction open
         try:
             self._take_in_waiting()
             if run is not None and run.id is None and not self._backlog.waits:
@@ -102,7 +102,7 @@ class RowWriter:
             return False
         if self._backlog.waits:
             return False
-        self._tell_dropped()
+        self._report_dropped()
         return not self._backlog.waits
 
     def _is_behind(self, run: Run | None) -> bool:
@@ -112,7 +112,7 @@ class RowWriter:
             or self._backlog.waits
             or connection.in_transaction
             or (run is not None and run.id is None)
-            or self._counts.untold > 0
+            or self._counts.unreported > 0
         )
 
     def _write_failed(self, row: Row, error: Exception) -> None:
@@ -145,8 +145,8 @@ class RowWriter:
         for why in taken.unfit:
             self._counts.drop(1, why)
 
-    def _tell_dropped(self) -> None:
-        if self._counts.untold:
-            run, text = self._session.run, self._counts.tell()
+    def _report_dropped(self) -> None:
+        if self._counts.unreported:
+            run, text = self._session.run, self._counts.report()
             now = (self._clock.newest_s(run), time.time())
             self.write("event", run, (*now, "dropped", None, text))

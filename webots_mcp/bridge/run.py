@@ -13,7 +13,7 @@ class Run:
     """A stretch of rising simulation time; its id is None until its row is written.
 
     Attributes:
-        rows: States of it in the database.
+        rows: The number of its states in the database.
         counted: Whether `rows` is exact: an interrupt may come between a row and its count.
     """
 
@@ -37,7 +37,7 @@ class Run:
         self.started_wall_time_s = time.time()
 
     def begin_anew(self) -> None:
-        """It goes on as a run of its own in the database that is written to from now on."""
+        """Continue as a new run, in a new database."""
         self.id = None
         self.uuid = new_uuid()
         self.rows = 0

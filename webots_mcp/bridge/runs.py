@@ -1,4 +1,4 @@
-"""Beginning runs: the first of a session, and one with each reset of the world."""
+"""Beginning runs: the first of a session, and one at each reset of the world."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from webots_mcp.bridge.throttle import Throttle
 
 
 class Runs:
-    """Enters each run as it begins, and calls the controller's callbacks."""
+    """Begins each run, and calls the controller's callbacks."""
 
     def __init__(
         self,
@@ -39,7 +39,7 @@ class Runs:
         self._motors = motors
 
     def look(self, *, after_step: bool = False) -> None:
-        """Begin a run if simulation time went back since the last look.
+        """Begin a run if simulation time went back since the last call.
 
         Args:
             after_step: A step has just ended.
@@ -48,18 +48,18 @@ class Runs:
             self.begin()
 
     def look_after_step(self) -> None:
-        """A step is over: time has passed, or gone back, and the loop has not come round yet."""
+        """Look right after a step, before the loop's own code runs."""
         self.look(after_step=True)
         self._heartbeat.beat_if_due()
 
     def begin(self) -> None:
-        """Simulation time went back: the old run ends with what was last known of it."""
+        """Simulation time went back: end the old run at its newest known time, begin a new one."""
         self._recorder.end_run("reset", self._clock.ended_sim_time_s)
         self._recorder.session.run = self._clock.run
         self._throttle.begin_run()
         self._reloads.happened()
         self._journal.event("reset")
-        # Before the callbacks, which may ask for values that waited for the reset, and for others.
+        # Before the callbacks, which may read values that waited for the reset, and set others.
         self._parameters.begin_run()
         self._scene.begin_run()
         self._motors.begin_run()
@@ -67,7 +67,7 @@ class Runs:
         self._heartbeat.beat()
 
     def begin_first(self, *, reloaded: bool) -> None:
-        """The session's first run, after a reload or not."""
+        """Begin the session's first run, after a reload or a start."""
         run = self._clock.run
         run.start_reason = "reload" if reloaded else "start"
         self._journal.event(run.start_reason)

@@ -1,8 +1,7 @@
 """The scene tree of a world, walked from its root.
 
-Each look at a field or at one of its entries may be a request that Webots has to answer, so a walk
-is a generator: whoever walks decides when to go on. It does not look at shapes and appearances
-unless told to.
+Reading a field or one of its entries may be a request to Webots, so a walk is a generator: its
+caller decides when to continue. It skips shapes and appearances unless `everything` is set.
 """
 
 from __future__ import annotations
@@ -12,11 +11,11 @@ from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-MOST_NODES: Final = 5000  # that one walk gives
+MOST_NODES: Final = 5000  # that one walk yields
 DEEPEST: Final = 24  # levels below the root
 
 _CHILDREN: Final = ("children",)
-# By base type: the fields in which solids, joints and devices stand. What is not here holds none.
+# By base type: the fields that contain solids, joints and devices. Other types contain none.
 _FIELDS: Final[dict[str, tuple[str, ...]]] = {
     **dict.fromkeys(("Group", "Pose", "Transform", "Billboard", "Solid", "Robot"), _CHILDREN),
     **dict.fromkeys(("Accelerometer", "Altimeter", "Camera", "Charger", "Compass"), _CHILDREN),
@@ -32,8 +31,8 @@ _FIELDS: Final[dict[str, tuple[str, ...]]] = {
     "Track": ("device", *_CHILDREN),
 }
 WALKED: Final = frozenset(_FIELDS)
-"""Base types of the nodes that a walk gives without being told to give everything."""
-_GROUPS: Final = ("Group", "Pose", "Transform")  # which hold nodes as children only
+"""Base types of the nodes that a walk yields even without `everything`."""
+_GROUPS: Final = ("Group", "Pose", "Transform")  # whose only field of nodes is `children`
 _NO_SOLIDS: Final = ("Group", "Pose", "Transform", "Billboard", "Fluid")
 SOLIDS: Final = frozenset(
     name for name, fields in _FIELDS.items() if "children" in fields and name not in _NO_SOLIDS
@@ -43,18 +42,18 @@ SOLIDS: Final = frozenset(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SceneNode:
-    """A node where it stands in the tree.
+    """A node and its position in the tree.
 
     Attributes:
         node: Webots' `Node`.
-        id: Its number; no other node of the world has it, and none ever gets it again.
-        type_name: `E-puck`, of a PROTO node; else as `base_type`.
-        base_type: `Robot`.
+        id: Its number, which is unique in the world and never used again.
+        type_name: The PROTO's name, such as `E-puck`; else the same as `base_type`.
+        base_type: The type of node, such as `Robot`.
         definition: Its DEF name, or "".
-        parent: The node around it; None at the top of the tree.
-        field: The field of the parent, or of the root, in which it stands.
-        index: Its place in that field; None where the field holds one node.
-        hidden: It stands inside a PROTO node: it can be looked at, and not be changed.
+        parent: Its parent node; None at the top of the tree.
+        field: The field of the parent, or of the root, that contains it.
+        index: Its index in that field; None where the field holds a single node.
+        hidden: It is inside a PROTO node: it can be read, but not changed.
     """
 
     node: Any
@@ -71,13 +70,13 @@ class SceneNode:
     def of(
         cls, node: Any, parent: SceneNode | None, field: str, index: int | None, *, hidden: bool
     ) -> SceneNode:
-        """A node of Webots', with where it stands."""
+        """A `Node` of Webots with its position in the tree."""
         kinds = (node.getTypeName(), node.getBaseTypeName(), node.getDef())
         return cls(node, int(node.getId()), *kinds, parent, field, index, hidden)
 
     @property
     def depth(self) -> int:
-        """How many nodes are around it."""
+        """The number of its ancestors."""
         return 0 if self.parent is None else self.parent.depth + 1
 
     @property
@@ -92,7 +91,7 @@ class SceneNode:
 
     @property
     def name(self) -> str:
-        """What its field `name` holds; "" where it has none."""
+        """The value of its field `name`; "" where it has none."""
         value = read_value(self.node, "name")
         return value if isinstance(value, str) else ""
 
@@ -103,7 +102,7 @@ class NodeField(NamedTuple):
     Attributes:
         name: Its name.
         field: Webots' `Field`.
-        hidden: It belongs to the inside of a PROTO node.
+        hidden: It belongs to the internal node of a PROTO.
     """
 
     name: str
@@ -119,21 +118,21 @@ def walk(
     inside: bool = True,
     everything: bool = False,
 ) -> Generator[SceneNode]:
-    """The nodes of the tree, each once, those near the root first.
+    """The nodes of the tree, each once, breadth first.
 
     Args:
-        root: The node to begin at, which is not given itself: `supervisor.getRoot()`, or another.
-        most: It ends after so many nodes.
-        deepest: It goes no more than so many levels below the root.
-        inside: It looks into PROTO nodes too, whose inside Webots lets be read.
-        everything: It gives shapes, appearances and the like as well.
+        root: The node to begin at, which is not yielded itself: `supervisor.getRoot()`, or another.
+        most: The largest number of nodes to yield.
+        deepest: The largest number of levels below the root.
+        inside: Also yield the nodes inside PROTO nodes, which Webots allows to be read.
+        everything: Also yield shapes, appearances and the like.
     """
     seen: set[int] = {int(root.getId())}
     waiting: deque[tuple[Any, SceneNode | None]] = deque([(root, None)])
     while waiting:
         node, around = waiting.popleft()
         for found in _nodes_in(node, around, inside=inside, everything=everything):
-            if found.id in seen:  # a USE, or what a slot shows a second time
+            if found.id in seen:  # a USE, or a node that is reachable through a slot as well
                 continue
             if len(seen) > most:
                 return
@@ -154,7 +153,7 @@ def _nodes_in(
 
 
 def node_fields(node: Any, *, inside: bool = True, everything: bool = False) -> Iterator[NodeField]:
-    """The fields of a node in which nodes can stand; of a PROTO node those inside it come last."""
+    """The fields of a node that can contain nodes; of a PROTO node the internal ones come last."""
     base_type: str = node.getBaseTypeName()
     if node.isProto() or (everything and base_type not in _GROUPS):
         yield from _all_node_fields(node)
@@ -176,31 +175,31 @@ def _all_node_fields(node: Any) -> Iterator[NodeField]:
 
 
 def holds_solids(node: Any) -> bool:
-    """Whether a walk gives it without being told to give everything."""
+    """Whether a walk yields it even without `everything`."""
     return node.getBaseTypeName() in WALKED
 
 
 def find_inner_field(node: Any, name: str) -> Any | None:
-    """A field of the node that a PROTO node is made of, to be read only; None where it has none."""
+    """A read-only field of the node that a PROTO node is made of; None where it has none."""
     # R2025a renamed what R2023b calls getProtoField.
     look = getattr(node, "getBaseNodeField", None) or getattr(node, "getProtoField", None)
     return None if look is None or not node.isProto() else look(name)
 
 
 def find_field(node: Any, name: str) -> Any | None:
-    """A field of a node: its own, or else one of what a PROTO node is made of."""
+    """A field of a node: its own, or else one of the node that a PROTO node is made of."""
     field = node.getField(name)
     return find_inner_field(node, name) if field is None else field
 
 
 def read_value(node: Any, name: str) -> Any | None:
-    """The value of a field that holds one; None where the node has no such field."""
+    """The value of a single-valued field; None where the node has no such field."""
     field = find_field(node, name)
     return None if field is None or field.getCount() >= 0 else field.value
 
 
 def entries(field: Any) -> Iterator[tuple[int | None, Any]]:
-    """The nodes in a field, with their places."""
+    """The nodes in a field, with their indices."""
     if field.getTypeName() == "SFNode":
         node = field.getSFNode()
         if node is not None:

@@ -1,7 +1,7 @@
 """The built-in actions that change the scene tree: set a field, add and remove a node.
 
-Webots sets a field with the next step, so an answer says what the field holds after it. Each change
-is an event, and is remembered, so that a reset puts it back.
+Webots sets a field with the next step, so the answer has the field's value after that step. Each
+change is an event, and is remembered, so that a reset puts it back.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from webots_mcp.bridge.text import cut
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
 _LONGEST_NODE: Final = 50_000  # characters of a node that is added
-_LONGEST_SHOWN: Final = 1_000  # characters of a value
+_LONGEST_SHOWN: Final = 1_000  # characters of a value in an answer
 _LONGEST_STEP_S: Final = 3.0  # of wall time, until the next round of the loop
 _STAY: Final = ("WorldInfo", "Viewpoint")
 _ONE_NODE: Final = re.compile(r"\s*(?:DEF\s+\S+\s+)?[A-Za-z_][\w-]*\s*\{.*\}\s*\Z", re.DOTALL)
 _WORD: Final = re.compile(r'"(?:[^"\\]|\\.)*"|#[^\r\n]*|[{}\[\]]|[^\s,"#{}\[\]]+', re.DOTALL)
 _ADDED_BEFORE: Final = "does not bring it back: it was added in this run"
-_SAYS: Final = "Webots' console (webots_get_logs, if it is recorded) says why"
+_SAYS: Final = "Webots' console has the reason (see webots_get_logs, if it is recorded)"
 
 
 def set_field(context: Context, command: ClaimedCommand) -> Progress:
-    """Set the field, or the entry of one, that a `path` leads to, to a `value`."""
+    """Set the field, or the entry of a field, at a `path` to a `value`."""
     robot, params = context.simulation.robot, command.params
     place = yield from find(robot, params.get("path"))
     _require_settable(robot, place)
@@ -59,22 +59,22 @@ def set_field(context: Context, command: ClaimedCommand) -> Progress:
     now = _read_again(robot, place)
     if not is_stepped and not is_same(place.type_name, now, value):
         facts["now"] = _shown(now)
-        facts["when"] = "it is set with the next step: time stands still"
+        facts["when"] = "it is set with the next step: simulation time stands still"
     elif not is_nearer(place.type_name, now, value, before) and not is_same(
         place.type_name, before, value
     ):
         raise CommandRefusedError(
             f"{place.path} is {now!r:.200} after it was set: a controller set it again, or Webots "
-            f"did not take the value; {_SAYS}. What is inside a PROTO cannot be set"
+            f"refused the value; {_SAYS}. Fields inside a PROTO cannot be set"
         )
     elif not is_same(place.type_name, now, value):
-        facts["now"] = _shown(now)  # the simulation has moved it on
+        facts["now"] = _shown(now)  # the simulation has changed it since
     context.journal.event("set_field", facts | _asked_by(command), place.path)
-    return facts | {"sim_time_s": context.clock.sim_time_s} | _told_of_reset(is_remembered)
+    return facts | {"sim_time_s": context.clock.sim_time_s} | _effect_of_reset(is_remembered)
 
 
 def _shown(value: Any) -> Any:
-    """A value as it is, or the beginning of its text where it is long."""
+    """A value, or the beginning of its text where it is long."""
     text = json.dumps(value, ensure_ascii=False)
     return value if len(text) <= _LONGEST_SHOWN else cut(text, _LONGEST_SHOWN)
 
@@ -102,21 +102,23 @@ def _require_settable(robot: Any, place: Place) -> None:
         )
     if place.field.getName() == "supervisor" and place.node.getId() == robot.getSelf().getId():
         raise InvalidInputError(
-            f"{place.path} stays as it is: the bridge that would set it needs the right itself"
+            f"{place.path} cannot be set: this bridge needs the permission of a Supervisor itself"
         )
 
 
 def _read_again(robot: Any, place: Place) -> Any:
-    """Setting a field may make a PROTO's inside anew, so that it is looked for once more."""
+    """The value of a field after setting it; setting may rebuild a PROTO, so it is found again."""
     assert place.field is not None
     field = find_again(robot, int(place.node.getId()), str(place.field.getName()))
     if field is None:
-        raise CommandRefusedError(f"{place.path} is not there any more after it was set")
+        raise CommandRefusedError(
+            f"{place.path} does not exist any more after it was set: look with webots_get_scene"
+        )
     return read(field, place.index)
 
 
 def _until_stepped(context: Context) -> Generator[None, None, bool]:
-    """Wait for a step of the simulation; False where its time stands still."""
+    """Wait for a step of the simulation; False where simulation time stands still."""
     clock, from_step = context.clock, context.clock.steps_seen
     until_s = time.monotonic() + _LONGEST_STEP_S
     while clock.steps_seen == from_step:
@@ -131,14 +133,14 @@ def _asked_by(command: ClaimedCommand) -> dict[str, Any]:
     return {"command_id": command.id, "requested_by": command.requested_by}
 
 
-def _told_of_reset(is_remembered: bool) -> dict[str, Any]:
+def _effect_of_reset(is_remembered: bool) -> dict[str, Any]:
     if is_remembered:
         return {"a_reset": "puts it back"}
-    return {"a_reset": f"leaves it so: {MOST_EDITS} changes are remembered, and no more"}
+    return {"a_reset": f"does not undo it: at most {MOST_EDITS} changes are remembered"}
 
 
 def add_node(context: Context, command: ClaimedCommand) -> Progress:
-    """Add the node that `vrml` describes to the children of a `path`, or to a field of nodes."""
+    """Add the node of the text `vrml` to the children of the node, or to the field, at a `path`."""
     robot, params = context.simulation.robot, command.params
     text = _require_one_node(params.get("vrml"))
     place = yield from _find_room(robot, params.get("path") or "root")
@@ -150,14 +152,14 @@ def add_node(context: Context, command: ClaimedCommand) -> Progress:
     if node is None:
         raise CommandRefusedError(
             f"Webots added nothing to {place.path}; {_SAYS}. A PROTO has to be declared in the "
-            "world first: IMPORTABLE EXTERNPROTO"
+            "world file first: IMPORTABLE EXTERNPROTO"
         )
     path = _path_of(robot, node)
     is_remembered = context.scene.remember_added(path, int(node.getId()))
     facts: dict[str, Any] = {"path": path, "type": str(node.getTypeName()), "parent": place.path}
     yield from _until_stepped(context)
     context.journal.event("add_node", facts | {"vrml": cut(text, 2000)} | _asked_by(command), path)
-    reset = {"a_reset": "removes it"} if is_remembered else _told_of_reset(is_remembered)
+    reset = {"a_reset": "removes it"} if is_remembered else _effect_of_reset(is_remembered)
     return facts | {"node": label(node), "sim_time_s": context.clock.sim_time_s} | reset
 
 
@@ -166,7 +168,7 @@ def _count(place: Place) -> int:
 
 
 def _newest(robot: Any, place: Place, before: int) -> Any | None:
-    """The node that came to a field since; None where none did."""
+    """The node that was added to a field since; None where none was."""
     field = find_again(robot, int(place.node.getId()), str(place.webots_field.getName()))
     if field is None or place.type_name == "SFNode":
         return None if field is None else field.getSFNode()
@@ -174,10 +176,10 @@ def _newest(robot: Any, place: Place, before: int) -> Any | None:
 
 
 def _require_one_node(text: object) -> str:
-    """The text of a node; what is no node at all is refused before Webots is asked.
+    """The text of a node; a text that cannot be one is refused before Webots is asked.
 
     Raises:
-        InvalidInputError: It is none.
+        InvalidInputError: It is not the text of one node.
     """
     what = 'give vrml as one node of a world file, such as DEF BOX Solid { name "box" }'
     if not isinstance(text, str) or len(text) > _LONGEST_NODE or not _ONE_NODE.match(text):
@@ -210,16 +212,18 @@ def _find_room(robot: Any, path: object) -> Generator[None, None, Place]:
     room = place.webots_field
     if place.type_name == "SFNode" and room.getSFNode() is not None:
         holds = label(room.getSFNode())
-        raise InvalidInputError(f"{place.path} holds a node ({holds}): remove that one first")
+        raise InvalidInputError(f"{place.path} already has a node ({holds}): remove that one first")
     if not place.type_name.endswith("Node"):
-        raise InvalidInputError(f"{place.path} is of type {place.type_name}: it takes no nodes")
+        raise InvalidInputError(
+            f"{place.path} is of type {place.type_name}, which cannot contain nodes"
+        )
     if place.is_hidden:
         raise InvalidInputError(f"{place.path} is inside a PROTO, where nothing can be added")
     return place
 
 
 def _path_of(robot: Any, node: Any) -> str:
-    """A path that leads to a node for as long as it is there."""
+    """A path that identifies a node as long as it exists."""
     definition = str(node.getDef())
     found = robot.getFromDef(definition) if definition else None
     is_first = found is not None and found.getId() == node.getId()
@@ -227,7 +231,7 @@ def _path_of(robot: Any, node: Any) -> str:
 
 
 def remove_node(context: Context, command: ClaimedCommand) -> Progress:
-    """Remove the node that a `path` leads to, with all in it."""
+    """Remove the node at a `path`, with everything in it."""
     robot = context.simulation.robot
     place = yield from find_node(robot, command.params.get("path"))
     _require_removable(robot, place)
@@ -255,14 +259,14 @@ def _brought_back(removal: Removal | None, is_remembered: bool) -> str:
         return "puts it back"
     if removal is None or not removal.is_written_out:
         return "does not bring it back; a reload does"
-    return str(_told_of_reset(False)["a_reset"])
+    return str(_effect_of_reset(False)["a_reset"])
 
 
 def _require_removable(robot: Any, place: Place) -> None:
-    """Refuse what the world, or this very bridge, cannot do without.
+    """Refuse to remove a node that the world, or this bridge, depends on.
 
     Raises:
-        InvalidInputError: With the reason.
+        InvalidInputError: The text has the reason.
     """
     node = place.node
     if place.is_hidden:
@@ -273,14 +277,14 @@ def _require_removable(robot: Any, place: Place) -> None:
     while each is not None:
         if each.getId() == node.getId():
             raise InvalidInputError(
-                f"{place.path} holds the robot {robot.getName()!r}, whose bridge would remove it: "
-                "it stays"
+                f"{place.path} contains the robot {robot.getName()!r} and cannot be removed: the "
+                "bridge of that robot runs this command"
             )
         each = each.getParentNode()
 
 
 def _removal(robot: Any, place: Place, node_id: int) -> Generator[None, None, Removal | None]:
-    """How to bring it back; None where its place is not found, or Webots cannot write it out."""
+    """How to bring a node back; None where its position is not found, or it cannot be exported."""
     found = yield from spot_of(robot, place.node)
     export = getattr(place.node, "exportString", None)
     if found is None or export is None:

@@ -1,7 +1,7 @@
-"""What commands changed in the scene, so that it is put back when the world is reset.
+"""The changes that commands made to the scene, which are undone when the world is reset.
 
-A reset by Webots brings poses back and removes what was added. It neither sets other fields back
-nor brings removed nodes back: that is done here, as long as the controller's process lives.
+A reset by Webots restores poses and removes added nodes. It does not restore other fields or
+removed nodes: that is done here, as long as the controller's process lives.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ MOST_EDITS: Final = 200  # that are put back
 
 
 class SceneEdits:
-    """Remembers changes of the scene, and has them put back after a reset.
+    """Remembers changes of the scene, and undoes them after a reset.
 
     Args:
-        simulation: Whose scene it is.
-        clock: Tells when a step has been made, with which Webots sets fields.
-        journal: Is told what was put back.
-        failed: Is told of what could not be asked of Webots.
+        simulation: Has the scene.
+        clock: Counts the steps: Webots sets fields with the next one.
+        journal: Receives an event with what was put back.
+        failed: Receives each error of a call to Webots.
 
     Attributes:
-        fields: What was set in this run, in that order.
+        fields: The fields that were set in this run, in that order.
         added: The paths of the nodes that were added in this run, by their numbers.
-        removed: What was removed in this run or an earlier one.
+        removed: The nodes that were removed in this run or an earlier one.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class SceneEdits:
         self.removed: list[Removal] = []
 
     def remember_field(self, edit: FieldEdit) -> bool:
-        """A field is about to be set; False if that will not be put back."""
+        """Remember that a field is about to be set; False if that will not be undone."""
         key = (edit.node_id, edit.name, edit.entry)
         known = self.fields.get(key)
         if known is None and self._is_full:
@@ -61,16 +61,16 @@ class SceneEdits:
         return True
 
     def remember_added(self, path: str, node_id: int) -> bool:
-        """A node was added; False if that will not be taken back."""
+        """Remember an added node; False if that will not be undone."""
         if self._is_full:
             return False
         self.added[node_id] = path
         return True
 
     def remember_removed(self, removal: Removal) -> bool:
-        """A node was removed; False if it will not be brought back."""
+        """Remember a removed node; False if it will not be restored."""
         if self.added.pop(removal.node_id, None) is not None:
-            return True  # it was not there when the run began
+            return True  # it did not exist when the run began
         if self._is_full or not removal.is_written_out:
             return False
         self.removed.append(removal)
@@ -81,10 +81,10 @@ class SceneEdits:
         return len(self.fields) + len(self.added) + len(self.removed) >= MOST_EDITS
 
     def begin_run(self) -> None:
-        """The world was reset: put back what Webots left as commands had made it."""
+        """The world was reset: undo the changes that Webots has not undone."""
         if not (self.fields or self.added or self.removed):
             return
-        from webots_mcp.bridge.scene_restoring import Restoration  # only where there is something
+        from webots_mcp.bridge.scene_restoring import Restoration  # only here: seldom needed
 
         self._restoration = Restoration(self._simulation.robot, self._failed)
         self._restored_at_step = self._clock.steps_seen
@@ -93,7 +93,7 @@ class SceneEdits:
         self.removed = self._restoration.put_back(fields, added, self.removed)
 
     def look(self) -> None:
-        """Record what was put back, once the step has been made that sets fields."""
+        """Record what was put back, after the step with which Webots sets the fields."""
         restoration = self._restoration
         if restoration is not None and self._clock.steps_seen != self._restored_at_step:
             self._restoration = None

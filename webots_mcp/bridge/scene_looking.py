@@ -1,6 +1,6 @@
-"""The built-in actions that look at the scene tree: its nodes, and what a path leads to.
+"""The built-in actions that read the scene tree: its nodes, and the node or field at a path.
 
-They ask Webots from within the controller's loop, a few milliseconds a round.
+They ask Webots from within the controller's loop, for a few milliseconds per round.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _LONGEST_TEXT: Final = 80  # of a field among others
 _USUAL_DEPTH: Final = 2
 _MOST_AT_THE_TOP: Final = 200
 _MOST_PATTERNS: Final = 20
-_MOST_NEAR: Final = 10  # types or names that are told where none matches
+_MOST_NEAR: Final = 10  # types or names that are listed where none matches
 
 
 def get_scene(context: Context, command: ClaimedCommand) -> Progress:
@@ -49,6 +49,7 @@ def get_scene(context: Context, command: ClaimedCommand) -> Progress:
     keys: dict[int, tuple[int, ...]] = {}
     for looked, found in enumerate(tree, 1):
         yield from pace.rest()
+        # The walk is breadth first; these keys sort the answer's rows depth first, as a tree reads.
         before = keys.get(found.parent.id, ()) if found.parent else ()
         keys[found.id] = (*before, looked)
         row = _row(found, definitions, wanted)
@@ -56,20 +57,20 @@ def get_scene(context: Context, command: ClaimedCommand) -> Progress:
         if looked <= after or not _matches(found, types, names):
             continue
         if not rows.fits(row):
-            return rows.told([row for _, row in sorted(shown)]) | {"cursor": looked - 1}
+            return rows.as_table([row for _, row in sorted(shown)]) | {"cursor": looked - 1}
         shown.append((keys[found.id], row))
-    told = rows.told([row for _, row in sorted(shown)]) | {"looked_at": looked}
+    answer = rows.as_table([row for _, row in sorted(shown)]) | {"looked_at": looked}
     if (types or names) and not shown and not after:
-        told["nearest"] = nearest_first((names or types)[0], filter(None, seen))[:_MOST_NEAR]
+        answer["nearest"] = nearest_first((names or types)[0], filter(None, seen))[:_MOST_NEAR]
     if place is not None:
-        return told | {"below": place.path}
+        return answer | {"below": place.path}
     if types or names:
-        return told
-    return told | {"also_at_the_top": (yield from _others_at_the_top(around, pace))}
+        return answer
+    return answer | {"also_at_the_top": (yield from _others_at_the_top(around, pace))}
 
 
 def _others_at_the_top(root: Any, pace: Pace) -> Generator[None, None, list[str]]:
-    """The types of the nodes that are neither solids nor groups of them: WorldInfo, lights."""
+    """The types of the top nodes that are neither solids nor groups: WorldInfo, lights."""
     field, others = children(root), dict[str, None]()
     for index in range(min(field.getCount(), _MOST_AT_THE_TOP)):
         yield from pace.rest()
@@ -80,7 +81,7 @@ def _others_at_the_top(root: Any, pace: Pace) -> Generator[None, None, list[str]
 
 
 class _Rows:
-    """Rows of an answer, as far as there is room for them."""
+    """The rows of an answer, limited in characters."""
 
     def __init__(self, columns: list[str]) -> None:
         self._columns = columns
@@ -90,12 +91,12 @@ class _Rows:
         self._characters += len(json.dumps(row, default=str)) + 1
         return self._characters <= _MOST_CHARACTERS
 
-    def told(self, rows: list[list[Any]]) -> dict[str, Any]:
+    def as_table(self, rows: list[list[Any]]) -> dict[str, Any]:
         return {"columns": self._columns, "rows": rows}
 
 
 def _row(found: SceneNode, definitions: set[str], wanted: list[str]) -> list[Any]:
-    """Its depth, a path to it that is no other's, its type, its name, and the wanted fields."""
+    """A node's depth, unique path, type and name, and the values of the wanted fields."""
     path = found.definition if found.definition not in definitions else ""
     definitions.add(found.definition)
     kind = found.type_name
@@ -121,12 +122,12 @@ def _called(found: SceneNode) -> tuple[str, str]:
 
 
 def _any_match(texts: Iterable[str], patterns: list[str]) -> bool:
-    """Whether one of the texts is as one of the patterns says, whatever their case."""
+    """Whether one of the texts matches one of the patterns, ignoring case."""
     return any(fnmatchcase(text.lower(), each.lower()) for text in texts for each in patterns)
 
 
 def get_field(context: Context, command: ClaimedCommand) -> Progress:
-    """What a `path` leads to: the value of a field, or a node with all its fields."""
+    """The value of the field, or all fields of the node, at a `path`."""
     place = yield from find(context.simulation.robot, command.params.get("path"))
     start = _whole(command.params, "start", 0, 0, 10**9)
     facts: dict[str, Any] = {"path": place.path}
@@ -152,9 +153,9 @@ def _describe_node(place: Place, start: int) -> Generator[None, None, dict[str, 
         if index < start:
             continue
         if not rows.fits(row):
-            return facts | rows.told(shown) | {"next_start": index}
+            return facts | rows.as_table(shown) | {"next_start": index}
         shown.append(row)
-    return facts | rows.told(shown)
+    return facts | rows.as_table(shown)
 
 
 def _describe_entries(place: Place, start: int) -> dict[str, Any]:
@@ -172,7 +173,7 @@ def _describe_entries(place: Place, start: int) -> dict[str, Any]:
 
 
 def _value(field: Any, index: int | None) -> Any:
-    """A single value, or an entry; nodes in few words."""
+    """A single value, or an entry; a node as its number and label."""
     if not str(field.getTypeName()).endswith("Node"):
         value = read(field, index)
         return cut(value, _MOST_CHARACTERS // 2) if isinstance(value, str) else value
@@ -181,7 +182,7 @@ def _value(field: Any, index: int | None) -> Any:
 
 
 def _brief(field: Any) -> Any:
-    """A value among others: of a list the first entries and how many there are."""
+    """A value shortened for a table; of a list the first entries and their number."""
     if field is None:
         return None
     if field.getCount() < 0:
@@ -202,10 +203,14 @@ def _patterns(params: dict[str, Any], name: str) -> list[str]:
     if not isinstance(given, list) or not all(
         isinstance(each, str) for each in cast("list[Any]", given)
     ):
-        raise InvalidInputError(f'{name} is a list of texts, such as ["Robot"], not {given!r:.80}')
+        raise InvalidInputError(
+            f'{name} must be a list of texts, such as ["Robot"], not {given!r:.80}'
+        )
     texts = cast("list[str]", given)
     if len(texts) > _MOST_PATTERNS:
-        raise InvalidInputError(f"{name} are {len(texts)}: at most {_MOST_PATTERNS}")
+        raise InvalidInputError(
+            f"{name} has {len(texts)} texts; at most {_MOST_PATTERNS} may be given"
+        )
     return texts
 
 
@@ -214,5 +219,7 @@ def _whole(params: dict[str, Any], name: str, usual: int, least: int, most: int)
     if value is None:
         return usual
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-        raise InvalidInputError(f"{name} is a whole number from {least} to {most}, not {value!r}")
+        raise InvalidInputError(
+            f"{name} must be a whole number from {least} to {most}, not {value!r}"
+        )
     return value

@@ -1,8 +1,8 @@
 """Paths into the scene tree: `ROVER.translation`, `BALL.children[0].appearance`, `#12.name`.
 
 A path begins with a DEF name, the name of a robot or another Solid, the type of a node at the top
-of the tree (`WorldInfo`), `root`, or `#` and a node's number. What follows are names of fields, and
-places in brackets. One that leads nowhere is answered with what there is.
+of the tree (`WorldInfo`), `root`, or `#` and a node's number. Names of fields and indices in
+brackets follow. For a path that leads nowhere the error lists the nearest existing names.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ MOST_FIELDS: Final = 100  # of one node
 
 _MOST_NAMED: Final = 20
 _LONGEST_PATH: Final = 500
-_SLICE_S: Final = 0.005  # of one round of the controller's loop
+_SLICE_S: Final = 0.005  # the time that reading may take in one round of the controller's loop
 _HEAD: Final = re.compile(
     r"\s*/?(?:root\s*[./]\s*(?=children))?(?:(?:DEF|USE)\s+)?"
     r'(?:"(?P<quoted>[^"]+)"|(?P<plain>[^."\[/][^.\[/]*))'
@@ -30,17 +30,17 @@ _HEAD: Final = re.compile(
 _STEP: Final = re.compile(
     r"\s*(?:\[\s*(?P<index>-?\d+)\s*\]|[./]\s*(?P<place>\d+)(?=[./\[]|$)|[./]\s*(?P<name>[^.\[\]/]+))"
 )
-_HOW: Final = "write such as ROVER.translation, BALL.children[0].appearance or #12.name"
+_HOW: Final = "write a path such as ROVER.translation, BALL.children[0].appearance or #12.name"
 
 
 class Pace:
-    """Lets a long look at the scene rest, so that the controller's loop goes on meanwhile."""
+    """Interrupts a long reading of the scene, so that the controller's loop continues meanwhile."""
 
     def __init__(self) -> None:
         self._until_s = time.monotonic() + _SLICE_S
 
     def rest(self) -> Generator[None]:
-        """Wait for the next round, where this one has been used up."""
+        """Wait for the next round if the time of this one is used up."""
         if time.monotonic() > self._until_s:
             yield
             self._until_s = time.monotonic() + _SLICE_S
@@ -48,15 +48,15 @@ class Pace:
 
 @dataclass(frozen=True)
 class Place:
-    """What a path leads to: a node, or (with `field`) one of its fields.
+    """The target of a path: a node, or (with `field`) one of its fields.
 
     Attributes:
-        path: The way to it.
+        path: The path to it.
         node: Webots' `Node`.
         field: Webots' `Field`; None where the path ends at the node.
-        index: The entry of the field that is meant; None for all of it.
-        is_hidden: It stands inside a PROTO node: it can be read, and not be changed.
-        definition: The DEF names that lead to the node, with dots; "" for another way.
+        index: The index of the entry in the field; None for the whole field.
+        is_hidden: It is inside a PROTO node: it can be read, but not changed.
+        definition: The path as DEF names with dots; "" where it has other parts.
     """
 
     path: str
@@ -73,16 +73,16 @@ class Place:
 
     @property
     def type_name(self) -> str:
-        """Of the field, such as SFVec3f; of one entry the type of a single field."""
+        """The type of the field, such as SFVec3f; for one entry the single-valued type."""
         whole = str(self.field.getTypeName()) if self.field is not None else ""
         return whole if self.index is None else f"SF{whole[2:]}"
 
 
 def find(supervisor: Any, path: object) -> Generator[None, None, Place]:
-    """Go a path.
+    """Resolve a path.
 
     Raises:
-        InvalidInputError: It is no path, or leads nowhere; what there is instead is named.
+        InvalidInputError: It is not a path, or leads nowhere; the text lists the nearest names.
     """
     head, steps = parse(path)
     place = yield from _find_head(supervisor, head, Pace())
@@ -92,7 +92,7 @@ def find(supervisor: Any, path: object) -> Generator[None, None, Place]:
 
 
 def find_node(supervisor: Any, path: object) -> Generator[None, None, Place]:
-    """Go a path that is to lead to a node, also by a field that holds one.
+    """Resolve a path to a node, or to a field that contains a single node.
 
     Raises:
         InvalidInputError: As `find`, or there is no node at its end.
@@ -109,10 +109,10 @@ def parse(path: object) -> tuple[str, list[str | int]]:
     """The name that a path begins with, and its steps.
 
     Raises:
-        InvalidInputError: It is no path.
+        InvalidInputError: It is not a path.
     """
     if not isinstance(path, str) or not path.strip() or len(path) > _LONGEST_PATH:
-        raise InvalidInputError(f"{path!r:.80} is no path of the scene tree: {_HOW}")
+        raise InvalidInputError(f"{path!r:.80} is not a path of the scene tree: {_HOW}")
     head = _HEAD.match(path)
     position, steps = (head.end() if head else 0), list[str | int]()
     while head and position < len(path.rstrip()):
@@ -123,7 +123,7 @@ def parse(path: object) -> tuple[str, list[str | int]]:
         position = step.end()
     if head is None or position < len(path.rstrip()):
         raise InvalidInputError(
-            f"{path!r} is no path of the scene tree from {path[position:]!r} on: {_HOW}"
+            f"{path!r} is not a path of the scene tree: {path[position:]!r} is invalid; {_HOW}"
         )
     return (head["quoted"] or head["plain"]).strip(), steps
 
@@ -147,12 +147,12 @@ def _numbered(supervisor: Any, head: str) -> Any:
     digits = head[1:].strip()
     node = supervisor.getFromId(int(digits)) if digits.isdigit() and len(digits) < 10 else None
     if node is None:
-        raise InvalidInputError(f"there is no node {head}; webots_get_scene names the nodes")
+        raise InvalidInputError(f"there is no node {head}; webots_get_scene lists the nodes")
     return node
 
 
 def _named(root: Any, head: str, pace: Pace) -> Generator[None, None, SceneNode]:
-    """The Solid of that name, else the node at the top of that type, if it is the only one."""
+    """The only Solid of that name, preferably a Robot; else the only top node of that type."""
     solids, types, labels = list[SceneNode](), list[SceneNode](), list[str]()
     top = list[SceneNode]()
     for index in range(min(children(root).getCount(), MOST_SEARCHED)):
@@ -175,7 +175,9 @@ def _named(root: Any, head: str, pace: Pace) -> Generator[None, None, SceneNode]
         if len(several) == 1:
             return several[0]
         if several:
-            raise InvalidInputError(f"{len(several)} nodes are called {head!r}: {_listed(several)}")
+            raise InvalidInputError(
+                f"{len(several)} nodes have the name {head!r}: {_listed(several)}"
+            )
     raise InvalidInputError(_unknown(head, labels, searched))
 
 
@@ -193,21 +195,21 @@ def _at_the_top(root: Any, index: int) -> SceneNode:
 
 
 def children(root: Any) -> Any:
-    """The field of the root in which the top of the tree stands."""
+    """The field of the root that contains the top nodes of the tree."""
     return root.getField("children")
 
 
 def _listed(several: Sequence[SceneNode]) -> str:
     shown = ", ".join(f"#{each.id} {each.type_name}" for each in several[:_MOST_NAMED])
-    return f"{shown}; write the number of the one that is meant"
+    return f"{shown}; give the number of one of them"
 
 
 def _unknown(head: str, labels: list[str], searched: int) -> str:
-    there = list(dict.fromkeys(nearest_first(head, labels)))
+    existing = list(dict.fromkeys(nearest_first(head, labels)))
     bound = f" among the first {MOST_SEARCHED} nodes" if searched >= MOST_SEARCHED else ""
     return (
-        f"no node is called {head!r}{bound}, by DEF, name or type; at the top there are "
-        f"(the nearest first): {some(there)}"
+        f"no node has the DEF name, name or type {head!r}{bound}; robots and nodes at the top "
+        f"(the nearest first): {some(existing)}"
     )
 
 
@@ -220,10 +222,12 @@ def _go(supervisor: Any, place: Place, step: str | int) -> Place:
         return _field_of(supervisor, _enter(place), step)
     if place.type_name == "MFNode":
         raise InvalidInputError(
-            f"{place.path} is a list of nodes: say which, such as {place.path}[0]; it has "
+            f"{place.path} is a list of nodes: give an index, such as {place.path}[0]; it has "
             f"{_entries_of(place)}"
         )
-    raise InvalidInputError(f"{place.path} is of type {place.type_name}: nothing is below it")
+    raise InvalidInputError(
+        f"{place.path} is of type {place.type_name}: it has no fields, so the path must end there"
+    )
 
 
 def _enter(place: Place) -> Place:
@@ -231,7 +235,7 @@ def _enter(place: Place) -> Place:
     assert place.field is not None
     node = place.field.getSFNode()
     if node is None:
-        raise InvalidInputError(f"{place.path} is NULL: no node stands there")
+        raise InvalidInputError(f"{place.path} is NULL: it contains no node")
     return Place(place.path, node, is_hidden=place.is_hidden)
 
 
@@ -277,7 +281,7 @@ def _entry_of(place: Place, index: int) -> Place:
     count = field.getCount() if place.index is None else -1
     if count < 0:
         raise InvalidInputError(
-            f"{place.path} is one value of type {place.type_name}, no list: set or read all of it"
+            f"{place.path} is one value of type {place.type_name}, not a list: use it without index"
         )
     if not -count <= index < count:
         raise InvalidInputError(f"{place.path} has no entry {index}: it has {_entries_of(place)}")
@@ -289,7 +293,7 @@ def _entry_of(place: Place, index: int) -> Place:
 
 
 def _entries_of(place: Place) -> str:
-    """How many entries a field has, and which nodes they are."""
+    """The number of entries of a field, and its nodes."""
     field = place.field
     assert field is not None
     count = field.getCount()
@@ -302,13 +306,13 @@ def _entries_of(place: Place) -> str:
 
 
 def label(node: Any) -> str:
-    """A node in few words: its type, with its DEF name or else its name."""
+    """A short label of a node: its type, with its DEF name or else its name."""
     name = node.getDef() or read_value(node, "name")
     return f"{node.getTypeName()} {name}" if name else str(node.getTypeName())
 
 
 def some(names: Sequence[str], total: int | None = None) -> str:
-    """The first of some names, and how many there are beyond."""
+    """The first names, and the number of further ones."""
     total = len(names) if total is None else total
     shown = names[:_MOST_NAMED]
     more = f" and {total - len(shown)} more" if total > len(shown) else ""

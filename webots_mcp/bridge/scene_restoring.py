@@ -1,4 +1,4 @@
-"""Putting the scene back after a reset, as far as Webots has not done so itself."""
+"""Restoring the scene after a reset, as far as Webots has not done so itself."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from webots_mcp.bridge.scene import entries
 from webots_mcp.bridge.scene_path import Pace, children, fields_of
 from webots_mcp.bridge.scene_values import is_same, read, write
 
-# Where a body is, it was moved on since it was put there, and a reset brings it back by itself.
+# Physics has changed these since a command set them, and Webots' own reset restores them.
 _MOVED_BY_PHYSICS: Final = ("translation", "rotation", "battery")
 
 _MOST_EXPORTED_CHARACTERS: Final = 200_000  # of a removed node
@@ -21,11 +21,11 @@ class FieldEdit(NamedTuple):
     """A field, or an entry of one, that was set.
 
     Attributes:
-        path: The way to it, as it was asked for.
+        path: The path of the command.
         node_id: The number of its node.
-        name: Of the field.
-        entry: Its place; None for all of the field.
-        type_name: Of what was set.
+        name: The name of the field.
+        entry: The index of the entry; None for the whole field.
+        type_name: The type of the value.
         before: The value before it was set for the first time in this run.
         value: The newest value that it was set to.
     """
@@ -40,15 +40,15 @@ class FieldEdit(NamedTuple):
 
 
 class Removal(NamedTuple):
-    """A node that was removed, as text, and where it stood.
+    """A node that was removed, as text, and its former position.
 
     Attributes:
-        path: The way to it, as it was asked for.
-        node_id: Of the node, or of the one that took its place at the last reset.
-        parent_id: Of the node around it; None for the top of the tree.
-        field: The name of the field in which it stood.
-        entry: Its place in the field; None in one that holds a single node.
-        text: As it would stand in a world file.
+        path: The path of the command.
+        node_id: The number of the node, or of the one that replaced it at the last reset.
+        parent_id: The number of its parent; None for the top of the tree.
+        field: The name of the field that contained it.
+        entry: Its index in the field; None in a field for a single node.
+        text: Its text as in a world file.
     """
 
     path: str
@@ -60,32 +60,32 @@ class Removal(NamedTuple):
 
     @property
     def is_written_out(self) -> bool:
-        """Whether the text is there, and short enough to be remembered."""
+        """Whether Webots exported its text, and it is short enough to be remembered."""
         return 0 < len(self.text) <= _MOST_EXPORTED_CHARACTERS
 
 
 class Restoration:
-    """One reset.
+    """Undoes the changes of one run, after its reset.
 
     Args:
         robot: The Supervisor.
-        failed: Is told of what Webots' package did not take.
+        failed: Receives each error of a call to Webots.
     """
 
     def __init__(self, robot: Any, failed: Callable[[str, Exception], None]) -> None:
         self._robot = robot
         self._failed = failed
         self._set: list[FieldEdit] = []
-        self._told: dict[str, list[str]] = {"by_webots": [], "by_bridge": [], "not": []}
+        self._outcomes: dict[str, list[str]] = {"by_webots": [], "by_bridge": [], "not": []}
 
     def put_back(
         self, fields: list[FieldEdit], added: dict[int, str], removed: list[Removal]
     ) -> list[Removal]:
-        """Set fields back, take away what was added, and bring back what was removed.
+        """Restore fields, remove added nodes, and add removed nodes again.
 
         Returns:
-            What was removed, with the numbers of the nodes that stand there now: Webots takes
-            them for added ones, so that the next reset will remove them once more.
+            The removed nodes with their new numbers. They have to be remembered: to Webots they
+            are added nodes, so the next reset will remove them again.
         """
         for edit in reversed(fields):
             self._try(edit.path, self._set_back, edit)
@@ -95,31 +95,31 @@ class Restoration:
         return [self._try(each.path, self._bring_back, each) or each for each in in_order]
 
     def outcome(self) -> dict[str, object]:
-        """What was put back by whom, a step later, and what was not."""
+        """What was put back by Webots, what by the bridge, and what was not; a step later."""
         for edit in self._set:
-            self._try(edit.path, self._tell_whether_set, edit)
-        return {how: paths for how, paths in self._told.items() if paths}
+            self._try(edit.path, self._check_set, edit)
+        return {how: paths for how, paths in self._outcomes.items() if paths}
 
     def _try(self, path: str, restore: Callable[..., Any], *arguments: Any) -> Any:
         try:
             return restore(*arguments)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._failed(f"putting {path} back", error)
-            self._told["not"].append(path)
+            self._outcomes["not"].append(path)
             return None
 
     def _set_back(self, edit: FieldEdit) -> None:
         field = find_again(self._robot, edit.node_id, edit.name)
         if field is None:
-            self._told["not"].append(f"{edit.path}: its node is not there any more")
+            self._outcomes["not"].append(f"{edit.path}: its node does not exist any more")
         elif edit.name in _MOVED_BY_PHYSICS or not self._holds(edit, edit.value):
-            self._told["by_webots"].append(edit.path)
+            self._outcomes["by_webots"].append(edit.path)
         else:
             write(field, edit.before, edit.entry)
             self._set.append(edit)
 
-    def _tell_whether_set(self, edit: FieldEdit) -> None:
-        self._tell(edit.path, done=self._holds(edit, edit.before))
+    def _check_set(self, edit: FieldEdit) -> None:
+        self._note(edit.path, done=self._holds(edit, edit.before))
 
     def _holds(self, edit: FieldEdit, value: Any) -> bool:
         field = find_again(self._robot, edit.node_id, edit.name)
@@ -128,10 +128,10 @@ class Restoration:
     def _take_away(self, node_id: int, path: str) -> None:
         node = self._robot.getFromId(node_id)
         if node is None:
-            self._told["by_webots"].append(f"{path} (added)")
+            self._outcomes["by_webots"].append(f"{path} (added)")
             return
         node.remove()
-        self._tell(f"{path} (added)", done=self._robot.getFromId(node_id) is None)
+        self._note(f"{path} (added)", done=self._robot.getFromId(node_id) is None)
 
     def _bring_back(self, removal: Removal) -> Removal:
         if self._robot.getFromId(removal.node_id) is not None:
@@ -141,15 +141,15 @@ class Restoration:
             parent = self._robot.getFromId(removal.parent_id)
         field = None if parent is None else parent.getField(removal.field)
         node = None if field is None else import_node(field, removal.text, removal.entry)
-        self._tell(f"{removal.path} (removed)", done=node is not None)
+        self._note(f"{removal.path} (removed)", done=node is not None)
         return removal if node is None else removal._replace(node_id=int(node.getId()))
 
-    def _tell(self, path: str, *, done: bool) -> None:
-        self._told["by_bridge" if done else "not"].append(path)
+    def _note(self, path: str, *, done: bool) -> None:
+        self._outcomes["by_bridge" if done else "not"].append(path)
 
 
 def find_again(robot: Any, node_id: int, name: str) -> Any | None:
-    """The field of that name, of a node that may be gone by now."""
+    """The field of that name, of a node that may not exist any more."""
     node = robot.getFromId(node_id)
     return None if node is None else node.getField(name)
 
@@ -157,7 +157,8 @@ def find_again(robot: Any, node_id: int, name: str) -> Any | None:
 def import_node(field: Any, text: str, index: int | None = None) -> Any | None:
     """Add a node to a field of nodes, by default at its end.
 
-    Webots' console tells what it did not take, and the package says nothing: the field shows it.
+    Webots reports errors in its console only, and the package raises nothing, so the field is
+    compared with before.
 
     Returns:
         The new node; None if none was added.
@@ -172,7 +173,7 @@ def import_node(field: Any, text: str, index: int | None = None) -> Any | None:
 
 
 def spot_of(robot: Any, node: Any) -> Generator[None, None, _Spot | None]:
-    """Where a node stands: the number of its parent (None: the top), the field, and the entry.
+    """The position of a node: the number of its parent (None: the top), the field, and the index.
 
     Returns:
         None where it is not found.

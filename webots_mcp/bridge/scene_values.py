@@ -1,7 +1,7 @@
-"""Values of fields: read as plain JSON, checked before they are set, compared after it.
+"""Values of fields: read as plain JSON, checked before they are set, compared afterwards.
 
-Webots' package takes exact types only and prints what it refuses, so nothing is given to it that
-was not checked here first.
+Webots' package accepts exact types only and reports others by printing, so every value is checked
+here first.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ MOST_ENTRIES: Final = 200  # of a field that are set at once: each is a request 
 MOST_CHARACTERS: Final = 10_000  # of one text
 
 _LARGEST_FLOAT: Final = 3.4028234e38  # beyond it Webots refuses a number
-_TOLERANCE: Final = 1e-6  # Webots may hold what it was given in single precision
+_TOLERANCE: Final = 1e-6  # relative: Webots may store a value in single precision
 
 
-# Fields that name what Webots runs: it looks for each in a folder of its own of the project.
+# Fields that name programs that Webots runs: it searches each in its folder of the project.
 _PROGRAMS: Final = ("controller", "window", "remoteControl", "physics")
 
 
@@ -50,7 +50,7 @@ def _float(value: object) -> float:
 
 
 def _string(value: object) -> str:
-    if isinstance(value, (list, dict)):  # a JSON text, which clients and their SDK like to read
+    if isinstance(value, (list, dict)):  # a JSON text that the client's SDK has already parsed
         value = json.dumps(value, ensure_ascii=False)
     if not isinstance(value, str) or len(value) > MOST_CHARACTERS or "\0" in value:
         raise _RefusedError
@@ -99,31 +99,31 @@ _KINDS: Final[dict[str, _Kind]] = {
 
 
 def require_no_path(field: str, value: object) -> None:
-    """See that a field which names a program names none that lies elsewhere.
+    """Refuse a path in a field that names a program: it could start one outside of the project.
 
     Raises:
-        InvalidInputError: It does.
+        InvalidInputError: The value is a path.
     """
     if field not in _PROGRAMS or not isinstance(value, str):
         return
     if value == ".." or any(each in value for each in "/\\"):
         raise InvalidInputError(
-            f"{field} is a name, by which Webots finds the program in its folder of the project, "
-            f"and no path: {value!r:.200}"
+            f"{field} must be the name of a program in its folder of the project, not a path: "
+            f"{value!r:.200}"
         )
 
 
 def checked(path: str, type_name: str, value: object) -> Any:
-    """The value as Webots' package takes it.
+    """The value in the type that Webots' package accepts.
 
     Raises:
-        InvalidInputError: The field at the path takes another; the text shows one.
+        InvalidInputError: The field at the path has another type; the text shows an example.
     """
     many, kind = type_name.startswith("MF"), _KINDS.get(type_name[2:])
     if kind is None:
         raise InvalidInputError(
-            f"{path} holds nodes ({type_name}): webots_edit_scene adds and removes them; "
-            f"to set a field of a node in it, go on with the path, such as {path}"
+            f"{path} contains nodes ({type_name}): webots_edit_scene adds and removes them; "
+            f"to set a field of a node in it, extend the path, such as {path}"
             f"{'[0]' if many else ''}.name"
         )
     try:
@@ -154,7 +154,7 @@ def read(field: Any, index: int | None = None) -> Any:
 
 
 def read_entries(field: Any, start: int, most: int) -> list[Any]:
-    """So many entries of a field that has entries, from one of them on."""
+    """Up to `most` entries of a multi-valued field, from index `start` on."""
     return [read(field, index) for index in range(start, min(start + most, field.getCount()))]
 
 
@@ -174,7 +174,7 @@ def write(field: Any, value: Any, index: int | None = None) -> None:
 
 
 def _write_all(field: Any, kind: str, values: Sequence[Any]) -> None:
-    """Set the entries that are there, then add those that are missing or remove what is left."""
+    """Set the existing entries, then insert missing ones or remove surplus ones."""
     set_entry, count = getattr(field, f"setMF{kind}"), field.getCount()
     for index, value in enumerate(values[:count]):
         set_entry(index, value)
@@ -185,7 +185,7 @@ def _write_all(field: Any, kind: str, values: Sequence[Any]) -> None:
 
 
 def is_same(type_name: str, one: Any, other: Any) -> bool:
-    """Whether two values of a field mean the same, as exactly as Webots holds them."""
+    """Whether two values of a field are equal within the precision that Webots stores."""
     if type_name.startswith("MF"):
         single = f"SF{type_name[2:]}"
         return len(one) == len(other) and all(map(lambda a, b: is_same(single, a, b), one, other))
@@ -193,7 +193,10 @@ def is_same(type_name: str, one: Any, other: Any) -> bool:
 
 
 def is_nearer(type_name: str, value: Any, wanted: Any, before: Any) -> bool:
-    """Whether a value is rather what was wanted than what it was before."""
+    """Whether a value is closer to the wanted one than to the one before.
+
+    Physics may have changed it since it was set, so that it equals neither.
+    """
     if type_name.startswith("MF") or type_name[2:] in ("Bool", "Int32", "String"):
         return is_same(type_name, value, wanted)
     from_before = _distance(type_name, value, before)
@@ -201,7 +204,7 @@ def is_nearer(type_name: str, value: Any, wanted: Any, before: Any) -> bool:
 
 
 def _distance(type_name: str, one: Any, other: Any) -> float:
-    """How far two single values are apart; 0 where that is within what Webots rounds."""
+    """The distance of two single values; 0 within the precision that Webots stores."""
     if type_name[2:] in ("Bool", "Int32", "String"):
         return float(one != other)
     a, b = _as_vector(type_name, one), _as_vector(type_name, other)

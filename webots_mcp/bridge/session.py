@@ -1,4 +1,4 @@
-"""The session of one controller process: its parts, its beginning and its end."""
+"""The session of one controller process: its parts, its start and its end."""
 
 from __future__ import annotations
 
@@ -42,19 +42,19 @@ from webots_mcp.contract import (
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.maintenance import Maintainer
 
-_IDLE_S: Final = 0.5  # a loop that recorded nothing for so long stands still
-_UNSEEN_S: Final = 1.0  # of simulation time; an interrupt may keep the end of a step from us
+_IDLE_S: Final = 0.5  # a loop that recorded nothing for so long is blocked or waiting
+_UNSEEN_S: Final = 1.0  # of simulation time; less may be one step whose end an interrupt hid
 _UNMOVED_S: Final = 10.0  # of wall time
 
 
 class Session:
-    """Everything that a bridge has from its construction to its end.
+    """All parts of a bridge, from its construction to its end.
 
     Attributes:
         context: The parts that commands work with.
         control: Serves commands.
-        publisher: Takes published states.
-        runs: Notices resets.
+        publisher: Handles published states.
+        runs: Detects resets.
     """
 
     def __init__(
@@ -107,8 +107,8 @@ class Session:
         )
         self.control = Control(self.context)
         self.publisher = Publisher(self.context, self.runs)
-        self._unseen_told = False
-        self._began_s: float | None = time.monotonic()  # None once nothing is to be told of it
+        self._unseen_reported = False
+        self._began_s: float | None = time.monotonic()  # None once `_look_after` has judged it
         self._maintainer = _start_maintainer(database, self._look_after)
 
     @property
@@ -118,7 +118,7 @@ class Session:
         return registration.robot_name if registration else self._identity.robot_name
 
     def begin(self) -> None:
-        """Enter the first run, and go on with what the session before this one left."""
+        """Begin the first run, and continue the previous session's reload or pause."""
         registration = self.context.recorder.session.registration
         self.runs.begin_first(reloaded=registration is not None and registration.reloaded)
         if registration is not None:
@@ -134,7 +134,7 @@ class Session:
             self.context.pause.take_over(registration.paused_mode)
 
     def serve(self) -> ClaimedCommand | None:
-        """One round of the loop: the commands that wait, and the heartbeat."""
+        """One round of the loop: the pending commands, and the heartbeat."""
         simulation = self.context.simulation
         self.runs.look()
         if simulation.over:
@@ -156,7 +156,10 @@ class Session:
             self.context.recorder.errors.failed("Parameter.set", error)
 
     def _set_parameter(self, name: str, value: object) -> None:
-        """The controller's code sets a parameter: now in a handler, else with `get_command()`."""
+        """Set a parameter from the controller's code: at once in a handler, else at the next call.
+
+        Within a round of the loop values must not change, so it waits for `get_command()` there.
+        """
         parameters = self.context.parameters
         if self.control.handlers.running:
             parameters.set_now({name: value}, CODE)
@@ -167,32 +170,32 @@ class Session:
             self.context.recorder.errors.failed("Parameter.set", error)
 
     def look_for_unseen(self, seen_s: float) -> None:
-        """Say once that the loop steps in a way that the bridge does not see.
+        """Warn once that the loop makes steps that the bridge does not see.
 
         Args:
-            seen_s: The newest simulation time that it saw the loop at.
+            seen_s: The newest simulation time at which the bridge saw the loop.
         """
         simulation = self.context.simulation
-        if self._unseen_told or simulation.over:
+        if self._unseen_reported or simulation.over:
             return
         unseen_s = simulation.time_s - seen_s
         if unseen_s < _UNSEEN_S or not simulation.waits_for_robot:
             return
-        self._unseen_told = True
-        text = f"{UNSEEN}; {unseen_s:.1f} s of simulation time went by unseen so far"
+        self._unseen_reported = True
+        text = f"{UNSEEN}; so far it has missed {unseen_s:.1f} s of simulation time"
         self.context.journal.log("warning", "bridge", text)
         self.context.recorder.errors.warn("unseen", text)
 
     def close(self, reason: str | None) -> None:
-        """Write what waits and end; for the reason given, or as far as it is known."""
+        """Write the waiting rows and end, for the given or the known reason."""
         if self._maintainer is not None:
-            self._maintainer.stop()
+            self._maintainer.stop()  # first: its thread uses the recorder too
         self.context.keeper.close()
         reason = reason or self._end_reason
         self.context.recorder.close(reason, self.context.clock.sim_time_s)
 
     def let_go(self) -> None:
-        """A pause that nobody could end any more would stop the whole simulation."""
+        """Resume a paused simulation, which no command could resume later, and answer commands."""
         self.context.pause.close()
         self.control.report_end(extern=self._identity.extern)
 
@@ -201,16 +204,19 @@ class Session:
         return "reload" if self.context.reloads.requested_by else "finished"
 
     def end(self) -> None:
-        """Webots may kill the process from here on, or let the loop say its last words."""
+        """Write everything when Webots says quit: it may kill the process from here on.
+
+        The session stays usable, since the loop may also continue for a last few statements.
+        """
         self.control.report_end(extern=self._identity.extern)
         self.context.keeper.write_all()
         self.context.recorder.end(self._end_reason, self.context.clock.sim_time_s)
 
     def _look_after(self) -> None:
-        """Called from the maintainer's thread: for a loop that stands still, or is not seen.
+        """Called in the maintainer's thread, for a loop that is blocked or never calls the bridge.
 
-        What waits is written. Webots is not asked for anything here: whether time goes on without
-        the bridge is not known before the loop's thread comes by.
+        Waiting rows are written. Webots' API must not be called in this thread, so it is not known
+        here whether simulation time advances without the bridge.
         """
         recorder, began_s = self.context.recorder, self._began_s
         if recorder.rows_waiting and time.monotonic() - recorder.last_use_s > _IDLE_S:
@@ -223,7 +229,7 @@ class Session:
 
 
 def _start_maintainer(database: Database, on_tick: Callable[[], Any]) -> Maintainer | None:
-    """A log to keep short exists only in a file."""
+    """Start the maintainer; a database in memory has no write-ahead log to keep short."""
     if isinstance(database, MemoryDatabase):
         return None
     maintainer = Maintainer(database, "bridge", on_tick=on_tick)

@@ -1,4 +1,4 @@
-"""The connection on which a session records: opened, looked after, closed."""
+"""The connection on which a session records: opening, checking and closing it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from webots_mcp.transactions import is_busy
 
 Result = TypeVar("Result")
 
-_PATIENCE_S: Final = 0.001  # with another writer, whose commit takes 50 us
+_PATIENCE_S: Final = 0.001  # how long to wait for another writer, whose commit takes 50 us
 _RUN_ID: Final = "SELECT id FROM run WHERE uuid = ?"
 _GO_ON: Final = "UPDATE run SET end_reason = NULL, ended_wall_time_s = NULL WHERE id = ?"
 
@@ -41,8 +41,8 @@ class SessionConnection:
     Attributes:
         run: The run that is being recorded.
         actions: Docstrings of the registered custom actions, by name.
-        standing: Each gives what else a database has to be told that does not know the session:
-            the kind, whether it belongs to the run, and the values.
+        new_database_entries: Called when a new database is begun. Each returns the entries that
+            it needs to know the session: kind, whether it belongs to the run, and values.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class SessionConnection:
         self.uuid = new_uuid()
         self.run = run
         self.actions: dict[str, str] = {}
-        self.standing: list[Callable[[], Iterable[tuple[Kind, bool, Values]]]] = []
+        self.new_database_entries: list[Callable[[], Iterable[tuple[Kind, bool, Values]]]] = []
         self.connection: sqlite3.Connection | None = None
         self.registration: Registration | None = None
         self._identity = identity
@@ -62,19 +62,19 @@ class SessionConnection:
 
     @property
     def opened(self) -> tuple[sqlite3.Connection, Registration]:
-        """Both, for whoever knows that it is open."""
+        """Connection and ids, for a caller that knows that it is open."""
         assert self.connection is not None
         assert self.registration is not None
         return self.connection, self.registration
 
     def open(self, *, patient: bool) -> None:
-        """Open or make the database, and enter the session or go on with it.
+        """Open or create the database, and enter or continue the session.
 
         Raises:
             DatabaseError, sqlite3.Error, OSError: As `open_session`.
         """
-        who = (self._identity, self.uuid, self.actions_text())
-        self.connection, self.registration = open_session(self.database, *who, patient=patient)
+        session = (self._identity, self.uuid, self.actions_text())
+        self.connection, self.registration = open_session(self.database, *session, patient=patient)
         self._files = identify_files(self.database)
         if isinstance(self.database, Path):
             self._log_watch = LogWatch(f"{self.database}-wal")
@@ -91,15 +91,16 @@ class SessionConnection:
 
     def abandon(self) -> None:
         """In a forked child: the connection belongs to the parent."""
-        _of_parents.append(self.connection)  # not even closed: SQLite forbids any use
+        # Kept for ever, so that it is never closed: SQLite forbids any use after a fork.
+        _of_parents.append(self.connection)
         self.connection = self.registration = None
 
     def find_fault(self) -> str | None:
-        """Why nobody would find what is written now: deleted files still take rows."""
+        """Why written rows would be lost: deleted files still accept them. None if all is well."""
         if self._files != identify_files(self.database):
             return "the database file or its write-ahead log was deleted or replaced"
         if self._log_watch is not None and not self._log_watch.is_whole():
-            return "the database's write-ahead log was cut short"
+            return "the database's write-ahead log was truncated"
         return None
 
     def execute(self, statement: str, values: Values) -> int:
@@ -114,7 +115,7 @@ class SessionConnection:
         return patiently(lambda: connection.execute(statement, values).rowcount)
 
     def enter_run(self, run: Run) -> None:
-        """Write the run's row, or go on with the one that is there."""
+        """Write the run's row, or continue the existing one."""
         connection, registration = self.opened
         values = bind(None, registration.session_id, run.describe(self._identity))
         entered = self.execute(STATEMENTS["run"], values)
@@ -128,7 +129,7 @@ class SessionConnection:
         return run.describe(self._identity)
 
     def describe_session(self) -> dict[str, Any]:
-        """Who records, for a database that does not know of this session."""
+        """The values of robot and session, for a database that does not have this session."""
         name = self.registration.robot_name if self.registration else self._identity.robot_name
         return {
             "robot": describe_robot(self._identity, name),
@@ -141,7 +142,7 @@ class SessionConnection:
 
 
 def patiently(act: Callable[[], Result]) -> Result:
-    """Do it, trying again for a moment while another writer has the lock."""
+    """Call `act`, and again for a millisecond while another writer has the lock."""
     until_s = time.monotonic() + _PATIENCE_S
     while True:
         try:

@@ -1,4 +1,4 @@
-"""What the bridge asks of Webots: only from the controller's own thread, never after a quit."""
+"""All calls to Webots' API: only in the controller's own thread, and never after a quit."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from webots_mcp.bridge.gate import QUIT, Guard, StepGate
 from webots_mcp.errors import CommandRefusedError
 
 _ROBOT_METHODS: Final = ("step", "getTime", "getName", "getBasicTimeStep")
-_INSIDE: Final = ("robot", "supervisor", "inner", "env", "unwrapped", "_robot")  # of wrappers
+_INSIDE: Final = ("robot", "supervisor", "inner", "env", "unwrapped", "_robot")  # in wrappers
 
 
 class Simulation:
-    """The user's robot, seen as the way to its simulation.
+    """The simulation, as the user's robot can read and control it.
 
     Args:
         robot: A Webots `Robot` or `Supervisor`, or an instance of a subclass.
@@ -40,17 +40,17 @@ class Simulation:
 
     @property
     def waits_for_robot(self) -> bool:
-        """Whether the world stands still until this robot asks for its next step."""
+        """Whether the simulation waits for this robot's next step (field `synchronization`)."""
         return bool(self.robot.getSynchronization())
 
     @property
     def mode(self) -> int:
-        """The simulation mode as of the last answer from Webots."""
+        """The simulation mode in Webots' last answer."""
         return int(self.robot.simulationGetMode())
 
     @property
     def paused(self) -> bool:
-        """Whether the last answer from Webots said PAUSE."""
+        """Whether the mode in Webots' last answer is PAUSE."""
         return self.mode == self.robot.SIMULATION_MODE_PAUSE
 
     def set_mode(self, name: str) -> None:
@@ -64,14 +64,14 @@ class Simulation:
         return names.get(self.mode, "real_time")
 
     def pump(self) -> bool:
-        """Exchange news with Webots without letting time pass; False if Webots says quit."""
+        """Exchange messages with Webots without advancing time; False if it says quit."""
         if self._gate.exchange() != QUIT:
             return True
         self.end()
         return False
 
     def guard_steps(self, guard: Guard | None) -> None:
-        """Let `guard` answer the controller's steps, or (None) Webots itself again."""
+        """Let `guard` answer the controller's steps; None: let Webots answer them again."""
         if self.over:
             return
         if guard is None:
@@ -80,10 +80,10 @@ class Simulation:
             self._gate.close(guard)
 
     def end(self) -> None:
-        """Webots wants the controller to end: the API must not be called any more.
+        """Webots wants the controller to end: its API must not be called any more.
 
-        The next `step` of the user's loop would end the process in the middle, without any
-        cleanup, so it is answered here: -1, which ends the loop as Webots itself would.
+        Webots' library would end the process in the next `step` of the user's loop, without any
+        cleanup. So that step is answered here, with -1, on which the loop ends by itself.
         """
         self._gate.close(lambda _: QUIT)
         self.over = True
@@ -92,7 +92,7 @@ class Simulation:
         """Refuse what only a Supervisor can do.
 
         Raises:
-            CommandRefusedError: With what to change.
+            CommandRefusedError: The robot is not one; the text says what to change.
         """
         if self.supervisor:
             return
@@ -110,7 +110,7 @@ def _require_robot(robot: Any) -> None:
     if not missing:
         return
     inside = next((name for name in _INSIDE if _is_robot(getattr(robot, name, None))), None)
-    hint = f"; give its attribute: MCPBridge(x.{inside})" if inside else ""
+    hint = f"; pass its attribute: MCPBridge(x.{inside})" if inside else ""
     raise TypeError(
         f"MCPBridge needs a Webots Robot or Supervisor; the class {type(robot).__name__} has no "
         f"{', '.join(missing)}{hint}"
@@ -122,10 +122,10 @@ def _is_robot(value: object) -> bool:
 
 
 def _has_method(robot: object, name: str) -> bool:
-    """Of its class: an object that passes everything on to its robot is none itself."""
+    """Whether its class has the method: a wrapper that forwards all attributes is not a robot."""
     return callable(getattr(type(robot), name, None))
 
 
 def _may_supervise(robot: Any) -> bool:
-    """Both are needed: the class that has the methods, and the world's permission."""
+    """Whether it is a Supervisor: by its class, and by the permission in the world file."""
     return hasattr(robot, "simulationSetMode") and bool(robot.getSupervisor())

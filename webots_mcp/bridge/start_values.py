@@ -1,4 +1,4 @@
-"""Values that parameters get from the environment, in place of those in the code."""
+"""First values of parameters from the environment, which replace those in the code."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ _MOST_NAMED: Final = 5
 
 
 class StartValues:
-    """What `WEBOTS_MCP_PARAMETERS` says: a JSON object of values by the names of parameters.
+    """The value of `WEBOTS_MCP_PARAMETERS`: a JSON object of values by the names of parameters.
 
-    Beside them it may have objects by the names of robots, whose values are for that robot alone:
-    `{"kp": 3.0, "rover": {"kp": 4.0}}`. What cannot be used is warned of, and the code's value
-    counts.
+    In addition it may have objects by the names of robots, whose values are for that robot alone:
+    `{"kp": 3.0, "rover": {"kp": 4.0}}`. A value that cannot be used is warned of, and the code's
+    value is used.
 
     Args:
-        text: The variable's value; None or empty without any.
+        text: The variable's value; None or empty where it is not set.
         robot: The name of this robot.
-        errors: Is told of what cannot be used.
+        errors: Receives a warning for each value that cannot be used.
     """
 
     def __init__(self, text: str | None, robot: str, errors: ErrorReport) -> None:
@@ -32,10 +32,10 @@ class StartValues:
         self._robot = robot
         self._errors = errors
         self._values: dict[str, Any] | None = None
-        self._unknown_told = not text
+        self._unknown_reported = not text
 
     def take(self, declaration: Declaration) -> Value | None:
-        """The value that a parameter begins with; None for the one in the code."""
+        """The first value of a parameter; None for the one in the code."""
         values = self._read()
         if declaration.name not in values:
             return None
@@ -46,10 +46,10 @@ class StartValues:
             return None
 
     def warn_of_unknown(self, declared: Container[str]) -> None:
-        """Warn once of names that the controller has not declared before it asked for commands."""
-        if self._unknown_told:
+        """Warn once of names that the controller has not declared before its first command call."""
+        if self._unknown_reported:
             return
-        self._unknown_told = True
+        self._unknown_reported = True
         unknown = [  # an object by another name may be for another robot
             name
             for name, value in self._read().items()
@@ -72,7 +72,8 @@ class StartValues:
         else:
             why = f"it is a {type(found).__name__}"
         if not isinstance(found, dict):
-            self._warn("", f'{why}, not an object such as {{"kp": 3.0}}; the code\'s values count')
+            example = 'not an object such as {"kp": 3.0}'
+            self._warn("", f"{why}, {example}; the code's values are used")
             return {}
         values = cast("dict[str, Any]", found)
         own = values.get(self._robot)

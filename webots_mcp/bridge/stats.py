@@ -1,4 +1,4 @@
-"""What a bridge recorded, and what that cost the control loop."""
+"""Statistics of a bridge: what it recorded, and the time that this took in the control loop."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ from typing import NamedTuple
 
 
 class BridgeStats(NamedTuple):
-    """What a bridge recorded so far, and what it could not.
+    """What a bridge recorded so far, and what it could not record.
 
     Attributes:
         rows_written: Rows that the database has taken.
-        rows_waiting: Rows that it could not take yet: in the file beside it, else in memory.
+        rows_waiting: Rows that it could not take yet: in the file next to it, else in memory.
         rows_dropped: Rows that will never be in it.
-        publish_calls: Calls of `publish` in the current run, and of `auto_publish`.
-        publish_throttled: Those of them that the throttle did not record.
+        publish_calls: Calls of `publish` and `auto_publish` in the session.
+        publish_throttled: Calls that the throttle did not record.
         values_replaced: Values that JSON cannot hold; the column `odd` of their row names them.
-        publish_mean_us: What a recorded call took on average, in microseconds.
-        publish_max_us: What the longest took, in microseconds.
+        publish_mean_us: The mean duration of a recorded call, in microseconds.
+        publish_max_us: The longest duration of a recorded call, in microseconds.
         ring_interval: One call of `auto_publish` in this many is held in the ring buffer.
-        frames_missed: Camera frames that could not be taken for it, or not be written.
+        frames_missed: Camera frames that could not be taken or written.
         failures: Calls of the bridge's methods that failed.
-        last_error: The newest thing that could not be recorded, and why; None if there is none.
+        last_error: The newest error, with its reason; None if there was none.
     """
 
     rows_written: int

@@ -1,4 +1,4 @@
-"""Texts of a controller, as the database takes them."""
+"""Preparing texts of a controller for the database."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ _MOST_CHARACTERS: Final = 2000  # of what an error says
 
 
 def cut(text: str, most_characters: int) -> str:
-    """The text, or its beginning and how long it was."""
+    """The text, or its beginning with the original length."""
     if len(text) <= most_characters:
         return text
     return f"{text[:most_characters]}... (cut: it had {len(text)} characters)"
 
 
 def storable(text: str) -> str:
-    """No encoding has surrogates, and SQLite's shell would end the text at a NUL."""
+    """A text without surrogates, which UTF-8 lacks, and NULs, at which SQLite's shell ends it."""
     return text.encode("utf-8", "replace").decode().replace("\0", "\\0")
 
 
 def describe(error: BaseException) -> str:
-    """What was wrong; for an exception of the user's own code also its kind and place."""
+    """The text of an error; for one of the user's code also its type, file and line."""
     text = _text_of(error)
     if isinstance(error, WebotsMCPError):
         return text
@@ -40,4 +40,4 @@ def _text_of(error: BaseException) -> str:
     try:
         return cut(str(error), _MOST_CHARACTERS)
     except Exception as failure:  # noqa: BLE001  (an exception of the user's own kind)
-        return f"(without words: its str() raised {type(failure).__name__})"
+        return f"(no text: its str() raised {type(failure).__name__})"

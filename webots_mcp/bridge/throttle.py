@@ -4,10 +4,10 @@ from __future__ import annotations
 
 
 class Throttle:
-    """One call in so many is recorded, and whenever somebody waits for the newest state.
+    """Admits one call in `interval`, and each call that is wanted for another reason.
 
     Attributes:
-        interval: One call in this many.
+        interval: One call in this many is recorded.
 
     Raises:
         ValueError: The interval is less than 1.
@@ -21,18 +21,18 @@ class Throttle:
         self._calls_before_run = 0
         self.calls = 0
         self.skipped = 0
-        self.stale = False  # what was published last is not what was recorded last
+        self.stale = False  # the newest published state is not the newest recorded one
 
     def begin_run(self) -> None:
-        """Count from here: like runs are recorded at like times."""
+        """Count from here, so that equal runs are recorded at equal times."""
         self._calls_before_run = self.calls
 
     def want(self) -> None:
-        """Let the next call pass, whatever its number."""
+        """Admit the next call, whatever its number."""
         self._wanted = True
 
     def admits(self, force: object) -> bool:
-        """Count a call; True if it is to be recorded, as whatever is true for `force` demands."""
+        """Count a call; True if it is to be recorded, which any true value of `force` demands."""
         self.calls += 1
         if (self.calls - self._calls_before_run) % self.interval and not (force or self._wanted):
             self.skipped += 1

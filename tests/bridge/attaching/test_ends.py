@@ -79,7 +79,7 @@ def test_attaching_twice_gives_the_same_bridge(
     assert MCPBridge.attach(robot) is attached
     robot.step(STEP_MS)
     assert len(times(recording)) == 1
-    with pytest.raises(ValueError, match="throttle_interval cannot be set any more"):
+    with pytest.raises(ValueError, match="so throttle_interval cannot be set"):
         MCPBridge.attach(robot, throttle_interval=3)
 
 

@@ -55,7 +55,7 @@ def test_steps_that_pass_an_attached_bridge_by_are_told_at_its_end(
             assert step() == 0
 
     (told,) = warnings(recording)
-    assert "9.6 s of simulation time went by unseen" in told
+    assert "so far it has missed 9.6 s of simulation time" in told
     assert "bridge.publish({...}) and bridge.get_command()" in told
     assert "MCPBridge.attach(robot) before anything takes or replaces robot.step" in told
     assert recording.rows("SELECT last_error FROM session") == [told]
@@ -101,7 +101,7 @@ def test_a_loop_that_steps_and_never_calls_its_bridge_is_told_at_the_end(
             robot.step(STEP_MS)
 
     (told,) = warnings(recording)
-    assert "1.6 s of simulation time went by unseen" in told
+    assert "so far it has missed 1.6 s of simulation time" in told
 
 
 def test_a_loop_that_published_and_goes_on_without_is_not_told(

@@ -148,7 +148,7 @@ def test_what_a_ring_holds_takes_no_more_memory_than_it_says(
         for number in range(1200):
             held, odd = copy_or_encode(make_state(number)), None
             if not isinstance(held, bytes):
-                held, odd = held.text, held.odd_text
+                held, odd = held.text, held.replaced_text
             ring.add(RingRow(number, number / 100, number + 0.5, held, odd))
         taken, _ = tracemalloc.get_traced_memory()
     finally:

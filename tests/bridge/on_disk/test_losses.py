@@ -154,7 +154,7 @@ def test_recording_goes_on_after_the_write_ahead_log_was_cut_short(
     os.truncate(log, int(log.stat().st_size * part))
     deadline_s = time.monotonic() + 20
     n = 50
-    while "cut short" not in capfd.readouterr().err:
+    while "truncated" not in capfd.readouterr().err:
         bridge.publish({"n": n})
         heartbeat_now(bridge)
         n += 1

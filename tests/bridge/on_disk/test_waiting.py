@@ -69,7 +69,7 @@ def test_what_waits_when_a_bridge_closes_is_kept_and_said(
         path = waiting_file(bridge)
         bridge.close()
         assert bridge.stats().rows_dropped == 0
-        assert f"rows wait in {path}, because database is locked" in capfd.readouterr().err
+        assert f"rows are still in {path}, because database is locked" in capfd.readouterr().err
     assert adopt_into(file) > 0
     assert numbers(filed) == [1]
     assert filed.rows("SELECT end_reason FROM session") == ["finished"]

@@ -146,7 +146,7 @@ def test_changes_of_one_run_are_so_many_at_most(
     kp.set(2)
     lenient.get_command()
     assert kp.value == 1
-    assert "changes of parameters are recorded of one run" in capfd.readouterr().err
+    assert "changes of parameters are recorded in one run" in capfd.readouterr().err
 
 
 def test_values_that_wait_for_the_reset_come_with_it_and_stay(

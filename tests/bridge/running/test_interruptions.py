@@ -124,7 +124,7 @@ def test_two_at_once_are_refused_and_the_first_goes_on(
     rounds.drive(10)
     status, _, error = recording.fate(second)
     assert status == "failed"
-    assert error is not None and f"command {first} (run) is under way" in error
+    assert error is not None and f"command {first} (run) is still running" in error
     rounds.drive(20)
     assert recording.fate(first)[1]["values"] == {"n": 20}
     assert recording.rows("SELECT count(*) FROM run") == [1]
@@ -146,15 +146,15 @@ def test_a_command_that_is_refused_interrupts_nothing(
     [
         ({}, "give until"),
         ({"until": "n <"}, "condition 'n <'"),
-        ({"until": 3}, "until is a condition"),
+        ({"until": 3}, "until must be a condition"),
         ({"for_s": 0}, "above 0"),
-        ({"for_s": float("1e9")}, "up to 1000000"),
-        ({"for_s": True}, "for_s is a number"),
-        ({"for_s": "20"}, "for_s is a number"),
+        ({"for_s": float("1e9")}, "at most 1000000"),
+        ({"for_s": True}, "for_s must be simulated seconds"),
+        ({"for_s": "20"}, "for_s must be simulated seconds"),
         ({"for_s": 1, "pace": "slow"}, "pace must be one of null, 'fast', 'real_time', not 'slow'"),
         ({"for_s": 1, "then": "stop"}, "then must be one of 'pause', 'go_on', 'as_before'"),
         ({"for_s": 1, "reset": "yes"}, "reset must be one of False, True"),
-        ({"for_s": 1, "parameters": [1]}, "parameters are names and values"),
+        ({"for_s": 1, "parameters": [1]}, "parameters must be an object"),
         ({"for_s": 1, "parameters": {"kp": 1}}, "kp"),
         ({"for_s": 1, "parameters": {"gain": 11}}, "up to 10"),
         ({"for_s": 1, "parameters": {"gain": 5, "kp": 1}, "reset": True}, "kp"),

@@ -99,6 +99,9 @@ def test_what_came_is_said_and_what_is_missing_of_it(ask: Ask, lab: Lab) -> None
         "which a server does ('webots-mcp serve')",
     ]
     assert ask(*words).splitlines()[1] == "here already: run 1 to 2"
+    told = json.loads(ask(*words, "--json"))
+    assert (told["fetched_run_ids"], told["known_run_ids"]) == ([], [1, 2])
+    assert told["not_taken"] == {"going_on": [], "not_wholly_shipped": [], "without_uuid": 0}
 
 
 @files

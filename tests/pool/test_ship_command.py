@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
 from tests.pool.conftest import Shipped
@@ -34,6 +36,19 @@ def test_a_pause_without_anything_to_wait_for_is_refused(
     asked = ["ship", "--data-dir", str(shipped.folder), "--to", "/srv/pool", "--every", "5"]
     assert main(asked) == 2
     assert "--every is for --follow" in capsys.readouterr().err
+
+
+def test_programs_read_in_one_object_what_was_sent_or_why_not(
+    shipped: Shipped, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shipped.add_run(7)
+    url = str(shipped.folder.parent / "files")
+    line = ["ship", "--data-dir", str(shipped.folder), "--full", "--json", "--to"]
+    assert main([*line, url]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["pool"], told["complete"], told["rows"]["state"]) == (url, True, 7)
+    assert main([*line, "postgresql://127.0.0.1:1/pool"]) == 2
+    assert json.loads(capsys.readouterr().out).keys() == {"error"}
 
 
 def test_a_recording_is_shipped_to_postgresql_as_it_is(

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 
 from webots_mcp.cli.limits import Limits
 from webots_mcp.cli.progress import shown_progress
-from webots_mcp.cli.recordings import Json, Range, Where, past_invalid_rows, past_wrong_values
+from webots_mcp.cli.recordings import HERE, Json, Range, Where, past_invalid_rows, past_wrong_values
 from webots_mcp.cli.rendering import id_ranges, print_json, print_notes, print_table
 from webots_mcp.cli.terminal import binary_stdout
 from webots_mcp.cli.values import Id, refuse_options
@@ -40,7 +40,6 @@ class _Written(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-_ANYWHERE: Final = Where()
 _ALL: Final = Range()
 _UNLIMITED: Final = Limits()
 
@@ -77,7 +76,7 @@ def export(
         ),
     ] = None,
     part: Range = _ALL,
-    recorded: Where = _ANYWHERE,
+    recorded: Where = HERE,
     json: Json = False,
 ) -> None:
     """Write recorded states as a table, or all of a run for a viewer or for another recording.
@@ -217,7 +216,7 @@ def import_(
             help="The name to record under, which no robot may have yet (imported).",
         ),
     ] = "imported",
-    recorded: Where = _ANYWHERE,
+    recorded: Where = HERE,
     json: Json = False,
 ) -> None:
     """Import another recording, or the data folder of a bridge that writes JSON files.
@@ -292,7 +291,7 @@ def prune(
     *,
     dry_run: Annotated[bool, Parameter("--dry-run", help="Only tell what would go.")] = False,
     limits: Limits = _UNLIMITED,
-    recorded: Where = _ANYWHERE,
+    recorded: Where = HERE,
     json: Json = False,
 ) -> None:
     """Delete what is beyond the limits, and give the space back to the disk.
@@ -340,7 +339,7 @@ def retain(
     *run_ids: Annotated[Id, Parameter("RUN", help="As 'webots-mcp runs' lists them.")],
     release: Annotated[bool, Parameter("--release", help="Let retention have them again.")] = False,
     limits: Limits = _UNLIMITED,
-    recorded: Where = _ANYWHERE,
+    recorded: Where = HERE,
     json: Json = False,
 ) -> None:
     """Mark runs that are never pruned, or set how much is kept of the others.

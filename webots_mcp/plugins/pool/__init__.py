@@ -6,6 +6,11 @@ shipped, `target` what a pool can do; `engines` opens one of the two kinds, whic
 `parquet`.
 """
 
-from webots_mcp.plugins import Plugin
+from webots_mcp.plugins import Plugin, PluginCommand
 
-PLUGIN = Plugin(command_modules=(f"{__name__}.pool_commands", f"{__name__}.ship_command"))
+PLUGIN = Plugin(
+    commands=tuple(
+        PluginCommand(name, "Recordings", f"{__name__}.pool_commands:{name}")
+        for name in ("fetch", "pool", "ship")
+    )
+)

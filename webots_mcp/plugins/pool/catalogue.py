@@ -6,7 +6,9 @@ import fnmatch
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final
+
+from cyclopts import Parameter
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.naming import nearest_first
@@ -17,25 +19,41 @@ _MOST_OFFERED: Final = 3
 _MOST_COMPARED: Final = 2000  # names or UUIDs, with one that is not there
 
 
+def _option(name: str, metavar: str, text: str) -> Parameter:
+    return Parameter(name, metavar=metavar, help=text)
+
+
+@Parameter(name="*")
 @dataclass(frozen=True)
 class Choice:
-    """Which runs are meant: those of which all that is given is true.
+    """Which runs are meant: those of which all that is given is true."""
 
-    Attributes:
-        run_uuid: The UUID of one, or the first letters of it.
-        label: Its label; `*` stands for any letters.
-        trials: The UUID of a trial set, or the first letters of it: the runs of its trials.
-        robot: Its robot.
-        since: It went on after this wall time (ISO 8601 or Unix seconds).
-        until: It began before this wall time.
-    """
-
-    run_uuid: str | None = None
-    label: str | None = None
-    trials: str | None = None
-    robot: str | None = None
-    since: str | None = None
-    until: str | None = None
+    run_uuid: Annotated[
+        str | None, _option("--run", "UUID", "The run of that UUID, or that begins so.")
+    ] = None
+    label: Annotated[
+        str | None, _option("--label", "TEXT", "Runs with that label; '*' is any letters.")
+    ] = None
+    trials: Annotated[
+        str | None,
+        _option(
+            "--trials",
+            "UUID",
+            "The runs of the trial set of that UUID, or that begins so; and its trials.",
+        ),
+    ] = None
+    robot: Annotated[str | None, _option("--robot", "NAME", "Runs of that robot.")] = None
+    since: Annotated[
+        str | None,
+        _option(
+            "--since",
+            "TIME",
+            "Runs that went on after this wall time (ISO 8601 or Unix seconds).",
+        ),
+    ] = None
+    until: Annotated[
+        str | None, _option("--until", "TIME", "Runs that began before this wall time.")
+    ] = None
 
 
 @dataclass(frozen=True)

@@ -1,51 +1,54 @@
-"""Commands about a pool: what is in it, and runs of it brought back."""
+"""Commands about a pool: what is in it, a recording shipped to it, runs of it brought back."""
 
 from __future__ import annotations
 
-import argparse
-import json
+import functools
+import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import fields
-from typing import TYPE_CHECKING, Any, Final
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple
 
-from webots_mcp.cli.command import (
-    DATA_DIR,
-    DATABASE,
-    JSON,
-    Argument,
-    argument,
-    command,
-    count,
-    writing,
-)
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
 from webots_mcp.cli.progress import shown_progress
-from webots_mcp.cli.tables import clock_text, id_ranges, print_notes, print_result, print_table
+from webots_mcp.cli.recordings import HERE, Json, Where
+from webots_mcp.cli.rendering import clock_text, id_ranges, print_json, print_notes, print_table
+from webots_mcp.cli.values import Count
+from webots_mcp.errors import InvalidInputError, WebotsMCPError
+from webots_mcp.plugins.pool.catalogue import (
+    Choice,
+    chosen_runs,
+    chosen_trial_sets,
+    meant,
+    robots,
+)
 
 if TYPE_CHECKING:
-    from webots_mcp.plugins.pool.catalogue import Choice
     from webots_mcp.plugins.pool.fetching import Fetched
+    from webots_mcp.plugins.pool.report import Report
     from webots_mcp.plugins.pool.target import Pool
+    from webots_mcp.store.questions.sql import Result
 
 _MOST_NAMED: Final = 3
 _SHORT: Final = 8  # of a UUID: as much of it as tells one from the others
-_CHOICE: Final[tuple[Argument, ...]] = (
-    argument("--run", metavar="UUID", dest="run_uuid",
-             help="the run of that UUID, or that begins so"),
-    argument("--label", metavar="TEXT", help="runs with that label, with '*'"),
-    argument("--trials", metavar="UUID", help="the runs of that trial set, and its trials"),
-    argument("--robot", metavar="NAME", help="runs of that robot"),
-    argument("--since", metavar="TIME",
-             help="runs that went on after this wall time (ISO 8601 or Unix seconds)"),
-    argument("--until", metavar="TIME", help="runs that began before this wall time"),
-)  # fmt: skip
+_ALL: Final = Choice()
 
 
-@command(
-    "fetch", DATA_DIR, DATABASE, *_CHOICE,
-    argument("--from", dest="url", metavar="URL", required=True,
-             help="the pool: postgresql://HOST/DATABASE, a folder, s3://BUCKET/PREFIX, ..."),
-)  # fmt: skip
-def fetch(arguments: argparse.Namespace) -> int:
+def fetch(
+    *,
+    url: Annotated[
+        str,
+        Parameter(
+            "--from",
+            metavar="URL",
+            help="The pool: postgresql://HOST/DATABASE, a folder, s3://BUCKET/PREFIX, ...",
+        ),
+    ],
+    choice: Choice = _ALL,
+    recorded: Where = HERE,
+    json: Json = False,
+) -> int:
     """Bring runs of a pool back into a recording here, for every command, tool and plot.
 
     They come with their sessions, commands, trials and what was shipped of their pictures, each
@@ -53,19 +56,36 @@ def fetch(arguments: argparse.Namespace) -> int:
     were shipped and no rows, the summaries come, and every answer says so. A run that goes on or is
     still being shipped is not taken: fetch it again when it is whole.
     """
-    from webots_mcp.plugins.pool.catalogue import meant
     from webots_mcp.plugins.pool.engines import open_pool
     from webots_mcp.plugins.pool.fetching import fetch as fetch_runs
 
-    with open_pool(arguments.url) as pool:
-        wanted = meant(pool, _choice(arguments))  # first: no database is made for nothing
+    with open_pool(url) as pool:
+        wanted = meant(pool, choice)  # first: no database is made for nothing
         with (
-            writing(arguments, create=True) as (here, connection),
+            recorded.writer(create=True) as (here, connection),
             shown_progress("fetching") as progress,
         ):
             found = fetch_runs(pool, connection, here.data_dir, wanted, progress)
-        _print_fetched(found, pool.address)
+        if json:
+            print_json({"pool": pool.address, **_as_data(found)})
+        else:
+            _print_fetched(found, pool.address)
     return 0 if found.runs else 1
+
+
+def _as_data(found: Fetched) -> dict[str, Any]:
+    """The ids of the runs that are here, and what was not taken, by its UUIDs."""
+    return {
+        "fetched_run_ids": found.come,
+        "known_run_ids": [found.runs[uuid] for uuid in found.known],
+        "only_summaries_run_ids": [found.runs[uuid] for uuid in found.summaries],
+        "incomplete_summaries_run_ids": [found.runs[uuid] for uuid in found.unsummed],
+        "not_taken": {
+            "going_on": found.going_on,
+            "not_wholly_shipped": found.arriving,
+            "without_uuid": found.nameless,
+        },
+    }
 
 
 def _print_fetched(found: Fetched, address: str) -> None:
@@ -101,99 +121,104 @@ def _named(uuids: Sequence[str]) -> str:
     return f"run {shown}" + (f" and {len(uuids) - _MOST_NAMED} more" * (len(uuids) > _MOST_NAMED))
 
 
-@command(
-    "pool", JSON, *_CHOICE,
-    argument("url", metavar="URL", help="postgresql://HOST/DATABASE, a folder, s3://..."),
-    argument("part", nargs="?", choices=("robots", "runs", "trials", "sizes"), default="robots",
-             help="what to list (robots)"),
-    argument("--sql", metavar="SELECT", help="one SELECT in the language of the pool, in quotes"),
-    count("-n", "the newest N, or N rows (of a SELECT up to 1000)", default=20, dest="max_rows"),
-)  # fmt: skip
-def pool(arguments: argparse.Namespace) -> None:
+def pool(
+    url: Annotated[str, Parameter("URL", help="postgresql://HOST/DATABASE, a folder, s3://...")],
+    part: Annotated[
+        Literal["robots", "runs", "trials", "sizes"],
+        Parameter("PART", help="What to list (robots)."),
+    ] = "robots",
+    /,
+    *,
+    sql: Annotated[
+        str | None,
+        Parameter(
+            "--sql", metavar="SELECT", help="One SELECT in the language of the pool, in quotes."
+        ),
+    ] = None,
+    max_rows: Annotated[
+        Count,
+        Parameter("-n", metavar="N", help="The newest N, or N rows (20); of a SELECT up to 1000."),
+    ] = 20,
+    choice: Choice = _ALL,
+    json: Json = False,
+) -> None:
     """List what is in a pool, or ask it one SELECT; nothing is changed.
 
     A SELECT ends after a minute, and its values are cut to 200 characters.
 
-    webots-mcp pool ./pool runs --robot rover
+        webots-mcp pool ./pool runs --robot rover
 
-    webots-mcp pool postgresql:///lab --sql 'SELECT count(*) FROM run'
+        webots-mcp pool postgresql:///lab --sql 'SELECT count(*) FROM run'
     """
     from webots_mcp.plugins.pool.engines import open_pool
 
-    with open_pool(arguments.url) as opened:
-        if arguments.sql is not None:
-            found = opened.select(arguments.sql, arguments.max_rows)
-            return print_result(found, as_json=arguments.json)
-        return _LISTS[arguments.part](opened, arguments)
+    with open_pool(url) as opened:
+        if sql is not None:
+            answer = opened.select(sql, max_rows)
+            return print_json(asdict(answer)) if json else _print_answer(answer)
+        if part == "sizes":
+            return _print_sizes(opened, as_json=json)
+        listed = _listed(opened, part, choice)
+    total = len(listed.found)
+    if json:
+        shown = [vars(each) for each in listed.found[:max_rows]]
+        return print_json({listed.key: shown, "total": total})
+    print_table(listed.columns, listed.rows[:max_rows])
+    if total > max_rows:
+        print_notes([f"{total} {listed.key.replace('_', ' ')} in all: -n shows more"])
 
 
-def _print_robots(pool: Pool, arguments: argparse.Namespace) -> None:
-    from webots_mcp.plugins.pool.catalogue import chosen_runs, robots
+class _List(NamedTuple):
+    """What a pool holds of a kind, as it is called in JSON; and as rows of a table."""
 
-    found = robots(chosen_runs(pool, _choice(arguments)))
-    shown = found[: arguments.max_rows]
-    if arguments.json:
-        return _print({"robots": [vars(robot) for robot in shown], "total": len(found)})
-    print_table(
-        ("robot", "recordings", "runs", "rows", "first", "last"),
-        [
+    key: str
+    found: Sequence[object]
+    columns: tuple[str, ...]
+    rows: Sequence[list[Any]]
+
+
+def _listed(pool: Pool, part: str, choice: Choice) -> _List:
+    if part == "robots":
+        found = robots(chosen_runs(pool, choice))
+        columns = ("robot", "recordings", "runs", "rows", "first", "last")
+        rows: list[list[Any]] = [
             [
                 each.robot, each.recordings, each.runs, each.rows,
                 clock_text(each.started_wall_time_s), clock_text(each.last_wall_time_s),
             ]
-            for each in shown
-        ],
-    )  # fmt: skip
-    _say_more(shown, found, "robots")
-
-
-def _print_runs(pool: Pool, arguments: argparse.Namespace) -> None:
-    from webots_mcp.plugins.pool.catalogue import chosen_runs
-
-    found = chosen_runs(pool, _choice(arguments))[::-1]
-    shown = found[: arguments.max_rows]
-    if arguments.json:
-        return _print({"runs": [vars(run) for run in shown], "total": len(found)})
-    print_table(
-        ("run", "robot", "label", "started", "duration_s", "rows", "ended by", "recording"),
-        [
-            [
-                run.uuid[:_SHORT], run.robot, run.label, clock_text(run.started_wall_time_s),
-                run.last_sim_time_s - run.started_sim_time_s, run.rows,
-                run.end_reason or "going on", run.recording_uuid[:_SHORT],
-            ]
-            for run in shown
-        ],
-    )  # fmt: skip
-    _say_more(shown, found, "runs")
-
-
-def _print_trials(pool: Pool, arguments: argparse.Namespace) -> None:
-    from webots_mcp.plugins.pool.catalogue import chosen_trial_sets
-
-    found = chosen_trial_sets(pool, _choice(arguments))[::-1]
-    shown = found[: arguments.max_rows]
-    if arguments.json:
-        return _print({"trial_sets": [vars(each) for each in shown], "total": len(found)})
-    print_table(
-        ("set", "made", "trials", "runs", "recording"),
-        [
+            for each in found
+        ]  # fmt: skip
+        return _List("robots", found, columns, rows)
+    if part == "trials":
+        sets = chosen_trial_sets(pool, choice)[::-1]
+        columns = ("set", "made", "trials", "runs", "recording")
+        rows = [
             [
                 each.uuid[:_SHORT], clock_text(each.created_wall_time_s), each.trials,
                 len(each.runs), each.recording_uuid[:_SHORT],
             ]
-            for each in shown
-        ],
-    )  # fmt: skip
-    _say_more(shown, found, "trial sets")
+            for each in sets
+        ]  # fmt: skip
+        return _List("trial_sets", sets, columns, rows)
+    runs = chosen_runs(pool, choice)[::-1]
+    columns = ("run", "robot", "label", "started", "duration_s", "rows", "ended by", "recording")
+    rows = [
+        [
+            run.uuid[:_SHORT], run.robot, run.label, clock_text(run.started_wall_time_s),
+            run.last_sim_time_s - run.started_sim_time_s, run.rows,
+            run.end_reason or "going on", run.recording_uuid[:_SHORT],
+        ]
+        for run in runs
+    ]  # fmt: skip
+    return _List("runs", runs, columns, rows)
 
 
-def _print_sizes(pool: Pool, arguments: argparse.Namespace) -> None:
+def _print_sizes(pool: Pool, *, as_json: bool) -> None:
     from webots_mcp.store.retention.notation import size_text
 
     found = list(pool.sizes())
-    if arguments.json:
-        return _print({"tables": [vars(each) for each in found]})
+    if as_json:
+        return print_json({"tables": [vars(each) for each in found]})
     sizes = [each.size_bytes for each in found if each.size_bytes is not None]
     rows: list[list[Any]] = [
         [each.table, each.rows, None if each.size_bytes is None else size_text(each.size_bytes)]
@@ -203,20 +228,123 @@ def _print_sizes(pool: Pool, arguments: argparse.Namespace) -> None:
     print_notes([f"{size_text(sum(sizes))} in all"] if sizes else [])
 
 
-_LISTS: Final = {
-    "robots": _print_robots, "runs": _print_runs, "trials": _print_trials, "sizes": _print_sizes,
-}  # fmt: skip
+def _print_answer(answer: Result) -> None:
+    rows = [["NULL" if cell is None else cell for cell in row] for row in answer.rows]
+    print_table(answer.columns, rows)
+    cut = f"{answer.shortened} long values are cut" if answer.shortened else None
+    print_notes(filter(None, (answer.truncated, cut, None if rows else "no row")))
 
 
-def _choice(arguments: argparse.Namespace) -> Choice:
-    from webots_mcp.plugins.pool.catalogue import Choice
+def ship(
+    *,
+    urls: Annotated[
+        list[str],
+        Parameter(
+            "--to",
+            metavar="URL",
+            help="The pool: postgresql://[USER@]HOST/DATABASE, a folder, or s3://BUCKET/PREFIX "
+            "and the like.",
+        ),
+    ],
+    follow: Annotated[
+        bool, Parameter("--follow", help="Go on with what comes, until Ctrl-C.")
+    ] = False,
+    full: Annotated[
+        bool,
+        Parameter(
+            "--full",
+            help="Ship all states; else only those of kept stretches, and the rollups of all.",
+        ),
+    ] = False,
+    pictures: Annotated[
+        bool, Parameter("--pictures", help="Ship the files of pictures as well.")
+    ] = False,
+    pause_s: Annotated[
+        float | None,
+        Parameter(
+            "--every",
+            metavar="SECONDS",
+            validator=Number(gte=0.1, lte=86_400),
+            help="With --follow, how long to wait between two looks (2; for files 60).",
+        ),
+    ] = None,
+    recorded: Where = HERE,
+    json: Json = False,
+) -> None:
+    """Ship a recording to a pool, where the recordings of many machines are.
 
-    return Choice(**{each.name: getattr(arguments, each.name) for each in fields(Choice)})
+    The pool is a PostgreSQL database, or a dataset of Parquet files in a folder or an object store.
+    The recording is only read, but that runs whose process was killed are ended. What the pool has
+    is not sent again, so that this may be killed and started again at any time; a run that another
+    recording has shipped stays that one's.
+
+    Runs, commands, events, log lines, parameters, trials, rollups and kept stretches are shipped,
+    with --full each state. A password comes from PGPASSWORD, ~/.pgpass or a service file, never
+    from the URL.
+    """
+    from webots_mcp.plugins.pool.engines import open_target, pause_of
+    from webots_mcp.plugins.pool.following import follow as follow_recording
+    from webots_mcp.plugins.pool.report import Report
+    from webots_mcp.plugins.pool.shipping import Order
+    from webots_mcp.plugins.pool.shipping import ship as ship_once
+    from webots_mcp.plugins.pool.target import redacted
+
+    if len(urls) > 1:
+        raise InvalidInputError(
+            f"--to is given {len(urls)} times: one call ships to one pool; start another "
+            "for the other"
+        )
+    if pause_s is not None and not follow:
+        raise InvalidInputError("--every is for --follow: without it, everything is shipped once")
+    (url,) = urls
+    connect = functools.partial(open_target, url)
+    order = Order(recorded.recording(), connect, full, pictures)
+    report, is_done = Report(), False
+    try:
+        if follow:
+            _say(f"shipping to {redacted(url)} until Ctrl-C")
+            follow_recording(order, report, _say, pause_s or pause_of(url))
+        else:
+            ship_once(order, report)
+            is_done = True
+    finally:
+        is_told = json and isinstance(sys.exc_info()[1], WebotsMCPError)  # as the only object
+        if not is_told:
+            _show_report(redacted(url), report, is_done=is_done, as_json=json)
 
 
-def _say_more(shown: Sequence[object], found: Sequence[object], what: str) -> None:
-    print_notes([f"{len(found)} {what} in all: -n shows more"] if len(found) > len(shown) else [])
+def _say(text: str) -> None:
+    print(f"webots-mcp: {text}", file=sys.stderr, flush=True)
 
 
-def _print(found: dict[str, Any]) -> None:
-    print(json.dumps(found, ensure_ascii=False, default=str))
+def _show_report(address: str, report: Report, *, is_done: bool, as_json: bool) -> None:
+    notes = [*_notes(report), *report.notes]
+    if as_json:
+        return print_json({"pool": address, "complete": is_done, **vars(report), "notes": notes})
+    sent = [f"{table} {rows}" for table, rows in sorted(report.rows.items()) if rows]
+    sent += [f"pictures {report.pictures}"] if report.pictures else []
+    if sent:
+        print(f"sent to {address}: {', '.join(sent)}")
+    elif is_done:
+        print(f"{address} has everything already")
+    print_notes(notes)
+
+
+def _notes(report: Report) -> list[str]:
+    notes: list[str] = []
+    if lost := [f"{table} {rows}" for table, rows in sorted(report.lost.items()) if rows]:
+        notes.append(f"rows deleted before they could be shipped: {', '.join(lost)}")
+    if report.replaced:
+        altered = [f"{column} {values}" for column, values in sorted(report.replaced.items())]
+        notes.append(
+            "values that the pool cannot hold, in whose place is what comes nearest: "
+            + ", ".join(altered)
+        )
+    if report.lost_pictures:
+        notes.append(f"pictures that are not there any more: {report.lost_pictures}")
+    for recording in sorted(set(report.foreign.values())):
+        runs = [uuid for uuid, owner in report.foreign.items() if owner == recording]
+        notes.append(
+            f"{len(runs)} runs are left to the recording {recording}, which shipped them before"
+        )
+    return notes

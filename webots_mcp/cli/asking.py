@@ -18,11 +18,12 @@ from pydantic import ValidationError
 from pydantic.json_schema import SkipJsonSchema
 
 from webots_mcp.cli.progress import line_of_progress, show_progress
-from webots_mcp.cli.recordings import Json, Where, sum_up_first
+from webots_mcp.cli.recordings import Json, Range, Where, sum_up_first
 from webots_mcp.cli.rendering import print_answer
 from webots_mcp.cli.values import refuse_options, settings_of, value_of, whole_number
 from webots_mcp.cli.wording import Typed, as_typed, speak_of
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
+from webots_mcp.questions.argument_types import SCOPE
 from webots_mcp.questions.declaring import Caller, Question, Reply
 from webots_mcp.questions.faults import faults_of
 from webots_mcp.store.recording import Recording
@@ -34,10 +35,10 @@ OPTIONS: Final[Mapping[str, str]] = types.MappingProxyType(
         "last_s": "--last",
         "start_s": "--start",
         "end_s": "--end",
-        "for_s": "--for",
-        "timeout_s": "--timeout",
         "since_wall_time": "--since",
         "until_wall_time": "--until",
+        "for_s": "--for",
+        "timeout_s": "--timeout",
         "kinds": "--kind",
         "signals": "--signal",
         "limit": "-n",
@@ -45,6 +46,11 @@ OPTIONS: Final[Mapping[str, str]] = types.MappingProxyType(
         "trial_set": "--trials",
     }
 )
+_VALUE_NAMES: Final = {
+    "_s": "S", "_m": "M", "_px": "PX", "limit": "N", "robot": "NAME", "run_id": "ID",
+    "signals": "SIGNAL", "position": "X Y", "mode": "SIGNAL",
+    "where": "CONDITION", "until": "CONDITION",
+}  # fmt: skip
 _OF_SIGNALS: Final = frozenset({"signals", "pattern"})  # of what summaries are made of
 _NOT_DONE: Final = ("failed", "expired", "cancelled", "lost", "claimed")
 
@@ -53,9 +59,13 @@ def command_of(question: Question) -> Callable[..., None]:
     """The function that the command line calls for a question."""
 
     def run(
-        *positional: Any, recorded: Where | None = None, json: bool = False, **options: Any
+        *positional: Any,
+        span: Range | None = None,
+        recorded: Where | None = None,
+        json: bool = False,
+        **options: Any,
     ) -> None:
-        given = _named(question, positional) | options
+        given = _named(question, positional) | options | (vars(span) if span else {})
         reply = ask(question, given, recorded or Where())
         show(question, reply, as_json=json)
 
@@ -63,9 +73,16 @@ def command_of(question: Question) -> Callable[..., None]:
         Typed(each.name, option_of(question, each.name), each.name.upper())
         for each in question.parameters
     )
-    parameters = [_parameter(question, each) for each in question.parameters if _is_shown(each)]
+    in_range = SCOPE if question.has_scope else ()
+    parameters = [
+        _parameter(question, each)
+        for each in question.parameters
+        if _is_shown(each) and each.name not in in_range
+    ]
     parameters.sort(key=lambda each: (each.kind, *_place(question, each.name)))
     keyword = inspect.Parameter.KEYWORD_ONLY
+    if in_range:
+        parameters.append(inspect.Parameter("span", keyword, default=Range(), annotation=Range))
     parameters += [
         inspect.Parameter("json", keyword, default=False, annotation=Json),
         inspect.Parameter("recorded", keyword, default=Where(), annotation=Where),
@@ -229,8 +246,15 @@ def _parameter(question: Question, declared: inspect.Parameter) -> inspect.Param
         shown = Parameter(f"--{name.replace('_', '-')}", help=text, negative=option)
     else:
         converter = whole_number if _without_none(kind) is int else None
-        shown = Parameter(option, help=text, negative=(), converter=converter)
+        shown = Parameter(
+            option, help=text, negative=(), converter=converter, metavar=_value_name(name)
+        )
     return inspect.Parameter(name, place, default=default, annotation=Annotated[kind, shown])
+
+
+def _value_name(argument: str) -> str | None:
+    """How the help calls its value; None for the name of its type."""
+    return next((name for end, name in _VALUE_NAMES.items() if argument.endswith(end)), None)
 
 
 def _place(question: Question, argument: str) -> list[int]:

@@ -13,7 +13,6 @@ from typing import Any, Final, NamedTuple
 from cyclopts import App, Argument, Group, Parameter
 
 from webots_mcp.plugins import plugin_commands
-from webots_mcp.questions.declaring import Question
 
 
 class Command(NamedTuple):
@@ -23,16 +22,18 @@ class Command(NamedTuple):
     module: str
     name: str
 
-    def declared(self) -> Question | Callable[..., Any]:
-        """What the module has under its name."""
+    def declared(self) -> Any:
+        """What the module has under its name: a `Question`, or a function."""
         return getattr(importlib.import_module(self.module), self.name)
 
     def load(self) -> Callable[..., Any]:
         """Its function, with the parameters that are its options."""
+        found = self.declared()
+        if inspect.isfunction(found):
+            return found
         from webots_mcp.cli.asking import command_of
 
-        found = self.declared()
-        return command_of(found) if isinstance(found, Question) else found
+        return command_of(found)
 
 
 NOW, PAST, STEER, DATA, SETUP = (

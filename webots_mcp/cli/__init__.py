@@ -24,7 +24,7 @@ from webots_mcp.naming import spelled_out
 
 __all__ = ["main"]
 _FAMILIES: Final = (
-    "serving", "setting_up", "observing", "diagnosing", "contents",
+    "contents",
     "trials", "tuning", "steering", "scene", "breakpoints",
 )  # fmt: skip
 EXIT_SYSTEM: Final = 1

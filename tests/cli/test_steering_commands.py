@@ -78,8 +78,8 @@ def test_send_pause_step_and_resume(
     ("arguments", "told"),
     [
         (["run"], "give --until CONDITION"),
-        (["run", "--for", "nan"], "--for is a number of simulated seconds above 0"),
-        (["run", "--for", "inf"], "up to 1000000, not inf"),
+        (["run", "--for", "nan"], "--for must be simulated seconds above 0"),
+        (["run", "--for", "inf"], "at most 1000000, not inf"),
         (["run", "--for", "1", "--set", "kp"], "names no value"),
         (["run", "--for", "1", "--set", "kp=1"], "declares no parameters"),
         (["run", "--until", "stepz > 1000"], "steps"),

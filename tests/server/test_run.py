@@ -203,7 +203,7 @@ async def test_what_cannot_end_is_refused_before_anything_is_sent(
         assert "steps" in misspelt
         assert "never published" in misspelt
         holds = await fail(client, "webots_run", until="steps >= 3")
-        assert "holds already" in holds
+        assert "already holds" in holds
         assert "since 0.048 s" in holds
         assert "reset=true" in holds
         assert "until" in await fail(client, "webots_run")

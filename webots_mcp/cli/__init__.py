@@ -24,7 +24,6 @@ from webots_mcp.naming import spelled_out
 
 __all__ = ["main"]
 _FAMILIES: Final = (
-    "contents",
     "trials", "tuning", "steering", "scene", "breakpoints",
 )  # fmt: skip
 EXIT_SYSTEM: Final = 1

@@ -44,6 +44,7 @@ _Q: Final = "webots_mcp.questions"
 _OF_THE_CORE: Final = {
     "events": Command(PAST, f"{_Q}.find_events", "webots_find_events"),
     "compare": Command(PAST, f"{_Q}.compare_runs", "webots_compare_runs"),
+    "logs": Command(PAST, f"{_Q}.get_logs", "webots_get_logs"),
     "history": Command(PAST, f"{_Q}.query_history", "webots_query_history"),
     "label": Command(DATA, f"{_Q}.compare_runs", "webots_annotate_run"),
     "runs": Command(PAST, f"{_Q}.compare_runs", "webots_list_runs"),

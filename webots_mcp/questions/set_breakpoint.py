@@ -49,6 +49,7 @@ async def webots_breakpoint(
         action=action,
         after_hits=after_hits,
         robot=robot,
+        set_by=caller.client,
     )
 
 

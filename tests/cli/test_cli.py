@@ -256,6 +256,9 @@ def test_an_old_database_is_migrated_with_its_data(
     assert "webots-mcp migrate" in capsys.readouterr().err
     assert main(["migrate", "--database", str(file)]) == 0
     assert f"schema 1, now {SCHEMA_VERSION}" in capsys.readouterr().out
+    assert main(["migrate", "--json", "--database", str(file)]) == 0
+    now = {"database": str(file), "before": SCHEMA_VERSION, "after": SCHEMA_VERSION}
+    assert json.loads(capsys.readouterr().out) == now
     with closing(sqlite3.connect(file)) as connection:
         assert connection.execute("PRAGMA user_version").fetchone() == (SCHEMA_VERSION,)
 

@@ -58,7 +58,8 @@ def test_logs_are_those_of_all_runs_or_of_a_range(tmp_path: Path, say: Say) -> N
 
     def lines(*arguments: str) -> list[str]:
         told = json.loads(say("logs", *arguments, "--json", database=database))
-        return [line["message"] for line in told["lines"]]
+        rows = told["lines"]["rows"]
+        return [dict(zip(told["lines"]["columns"], row, strict=True))["message"] for row in rows]
 
     assert lines() == ["begun", "battery low", "begun again", "wheel lost"]
     assert lines("--level", "warning") == ["battery low", "wheel lost"]
@@ -68,8 +69,22 @@ def test_logs_are_those_of_all_runs_or_of_a_range(tmp_path: Path, say: Say) -> N
     assert lines("--text", "BEGUN", "-n", "1") == ["begun again"]
     table = say("logs", "-n", "1", database=database)
     assert line_with(table, "4.5", "error", "2", "wheel lost")
-    assert "3 older lines" in table
+    assert "the newest 1 of 4: ask again with --before for older ones" in table
+    told = json.loads(say("logs", "-n", "2", "--json", database=database))
+    assert lines("--before", str(told["cursor"])) == ["begun", "battery low"]
     assert "no line matches" in say("logs", "--text", "fire", database=database)
+
+
+def test_a_person_reads_log_lines_whole_and_as_many_as_were_asked_for(
+    tmp_path: Path, say: Say
+) -> None:
+    recording = Recorded(tmp_path / "webots.db")
+    robot = recording.robot("rover")
+    for number in range(100):
+        robot.log(1.0, "x" * 1000 + f"end {number}")
+    recording.close()
+    told = json.loads(say("logs", "-n", "100", "--json", database=tmp_path / "webots.db"))
+    assert [row[-1][1000:] for row in told["lines"]["rows"]] == [f"end {n}" for n in range(100)]
 
 
 def test_sql_reads_and_a_null_is_seen(say: Say) -> None:
@@ -96,7 +111,7 @@ def test_a_label_is_given_shown_and_taken_away(story: Path, tmp_path: Path, say:
     [
         (["signals", "moed"], "mode"),
         (["signals", "--run", "99"], "newest runs are [3, 2, 1]"),
-        (["logs", "--last", "-3"], "--last -3.0 must be"),
+        (["logs", "--last", "-3"], "--last must be greater than 0, not -3.0"),
         (["logs", "--start", "9", "--end", "3"], "reversed"),
         (["logs", "--robot", "rovr"], "did you mean 'rover'"),
         (["sql", "DELETE FROM run"], "only one reading statement"),
@@ -107,7 +122,9 @@ def test_a_label_is_given_shown_and_taken_away(story: Path, tmp_path: Path, say:
         (["label", "99", "x"], "newest runs are"),
         (["label", "1", "x" * 101], "at most 100"),
         (["label", "1", "\udcff"], "TEXT must be a valid string"),
-        (["logs", "--text", "\udcff"], "cannot be written as utf-8"),
+        (["logs", "--text", "\udcff"], "--text must be a valid string"),
+        (["logs", "--follow", "--before", "3"], "leave out --before"),
+        (["logs", "--level", "loud"], "--level"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import io
 import json
@@ -430,8 +429,7 @@ def test_a_limit_is_written_as_it_is_read(text: str) -> None:
 def test_the_help_tells_the_limits_that_are_in_force(
     command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with contextlib.suppress(SystemExit):
-        main([command, "--help"])
+    main([command, "--help"])
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     options = text[text.rindex("--keep-states LIMIT") :]
     for kind in ("state", "rollup", "log", "event", "image"):

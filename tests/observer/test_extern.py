@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 import subprocess
 import sys
@@ -35,14 +36,18 @@ def rows(file: Path) -> int:
 
 
 def test_it_records_a_running_world_and_ends_with_it(extern_world: Path, tmp_path: Path) -> None:
-    line = [sys.executable, "-m", "webots_mcp", "observe", "--data-dir", str(tmp_path / "data")]
+    where = ["--data-dir", str(tmp_path / "data")]
+    line = [sys.executable, "-m", "webots_mcp", "observe", "--json", *where]
     with Simulation(extern_world) as simulation:
         environment = simulation.environment_of("mcp_observer")
-        with subprocess.Popen(line, env=environment, stderr=subprocess.PIPE, text=True) as process:
+        with subprocess.Popen(
+            line, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as process:
             simulation.wait_for(lambda: rows(tmp_path / "data" / "webots.db") > 3, 60)
             simulation.quit()
-            _, said = process.communicate(timeout=30)
+            told, said = process.communicate(timeout=30)
     assert (process.returncode, said) == (0, "")
+    assert json.loads(told)["data_dir"] == str(tmp_path / "data")
 
 
 @pytest.mark.parametrize(

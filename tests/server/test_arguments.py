@@ -133,7 +133,7 @@ async def test_a_reload_may_be_forced_which_its_schema_leaves_to_that_of_the_con
         (tool,) = [
             each for each in (await client.list_tools()).tools if each.name == "webots_world_reload"
         ]
-    assert "keyboard: " in told and "force=true would" not in told
+    assert "keyboard: " in told and "needs force=true" not in told
     assert "force" not in tool.input_schema["properties"]
 
 

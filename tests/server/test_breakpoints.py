@@ -75,7 +75,7 @@ async def test_one_that_would_go_off_at_once_says_so(connect: Connect, driver: D
         await newest_state(client)
         answer = await ask(client, "webots_breakpoint", condition="mode > 1", action="log")
         (note,) = answer["notes"]
-        assert note.startswith("it goes off with the first state that is like the last ones")
+        assert note.startswith("it will be turned off by the next state like the last ones")
         assert "> the number 1?" in note
 
 

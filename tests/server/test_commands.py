@@ -184,7 +184,10 @@ async def test_a_robot_whose_simulation_another_one_holds_refuses_at_once(
     recorded.robot("referee", hold="paused")
     async with connect() as client:
         text = await fail(client, "webots_send_command", action="go", robot="rover")
-    assert "robot 'referee' holds their simulation; resume or step it there first" in text
+    assert (
+        "the bridge of robot 'referee' has paused their simulation; resume or step it there first"
+        in text
+    )
 
 
 async def test_a_failed_action_is_answered_with_where_its_docstring_stands_and_not_with_its_words(

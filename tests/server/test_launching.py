@@ -80,7 +80,7 @@ async def test_a_world_is_started_changed_and_ended(begin: Begin, project: Path)
         assert answer["result"]["world"] == str(project / "worlds" / "arena.wbt")
         family = _family(answer)
         text = await fail(client, "webots_launch_world", world="field.wbt")
-        assert "still runs arena.wbt: action=load opens another world in it" in text
+        assert "still running with arena.wbt: action=load opens another world in it" in text
 
         loaded = await ask(client, "webots_load_world", world="field.wbt", timeout_s=60)
         assert (loaded["outcome"], loaded["route"]) == ("done", "bridge")
@@ -186,7 +186,7 @@ async def test_a_robot_that_is_no_supervisor_has_another_world_by_webots_itself(
         first = await ask(client, "webots_launch_world", world="arena.wbt", stream=True)
         loaded = await ask(client, "webots_load_world", world="field.wbt", timeout_s=60)
         assert loaded["route"] == "websocket"
-        assert loaded["proof"].startswith("Webots said 'delete world'; run ")
+        assert loaded["proof"].startswith("Webots replied 'delete world'; run ")
         assert loaded["proof"].endswith(" of rover began in field.wbt")
         assert loaded["run_id"] > first["run_id"]
 
@@ -197,7 +197,7 @@ async def test_without_stream_it_is_said_how_to_have_another_world(begin: Begin)
         text = await fail(client, "webots_load_world", world="field.wbt")
     assert "bridge: load_world needs a Supervisor" in text
     assert "was started without --stream" in text
-    assert "Open it in Webots (File, Open World); or end Webots and start it with that" in text
+    assert "Open it in Webots (File, Open World), or end Webots and start it with that" in text
 
 
 async def test_a_world_of_the_same_name_in_another_project_is_not_opened_instead(
@@ -212,7 +212,7 @@ async def test_a_world_of_the_same_name_in_another_project_is_not_opened_instead
         port = free_port()
         wait_for_line(start_webots("--stdout", "--stream", f"--port={port}", foreign), "ready")
         text = await fail(client, "webots_load_world", world="arena.wbt")
-    assert f"only worlds of the folder of the present one, {foreign.parent}" in text
+    assert f"only worlds in the folder of the current one, {foreign.parent}" in text
 
 
 async def test_an_observer_opens_another_world_for_a_robot_that_is_no_supervisor(

@@ -147,7 +147,7 @@ async def test_a_robot_that_is_no_supervisor_is_looked_at_by_one_that_is(
     crowd.add(InProcessRobot, "rover")
     async with connect() as client:
         said = await fail(client, "webots_get_scene", robot="rover")
-        assert "no live controller may look at the scene of the simulation of robot 'rover'" in said
+        assert "no live controller can read the scene of the simulation of robot 'rover'" in said
         assert "'supervisor' of a Robot node to TRUE" in said
         assert "webots-mcp init --observer" in said
         crowd.add(InProcessSupervisor, "referee")
@@ -186,7 +186,7 @@ async def test_a_server_that_only_reads_asks_no_controller(connect: Connect) -> 
     async with connect(read_only=True) as client:
         for tool, arguments in (("get_scene", dict[str, Any]()), ("get_field", {"path": "BALL"})):
             said = await fail(client, f"webots_{tool}", **arguments)
-            assert "a server that is --read-only asks for nothing" in said
+            assert "a --read-only server sends none" in said
 
 
 async def test_where_nothing_was_recorded_it_says_how_to_record(connect: Connect) -> None:

@@ -13,7 +13,7 @@ from typing import Any, get_args
 import pytest
 
 from tests.trials.conftest import Run, command, rows, wait_for_trial
-from webots_mcp.steering.trial_sets import told_of_set
+from webots_mcp.steering.trial_sets import set_facts
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.trials import Trial
 from webots_mcp.trials.plan import Range, Search, TrialPlan
@@ -119,7 +119,7 @@ def test_a_search_runs_trials_and_ends_early_what_is_pruned(
     statuses = rows(project, "SELECT DISTINCT status, ended_by, run_id > 0, error FROM trial")
     assert sorted(statuses)[0] == ("done", "for_s", 1, None)
     assert sorted(statuses)[1][:3] == ("pruned", "prune", 1)
-    told = told_of_set(Recording(project / "data" / "webots.db", project / "data"), None)
+    told = set_facts(Recording(project / "data" / "webots.db", project / "data"), None)
     assert (told["state"], told["trials"], told["pruned"]) == ("done", 3, pruned["pruned"])
     assert told["failed"] is None
     table = run("--search", "random").stdout
@@ -143,7 +143,7 @@ def test_a_search_that_was_killed_goes_on_as_if_it_had_not_been(
         wait_for_trial(project, 2, killed)
         killed.kill()
 
-    left = told_of_set(Recording(project / "data" / "webots.db", project / "data"), None)
+    left = set_facts(Recording(project / "data" / "webots.db", project / "data"), None)
     assert left["state"] == "left"
     assert left["trials"] > left["over"]
     answer = json.loads(run("--search", "tpe", "--json").stdout)

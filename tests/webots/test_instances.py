@@ -24,7 +24,7 @@ def test_how_a_webots_was_started_is_told(start_webots: StartWebots, world: Path
     found = of(process)
     assert found == Instance(process.pid, port, True, "fast", True, world)
     assert instance_at(port) == found
-    assert give_order(found.address, "pause", 10).heard == "paused by client"
+    assert give_order(found.address, "pause", 10).text == "paused by client"
     assert wait_for_line(process, "pause") == "pause\n"
 
 

@@ -48,26 +48,26 @@ def test_with_stream_webots_obeys_and_its_words_are_heard(
 ) -> None:
     with WebotsServer(streams=True) as server:
         reply = give_order(at(server), order)
-        assert (reply.heard, server.heard) == (heard, [sent])
+        assert (reply.text, server.heard) == (heard, [sent])
 
 
 def test_another_world_of_the_folder_is_loaded() -> None:
     with WebotsServer(streams=True) as server:
-        assert load_world(at(server), "maze.wbt").heard == "delete world"
+        assert load_world(at(server), "maze.wbt").text == "delete world"
         assert server.heard == ["load:maze.wbt"]
 
 
 def test_a_reset_may_be_obeyed_without_a_word() -> None:
     with WebotsServer(streams=True) as server:
         reply = give_order(at(server), "reset", 0.2)
-        assert (reply.heard, reply.is_alive, server.heard) == (None, True, ["reset"])
+        assert (reply.text, reply.is_alive, server.heard) == (None, True, ["reset"])
 
 
 def test_without_stream_it_is_said_that_webots_hears_but_does_not_obey() -> None:
     with WebotsServer(streams=False) as server:
         for order in get_args(Order):
             reply = give_order(at(server), order, 0.3)
-            assert reply.heard is None
+            assert reply.text is None
             assert "was started without --stream" in why_not_obeyed(at(server), reply)
             assert "busy" not in why_not_obeyed(at(server), reply)
         assert server.mode == "pause"
@@ -77,7 +77,7 @@ def test_an_answer_that_is_not_known_is_told_and_is_no_sign_of_a_start_without_s
     with WebotsServer(streams=True, manner="in other words") as server:
         reply = give_order(at(server), "pause", 5)
         told = why_not_obeyed(at(server), reply)
-        assert (reply.heard, server.mode) == (None, "pause")
+        assert (reply.text, server.mode) == (None, "pause")
         assert "answered 'state: changed', which does not tell whether it obeyed" in told
         assert "--stream" not in told
 

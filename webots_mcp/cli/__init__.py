@@ -14,7 +14,7 @@ import json
 import os
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from webots_mcp.cli.ending import ended_by, ending_by_signals
 from webots_mcp.cli.terminal import spelling_out
@@ -22,12 +22,9 @@ from webots_mcp.cli.wording import Typed, as_typed, speak_of
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.naming import spelled_out
 
-if TYPE_CHECKING:
-    from cyclopts import CycloptsError
-
 __all__ = ["main"]
 _FAMILIES: Final = (
-    "serving", "setting_up", "observing", "diagnosing", "contents", "trials",
+    "trials", "tuning", "steering", "scene", "breakpoints",
 )  # fmt: skip
 EXIT_SYSTEM: Final = 1
 EXIT_BAD_INPUT: Final = 2
@@ -75,9 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         said = as_typed(str(error))
         if "--json" in given and is_declared(given[0]):
             with contextlib.suppress(OSError):
-                answer = getattr(error, "answer", {})
-                told = {**answer, "error": said}
-                print(spelled_out(json.dumps(told, ensure_ascii=False)))
+                print(spelled_out(json.dumps({"error": said}, ensure_ascii=False)))
         return _end(EXIT_BAD_INPUT, said)
     except UnicodeEncodeError as error:  # bytes of the command line that are no text
         said = f"{error.object!r} cannot be written as {error.encoding}: {error.reason}"
@@ -104,17 +99,13 @@ def _run(argv: Sequence[str]) -> tuple[int] | None:
     """Call the command that was given; None where it is none of `commands`."""
     from cyclopts import CycloptsError
 
-    from webots_mcp.cli.commands import COMMANDS, app_for, called_value
+    from webots_mcp.cli.commands import COMMANDS, app_for
 
     if not argv or argv[0] not in COMMANDS:
         return None
     app = app_for(argv)
     speak_of(
-        Typed(
-            each.field_info.name,
-            each.names[0],
-            called_value(each),
-        )
+        Typed(each.field_info.name, each.names[0], each.field_info.name.upper())
         for each in app[argv[0]].assemble_argument_collection()
         if each.names
     )
@@ -123,17 +114,9 @@ def _run(argv: Sequence[str]) -> tuple[int] | None:
         try:
             code = app(argv, exit_on_error=False, print_error=False, result_action="return_value")
         except CycloptsError as error:
-            raise InvalidInputError(_named(error)) from error
+            raise InvalidInputError(str(error)) from error
         sys.stdout.flush()
     return (code or 0,)
-
-
-def _named(error: CycloptsError) -> str:
-    """What is wrong, and of what; of a value without an option cyclopts leaves its name out."""
-    text, argument = str(error), error.argument
-    if argument is None or any(name in text for name in argument.names):
-        return text
-    return f"Invalid value for {argument.names[0]}: {text}"
 
 
 def _end(code: int, text: str) -> int:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import inspect
 import json
-import shlex
+import sys
 import types
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,12 +20,12 @@ from pydantic.json_schema import SkipJsonSchema
 
 from webots_mcp.cli.progress import line_of_progress, show_progress
 from webots_mcp.cli.recordings import Json, Range, Where, sum_up_first
-from webots_mcp.cli.rendering import print_answer
+from webots_mcp.cli.rendering import print_answer, text_of
+from webots_mcp.cli.terminal import wait
 from webots_mcp.cli.values import refuse_options, settings_of, value_of, whole_number
-from webots_mcp.cli.wording import Typed, as_typed, speak_of, value_name
-from webots_mcp.contract import LOOPING
+from webots_mcp.cli.wording import Typed, as_typed, speak_of
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
-from webots_mcp.questions.argument_types import FOR_A_PERSON, SCOPE
+from webots_mcp.questions.argument_types import SCOPE
 from webots_mcp.questions.declaring import Caller, Question, Reply
 from webots_mcp.questions.faults import faults_of
 from webots_mcp.store.recording import Recording
@@ -53,15 +53,15 @@ _VALUE_NAMES: Final = {
     "signals": "SIGNAL", "position": "X Y", "mode": "SIGNAL",
     "where": "CONDITION", "until": "CONDITION",
 }  # fmt: skip
-# What a person does not give, where a model's client would soon give up waiting.
-_DEFAULTS: Final[Mapping[str, Any]] = types.MappingProxyType({"timeout_s": 600.0})
 _OF_SIGNALS: Final = frozenset({"signals", "pattern"})  # of what summaries are made of
+_FOLLOW: Final = Annotated[
+    bool,
+    Parameter(
+        "--follow", help="Go on with what comes, until Ctrl-C; as JSON each row is an object."
+    ),
+]
+_LOOK_EVERY_S: Final = 0.5
 _NOT_DONE: Final = ("failed", "expired", "cancelled", "lost", "claimed")
-_UNDER_WAY: Final = (
-    "the controller is still busy with it and goes on: do not send it again, but go on waiting "
-    "with\n\n    {}\n"
-)
-_END_IT: Final = "\nor end it with\n\n    {}\n"
 
 
 def command_of(question: Question) -> Callable[..., None]:
@@ -72,15 +72,18 @@ def command_of(question: Question) -> Callable[..., None]:
         span: Range | None = None,
         recorded: Where | None = None,
         json: bool = False,
+        follow: bool = False,
         **options: Any,
     ) -> None:
         given = _named(question, positional) | options | (vars(span) if span else {})
-        ask_and_show(question, given, recorded or Where(), as_json=json)
+        if follow:
+            return _follow(question, given, recorded or Where(), as_json=json)
+        reply = ask(question, given, recorded or Where())
+        show(question, reply, as_json=json)
 
     speak_of(
-        Typed(each.name, option, _value_name(each.name) or value_name(option))
+        Typed(each.name, option_of(question, each.name), each.name.upper())
         for each in question.parameters
-        for option in [option_of(question, each.name)]
     )
     in_range = SCOPE if question.has_scope else ()
     parameters = [
@@ -92,6 +95,8 @@ def command_of(question: Question) -> Callable[..., None]:
     keyword = inspect.Parameter.KEYWORD_ONLY
     if in_range:
         parameters.append(inspect.Parameter("span", keyword, default=Range(), annotation=Range))
+    if question.follows:
+        parameters.append(inspect.Parameter("follow", keyword, default=False, annotation=_FOLLOW))
     parameters += [
         inspect.Parameter("json", keyword, default=False, annotation=Json),
         inspect.Parameter("recorded", keyword, default=Where(), annotation=Where),
@@ -115,8 +120,7 @@ def _named(question: Question, positional: Sequence[Any]) -> dict[str, Any]:
 
 def _is_list(question: Question, argument: str) -> bool:
     (declared,) = (each for each in question.parameters if each.name == argument)
-    kind = _plain(declared.annotation)
-    return get_origin(_without_none(kind)) is list or _is_mapping(kind)
+    return get_origin(_without_none(_plain(declared.annotation))) is list
 
 
 def _without_none(kind: Any) -> Any:
@@ -124,17 +128,6 @@ def _without_none(kind: Any) -> Any:
     kinds = [each for each in get_args(kind) if each is not type(None)]
     is_optional = get_origin(kind) in (Union, types.UnionType) and len(kinds) == 1
     return kinds[0] if is_optional else kind
-
-
-def ask_and_show(
-    question: Question, given: Mapping[str, Any], where: Where, *, as_json: bool
-) -> None:
-    """Ask a question and print its answer.
-
-    Raises:
-        WebotsMCPError: As `ask`, and as `show`.
-    """
-    show(question, ask(question, given, where), where, as_json=as_json)
 
 
 def ask(question: Question, given: Mapping[str, Any], where: Where) -> Reply:
@@ -145,8 +138,7 @@ def ask(question: Question, given: Mapping[str, Any], where: Where) -> Reply:
         NothingRecordedError: There is nothing to ask about.
         WebotsMCPError: As the question says.
     """
-    asks_controllers = question.has_caller  # which takes a row in the queue, also to read
-    recording = where.recording(read_only=question.effect.reads and not asks_controllers)
+    recording = where.recording(read_only=question.effect.reads)
     valid = _valid(question, given, recording)
     if not _OF_SIGNALS.isdisjoint(each.name for each in question.parameters):
         sum_up_first(recording)
@@ -174,18 +166,16 @@ def _valid(question: Question, given: Mapping[str, Any], recording: Recording) -
     """The arguments as the question takes them; what was not given is left to their defaults."""
     meant: dict[str, Any] = {}
     for parameter in question.parameters:
-        value, kind = given.get(parameter.name), _plain(parameter.annotation)
-        if value is None:
-            value = _DEFAULTS.get(parameter.name)
-        if value is None:
+        if parameter.name not in given or given[parameter.name] is None:
             continue
-        if _is_mapping(kind) and not isinstance(value, Mapping):
-            value = settings_of(value, _kinds_in(recording) if _is_of_parameters(kind) else {})
+        value, kind = given[parameter.name], _plain(parameter.annotation)
+        if _is_mapping(kind):
+            value = settings_of(value, _kinds_in(recording))
         elif _is_json(kind) and isinstance(value, str):
             value = value_of(value)
         meant[parameter.name] = value
     try:
-        model = question.arguments.model_validate(meant, context=FOR_A_PERSON)
+        model = question.arguments.model_validate(meant)
     except ValidationError as error:
         raise InvalidInputError(
             faults_of(
@@ -203,7 +193,7 @@ def _kinds_in(recording: Recording) -> Mapping[str, str]:
         return kinds_of(connection)
 
 
-def show(question: Question, reply: Reply, where: Where, *, as_json: bool) -> None:
+def show(question: Question, reply: Reply, *, as_json: bool) -> None:
     """Print an answer.
 
     Raises:
@@ -213,33 +203,66 @@ def show(question: Question, reply: Reply, where: Where, *, as_json: bool) -> No
     data = reply.data
     if data is None:
         return print(*(each for each in reply.shown if isinstance(each, str)), sep="\n")
-    if data.get("status") == "never seen" and set(data) == {"status", "hint"}:
-        raise NothingRecordedError(data["hint"])
+    _require_recorded(data)
     if data.get("outcome") in _NOT_DONE:
-        refused = CommandRefusedError(_not_done(question, data, where))
-        refused.answer = {name: value for name, value in data.items() if name != "hint"}
-        raise refused
+        why = "; ".join(filter(None, (data.get("error"), data.get("hint")))) or "no answer in time"
+        action = data.get("action") or question.name
+        raise CommandRefusedError(f"{action} is not done ({data['outcome']}): {why}")
     if as_json:
         print(json.dumps(data, ensure_ascii=False))
     else:
         print_answer(data)
 
 
-def _not_done(question: Question, answer: Mapping[str, Any], where: Where) -> str:
-    """What became of a command, and what to do next."""
-    is_under_way = answer["outcome"] == "claimed" and "command_id" in answer
-    hint = _under_way(answer, where) if is_under_way else answer.get("hint")
-    why = "; ".join(filter(None, (answer.get("error"), hint))) or "no answer in time"
-    return f"{answer.get('action') or question.name} is not done ({answer['outcome']}): {why}"
+def _require_recorded(data: Mapping[str, Any]) -> None:
+    if data.get("status") == "never seen" and set(data) == {"status", "hint"}:
+        raise NothingRecordedError(data["hint"])
 
 
-def _under_way(answer: Mapping[str, Any], where: Where) -> str:
-    """The command lines that go on waiting, and that end what lets the loop come round."""
-    wait = shlex.join(["webots-mcp", "wait", str(answer["command_id"]), *where.typed()])
-    robot = ["--robot", answer["robot"]] if "robot" in answer else []
-    end = shlex.join(["webots-mcp", "pause", *robot, *where.typed()])
-    is_loop = answer.get("action") in LOOPING
-    return _UNDER_WAY.format(wait) + (_END_IT.format(end) if is_loop else "")
+def _follow(question: Question, given: dict[str, Any], where: Where, *, as_json: bool) -> None:
+    """Show an answer, then the rows that come: asked again and again, of a flood the newest.
+
+    It ends after the answer where nothing can be written to the recording.
+
+    Raises:
+        BrokenPipeError: Nobody reads it any more.
+    """
+    assert question.follows is not None
+    if given.get("cursor") is not None:
+        option = option_of(question, "cursor")
+        raise InvalidInputError(f"--follow shows what comes: leave out {option}, which looks back")
+    bounds = question.arguments.model_fields[question.follows].metadata
+    most = max(each.le for each in bounds if hasattr(each, "le"))
+    newest: dict[bool, int] = {}
+    reply = ask(question, given, where)
+    if not as_json:
+        show(question, reply, as_json=False)
+        sys.stdout.flush()
+    is_shown = not as_json
+    while True:
+        data = reply.data or {}
+        _require_recorded(data)
+        table = data[question.follows]
+        for values in table["rows"]:
+            row = dict(zip(table["columns"], values, strict=True))
+            waits = row["run_id"] is None  # for a run; such rows are numbered by themselves
+            is_new = row["id"] > newest.get(waits, 0)
+            newest[waits] = max(newest.get(waits, 0), row["id"])
+            if is_new and not is_shown:
+                _print_row(row, as_json=as_json)
+        if "storage" in data:
+            return
+        is_shown = False
+        wait(_LOOK_EVERY_S)
+        reply = ask(question, given | {question.follows: most}, where)
+
+
+def _print_row(row: Mapping[str, Any], *, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(row, ensure_ascii=False), flush=True)
+    else:
+        shown = (text_of(value) or "-" for name, value in row.items() if name != "id")
+        print(*shown, flush=True)
 
 
 def option_of(question: Question, argument: str) -> str:
@@ -266,8 +289,8 @@ def _parameter(question: Question, declared: inspect.Parameter) -> inspect.Param
     default = declared.default if isinstance(declared.default, bool) else None
     if declared.default is inspect.Parameter.empty:
         default = inspect.Parameter.empty
-    elif (usual := _DEFAULTS.get(name, declared.default)) not in (None, "", False, True):
-        text = f"{text} ({usual:g})" if isinstance(usual, float) else f"{text} ({usual})"
+    elif declared.default not in (None, "", False, True):
+        text = f"{text} ({declared.default})"
     if default is None and type(None) not in get_args(kind):
         kind = Union[kind, None]  # noqa: UP007
     option = option_of(question, name)
@@ -339,11 +362,6 @@ def _is_mapping(kind: Any) -> bool:
     each = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
     kinds = [one for one in each if one is not type(None)]
     return len(kinds) == 1 and get_origin(kinds[0]) is dict
-
-
-def _is_of_parameters(kind: Any) -> bool:
-    """Whether the values of a mapping are those of parameters, which have declared kinds."""
-    return get_args(_without_none(kind))[1] is not Any
 
 
 def _is_json(kind: Any) -> bool:

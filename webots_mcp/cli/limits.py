@@ -1,15 +1,13 @@
-"""How much is kept, as arguments of the commands that delete."""
+"""How much is kept, as options of the commands that delete."""
 
 from __future__ import annotations
 
-import argparse
 import math
 from dataclasses import dataclass, replace
 from typing import Annotated, Final
 
 from cyclopts import Parameter
 
-from webots_mcp.cli.command import argument
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.retention.limits import Asked
 from webots_mcp.store.retention.notation import NO_LIMIT, limit_text, option_of, parse_limit
@@ -17,84 +15,7 @@ from webots_mcp.store.retention.policy import DEFAULT, Limit
 
 _BACK: Final = "default"
 _RUNS: Final = "outlive"
-_KINDS: Final = {
-    "state": "recorded states",
-    "kept_state": "what is kept at full rate (kept stretches)",
-    "rollup": "rollups and change points",
-    "log": "log lines",
-    "event": "events; its age also holds for commands",
-    "image": "pictures with their files",
-}
-_SIZE: Final = "unshipped"  # a limit of its own, whose size alone can be given
-
-
-class _Default:
-    """What a limit is by default; looked up where a help shows it, because importing it costs."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-
-    def __str__(self) -> str:
-        value = getattr(DEFAULT, self._name)
-        if not isinstance(value, Limit):
-            return f"{value:g}"
-        spared = f"; an age spares the newest {value.spared_rows:,}" if value.limits else ""
-        return f"{limit_text(value)}{spared}"
-
-
-def _times(text: str) -> float:
-    """How many times; 0 for ever, which a person might take for the opposite, and writes as all."""
-    try:
-        return _times_of(text)
-    except InvalidInputError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-
-
-LIMITS: Final = (
-    *(
-        argument(
-            "--keep-stretches" if kind == "kept_state" else f"--keep-{kind}s",
-            metavar="LIMIT",
-            dest=kind,
-            default=_Default(kind),
-            help=f"how much to keep of {what} (%(default)s)",
-        )
-        for kind, what in _KINDS.items()
-    ),
-    argument(
-        "--keep-until-shipped",
-        metavar="SIZE",
-        dest=_SIZE,
-        default=_Default(_SIZE),
-        help="how much of what is beyond these limits to keep until 'webots-mcp ship' has shipped "
-        "it (%(default)s)",
-    ),
-    argument(
-        "--keep-runs",
-        type=_times,
-        metavar="TIMES",
-        dest="outlive",
-        default=_Default("outlive"),
-        help="keep what is left of a run this many times longer than its states (%(default)s), or "
-        "for ever: all",
-    ),
-)
-
-
-def limits_of(arguments: argparse.Namespace) -> dict[str, Limit | float | None]:
-    """The limits that were given, by the names of `Retention`; None goes back to the default.
-
-    Raises:
-        InvalidInputError: A text is not a limit, or a number is negative.
-    """
-    asked = {name: getattr(arguments, name) for name in (*_KINDS, _SIZE, "outlive")}
-    given = {name: value for name, value in asked.items() if not isinstance(value, _Default)}
-    for kind in given.keys() & {*_KINDS, _SIZE}:
-        text = given[kind]
-        given[kind] = None if text == _BACK else parse_limit(text, getattr(DEFAULT, kind))
-    if given.get(_SIZE) is not None:
-        replace(DEFAULT, **{_SIZE: given[_SIZE]})  # refuses what is no size
-    return given
+_SIZE: Final = "unshipped"  # whose size alone can be given
 
 
 def _option(name: str, text: str) -> Parameter:

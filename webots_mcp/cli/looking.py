@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import select
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,6 +22,7 @@ from webots_mcp.cli.recordings import (
     sum_up_first,
 )
 from webots_mcp.cli.rendering import print_json, print_notes, printable
+from webots_mcp.cli.terminal import wait
 from webots_mcp.cli.values import Count, Id, whole_number
 from webots_mcp.contract import whole_file
 from webots_mcp.errors import InvalidInputError
@@ -74,22 +73,6 @@ def tail(
         while following:
             wait(interval_s)
             _print_lines(_newest_states_only(follower.look()), as_json=json)
-
-
-def wait(seconds: float) -> None:
-    """Wait for the next look, or end where nobody reads a pipe any more (`tail | head`).
-
-    Raises:
-        BrokenPipeError: The reader is gone; printing would tell only when there is a line.
-    """
-    try:
-        output = sys.stdout.fileno()
-        watch = select.poll()  # not on Windows
-    except (AttributeError, OSError):
-        return time.sleep(seconds)
-    watch.register(output, 0)
-    if watch.poll(seconds * 1000):
-        raise BrokenPipeError
 
 
 def _print_lines(lines: Sequence[Line], *, as_json: bool) -> None:

@@ -29,6 +29,15 @@ Json: TypeAlias = Annotated[bool, Parameter("--json", negative=(), help="Print J
 Robot: TypeAlias = Annotated[
     str | None, Parameter("--robot", metavar="NAME", help="Only this robot.")
 ]
+DataDir: TypeAlias = Annotated[
+    str | None,
+    Parameter(
+        "--data-dir",
+        metavar="DIR",
+        help="The folder of the database and the pictures; by default mcp_data/ in the nearest "
+        "Webots project, else ~/.webots-mcp/data; also WEBOTS_MCP_DATA_DIR.",
+    ),
+]
 RunId: TypeAlias = Annotated[
     Id | None, Parameter("--run", metavar="ID", help="That run, not the newest one.")
 ]
@@ -39,15 +48,7 @@ RunId: TypeAlias = Annotated[
 class Where:
     """The recording of a command."""
 
-    data_dir: Annotated[
-        str | None,
-        Parameter(
-            "--data-dir",
-            metavar="DIR",
-            help="The folder of the database and the pictures; by default mcp_data/ in the nearest "
-            "Webots project, else ~/.webots-mcp/data; also WEBOTS_MCP_DATA_DIR.",
-        ),
-    ] = None
+    data_dir: DataDir = None
     database: Annotated[
         str | None, Parameter("--database", metavar="FILE", help="The database file itself.")
     ] = None
@@ -59,11 +60,6 @@ class Where:
 
         where = resolve_database(self.database, self.data_dir)
         return Recording(*where, read_only=read_only, asker="cli")
-
-    def typed(self) -> list[str]:
-        """The options that name it in another command line."""
-        given = (("--data-dir", self.data_dir), ("--database", self.database))
-        return [text for option, value in given if value for text in (option, value)]
 
     @contextmanager
     def reader(self) -> Generator[sqlite3.Connection]:

@@ -1,47 +1,59 @@
-"""Commands that run something: the server, a migration."""
+"""Commands that run beside Webots: the server, the observer; and the one that migrates."""
 
 from __future__ import annotations
 
-import argparse
 import gc
+import os
 import sys
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
-from webots_mcp.cli.command import DATA_DIR, DATABASE, argument, command
+from cyclopts import Parameter
+
 from webots_mcp.cli.ending import ending_in_time
-from webots_mcp.cli.limits import LIMITS, limits_of
-from webots_mcp.errors import InvalidInputError, WebotsMCPError
+from webots_mcp.cli.limits import Limits
+from webots_mcp.cli.recordings import HERE, DataDir, Json, Where
+from webots_mcp.cli.rendering import print_json
+from webots_mcp.cli.values import whole_number
+from webots_mcp.contract import OBSERVER_NAME
+from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 
 if TYPE_CHECKING:
     from webots_mcp.contract import Database
     from webots_mcp.store.retention.limits import Asked
 
 
-@command(
-    "serve",
-    DATA_DIR,
-    DATABASE,
-    argument(
-        "--read-only", action="store_true", help="leave out the tools that change the simulation"
-    ),
-    argument(
-        "--tools",
-        choices=("all", "core"),
-        default="all",
-        help="which tools to list: core are the 17 that answer most questions; the others are "
-        "there when they are called by name",
-    ),
-    argument(
-        "--output-schemas",
-        action="store_true",
-        help="list the schemas of the answers too, which need four times as much room as all else",
-    ),
-    *LIMITS,
-)
-def serve(arguments: argparse.Namespace) -> None:
+_AS_BEFORE: Final = Limits()
+_URL: Final = "WEBOTS_CONTROLLER_URL"
+
+
+def serve(
+    *,
+    read_only: Annotated[
+        bool,
+        Parameter("--read-only", help="Leave out the tools that change the simulation."),
+    ] = False,
+    tools: Annotated[
+        Literal["all", "core"],
+        Parameter(
+            "--tools",
+            help="Which tools to list: core are the 17 that answer most questions; the others are "
+            "there when they are called by name.",
+        ),
+    ] = "all",
+    output_schemas: Annotated[
+        bool,
+        Parameter(
+            "--output-schemas",
+            help="List the schemas of the answers too, which need four times as much room as all "
+            "else.",
+        ),
+    ] = False,
+    limits: Limits = _AS_BEFORE,
+    recorded: Where = HERE,
+) -> None:
     """Serve a recording to an MCP client over stdin and stdout.
 
     Starts whether or not anything was recorded yet. 'webots-mcp init' tells clients of it; by
@@ -61,26 +73,26 @@ def serve(arguments: argparse.Namespace) -> None:
     from webots_mcp.contract import resolve_database
 
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr)
-    database, data_dir = resolve_database(arguments.database, arguments.data_dir)
-    limits = limits_of(arguments)
+    database, data_dir = resolve_database(recorded.database, recorded.data_dir)
+    asked = limits.asked()
     if sys.stdin.isatty():
         print(
             f"webots-mcp: serving {database} to an MCP client on stdin and stdout; Ctrl-C ends it. "
             "Clients start this command themselves, see 'webots-mcp serve --help'.",
             file=sys.stderr,
         )
-    if limits and not arguments.read_only:
-        _ask_for(limits, database, data_dir)
+    if asked and not read_only:
+        _ask_for(asked, database, data_dir)
     with _keeping_what_is_made():
         from webots_mcp.server import create_server
 
         server = create_server(
             database,
             data_dir,
-            read_only=arguments.read_only,
-            core=arguments.tools == "core",
-            output_schemas=arguments.output_schemas,
-            limits=limits,
+            read_only=read_only,
+            core=tools == "core",
+            output_schemas=output_schemas,
+            limits=asked,
         )
     with ending_in_time(), _ending_with_the_client():
         server.run()
@@ -131,25 +143,101 @@ def _ask_for(limits: Asked, database: Database, data_dir: Path) -> None:
         print(f"webots-mcp: {note}", file=sys.stderr)
 
 
-@command(
-    "migrate",
-    DATA_DIR,
-    DATABASE,
-    argument("--revision", default="head", help="an Alembic revision (default: the newest)"),
-)
-def migrate(arguments: argparse.Namespace) -> None:
+def migrate(
+    *,
+    revision: Annotated[
+        str, Parameter("--revision", help="An Alembic revision; else the newest.")
+    ] = "head",
+    as_json: Json = False,
+    recorded: Where = HERE,
+) -> None:
     """Bring a database to the schema of this version; its data is kept."""
     from alembic.util import CommandError
 
     from webots_mcp.connection import is_there
-    from webots_mcp.contract import MemoryDatabase, resolve_database
-    from webots_mcp.store.recording import Recording
+    from webots_mcp.contract import MemoryDatabase
 
-    database, data_dir = resolve_database(arguments.database, arguments.data_dir)
+    recording = recorded.recording(read_only=False)
+    database = recording.database
     if isinstance(database, MemoryDatabase) or not is_there(database):
         raise InvalidInputError(f"no database at {database}: give --data-dir or --database")
     try:
-        before, after = Recording(database, data_dir).migrate(arguments.revision)
+        before, after = recording.migrate(revision)
     except CommandError as error:
-        raise InvalidInputError(f"--revision {arguments.revision}: {error}") from error
+        raise InvalidInputError(f"--revision {revision}: {error}") from error
+    if as_json:
+        return print_json({"database": str(database), "before": before, "after": after})
     print(f"{database}: schema {before}, now {after}" if before != after else f"schema {after}")
+
+
+def observe(
+    *,
+    robot: Annotated[
+        str,
+        Parameter(
+            "--robot",
+            metavar="NAME",
+            help=f"The Robot node to be, with supervisor TRUE ({OBSERVER_NAME}).",
+        ),
+    ] = OBSERVER_NAME,
+    url: Annotated[
+        str | None,
+        Parameter(
+            "--url",
+            metavar="URL",
+            help="Where Webots is: ipc://1234, tcp://192.168.1.5:1234; else here, at port 1234.",
+        ),
+    ] = None,
+    period_ms: Annotated[
+        int | None,
+        Parameter(
+            "--period-ms",
+            metavar="N",
+            converter=whole_number,
+            help="Milliseconds of simulation time between two rows (100).",
+        ),
+    ] = None,
+    data_dir: DataDir = None,
+    as_json: Json = False,
+) -> None:
+    """Record where all robots of a running world are, as an extern controller of it.
+
+    The world needs a robot for it, which 'webots-mcp init --observer WORLD --extern' adds; without
+    --extern Webots starts the observer itself, and this command is not needed. It ends when Webots
+    reloads the world or ends; with --json it says then where it has recorded.
+    """
+    from webots_mcp.contract import resolve_data_dir
+    from webots_mcp.observer import observe as observer
+
+    period_ms = observer.checked_period(observer.PERIOD_MS if period_ms is None else period_ms)
+    address = _connect_to(url, robot)
+    from controller import Supervisor  # type: ignore[import-not-found]
+
+    observer.observe(Supervisor(), period_ms, data_dir=data_dir)
+    if as_json:
+        print_json({"url": address, "data_dir": str(resolve_data_dir(data_dir))})
+
+
+def _connect_to(url: str | None, robot: str) -> str:
+    """Set what Webots' library needs to find its simulator; returns the address of the robot.
+
+    Raises:
+        CommandRefusedError: There is no such library.
+    """
+    from webots_mcp.webots.installations import HOME_VARIABLE, installations
+    from webots_mcp.webots.instances import DEFAULT_PORT
+
+    url = url or os.environ.get(_URL) or f"ipc://{DEFAULT_PORT}"
+    os.environ[_URL] = f"{url.rstrip('/')}/{robot}" if url.count("/") == 2 else url
+    found = next((each for each in installations() if each.python_api), None)
+    if found is not None and found.python_api is not None:
+        os.environ.setdefault(HOME_VARIABLE, str(found.home))
+        sys.path.append(str(found.python_api))
+    try:
+        import controller  # type: ignore[import-not-found]  # noqa: F401
+    except (ImportError, KeyError, OSError) as error:
+        raise CommandRefusedError(
+            f"Webots' Python package 'controller' cannot be used ({error}): set {HOME_VARIABLE} "
+            "to the folder of Webots"
+        ) from error
+    return os.environ[_URL]

@@ -1,45 +1,158 @@
-"""The command that makes a Webots project ready."""
+"""Commands that make a project ready, and say why nothing works."""
 
 from __future__ import annotations
 
-import argparse
 import difflib
-import json
 import sys
+import textwrap
+from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from webots_mcp.cli.command import JSON, argument, command
-from webots_mcp.cli.tables import print_notes
+from cyclopts import Parameter
+
+from webots_mcp.cli.recordings import HERE, Json, Where
+from webots_mcp.cli.rendering import (
+    print_json,
+    print_notes,
+    printable,
+    terminal_width,
+)
+from webots_mcp.cli.wording import as_typed
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from webots_mcp.diagnosis.doctor import Checked, Examined
     from webots_mcp.setup.client_entries import Client
     from webots_mcp.setup.file_changes import FileChange
     from webots_mcp.setup.webots_project import ProjectController
 
+_WRONG: Final = 1  # the exit code
+_LEAST_COLUMN: Final = 30  # characters that a line of a folded text has at least
 
-@command(
-    "init",
-    argument("project", nargs="?", metavar="PROJECT",
-             help="a folder in the project (default: the current one)"),
-    argument("--claude-desktop", action="store_true",
-             help="tell Claude Desktop too, whose file is not in the project"),
-    argument("--name", default="webots", help="what clients call the server (webots)"),
-    argument("--patch", metavar="FILE",
-             help="put the bridge's lines into this controller, and do nothing else"),
-    argument("--observer", metavar="WORLD",
-             help="add a robot that records where all robots are, to a copy of this world"),
-    argument("--in-place", action="store_true", help="with --observer: to the world itself"),
-    argument("--extern", action="store_true",
-             help="with --observer: to be run by 'webots-mcp observe', not by Webots"),
-    argument("--undo", metavar="FILE",
-             help="take the bridge's lines out of a controller, or the observer out of a world"),
-    argument("--yes", action="store_true", help="change what is there without asking"),
-    argument("--dry-run", action="store_true", help="write nothing, and say what would be written"),
-    JSON,
-)  # fmt: skip
-def init(arguments: argparse.Namespace) -> None:
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Writing:
+    """Whether files are written, and how it is answered what was."""
+
+    yes: Annotated[
+        bool, Parameter("--yes", negative=(), help="Change what is there without asking.")
+    ] = False
+    dry_run: Annotated[
+        bool,
+        Parameter("--dry-run", negative=(), help="Write nothing, and say what would be written."),
+    ] = False
+    as_json: Json = False
+
+    def require_yes(self, file: Path) -> None:
+        """Ask whether a file may be written.
+
+        Raises:
+            CommandRefusedError: It may not, or nobody can be asked.
+        """
+        if self.yes or self.dry_run:
+            return
+        if not sys.stdin.isatty() or self.as_json:
+            raise CommandRefusedError(f"{file} is left as it is: --yes writes it")
+        try:
+            answer = input(f"Write {file}? [y/N] ")
+        except EOFError:
+            answer = ""
+        if answer.strip().lower() not in ("y", "yes"):
+            raise CommandRefusedError(f"{file} is left as it is")
+
+    def require_yes_to(self, change: FileChange) -> str:
+        """Show what changes, and ask whether it may; returns the lines that change.
+
+        Raises:
+            CommandRefusedError: It may not, or nobody can be asked.
+        """
+        diff = _diff_of(change)
+        if not self.as_json:
+            print(diff)
+        self.require_yes(change.file)
+        return diff
+
+    def apply(self, change: FileChange) -> dict[str, str]:
+        """Write a file unless it holds that already; what was done."""
+        from webots_mcp.setup.file_changes import apply
+
+        if not change.is_needed:
+            return {"file": str(change.file), "outcome": "unchanged"}
+        if not self.dry_run:
+            apply(change)
+        return self._done(change.file, "written")
+
+    def delete(self, file: Path) -> dict[str, str]:
+        """Delete a file; what was done."""
+        if not self.dry_run:
+            file.unlink()
+        return self._done(file, "deleted")
+
+    def _done(self, file: Path, outcome: str) -> dict[str, str]:
+        return {
+            "file": str(file),
+            "outcome": f"would be {outcome}" if self.dry_run else outcome,
+        }
+
+
+_ASKING: Final = Writing()
+
+
+def init(
+    project: Annotated[
+        str | None, Parameter("PROJECT", help="A folder in the project; else the current one.")
+    ] = None,
+    /,
+    *,
+    claude_desktop: Annotated[
+        bool,
+        Parameter(
+            "--claude-desktop", help="Tell Claude Desktop too, whose file is not in the project."
+        ),
+    ] = False,
+    name: Annotated[
+        str, Parameter("--name", metavar="NAME", help="What clients call the server (webots).")
+    ] = "webots",
+    patch: Annotated[
+        Path | None,
+        Parameter(
+            "--patch",
+            metavar="FILE",
+            help="Put the bridge's lines into this controller, and do nothing else.",
+        ),
+    ] = None,
+    observer: Annotated[
+        Path | None,
+        Parameter(
+            "--observer",
+            metavar="WORLD",
+            help="Add a robot that records where all robots are, to a copy of this world.",
+        ),
+    ] = None,
+    in_place: Annotated[
+        bool, Parameter("--in-place", help="With --observer: to the world itself.")
+    ] = False,
+    extern: Annotated[
+        bool,
+        Parameter(
+            "--extern", help="With --observer: to be run by 'webots-mcp observe', not by Webots."
+        ),
+    ] = False,
+    undo: Annotated[
+        Path | None,
+        Parameter(
+            "--undo",
+            metavar="FILE",
+            help="Take the bridge's lines out of a controller, or the observer out of a world.",
+        ),
+    ] = None,
+    writing: Writing = _ASKING,
+) -> None:
     """Make a Webots project ready: tell MCP clients of the server, look at the controllers.
 
     The project is the nearest folder with worlds/ and controllers/. Claude Code (.mcp.json), Cursor
@@ -57,56 +170,46 @@ def init(arguments: argparse.Namespace) -> None:
 
         webots-mcp init --observer worlds/arena.wbt
     """
-    if sum(map(bool, (arguments.patch, arguments.undo, arguments.observer))) > 1:
+    from webots_mcp.setup.controller_patch import patch as patched
+    from webots_mcp.setup.controller_patch import unpatch
+
+    if sum(each is not None for each in (patch, undo, observer)) > 1:
         raise InvalidInputError("--patch, --observer and --undo exclude each other")
-    if (arguments.in_place or arguments.extern) and not arguments.observer:
+    if (in_place or extern) and observer is None:
         raise InvalidInputError("--in-place and --extern say what --observer WORLD does")
-    if arguments.observer:
-        from webots_mcp.cli.observing import add_observer
+    if observer is not None:
+        _add_observer(observer, writing, in_place=in_place, extern=extern)
+    elif undo is not None and undo.suffix == ".wbt":
+        _remove_observer(undo, writing)
+    elif undo is not None:
+        _change_controller(undo, unpatch, writing)
+    elif patch is not None:
+        _change_controller(patch, patched, writing)
+    else:
+        _make_ready(project, name, writing, claude_desktop=claude_desktop)
 
-        return add_observer(arguments)
-    if arguments.undo and arguments.undo.endswith(".wbt"):
-        from webots_mcp.cli.observing import remove_observer
 
-        return remove_observer(arguments)
-    if arguments.patch or arguments.undo:
-        return _change_controller(arguments)
-    _make_ready(arguments)
+def _change_controller(file: Path, changed: Callable[[bytes], bytes], writing: Writing) -> None:
+    from webots_mcp.setup.controller_patch import AlreadyPatchedError
+    from webots_mcp.setup.file_changes import FileChange, read
 
-
-def _change_controller(arguments: argparse.Namespace) -> None:
-    from webots_mcp.setup.controller_patch import AlreadyPatchedError, patch, unpatch
-    from webots_mcp.setup.file_changes import FileChange, apply, read
-
-    file, change = (arguments.patch, patch) if arguments.patch else (arguments.undo, unpatch)
-    if Path(file).is_dir():
+    if file.is_dir():
         raise InvalidInputError(f"{file} is a folder: name the controller's file in it")
-    before = read(Path(file))
+    before = read(file)
     if before is None:
         raise InvalidInputError(f"there is no file {file}")
     try:
-        wanted = FileChange(Path(file), before, change(before))
+        change = FileChange(file, before, changed(before))
     except AlreadyPatchedError as error:
-        return _tell_patched(arguments, file, "unchanged", note=f"already patched: {error}")
+        there = {"file": str(file), "outcome": "unchanged", "note": f"already patched: {error}"}
+        return _print_files([there], writing)
     except InvalidInputError as error:
         raise InvalidInputError(f"{file} is left as it is: {error}") from error
-    diff = diff_of(wanted)
-    if not arguments.json:
-        print(diff)
-    if not arguments.dry_run:
-        require_yes(arguments, file)
-        apply(wanted)
-    done = "would be written" if arguments.dry_run else "written"
-    _tell_patched(arguments, file, done, diff=diff)
+    diff = writing.require_yes_to(change)
+    _print_files([writing.apply(change) | {"diff": diff}], writing)
 
 
-def _tell_patched(arguments: argparse.Namespace, file: str, outcome: str, **more: str) -> None:
-    if arguments.json:
-        return print_json({"file": file, "outcome": outcome, **more})
-    print(f"{file}: {more.get('note', outcome)}")
-
-
-def diff_of(change: FileChange) -> str:
+def _diff_of(change: FileChange) -> str:
     """The lines that change, whatever the file's encoding."""
     before, after = (
         (content or b"").decode("utf-8", "replace").splitlines()
@@ -116,92 +219,122 @@ def diff_of(change: FileChange) -> str:
     return "\n".join(difflib.unified_diff(before, after, *names, lineterm="", n=2))
 
 
-def require_yes(arguments: argparse.Namespace, file: str) -> None:
-    """Ask whether a file may be written.
+def _add_observer(world: Path, writing: Writing, *, in_place: bool, extern: bool) -> None:
+    """Put the observer into a copy of a world, or into the world itself."""
+    from webots_mcp.setup.observed_world import controller_change, world_change
+    from webots_mcp.setup.webots_project import project_of
 
-    Raises:
-        CommandRefusedError: It may not, or nobody can be asked.
-    """
-    if arguments.yes:
-        return
-    if not sys.stdin.isatty() or arguments.json:
-        raise CommandRefusedError(f"{file} is left as it is: --yes writes it")
-    try:
-        answer = input(f"Write {file}? [y/N] ")
-    except EOFError:
-        answer = ""
-    if answer.strip().lower() not in ("y", "yes"):
-        raise CommandRefusedError(f"{file} is left as it is")
-
-
-def print_json(found: dict[str, Any]) -> None:
-    """Print an answer for programs."""
-    print(json.dumps(found, ensure_ascii=False))
+    change = world_change(world, in_place=in_place, extern=extern)
+    project = project_of(str(world.resolve().parent))
+    changes = [change] if extern else [controller_change(project), change]
+    for each in changes:  # what somebody has changed is not written over without a yes
+        is_meant = in_place and each is change
+        if each.before is not None and each.is_needed and not is_meant:
+            writing.require_yes_to(each)
+    files = [writing.apply(each) for each in changes]
+    if not extern and not writing.dry_run:
+        files += _python_for(changes[0].file, writing)
+    run_it = ", and run 'webots-mcp observe'" if extern else ""
+    _print_files(files, writing, then=f"open {change.file} in Webots{run_it}")
 
 
-def _make_ready(arguments: argparse.Namespace) -> None:
+def _python_for(controller: Path, writing: Writing) -> list[dict[str, str]]:
+    """The Python that can run the observer, where the one that Webots takes cannot."""
+    from webots_mcp.setup.observed_world import python_change
+    from webots_mcp.setup.webots_project import look_into
+
+    found = look_into(controller)
+    if found.error is None:
+        return []
+    change = python_change(controller, sys.executable)
+    if change.before is None:
+        return [writing.apply(change)]
+    note = f"{found.error}: {found.fix}"
+    return [{"file": str(change.file), "outcome": "unchanged", "note": note}]
+
+
+def _remove_observer(world: Path, writing: Writing) -> None:
+    """Take the observer out of a world, or delete the copy that was made for it."""
+    from webots_mcp.contract import find_project
+    from webots_mcp.setup.observed_world import undo, unused_controller
+
+    change = undo(world)
+    writing.require_yes(world)
+    files = [writing.delete(world) if change is None else writing.apply(change)]
+    project = find_project(world.resolve().parent)
+    if project is not None:
+        unused = unused_controller(project, sys.executable)
+        files += [writing.delete(file) for file in unused]
+        for folder in {file.parent for file in unused}:
+            if not any(folder.iterdir()):
+                folder.rmdir()
+    _print_files(files, writing)
+
+
+def _print_files(
+    files: Sequence[dict[str, str]], writing: Writing, *, then: str | None = None
+) -> None:
+    """Say what became of each file, and what is to be done next."""
+    if writing.as_json:
+        return print_json({"files": files} | ({"then": then} if then else {}))
+    for each in files:
+        note = f" ({each['note']})" if "note" in each else ""
+        print(f"{each['outcome']}: {each['file']}{note}")
+    if then and not writing.dry_run:
+        print(then)
+
+
+def _make_ready(folder: str | None, name: str, writing: Writing, *, claude_desktop: bool) -> None:
+    """Tell clients of the server, and say what the controllers need."""
     from webots_mcp.contract import PROJECT_DATA_FOLDER
-    from webots_mcp.setup.client_entries import (
-        claude_desktop,
-        clients_of,
-        server_command,
-        server_hindrance,
-    )
+    from webots_mcp.setup import client_entries
     from webots_mcp.setup.webots_project import controllers_of, project_of
 
-    project = project_of(arguments.project)
+    project = project_of(folder)
     data_dir = project / PROJECT_DATA_FOLDER
-    clients = clients_of(project) + ([claude_desktop()] if arguments.claude_desktop else [])
-    line = server_command(data_dir)
-    files = [_ignored(data_dir, dry_run=arguments.dry_run)]
-    files += [_told(client, line, arguments) for client in clients]
+    clients = client_entries.clients_of(project)
+    clients += [client_entries.claude_desktop()] if claude_desktop else []
+    line = client_entries.server_command(data_dir)
+    files = [_ignored(data_dir, writing)]
+    files += [_told(client, name, line, writing) for client in clients]
     controllers = [_described(found, project) for found in controllers_of(project)]
-    note = server_hindrance()
+    note = client_entries.server_hindrance()
     found = {"project": str(project), "server": line, "files": files, "controllers": controllers}
-    if arguments.json:
+    if writing.as_json:
         print_json(found | ({"note": note} if note else {}))
     else:
-        _print(found, [note] if note else [])
+        _print_project(found, [note] if note else [])
     refused = [each["file"] for each in files if each["outcome"] == "refused"]
     if refused:
         raise CommandRefusedError(f"not written: {', '.join(refused)}; the reasons are above")
 
 
-def _ignored(data_dir: Path, *, dry_run: bool) -> dict[str, str]:
+def _ignored(data_dir: Path, writing: Writing) -> dict[str, str]:
+    """Keep what is recorded out of the project's repository."""
     from webots_mcp.contract import make_folder
     from webots_mcp.setup.client_entries import ignore_file
 
     file = data_dir / ".gitignore"
     try:
         change = ignore_file(data_dir)
-        if change.is_needed and not dry_run:
+        if change.is_needed and not writing.dry_run:
             make_folder(data_dir)
-        return apply_change(change, dry_run=dry_run)
+        return writing.apply(change)
     except (WebotsMCPError, OSError) as error:
         return {"file": str(file), "outcome": "refused", "note": str(error)}
 
 
-def _told(client: Client, line: list[str], arguments: argparse.Namespace) -> dict[str, str]:
+def _told(client: Client, name: str, line: list[str], writing: Writing) -> dict[str, str]:
+    """Put the server into a client's file."""
     from webots_mcp.setup.client_entries import plan_entry
 
     named = {"client": client.name}
     try:
-        entry = plan_entry(client, arguments.name, line)
+        entry = plan_entry(client, name, line)
         note = {"note": entry.note} if entry.note else {}
-        return named | apply_change(entry.change, dry_run=arguments.dry_run) | note
+        return named | writing.apply(entry.change) | note
     except (WebotsMCPError, OSError) as error:
         return {**named, "file": str(client.file), "outcome": "refused", "note": str(error)}
-
-
-def apply_change(change: FileChange, *, dry_run: bool) -> dict[str, str]:
-    """Write a file unless it holds that already or nothing is to be written; what was done."""
-    from webots_mcp.setup.file_changes import apply
-
-    if not change.is_needed:
-        return {"file": str(change.file), "outcome": "unchanged"}
-    if not dry_run:
-        apply(change)
-    return {"file": str(change.file), "outcome": "would be written" if dry_run else "written"}
 
 
 def _described(controller: ProjectController, project: Path) -> dict[str, Any]:
@@ -212,20 +345,21 @@ def _described(controller: ProjectController, project: Path) -> dict[str, Any]:
     from webots_mcp.setup.webots_project import look_into
 
     file = controller.file.relative_to(project)
-    told: dict[str, Any] = {"file": file.as_posix(), "language": controller.language}
+    described: dict[str, Any] = {"file": file.as_posix(), "language": controller.language}
     if not controller.is_python:
-        return told
+        return described
     try:
-        told["lines"] = [IMPORT, attach_line(controller.file.read_bytes())]
+        described["lines"] = [IMPORT, attach_line(controller.file.read_bytes())]
     except AlreadyPatchedError as error:
-        told["has_bridge"] = str(error)
+        described["has_bridge"] = str(error)
     except (InvalidInputError, OSError) as error:
-        told["unclear"] = str(error)
+        described["unclear"] = str(error)
     python = asdict(look_into(controller.file))
-    return told | {"python": {name: value for name, value in python.items() if value is not None}}
+    known = {name: value for name, value in python.items() if value is not None}
+    return described | {"python": known}
 
 
-def _print(found: dict[str, Any], notes: list[str]) -> None:
+def _print_project(found: dict[str, Any], notes: list[str]) -> None:
     print(f"project {found['project']}\n")
     for each in found["files"]:
         note = f" ({each['note']})" if "note" in each else ""
@@ -245,18 +379,18 @@ def _print(found: dict[str, Any], notes: list[str]) -> None:
     print_notes(notes)
 
 
-def _print_controller(told: dict[str, Any]) -> None:
-    if "python" not in told:
-        print(f"  is {told['language']}: the bridge is for controllers in Python")
+def _print_controller(described: dict[str, Any]) -> None:
+    if "python" not in described:
+        print(f"  is {described['language']}: the bridge is for controllers in Python")
         return
-    if "lines" in told:
+    if "lines" in described:
         print("  needs these lines, the second where the robot is made (or: --patch)\n")
-        print("".join(f"      {line}\n" for line in told["lines"]))
-    elif "unclear" in told:
-        print(f"  where the lines belong is not clear: {told['unclear']}")
+        print("".join(f"      {line}\n" for line in described["lines"]))
+    elif "unclear" in described:
+        print(f"  where the lines belong is not clear: {described['unclear']}")
     else:
-        print(f"  {told['has_bridge']}")
-    _print_python(told["python"])
+        print(f"  {described['has_bridge']}")
+    _print_python(described["python"])
 
 
 def _print_python(python: dict[str, Any]) -> None:
@@ -266,3 +400,66 @@ def _print_python(python: dict[str, Any]) -> None:
         print(f"  which has webots-mcp {python['bridge']}")
         return
     print(f"  where the bridge cannot be used: {python['error']}")
+
+
+def doctor(
+    *,
+    no_server: Annotated[
+        bool, Parameter("--no-server", help="Start no server to talk to.")
+    ] = False,
+    as_json: Json = False,
+    recorded: Where = HERE,
+) -> int:
+    """Look at each link of the chain from controller to client, and say what mends it.
+
+    Nothing is changed. Exit code 0: nothing is wrong (there may be warnings). 1: something is
+    wrong. 2: it could not look.
+    """
+    from webots_mcp.diagnosis.doctor import all_checks, diagnose
+
+    checked = diagnose(_examined(recorded), all_checks(with_server=not no_server))
+    if as_json:
+        print_json({"checks": [_facts(each) for each in checked]})
+    else:
+        _print_checks(checked)
+    return _WRONG if any(each.finding.verdict == "wrong" for each in checked) else 0
+
+
+def _examined(recorded: Where) -> Examined:
+    from webots_mcp.contract import choose_data_dir
+    from webots_mcp.diagnosis.doctor import subject_of
+
+    try:
+        recording = recorded.recording()
+        named = recorded.database is not None
+        rule = "--database" if named else choose_data_dir(recorded.data_dir).chosen_by
+    except OSError as error:
+        raise InvalidInputError(str(error)) from error
+    return subject_of(recording, rule)
+
+
+def _facts(checked: Checked) -> dict[str, Any]:
+    check, finding = checked
+    mend = {} if checked.is_well else {"fix": finding.fix, "page": check.page}
+    return {"check": check.name, "verdict": finding.verdict, "seen": finding.seen, **mend}
+
+
+def _print_checks(checked: list[Checked]) -> None:
+    for check, finding in checked:
+        _print_folded(f"{finding.verdict:13}  {check.name:15}  ", finding.seen)
+        if finding.fix:
+            _print_folded(f"{'':30}  -> ", f"{finding.fix} ({check.page})")
+    counts = Counter(each.finding.verdict for each in checked)
+    print(", ".join(f"{count} {verdict}" for verdict, count in counts.items()))
+
+
+def _print_folded(head: str, text: str) -> None:
+    """Print a text behind a head; on a terminal its further lines stand below its first."""
+    width = terminal_width(sys.stdout)
+    lines = textwrap.wrap(
+        printable(as_typed(text)),
+        max(width - len(head), _LEAST_COLUMN),
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    print(head + f"\n{'':{len(head)}}".join(lines))

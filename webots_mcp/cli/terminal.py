@@ -10,7 +10,9 @@ from __future__ import annotations
 import codecs
 import contextlib
 import io
+import select
 import sys
+import time
 from collections.abc import Generator
 from typing import Any, TextIO, cast
 
@@ -61,6 +63,22 @@ def spelling_out() -> Generator[None]:
 def binary_stdout() -> Any:
     """Where data is written as it is; on a terminal it is spelled out as all else."""
     return _Bytes(sys.stdout) if sys.stdout.isatty() else sys.stdout.buffer
+
+
+def wait(seconds: float) -> None:
+    """Wait for the next look, or end where nobody reads a pipe any more (`tail | head`).
+
+    Raises:
+        BrokenPipeError: The reader is gone; printing would tell only when there is a line.
+    """
+    try:
+        output = sys.stdout.fileno()
+        watch = select.poll()  # not on Windows
+    except (AttributeError, OSError):
+        return time.sleep(seconds)
+    watch.register(output, 0)
+    if watch.poll(seconds * 1000):
+        raise BrokenPipeError
 
 
 def rewrite(stream: TextIO, text: str = "") -> None:

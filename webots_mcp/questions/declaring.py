@@ -99,6 +99,9 @@ class Question:
         positional: The arguments that the command line takes without an option's name.
         options: Names of options that differ from the argument's, as `--run` for `run_id`.
         core: Whether it is among the few that `serve --tools core` lists.
+        follows: The table of the answer, oldest row first, that `--follow` goes on with as rows
+            come. A row has an `id` for a person, and a `run_id`. The argument of that name says how
+            many rows there may be.
     """
 
     function: Callable[..., Any]
@@ -108,6 +111,7 @@ class Question:
     positional: tuple[str, ...] = ()
     options: Mapping[str, str] | None = None
     core: bool = False
+    follows: str | None = None
 
     @property
     def name(self) -> str:
@@ -256,9 +260,12 @@ def question(
     positional: tuple[str, ...] = (),
     options: Mapping[str, str] | None = None,
     core: bool = False,
+    follows: str | None = None,
 ) -> Callable[[Callable[..., Any]], Question]:
     """Declare a function as a question; see `Question`."""
-    return lambda function: Question(function, title, effect, command, positional, options, core)
+    return lambda function: Question(
+        function, title, effect, command, positional, options, core, follows
+    )
 
 
 def questions_in(module: ModuleType) -> Iterator[Question]:

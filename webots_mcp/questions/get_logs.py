@@ -13,7 +13,7 @@ from webots_mcp.contract import LogLevel, LogSource
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
 from webots_mcp.questions.answers import LogsAnswer, Table
 from webots_mcp.questions.argument_types import Cursor, EndS, LastS, RobotName, RunId, StartS
-from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.declaring import READS, is_for_a_person, question
 from webots_mcp.questions.shortening import cut_text
 from webots_mcp.store.logs import (
     COUNT_LIMIT,
@@ -30,7 +30,8 @@ from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.robots import list_robots
 
-LOG_COLUMNS: Final = ("sim_time_s", "level", "message", "run_id")
+_COLUMNS: Final = ("sim_time_s", "level", "message", "run_id")
+_FOR_A_PERSON: Final = ("id", "sim_time_s", "level", "run_id", "message")
 _LONGEST_MESSAGE: Final = 500
 _BUDGET: Final = 6_000
 _NO_RUN_YET: Final = (
@@ -39,7 +40,14 @@ _NO_RUN_YET: Final = (
 )
 
 
-@question("Get log lines", READS, core=True)
+@question(
+    "Get log lines",
+    READS,
+    command="logs",
+    options={"lines": "-n", "filter_text": "--text", "cursor": "--before"},
+    core=True,
+    follows="lines",
+)
 def webots_get_logs(
     recording: Recording,
     lines: Annotated[int, Field(ge=1, le=1000, description="The most lines.")] = 50,
@@ -79,20 +87,25 @@ def webots_get_logs(
         return LogsAnswer(lines=_table(waiting), matching=len(waiting), hint=_NO_RUN_YET)
 
 
-def _log_row(line: LogLine) -> list[object]:
-    """A line as a row under `LOG_COLUMNS`."""
+def _row(line: LogLine) -> dict[str, object]:
     message = line.message
     if line.source == "controller" and line.logger is not None:
         message = f"[{line.logger}] {message}"
     if line.source != "controller":
         message = f"{line.source}: {message}"
-    text = cut_text(message, _LONGEST_MESSAGE)
-    time_s = None if line.sim_time_s is None else round(line.sim_time_s, 3)
-    return [time_s, line.level, text, line.run_id]
+    return {
+        "id": line.id,
+        "sim_time_s": None if line.sim_time_s is None else round(line.sim_time_s, 3),
+        "level": line.level,
+        "message": message if is_for_a_person() else cut_text(message, _LONGEST_MESSAGE),
+        "run_id": line.run_id,
+    }
 
 
 def _table(lines: list[LogLine]) -> Table:
-    return Table(columns=list(LOG_COLUMNS), rows=[_log_row(line) for line in lines])
+    columns = _FOR_A_PERSON if is_for_a_person() else _COLUMNS
+    rows = [_row(line) for line in lines]
+    return Table(columns=list(columns), rows=[[row[name] for name in columns] for row in rows])
 
 
 def _answer(recording: Recording, view: View, asked: LogFilter, limit: int) -> LogsAnswer:
@@ -118,7 +131,9 @@ def _answer(recording: Recording, view: View, asked: LogFilter, limit: int) -> L
 
 
 def _fitting(lines: list[LogLine]) -> list[LogLine]:
-    """The newest ones whose text fits the budget, at least one."""
+    """The newest ones whose text fits a model's budget, at least one."""
+    if is_for_a_person():
+        return lines
     room = _BUDGET
     for number, line in enumerate(reversed(lines)):
         room -= min(len(line.message), _LONGEST_MESSAGE) + 30

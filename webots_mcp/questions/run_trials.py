@@ -117,13 +117,13 @@ async def webots_run_trials(
         with anyio.CancelScope(shield=True):
             await to_thread.run_sync(_end, recording, workers, number)
         raise
-    return TrialsAnswer(**await to_thread.run_sync(trial_sets.told_of_set, recording, number))
+    return TrialsAnswer(**await to_thread.run_sync(trial_sets.set_facts, recording, number))
 
 
 @question("Get trials", READS)
 def webots_get_trials(recording: Recording, trial_set: TrialSetId = None) -> TrialsAnswer:
     """How far trials are, also those from a shell; the parameters, ranked by score."""
-    return TrialsAnswer(**trial_sets.told_of_set(recording, trial_set))
+    return TrialsAnswer(**trial_sets.set_facts(recording, trial_set))
 
 
 def _begin(

@@ -25,14 +25,7 @@ _ACTIONS_BUDGET: Final = 2_400
 _LONGEST_TEXT: Final = 200
 
 
-@question(
-    "Send a command",
-    DESTROYS,
-    command="send",
-    positional=("action", "params"),
-    options={"params": "NAME=VALUE"},
-    core=True,
-)
+@question("Send a command", DESTROYS, core=True)
 async def webots_send_command(
     recording: Recording,
     action: Annotated[
@@ -52,13 +45,7 @@ async def webots_send_command(
     return await dispatcher.ask(robot, action, timeout_s, params)
 
 
-@question(
-    "Wait for a command",
-    READS,
-    command="wait",
-    positional=("command_id",),
-    options={"command_id": "COMMAND"},
-)
+@question("Wait for a command", READS)
 async def webots_wait_for_command(
     recording: Recording,
     command_id: Annotated[Id, Field(description="From its answer.")],
@@ -69,7 +56,7 @@ async def webots_wait_for_command(
     return await Dispatcher(recording, caller.report).wait(command_id, timeout_s)
 
 
-@question("List the commands", READS, command="commands", core=True)
+@question("List the commands", READS, core=True)
 def webots_list_commands(
     recording: Recording,
     limit: Annotated[int, Field(ge=1, le=200, description="Most shown.")] = 10,

@@ -1,4 +1,4 @@
-"""Setting and removing breakpoints: stored for the robot, and read anew by its controller."""
+"""Setting and removing breakpoints: stored for the robot, and read again by its controller."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ async def set_breakpoint(
     robot: str | None = None,
     set_by: str = "mcp",
 ) -> BreakpointAnswer:
-    """Store a breakpoint, have the controller arm it, and say whether it did.
+    """Store a breakpoint, let the controller arm it, and report whether it did.
 
     Raises:
         InvalidInputError: The condition is not in the language, or there are too many already.
@@ -49,10 +49,10 @@ async def set_breakpoint(
     name, number, notes = await to_thread.run_sync(
         _store, recording, robot, parsed, action, after_hits, set_by
     )
-    told = await _arm(recording, report, name)
-    armed = number in told.armed
-    if action == "pause" and told.cannot_pause:
-        notes.append(f"it will only record: {told.cannot_pause}")
+    reply = await _arm(recording, report, name)
+    armed = number in reply.armed
+    if action == "pause" and reply.cannot_pause:
+        notes.append(f"it will record its hits, but not pause: {reply.cannot_pause}")
     return BreakpointAnswer(
         **await to_thread.run_sync(_header, recording, name),
         breakpoint_id=number,
@@ -60,26 +60,26 @@ async def set_breakpoint(
         action=action,
         armed=armed,
         notes=notes or None,
-        hint=None if armed else f"it is stored, but not armed yet: {told.why_not}",
+        hint=None if armed else f"it is stored, but not armed yet: {reply.why_not}",
     )
 
 
 async def remove_breakpoint(
     recording: Recording, report: Report, breakpoint_id: int, *, robot: str | None = None
 ) -> BreakpointAnswer:
-    """Remove a breakpoint, and have the controller forget it.
+    """Remove a breakpoint, and let the controller disarm it.
 
     Raises:
-        InvalidInputError: The robot has none of that id.
+        InvalidInputError: The robot has no breakpoint of that id.
         NothingRecordedError: There is no robot.
     """
     name = await to_thread.run_sync(_remove, recording, robot, breakpoint_id)
-    told = await _arm(recording, report, name)
+    reply = await _arm(recording, report, name)
     return BreakpointAnswer(
         **await to_thread.run_sync(_header, recording, name),
         breakpoint_id=breakpoint_id,
-        armed=breakpoint_id in told.armed,
-        hint=f"removed; {told.why_not}" if told.why_not else None,
+        armed=breakpoint_id in reply.armed,
+        hint=f"removed; {reply.why_not}" if reply.why_not else None,
     )
 
 
@@ -90,12 +90,13 @@ def breakpoint_rows(view: View) -> list[list[Any]]:
 
 
 @dataclass(frozen=True)
-class _Told:
-    """What the controller said of its breakpoints.
+class _Reply:
+    """The controller's reply to `arm_breakpoints`.
 
     Attributes:
-        armed: Their ids.
-        why_not: Why it has not read them anew; empty where it has.
+        armed: The ids of the armed breakpoints.
+        cannot_pause: Why the controller cannot pause; None where it can.
+        why_not: Why it has not read its breakpoints again; empty where it has.
     """
 
     armed: tuple[int, ...] = ()
@@ -111,7 +112,7 @@ def _store(
     after_hits: int,
     set_by: str,
 ) -> tuple[str, int, list[str]]:
-    """Name of the robot, id of the breakpoint, and what there is to say of its signals."""
+    """Name of the robot, id of the breakpoint, and notes on its signals."""
     with recording.view(robot) as view:
         name, robot_id, notes = view.robot.name, view.robot.id, _notes(view, condition)
     with recording.writer() as connection:
@@ -127,7 +128,7 @@ def _notes(view: View, condition: Condition) -> list[str]:
     try:
         holds_since(view.connection, view.run.id, condition)
     except InvalidInputError as error:
-        notes.append(f"it goes off with the first state that is like the last ones: {error}")
+        notes.append(f"it will be turned off by the next state like the last ones: {error}")
     return notes
 
 
@@ -139,16 +140,16 @@ def _remove(recording: Recording, robot: str | None, breakpoint_id: int) -> str:
     return name
 
 
-async def _arm(recording: Recording, report: Report, robot: str) -> _Told:
-    """Have the controller read its breakpoints anew."""
+async def _arm(recording: Recording, report: Report, robot: str) -> _Reply:
+    """Let the controller read its breakpoints again."""
     try:
         answer = await Dispatcher(recording, report).ask(robot, _ARM, _WAIT_S)
     except CommandRefusedError as refused:
-        return _Told(why_not=f"{refused}. A controller of this robot reads them when it starts")
+        return _Reply(why_not=f"{refused}. A controller of this robot reads them when it starts")
     if answer.outcome != "done":
-        return _Told(why_not=f"{_reason(answer)}. With the next reset it reads them all the same")
+        return _Reply(why_not=f"{_reason(answer)}. It will read them at the next reset in any case")
     result: dict[str, Any] = answer.result
-    return _Told(tuple(result.get("armed", ())), result.get("cannot_pause"))
+    return _Reply(tuple(result.get("armed", ())), result.get("cannot_pause"))
 
 
 def _reason(answer: CommandAnswer) -> str:

@@ -1,4 +1,4 @@
-"""Sending a command to a robot's controller, and waiting for the truth about it."""
+"""Sending a command to a robot's controller, and waiting for its outcome."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from webots_mcp.questions.history_answers import RunAnswer
 from webots_mcp.questions.shortening import RESULT_BUDGET, WHOLE, cut_text, shorten
 from webots_mcp.queue import Command, CommandQueue, fetch_command
 from webots_mcp.steering.running import ACTION as RUN
-from webots_mcp.steering.running import progress_of, told_of_run
+from webots_mcp.steering.running import progress_of, run_facts
 from webots_mcp.steering.target import find_target
 from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.robots import robot_name
@@ -25,18 +25,18 @@ from webots_mcp.store.status import handler_at_work
 
 Report = Callable[[float, float | None, str], Awaitable[None]]
 
-# A look at one row by its key costs microseconds, as little as PRAGMA data_version, and is right
-# for commits of the same connection as well.
+# Reading one row by its key takes microseconds, no longer than PRAGMA data_version, which would
+# miss commits of the same connection.
 _POLL_INTERVAL_S: Final = 0.004
 _REPORT_INTERVAL_S: Final = 1.0
-# The deadline decides, by taking the command back. Only if this server dies while it waits does
-# the command's own time to live end it, soon after anybody could still be waiting for it.
+# At the deadline the command is cancelled. Its own time to live only matters if this server dies
+# while it waits: the command then expires soon after the deadline.
 _OUTLIVES_WAITING_S: Final = 1.0
 _ERROR_CHARACTERS: Final = 2_000
 
 
 class Dispatcher:
-    """Sends commands, watches their rows and reports to the client how long it has waited."""
+    """Sends commands, watches their rows, and reports to the client how long it has waited."""
 
     def __init__(self, recording: Recording, report: Report) -> None:
         self._recording = recording
@@ -49,14 +49,14 @@ class Dispatcher:
         timeout_s: float,
         params: Mapping[str, Any] | None = None,
     ) -> CommandAnswer:
-        """Send a command, wait until its fate is settled or time is up, and say what happened.
+        """Send a command, wait until it is final or the time is up, and report its outcome.
 
-        At the deadline a command that nobody has claimed is taken back, so that it cannot run when
-        nobody waits for it any more; the same happens when the caller goes away.
+        A command that is not claimed at the deadline is cancelled, so that it cannot run when its
+        caller has stopped waiting; the same happens when the caller disconnects.
 
         Raises:
-            InvalidInputError: The robot, the action or its parameters are wrong.
-            CommandRefusedError: Nobody alive could run it.
+            InvalidInputError: The robot, the action or its parameters are invalid.
+            CommandRefusedError: No live controller could run it.
             NothingRecordedError: There is no robot to ask.
         """
         started_s = time.monotonic()
@@ -66,7 +66,7 @@ class Dispatcher:
         return await to_thread.run_sync(self._answer, command, waited_s)
 
     async def wait(self, command_id: int, timeout_s: float) -> CommandAnswer:
-        """Go on waiting for a command that was sent before; nothing is taken back at the deadline.
+        """Continue to wait for a command that was sent before; it is not cancelled at the deadline.
 
         Raises:
             InvalidInputError: There is no such command.
@@ -96,7 +96,7 @@ class Dispatcher:
             command = await self._watch(command.id, timeout_s)
             return await to_thread.run_sync(self._at_the_deadline, command)
         except (anyio.get_cancelled_exc_class(), KeyboardInterrupt):
-            # A signal's interrupt is raised wherever the main thread is: also in this very task.
+            # A KeyboardInterrupt is raised wherever the main thread is, which may be in this task.
             with anyio.CancelScope(shield=True):
                 await to_thread.run_sync(self._leave, command)
             raise
@@ -137,18 +137,18 @@ class Dispatcher:
         if command.is_final:
             return command
         self._recording.settle()
-        return self._take_back(command.id, "nobody claimed it in time; it will not run")
+        return self._cancel(command.id, "no controller claimed it in time; it will not run")
 
     def _leave(self, command: Command) -> None:
-        """Nobody waits any more; a run that has begun ends now, as its `then` says, or a step."""
+        """The caller has left: cancel the command; a begun `run` or `step` ends now."""
         with self._recording.writer() as connection:
             queue = CommandQueue(connection)
-            goes_on = queue.leave(command.id, "the client disconnected")
-            if goes_on and command.action in LOOPING:
+            is_running = queue.leave(command.id, "the client disconnected")
+            if is_running and command.action in LOOPING:
                 params, asker = {"command_id": command.id}, self._recording.asker
                 queue.enqueue(command.robot_id, "cancel_run", params, requested_by=asker)
 
-    def _take_back(self, command_id: int, why: str) -> Command:
+    def _cancel(self, command_id: int, why: str) -> Command:
         with self._recording.writer() as connection:
             CommandQueue(connection).cancel(command_id, why)
             return fetch_command(connection, command_id)
@@ -166,12 +166,12 @@ class Dispatcher:
                 "hint": _hint(view, command),
             }
             if command.action == RUN:
-                return RunAnswer(**facts, **told_of_run(view, command))
+                return RunAnswer(**facts, **run_facts(view, command))
             return CommandAnswer(**facts, result=shown_result(command))
 
 
 class _Sending:
-    """Sends a command in a thread, which goes on when Ctrl-C ends the task that waits for it."""
+    """Sends a command in a thread, which Ctrl-C does not end with the task that waits for it."""
 
     def __init__(self, enqueue: Callable[[], Command]) -> None:
         self._enqueue = enqueue
@@ -186,14 +186,14 @@ class _Sending:
             return self._sent
 
     def stop(self) -> Command | None:
-        """From now on nothing is sent; what was."""
+        """Prevent sending from now on; returns the command if it was already sent."""
         with self._lock:
             self._stopped = True
             return self._sent
 
 
 def shown_result(command: Command, budget: int = RESULT_BUDGET) -> Any:
-    """The result of a command; its numbers are exact, what is long is shortened."""
+    """The result of a command; its numbers are exact, long values are shortened."""
     if command.result is None:
         return None
     return shorten(command.decoded_result(), budget, WHOLE).value
@@ -211,16 +211,16 @@ def _progress(command: Command, waited_s: float) -> str:
 
 
 def _hint(view: View, command: Command) -> str | None:
-    """What to do next where an outcome does not speak for itself."""
+    """What to do next, where the outcome alone does not say it."""
     if command.status == "pending":
         return "no controller has claimed it yet"
     if command.status == "done":
-        return command.error  # what of the result had to be replaced
+        return command.error  # the values of the result that had to be replaced
     if command.status == "failed":
         return _instructions(view, command.action)
     if command.status == "claimed":
         return (
-            "the controller is still busy with it: keep waiting with "
+            "the controller is still running it: keep waiting with "
             f'webots_list_commands(what="outcome", command_id={command.id}); do not send it again'
         )
     if command.status == "lost":
@@ -229,15 +229,15 @@ def _hint(view: View, command: Command) -> str | None:
 
 
 def _after_loss(view: View) -> str:
-    """A command may be sent again only to a controller that runs, and to a robot one has seen."""
-    look = "look at the robot before you send it again"
+    """What to do after a lost command, which may have run: first start and check, then resend."""
+    look = "check the robot's state before you send it again"
     if view.robot.live:
         return look
     return f"start its controller (reload the world in Webots; an extern one by hand), then {look}"
 
 
 def _instructions(view: View, action: str) -> str | None:
-    """Where the description of a custom action stands: it is the controller's text, not ours."""
+    """Where to find the description of a custom action, which the controller provides."""
     described = view.session is not None and action in view.session.actions
     return "webots_list_commands has the action's description" if described else None
 
@@ -250,12 +250,12 @@ def _after_no_answer(view: View) -> str:
         return "wait until that handler has returned, then ask again"
     if not session.heartbeat_is_fresh(view.now_s):
         return (
-            "press play in Webots if it is paused there: only a person can, while the controller "
-            "is inside step(); else see what its loop waits for"
+            "press play in Webots if it is paused there: only a person can resume it while the "
+            "controller is inside step(); else check what its loop is waiting for"
         )
     if session.last_poll_wall_time_s is None:
         return "the controller's loop never calls bridge.get_command(): add that line to its loop"
     silent_s = session.age_s(session.last_poll_wall_time_s, view.now_s)
     if silent_s > HEARTBEAT_LATE_S:
         return f"its loop runs, but last called bridge.get_command() {silent_s:.0f} s ago"
-    return "its loop runs but did not take it in time: ask again with a longer timeout_s"
+    return "its loop runs but did not claim it in time: ask again with a longer timeout_s"

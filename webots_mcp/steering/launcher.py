@@ -1,4 +1,4 @@
-"""The Webots that a server has started: one at most, which ends with the server."""
+"""The Webots that a server has started: at most one, which ends with the server."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Launcher:
     """Starts Webots for a recording.
 
     Attributes:
-        launched: The one that was started last.
+        launched: The Webots that was started last.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -29,7 +29,7 @@ class Launcher:
 
     @property
     def running(self) -> Launch | None:
-        """The one that runs."""
+        """The Webots that is still running, or None."""
         launched = self.launched
         return launched if launched is not None and not launched.webots.is_over else None
 
@@ -37,16 +37,17 @@ class Launcher:
         """Start Webots.
 
         Raises:
-            CommandRefusedError: It runs already, or there is none, or no display.
-            DatabaseError: Nothing can be recorded.
+            CommandRefusedError: It already runs, it is not installed, or there is no display.
+            DatabaseError: The database cannot be used.
         """
         with self._lock:
             if self.running is not None:
                 raise CommandRefusedError(
-                    f"the Webots that this server has started still runs {self.running.world.name}:"
-                    " action=load opens another world in it, action=quit ends it"
+                    f"the Webots that this server started is still running with "
+                    f"{self.running.world.name}: action=load opens another world in it, "
+                    "action=quit ends it"
                 )
-            self.launched = Launch(self._recording, start, self._environment(), _overhear)
+            self.launched = Launch(self._recording, start, self._environment(), _ignore)
             return self.launched
 
     def stop(self) -> None:
@@ -56,7 +57,7 @@ class Launcher:
                 self.launched.webots.end()
 
     def _environment(self) -> dict[str, str]:
-        """What has its controllers record where this server reads."""
+        """The environment with which its controllers record where this server reads."""
         recording = self._recording
         if recording.database != recording.data_dir / DATABASE_NAME:
             return {}
@@ -65,7 +66,7 @@ class Launcher:
 
 @dataclass(frozen=True)
 class Companions:
-    """What runs beside a server's answers, as long as the server does."""
+    """What runs in the background of a server, until the server ends."""
 
     trials: TrialWorkers
     webots: Launcher
@@ -77,19 +78,19 @@ class Companions:
 
 
 def project_of(recording: Recording) -> Path:
-    """The Webots project that a server is for: of its data folder, else of the current one.
+    """The Webots project of a server: that of its data folder, else of its current folder.
 
     Raises:
-        InvalidInputError: There is none.
+        InvalidInputError: Neither folder is in a project.
     """
     project = find_project(recording.data_dir) or find_project(Path.cwd())
     if project is None:
         raise InvalidInputError(
-            f"this server is for no Webots project: neither its data folder {recording.data_dir} "
-            "nor its current folder is in one; start it with --data-dir PROJECT/mcp_data"
+            f"this server has no Webots project: neither its data folder {recording.data_dir} nor "
+            "its current folder is in one; start it with --data-dir PROJECT/mcp_data"
         )
     return project.resolve()
 
 
-def _overhear(line: WebotsLine) -> None:
-    """Its newest lines are kept by `LaunchedWebots`."""
+def _ignore(line: WebotsLine) -> None:
+    """Ignore a line of Webots' output: `LaunchedWebots` keeps the newest ones."""

@@ -1,4 +1,4 @@
-"""What a controller is asked to do with the simulation: sent, waited for, tried in other ways."""
+"""A request to steer the simulation: sent to a controller, waited for, tried by other routes."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from webots_mcp.questions.answers import CommandAnswer
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.recording import Recording
 
-CLAIMING_S: Final = HEARTBEAT_LATE_S + 0.5  # by then a loop that has just stopped is known as such
+CLAIMING_S: Final = HEARTBEAT_LATE_S + 0.5  # a loop that has just stopped is detected within it
 UNCLAIMED: Final = ("cancelled", "expired")
-LEAST_S: Final = 0.1  # that each way gets
+LEAST_S: Final = 0.1  # that each route gets
 
 
 @dataclass
 class Request:
-    """One request, through all ways.
+    """One request, by all routes.
 
     Attributes:
-        robot: Whose simulation is meant; None where there is just one.
-        timeout_s: For all ways together.
-        tried: Why each way did not work, by its name.
+        robot: The robot whose simulation to steer; None where there is only one.
+        timeout_s: The wall time for all routes together, in seconds.
+        tried: Why each route did not work, by its name.
     """
 
     recording: Recording
@@ -37,7 +37,7 @@ class Request:
     async def _sent(
         self, robot: str | None, action: str, params: Mapping[str, Any], claiming_s: float
     ) -> CommandAnswer:
-        """What became of a command; nobody waits longer until the controller's loop takes it."""
+        """The outcome of a command, which the controller must claim within `claiming_s`."""
         wait_s = min(self._left_s, claiming_s)
         answer = await self.dispatcher.ask(robot, action, wait_s, params)
         if answer.outcome == "claimed" and answer.command_id is not None:
@@ -49,7 +49,7 @@ class Request:
         with self.recording.view(robot) as view:
             return view.header()
 
-    def _told(self) -> str:
+    def _failed_routes(self) -> str:
         return "; ".join(f"{route}: {why}" for route, why in self.tried.items())
 
     @property

@@ -1,6 +1,6 @@
-"""Ways to steer the simulation, tried in turn: controller, observer, Webots' WebSocket, its keys.
+"""Routes to steer the simulation, tried in turn: controller, observer, WebSocket, key presses.
 
-An answer names the way that worked and what shows that it did; where none does, each says why.
+An answer names the route that worked and the evidence for it, or why each route failed.
 """
 
 from __future__ import annotations
@@ -43,18 +43,18 @@ from webots_mcp.webots.stream import (
 )
 
 _POLL_S: Final = 0.05
-_PROOF_S: Final = 3.0  # a heartbeat tells within half a second that time goes on
-_RESTART_S: Final = 5.0  # until a controller that Webots starts again has recorded
+_PROOF_S: Final = 3.0  # a heartbeat shows within half a second that simulation time advances
+_RESTART_S: Final = 5.0  # until a controller that Webots restarts has recorded
 _NOTHING_SEEN: Final = (
-    "the recording does not show it yet: a controller that hangs, or an extern one that is "
-    "missing, stops the time of a simulation that runs"
+    "the recording does not show it yet: simulation time also stands still while a controller "
+    "hangs, or while an extern one has not been started"
 )
 _NONE_LIVES: Final = "none of the recorded robots has a live controller"
-_NO_FORCE: Final = "force=true would press Webots' own keys"
+_NO_FORCE: Final = "not tried: it presses keys in Webots' window, which needs force=true"
 
 
 class Moment(NamedTuple):
-    """Where the recording is: what comes after it shows what an order did."""
+    """The newest moment of the recording before an order; later rows show its effect."""
 
     run_id: int | None
     sim_time_s: float | None
@@ -62,17 +62,17 @@ class Moment(NamedTuple):
 
 @dataclass
 class Situation:
-    """What is known before the first way is tried.
+    """What is known before the first route is tried.
 
     Attributes:
-        robot: The robot as it is recorded; None where none was.
-        can_command: Whether its controller can be sent a command, if only to wait for it.
-        silent: Why a command would wait now; None where the controller's loop turns.
-        address: Where its session says that Webots listens, or the caller.
-        before: Where its recording was.
-        observer: The name of the observer of its simulation, if one lives.
-        is_there: Whether the address is that of the Webots that is meant: who called has named it,
-            or a controller lives there. Another one may listen where one was.
+        robot: The recorded name of the robot; None where none is recorded.
+        can_command: Whether a command can be queued for its controller.
+        silent: Why a command would wait now; None where the controller's loop runs.
+        address: Webots' address as named by the caller or by the robot's session.
+        before: The newest moment of its recording.
+        observer: The name of the live observer of its simulation, if there is one.
+        is_there: Whether the address is sure to be that of the wanted Webots: the caller has named
+            it, or a live controller runs there. Else another Webots may listen at it by now.
     """
 
     robot: str | None
@@ -89,7 +89,7 @@ class Attempt(Request):
     """One request to steer.
 
     Attributes:
-        port: Of the Webots that is meant; None for that of the robot.
+        port: The port of the wanted Webots; None for that of the robot.
     """
 
     order: Order
@@ -98,31 +98,31 @@ class Attempt(Request):
     port: int | None = None
 
     async def steer(self) -> CommandAnswer:
-        """Go the first way that works.
+        """Steer by the first route that works.
 
         Raises:
             InvalidInputError: There is no such robot, or several are possible.
-            CommandRefusedError: No way works; each is named with the reason.
+            CommandRefusedError: No route works; each is named with the reason.
         """
-        situation = await self._look_around()
+        situation = await self._assess()
         if situation.silent is None:
             answer = await self._by_bridge(situation, CLAIMING_S)
             if answer.outcome not in UNCLAIMED:
                 return answer
-            situation = await self._look_around()
+            situation = await self._assess()
         if situation.silent is None:
             return await self._by_bridge(situation)
         self.tried["bridge"] = situation.silent
-        for way in (self._by_observer, self._by_websocket, self._by_keyboard):
-            answer = await way(situation)
+        for route in (self._by_observer, self._by_websocket, self._by_keyboard):
+            answer = await route(situation)
             if answer is not None:
                 return answer
         if not situation.can_command:
-            raise CommandRefusedError(_no_way(self.order, self._told()))
+            raise CommandRefusedError(_no_route(self.order, self._failed_routes()))
         return await self._by_bridge(situation)
 
-    async def _look_around(self) -> Situation:
-        found = await to_thread.run_sync(look_around, self.recording, self.robot, self.order)
+    async def _assess(self) -> Situation:
+        found = await to_thread.run_sync(assess, self.recording, self.robot, self.order)
         named = None if self.port is None else WebotsAddress("127.0.0.1", self.port)
         if named is None or (found.is_there and found.address == named):
             return found
@@ -133,8 +133,8 @@ class Attempt(Request):
         """Send a command to the controller, and wait for it as long as there is time.
 
         Args:
-            situation: As it was looked at.
-            claiming_s: Nobody waits for longer until its loop takes the command.
+            situation: What is known of the robot.
+            claiming_s: How long to wait for its loop to claim the command, in wall seconds.
         """
         answer = await self._sent(self.robot, self.order, self.params, claiming_s)
         if situation.robot is not None and situation.robot == situation.observer:
@@ -146,7 +146,7 @@ class Attempt(Request):
         return answer
 
     async def _by_observer(self, situation: Situation) -> CommandAnswer | None:
-        """Its loop turns also where time stands still, so it is asked without a long wait."""
+        """Ask the observer, whose loop also runs while simulation time stands still."""
         observer = situation.observer
         if observer is None or observer == situation.robot:
             return None
@@ -161,7 +161,7 @@ class Attempt(Request):
         return await self._done_by_observer(situation, answer)
 
     async def _done_by_observer(self, situation: Situation, answer: CommandAnswer) -> CommandAnswer:
-        """It asks Webots for something that others may prevent: the recording shows it, or not."""
+        """Add evidence from the recording: other controllers may prevent what Webots accepted."""
         if answer.outcome != "done":
             return answer
         answer.route = "observer"
@@ -172,7 +172,7 @@ class Attempt(Request):
 
     async def _by_websocket(self, situation: Situation) -> CommandAnswer | None:
         try:
-            address = await to_thread.run_sync(webots_meant, self.recording, situation)
+            address = await to_thread.run_sync(find_webots, self.recording, situation)
             reply, made = await self._give(address)
         except CommandRefusedError as error:
             self.tried["websocket"] = str(error)
@@ -180,20 +180,20 @@ class Attempt(Request):
         if made:
             return await self._obeyed(situation, reply, made)
         seen = None
-        if self.order in RESTARTING:  # of which Webots need not say anything
+        if self.order in RESTARTING:  # Webots need not reply to these
             seen = await self._shown(situation, _RESTART_S)
         if seen is None:
-            self.tried["websocket"] = await to_thread.run_sync(why_no_word, address, reply)
+            self.tried["websocket"] = await to_thread.run_sync(why_no_reply, address, reply)
             return None
         return await self._answered(situation, "websocket", seen)
 
     async def _give(self, address: WebotsAddress) -> tuple[OrderReply, int]:
-        """Once, or as many steps as are asked for; the last reply, and how many were heard."""
+        """Give the order once per wanted step; returns the last reply and the number of replies."""
         reply, made = OrderReply(None, is_alive=False), 0
         while made < self._wanted and (made == 0 or self._left_s > LEAST_S):
             timeout_s = min(ANSWER_S, self._left_s)
             reply = await to_thread.run_sync(give_order, address, self.order, timeout_s)
-            if reply.heard is None:
+            if reply.text is None:
                 break
             made += 1
         return reply, made
@@ -203,13 +203,13 @@ class Attempt(Request):
         return int(self.params.get("steps", 1))
 
     async def _obeyed(self, situation: Situation, reply: OrderReply, made: int) -> CommandAnswer:
-        """Webots has said so; the recording soon shows it as well, where controllers record."""
-        said = f"Webots said {reply.heard!r}" if reply.heard else "Webots obeyed"
+        """The answer after Webots' reply, with evidence from the recording where there is some."""
+        replied = f"Webots replied {reply.text!r}" if reply.text else "Webots obeyed"
         if self._wanted > 1:
-            said = f"Webots made {made} of {self._wanted} basic time steps"
+            replied = f"Webots made {made} of {self._wanted} basic time steps"
         wait_s = self._left_s if self.order in RESTARTING else _PROOF_S
         seen = None if self.order == "pause" else await self._shown(situation, wait_s)
-        proof = f"{said}; {seen}" if seen else said
+        proof = f"{replied}; {seen}" if seen else replied
         answer = await self._answered(situation, "websocket", proof)
         if made < self._wanted:
             answer.outcome = "failed"
@@ -231,13 +231,13 @@ class Attempt(Request):
         if seen is not None:
             return await self._answered(situation, "keyboard", seen)
         self.tried["keyboard"] = (
-            f"{KEYS[self.order].spoken} was sent, and nothing in the recording shows that "
-            "Webots obeyed: look at its window"
+            f"{KEYS[self.order].spoken} was pressed, but the recording does not show that Webots "
+            "obeyed: check its window"
         )
         return None
 
     async def _shown(self, situation: Situation, wait_s: float) -> str | None:
-        """What the recording shows of it, as soon as it does; None if nothing in that time."""
+        """The evidence in the recording, as soon as there is some; None after that time."""
         if situation.robot is None:
             return None
         until_s = time.monotonic() + min(wait_s, self._left_s)
@@ -265,12 +265,12 @@ class Attempt(Request):
         )
 
 
-def look_around(recording: Recording, robot: str | None, action: str) -> Situation:
-    """Who could be asked for an action of the bridge that steers the simulation.
+def assess(recording: Recording, robot: str | None, action: str) -> Situation:
+    """Find out which controllers could run an action that steers the simulation.
 
     Raises:
         InvalidInputError: There is no such robot, or several are possible.
-        CommandRefusedError: Another robot's bridge holds the simulation.
+        CommandRefusedError: Another robot's bridge has paused the simulation.
     """
     try:
         with recording.reader() as connection:
@@ -285,12 +285,12 @@ def look_around(recording: Recording, robot: str | None, action: str) -> Situati
                 _require_not_held_elsewhere(view, error)
                 return _situation(view, can_command=False, silent=str(error))
             return _situation(view, can_command=True, silent=_why_silent(view))
-    except (NoDatabaseError, NothingRecordedError) as error:  # which say how to record
+    except (NoDatabaseError, NothingRecordedError) as error:  # their texts say how to record
         return Situation(None, False, str(error).rstrip("."), None, Moment(None, None))
 
 
 def _require_not_held_elsewhere(view: View, error: CommandRefusedError) -> None:
-    """What another robot's bridge holds, only that bridge can let go."""
+    """Refuse a simulation that another robot's bridge has paused: only that bridge resumes it."""
     session = view.session
     if session is None or not session.is_alive(view.now_s):
         return
@@ -312,7 +312,7 @@ def _situation(view: View, *, can_command: bool, silent: str | None) -> Situatio
 
 
 def _why_silent(view: View) -> str | None:
-    """Why a command would not be claimed soon; None where it would, or that is not known."""
+    """Why a command would not be claimed soon; None where it would, or this is unknown."""
     session = view.session
     if session is None or not session.is_alive(view.now_s):
         return None  # it is being reloaded
@@ -324,7 +324,7 @@ def _why_silent(view: View) -> str | None:
 
 
 def _never_asks(session: Session, now_s: float) -> bool:
-    """Whether it turns for longer than a heartbeat may take without looking for commands."""
+    """Whether the loop has run for two heartbeats without calling `get_command()`."""
     since_s = session.last_poll_wall_time_s or session.started_wall_time_s
     return session.age_s(since_s, now_s) > 2 * HEARTBEAT_LATE_S
 
@@ -339,7 +339,7 @@ def _moved(before: Moment, view: View) -> str | None:
     now_s = view.header()["sim_time_s"]
     if now_s is None or (before.sim_time_s is not None and now_s <= before.sim_time_s):
         return _begun(before, view)
-    return f"simulation time went on to {now_s} s"
+    return f"simulation time advanced to {now_s} s"
 
 
 def _standing(before: Moment, view: View) -> str | None:
@@ -357,19 +357,19 @@ _SIGNS: Final[dict[Order, Callable[[Moment, View], str | None]]] = {
 }
 
 
-def why_no_word(address: WebotsAddress, reply: OrderReply) -> str:
-    """Why Webots said nothing to an order: how it was started shows it, where it runs here."""
+def why_no_reply(address: WebotsAddress, reply: OrderReply) -> str:
+    """Why Webots did not reply to an order, judged by its command line where it runs here."""
     found = instance_at(address.port)
     if reply.is_alive and found is not None and found.address == address and found.streams:
         return (
-            f"Webots at {address} was started with --stream and hears: it was asked, and may have "
-            "obeyed, but neither its answer nor the recording shows it; webots_get_logs may"
+            f"Webots at {address} was started with --stream and received the order; it may have "
+            "obeyed, but neither its reply nor the recording shows it; check webots_get_logs"
         )
     return why_not_obeyed(address, reply)
 
 
-def webots_meant(recording: Recording, situation: Situation) -> WebotsAddress:
-    """Where the Webots listens that is meant; where that is not known, the only one of ours.
+def find_webots(recording: Recording, situation: Situation) -> WebotsAddress:
+    """The address of the wanted Webots; where that is not known, of the only one of this project.
 
     Raises:
         CommandRefusedError: There is none, or several, or only those of others.
@@ -378,7 +378,7 @@ def webots_meant(recording: Recording, situation: Situation) -> WebotsAddress:
     if address is not None and situation.is_there:
         return address
     running = instances()
-    if address is not None and not running:  # the system may not show it
+    if address is not None and not running:  # the system may not list its processes
         return address
     ours = [each for each in running if belongs(each, recording)]
     same = [each for each in ours if each.address == address]
@@ -386,8 +386,8 @@ def webots_meant(recording: Recording, situation: Situation) -> WebotsAddress:
 
 
 def _window_owner(recording: Recording, situation: Situation) -> int:
-    """The process whose window gets the keys."""
-    address = webots_meant(recording, situation)
+    """The id of the process whose window receives the keys."""
+    address = find_webots(recording, situation)
     found = instance_at(address.port)
     if found is not None and found.address == address:  # another machine may use the same port
         return found.pid
@@ -402,18 +402,18 @@ def _only(ours: list[Instance], running: list[Instance]) -> Instance:
     worlds = ", ".join(f"{each.world or 'a world'} at port {each.port}" for each in running)
     if ours:
         raise CommandRefusedError(
-            f"{len(ours)} Webots run ({worlds}), and no live session tells which is meant: name "
-            "its port"
+            f"{len(ours)} Webots run ({worlds}), and no live session shows which one to steer: "
+            "give its port"
         )
     raise CommandRefusedError(
-        f"the Webots that runs here is not of this recording's project ({worlds}): name its port "
-        "if it is meant all the same"
+        f"the Webots that runs here is not of this recording's project ({worlds}): give its port "
+        "to steer it nevertheless"
     )
 
 
-def _no_way(order: Order, told: str) -> str:
+def _no_route(order: Order, failed_routes: str) -> str:
     return (
-        f"no route to {order} the simulation works. {told}. Press {KEYS[order].spoken} in "
+        f"no route to {order} the simulation works. {failed_routes}. Press {KEYS[order].spoken} in "
         "Webots, start Webots with --stream, or open the world with an observer in it (made by "
         "'webots-mcp init --observer WORLD'): both let it be steered without a controller"
     )

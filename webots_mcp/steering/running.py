@@ -1,4 +1,4 @@
-"""Running until a condition holds or a time is over: what is refused, and what came of it."""
+"""The `run` command: what is refused before it is sent, its progress, and its outcome."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _EVENTS_BUDGET: Final = 1_700
 _SHOWN_SIGNALS: Final = 8
 _SHOWN_EVENTS: Final = 12
 _MOST_COLUMNS: Final = 8
-_REMEMBERED_S: Final = 60.0  # how far back a condition is asked whether it holds already
+_REMEMBERED_S: Final = 60.0  # how far back rows are read to see whether a condition holds already
 _MOST_REMEMBERED_ROWS: Final = 4_000
 _RUNS_SEARCHED: Final = 5
 
@@ -67,12 +67,13 @@ _NEWEST_RUNS: Final = "SELECT id FROM run WHERE robot_id = ? ORDER BY id DESC LI
 def require_possible(
     recording: Recording, robot: str | None, until: str | None, for_s: float | None, *, reset: bool
 ) -> None:
-    """Refuse what cannot end as it was meant, before anything is sent.
+    """Refuse a run that could not end as requested, before anything is sent.
 
     Raises:
-        InvalidInputError: Neither a condition nor a time is given, the condition is not in the
-            language, reads signals that were never seen, or holds already.
-        CommandRefusedError: No controller of the robot could run it.
+        InvalidInputError: Neither a condition nor a time is given, or the condition is invalid or
+            reads signals that were never published.
+        CommandRefusedError: No controller of the robot could run it, or the condition holds
+            already.
     """
     if until is None and for_s is None:
         raise InvalidInputError(
@@ -80,7 +81,7 @@ def require_possible(
         )
     if for_s is not None and not 0 < for_s <= MAX_RUN_S:
         raise InvalidInputError(
-            f"for_s is a number of simulated seconds above 0, up to {MAX_RUN_S:.0f}, not {for_s}"
+            f"for_s must be simulated seconds above 0 and at most {MAX_RUN_S:.0f}, not {for_s}"
         )
     condition = None if until is None else parse_condition(until)
     with recording.reader() as connection:
@@ -92,13 +93,13 @@ def require_possible(
 
 
 def _require_known(view: View, condition: Condition) -> None:
-    """A signal that was never seen is most likely misspelt; before the first row any may come."""
-    known = known_names(view)
+    """Refuse signals that were never published: most likely a name is misspelt."""
+    known = known_names(view)  # empty before the first row, when nothing can be said
     if known and (unknown := condition.describe_unknown(known)):
         raise UnknownSignalError(
             "; ".join(unknown)
             + f": {'it was' if len(unknown) == 1 else 'they were'} never published by robot "
-            f"{view.robot.name!r}, so the condition could not come true"
+            f"{view.robot.name!r}, so the condition could never hold"
         )
 
 
@@ -116,7 +117,7 @@ def known_names(view: View) -> set[str]:
 def _require_open(view: View, condition: Condition) -> None:
     """Refuse a condition that holds at the newest row: the run would be over at once.
 
-    A change is of one step only: whoever asks for it means the next one.
+    A condition with `changed` may hold: a change lasts one step, so the next one is awaited.
     """
     if view.run is None or "changed(" in condition.text:
         return
@@ -124,9 +125,9 @@ def _require_open(view: View, condition: Condition) -> None:
     if since_s is None:
         return
     raise CommandRefusedError(
-        f"{condition.text!r} holds already, at the newest row since {since_s:.3f} s of simulation "
-        f"time: run until 'not ({condition.text})' first, give for_s alone, or reset=true, with "
-        "which it is asked after the reset"
+        f"{condition.text!r} already holds, at the newest row since {since_s:.3f} s of simulation "
+        f"time: run until 'not ({condition.text})' first, give for_s alone, or give reset=true, so "
+        "that it is evaluated after the reset"
     )
 
 
@@ -134,7 +135,7 @@ def holds_since(connection: sqlite3.Connection, run_id: int, condition: Conditio
     """Since when a condition holds in the last rows of a run; None where it does not.
 
     Raises:
-        InvalidInputError: It cannot be asked of values like those.
+        InvalidInputError: It cannot be evaluated on such values.
     """
     newest = connection.execute(_LAST_ROWS, (run_id, 1e300, _MOST_REMEMBERED_ROWS)).fetchall()
     rows = [row for row in newest if row[0] >= newest[0][0] - _REMEMBERED_S]
@@ -146,19 +147,21 @@ def holds_since(connection: sqlite3.Connection, run_id: int, condition: Conditio
             elif since_s is None:
                 since_s = float(sim_time_s)
     except ConditionFailedError as error:
-        raise InvalidInputError(f"{error} (as robots published until now)") from error
+        raise InvalidInputError(f"{error} (in the values published so far)") from error
     return since_s
 
 
-# -- while it is under way --------------------------------------------------------------------
+# -- while it is running ----------------------------------------------------------------------
 
 
-class Way(NamedTuple):
-    """How far a `run` command has come.
+class Progress(NamedTuple):
+    """The progress of a `run` command.
 
     Attributes:
-        run_id: The run that it is about; None before the controller has claimed it.
-        factor: Simulated per wall seconds; None where nothing tells.
+        run_id: The run in which it advances; None before the controller has claimed it.
+        from_s: The simulation time at which it began, in seconds.
+        to_s: The simulation time that it has reached, in seconds.
+        factor: Simulated per wall seconds; None where it is unknown.
     """
 
     run_id: int | None
@@ -172,27 +175,29 @@ class Way(NamedTuple):
         return max(self.to_s - self.from_s, 0.0)
 
 
-def _way_of(connection: sqlite3.Connection, command: Command) -> Way:
-    """How far it came, as the bridge says; while it does not, as far as its heartbeat shows."""
+def _progress_in(connection: sqlite3.Connection, command: Command) -> Progress:
+    """The progress in the bridge's result; until there is one, as the heartbeat shows it."""
     if result := _result_of(command):
         run_id = result.get("run_id") or _run_of(connection, command)
-        return Way(run_id, result["from_s"], result["sim_time_s"], result.get("factor"))
+        return Progress(run_id, result["from_s"], result["sim_time_s"], result.get("factor"))
     if command.session_id is None:
-        return Way(None, 0.0, 0.0, None)
+        return Progress(None, 0.0, 0.0, None)
     row = connection.execute(_OF_SESSION, (command.session_id,)).fetchone()
     session = fetch_session(connection, command.session_id)
     if row is None or session is None:
-        return Way(None, 0.0, 0.0, None)
-    return _seen_way(command, row, session.sim_time_s or 0.0)
+        return Progress(None, 0.0, 0.0, None)
+    return _observed_progress(command, row, session.sim_time_s or 0.0)
 
 
 def _run_of(connection: sqlite3.Connection, command: Command) -> int | None:
-    """The run in which it ended; its bridge did not know the id while the row waited."""
+    """The run in which it ended, where the bridge did not know its id: its row was waiting."""
     times = (command.session_id, command.finished_wall_time_s)
     return connection.execute(_BEGUN_BY, times).fetchone()[0]
 
 
-def _seen_way(command: Command, run: tuple[int, float, float, float], beat_s: float) -> Way:
+def _observed_progress(
+    command: Command, run: tuple[int, float, float, float], beat_s: float
+) -> Progress:
     run_id, _, last_s, began_wall_s = run
     claimed_wall_s, to_s = command.claimed_wall_time_s or 0.0, max(last_s, beat_s)
     has_reset = began_wall_s >= claimed_wall_s
@@ -200,55 +205,55 @@ def _seen_way(command: Command, run: tuple[int, float, float, float], beat_s: fl
     wall_s = (command.finished_wall_time_s or time.time()) - max(claimed_wall_s, began_wall_s)
     if _params_of(command).get("reset") and not has_reset:
         to_s = from_s
-    return Way(run_id, from_s, to_s, pace(to_s - from_s, wall_s))
+    return Progress(run_id, from_s, to_s, pace(to_s - from_s, wall_s))
 
 
 def progress_of(
     connection: sqlite3.Connection, command: Command
 ) -> tuple[float, float | None, str]:
-    """Simulated seconds so far, those asked for, and a word."""
-    way = _way_of(connection, command)
+    """Simulated seconds so far, the wanted ones (None without a limit), and a text."""
+    progress = _progress_in(connection, command)
     until, for_s = (_params_of(command).get(name) for name in ("until", "for_s"))
-    if way.run_id is None:
+    if progress.run_id is None:
         return 0.0, for_s, "waiting for the controller"
     of = f" of {for_s:g}" if for_s else ""
-    word = f"{way.advanced_s:.1f}{of} s simulated" + (f", until {until}" if until else "")
-    return way.advanced_s, for_s, word
+    word = f"{progress.advanced_s:.1f}{of} s simulated" + (f", until {until}" if until else "")
+    return progress.advanced_s, for_s, word
 
 
 def _result_of(command: Command) -> dict[str, Any]:
-    """What the bridge says of a run that is over; empty where it says nothing."""
+    """The bridge's result of a finished run; empty where there is none."""
     result = command.decoded_result()
     return cast("dict[str, Any]", result) if isinstance(result, dict) else {}
 
 
 def _params_of(command: Command) -> Mapping[str, Any]:
-    """What a command was sent with."""
+    """The parameters of a command."""
     return json.loads(command.params)
 
 
 # -- when it is over --------------------------------------------------------------------------
 
 
-def told_of_run(view: View, command: Command) -> dict[str, Any]:
-    """What an answer says of a `run` command: why it stopped, how far it came, what happened."""
-    way, result = _way_of(view.connection, command), _result_of(command)
+def run_facts(view: View, command: Command) -> dict[str, Any]:
+    """The facts of an answer about a `run` command: why it stopped, its progress, its events."""
+    progress, result = _progress_in(view.connection, command), _result_of(command)
     stopped, why = _why_stopped(command, result)
-    told: dict[str, Any] = {"stopped": stopped, "why_stopped": why}
-    if way.run_id is None or stopped is None:
-        return told
-    told |= {
+    facts: dict[str, Any] = {"stopped": stopped, "why_stopped": why}
+    if progress.run_id is None or stopped is None:
+        return facts
+    facts |= {
         "ran": {
-            "run_id": way.run_id,
-            "from_s": seconds(way.from_s),
-            "to_s": seconds(way.to_s),
-            "advanced_s": seconds(way.advanced_s),
-            "factor": figure(way.factor),
+            "run_id": progress.run_id,
+            "from_s": seconds(progress.from_s),
+            "to_s": seconds(progress.to_s),
+            "advanced_s": seconds(progress.advanced_s),
+            "factor": figure(progress.factor),
         },
         "values": shown(result.get("values")) if result.get("values") else None,
         "mode": result.get("mode"),
     }
-    return told | _what_happened(view, command, way) if command.is_final else told
+    return facts | _what_happened(view, command, progress) if command.is_final else facts
 
 
 def _why_stopped(command: Command, result: Mapping[str, Any]) -> tuple[str | None, str | None]:
@@ -259,20 +264,20 @@ def _why_stopped(command: Command, result: Mapping[str, Any]) -> tuple[str | Non
     return result.get("ended"), result.get("why")
 
 
-def _what_happened(view: View, command: Command, way: Way) -> dict[str, Any]:
+def _what_happened(view: View, command: Command, progress: Progress) -> dict[str, Any]:
     """The state at the end, trends and events in between, and the rows before the end."""
-    assert way.run_id is not None
-    subject = Subject(view.robot.id, view.robot.name, way.run_id)
-    end_s = way.to_s + SAME_TIME_S
-    told: dict[str, Any] = {"rows": _last_rows(view, command, way, end_s)}
-    if state := state_at(view.connection, way.run_id, end_s):
-        told |= _as_shown(state)
-    scope = Scope(start_s=way.from_s, end_s=max(way.to_s, way.from_s) + 0.001)
+    assert progress.run_id is not None
+    subject = Subject(view.robot.id, view.robot.name, progress.run_id)
+    end_s = progress.to_s + SAME_TIME_S
+    facts: dict[str, Any] = {"rows": _last_rows(view, command, progress, end_s)}
+    if state := state_at(view.connection, progress.run_id, end_s):
+        facts |= _as_shown(state)
+    scope = Scope(start_s=progress.from_s, end_s=max(progress.to_s, progress.from_s) + 0.001)
     try:
         asked = find_range(view.connection, scope, subject)
     except NothingRecordedError:
-        return told
-    return told | _in_between(view, command, asked)
+        return facts
+    return facts | _in_between(view, command, asked)
 
 
 def _as_shown(state: State) -> dict[str, Any]:
@@ -285,14 +290,14 @@ def _as_shown(state: State) -> dict[str, Any]:
 
 
 def _in_between(view: View, command: Command, asked: TimeRange) -> dict[str, Any]:
-    (told,) = trends(view.connection, asked, limit=MOST_SIGNALS).runs
+    (of_run,) = trends(view.connection, asked, limit=MOST_SIGNALS).runs
     found = search_events(view.connection, asked)
     of_others = found.only([each for each in found.events if not _is_own(each, command)])
     shown_events, events = fitting_events(of_others, _SHOWN_EVENTS, _EVENTS_BUDGET, view)
     return {
         "movement": movement(view, asked),
-        "trends": trend_tables(told, _SHOWN_SIGNALS, _TRENDS_BUDGET)
-        if told.rows or told.cut_at_s is not None
+        "trends": trend_tables(of_run, _SHOWN_SIGNALS, _TRENDS_BUDGET)
+        if of_run.rows or of_run.cut_at_s is not None
         else None,
         "events": events,
         "not_shown": not_shown_of(shown_events),
@@ -307,10 +312,10 @@ def _is_own(event: Event, command: Command) -> bool:
     return event.kind == "noticed" and data.get("command_id") == command.id
 
 
-def _last_rows(view: View, command: Command, way: Way, end_s: float) -> Any:
+def _last_rows(view: View, command: Command, progress: Progress, end_s: float) -> Any:
     """The last rows, of the condition's signals."""
     until = _params_of(command).get("until")
-    rows = view.connection.execute(_LAST_ROWS, (way.run_id, end_s, _ROWS_AROUND)).fetchall()
+    rows = view.connection.execute(_LAST_ROWS, (progress.run_id, end_s, _ROWS_AROUND)).fetchall()
     if until is None or not rows:
         return None
     condition = parse_condition(until)

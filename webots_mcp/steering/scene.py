@@ -1,4 +1,4 @@
-"""Asking about the scene of a simulation, which any of its live Supervisors can see and change."""
+"""Reading and changing the scene of a simulation, by any of its live Supervisors."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from webots_mcp.store.sessions import Session
 from webots_mcp.store.status import find_holder
 
 _WAIT_S: Final = 15.0  # of wall time
-_NOBODY: Final = (
-    "no live controller may look at the scene of {}: set the field 'supervisor' of a Robot node to "
+_NO_SUPERVISOR: Final = (
+    "no live controller can read the scene of {}: set the field 'supervisor' of a Robot node to "
     "TRUE and create that robot with Supervisor(), or open the world with an observer in it, made "
     "by webots-mcp init --observer WORLD"
 )
@@ -40,25 +40,25 @@ async def ask_scene(
     *,
     robot: str | None = None,
 ) -> CommandAnswer:
-    """Have a Supervisor of the simulation look at its scene, or change it.
+    """Let a Supervisor of the simulation read its scene, or change it.
 
     Args:
         recording: Where its bridge records.
-        report: Is told how long it has waited.
-        action: Built in, such as `get_field`.
-        params: Of the action; None is left out.
-        robot: In whose simulation; None where there is just one.
+        report: Called with the time that it has waited.
+        action: A built-in action, such as `get_field`.
+        params: The parameters of the action; those that are None are left out.
+        robot: A robot of the simulation; None where there is only one simulation.
 
     Raises:
         InvalidInputError: There is no such robot, several simulations are possible, or this server
-            sends nothing.
-        CommandRefusedError: Nobody alive may see the scene.
-        NothingRecordedError: No robot was ever seen.
+            is read-only.
+        CommandRefusedError: No live controller can read the scene.
+        NothingRecordedError: No robot was ever recorded.
     """
     if recording.read_only:
         raise InvalidInputError(
-            "the scene is asked of a controller, and a server that is --read-only asks for "
-            "nothing; webots_get_world_info has what was recorded"
+            "reading the scene needs a command to a controller, and a --read-only server sends "
+            "none; webots_get_world_info has what was recorded"
         )
     name = await to_thread.run_sync(_find_supervisor, recording, robot)
     given = {key: value for key, value in params.items() if value is not None}
@@ -70,20 +70,20 @@ def _find_supervisor(recording: Recording, robot: str | None) -> str:
         session = look(connection, robot).session if robot is not None else None
         found = _supervisors(connection, session)
         if not found:
-            look(connection, robot)  # which says how to record, where nothing was
+            look(connection, robot)  # raises where nothing is recorded, and says how to record
             where = "this simulation" if robot is None else f"the simulation of robot {robot!r}"
-            raise CommandRefusedError(_NOBODY.format(where))
+            raise CommandRefusedError(_NO_SUPERVISOR.format(where))
         if len({each.session.instance for each in found}) > 1:
             listed = ", ".join(repr(each.name) for each in found)
             raise AmbiguousRobotError(
-                f"Supervisors of several simulations are live: {listed}; say in whose simulation, "
-                "with robot=..."
+                f"Supervisors of several simulations are live: {listed}; choose a simulation with "
+                "robot=..."
             )
         return _best(connection, found, robot).name
 
 
 def _supervisors(connection: sqlite3.Connection, session: Session | None) -> list[_Supervisor]:
-    """Those that live, of one simulation or (without a session) of any."""
+    """The live Supervisors of the session's simulation, or without a session of any."""
     robots = list_robots(connection, time.time())
     return [
         _Supervisor(each.name, each.kind, each.session)
@@ -96,9 +96,10 @@ def _supervisors(connection: sqlite3.Connection, session: Session | None) -> lis
 def _best(
     connection: sqlite3.Connection, found: list[_Supervisor], robot: str | None
 ) -> _Supervisor:
-    """Who holds the simulation, as no other loop turns then; else the one that is named; and so on.
+    """The Supervisor to ask: the one that has paused the simulation, as no other loop runs then.
 
-    The others are an observer, which nothing else keeps busy, and the one that came first.
+    Else one with a fresh heartbeat, the named one, an observer (which has no other work), or the
+    first, in this order.
     """
     now_s = time.time()
     holder = find_holder(connection, found[0].session, now_s)

@@ -1,4 +1,4 @@
-"""Which part of a published state is sensor values."""
+"""Finding the sensor values in a published state."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 from typing import Any, Final, cast
 
-# Webots device classes that sense nothing.
+# Webots device classes that are not sensors.
 _NO_SENSORS: Final = (
     "Brake", "Connector", "Display", "Emitter", "LED", "LinearMotor", "Motor", "Muscle", "Pen",
     "Propeller", "RotationalMotor", "Skin", "Speaker", "Track", "VacuumGripper",
@@ -22,20 +22,20 @@ _WORD: Final = re.compile(r"[^\W\d_]+|\d+")
 
 
 def sensor_part(state: dict[str, Any], devices: dict[str, str]) -> dict[str, Any]:
-    """The members of a state that are named after a sensor of the robot, or like one."""
+    """The members of a state that have the name of a sensor of the robot, or a sensor's word."""
     sensors = _sensor_devices(devices)
-    return {key: state[key] for key in state if key in sensors or _sounds_like_a_sensor(key)}
+    return {key: state[key] for key in state if key in sensors or _has_sensor_word(key)}
 
 
 def _sensor_devices(devices: dict[str, str]) -> dict[str, str]:
-    """The devices that sense: name to class."""
+    """The devices that are sensors: name to class."""
     return {name: kind for name, kind in devices.items() if kind not in _NO_SENSORS}
 
 
 def unnamed_devices(state: dict[str, Any], devices: dict[str, str]) -> dict[str, str]:
     """The sensor devices whose name is in no name of the published values.
 
-    The words of a name may stand anywhere: `front left`, `left_front` and `ds0` are in
+    The words of a name may be anywhere in a path: `front left`, `left_front` and `ds0` match
     `front: {left: 1}` and `ds: [1]`.
     """
     published = [_words(path) for path in _paths(state)]
@@ -46,12 +46,12 @@ def unnamed_devices(state: dict[str, Any], devices: dict[str, str]) -> dict[str,
     }
 
 
-def _sounds_like_a_sensor(key: str) -> bool:
+def _has_sensor_word(key: str) -> bool:
     return any(word in key.lower() for word in _WORDS)
 
 
 def _paths(value: Any, path: str = "") -> Iterator[str]:
-    """The name of each member, however deep, and of the first items of arrays."""
+    """The path of each member at any depth, and of the first items of arrays."""
     yield path
     if isinstance(value, dict):
         for key, member in cast("dict[str, Any]", value).items():

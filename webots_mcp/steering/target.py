@@ -1,4 +1,4 @@
-"""Whose controller is to run a command; refused at once where it is known that none could."""
+"""Finding the robot whose controller is to run a command, or refusing it where none could."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ def find_target(connection: sqlite3.Connection, robot: str | None, action: str) 
 
     Raises:
         InvalidInputError: There is no such robot or action, or several robots are possible.
-        CommandRefusedError: It cannot run it: no controller of it lives, it is no Supervisor, or
-            another robot holds the simulation.
-        NothingRecordedError: No robot was ever seen.
+        CommandRefusedError: It cannot run it: it has no live controller, it is not a Supervisor, or
+            another robot's bridge has paused the simulation.
+        NothingRecordedError: No robot was ever recorded.
     """
     if robot is None and _needs_supervisor(action):
         robot = _only_supervisor(connection)
@@ -58,9 +58,9 @@ def _only_supervisor(connection: sqlite3.Connection) -> str | None:
 
 
 def _require_action(view: View, action: str) -> None:
-    """Refuse what the controller does not know.
+    """Refuse an action that the controller does not know.
 
-    A controller that has registered nothing may look at what get_command() returns: it gets all.
+    Without registered actions nothing is refused: the loop may handle what get_command() returns.
     """
     known = list(view.session.actions) if view.session else []
     if not known or action in known or action in BUILT_IN_ACTIONS:
@@ -70,13 +70,13 @@ def _require_action(view: View, action: str) -> None:
     near = near or difflib.get_close_matches(action, possible, n=3, cutoff=0.5)
     offer = f"did you mean {' or '.join(map(repr, near))}? " if near else ""
     raise UnknownActionError(
-        f"robot {view.robot.name!r} has registered no action {action!r}; {offer}its actions are "
-        f"{known[:_SHOWN_ACTIONS]}, built in are {list(BUILT_IN_ACTIONS)}"
+        f"robot {view.robot.name!r} has registered no action {action!r}; {offer}its own actions "
+        f"are {known[:_SHOWN_ACTIONS]}, the built-in ones {list(BUILT_IN_ACTIONS)}"
     )
 
 
 def _require_live(view: View) -> Session:
-    """Its session; one that Webots reloads has a successor soon, which will run the command."""
+    """The robot's session; during a reload the old one, since its successor runs the command."""
     session = view.session
     if session is not None and (view.robot.live or _is_reloading(session, view.now_s)):
         return session
@@ -110,19 +110,19 @@ def _who_may(view: View, session: Session, action: str) -> str:
 
 
 def _ended_supervisors(view: View, session: Session) -> list[str]:
-    """Robots that were last seen as a Supervisor of the same simulation, and are not alive."""
+    """Former Supervisors of the same simulation whose controller has ended."""
     robots = [each for each in list_robots(view.connection, view.now_s) if not each.live]
     seen = [(each.name, each.session) for each in robots if each.session is not None]
     return [name for name, it in seen if it.supervisor and it.instance == session.instance]
 
 
 def _require_free(view: View, session: Session, action: str) -> None:
-    """A loop whose simulation another robot holds does not come round until that lets go."""
+    """Refuse while another robot's bridge has paused the simulation: this loop cannot run then."""
     holder = find_holder(view.connection, session, view.now_s)
     if holder is None or holder.id == session.id:
         return
     name = robot_name(view.connection, holder.robot_id)
     raise CommandRefusedError(
-        f"robot {view.robot.name!r} cannot run {action!r} now: robot {name!r} holds their "
-        f"simulation; resume or step it there first (robot={name!r})"
+        f"robot {view.robot.name!r} cannot run {action!r} now: the bridge of robot {name!r} has "
+        f"paused their simulation; resume or step it there first (robot={name!r})"
     )

@@ -1,4 +1,4 @@
-"""Trial sets in a robot's simulation: what is refused, and what an answer says of one."""
+"""Trial sets in a robot's simulation: checks before one begins, and the facts of an answer."""
 
 from __future__ import annotations
 
@@ -56,9 +56,9 @@ _LONGEST_WHY: Final = 120
 _FIGURES: Final = ("score", "range", "scored", "pruned", "failed", "why", "runs")
 _MOST_NAMED_RUNS: Final = 5
 _STANDING_DEADLINE_S: Final = 1.0
-_MOVED_M: Final = 0.1  # and more: it went somewhere
-_STILL_M: Final = 0.01  # less: it stood
-_STILL_NOISES: Final = 4.0  # deviations of the position's noise that are no motion either
+_MOVED_M: Final = 0.1  # a robot that travelled as far has moved
+_STILL_M: Final = 0.01  # a robot that travelled less has stood still
+_STILL_NOISES: Final = 4.0  # standard deviations of the position's noise that are not motion
 _BEFORE: Final = (
     "SELECT id FROM run WHERE robot_id = ? AND id < ? "
     "ORDER BY start_reason = 'reset', id DESC LIMIT 5"
@@ -74,18 +74,19 @@ def begin_set(
     robot: str | None,
     **asked: Any,
 ) -> int:
-    """Enter a set of trials, once it is sure that they can be run; returns its id.
+    """Enter a set of trials, after checking that they can be run; returns its id.
 
     Args:
-        recording: Of the robot.
-        parameters: Sets of values, or a grid whose every combination is tried.
-        robot: Whose controller; None for the only live one.
+        recording: The recording of the robot.
+        parameters: Sets of values, or a grid of which every combination is tried.
+        robot: The robot's name; None for the only live one.
         asked: The other fields of a `TrialPlan`.
 
     Raises:
         InvalidInputError: The controller does not declare a parameter or not with such a value,
             a signal of the score or of `until` was never recorded, or the plan contradicts itself.
-        CommandRefusedError: Nobody alive could run them, or another set of the robot is not over.
+        CommandRefusedError: No live controller could run them, or another set of the robot is not
+            over.
     """
     sets = combinations(dict(parameters)) if isinstance(parameters, Mapping) else parameters
     require_possible(recording, robot, asked.get("until"), asked.get("for_s"), reset=True)
@@ -106,12 +107,12 @@ def planned_for_cluster(
     robot: str | None,
     **asked: Any,
 ) -> WorldPlan:
-    """A plan in the world of a robot's newest run, which need not go on.
+    """A plan in the world of a robot's newest run; the robot need not be live.
 
     Args:
-        recording: Of the robot.
+        recording: The recording of the robot.
         parameters: As in `begin_set`.
-        robot: None for the only one.
+        robot: The robot's name; None for the only one.
         asked: As in `begin_set`.
 
     Raises:
@@ -123,7 +124,7 @@ def planned_for_cluster(
         view = look(connection, robot)
         run = view.require_run()
         if run.world is None:
-            raise InvalidInputError(f"run {run.id} does not tell of which world file it is")
+            raise InvalidInputError(f"the world file of run {run.id} is not recorded")
         checked = _as_declared(declared_for(connection, view.robot.id), sets)
         plan = WorldPlan(world=run.world, parameters=checked, robot=view.robot.name, **asked)
         _require_scorable(connection, plan, view)
@@ -147,7 +148,7 @@ def _require_scorable(connection: sqlite3.Connection, plan: TrialPlan, view: Vie
 def _as_declared(
     declared: Mapping[str, Declared], sets: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
-    """The values as the parameters hold them."""
+    """The values in the types of the declared parameters."""
     require_known(list({name: None for values in sets for name in values}), list(declared))
     return [
         {name: declared[name].declaration.checked(value) for name, value in values.items()}
@@ -171,10 +172,10 @@ def names_world(plan: str) -> bool:
 
 
 def require_ours(recording: Recording, set_id: int) -> None:
-    """Refuse a set that nobody here can go on with.
+    """Refuse a set that this server cannot continue.
 
     Raises:
-        InvalidInputError: It is one, or there is no such set.
+        InvalidInputError: It cannot be continued here, or there is no such set.
     """
     with recording.reader() as connection:
         found = fetch_trial_set(connection, set_id)
@@ -182,24 +183,24 @@ def require_ours(recording: Recording, set_id: int) -> None:
             why = f"has simulators of its own: {_goes_on(found)}"
             raise InvalidInputError(
                 f"trial set {set_id} {why if names_world(found.plan) else _FROM_ELSEWHERE}; "
-                f'webots_list_runs(what="trials", trial_set={set_id}) tells of it'
+                f'webots_list_runs(what="trials", trial_set={set_id}) has its trials'
             )
 
 
 def _goes_on(found: TrialSet) -> str:
-    """How a set goes on whose trials have simulators of their own."""
+    """How to continue a set whose trials have simulators of their own."""
     scheduler = json.loads(found.plan).get(SCHEDULER)
     again = f"webots_run_trials(trial_set={found.id}, scheduler={scheduler or 'tcp://...'!r})"
     return f"{again} continues it" if scheduler else f"{_GOES_ON}, or {again} on a cluster"
 
 
 def go_on(recording: Recording, set_id: int) -> None:
-    """Have a set that stopped go on."""
+    """Let a stopped set continue."""
     _stop(recording, set_id, None)
 
 
 def cancel(recording: Recording, set_id: int) -> None:
-    """Have a set stop after its current trial."""
+    """Let a set stop after its current trial."""
     _stop(recording, set_id, CANCELLED)
 
 
@@ -208,37 +209,37 @@ def _stop(recording: Recording, set_id: int, reason: str | None) -> None:
         stop_trial_set(connection, set_id, reason)
 
 
-# -- what came of it --------------------------------------------------------------------------
+# -- answers ----------------------------------------------------------------------------------
 
 
-def told_of_set(recording: Recording, set_id: int | None) -> dict[str, Any]:
-    """What an answer says of a set, by default of the newest.
+def set_facts(recording: Recording, set_id: int | None) -> dict[str, Any]:
+    """The facts of an answer about a set, by default about the newest one.
 
     Raises:
         InvalidInputError: There is no such set.
         NothingRecordedError: There is no database.
     """
     with recording.reader() as connection:
-        return _told_of_set(connection, set_id)
+        return _set_facts(connection, set_id)
 
 
 @in_one_snapshot
-def _told_of_set(connection: sqlite3.Connection, set_id: int | None) -> dict[str, Any]:
+def _set_facts(connection: sqlite3.Connection, set_id: int | None) -> dict[str, Any]:
     number = find_trial_set(connection) if set_id is None else set_id
     if number is None:
         return {**header_of_only(connection), "hint": "no trials were begun: webots_run_trials"}
     found = fetch_trial_set(connection, number)
-    return {**_header(connection, found), **_told(connection, found)}
+    return {**_header(connection, found), **_facts(connection, found)}
 
 
 def _header(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
-    with suppress(NothingRecordedError):  # the trials are there all the same
+    with suppress(NothingRecordedError):  # the robot's rows may be gone while its trials remain
         if found.robot_id is not None:
             return look(connection, robot_name(connection, found.robot_id)).header()
     return header_of_only(connection)
 
 
-def _told(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
+def _facts(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
     trials, plan = trials_of(connection, found.id), json.loads(found.plan)
     best = best_of(plan)
     over = sum(each.is_over for each in trials)
@@ -272,7 +273,7 @@ def _told(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
 
 
 def _state(found: TrialSet, left: int, *, at_work: bool) -> tuple[str, str | None]:
-    """Whether it goes on, and what to do next."""
+    """The state of a set, and what to do next."""
     again = f"webots_run_trials(trial_set={found.id})"
     if at_work:
         if found.stop_reason:
@@ -280,16 +281,16 @@ def _state(found: TrialSet, left: int, *, at_work: bool) -> tuple[str, str | Non
         return "under way", f"{again} waits for it, with cancel=true it stops"
     why = f"stopped: {found.stop_reason}" if found.stop_reason else "left by a server that ended"
     if found.former_values is not None:
-        return why, f"{again} goes on and sets the parameters back"
+        return why, f"{again} continues it and restores the parameters"
     if not left:
         return "done", None
     if found.robot_id is None:
         return "left", _goes_on(found) if names_world(found.plan) else _FROM_ELSEWHERE
-    return why, f"{again} goes on with the {left} that are left"
+    return why, f"{again} continues with the {left} that are left"
 
 
 def _names(ranking: Ranking) -> list[str]:
-    """The parameters as columns beside those of the figures."""
+    """The parameters as columns, renamed where a column of figures has the same name."""
     names = dict.fromkeys(name for each in ranking.sets for name in each.parameters)
     return [f"parameter {name}" if name in _FIGURES else name for name in names]
 
@@ -325,7 +326,7 @@ def _row(ranked: Ranked, names: Sequence[str], runs: Sequence[int]) -> list[Any]
 def _standing(
     connection: sqlite3.Connection, found: TrialSet, trials: Sequence[Trial]
 ) -> list[str]:
-    """That a robot moved before its trials and stood still in all of them: they say nothing."""
+    """A note where a robot moved before its trials, but stood still in all of them."""
     runs = [each.run_id for each in trials if each.is_over and each.run_id is not None]
     if found.robot_id is None or not runs:
         return []
@@ -341,8 +342,8 @@ def _standing(
         way = way_of_run(connection, Subject(found.robot_id, robot, run_id), deadline)
         if way is not None and way.length_m >= max(_MOVED_M, _STILL_NOISES * way.noise_m):
             return [
-                f"the robot went {figure(way.length_m)} m in run {run_id}, before the trials, and "
-                f"stood still in all {stood} that were looked at: a reset does not do again what "
+                f"the robot travelled {figure(way.length_m)} m in run {run_id}, before the trials, "
+                f"but stood still in all {stood} that were checked: a reset does not repeat what "
                 "its controller does once, before its loop (docs/trials.md: motors after a reset)"
             ]
     return []
@@ -354,7 +355,7 @@ def _left_out(count: int) -> list[str]:
 
 
 def _gone(connection: sqlite3.Connection, trials: Sequence[Trial]) -> list[str]:
-    """Scores stay where rows do not."""
+    """A note on trials whose rows were purged: their scores remain."""
     asked = json.dumps([each.run_id for each in trials if each.run_id is not None])
     purged = {number for (number,) in connection.execute(_PURGED, (asked,)).fetchall()}
     deleted = [each.number for each in trials if each.score is not None and each.run_id is None]
@@ -364,7 +365,7 @@ def _gone(connection: sqlite3.Connection, trials: Sequence[Trial]) -> list[str]:
     listed = ", ".join(map(str, gone[:_MOST_NAMED_RUNS])) + (
         f" and {len(gone) - _MOST_NAMED_RUNS} more" if len(gone) > _MOST_NAMED_RUNS else ""
     )
-    return [f"rows of trial {listed} were purged since: the scores stay"]
+    return [f"rows of trial {listed} were purged since; the scores remain"]
 
 
 _PURGED: Final = (

@@ -1,8 +1,8 @@
 """Runs the trials of a set one after another in a robot's simulation, in a thread of the server.
 
-Whatever happened is in the database before the next step is taken, so that another server can go on
-where this one was killed: the command of a trial has a key by which it is found again, and is never
-sent twice.
+Each result is in the database before the next action, so that another server can continue where
+this one was killed: the command of a trial has a key by which it is found again, and is never sent
+twice.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from webots_mcp.store.trials import (
 from webots_mcp.trials.plan import TrialPlan, WorldPlan, stored_plan
 
 _LOOK_EVERY_S: Final = 0.02
-# So long that a controller that knows a reset only by its time having gone back notices the next.
+# Long enough that simulation time visibly goes back at the next reset, by which it is detected.
 _SOME_STEPS_S: Final = 0.2
 _SETTLE_EVERY_S: Final = 1.0
 _PATIENCE_S: Final = 5.0  # with a command that takes a round of the loop
@@ -61,22 +61,22 @@ _REACHED: Final = (
     ", last_sim_time_s)) FROM run WHERE id = ?"
 )
 _HANGS: Final = (
-    "the loop of robot {!r} does not come to bridge.get_command() any more: see what it waits for, "
-    "or start its controller again"
+    "the loop of robot {!r} does not call bridge.get_command() any more: check what it is waiting "
+    "for, or restart its controller"
 )
 
 _log = logging.getLogger(__name__)
 
 
 class _StopError(Exception):
-    """The server ends, or the call was cancelled; the set waits for another one."""
+    """The server ends, or the call was cancelled; another server can continue the set."""
 
 
 class TrialWorker(threading.Thread):
-    """Works on a set until it is over or something speaks against going on.
+    """Works on a set until it is over or cannot be continued.
 
     Args:
-        recording: Of the robot.
+        recording: The recording of the robot.
         set_id: The set.
 
     Raises:
@@ -95,12 +95,12 @@ class TrialWorker(threading.Thread):
         self._plan: TrialPlan = stored_plan(self._set.plan)
 
     def stop(self) -> None:
-        """End the trial that runs, which waits to be run again, and leave the set as it is."""
+        """End the running trial, which will be run again later, and leave the set as it is."""
         self._stopping.set()
         self.join(2 * _END_PATIENCE_S + 1)
 
     def run(self) -> None:
-        """Run what is left of the set, as long as it is ours."""
+        """Run the rest of the set, as long as this thread has the set's lease."""
         try:
             with self._job.renewed():
                 self._work()
@@ -116,17 +116,17 @@ class TrialWorker(threading.Thread):
         except _StopError:
             pass
         except WebotsMCPError as error:
-            self._say_why(str(error))
-        except Exception as error:  # noqa: BLE001  (no thread ends without a word)
+            self._record_stop(str(error))
+        except Exception as error:  # noqa: BLE001  (a thread must not end without a report)
             _log.exception("trial set %d failed", self.set_id)
-            self._say_why(f"a defect of webots-mcp ({type(error).__name__}: {error})")
+            self._record_stop(f"a defect of webots-mcp ({type(error).__name__}: {error})")
         finally:
             self._leave()
 
     # -- one trial -----------------------------------------------------------------------------
 
     def _next(self) -> Trial | None:
-        """What a killed server has begun comes first; a set that stops begins no other."""
+        """The next trial, first one that a killed server has begun; None where the set stops."""
         if self._stopping.is_set():
             raise _StopError
         with self._recording.reader() as connection:
@@ -165,7 +165,10 @@ class TrialWorker(threading.Thread):
             )
 
     def _asked(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """What runs a trial; a reset would leave a parameter as the trial before had it."""
+        """The parameters of a trial's `run` command.
+
+        They name every tried parameter, since a reset keeps the values of the trial before.
+        """
         asked = {
             "until": self._plan.until,
             "prune": self._plan.prune,
@@ -179,7 +182,7 @@ class TrialWorker(threading.Thread):
         return {name: value for name, value in asked.items() if value is not None}
 
     def _borrow(self, connection: sqlite3.Connection) -> View:
-        """The robot; what its parameters are is noted first, of each controller once."""
+        """The robot; the parameters' values are stored first, once for each of its sessions."""
         view = find_target(connection, self._robot, ACTION)
         noted = fetch_trial_set(connection, self.set_id)
         assert view.session is not None  # it is live
@@ -191,15 +194,15 @@ class TrialWorker(threading.Thread):
         return view
 
     def _watched(self, command: Command, timeout_s: float) -> Command:
-        """Wait until it is settled; a run that takes longer is ended."""
+        """Wait until the command is final; a run that takes longer is ended."""
         command = self._settled(command.id, timeout_s)
         if not command.is_final:
-            self._take_back(command)
+            self._cancel(command)
             command = self._settled(command.id, _PATIENCE_S)
         return command
 
     def _settled(self, command_id: int, timeout_s: float, *, hurried: bool = False) -> Command:
-        """The command, once its fate is settled or the time is over."""
+        """The command, once it is final or the time is over."""
         until_s, settle_s = time.monotonic() + timeout_s, time.monotonic() + _SETTLE_EVERY_S
         with self._recording.reader() as connection:
             while not (command := fetch_command(connection, command_id)).is_final:
@@ -212,53 +215,53 @@ class TrialWorker(threading.Thread):
                 if hurried:
                     time.sleep(_LOOK_EVERY_S)
                 elif self._stopping.wait(_LOOK_EVERY_S):
-                    self._take_back(command)
+                    self._cancel(command)
                     self._settled(command_id, _END_PATIENCE_S, hurried=True)
                     raise _StopError
         return command
 
-    def _take_back(self, command: Command) -> None:
-        """It does not run, or ends now."""
+    def _cancel(self, command: Command) -> None:
+        """Cancel a pending command, or end a running one."""
         with self._job.writer() as connection:
             queue = CommandQueue(connection)
             if not queue.cancel(command.id, "its trial was stopped"):
                 params = {"command_id": command.id}
                 queue.enqueue(command.robot_id, "cancel_run", params, requested_by=_ASKER)
 
-    # -- what came of it -----------------------------------------------------------------------
+    # -- results -------------------------------------------------------------------------------
 
     def _result(self, trial: Trial, command: Command) -> Result:
-        """What became of a trial.
+        """The result of a trial.
 
         Raises:
-            CommandRefusedError: Nobody ran it, or somebody else decides what the simulation does.
+            CommandRefusedError: No controller ran it, or another command interrupted it.
             InvalidInputError: No trial of the set can succeed.
         """
         if command.status in ("expired", "cancelled"):
             with self._recording.reader() as connection:
-                find_target(connection, self._robot, ACTION)  # tells why nobody ran it
+                find_target(connection, self._robot, ACTION)  # raises with the reason, if any
             raise CommandRefusedError(f"trial {trial.number} was not run: {command.error}")
         with self._recording.reader() as connection:
             run_id = connection.execute(_RUN_OF, (command.session_id, command.id)).fetchone()[0]
             if command.status != "done":
                 why = self._too_long if command.status == "claimed" else command.error
                 return Result(run_id, None, f"{_reached(connection, run_id)}: {why}")
-            told: Mapping[str, Any] = command.decoded_result() or {}
-            if told.get("ended") in _ENDS:
-                _require_untouched(connection, trial, run_id, told["sim_time_s"])
-                return self._scored(connection, run_id, told)
-            return Result(run_id, None, self._why_not(connection, trial, run_id, told))
+            answer: Mapping[str, Any] = command.decoded_result() or {}
+            if answer.get("ended") in _ENDS:
+                _require_untouched(connection, trial, run_id, answer["sim_time_s"])
+                return self._scored(connection, run_id, answer)
+            return Result(run_id, None, self._why_not(connection, trial, run_id, answer))
 
     def _why_not(
         self,
         connection: sqlite3.Connection,
         trial: Trial,
         run_id: int | None,
-        told: Mapping[str, Any],
+        answer: Mapping[str, Any],
     ) -> str:
         """Why a run ended without having reached its end."""
-        why = str(told.get("why") or told.get("ended"))
-        if told.get("ended") == "interrupted":
+        why = str(answer.get("why") or answer.get("ended"))
+        if answer.get("ended") == "interrupted":
             if "cancelled" not in why:
                 raise CommandRefusedError(f"trial {trial.number} was interrupted: {why}")
             why = self._too_long
@@ -269,11 +272,11 @@ class TrialWorker(threading.Thread):
         return f"it took longer than {self._plan.timeout_s:g} s of wall time"
 
     def _scored(
-        self, connection: sqlite3.Connection, run_id: int, told: Mapping[str, Any]
+        self, connection: sqlite3.Connection, run_id: int, answer: Mapping[str, Any]
     ) -> Result:
-        end_s = told["sim_time_s"]
-        ended = (_ENDS[told["ended"]], end_s)
-        if told["ended"] == "pruned":
+        end_s = answer["sim_time_s"]
+        ended = (_ENDS[answer["ended"]], end_s)
+        if answer["ended"] == "pruned":
             why = f"{self._plan.prune!r} held at {end_s:.3f} s"
             return Result(run_id, None, why, *ended, pruned=True)
         try:
@@ -286,25 +289,25 @@ class TrialWorker(threading.Thread):
 
     # -- at the end ----------------------------------------------------------------------------
 
-    def _say_why(self, reason: str) -> None:
-        """Why the set does not go on; what was said first counts."""
+    def _record_stop(self, reason: str) -> None:
+        """Store why the set stops, unless a reason is stored already."""
         with self._job.writer() as connection:
             if fetch_trial_set(connection, self.set_id).stop_reason is None:
                 stop_trial_set(connection, self.set_id, reason)
 
     def _leave(self) -> None:
-        """Set the parameters back, and let others work on the set."""
+        """Restore the parameters, and release the set for other servers."""
         try:
             self._give_back()
         except LeaseLostError:
             raise
         except WebotsMCPError as error:
-            _log.warning("trial set %d: the parameters were not set back: %s", self.set_id, error)
+            _log.warning("trial set %d: the parameters were not restored: %s", self.set_id, error)
         with self._job.writer() as connection:
             lay_down(connection, self.set_id, self._job.lease)
 
     def _give_back(self) -> None:
-        """A controller that has ended has no values any more."""
+        """Restore the parameters of a live controller; one that has ended needs nothing."""
         with self._job.writer() as connection:
             noted = fetch_trial_set(connection, self.set_id)
             if noted.former_values is None:
@@ -318,15 +321,17 @@ class TrialWorker(threading.Thread):
             with self._job.writer() as connection:
                 borrow_parameters(connection, self.set_id, noted.session_id, None)
         else:
-            self._say_why(f"its parameters were not set back: {command.error or command.status}")
+            self._record_stop(
+                f"its parameters were not restored: {command.error or command.status}"
+            )
 
     def _ask_back(self, connection: sqlite3.Connection, noted: TrialSet) -> Command | None:
-        """The command that sets the parameters back; None where there is nothing, or nobody."""
+        """The command that restores the parameters; None without any, or without its controller."""
         assert noted.robot_id is not None and noted.former_values is not None
         former = json.loads(noted.former_values)
         if noted.stop_reason is None and not self._stopping.is_set():
             action, params = ACTION, _new_run_with(former)
-        elif former:  # somebody looks at what the trial left: no reset
+        elif former:  # no reset: a person may want to see the state that the trial left
             action, params = _SET_PARAMETERS, {"values": former, "when": "now", "by": "trial"}
         else:
             return None
@@ -340,12 +345,12 @@ class TrialWorker(threading.Thread):
 
 
 class SetWorker(Protocol):
-    """A thread that works on a trial set, here or by other machines."""
+    """A thread that works on a trial set, here or on other machines."""
 
     set_id: int
 
     def is_alive(self) -> bool:
-        """Whether it still does."""
+        """Whether it is still working."""
         ...
 
     def stop(self) -> None:
@@ -354,10 +359,10 @@ class SetWorker(Protocol):
 
 
 class TrialWorkers:
-    """Those of a server.
+    """The workers of a server.
 
     Args:
-        recording: Of the robots.
+        recording: The recording of the robots.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -368,7 +373,7 @@ class TrialWorkers:
         """Work on a set.
 
         Raises:
-            CommandRefusedError: Another process does.
+            CommandRefusedError: Another process works on it.
         """
         worker = TrialWorker(self._recording, set_id)
         worker.start()
@@ -385,9 +390,9 @@ class TrialWorkers:
         """Work on a set whose trials have simulators of their own; returns its id.
 
         Args:
-            scheduler: The address of Dask's.
-            plan: Of the trials.
-            enter: Gives the set's id, once it is sure that its trials can be run.
+            scheduler: The address of the Dask scheduler.
+            plan: The plan of the trials.
+            enter: Enters the set and returns its id; called once its trials can be run.
             is_stand_in: They run on the stand-in.
 
         Raises:
@@ -409,34 +414,34 @@ class TrialWorkers:
                 worker.stop()
 
     def stop(self) -> None:
-        """The server ends."""
+        """Stop all workers, since the server ends."""
         for worker in self._workers:
             worker.stop()
 
 
 def _new_run_with(values: Mapping[str, Any]) -> dict[str, Any]:
-    """What begins another run than that of the last trial, which would else go on with it."""
+    """The `run` parameters that begin a new run, so that the last trial's run does not continue."""
     asked = {"for_s": _SOME_STEPS_S, "reset": True, "pace": "fast", "then": "pause"}
     return {**asked, "parameters": values, "by": "trial"}
 
 
 def _key(trial: Trial) -> str:
-    """Of the command of a trial that was begun at that time."""
+    """The idempotency key of a trial's command; a trial that is begun again has another one."""
     return f"trial {trial.uuid} {trial.started_wall_time_s}"
 
 
 def _value(parameter: Mapping[str, Any]) -> Any:
-    """Its value; before the first was recorded, what the code declares."""
+    """A parameter's value; before the first is recorded, the declared default."""
     return parameter["default"] if parameter["value"] is None else parameter["value"]
 
 
 def _require_untouched(
     connection: sqlite3.Connection, trial: Trial, run_id: int, end_s: float
 ) -> None:
-    """A score of other values than those of the trial would be ranked as theirs.
+    """Refuse a trial whose parameters a command changed, since its score would be misattributed.
 
     Raises:
-        CommandRefusedError: Somebody set a parameter before the trial was over.
+        CommandRefusedError: A parameter was set before the trial was over.
     """
     for name, parameter in parameters_of(connection, [run_id])[run_id].items():
         for later in parameter.settings[1:]:
@@ -451,4 +456,4 @@ def _reached(connection: sqlite3.Connection, run_id: int | None) -> str:
     if run_id is None:
         return "its run did not start"
     reached_s = connection.execute(_REACHED, (run_id,)).fetchone()[0]
-    return f"never reached its end, but {reached_s:.3f} s"
+    return f"did not reach its end, only {reached_s:.3f} s"

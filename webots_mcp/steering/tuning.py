@@ -33,15 +33,15 @@ async def set_parameters(
 
     Args:
         recording: Where the robot records.
-        report: Is told how long it has waited.
-        values: By name.
+        report: Called with the time that it has waited.
+        values: The values by name.
         when: Now, or from the next reset of the world on.
-        robot: Whose; None for the only live robot's.
-        timeout_s: How long to wait, in wall time.
+        robot: The robot's name; None for the only live robot.
+        timeout_s: How long to wait, in wall seconds.
 
     Raises:
-        InvalidInputError: A name is unknown, or a value out of bounds or of another type.
-        CommandRefusedError: Nobody alive could set them.
+        InvalidInputError: A name is unknown, or a value is out of bounds or of another type.
+        CommandRefusedError: No live controller could set them.
         NothingRecordedError: There is no robot.
     """
     declared = await to_thread.run_sync(settable, recording, robot)
@@ -53,7 +53,7 @@ async def set_parameters(
 
 
 def settable(recording: Recording, robot: str | None) -> dict[str, Declared]:
-    """The parameters that a living controller declares.
+    """The parameters that a live controller declares.
 
     Raises:
         InvalidInputError, CommandRefusedError, NothingRecordedError: As `set_parameters`.

@@ -1,4 +1,4 @@
-"""A window of wall time: the rows that were recorded in it, and how far the robot went."""
+"""A window of wall time: the rows that were recorded in it, and the distance travelled."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from webots_mcp.store.signals.catalogue import known_signals
 
 @dataclass(frozen=True)
 class Window:
-    """What was recorded from a moment on.
+    """The recording since a moment.
 
     Attributes:
-        rows: Where there are rows; without segments if there are none.
-        around: The same with the time from the row before on and with what came after the last
-            row: a pause or a log line stands between rows.
+        rows: The time range of the rows; without segments if there are none.
+        around: The same range, extended to the row before and to everything after the last row,
+            since a pause or a log line lies between rows.
     """
 
     rows: TimeRange
@@ -56,7 +56,7 @@ def _from_row_before(connection: sqlite3.Connection, segment: Segment) -> float:
 
 
 def _standing(view: View, wall_start_s: float) -> Segment:
-    """The current run at its newest row, of which only what came in the window counts."""
+    """The current run from its newest row on, limited to what was recorded in the window."""
     run = view.require_run()
     newest_s = view.state.sim_time_s if view.state else run.started_sim_time_s
     return Segment(run.id, newest_s, math.inf, wall_start_s)
@@ -65,10 +65,10 @@ def _standing(view: View, wall_start_s: float) -> Segment:
 def movement(
     view: View, found: TimeRange, deadline_s: float = QUESTION_DEADLINE_S
 ) -> dict[str, Any] | None:
-    """Distance along the way and displacement, in metres; None without a position.
+    """Distance along the path and displacement, in metres; None without a position.
 
-    Over several runs they are told run by run: the jump to the start at a reset was not travelled.
-    Where reading took longer than the deadline, it is said from when on rows are missing.
+    Several runs are reported one by one: the jump to the start at a reset was not travelled. Where
+    reading took longer than the deadline, the answer has the time since which rows are missing.
     """
     known = known_signals(view.connection, found)
     position = find_motion(known, EventOptions()).position
@@ -82,11 +82,11 @@ def movement(
         way = read_way(view.connection, segment, position, deadline)
         times, is_cut = way.columns.times, way.columns.cut
         missing = {"rows_missing_from_s": seconds((times or [segment.start_s])[-1])}
-        if told := (_told(way) or {}) | (missing if is_cut else {}):
-            ways[segment.run_id] = told
+        if facts := (_distances(way) or {}) | (missing if is_cut else {}):
+            ways[segment.run_id] = facts
             took_s = times[-1] - times[0] if times else 0.0
-            went_m: float = told.get("distance_m") or 0.0
-            speeds_m_s.append(went_m / took_s if took_s else 0.0)
+            travelled_m: float = facts.get("distance_m") or 0.0
+            speeds_m_s.append(travelled_m / took_s if took_s else 0.0)
     if doubt := doubt_of_unit(position, max(speeds_m_s, default=0.0)):
         names |= {"unit": doubt}
     if len(ways) > 1:
@@ -94,8 +94,8 @@ def movement(
     return next((names | way for way in ways.values()), None)
 
 
-def _told(way: Way) -> dict[str, Any] | None:
-    """From where to where it went in one run; a lost position is no place."""
+def _distances(way: Way) -> dict[str, Any] | None:
+    """Start, end, distance and displacement in one run, without invalid positions."""
     times, x, y = places_of(way.columns, way.position)
     if len(times) < 2:
         return None

@@ -16,7 +16,7 @@ from webots_mcp.launch import Launch, SessionStart, newest_in, starts_since
 from webots_mcp.questions.answers import CommandAnswer
 from webots_mcp.steering.launcher import Launcher
 from webots_mcp.steering.request import CLAIMING_S, LEAST_S, UNCLAIMED, Request
-from webots_mcp.steering.routes import Situation, look_around, webots_meant, why_no_word
+from webots_mcp.steering.routes import Situation, assess, find_webots, why_no_reply
 from webots_mcp.webots.instances import instance_at
 from webots_mcp.webots.stream import ANSWER_S, WebotsAddress, address_of, load_world
 
@@ -26,9 +26,9 @@ _NONE_IS_OURS: Final = "no Webots that was started by this server runs"
 _OURS_IS_ANOTHER: Final = (
     "this robot is not in the Webots that was started by this server (without robot it is ended)"
 )
-_NOBODY_YET: Final = (
+_NOT_RECORDED_YET: Final = (
     "no controller has recorded in it yet: its robots may have no bridge, or the simulation is "
-    "paused; webots_get_logs and webots_diagnose tell more"
+    "paused; check webots_get_logs and webots_diagnose"
 )
 
 
@@ -43,57 +43,57 @@ class WorldRequest(Request):
 
         Raises:
             InvalidInputError: There is no such robot, or several are possible.
-            CommandRefusedError: No way works; each is named with the reason.
+            CommandRefusedError: No route works; each is named with the reason.
         """
-        situation = await self._look_around("load_world")
+        situation = await self._assess("load_world")
         before = await to_thread.run_sync(newest_in, self.recording)
         answer = await self._by_controller(situation, "load_world", {"world": str(world)})
         if answer is not None and answer.outcome != "done":
             return answer
-        said = "its controller has ended"
+        evidence = "its controller has ended"
         if answer is None:
-            said = await self._by_websocket(situation, world)
+            evidence = await self._by_websocket(situation, world)
         answer = answer or CommandAnswer(action="load_world", outcome="done", route="websocket")
-        return await self._proven(answer, situation, said, world, before)
+        return await self._proven(answer, situation, evidence, world, before)
 
     async def quit(self) -> CommandAnswer:
         """End Webots.
 
         Raises:
             InvalidInputError: There is no such robot, or several are possible.
-            CommandRefusedError: It is not ours, and no controller can be asked.
+            CommandRefusedError: This server has not started it, and no controller can be asked.
         """
         ours = self.launcher.running
         if ours is not None and await self._is_meant(ours):
             await to_thread.run_sync(self.launcher.stop)
             proof = f"its processes have ended, exit code {ours.webots.exit_code}"
             return self._answer("quit", "process", proof)
-        situation = await self._look_around("quit")
+        situation = await self._assess("quit")
         answer = await self._by_controller(situation, "quit", {})
         if answer is None:
             raise CommandRefusedError(
                 f"{_OURS_IS_ANOTHER if ours else _NONE_IS_OURS}, and no controller can be asked to "
-                f"end another. {self._told()}. Close its window (Ctrl+Q)"
+                f"end another. {self._failed_routes()}. Close its window (Ctrl+Q)"
             )
         if answer.outcome == "done":
             answer.proof = await self._gone(situation.address)
         return answer
 
     async def _is_meant(self, ours: Launch) -> bool:
-        """Whether the Webots of this server is the one of the robot, where one is named."""
+        """Whether the Webots of this server is that of the robot, where a robot is named."""
         if self.robot is None:
             return True
-        situation = await self._look_around("quit")
+        situation = await self._assess("quit")
         address = await to_thread.run_sync(ours.webots.address_now)
         return situation.is_there and situation.address == address
 
-    async def _look_around(self, action: str) -> Situation:
-        return await to_thread.run_sync(look_around, self.recording, self.robot, action)
+    async def _assess(self, action: str) -> Situation:
+        return await to_thread.run_sync(assess, self.recording, self.robot, action)
 
     async def _by_controller(
         self, situation: Situation, action: str, params: dict[str, Any]
     ) -> CommandAnswer | None:
-        """What the robot's controller made of it, or the observer; None where neither took it."""
+        """The answer of the robot's controller or the observer; None where neither claimed it."""
         if situation.silent is None:
             answer = await self._taken("bridge", self.robot, action, params)
             if answer is not None:
@@ -115,36 +115,41 @@ class WorldRequest(Request):
         return answer
 
     async def _by_websocket(self, situation: Situation, world: Path) -> str:
-        """Webots' own word.
+        """Ask Webots over its WebSocket; returns its reply.
 
         Raises:
-            CommandRefusedError: It cannot be asked so, or does not obey.
+            CommandRefusedError: It cannot be asked this way, or does not obey.
         """
         try:
             address = await to_thread.run_sync(self._address, situation)
-            await to_thread.run_sync(self._require_beside, situation, address, world)
+            await to_thread.run_sync(self._require_same_folder, situation, address, world)
             reply = await to_thread.run_sync(load_world, address, world.name, ANSWER_S)
-            if reply.heard is None:
-                raise CommandRefusedError(await to_thread.run_sync(why_no_word, address, reply))
+            if reply.text is None:
+                raise CommandRefusedError(await to_thread.run_sync(why_no_reply, address, reply))
         except CommandRefusedError as error:
             self.tried["websocket"] = str(error)
             raise CommandRefusedError(
-                f"no way to open {world.name} works. {self._told()}. Open it in Webots (File, Open "
-                "World); or end Webots and start it with that world (webots_launch_world "
-                "quits it, and launches one with stream=true for the next time)"
+                f"no route to open {world.name} works. {self._failed_routes()}. Open it in Webots "
+                "(File, Open World), or end Webots and start it with that world "
+                "(webots_launch_world can quit it, and launch one with stream=true)"
             ) from error
-        return f"Webots said {reply.heard!r}"
+        return f"Webots replied {reply.text!r}"
 
-    def _require_beside(self, situation: Situation, address: WebotsAddress, world: Path) -> None:
-        """Webots looks for it in the folder of the present world, and there alone."""
-        present = self._present_world(situation, address)
-        if present is None or present.parent != world.parent:
-            folder = present.parent if present else "which is not known"
+    def _require_same_folder(
+        self, situation: Situation, address: WebotsAddress, world: Path
+    ) -> None:
+        """Refuse a world of another folder: Webots looks for it next to the current world only."""
+        current = self._current_world(situation, address)
+        if current is None:
             raise CommandRefusedError(
-                f"Webots opens only worlds of the folder of the present one, {folder}"
+                "Webots opens only worlds in the folder of the current one, which is not known"
+            )
+        if current.parent != world.parent:
+            raise CommandRefusedError(
+                f"Webots opens only worlds in the folder of the current one, {current.parent}"
             )
 
-    def _present_world(self, situation: Situation, address: WebotsAddress) -> Path | None:
+    def _current_world(self, situation: Situation, address: WebotsAddress) -> Path | None:
         if situation.robot is not None:
             with self.recording.view(situation.robot) as view:
                 known = view.run.world if view.run else None
@@ -156,25 +161,25 @@ class WorldRequest(Request):
         return Path(known).resolve() if known else None
 
     def _address(self, situation: Situation) -> WebotsAddress:
-        """Of the robot's Webots, else of that which this server has started, else of the only one.
+        """The address of the robot's Webots, else of this server's, else of the only one.
 
         Raises:
-            CommandRefusedError: It is not known which one is meant, or it is not of this project.
+            CommandRefusedError: There are several, or the only one is not of this project.
         """
         ours = self.launcher.running
         started = ours.webots.address if ours and not situation.is_there else None
-        return started or webots_meant(self.recording, situation)
+        return started or find_webots(self.recording, situation)
 
     async def _proven(
-        self, answer: CommandAnswer, situation: Situation, said: str, world: Path, before: int
+        self, answer: CommandAnswer, situation: Situation, evidence: str, world: Path, before: int
     ) -> CommandAnswer:
-        """The answer with the run that began in the world, or what else there is to say."""
+        """The answer with the run that began in the world, or with a hint why none has."""
         begun = await self._wait(lambda: self._begun_in(situation, world, before))
         if begun is None:
-            answer.proof, answer.hint = said, _NOBODY_YET
+            answer.proof, answer.hint = evidence, _NOT_RECORDED_YET
         else:
             answer = answer.model_copy(update=await to_thread.run_sync(self._header, begun.robot))
-            answer.proof = f"{said}; run {begun.run_id} of {begun.robot} began in {world.name}"
+            answer.proof = f"{evidence}; run {begun.run_id} of {begun.robot} began in {world.name}"
         if self.launcher.running is not None:
             self.launcher.running.world = world
         answer.waited_s = self._waited_s
@@ -195,7 +200,7 @@ class WorldRequest(Request):
             await anyio.sleep(_POLL_S)
 
     async def _gone(self, address: WebotsAddress | None) -> str:
-        """What shows that Webots has ended."""
+        """The evidence that Webots has ended."""
         if address is None:
             return "its controller has ended"
         until_s = time.monotonic() + _GONE_S

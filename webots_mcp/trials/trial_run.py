@@ -240,7 +240,7 @@ def _concluded(attempt: TrialAttempt, watch: TrialWatch, end: End | None, why: s
             return _scored(connection, attempt.plan, attempt.values, watch, end)
         why = _ending_line(connection, watch.run_id) or why
     reached = "nothing" if watch.reached_s is None else f"{watch.reached_s:.3f} s"
-    return Result(watch.run_id, None, f"never reached its end, but {reached}: {why}")
+    return Result(watch.run_id, None, f"did not reach its end, only {reached}: {why}")
 
 
 def _ending_line(connection: sqlite3.Connection, run_id: int | None) -> str | None:

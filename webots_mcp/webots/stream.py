@@ -82,12 +82,12 @@ class OrderReply(NamedTuple):
     """What came of an order.
 
     Attributes:
-        heard: Webots' own words; None where it said nothing.
+        text: Webots' own words; None where it did not reply.
         is_alive: Whether its main thread answered at all, so that it is not busy.
         other: What it said instead, which only one that obeys orders does.
     """
 
-    heard: str | None
+    text: str | None
     is_alive: bool
     other: str | None = None
 

@@ -88,7 +88,7 @@ async def test_a_trial_without_a_score_or_an_end_failed_and_is_not_zero(
         )
         (row,) = rows_of(late["ranked"])
         assert row["failed"] == 1
-        assert row["why"].startswith("never reached its end, but ")
+        assert row["why"].startswith("did not reach its end, only ")
         assert "longer than 0.05 s" in row["why"]
 
 
@@ -99,8 +99,8 @@ async def test_a_loop_that_hangs_fails_its_trial_with_the_time_that_it_reached(
     async with connect() as client:
         answer = await trials(client, parameters={"kp": [HANGS_AT]}, trial_timeout_s=1)
         (row,) = rows_of(answer["ranked"])
-        assert row["why"].startswith("never reached its end, but 0.112 s: it took longer than 1 s")
-        assert "does not come to bridge.get_command() any more" in answer["state"]
+        assert row["why"].startswith("did not reach its end, only 0.112 s: it took longer than 1 s")
+        assert "does not call bridge.get_command() any more" in answer["state"]
 
 
 async def test_a_pause_by_somebody_else_stops_the_set_and_it_can_go_on(
@@ -116,7 +116,7 @@ async def test_a_pause_by_somebody_else_stops_the_set_and_it_can_go_on(
                 await anyio.sleep(0.02)
         assert told["state"].startswith("stopped: trial 1 was interrupted")
         assert told["over"] == 0
-        assert f"webots_run_trials(trial_set={first['trial_set']}) goes on" in told["hint"]
+        assert f"webots_run_trials(trial_set={first['trial_set']}) continues" in told["hint"]
         assert await value_of(client, "kp") == 2.0
 
 
@@ -151,4 +151,4 @@ async def test_rows_that_were_purged_leave_the_score_and_the_answer_says_so(
             connection.execute("DELETE FROM run WHERE id = ?", row["runs"][1:])
         told = await ask(client, "webots_get_trials")
         assert rows_of(told["ranked"])[0]["score"] == row["score"]
-        assert told["notes"] == ["rows of trial 1, 2 were purged since: the scores stay"]
+        assert told["notes"] == ["rows of trial 1, 2 were purged since; the scores remain"]

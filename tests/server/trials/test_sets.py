@@ -204,7 +204,7 @@ async def test_trials_of_a_robot_that_only_moved_before_them_say_so_before_they_
     driving.stop()
     assert answer["verdict"] == "all 2 scores are 0: no tried value changed the score"
     (note,) = answer["notes"]
-    assert "in run 1, before the trials, and stood still in all 2" in note
+    assert "in run 1, before the trials, but stood still in all 2" in note
     assert list(answer).index("notes") < list(answer).index("ranked")
 
 

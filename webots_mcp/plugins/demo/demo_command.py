@@ -12,7 +12,8 @@ from webots_mcp.cli.recordings import Json
 def demo(
     *,
     data_dir: Annotated[
-        str | None, Parameter("--data-dir", help="Where to record (~/.webots-mcp/demo).")
+        str | None,
+        Parameter("--data-dir", metavar="DIR", help="Where to record (~/.webots-mcp/demo)."),
     ] = None,
     keep: Annotated[
         bool, Parameter("--keep", help="Leave the robot running until Ctrl-C.")

@@ -20,7 +20,11 @@ def report(
     ],
     output: Annotated[
         str | None,
-        Parameter(("--output", "-o"), help="A .html file; else run-RUN.html in this folder."),
+        Parameter(
+            ("--output", "-o"),
+            metavar="FILE",
+            help="A .html file; else run-RUN.html in this folder.",
+        ),
     ] = None,
     overwrite: Annotated[
         bool, Parameter("--overwrite", help="Also if it is there already.")
@@ -29,11 +33,13 @@ def report(
         list[str] | None,
         Parameter(
             "--signal",
+            metavar="NAME",
             help="Draw this signal, with '*'; may be repeated. Else those that changed most.",
         ),
     ] = None,
     max_mb: Annotated[
-        float, Parameter("--max-mb", help="How large the file may become, 2 to 100 (10).")
+        float,
+        Parameter("--max-mb", metavar="MB", help="How large the file may become, 2 to 100 (10)."),
     ] = 10.0,
     robot: Robot = None,
     as_json: Json = False,

@@ -18,7 +18,7 @@ from webots_mcp.store.run_rows import State, newest_state, real_time_factor, sel
 
 def recorded_state(published: dict[str, Any]) -> State:
     encoded = encode(published)
-    return State(1, 1, 0.0, 0.0, encoded.text, encoded.odd_text)
+    return State(1, 1, 0.0, 0.0, encoded.text, encoded.replaced_text)
 
 
 def test_the_newest_state_of_a_run_is_found(recorded: Recorded) -> None:

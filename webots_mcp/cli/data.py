@@ -163,7 +163,8 @@ def _export_for_viewers(recorded: Where, part: Range, file: Path, form: str) -> 
         written = export_for_viewers(connection, data_dir, wanted, form, file, progress)
     counts = {kind: count for kind, count in written.counts.items() if count}
     text = ", ".join(f"{count} {kind}" for kind, count in counts.items())
-    data: dict[str, Any] = {"counts": counts}
+    by_kind = {kind.replace(" ", "_"): count for kind, count in counts.items()}
+    data: dict[str, Any] = {"counts": by_kind}
     if written.beside:
         text, data["beside"] = f"{text}; {written.beside}", written.beside
     return _Written(file, text, data, tuple(wanted.notes))

@@ -45,7 +45,7 @@ def recorded_run() -> Generator[Recorder]:
 def publish(recorder: Recorder, time_s: float, state: dict[str, Any]) -> None:
     """As the bridge does, with whatever the state holds."""
     encoded = encode(state)
-    recorder.insert("state", **recorder.at(time_s), data=encoded.text, odd=encoded.odd_text)
+    recorder.insert("state", **recorder.at(time_s), data=encoded.text, odd=encoded.replaced_text)
 
 
 def exported(connection: sqlite3.Connection, form: str, **wanted: Any) -> bytes:

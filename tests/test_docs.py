@@ -18,7 +18,7 @@ from webots_mcp.cli import names
 from webots_mcp.connection import OLDEST_SQLITE
 from webots_mcp.contract import BUILT_IN_ACTIONS, KEEP_AFTER_S
 from webots_mcp.questions.argument_types import MAX_WAIT_S
-from webots_mcp.questions.budget import LARGE_BUDGET
+from webots_mcp.questions.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS
 from webots_mcp.schema import SCHEMA_FILE
 from webots_mcp.server import create_server
 
@@ -71,7 +71,9 @@ def test_the_page_of_the_bridge_names_every_action_that_is_built_in_and_no_other
         ("bridge.md", f"how many and the nearest {WORDS[MOST_OBJECTS]}"),
         ("bridge.md", f"keeps the last seconds, and {WORDS[KEEP_AFTER_S]} more"),
         ("limits.md", f"No tool waits longer than {MAX_WAIT_S} s"),
-        ("limits.md", f"up to {LARGE_BUDGET:,} characters"),
+        ("limits.md", f"under {ANSWER_TOKENS:,} tokens"),
+        ("limits.md", f"up to {LARGE_ANSWER_TOKENS:,}"),
+        ("tools.md", f"up to {LARGE_ANSWER_TOKENS:,} tokens"),
         ("limits.md", f"SQLite {OLDEST_SQLITE[0]}.{OLDEST_SQLITE[1]} or newer is needed"),
     ],
 )

@@ -1,6 +1,6 @@
 """How long the answers are: every default one stays under 2,000 tokens, on any recording.
 
-Run with `-s` to see the table. A token is counted as four characters of what a model reads.
+Run with `-s` to see the table. Tokens are counted by the package's own rule, `tokens_in`.
 """
 
 from __future__ import annotations
@@ -13,15 +13,17 @@ import pytest
 
 from tests.recordings.fleet import build_fleet
 from tests.recordings.long import build
+from tests.recordings.rows import Recorded
 from tests.server.conftest import text_of
 from tests.server.story import client_on
 from webots_mcp.connection import connect
 from webots_mcp.questions import all_questions
+from webots_mcp.questions.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS
 from webots_mcp.questions.merging import MergedQuestion
+from webots_mcp.questions.shortening import tokens_in
 
 pytestmark = pytest.mark.anyio
 
-TOKENS: Final = 2_000
 RICH_TOKENS: Final = 1_500
 ROWS: Final = 5_000
 LONG_RUN: Final = 2
@@ -30,7 +32,13 @@ MORE_SIGNALS: Final = 30  # to the 39 of the long recording
 DEFAULTS: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
     ("webots_list_robots", {}),
     ("webots_diagnose", {}),
+    ("webots_get_world_info", {}),
     ("webots_get_robot_state", {}),
+    ("webots_get_sensors", {}),
+    ("webots_get_full_state", {}),
+    ("webots_get_parameters", {}),
+    ("webots_list_breakpoints", {}),
+    ("webots_get_trials", {}),
     ("webots_get_logs", {}),
     ("webots_list_commands", {}),
     ("webots_list_signals", {}),
@@ -81,7 +89,6 @@ async def test_robots_that_do_the_same_again_and_again_are_told_in_1500_tokens(
 ) -> None:
     async with client_on(fleet) as client:
         for tool, arguments in (
-            ("webots_get_full_state", {}),
             ("webots_list_signals", {}),
             ("webots_query_history", {"signals": ["*"]}),
             ("webots_query_history", {"signals": ["*"], "raw": True}),
@@ -94,7 +101,8 @@ async def test_robots_that_do_the_same_again_and_again_are_told_in_1500_tokens(
         ):
             result = await client.call_tool(tool, {"robot": "rover0", **arguments})
             assert not result.is_error, (tool, text_of(result))
-            assert len(text_of(result)) / 4 < RICH_TOKENS, (tool, arguments, len(text_of(result)))
+            tokens = tokens_in(text_of(result))
+            assert tokens < RICH_TOKENS, (tool, arguments, tokens)
 
 
 def _add_runs(connection: Any) -> None:
@@ -136,9 +144,9 @@ async def test_every_default_answer_is_under_2000_tokens(big: Path) -> None:
             asked = arguments | ({"run_id": LONG_RUN} if takes_run else {})
             result = await client.call_tool(tool, asked)
             assert not result.is_error, (tool, text_of(result))
-            size = len(text_of(result))
-            table.append(f"{tool:24} {json.dumps(asked):55} {size:6} {size / 4:6.0f}")
-            assert size / 4 < TOKENS, table[-1]
+            tokens = tokens_in(text_of(result))
+            table.append(f"{tool:24} {json.dumps(asked):55} {tokens:6}")
+            assert tokens < ANSWER_TOKENS, table[-1]
         print("\n" + "\n".join(table))
 
 
@@ -157,4 +165,63 @@ async def test_an_answer_that_was_asked_to_be_long_stays_under_what_clients_put_
             result = await client.call_tool(tool, arguments if "sql" in arguments else
                                             arguments | {"run_id": 2})  # fmt: skip
             assert not result.is_error, text_of(result)
-            assert len(text_of(result)) < 50_000, tool
+            assert tokens_in(text_of(result)) < LARGE_ANSWER_TOKENS, tool
+
+
+@pytest.fixture(scope="module")
+def wide(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A robot of 400 numbers, and 60 others beside it."""
+    file = tmp_path_factory.mktemp("wide") / "webots.db"
+    recorded = Recorded(file)
+    for number in range(60):
+        recorded.robot(f"a_rover_with_rather_a_long_name_{number}")
+    robot = recorded.robot("rover")
+    for step in range(50):
+        robot.state(step * 0.1, {f"joint_{i}_torque_nm": i * step / 7 for i in range(400)})
+    recorded.close()
+    return file
+
+
+@pytest.mark.parametrize(
+    ("tool", "arguments", "said"),
+    [
+        ("webots_list_robots", {}, "61 robots in all, the latest"),
+        ("webots_get_world_info", {"robot": "rover"}, ""),
+        ("webots_get_robot_state", {"robot": "rover"}, "336 more keys: joint_64"),
+        ("webots_get_sensors", {"robot": "rover"}, ""),
+        ("webots_get_full_state", {"robot": "rover"}, "not shown: joint_"),
+        ("webots_list_signals", {"robot": "rover"}, "of 400: go on with cursor"),
+        ("webots_query_history", {"robot": "rover", "signals": ["*"]}, "left out of run"),
+        (
+            "webots_query_history",
+            {"robot": "rover", "signals": ["*"], "raw": True},
+            "left out: joint_",
+        ),
+        ("webots_get_trends", {"robot": "rover"}, "of 399 numbers"),
+        ("webots_find_events", {"robot": "rover"}, ""),
+        ("webots_get_timeline", {"robot": "rover"}, ""),
+        ("webots_monitor", {"robot": "rover", "lookback_s": 60}, "of 399 numbers"),
+        ("webots_query_sql", {"sql": "SELECT * FROM state"}, "long values are cut"),
+        (
+            "webots_query_sql",
+            {
+                "sql": "SELECT "
+                + ", ".join(
+                    [
+                        f"replace(printf('%.*c', 20, 'a'), 'a', '0123456789') AS a_{i}"
+                        for i in range(60)
+                    ]
+                )
+            },
+            "texts over",
+        ),
+    ],
+)
+async def test_whoever_has_400_signals_reads_what_is_left_out_of_2000_tokens(
+    wide: Path, tool: str, arguments: dict[str, Any], said: str
+) -> None:
+    async with client_on(wide) as client:
+        result = await client.call_tool(tool, arguments)
+        assert not result.is_error, text_of(result)
+        assert tokens_in(text_of(result)) < ANSWER_TOKENS
+        assert said in text_of(result)

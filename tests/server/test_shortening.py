@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from webots_mcp.questions.shortening import GLANCE, WHOLE, compact_json, shorten
+from webots_mcp.questions.shortening import GLANCE, WHOLE, shorten, tokens_in, tokens_of
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
@@ -18,9 +18,33 @@ json_values = st.recursive(
 
 
 @settings(max_examples=50)
-@given(json_values, st.integers(min_value=200, max_value=5000))
-def test_whatever_was_published_fits_its_budget(value: Any, budget: int) -> None:
-    assert len(compact_json(shorten(value, budget).value)) <= budget + 50
+@given(json_values, st.integers(min_value=40, max_value=1250))
+def test_whatever_was_published_fits_its_budget(value: Any, budget_tokens: int) -> None:
+    assert tokens_of(shorten(value, budget_tokens).value) <= budget_tokens
+
+
+@pytest.mark.parametrize(
+    ("text", "tokens"),
+    [
+        ("the estimate and the odometry differ", 6),
+        ("-1.234", 4),
+        ("0.12345678901234567", 8),
+        ('{"left":1.5,"right":-2}', 11),
+        ("0123456789abcdef0123456789abcdef", 10),
+        (" " * 1600, 100),
+        ("\u4f60\u597d\U0001f916", 3),
+    ],
+)
+def test_numbers_take_more_tokens_than_words_of_the_same_length(text: str, tokens: int) -> None:
+    assert tokens_in(text) == tokens
+
+
+def test_what_fits_in_words_does_not_fit_in_numbers() -> None:
+    words = {"text": "odometry " * 80}
+    numbers = {"values": [[0.1234 + i] * 4 for i in range(15)]}
+    assert len(str(words)) > len(str(numbers))
+    assert shorten(words, 120, WHOLE).rule is None
+    assert shorten(numbers, 120, WHOLE).rule is not None
 
 
 @settings(max_examples=50)
@@ -59,14 +83,14 @@ def test_a_cut_text_says_how_long_it_was() -> None:
 
 
 def test_too_many_keys_are_counted() -> None:
-    assert shorten({str(i): 0 for i in range(70)}).value["…"] == "6 more keys"
+    assert shorten({str(i): 0 for i in range(70)}).value["…"] == ("6 more keys: 64 to 69")
 
 
 @pytest.mark.parametrize("levels", [GLANCE, WHOLE])
 def test_a_tighter_level_is_taken_where_the_first_does_not_fit(levels: Any) -> None:
     state = {f"group {i}": {f"key {j}": "text " * 10 for j in range(30)} for i in range(30)}
-    short = shorten(state, 2000, levels)
-    assert len(compact_json(short.value)) <= 2000
+    short = shorten(state, 500, levels)
+    assert tokens_of(short.value) <= 500
     assert short.rule
 
 

@@ -10,12 +10,11 @@ import pytest
 from tests.recordings.rows import Recorded
 from tests.server.conftest import DATA_TOOLS, Connect, ask, fail
 from webots_mcp.bridge.encoding import encode
-from webots_mcp.questions.shortening import compact_json
+from webots_mcp.questions.shortening import tokens_of
 from webots_mcp.steering.sensing import unnamed_devices
 
 pytestmark = pytest.mark.anyio
-DEFAULT_LIMIT = 8_000  # characters: about 2,000 tokens
-FULL_LIMIT = 22_000
+TOKENS = 2_000
 
 
 async def test_the_state_is_rounded_and_long_arrays_are_summarised(
@@ -36,7 +35,7 @@ async def test_odd_values_are_recognisable(connect: Connect, recorded: Recorded)
     lidar = [float("inf")] * 40 + [0.5] * 140
     encoded = encode({"front": float("nan"), "lidar": lidar, "x": 1.0})
     robot = recorded.robot()
-    robot.state(1.0, json.loads(encoded.text), encoded.odd)
+    robot.state(1.0, json.loads(encoded.text), encoded.replaced)
     async with connect() as client:
         answer = await ask(client, "webots_get_sensors")
     assert answer["sensors"]["front"] == "nan"
@@ -70,8 +69,13 @@ async def test_a_state_without_sensors_says_where_to_look(
         {"text": "x" * 1_000_000},
         {f"key {i}": {"value": i * 1.234567, "text": "y" * 50} for i in range(10_000)},
         {"grid": [[float(i * j) for i in range(200)] for j in range(200)]},
+        {f"joint_{i}_torque_nm": i / 7 for i in range(400)},
+        {
+            f"leg {i}": {f"joint {j}": {"q_rad": j / 7, "tau": i} for j in range(10)}
+            for i in range(20)
+        },
     ],
-    ids=["lidar", "long text", "1 MB of keys", "grid"],
+    ids=["lidar", "long text", "1 MB of keys", "grid", "400 signals", "nested"],
 )
 async def test_answers_stay_short_whatever_is_published(
     connect: Connect, recorded: Recorded, state: dict[str, Any]
@@ -84,9 +88,7 @@ async def test_answers_stay_short_whatever_is_published(
         robot.event(1.0, "change", "text", {"from": "v" * 5000, "to": "u" * 5000})
     async with connect() as client:
         for tool in DATA_TOOLS:
-            characters = len(compact_json(await ask(client, tool)))
-            limit = FULL_LIMIT if tool == "webots_get_full_state" else DEFAULT_LIMIT
-            assert characters < limit, tool
+            assert tokens_of(await ask(client, tool)) < TOKENS, tool
 
 
 async def test_a_part_of_the_state_comes_whole_in_pages(
@@ -104,6 +106,57 @@ async def test_a_part_of_the_state_comes_whole_in_pages(
         assert "there are ['lidar']" in await fail(
             client, "webots_get_full_state", path="sensors.lidr"
         )
+
+
+async def test_a_state_of_sixty_signals_is_whole_at_a_glance_and_exact(
+    connect: Connect, recorded: Recorded
+) -> None:
+    state = {f"joint_{i}_torque_nm": i / 7 for i in range(60)}
+    recorded.robot().state(1.0, state)
+    async with connect() as client:
+        glance = await ask(client, "webots_get_robot_state")
+        full = await ask(client, "webots_get_full_state")
+    assert len(glance["state"]) == 60
+    assert "shortened" not in glance
+    assert full["state"] == state
+    assert "total" not in full
+
+
+async def test_a_large_state_comes_in_pages_that_say_what_is_not_on_them(
+    connect: Connect, recorded: Recorded
+) -> None:
+    state = {f"joint_{i}_torque_nm": i / 7 for i in range(400)}
+    recorded.robot().state(1.0, state)
+    async with connect() as client:
+        page = await ask(client, "webots_get_full_state")
+        shown = len(page["state"])
+        assert 60 < shown < 400
+        assert (page["total"], page["next_offset"]) == (400, shown)
+        assert f"joint_{shown}_torque_nm" in page["hint"]
+        pages = dict(page["state"])
+        while "next_offset" in page:
+            page = await ask(client, "webots_get_full_state", offset=page["next_offset"])
+            assert tokens_of(page) < TOKENS
+            pages |= page["state"]
+        asked = await ask(client, "webots_get_full_state", limit=400)
+    assert list(pages.items()) == list(state.items())
+    assert asked["state"] == state
+    assert TOKENS < tokens_of(asked) < 10_000
+
+
+async def test_of_a_state_with_long_arrays_all_members_stay_and_these_are_summed_up(
+    connect: Connect, recorded: Recorded
+) -> None:
+    lidar = [i / 7 for i in range(360)]
+    numbers = {f"signal_{i}": i / 7 for i in range(30)}
+    recorded.robot().state(1.0, {"lidar": lidar, "depth": lidar, **numbers})
+    async with connect() as client:
+        answer = await ask(client, "webots_get_full_state")
+    state = answer["state"]
+    assert (state["lidar"]["count"], state["depth"]["count"]) == (360, 360)
+    assert {name: state[name] for name in numbers} == numbers
+    assert "arrays over 16 items" in answer["shortened"]
+    assert "lidar, depth" in answer["hint"]
 
 
 async def test_the_full_state_has_events_and_the_recorders_health(

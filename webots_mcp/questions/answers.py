@@ -90,7 +90,9 @@ class FullStateAnswer(Answer):
 
     state: Any = None
     path: str | None = None
-    total: int | None = Field(default=None, description="Length of the array or text at the path.")
+    total: int | None = Field(
+        default=None, description="How many members, items or characters it has."
+    )
     next_offset: int | None = Field(
         default=None, description="Ask again with this offset for more."
     )

@@ -12,19 +12,23 @@ from webots_mcp.naming import listed
 from webots_mcp.questions.answers import Answer, Table
 from webots_mcp.questions.declaring import is_for_a_person
 from webots_mcp.questions.shortening import (
-    DETAIL_BUDGET,
+    DETAIL_BUDGET_TOKENS,
     Limits,
     compact_json,
     cut_text,
     round_number,
     shorten,
+    tokens_of,
 )
 from webots_mcp.store.reading.moments import shown_time
 from webots_mcp.store.recording import View, look, storage
 
-BUDGET: Final = 5_000  # characters of JSON: 1,250 tokens; the header and the verdicts have 1,000
-LARGE_BUDGET: Final = 40_000  # where the asker said how much: clients put longer answers aside
-_FOR_A_PERSON: Final = 10_000_000
+ANSWER_TOKENS: Final = 2_000
+LARGE_ANSWER_TOKENS: Final = 10_000  # where it was said how much: clients warn of longer answers
+BUDGET_TOKENS: Final = 1_250  # of rows; the header, notes and verdicts have what is left
+_BESIDE_TOKENS: Final = ANSWER_TOKENS - BUDGET_TOKENS
+_HEADER_TOKENS: Final = 150  # with a hint
+_FOR_A_PERSON_TOKENS: Final = 10_000_000
 _AT_LENGTH: Final = (Limits(items=2000, text=20_000, keys=1000, depth=20),)
 LONGEST_NAME: Final = 80
 _LONGEST_NOTE: Final = 300
@@ -52,15 +56,22 @@ def header_of_only(connection: sqlite3.Connection) -> dict[str, Any]:
         return {**storage(connection)}
 
 
-def room(asked: int | None = None) -> int:
-    """The characters of an answer: more where it was said how much, in a terminal as many as come.
+def room_tokens(
+    asked: int | None = None, beside: Any = None, usual_tokens: int = BUDGET_TOKENS
+) -> int:
+    """The tokens for rows: more where it was said how many rows, in a terminal as many as come.
 
     Args:
         asked: The most rows or points that were asked for.
+        beside: What stands beside the rows and the header; where it is long, rows have less room.
+        usual_tokens: The most, where it was not said how many rows.
     """
     if is_for_a_person():
-        return _FOR_A_PERSON
-    return BUDGET if asked is None else LARGE_BUDGET
+        return _FOR_A_PERSON_TOKENS
+    least_beside = _HEADER_TOKENS + tokens_of(beside)
+    if asked is None:
+        return min(usual_tokens, ANSWER_TOKENS - least_beside)
+    return LARGE_ANSWER_TOKENS - max(_BESIDE_TOKENS, least_beside)
 
 
 def cut_for_a_model(text: str, longest: int) -> str:
@@ -68,11 +79,11 @@ def cut_for_a_model(text: str, longest: int) -> str:
     return text if is_for_a_person() else cut_text(text, longest)
 
 
-def detailed(value: Any, budget: int = DETAIL_BUDGET) -> Any:
+def detailed(value: Any, budget_tokens: int = DETAIL_BUDGET_TOKENS) -> Any:
     """A value of any kind, rounded, and for a model cut where it is long."""
     if is_for_a_person():
-        return shorten(value, _FOR_A_PERSON, _AT_LENGTH).value
-    return shorten(value, budget).value
+        return shorten(value, _FOR_A_PERSON_TOKENS, _AT_LENGTH).value
+    return shorten(value, budget_tokens).value
 
 
 def figure(value: float | None) -> float | None:
@@ -103,18 +114,13 @@ def short_name(name: str | None) -> str | None:
     return name and cut_for_a_model(name, LONGEST_NAME)
 
 
-def size_of(answer: Any) -> int:
-    """Characters of an answer, or a part of it, as the model reads it."""
-    return len(compact_json(answer))
-
-
-def fitting(items: Sequence[_T], budget: int | None = None) -> list[_T]:
+def fitting(items: Sequence[_T], budget_tokens: int | None = None) -> list[_T]:
     """The first items whose JSON fits the budget, at least one."""
-    budget = room() if budget is None else budget
+    left = room_tokens() if budget_tokens is None else budget_tokens
     kept: list[_T] = []
     for item in items:
-        budget -= size_of(item) + 1
-        if budget < 0 and kept:
+        left -= tokens_of(item)
+        if left < 0 and kept:
             break
         kept.append(item)
     return kept

@@ -25,7 +25,6 @@ from webots_mcp.questions.argument_types import (
     Value,
 )
 from webots_mcp.questions.budget import (
-    LARGE_BUDGET,
     answer_about,
     condensed,
     figure,
@@ -33,7 +32,7 @@ from webots_mcp.questions.budget import (
     fitting,
     header_of_only,
     notes_of,
-    room,
+    room_tokens,
     seconds,
     short_name,
     shown,
@@ -41,7 +40,7 @@ from webots_mcp.questions.budget import (
 )
 from webots_mcp.questions.declaring import READS, SETS, is_for_a_person, question
 from webots_mcp.questions.history_answers import ComparisonAnswer, RunsAnswer
-from webots_mcp.questions.shortening import DETAIL_BUDGET, WHOLE, shorten
+from webots_mcp.questions.shortening import DETAIL_BUDGET_TOKENS, WHOLE, shorten
 from webots_mcp.store.analysis.spread import MATTERS_SD, Spread
 from webots_mcp.store.detection.event import EventOptions, both_of
 from webots_mcp.store.questions.compare import (
@@ -214,8 +213,8 @@ def _no_runs(parameters: dict[str, Any] | None) -> str:
 
 def _values_of(parameters: Mapping[str, Any]) -> Any:
     """Values of parameters as they are, of many the first."""
-    budget = LARGE_BUDGET if is_for_a_person() else DETAIL_BUDGET
-    return shorten(dict(parameters), budget, WHOLE).value or None
+    budget_tokens = room_tokens() if is_for_a_person() else DETAIL_BUDGET_TOKENS
+    return shorten(dict(parameters), budget_tokens, WHOLE).value or None
 
 
 def _run_row(run: RunInfo) -> list[Any]:
@@ -272,12 +271,11 @@ def _compared(
         found = compare_code(view.connection, robot=view.robot.name, **asked)
     differing = [each for each in found.differences if _differs(each)]
     groups, measures = _groups(found), _measures(found)
-    told = [str(table.rows) for table in (groups, measures) if table]
-    left = room(limit) - len("".join(told)) - len(str(found.not_known))
-    rows = [_difference_row(each, with_extremes=names is not None) for each in differing]
-    rows = fitting(rows, left)
-    only_in = list(found.only_in.items())
+    notes, only_in = notes_of(found.notes), list(found.only_in.items())
     most = len(only_in) if is_for_a_person() else _MOST_ONLY_IN
+    beside = [*(table.rows for table in (groups, measures) if table), found.not_known, notes]
+    rows = [_difference_row(each, with_extremes=names is not None) for each in differing]
+    rows = fitting(rows, room_tokens(limit, [*beside, only_in[:most]]))
     return {
         "groups": groups,
         "compared_s": seconds(found.compared_s),
@@ -286,7 +284,7 @@ def _compared(
         "differences": without_empty(DIFFERENCE_COLUMNS, rows),
         "total": found.total,
         "only_in": {name: list(groups) for name, groups in only_in[:most]} or None,
-        "notes": notes_of(found.notes),
+        "notes": notes,
         "hint": _hint(found, len(rows), len(differing), len(only_in) - most),
     }
 

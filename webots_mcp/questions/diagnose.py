@@ -8,11 +8,11 @@ from typing import Final
 from webots_mcp.diagnosis.doctor import Checked, diagnose, subject_of, worst
 from webots_mcp.questions.answers import DiagnosisAnswer
 from webots_mcp.questions.declaring import READS, question
-from webots_mcp.questions.shortening import cut_text
+from webots_mcp.questions.shortening import cut_text, tokens_in
 from webots_mcp.store.recording import Recording
 
 _LONGEST_TEXT: Final = 320
-_BUDGET: Final = 5_000  # characters; the checks beyond it are told by name
+_BUDGET_TOKENS: Final = 1_250  # the checks beyond it are told by name
 
 
 @question("Diagnose the set-up", READS, core=True)
@@ -34,15 +34,15 @@ def webots_diagnose(recording: Recording) -> DiagnosisAnswer:
 def _not_well(checked: Sequence[Checked]) -> list[dict[str, str]]:
     """What is wrong before what might be."""
     told: list[dict[str, str]] = []
-    room = _BUDGET
+    left = _BUDGET_TOKENS
     for verdict in ("wrong", "warning"):
         for check, finding in checked:
             if finding.verdict == verdict:
                 head = {"check": check.name, "verdict": verdict}
                 texts = {"seen": finding.seen, "fix": finding.fix or ""}
                 cut = {name: cut_text(text, _LONGEST_TEXT) for name, text in texts.items() if text}
-                room -= sum(map(len, cut.values()))
-                told.append(head | (cut if room > 0 else {}))
+                left -= sum(map(tokens_in, cut.values()))
+                told.append(head | (cut if left > 0 else {}))
     return told
 
 

@@ -22,16 +22,15 @@ from webots_mcp.questions.budget import (
     answer_about,
     detailed,
     notes_of,
-    room,
+    room_tokens,
     seconds,
     short_name,
     shown,
-    size_of,
     without_empty,
 )
 from webots_mcp.questions.declaring import READS, question
 from webots_mcp.questions.history_answers import EventsAnswer, KindVerdicts
-from webots_mcp.questions.shortening import DETAIL_BUDGET
+from webots_mcp.questions.shortening import DETAIL_BUDGET_TOKENS, tokens_of
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold, both_of
 from webots_mcp.store.detection.registry import KINDS, kind_names
 from webots_mcp.store.detection.threshold import thresholds_on
@@ -67,7 +66,7 @@ EVENT_COLUMNS: Final = (
     "kind", "count", "run_id", "start_s", "duration_s", "ongoing", "name", "details",
 )  # fmt: skip
 DEFAULT_LIMIT: Final = 50
-_GROUP_BUDGET: Final = 640  # characters
+_GROUP_BUDGET_TOKENS: Final = 200
 
 
 @question(
@@ -155,7 +154,9 @@ def _found(
     cursor: str,
 ) -> dict[str, Any]:
     found = search_events(view.connection, asked, options, group=group, after=cursor or None)
-    told, events = fitting_events(found, limit or DEFAULT_LIMIT, room(limit), view)
+    verdicts, notes = verdicts_of(found.verdicts), notes_of(found.notes)
+    budget_tokens = room_tokens(limit, [verdicts.model_dump(exclude_none=True), notes])
+    told, events = fitting_events(found, limit or DEFAULT_LIMIT, budget_tokens, view)
     hints = ["ask again with this cursor for what is not shown"] if told.cursor else []
     if any(event.count > 1 for event in told.events):
         hints.append(
@@ -165,26 +166,26 @@ def _found(
         hints.append("nothing was left out before that cursor")
     return {
         "events": events,
-        "verdicts": verdicts_of(found.verdicts),
+        "verdicts": verdicts,
         "not_shown": not_shown_of(told),
         "cursor": told.cursor,
-        "notes": notes_of(found.notes),
+        "notes": notes,
         "hint": "; ".join(hints) or None,
     }
 
 
 def fitting_events(
-    found: Found, limit: int, budget: int, view: View
+    found: Found, limit: int, budget_tokens: int, view: View
 ) -> tuple[Events, Table | None]:
     """At most `limit` of what was found, and as much of it as fits the budget."""
     while True:
         told = found.told(view.connection, limit)
         made = events_table(told.events, view)
-        size = size_of([made.rows if made else [], not_shown_of(told), told.cursor])
-        if size <= budget or limit <= 1:
+        tokens = tokens_of([made.rows if made else [], not_shown_of(told), told.cursor])
+        if tokens <= budget_tokens or limit <= 1:
             return told, made
         shown_now = len(told.events)
-        limit = max(1, min(shown_now - 1, int(shown_now * budget / size)))
+        limit = max(1, min(shown_now - 1, int(shown_now * budget_tokens / tokens)))
 
 
 def verdicts_of(verdicts: Verdicts) -> KindVerdicts:
@@ -227,5 +228,5 @@ def events_table(events: Sequence[Event], view: View) -> Table | None:
 
 def _details_of(event: Event) -> Any:
     """What stands for many events may be longer: it stands once."""
-    budget = DETAIL_BUDGET if event.count == 1 else _GROUP_BUDGET
-    return detailed(event.details, budget)
+    budget_tokens = DETAIL_BUDGET_TOKENS if event.count == 1 else _GROUP_BUDGET_TOKENS
+    return detailed(event.details, budget_tokens)

@@ -13,6 +13,7 @@ from webots_mcp.contract import LogLevel, LogSource
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
 from webots_mcp.questions.answers import LogsAnswer, Table
 from webots_mcp.questions.argument_types import Cursor, EndS, LastS, RobotName, RunId, StartS
+from webots_mcp.questions.budget import fitting
 from webots_mcp.questions.declaring import READS, is_for_a_person, question
 from webots_mcp.questions.shortening import cut_text
 from webots_mcp.store.logs import (
@@ -33,7 +34,7 @@ from webots_mcp.store.robots import list_robots
 _COLUMNS: Final = ("sim_time_s", "level", "message", "run_id")
 _FOR_A_PERSON: Final = ("id", "sim_time_s", "level", "run_id", "message")
 _LONGEST_MESSAGE: Final = 500
-_BUDGET: Final = 6_000
+_BUDGET_TOKENS: Final = 1_500
 _NO_RUN_YET: Final = (
     "lines without a run_id came from Webots' console before a run began: a controller that never "
     "began one may have failed there"
@@ -84,7 +85,8 @@ def webots_get_logs(
             waiting = [] if is_any_live else waiting_lines(connection, asked, lines)
         if not waiting:
             raise
-        return LogsAnswer(lines=_table(waiting), matching=len(waiting), hint=_NO_RUN_YET)
+        shown = _table(_newest_fitting(waiting))
+        return LogsAnswer(lines=shown, matching=len(waiting), hint=_NO_RUN_YET)
 
 
 def _row(line: LogLine) -> dict[str, object]:
@@ -114,7 +116,7 @@ def _answer(recording: Recording, view: View, asked: LogFilter, limit: int) -> L
     waiting = list[LogLine]()
     if asked.run_id is None and asked.before_id is None:
         waiting = waiting_lines(view.connection, asked, limit)
-    shown = _fitting([*newest, *waiting][-limit:])
+    shown = _newest_fitting([*newest, *waiting][-limit:])
     recorded = [line for line in shown if line.run_id is not None]
     older = matching > len(recorded)
     hints = [_hint(asked, matching, len(recorded))] * bool(older or not waiting)
@@ -130,16 +132,12 @@ def _answer(recording: Recording, view: View, asked: LogFilter, limit: int) -> L
     )
 
 
-def _fitting(lines: list[LogLine]) -> list[LogLine]:
-    """The newest ones whose text fits a model's budget, at least one."""
+def _newest_fitting(lines: list[LogLine]) -> list[LogLine]:
+    """The newest ones that fit a model's budget, at least one."""
     if is_for_a_person():
         return lines
-    room = _BUDGET
-    for number, line in enumerate(reversed(lines)):
-        room -= min(len(line.message), _LONGEST_MESSAGE) + 30
-        if room < 0 and number:
-            return lines[-number:]
-    return lines
+    rows = [[*_row(line).values()] for line in reversed(lines)]
+    return lines[len(lines) - len(fitting(rows, _BUDGET_TOKENS)) :]
 
 
 def _hint(asked: LogFilter, matching: int, shown: int) -> str | None:

@@ -11,10 +11,11 @@ from webots_mcp.questions.argument_types import (
     TextCursor,
 )
 from webots_mcp.questions.bounds import range_in
-from webots_mcp.questions.budget import answer_about, notes_of, room, size_of
+from webots_mcp.questions.budget import answer_about, notes_of, room_tokens
 from webots_mcp.questions.declaring import READS, question
 from webots_mcp.questions.find_events import TimelineKinds, events_table, verdicts_of
 from webots_mcp.questions.history_answers import TimelineAnswer
+from webots_mcp.questions.shortening import tokens_of
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.registry import stored_kinds
 from webots_mcp.store.questions.timeline import timeline
@@ -53,15 +54,15 @@ def _found(
     view: View, asked: TimeRange, options: EventOptions, limit: int | None, cursor: str
 ) -> dict[str, Any]:
     """A page; a shorter one where it would be too long."""
-    budget = room(limit)
+    budget_tokens = room_tokens(limit)
     entries = limit or DEFAULT_LIMIT
     while True:
         page = timeline(view.connection, asked, options, limit=entries, after=cursor or None)
         events = events_table(page.events, view)
-        size = size_of(events.rows) if events else 0
-        if size <= budget or entries == 1:
+        tokens = tokens_of(events.rows) if events else 0
+        if tokens <= budget_tokens or entries == 1:
             break
-        entries = max(1, int(entries * 0.95 * budget / size))
+        entries = max(1, int(entries * 0.95 * budget_tokens / tokens))
     return {
         "events": events,
         "verdicts": verdicts_of(page.verdicts),

@@ -16,7 +16,7 @@ from webots_mcp.questions.budget import (
     figure,
     fitting,
     notes_of,
-    room,
+    room_tokens,
     seconds,
     short_name,
     shown,
@@ -25,7 +25,7 @@ from webots_mcp.questions.budget import (
 )
 from webots_mcp.questions.declaring import READS, is_for_a_person, question
 from webots_mcp.questions.history_answers import RunTrendTables, TrendsAnswer
-from webots_mcp.questions.shortening import compact_json
+from webots_mcp.questions.shortening import compact_json, tokens_of
 from webots_mcp.store.questions.trend import Trend
 from webots_mcp.store.questions.trends import RunTrends, StateTrend, trends
 from webots_mcp.store.reading.ranges import Scope, TimeRange
@@ -35,8 +35,9 @@ TREND_COLUMNS: Final = ("signal", "says", "last", "mean", "deviation")
 STATE_COLUMNS: Final = ("signal", "changes", "last", "since_s", "time_by_value_s")
 DEFAULT_LIMIT: Final = 20
 MOST_SIGNALS: Final = 500
-_STATES_SHARE: Final = 0.25  # of the budget
+_STATES_SHARE: Final = 0.25  # of the budget, at most
 _LONGEST_SAYING: Final = 200
+_ASK_FOR_OTHERS: Final = "signals=['...'] asks for others, limit for more"
 EMPTY: Final = '""'  # a name without a character
 _SHOWN_VALUES: Final = 6
 _SHOWN_CONSTANTS: Final = 20
@@ -71,26 +72,24 @@ def webots_get_trends(
 
 def _found(view: View, asked: TimeRange, names: Sequence[str], limit: int | None) -> dict[str, Any]:
     found = trends(view.connection, asked, names, limit=MOST_SIGNALS)
-    budget = room(limit) // max(len(found.runs), 1)
+    budget_tokens = room_tokens(limit) // max(len(found.runs), 1)
     recorded = [run for run in found.runs if run.rows or run.cut_at_s is not None]
-    runs = [trend_tables(run, limit or DEFAULT_LIMIT, budget) for run in recorded]
+    runs = [trend_tables(run, limit or DEFAULT_LIMIT, budget_tokens) for run in recorded]
     return {
         "runs": runs or None,
         "notes": notes_of(found.notes),
-        "hint": _hint(recorded, runs)
-        if runs
-        else "no row in that range: leave the range out, or see notes",
+        "hint": _hint(runs),
     }
 
 
-def trend_tables(run: RunTrends, limit: int, budget: int) -> RunTrendTables:
-    """The trends of a run as tables that fit the budget, in characters."""
+def trend_tables(run: RunTrends, limit: int, budget_tokens: int) -> RunTrendTables:
+    """The trends of a run as tables that fit the budget."""
     changed = [state for state in run.states if state.changes]
-    states = fitting([_state_row(state) for state in changed], int(budget * _STATES_SHARE))
+    states = fitting([_state_row(state) for state in changed], int(budget_tokens * _STATES_SHARE))
     moving = _moving(run)
-    rows = fitting(
-        [_trend_row(trend) for trend in moving[:limit]], int(budget * (1 - _STATES_SHARE))
-    )
+    constant, silent = some(_constants(run), _SHOWN_CONSTANTS), some(run.silent)
+    left_tokens = budget_tokens - tokens_of([states, constant, silent])
+    rows = fitting([_trend_row(trend) for trend in moving[:limit]], left_tokens)
     return RunTrendTables(
         run_id=run.run_id,
         start_s=seconds(run.start_s),
@@ -99,8 +98,9 @@ def trend_tables(run: RunTrends, limit: int, budget: int) -> RunTrendTables:
         from_means_of_s=run.resolution_s,
         numbers=table(TREND_COLUMNS, rows),
         states=table(STATE_COLUMNS, states),
-        constant=some(_constants(run), _SHOWN_CONSTANTS) or None,
-        silent=some(run.silent) or None,
+        constant=constant or None,
+        silent=silent or None,
+        not_shown=_not_shown(run, len(rows), len(states)),
         rows_missing_from_s=seconds(run.cut_at_s),
     )
 
@@ -148,18 +148,20 @@ def _state_row(state: StateTrend) -> list[Any]:
     ]
 
 
-def _hint(found: Sequence[RunTrends], runs: Sequence[RunTrendTables]) -> str | None:
-    counts = [
-        (run.run_id, len(run.numbers.rows) if run.numbers else 0, _changed(each))
-        for each, run in zip(found, runs, strict=True)
+def _hint(runs: Sequence[RunTrendTables]) -> str | None:
+    if not runs:
+        return "no row in that range: leave the range out, or see notes"
+    return _ASK_FOR_OTHERS if any(run.not_shown for run in runs) else None
+
+
+def _not_shown(run: RunTrends, numbers: int, states: int) -> str | None:
+    """How many of the signals that changed are not shown."""
+    all_states = sum(bool(state.changes) for state in run.states)
+    counts = (("numbers", numbers, _changed(run)), ("texts and flags", states, all_states))
+    others = [
+        f"{all_of - told} of {all_of} {what}" for what, told, all_of in counts if told < all_of
     ]
-    hints = [
-        f"run {run_id}: {told} of {changed} numbers that changed; signals=['...'] asks for others, "
-        "limit for more"
-        for run_id, told, changed in counts
-        if told < changed
-    ]
-    return "; ".join(hints) or None
+    return ", ".join(others) or None
 
 
 def _changed(run: RunTrends) -> int:

@@ -118,6 +118,7 @@ class RunTrendTables(Part):
     states: Table | None = Field(default=None, description="Text and flags that changed.")
     constant: str | None = Field(default=None, description="What never changed, with its value.")
     silent: str | None = Field(default=None, description="Signals without a value in the range.")
+    not_shown: str | None = Field(default=None, description="Of those that changed.")
     rows_missing_from_s: float | None = Field(
         default=None, description="Reading took too long: from here on rows are missing."
     )

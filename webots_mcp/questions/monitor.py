@@ -15,7 +15,7 @@ from pydantic.json_schema import SkipJsonSchema
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.argument_types import MAX_WAIT_S, RobotName
-from webots_mcp.questions.budget import BUDGET, answer_about, notes_of
+from webots_mcp.questions.budget import answer_about, notes_of, room_tokens
 from webots_mcp.questions.declaring import READS, Caller, question
 from webots_mcp.questions.find_events import fitting_events, not_shown_of, verdicts_of
 from webots_mcp.questions.get_trends import MOST_SIGNALS, trend_tables
@@ -32,6 +32,8 @@ USUAL_DURATION_S: Final = 10.0
 _REPORT_INTERVAL_S: Final = 1.0
 _SHOWN_SIGNALS: Final = 12
 _SHOWN_EVENTS: Final = 30
+_ROWS_TOKENS: Final = 1_300
+_EVENTS_SHARE: Final = 0.45  # of them
 _TOLD_RUNS: Final = 2  # whose trends are told: that before a reset, and that after it
 _ROWLESS: Final = EventOptions(kinds=("run", "command", "log", "noticed"))  # without any row
 
@@ -112,22 +114,25 @@ def _found(view: View, wall_start_s: float) -> dict[str, Any]:
     recorded = bool(window.rows.segments)
     told = trends(view.connection, window.rows, limit=MOST_SIGNALS).runs if recorded else ()
     newest = told[-_TOLD_RUNS:]
-    budget = 2 * BUDGET // 5 // max(len(newest), 1)
     found = search_events(view.connection, window.around, None if recorded else _ROWLESS)
     happened = [event for event in found.events if _in_window(event, window, wall_start_s)]
     in_window = found.only(happened)
-    shown, events = fitting_events(in_window, _SHOWN_EVENTS, BUDGET // 3, view)
+    verdicts = verdicts_of(in_window.verdicts if recorded else _unlooked(in_window.verdicts))
+    moved = movement(view, window.rows) if recorded else None
+    notes = notes_of(tuple(dict.fromkeys((*window.rows.notes, *found.notes, *_of_earlier(told)))))
+    beside = [verdicts.model_dump(exclude_none=True), moved, notes]
+    room = room_tokens(beside=beside, usual_tokens=_ROWS_TOKENS)
+    shown, events = fitting_events(in_window, _SHOWN_EVENTS, int(room * _EVENTS_SHARE), view)
+    of_a_run = int(room * (1 - _EVENTS_SHARE)) // max(len(newest), 1)
     rows = sum(run.rows for run in told)
     return {
         "rows": rows,
-        "movement": movement(view, window.rows) if recorded else None,
-        "trends": [trend_tables(run, _SHOWN_SIGNALS, budget) for run in newest] or None,
+        "movement": moved,
+        "trends": [trend_tables(run, _SHOWN_SIGNALS, of_a_run) for run in newest] or None,
         "events": events,
-        "verdicts": verdicts_of(in_window.verdicts if recorded else _unlooked(in_window.verdicts)),
+        "verdicts": verdicts,
         "not_shown": not_shown_of(shown),
-        "notes": notes_of(
-            tuple(dict.fromkeys((*window.rows.notes, *found.notes, *_of_earlier(told))))
-        ),
+        "notes": notes,
         "hint": _hint(recorded, bool(shown.left_out), wall_start_s, view),
     }
 

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Final
 from pydantic import Field
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.questions.answers import Part
 from webots_mcp.questions.argument_types import (
     Cursor,
     MaxPoints,
@@ -19,12 +20,12 @@ from webots_mcp.questions.budget import (
     answer_about,
     figure,
     figures,
+    fitting,
     notes_of,
-    room,
+    room_tokens,
     seconds,
     short_name,
     shown,
-    size_of,
     some,
 )
 from webots_mcp.questions.declaring import READS, question
@@ -35,6 +36,7 @@ from webots_mcp.questions.history_answers import (
     RowColumns,
     RunSeries,
 )
+from webots_mcp.questions.shortening import tokens_of
 from webots_mcp.store.questions.series import (
     DEFAULT_POINTS,
     ChangeColumns,
@@ -48,8 +50,8 @@ from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.signals.catalogue import signals_of
 
 _SHOWN_GAPS: Final = 10
-_CELL_CHARACTERS: Final = 28  # of a bucket of a numeric signal: min, max, mean and last
-_SIGNAL_CHARACTERS: Final = 200  # of a signal, beside its buckets
+_CELL_TOKENS: Final = 15  # of a bucket of a numeric signal: min, max, mean and last
+_SIGNAL_TOKENS: Final = 60  # of a signal, beside its buckets
 
 
 @question(
@@ -90,16 +92,16 @@ def _series(
     view: View, asked: TimeRange, names: Sequence[str], max_points: int | None
 ) -> dict[str, Any]:
     """As many buckets as were asked for, or as fit; fewer where the answer would be too long."""
-    budget = room(max_points)
-    points = min(max_points or DEFAULT_POINTS, _likely_points(view, asked, names, budget))
+    budget_tokens = room_tokens(max_points)
+    points = min(max_points or DEFAULT_POINTS, _likely_points(view, asked, names, budget_tokens))
     while True:
         history = query_history(view.connection, asked, names, max_points=points)
         runs = [_run_series(run) for run in history.runs if run.rows or run.cut_at_s is not None]
-        size = _size(runs)
-        if size <= budget or points == 1:
+        tokens = tokens_of([_told(run) for run in runs])
+        if tokens <= budget_tokens or points == 1:
             break
-        points = max(1, int(points * 0.9 * budget / size))
-    hints = [hint for run in runs if (hint := _drop_signals(run, budget // len(runs)))]
+        points = max(1, int(points * 0.9 * budget_tokens / tokens))
+    hints = [hint for run in runs if (hint := _drop_signals(run, budget_tokens // len(runs)))]
     if max_points is not None and points < max_points:
         hints.append(f"{points} points instead of {max_points} fit: ask for fewer signals for more")
     hints += [] if runs else ["no row in that range: leave the range out, or see notes"]
@@ -107,28 +109,32 @@ def _series(
     return {"runs": runs or None, "notes": notes, "hint": "; ".join(hints) or None}
 
 
-def _likely_points(view: View, asked: TimeRange, names: Sequence[str], budget: int) -> int:
+def _likely_points(view: View, asked: TimeRange, names: Sequence[str], budget_tokens: int) -> int:
     signals = signals_of(view.connection, asked, names)
     numbers = sum(signal.is_number for signal in signals)
-    room = budget - _SIGNAL_CHARACTERS * len(signals) * len(asked.segments)
-    return max(1, room // (_CELL_CHARACTERS * max(numbers, 1)))
+    room = budget_tokens - _SIGNAL_TOKENS * len(signals) * len(asked.segments)
+    return max(1, room // (_CELL_TOKENS * max(numbers, 1)))
 
 
-def _size(runs: Sequence[RunSeries]) -> int:
-    return size_of([run.model_dump(mode="json", exclude_none=True) for run in runs])
+def _told(part: Part) -> dict[str, Any]:
+    return part.model_dump(mode="json", exclude_none=True)
 
 
-def _drop_signals(run: RunSeries, budget: int) -> str | None:
+def _drop_signals(run: RunSeries, budget_tokens: int) -> str | None:
     """Leave out the last signals where not even one point of each fits; says which."""
+    over = tokens_of(_told(run)) - budget_tokens
     left_out: list[str] = []
-    for name in [*list(run.states or {})[:0:-1], *list(run.numbers or {})[:0:-1]]:
-        if _size([run]) <= budget:
-            break
-        left_out.append(name)
-        (run.states if run.states and name in run.states else run.numbers or {}).pop(name)
-    if not left_out:
-        return None
-    return f"left out of run {run.run_id}: {some(left_out[::-1])}; ask for them alone"
+    for series in (run.states or {}, run.numbers or {}):
+        for name in [*series][:0:-1]:
+            if over <= 0:
+                break
+            over -= tokens_of({name: _told(series.pop(name))})
+            left_out.append(name)
+    return f"left out of run {run.run_id}: {_others(left_out[::-1])}" if left_out else None
+
+
+def _others(left_out: Sequence[str]) -> str:
+    return f"{some(left_out)}; ask for them alone"
 
 
 def _run_series(run: RunHistory) -> RunSeries:
@@ -212,14 +218,22 @@ def _page(
     page = query_rows(
         view.connection, asked, names, limit=limit or DEFAULT_POINTS, after_id=after_id
     )
-    budget = room(limit)
-    rows = _most(lambda rows: size_of(_row_columns(page, rows, view).model_dump()), page, budget)
+    budget_tokens = room_tokens(limit)
+    rows = _most(lambda rows: tokens_of(_told(_row_columns(page, rows, view))), page, budget_tokens)
     cursor = page.ids[rows - 1] if 0 < rows < len(page.ids) else page.cursor
+    shown = _row_columns(page, rows, view)
+    left_out: list[str] = []
+    if tokens_of(_told(shown)) > budget_tokens:  # one row of many signals
+        kept = dict(fitting([*shown.signals.items()], budget_tokens))
+        left_out = [name for name in shown.signals if name not in kept]
+        shown.signals = kept
+    hints = [f"{rows} rows: go on with cursor" if cursor else _no_rows(page, rows, after_id)]
+    hints += [f"left out: {_others(left_out)}"] * bool(left_out)
     return {
-        "raw": _row_columns(page, rows, view),
+        "raw": shown,
         "cursor": cursor,
         "notes": notes_of(page.notes),
-        "hint": f"{rows} rows: go on with cursor" if cursor else _no_rows(page, rows, after_id),
+        "hint": "; ".join(filter(None, hints)) or None,
     }
 
 
@@ -231,11 +245,11 @@ def _no_rows(page: Page, rows: int, after_id: int) -> str | None:
     return "no rows after that cursor" if after_id else "no row in that range"
 
 
-def _most(size: Callable[[int], int], page: Page, budget: int) -> int:
+def _most(tokens: Callable[[int], int], page: Page, budget_tokens: int) -> int:
     """How many of the page's first rows fit the budget; at least one."""
     rows = len(page.ids)
-    while rows > 1 and (now := size(rows)) > budget:
-        rows = max(1, min(rows - 1, int(rows * budget / now)))
+    while rows > 1 and (now := tokens(rows)) > budget_tokens:
+        rows = max(1, min(rows - 1, int(rows * budget_tokens / now)))
     return rows
 
 

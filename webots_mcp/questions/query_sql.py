@@ -15,16 +15,23 @@ from pydantic import Field
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.answers import Table
 from webots_mcp.questions.argument_types import ShownLimit
-from webots_mcp.questions.budget import LONGEST_NAME, cut_for_a_model, header_of_only
+from webots_mcp.questions.budget import (
+    LONGEST_NAME,
+    cut_for_a_model,
+    fitting,
+    header_of_only,
+    room_tokens,
+)
 from webots_mcp.questions.declaring import READS, is_for_a_person, question
 from webots_mcp.questions.history_answers import SqlAnswer
+from webots_mcp.questions.shortening import tokens_of
 from webots_mcp.store.questions.sql import Cell, Result, require_select
 from webots_mcp.store.questions.sql_process import FOLDER, LINE, Statement, as_file, decode
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
 from webots_mcp.store.recording import Recording
 
 DEFAULT_ROWS: Final = 100
-_BUDGET_BYTES: Final = 4_400  # of values: quotes and brackets come to it
+_BUDGET_BYTES: Final = 5_000  # of values: what is read, of which as much is shown as fits
 _LARGE_BUDGET_BYTES: Final = 20_000
 _BYTES_FOR_A_PERSON: Final = 10_000_000
 _MOST_COLUMNS: Final = 60
@@ -49,20 +56,26 @@ async def webots_query_sql(
     robot_log, robot_command. Indexed by run_id and sim_time_s. Values:
     json_extract(data, '$.pose[0]'). All columns: the resource webots://schema.
     """
-    budget = _BUDGET_BYTES if limit is None else _LARGE_BUDGET_BYTES
+    max_bytes = _BUDGET_BYTES if limit is None else _LARGE_BUDGET_BYTES
     most_columns = _MOST_COLUMNS
     if is_for_a_person():
-        budget, most_columns = _BYTES_FOR_A_PERSON, sys.maxsize
+        max_bytes, most_columns = _BYTES_FOR_A_PERSON, sys.maxsize
     require_select(sql)
     header = await to_thread.run_sync(_header, recording)
-    found = await _run(recording, sql, limit or DEFAULT_ROWS, budget)
+    found = await _run(recording, sql, limit or DEFAULT_ROWS, max_bytes)
     columns = [cut_for_a_model(name, LONGEST_NAME) for name in found.columns[:most_columns]]
     rows = [list(row[:most_columns]) for row in found.rows]
+    budget_tokens = room_tokens(limit, columns)
+    rows = fitting(rows, budget_tokens)
+    longest = None
+    if len(rows) == 1 and tokens_of(rows) > budget_tokens:
+        longest = budget_tokens // len(columns)  # a character has at most a token
+        rows = [[_cut(each, longest) for each in rows[0]]]
     more = len(found.columns) > most_columns
     return SqlAnswer(
         **header,
         result=Table(columns=columns, rows=rows),
-        truncated=_truncated(found),
+        truncated=_truncated(found, len(rows), longest),
         hint=f"only the first {_MOST_COLUMNS} columns are shown" if more else _none(rows),
     )
 
@@ -105,9 +118,18 @@ async def _turn() -> AsyncGenerator[None]:
         turns.release()
 
 
-def _truncated(found: Result) -> str | None:
+def _cut(cell: Cell, longest: int) -> Cell:
+    return f"{cell[:longest]}…" if isinstance(cell, str) and len(cell) > longest else cell
+
+
+def _truncated(found: Result, shown: int, longest: int | None) -> str | None:
+    why = found.truncated
+    if shown < len(found.rows):
+        why = f"only {shown} rows: their values are too long; name fewer columns"
     cut = f"{found.shortened} long values are cut" if found.shortened else None
-    return "; ".join(filter(None, (found.truncated, cut))) or None
+    if longest is not None:
+        cut = f"texts over {longest} characters are cut: name fewer columns"
+    return "; ".join(filter(None, (why, cut))) or None
 
 
 def _none(rows: list[list[Cell]]) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from typing import Annotated, Any, Final, cast
 
 from pydantic import Field
@@ -9,14 +10,23 @@ from pydantic import Field
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.questions.answers import FullStateAnswer, SensorsAnswer, StateAnswer, Table
 from webots_mcp.questions.argument_types import RobotName, RunId
-from webots_mcp.questions.budget import some
+from webots_mcp.questions.budget import (
+    ANSWER_TOKENS,
+    LARGE_ANSWER_TOKENS,
+    detailed,
+    fitting,
+    some,
+)
 from webots_mcp.questions.declaring import READS, question
 from webots_mcp.questions.shortening import (
-    DETAIL_BUDGET,
-    FULL_BUDGET,
+    STATE_BUDGET_TOKENS,
     WHOLE,
+    Shortened,
+    compact_json,
     cut_text,
     shorten,
+    tokens_in,
+    tokens_of,
 )
 from webots_mcp.steering.sensing import sensor_part, unnamed_devices
 from webots_mcp.store.reading.kept import newest_kept
@@ -32,6 +42,10 @@ _PUBLISH: Final = (
 _EARLIER: Final = "SELECT max(id) FROM run WHERE robot_id = ? AND id < ? AND rows > 0"
 _PURGED: Final = "SELECT purged_rows FROM run WHERE id = ?"
 _EVENTS: Final = 10
+_EVENTS_TOKENS: Final = 250
+_PAGE: Final = 500  # members, items or characters where it was not said how many
+_SHOWN_NAMES: Final = 6
+_MARGIN_TOKENS: Final = 200  # for hints
 _SHOWN_REPLACED: Final = 20
 _SHOWN_DEVICES: Final = 30
 _ERROR_CHARACTERS: Final = 300
@@ -40,8 +54,8 @@ PagePath = Annotated[
     str,
     Field(max_length=1000, description="Dotted path, as sensors.lidar."),
 ]
-Offset = Annotated[int, Field(ge=0, description="First item or character at the path.")]
-PageSize = Annotated[int, Field(ge=1, le=2000, description="So many of them.")]
+Offset = Annotated[int, Field(ge=0, description="First member, item or character at the path.")]
+PageSize = Annotated[int | None, Field(ge=1, le=2000, description="So many, up to 10,000 tokens.")]
 
 
 @question("Get the robot's state", READS, core=True)
@@ -56,7 +70,9 @@ def webots_get_robot_state(
         if view.state is None:
             return StateAnswer(**view.header(), hint=_nothing_yet(view))
         short = shorten(view.state.value())
-        hint = "webots_get_full_state(path=...) shows a part whole" if short.rule else None
+        hint = (
+            "webots_get_full_state(path=...) shows a part whole, in pages" if short.rule else None
+        )
         return StateAnswer(
             **view.header(),
             state=short.value,
@@ -76,14 +92,16 @@ def webots_get_sensors(
             return SensorsAnswer(**view.header(), hint=_nothing_yet(view))
         state = view.state.value()
         sensors = sensor_part(state, view.robot.devices)
-        short = shorten(sensors)
         unnamed = unnamed_devices(state, view.robot.devices)
         missing = [f"{name} ({kind})" for name, kind in unnamed.items()]
+        replaced, not_named = _replaced_in(view.state, sensors), some(missing, _SHOWN_DEVICES)
+        left_tokens = ANSWER_TOKENS - _MARGIN_TOKENS - tokens_of([replaced, not_named])
+        short = shorten(sensors, min(STATE_BUDGET_TOKENS, left_tokens))
         return SensorsAnswer(
             **view.header(),
             sensors=short.value,
-            replaced=_replaced_in(view.state, sensors),
-            devices_not_named_in_state=some(missing, _SHOWN_DEVICES) or None,
+            replaced=replaced,
+            devices_not_named_in_state=not_named or None,
             shortened=short.rule,
             hint=None if sensors else _no_sensors(state),
         )
@@ -94,7 +112,7 @@ def webots_get_full_state(
     recording: Recording,
     path: PagePath = "",
     offset: Offset = 0,
-    limit: PageSize = 500,
+    limit: PageSize = None,
     robot: RobotName = None,
     run_id: RunId = None,
 ) -> FullStateAnswer:
@@ -107,15 +125,19 @@ def webots_get_full_state(
             hint, recorder = _nothing_yet(view), _recorder(view)
             return FullStateAnswer(**view.header(), hint=hint, recorder=recorder)
         part = select(view.state.value(), path)
-        if offset and not isinstance(part, (list, str)):
-            raise InvalidInputError("offset is for arrays and texts: give path to one of them")
-        answer = _page(part, path, offset, limit)
-        answer |= view.header()
-        if not path:
+        if offset and not isinstance(part, (dict, list, str)):
+            raise InvalidInputError(f"offset: {path!r:.80} is a single value, not in pages")
+        beside: dict[str, Any] = view.header()
+        if not (path or offset):
             replaced = list(view.state.odd_paths().items())[:_SHOWN_REPLACED]
-            answer |= {"replaced": dict(replaced) or None, "events": _events(view)}
-            answer |= {"recorder": _recorder(view)}
-        return FullStateAnswer(**answer)
+            beside |= {"replaced": dict(replaced) or None}
+            beside |= {"events": _events(view), "recorder": _recorder(view)}
+        most_tokens = ANSWER_TOKENS if limit is None else LARGE_ANSWER_TOKENS
+        told = {
+            name: each.model_dump() if name == "events" else each for name, each in beside.items()
+        }
+        left_tokens = most_tokens - _MARGIN_TOKENS - tokens_of(told)
+        return FullStateAnswer(**_page(part, path, offset, limit or _PAGE, left_tokens), **beside)
 
 
 def _nothing_yet(view: View) -> str:
@@ -136,53 +158,94 @@ def _nothing_yet(view: View) -> str:
     )
 
 
-def _page(part: Any, path: str, offset: int, limit: int) -> dict[str, Any]:
-    """A value that fits; of an array or a text the items from `offset` on."""
-    if not isinstance(part, (list, str)):
-        short = shorten(part, FULL_BUDGET, WHOLE)
-        return {"path": path or None, "state": short.value, "shortened": short.rule}
-    whole = cast("list[Any] | str", part)
-    page = whole[offset : offset + limit]
-    rule = None
-    if isinstance(page, list):
-        items, rule = _fitting_items(page)
-        page = items
+def _page(part: Any, path: str, offset: int, limit: int, budget_tokens: int) -> dict[str, Any]:
+    """What fits of a value; of an object, an array or a text from `offset` on."""
+    if not isinstance(part, (dict, list, str)):
+        return {"path": path, "state": part}
+    whole = cast("dict[str, Any] | list[Any] | str", part)
+    hints, rule = list[str](), None
+    if isinstance(whole, str):
+        page = whole[offset : offset + limit]
+    else:
+        named = isinstance(whole, dict)
+        members = [*whole.items()] if isinstance(whole, dict) else [*enumerate(whole)]
+        shown = _fitting_members(members[offset : offset + limit], budget_tokens, named=named)
+        page = {name: short.value for name, short in shown.items()}
+        cut = {str(name): short.rule for name, short in shown.items() if short.rule}
+        if cut:
+            rule = next(iter(cut.values()))
+            hints.append(f"path=... shows these in pages: {some([*cut], _SHOWN_NAMES)}")
+        page = page if named else [*page.values()]
     end = offset + len(page)
-    following = end if end < len(whole) else None
+    if end < len(whole) and isinstance(whole, dict):
+        left_out = [*whole][end:]
+        hints.append(
+            f"not shown: {some(left_out, _SHOWN_NAMES)}; ask with offset={end}, with path=... for "
+            f"one, or with limit for up to {LARGE_ANSWER_TOKENS:,} tokens"
+        )
     return {
-        "path": path,
+        "path": path or None,
         "state": page,
-        "total": len(whole),
-        "next_offset": following,
+        "total": None if isinstance(whole, dict) and len(page) == len(whole) else len(whole),
+        "next_offset": end if end < len(whole) else None,
         "shortened": rule,
+        "hint": "; ".join(hints) or None,
     }
 
 
-def _fitting_items(items: list[Any]) -> tuple[list[Any], str | None]:
-    """As many items as fit the budget; only an item that is itself too long is shortened."""
-    fitting: list[Any] = []
-    room, rule = FULL_BUDGET, None
-    for item in items:
-        short = shorten(item, FULL_BUDGET // 4, WHOLE)
-        room -= len(str(short.value)) + 1
-        if room < 0 and fitting:
+def _fitting_members(
+    members: Sequence[tuple[str | int, Any]], budget_tokens: int, *, named: bool
+) -> dict[str | int, Shortened]:
+    """The first members that fit, at least one.
+
+    Where all fit once arrays among the longest are summarised, all are shown; else each that is
+    not very long is shown whole, and others must be asked for.
+    """
+
+    def tokens(name: str | int, short: Shortened) -> int:
+        return tokens_in(f",{compact_json(name)}:" * named + compact_json(short.value))
+
+    shorts = {name: shorten(value, budget_tokens, WHOLE) for name, value in members}
+    sizes = {name: tokens(name, short) for name, short in shorts.items()}
+    longest = _longest_that_fits(sizes.values(), budget_tokens)
+    summarised = {
+        name: shorten(value, max(longest, budget_tokens // 2), WHOLE[1:])
+        for name, value in members
+        if sizes[name] > longest
+    }
+    after = {name: tokens(name, short) for name, short in summarised.items()}
+    if sum((sizes | after).values()) > budget_tokens:
+        summarised = {
+            name: each for name, each in summarised.items() if sizes[name] > budget_tokens // 4
+        }
+    shown: dict[str | int, Shortened] = {}
+    for name, short in (shorts | summarised).items():
+        budget_tokens -= tokens(name, short)
+        if budget_tokens < 0 and shown:
             break
-        fitting.append(short.value)
-        rule = rule or short.rule
-    return fitting, rule
+        shown[name] = short
+    return shown
+
+
+def _longest_that_fits(sizes: Collection[int], budget: int) -> int:
+    """The size to which the largest must come down for all of them to fit."""
+    for smaller, size in enumerate(sorted(sizes)):
+        share = budget // (len(sizes) - smaller)
+        if size > share:
+            return share
+        budget -= size
+    return max(sizes, default=0)
 
 
 def _events(view: View) -> Table:
+    """The newest events that fit, the oldest of them first."""
     events = newest_events(view.connection, view.require_run().id, _EVENTS)
     rows = [
-        [round(event.sim_time_s, 3), event.kind, event.name, _details(event.details())]
-        for event in events
+        [round(event.sim_time_s, 3), event.kind, event.name, detailed(event.details())]
+        for event in reversed(events)
     ]
-    return Table(columns=["sim_time_s", "kind", "name", "data"], rows=rows)
-
-
-def _details(details: Any) -> Any:
-    return shorten(details, DETAIL_BUDGET).value
+    shown = fitting(rows, _EVENTS_TOKENS)[::-1]
+    return Table(columns=["sim_time_s", "kind", "name", "data"], rows=shown)
 
 
 def _recorder(view: View) -> dict[str, Any] | None:

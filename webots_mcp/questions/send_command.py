@@ -10,9 +10,9 @@ from pydantic import Field
 from webots_mcp.contract import BUILT_IN_ACTIONS, CommandStatus
 from webots_mcp.questions.answers import CommandAnswer, CommandsAnswer
 from webots_mcp.questions.argument_types import Cursor, Id, RobotName, TimeoutS
-from webots_mcp.questions.budget import condensed
+from webots_mcp.questions.budget import condensed, fitting
 from webots_mcp.questions.declaring import DESTROYS, READS, Caller, question
-from webots_mcp.questions.shortening import DETAIL_BUDGET, cut_text, shorten
+from webots_mcp.questions.shortening import DETAIL_BUDGET_TOKENS, cut_text, shorten
 from webots_mcp.queue import Command, list_commands
 from webots_mcp.steering.dispatch import Dispatcher, shown_result
 from webots_mcp.store.recording import Recording, View
@@ -21,7 +21,8 @@ COMMAND_COLUMNS: Final = (
     "id", "action", "params", "outcome", "asked_ago_s", "took_s", "result", "error",
 )  # fmt: skip
 _WAIT_S: Final = 10.0
-_ACTIONS_BUDGET: Final = 2_400
+_ACTIONS_TOKENS: Final = 500
+_COMMANDS_TOKENS: Final = 1_100
 _LONGEST_TEXT: Final = 200
 
 
@@ -84,21 +85,23 @@ def _command_row(command: Command, now_s: float) -> list[Any]:
     return [
         command.id,
         command.action,
-        shorten(json.loads(command.params), DETAIL_BUDGET).value or None,
+        shorten(json.loads(command.params), DETAIL_BUDGET_TOKENS).value or None,
         command.status,
         round(now_s - command.created_wall_time_s, 1),
         took_s,
-        shown_result(command, DETAIL_BUDGET),
+        shown_result(command, DETAIL_BUDGET_TOKENS),
         cut_text(command.error, _LONGEST_TEXT) if command.error else None,
     ]
 
 
 def _answer(view: View, commands: list[Command], limit: int) -> CommandsAnswer:
     rows = [_command_row(command, view.now_s) for command in commands]
+    rows = fitting(rows, _COMMANDS_TOKENS)
+    more = len(rows) < len(commands) or len(commands) == limit
     return CommandsAnswer(
         **view.header(),
         commands=condensed(COMMAND_COLUMNS, rows),
-        cursor=commands[-1].id if len(commands) == limit else None,
+        cursor=commands[len(rows) - 1].id if more else None,
         actions=_actions(view),
         built_in=list(BUILT_IN_ACTIONS),
         hint=None if commands else "no such command was sent to this robot yet",
@@ -108,4 +111,4 @@ def _answer(view: View, commands: list[Command], limit: int) -> CommandsAnswer:
 def _actions(view: View) -> dict[str, Any]:
     """The registered actions; a controller that registers none sees commands in its loop."""
     actions = view.session.actions if view.session else {}
-    return dict(shorten(actions, _ACTIONS_BUDGET).value)
+    return dict(shorten(actions, _ACTIONS_TOKENS).value)

@@ -7,8 +7,9 @@ from typing import Annotated
 from pydantic import Field
 
 from webots_mcp.contract import BreakpointAction
-from webots_mcp.questions.answers import BreakpointAnswer, BreakpointsAnswer, Table
+from webots_mcp.questions.answers import BreakpointAnswer, BreakpointsAnswer
 from webots_mcp.questions.argument_types import Id, RobotName
+from webots_mcp.questions.budget import fitting, table
 from webots_mcp.questions.declaring import CHANGES, READS, Caller, question
 from webots_mcp.steering import arming
 from webots_mcp.store.recording import Recording
@@ -57,10 +58,13 @@ def webots_list_breakpoints(recording: Recording, robot: RobotName = None) -> Br
     """The robot's breakpoints, how often each was hit, and when last."""
     with recording.view(robot) as view:
         rows = arming.breakpoint_rows(view)
+        shown = fitting(rows)
+        more = f"{len(shown)} of {len(rows)}: webots_query_sql has all in table breakpoint"
+        none = "this robot has none: webots_breakpoint sets one"
         return BreakpointsAnswer(
             **view.header(),
-            breakpoints=Table(columns=list(arming.COLUMNS), rows=rows) if rows else None,
-            hint=None if rows else "this robot has none: webots_breakpoint sets one",
+            breakpoints=table(arming.COLUMNS, shown),
+            hint=more if len(shown) < len(rows) else None if rows else none,
         )
 
 

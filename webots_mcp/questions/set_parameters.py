@@ -14,7 +14,7 @@ from webots_mcp.questions.answers import CommandAnswer, ParametersAnswer
 from webots_mcp.questions.argument_types import RobotName, RunId, TimeoutS, Value
 from webots_mcp.questions.budget import fitting, seconds, without_empty
 from webots_mcp.questions.declaring import READS, SETS, Caller, question
-from webots_mcp.questions.shortening import DETAIL_BUDGET, WHOLE, shorten
+from webots_mcp.questions.shortening import DETAIL_BUDGET_TOKENS, WHOLE, shorten
 from webots_mcp.steering.tuning import SET_WAIT_S, When, set_parameters
 from webots_mcp.store.parameters import COLUMNS, described
 from webots_mcp.store.recording import Recording, View
@@ -89,7 +89,9 @@ def _shown_rows(view: View, names: list[str] | None) -> list[list[Any]]:
 
 def _shown(column: str, value: Any) -> Any:
     """Times as everywhere; values and bounds as they are, for they may be sent back."""
-    return seconds(value) if column == "since_s" else shorten(value, DETAIL_BUDGET, WHOLE).value
+    return (
+        seconds(value) if column == "since_s" else shorten(value, DETAIL_BUDGET_TOKENS, WHOLE).value
+    )
 
 
 def _meant(patterns: list[str] | None, known: list[str]) -> set[str]:

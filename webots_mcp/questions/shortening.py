@@ -9,14 +9,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple, cast
 
-STATE_BUDGET: Final = 4_800  # characters of JSON; a token is about four
-FULL_BUDGET: Final = 16_000
-RESULT_BUDGET: Final = 3_200
-DETAIL_BUDGET: Final = 320
+STATE_BUDGET_TOKENS: Final = 1_500
+RESULT_BUDGET_TOKENS: Final = 1_200
+DETAIL_BUDGET_TOKENS: Final = 120
 
 # A rule, for the tokenizer of one model tells little about another's: a word of up to 12 letters,
 # three digits, or some signs together are one token, and so is any other character.
-_TOKEN: Final = re.compile(r" ?[A-Za-z]{1,12}|\d{1,3}| ?[!-/:-@\[-`{-~]{1,4}|\s+|.")
+_TOKEN: Final = re.compile(r" ?[A-Za-z]{1,12}|\d{1,3}| ?[!-/:-@\[-`{-~]{1,4}|\s{1,16}|.")
+_LONGEST_TOKEN: Final = 16  # characters
 _DIGITS: Final = 4
 _DECIMALS: Final = 3
 _DUST: Final = 1e-12
@@ -41,7 +41,7 @@ class Limits:
         )
 
 
-# From generous to tight: the first under which a value fits its budget is taken.
+# From generous to tight: the first under which a value fits its budget is taken. Names go last.
 GLANCE: Final = (
     Limits(items=16, text=200, keys=64, depth=8),
     Limits(items=8, text=80, keys=32, depth=5),
@@ -53,7 +53,11 @@ GLANCE: Final = (
 
 WHOLE: Final = tuple(
     replace(limits, exact=True)
-    for limits in (Limits(items=2000, text=4000, keys=1000, depth=20), *GLANCE)
+    for limits in (
+        Limits(items=2000, text=4000, keys=1000, depth=20),
+        Limits(items=16, text=200, keys=1000, depth=20),
+        *GLANCE,
+    )
 )
 
 
@@ -64,8 +68,10 @@ class Shortened(NamedTuple):
     rule: str | None
 
 
-def shorten(value: Any, budget: int = STATE_BUDGET, levels: Sequence[Limits] = GLANCE) -> Shortened:
-    """Make a JSON value fit `budget` characters of compact JSON.
+def shorten(
+    value: Any, budget_tokens: int = STATE_BUDGET_TOKENS, levels: Sequence[Limits] = GLANCE
+) -> Shortened:
+    """Make a JSON value fit `budget_tokens` of compact JSON, as `tokens_in` counts them.
 
     Long arrays of numbers become `{"count", "min", "max", "mean", "argmin"}`, the names that the
     same array's signals have. With the levels `GLANCE` numbers are rounded (see
@@ -74,9 +80,12 @@ def shorten(value: Any, budget: int = STATE_BUDGET, levels: Sequence[Limits] = G
     for limits in levels:
         shortener = _Shortener(limits)
         short = shortener.shorten(value, 0)
-        if len(compact_json(short)) <= budget:
+        if _fits(short, budget_tokens):
             return Shortened(short, limits.rule() if shortener.cut else None)
-    return Shortened(_cut(compact_json(value), budget // 2), f"cut to {budget // 2} characters")
+    text, longest = compact_json(value), 4 * budget_tokens
+    while longest and not _fits(_cut(text, longest), budget_tokens):
+        longest //= 2
+    return Shortened(_cut(text, longest), f"cut to {longest} characters")
 
 
 def compact_json(value: Any) -> str:
@@ -86,7 +95,20 @@ def compact_json(value: Any) -> str:
 
 def tokens_in(text: str) -> int:
     """About how many tokens a model reads: of JSON in words 4 characters each, in numbers 1.8."""
-    return sum(1 for _ in _TOKEN.finditer(text))
+    return len(_TOKEN.findall(text))
+
+
+def tokens_of(value: Any) -> int:
+    """How many tokens of compact JSON an answer has, or a part of it."""
+    return tokens_in(compact_json(value))
+
+
+def _fits(value: Any, budget_tokens: int) -> bool:
+    """Whether it has no more tokens; of most values their length tells it, without a count."""
+    text = compact_json(value)
+    if len(text) <= budget_tokens or len(text) > budget_tokens * _LONGEST_TOKEN:
+        return len(text) <= budget_tokens
+    return tokens_in(text) <= budget_tokens
 
 
 def round_number(value: float) -> float:
@@ -139,7 +161,9 @@ class _Shortener:
         }
         if len(members) > len(shown):
             self.cut = True
-            shown["…"] = f"{len(members) - len(shown)} more keys"
+            first, last = [*members][len(shown)], [*members][-1]
+            more = f"{len(members) - len(shown)} more keys"
+            shown["…"] = f"{more}: {self._text(first)} to {self._text(last)}"
         return shown
 
     def _array(self, items: list[Any], depth: int) -> Any:

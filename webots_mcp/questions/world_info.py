@@ -10,9 +10,9 @@ from webots_mcp.errors import NothingRecordedError
 from webots_mcp.liveness import dead_sessions
 from webots_mcp.questions.answers import RobotsAnswer, Table, WorldAnswer
 from webots_mcp.questions.argument_types import RobotName, RunId
-from webots_mcp.questions.budget import cut_for_a_model
+from webots_mcp.questions.budget import cut_for_a_model, fitting, room_tokens
 from webots_mcp.questions.declaring import READS, is_for_a_person, question
-from webots_mcp.questions.shortening import cut_text, round_number
+from webots_mcp.questions.shortening import cut_text, round_number, shorten
 from webots_mcp.store.recording import GETTING_STARTED, Recording, View, name_of, storage, view_of
 from webots_mcp.store.retention.limits import described, unheeded
 from webots_mcp.store.retention.usage import file_sizes
@@ -25,7 +25,8 @@ _SHOWN_ROBOTS: Final = 50
 _SHOWN_IN_WORLD: Final = 40
 _TOLD_IN_WORLD: Final = ("key", "type", "def", "name", "controller", "on_robot")  # as they differ
 _PLACE: Final = ("x_m", "y_m", "z_m", "heading_rad", "speed_mps")
-_SHOWN_DEVICES: Final = 60
+_DEVICES_TOKENS: Final = 300
+_COMPANIONS_TOKENS: Final = 200
 _LONGEST_NAME: Final = 100
 _RECORDER_COLUMNS: Final = (
     "rows", "why", "rows_waiting", "waiting_in", "rows_dropped", "last_error",
@@ -49,7 +50,7 @@ def webots_list_robots(recording: Recording) -> RobotsAnswer:
         none = f"no robot has been recorded yet. {GETTING_STARTED}"
         if not robots and not told:
             raise NothingRecordedError(none)
-        views = [view_of(connection, robot, now_s) for robot in _liveliest(robots)]
+        views = _fitting([view_of(connection, robot, now_s) for robot in _liveliest(robots)])
         live = [view for view in views if view.robot.live]
         hint = f"{len(robots)} robots in all, the latest {len(views)} are shown"
         return RobotsAnswer(
@@ -73,9 +74,11 @@ def webots_get_world_info(
     with recording.view(robot, run_id) as view:
         run = view.require_run()
         session = fetch_session(view.connection, run.session_id)
-        return WorldAnswer(
+        others = _companions(view)
+        shown = others if is_for_a_person() else fitting(others, _COMPANIONS_TOKENS)
+        more = f"{len(others) - len(shown)} more robots beside it: webots_list_robots"
+        answer = WorldAnswer(
             **view.header(),
-            **_seen(world_seen(view.connection, run)),
             world=run.world,
             basic_time_step_ms=run.basic_time_step_ms,
             real_time_factor=_pace(view, run),
@@ -84,11 +87,15 @@ def webots_get_world_info(
             runs_recorded=count_runs(view.connection, view.robot.id),
             controller=_controller(session),
             devices=_devices(view.robot.devices),
-            companions=_companions(view),
+            companions=Table(columns=["robot", "kind", "hold"], rows=shown) if shown else None,
             database=name_of(recording.database),
             retention=_retention(recording, view.connection),
             data_dir=str(recording.data_dir),
         )
+        room = room_tokens(beside=answer.model_dump(exclude_none=True))
+        seen = _seen(world_seen(view.connection, run), room)
+        hints = [seen.pop("hint", None), more if len(shown) < len(others) else None]
+        return answer.model_copy(update=seen | {"hint": "; ".join(filter(None, hints)) or None})
 
 
 def _robots(views: list[View], *, told: bool) -> Table:
@@ -118,7 +125,7 @@ def _recorder(view: View) -> dict[str, Any]:
     }
 
 
-def _seen(world: WorldSeen | None) -> dict[str, Any]:
+def _seen(world: WorldSeen | None, budget_tokens: int) -> dict[str, Any]:
     """What an observer has seen of the world, robots first."""
     if world is None:
         return {}
@@ -129,12 +136,13 @@ def _seen(world: WorldSeen | None) -> dict[str, Any]:
         for column in (*_TOLD_IN_WORLD, *_PLACE)
         if any(body.get(column) is not None for body in shown)
     ]
-    more = f"the first {len(shown)} of {len(bodies)} bodies are shown"
+    rows = fitting([_in_world(body, used) for body in shown], budget_tokens)
+    more = f"the first {len(rows)} of {len(bodies)} bodies are shown"
     return {
         "title": world.told.get("title"),
         "observer": world.observer,
-        "in_world": Table(columns=used, rows=[_in_world(body, used) for body in shown]),
-        "hint": more if len(shown) < len(bodies) or world.told.get("more") else None,
+        "in_world": Table(columns=used, rows=rows),
+        "hint": more if len(rows) < len(bodies) or world.told.get("more") else None,
     }
 
 
@@ -161,10 +169,15 @@ def _retention(recording: Recording, connection: sqlite3.Connection) -> dict[str
 
 
 def _liveliest(robots: list[Any]) -> list[Any]:
-    """Those seen last, where there are too many to show; in the order of their first appearance."""
+    """Those seen last, where there are too many to show; the latest first."""
     latest = sorted(robots, key=lambda robot: (robot.live, robot.last_seen_wall_time_s))
-    shown = {robot.id for robot in latest[-_SHOWN_ROBOTS:]}
-    return [robot for robot in robots if robot.id in shown]
+    return latest[::-1][:_SHOWN_ROBOTS]
+
+
+def _fitting(views: list[View]) -> list[View]:
+    """The first that fit, in the order of their first appearance."""
+    fitting_rows = fitting([[*_row(view), *_recorder(view).values()] for view in views])
+    return sorted(views[: len(fitting_rows)], key=lambda view: view.robot.id)
 
 
 def _row(view: View) -> list[Any]:
@@ -209,16 +222,15 @@ def _controller(session: Session | None) -> dict[str, Any] | None:
 
 
 def _devices(devices: dict[str, str]) -> dict[str, str] | None:
-    return dict(list(devices.items())[:_SHOWN_DEVICES]) or None
+    return shorten(devices, _DEVICES_TOKENS).value or None
 
 
-def _companions(view: View) -> Table | None:
+def _companions(view: View) -> list[list[str]]:
     if view.session is None:
-        return None
+        return []
     others = companions(view.connection, view.session, view.now_s)
     robots = {robot.id: robot for robot in list_robots(view.connection, view.now_s)}
-    rows = [
+    return [
         [robots[other.robot_id].name, robots[other.robot_id].kind, other.hold or ""]
-        for other in others[:_SHOWN_ROBOTS]
+        for other in others
     ]
-    return Table(columns=["robot", "kind", "hold"], rows=rows) if rows else None

@@ -14,7 +14,7 @@ from anyio import to_thread
 from webots_mcp.contract import HEARTBEAT_LATE_S, LOOPING
 from webots_mcp.questions.answers import CommandAnswer
 from webots_mcp.questions.history_answers import RunAnswer
-from webots_mcp.questions.shortening import RESULT_BUDGET, WHOLE, cut_text, shorten
+from webots_mcp.questions.shortening import RESULT_BUDGET_TOKENS, WHOLE, cut_text, shorten
 from webots_mcp.queue import Command, CommandQueue, fetch_command
 from webots_mcp.steering.running import ACTION as RUN
 from webots_mcp.steering.running import progress_of, run_facts
@@ -192,11 +192,11 @@ class _Sending:
             return self._sent
 
 
-def shown_result(command: Command, budget: int = RESULT_BUDGET) -> Any:
+def shown_result(command: Command, budget_tokens: int = RESULT_BUDGET_TOKENS) -> Any:
     """The result of a command; its numbers are exact, long values are shortened."""
     if command.result is None:
         return None
-    return shorten(command.decoded_result(), budget, WHOLE).value
+    return shorten(command.decoded_result(), budget_tokens, WHOLE).value
 
 
 def _error(command: Command) -> str | None:

@@ -19,7 +19,7 @@ from webots_mcp.errors import (
     UnknownSignalError,
 )
 from webots_mcp.naming import flatten
-from webots_mcp.questions.budget import figure, seconds, shown, table
+from webots_mcp.questions.budget import detailed, figure, seconds, shown, table
 from webots_mcp.questions.find_events import fitting_events, not_shown_of
 from webots_mcp.questions.get_trends import MOST_SIGNALS, trend_tables
 from webots_mcp.questions.shortening import shorten
@@ -39,9 +39,10 @@ from webots_mcp.store.signals.catalogue import known_signals
 
 ACTION: Final = "run"
 _ROWS_AROUND: Final = 6
-_STATE_BUDGET: Final = 1_200
-_TRENDS_BUDGET: Final = 1_800
-_EVENTS_BUDGET: Final = 1_700
+_STATE_TOKENS: Final = 400
+_TRENDS_TOKENS: Final = 450
+_EVENTS_TOKENS: Final = 400
+_CELL_TOKENS: Final = 16  # of a row before the end
 _SHOWN_SIGNALS: Final = 8
 _SHOWN_EVENTS: Final = 12
 _MOST_COLUMNS: Final = 8
@@ -281,7 +282,7 @@ def _what_happened(view: View, command: Command, progress: Progress) -> dict[str
 
 
 def _as_shown(state: State) -> dict[str, Any]:
-    short = shorten(state.value(), _STATE_BUDGET)
+    short = shorten(state.value(), _STATE_TOKENS)
     return {
         "state": short.value,
         "state_at_s": seconds(state.sim_time_s),
@@ -293,10 +294,10 @@ def _in_between(view: View, command: Command, asked: TimeRange) -> dict[str, Any
     (of_run,) = trends(view.connection, asked, limit=MOST_SIGNALS).runs
     found = search_events(view.connection, asked)
     of_others = found.only([each for each in found.events if not _is_own(each, command)])
-    shown_events, events = fitting_events(of_others, _SHOWN_EVENTS, _EVENTS_BUDGET, view)
+    shown_events, events = fitting_events(of_others, _SHOWN_EVENTS, _EVENTS_TOKENS, view)
     return {
         "movement": movement(view, asked),
-        "trends": trend_tables(of_run, _SHOWN_SIGNALS, _TRENDS_BUDGET)
+        "trends": trend_tables(of_run, _SHOWN_SIGNALS, _TRENDS_TOKENS)
         if of_run.rows or of_run.cut_at_s is not None
         else None,
         "events": events,
@@ -323,5 +324,7 @@ def _last_rows(view: View, command: Command, progress: Progress, end_s: float) -
     lines: list[list[Any]] = []
     for sim_time_s, data in reversed(rows):
         values = flatten(json.loads(data))
-        lines.append([seconds(sim_time_s), *(shown(values.get(name)) for name in names)])
+        lines.append(
+            [seconds(sim_time_s), *(detailed(values.get(name), _CELL_TOKENS) for name in names)]
+        )
     return table(("sim_time_s", *names), lines)

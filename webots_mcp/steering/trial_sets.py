@@ -49,7 +49,7 @@ from webots_mcp.store.trials import (
 from webots_mcp.trials.plan import SCHEDULER, TrialPlan, WorldPlan, combinations
 
 CANCELLED: Final = "it was cancelled"
-_TABLE_BUDGET: Final = 5_400
+_TABLE_TOKENS: Final = 1_250
 _GOES_ON: Final = "the command 'webots-mcp trials PLAN' continues it"
 _FROM_ELSEWHERE: Final = "came from another recording, and its robot did not: begin a new set"
 _LONGEST_WHY: Final = 120
@@ -246,7 +246,7 @@ def _facts(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
     planned = count_planned(plan, trials)
     state, hint = _state(found, planned - over, at_work=is_at_work(connection, found))
     ranking = ranking_of(trials, best)
-    rows = fitting(_rows(ranking, trials), _TABLE_BUDGET)
+    rows = fitting(_rows(ranking, trials), _TABLE_TOKENS)
     left_out = len(ranking.sets) - len(rows)
     return {
         "trial_set": found.id,

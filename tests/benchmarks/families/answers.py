@@ -18,13 +18,13 @@ from tests.benchmarks.registry import Bench, benchmark
 from tests.benchmarks.table import Line, Target
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME
+from webots_mcp.questions.shortening import tokens_in
 from webots_mcp.server import create_server
 from webots_mcp.standin import Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 
 _ROWS: Final = 2000
 _START_TIMEOUT_S: Final = 120
-_CHARACTERS_PER_TOKEN: Final = 4
 _TOKENS: Final = 2000
 _OF_WEBOTS: Final = ("webots_launch_world", "webots_load_world", "webots_quit")
 _PLOT: Final = "webots_plot"
@@ -120,6 +120,6 @@ def _line(answer: _Answer) -> Line:
     ours = f"{len(answer.text.encode()):,} bytes"
     if answer.picture_bytes:
         ours += f", picture of {answer.picture_bytes:,}"
-    beside = f"all rows as JSON {answer.recorded_bytes / _CHARACTERS_PER_TOKEN:,.0f} tokens"
-    tokens = len(answer.text) / _CHARACTERS_PER_TOKEN
+    beside = f"all rows as JSON {answer.recorded_bytes:,} bytes"
+    tokens = tokens_in(answer.text)
     return Line(answer.tool, ours, beside, tokens, "tokens", Target(_TOKENS))

@@ -56,6 +56,7 @@ _OF_THE_CORE: Final = {
     "import": Command(DATA, "webots_mcp.cli.data", "import_"),
     "prune": Command(DATA, "webots_mcp.cli.data", "prune"),
     "retain": Command(DATA, "webots_mcp.cli.data", "retain"),
+    "completion": Command(SETUP, "webots_mcp.cli.setting_up", "completion"),
     "doctor": Command(SETUP, "webots_mcp.cli.setting_up", "doctor"),
     "init": Command(SETUP, "webots_mcp.cli.setting_up", "init"),
     "migrate": Command(SETUP, "webots_mcp.cli.serving", "migrate"),
@@ -89,10 +90,10 @@ def app_for(argv: Sequence[str]) -> App:
     )
     called = argv[0] if argv else ""
     names = [called] if called in COMMANDS else list(COMMANDS)
+    groups = {name: Group(name, sort_key=place) for place, name in enumerate(GROUPS)}
     for name in names:
         command = COMMANDS[name]
-        group = Group(command.group, sort_key=GROUPS.index(command.group))
-        app.command(command.load(), name=name, group=group)
+        app.command(command.load(), name=name, group=groups[command.group])
     return app
 
 

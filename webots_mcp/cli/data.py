@@ -41,13 +41,14 @@ class _Written(NamedTuple):
 
 
 _ALL: Final = Range()
+_STDOUT: Final = Path("-")
 _UNLIMITED: Final = Limits()
 
 
 def export(
     *,
     output: Annotated[
-        str | None,
+        Path | None,
         Parameter(
             ("--output", "-o"),
             metavar="FILE",
@@ -92,7 +93,7 @@ def export(
     from webots_mcp.store.export import BUNDLE, FOR_VIEWERS, FORMATS, format_of
     from webots_mcp.store.reading.ranges import Scope
 
-    file = Path(output) if output not in (None, "-") else None
+    file = output if output != _STDOUT else None
     form = form or (format_of(file) if file else "csv")
     if trial_set is not None and part.scope() != Scope():
         raise InvalidInputError("give --trials or a range of states, not both")
@@ -200,7 +201,7 @@ def _show(written: _Written, *, as_json: bool) -> None:
 
 def import_(
     source: Annotated[
-        str,
+        Path,
         Parameter(
             "SOURCE",
             help="A folder with status.json, logs/, camera/, ...; a recording, a webots.db; or a "
@@ -231,16 +232,15 @@ def import_(
     """
     from webots_mcp.store.bundle import is_bundle, unpacked
 
-    place = Path(source)
-    if not place.is_file():
-        return _import_folder(recorded, place, robot, as_json=json)
-    if is_bundle(place):
-        with unpacked(place) as database:
+    if not source.is_file():
+        return _import_folder(recorded, source, robot, as_json=json)
+    if is_bundle(source):
+        with unpacked(source) as database:
             found = _import_recording(recorded, database)
     else:
-        found = _import_recording(recorded, place)
+        found = _import_recording(recorded, source)
     if json:
-        return print_json({"source": source, **found})
+        return print_json({"source": str(source), **found})
     print(f"{source}: {_taken_in(found)}")
 
 

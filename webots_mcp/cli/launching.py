@@ -7,6 +7,7 @@ import os
 import sys
 import time
 from contextlib import ExitStack
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from cyclopts import Parameter
@@ -16,8 +17,6 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins import stand_in_simulator
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from webots_mcp.launch import Launch, SessionStart
     from webots_mcp.store.recording import Recording
     from webots_mcp.webots.stream import WebotsLine
@@ -27,7 +26,7 @@ MAX_PORT: Final = 65_535
 
 
 def launch(
-    world: Annotated[str, Parameter("WORLD", help="A .wbt file in a Webots project.")],
+    world: Annotated[Path, Parameter("WORLD", help="A .wbt file in a Webots project.")],
     /,
     *,
     headless: Annotated[
@@ -62,7 +61,7 @@ def launch(
         ),
     ] = False,
     data_dir: Annotated[
-        str | None,
+        Path | None,
         Parameter("--data-dir", help="Where controllers record; else mcp_data/ of the project."),
     ] = None,
     patience_s: Annotated[
@@ -102,7 +101,7 @@ def launch(
             launched.webots.end()
 
 
-def _recording(data_dir: str | None, project: Path) -> Recording:
+def _recording(data_dir: Path | None, project: Path) -> Recording:
     """Where the controllers of the project record, whatever folder this one is started in."""
     from webots_mcp.contract import DATA_DIR_VARIABLE, PROJECT_DATA_FOLDER, resolve_database
     from webots_mcp.store.recording import Recording

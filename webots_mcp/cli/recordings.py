@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, ParamSpec, TypeAlias
 
 from cyclopts import Parameter
@@ -29,8 +30,9 @@ Json: TypeAlias = Annotated[bool, Parameter("--json", negative=(), help="Print J
 Robot: TypeAlias = Annotated[
     str | None, Parameter("--robot", metavar="NAME", help="Only this robot.")
 ]
+# Of a `Path` the shell completes the names of files.
 DataDir: TypeAlias = Annotated[
-    str | None,
+    Path | None,
     Parameter(
         "--data-dir",
         metavar="DIR",
@@ -50,7 +52,7 @@ class Where:
 
     data_dir: DataDir = None
     database: Annotated[
-        str | None, Parameter("--database", metavar="FILE", help="The database file itself.")
+        Path | None, Parameter("--database", metavar="FILE", help="The database file itself.")
     ] = None
 
     def recording(self, *, read_only: bool = True) -> Recording:

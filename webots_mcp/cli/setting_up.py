@@ -8,7 +8,7 @@ import textwrap
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from cyclopts import Parameter
 
@@ -463,3 +463,49 @@ def _print_folded(head: str, text: str) -> None:
         break_on_hyphens=False,
     )
     print(head + f"\n{'':{len(head)}}".join(lines))
+
+
+def completion(
+    shell: Annotated[
+        Literal["bash", "zsh", "fish", "powershell"] | None,
+        Parameter("SHELL", help="Else the one that this is typed in."),
+    ] = None,
+    /,
+    *,
+    install: Annotated[
+        bool,
+        Parameter(
+            "--install",
+            help="Write it where the shell looks, with a line in its start-up file that loads it.",
+        ),
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Print the script by which a shell completes commands, options and files at the Tab key.
+
+    For one session:
+
+        source <(webots-mcp completion bash)
+
+    With --install for all that are begun from then on. After an update of webots-mcp write it
+    again.
+    """
+    from cyclopts.completion import detect_shell
+    from cyclopts.completion.detect import ShellDetectionError
+
+    from webots_mcp.cli.commands import app_for
+
+    try:
+        shell = shell or detect_shell()
+    except ShellDetectionError as error:
+        raise InvalidInputError("which shell this is cannot be told: name it") from error
+    app = app_for([])
+    if install:
+        file = app.install_completion(shell=shell, add_to_startup=shell != "fish")
+        if as_json:
+            return print_json({"shell": shell, "file": str(file)})
+        return print(f"written: {file}; begin a new {shell} to use it")
+    script = app.generate_completion(shell=shell)
+    if as_json:
+        return print_json({"shell": shell, "script": script})
+    print(script)

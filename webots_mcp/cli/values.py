@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Final, TypeAlias
 
@@ -34,7 +35,8 @@ def refuse_options(_kind: Any, value: Any) -> None:
     Raises:
         ValueError: It is an option, and nobody knows it.
     """
-    if isinstance(value, str) and value.startswith("-") and value != "-":
+    is_text = isinstance(value, (str, Path))
+    if is_text and str(value).startswith("-") and str(value) != "-":
         raise ValueError(f"unknown option {value}")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
@@ -12,7 +13,7 @@ from webots_mcp.cli.recordings import Json
 def demo(
     *,
     data_dir: Annotated[
-        str | None,
+        Path | None,
         Parameter("--data-dir", metavar="DIR", help="Where to record (~/.webots-mcp/demo)."),
     ] = None,
     keep: Annotated[
@@ -27,5 +28,5 @@ def demo(
     from webots_mcp.contract import full_path
     from webots_mcp.plugins.demo.conversation import DEFAULT_DATA_DIR, run
 
-    chosen = full_path(data_dir) if data_dir else None
+    chosen = full_path(data_dir) if data_dir is not None else None
     run(chosen or DEFAULT_DATA_DIR, keep=keep, as_json=as_json)

@@ -19,7 +19,7 @@ def report(
         Id, Parameter("RUN", help="One run, or two beside each other; none: the newest.")
     ],
     output: Annotated[
-        str | None,
+        Path | None,
         Parameter(
             ("--output", "-o"),
             metavar="FILE",
@@ -65,7 +65,7 @@ def report(
     sum_up_first(recording)
     with recorded.reader() as connection, shown_progress("reporting") as progress:
         chosen = run_ids or [find_subject(connection, robot).run_id]
-        file = Path(output or file_name(chosen))
+        file = output or Path(file_name(chosen))
         require_free(file, overwrite=overwrite)
         require_folder(file)
         made = make_report(

@@ -1,0 +1,78 @@
+"""What a shell completes at the Tab key."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from webots_mcp.cli import main
+from webots_mcp.cli.commands import COMMANDS
+
+BASH = shutil.which("bash")
+# What bash itself does at Tab: it calls the function that `complete` has named for the command.
+TAB = """
+source "$1"; shift
+function=$(complete -p webots-mcp | sed 's/.*-F \\([^ ]*\\).*/\\1/')
+COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); COMPREPLY=()
+$function
+printf '%s\\n' "${COMPREPLY[@]}"
+"""
+
+
+@pytest.fixture(scope="module")
+def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The script for bash, written to a file as `--install` does."""
+    home = tmp_path_factory.mktemp("home")
+    with pytest.MonkeyPatch().context() as here:
+        here.setenv("HOME", str(home))
+        assert main(["completion", "bash", "--install"]) == 0
+    (file,) = (home / ".local" / "share" / "bash-completion" / "completions").iterdir()
+    assert f'. "{file}"' in (home / ".bashrc").read_text()
+    return file
+
+
+@pytest.mark.skipif(BASH is None, reason="no bash")
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [
+        ([""], set(COMMANDS)),
+        (["rep"], {"report"}),
+        (["report", "--over"], {"--overwrite"}),
+        (["launch", "--mode", ""], {"fast", "realtime", "pause"}),
+        (["launch", "wor"], {"worlds"}),
+        (["status", "--data-dir", "wor"], {"worlds"}),
+        (["events", "--datab"], {"--database"}),
+    ],
+)
+def test_bash_completes_commands_options_choices_and_files(
+    script: Path, tmp_path: Path, typed: list[str], offered: set[str]
+) -> None:
+    (tmp_path / "worlds").mkdir()
+    ended = subprocess.run(
+        [str(BASH), "--noprofile", "--norc", "-c", TAB, "bash", script, "webots-mcp", *typed],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert set(ended.stdout.split()) - {"--help", "--version"} == offered, ended.stderr
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish", "powershell"])
+def test_each_shell_has_a_script_that_knows_every_command(
+    shell: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    assert [name for name in COMMANDS if name not in script] == []
+    assert main(["completion", shell, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"shell": shell, "script": script[:-1]}
+
+
+def test_an_unknown_shell_is_refused_with_those_there_are(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["completion", "tcsh"]) == 2
+    refused = capsys.readouterr().err
+    assert all(shell in refused for shell in ("bash", "zsh", "fish", "powershell"))

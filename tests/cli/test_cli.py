@@ -263,6 +263,11 @@ def test_an_old_database_is_migrated_with_its_data(
         assert connection.execute("PRAGMA user_version").fetchone() == (SCHEMA_VERSION,)
 
 
+def test_an_argument_too_many_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["migrate", "head", "now"]) == 2
+    assert "migrate takes no further argument: 'head' 'now'" in capsys.readouterr().err
+
+
 def test_an_unknown_revision_is_bad_input(
     rover: RecordedRobot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -97,7 +97,7 @@ def is_declared(name: str) -> bool:
 
 def _run(argv: Sequence[str]) -> tuple[int] | None:
     """Call the command that was given; None where it is none of `commands`."""
-    from cyclopts import CycloptsError
+    from cyclopts import CycloptsError, UnusedCliTokensError
 
     from webots_mcp.cli.commands import COMMANDS, app_for
 
@@ -113,6 +113,9 @@ def _run(argv: Sequence[str]) -> tuple[int] | None:
     with ending_by_signals(), contextlib.nullcontext() if is_help else spelling_out():
         try:
             code = app(argv, exit_on_error=False, print_error=False, result_action="return_value")
+        except UnusedCliTokensError as error:
+            unused = " ".join(map(repr, error.unused_tokens or ()))
+            raise InvalidInputError(f"{argv[0]} takes no further argument: {unused}") from error
         except CycloptsError as error:
             raise InvalidInputError(str(error)) from error
         sys.stdout.flush()

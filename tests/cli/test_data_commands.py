@@ -179,6 +179,15 @@ def test_what_export_tells_is_not_mixed_with_a_table_on_stdout(
     assert "--json tells what a file got" in json.loads(capsys.readouterr().out)["error"]
 
 
+@pytest.mark.parametrize("asked", [("import", "x" * 300), ("prune", "--data-dir", "a\0b")])
+def test_programs_read_an_error_of_the_system_as_json_too(
+    asked: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*asked, "--json"]) == 1
+    said = capsys.readouterr()
+    assert json.loads(said.out)["error"] in said.err
+
+
 # -- import ---------------------------------------------------------------------------------------
 
 

@@ -69,22 +69,18 @@ def main(argv: Sequence[str] | None = None) -> int:
                 sys.stdout.flush()
             return code
     except WebotsMCPError as error:
-        said = as_typed(str(error))
-        if "--json" in given and is_declared(given[0]):
-            with contextlib.suppress(OSError):
-                print(spelled_out(json.dumps({"error": said}, ensure_ascii=False)))
-        return _end(EXIT_BAD_INPUT, said)
+        return _fail(EXIT_BAD_INPUT, as_typed(str(error)), given)
     except UnicodeEncodeError as error:  # bytes of the command line that are no text
         said = f"{error.object!r} cannot be written as {error.encoding}: {error.reason}"
-        return _end(EXIT_BAD_INPUT, said)
+        return _fail(EXIT_BAD_INPUT, said, given)
     except ModuleNotFoundError as error:
-        return _end(EXIT_SYSTEM, _explain_missing(error))
+        return _fail(EXIT_SYSTEM, _explain_missing(error), given)
     except KeyboardInterrupt as interrupt:
         return _end(*ended_by(interrupt))
     except BrokenPipeError:  # the reader of a pipe has seen enough
         _discard_output()
     except OSError as error:
-        return _end(EXIT_SYSTEM, str(error))
+        return _fail(EXIT_SYSTEM, str(error), given)
     return 0
 
 
@@ -120,6 +116,14 @@ def _run(argv: Sequence[str]) -> tuple[int] | None:
             raise InvalidInputError(str(error)) from error
         sys.stdout.flush()
     return (code or 0,)
+
+
+def _fail(code: int, text: str, given: Sequence[str]) -> int:
+    """End with an error, which programs read as JSON."""
+    if "--json" in given and is_declared(given[0]):
+        with contextlib.suppress(OSError):
+            print(spelled_out(json.dumps({"error": text}, ensure_ascii=False)))
+    return _end(code, text)
 
 
 def _end(code: int, text: str) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import sys
 import textwrap
 from collections import Counter
@@ -65,17 +64,15 @@ class Writing:
         if answer.strip().lower() not in ("y", "yes"):
             raise CommandRefusedError(f"{file} is left as it is")
 
-    def require_yes_to(self, change: FileChange) -> str:
-        """Show what changes, and ask whether it may; returns the lines that change.
+    def require_yes_to(self, change: FileChange) -> None:
+        """Show the lines that change, and ask whether they may.
 
         Raises:
             CommandRefusedError: It may not, or nobody can be asked.
         """
-        diff = _diff_of(change)
         if not self.as_json:
-            print(diff)
+            print(change.diff)
         self.require_yes(change.file)
-        return diff
 
     def apply(self, change: FileChange) -> dict[str, str]:
         """Write a file unless it holds that already; what was done."""
@@ -170,8 +167,7 @@ def init(
 
         webots-mcp init --observer worlds/arena.wbt
     """
-    from webots_mcp.setup.controller_patch import patch as patched
-    from webots_mcp.setup.controller_patch import unpatch
+    from webots_mcp.setup import controller_patch
 
     if sum(each is not None for each in (patch, undo, observer)) > 1:
         raise InvalidInputError("--patch, --observer and --undo exclude each other")
@@ -182,9 +178,9 @@ def init(
     elif undo is not None and undo.suffix == ".wbt":
         _remove_observer(undo, writing)
     elif undo is not None:
-        _change_controller(undo, unpatch, writing)
+        _change_controller(undo, controller_patch.unpatch, writing)
     elif patch is not None:
-        _change_controller(patch, patched, writing)
+        _change_controller(patch, controller_patch.patch, writing)
     else:
         _make_ready(project, name, writing, claude_desktop=claude_desktop)
 
@@ -205,18 +201,8 @@ def _change_controller(file: Path, changed: Callable[[bytes], bytes], writing: W
         return _print_files([there], writing)
     except InvalidInputError as error:
         raise InvalidInputError(f"{file} is left as it is: {error}") from error
-    diff = writing.require_yes_to(change)
-    _print_files([writing.apply(change) | {"diff": diff}], writing)
-
-
-def _diff_of(change: FileChange) -> str:
-    """The lines that change, whatever the file's encoding."""
-    before, after = (
-        (content or b"").decode("utf-8", "replace").splitlines()
-        for content in (change.before, change.after)
-    )
-    names = str(change.file), f"{change.file} (new)"
-    return "\n".join(difflib.unified_diff(before, after, *names, lineterm="", n=2))
+    writing.require_yes_to(change)
+    _print_files([writing.apply(change) | {"diff": change.diff}], writing)
 
 
 def _add_observer(world: Path, writing: Writing, *, in_place: bool, extern: bool) -> None:
@@ -278,10 +264,14 @@ def _print_files(
     if writing.as_json:
         return print_json({"files": files} | ({"then": then} if then else {}))
     for each in files:
-        note = f" ({each['note']})" if "note" in each else ""
-        print(f"{each['outcome']}: {each['file']}{note}")
+        print(_outcome(each))
     if then and not writing.dry_run:
         print(then)
+
+
+def _outcome(file: dict[str, str]) -> str:
+    note = f" ({file['note']})" if "note" in file else ""
+    return f"{file['outcome']}: {file['file']}{note}"
 
 
 def _make_ready(folder: str | None, name: str, writing: Writing, *, claude_desktop: bool) -> None:
@@ -362,8 +352,7 @@ def _described(controller: ProjectController, project: Path) -> dict[str, Any]:
 def _print_project(found: dict[str, Any], notes: list[str]) -> None:
     print(f"project {found['project']}\n")
     for each in found["files"]:
-        note = f" ({each['note']})" if "note" in each else ""
-        print(f"  {each['outcome']}: {each['file']}{note}")
+        print(f"  {_outcome(each)}")
     for each in found["controllers"]:
         print(f"\n{each['file']}")
         _print_controller(each)

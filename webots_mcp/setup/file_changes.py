@@ -7,6 +7,7 @@ it was, comments and trailing commas too.
 from __future__ import annotations
 
 import contextlib
+import difflib
 import json
 import os
 import re
@@ -34,6 +35,16 @@ class FileChange(NamedTuple):
     def is_needed(self) -> bool:
         """Whether the file differs from what it is to hold."""
         return self.before != self.after
+
+    @property
+    def diff(self) -> str:
+        """The lines that change, whatever the file's encoding."""
+        before, after = (
+            (content or b"").decode("utf-8", "replace").splitlines()
+            for content in (self.before, self.after)
+        )
+        names = str(self.file), f"{self.file} (new)"
+        return "\n".join(difflib.unified_diff(before, after, *names, lineterm="", n=2))
 
 
 def read(file: Path) -> bytes | None:

@@ -62,18 +62,18 @@ class ReadingConnection(sqlite3.Connection):
         keep_deadline(self)
 
     def execute(self, *statement: Any) -> sqlite3.Cursor:
-        """As of any connection, with a deadline of its own."""
+        """Execute like any connection, with a deadline of its own."""
         self._until_s[0] = time.monotonic() + LONGEST_READ_S
         return super().execute(*statement)
 
     def is_late(self) -> Callable[[], bool]:
-        """Tells whether the statement that was begun last has had its time."""
+        """A function that returns whether the newest statement has exceeded its time."""
         until_s = self._until_s
         return lambda: time.monotonic() > until_s[0]
 
 
 def keep_deadline(connection: sqlite3.Connection) -> None:
-    """Give a connection back the deadline of its own, if it has one, after another's."""
+    """Restore a connection's own deadline, if it has one, after another one was set."""
     is_late = connection.is_late() if isinstance(connection, ReadingConnection) else None
     connection.set_progress_handler(is_late, _STEPS_PER_LOOK)
 
@@ -81,8 +81,8 @@ def keep_deadline(connection: sqlite3.Connection) -> None:
 class FrozenConnection(ReadingConnection):
     """To a file in a place that cannot be written, read as it lies on the disk.
 
-    Reading a database in WAL mode needs two files beside it. Where they cannot be made and are
-    not there, nothing but the file itself counts, and SQLite reads it as one that never changes.
+    Reading a database in WAL mode needs two files next to it. Where they cannot be created and do
+    not exist, only the file itself counts, and SQLite reads it as one that never changes.
     """
 
 
@@ -215,13 +215,13 @@ def _open(address: str, timeout_s: float, kind: type[sqlite3.Connection]) -> sql
 
 
 def _open_frozen(file: Path) -> sqlite3.Connection:
-    """Never beside a log: it may hold the newest rows, or somebody may be writing it."""
+    """Only without a write-ahead log, which may have the newest rows, or be written right now."""
     log = file.with_name(f"{file.name}-wal")
     if log.exists():
         raise DatabaseError(
-            f"{file} lies where nothing can be written, and rows that are still in {log.name} can "
-            "only be read where SQLite can make a file beside it: copy both to a folder of your "
-            "own and give --database that copy"
+            f"{file} is in a folder that cannot be written, and the rows in {log.name} can only be "
+            "read where SQLite can create a file next to it: copy both to a folder of your own and "
+            "give --database that copy"
         )
     connection = _open(f"{file.absolute().as_uri()}?mode=ro&immutable=1", 0, FrozenConnection)
     try:
@@ -235,7 +235,7 @@ def _open_frozen(file: Path) -> sqlite3.Connection:
 def identify_files(database: Database) -> tuple[int, ...]:
     """Which files a database consists of at this moment.
 
-    A connection to files that were deleted or replaced still works, on what nobody else sees.
+    A connection to files that were deleted or replaced still works, on data that no other sees.
     """
     if isinstance(database, MemoryDatabase):
         return ()
@@ -266,7 +266,7 @@ def _why_none_is_in(folder: Path) -> str:
 
 
 def _make(file: Path) -> None:
-    """An empty file that is its owner's alone, as SQLite then makes the log beside it."""
+    """Create an empty file that only its owner can read: SQLite gives its log the same rights."""
     try:
         make_folder(file.parent)
     except OSError as error:

@@ -95,8 +95,8 @@ BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
 
 OBSERVER: Final = "Observer"  # the kind of a robot that only looks at the others, and steers
 OBSERVER_NAME: Final = "mcp_observer"  # of its Robot node and of its controller
-WORLD_EVENT: Final = "world"  # the event that tells which robots and solids an observer sees
-MODE_EVENT: Final = "mode"  # the event that tells which simulation mode it sees
+WORLD_EVENT: Final = "world"  # the event with the robots and solids that an observer sees
+MODE_EVENT: Final = "mode"  # the event with the simulation mode that an observer sees
 LOOK_AT: Final = "look_at"  # its action
 
 BreakpointAction = Literal["pause", "log", "keep"]
@@ -117,7 +117,7 @@ SEE_STEPS: Final = (
 )
 UNSEEN: Final = f"the controller's loop steps in a way that the bridge does not see: {SEE_STEPS}"
 UNMOVED: Final = (
-    "the bridge has seen no simulation time go by since it began: the simulation is paused in "
+    "the bridge has not seen simulation time advance since it began: the simulation is paused in "
     "Webots, the controller has not reached its loop, or its loop steps in a way that the bridge "
     f"does not see; then {SEE_STEPS}"
 )
@@ -133,7 +133,7 @@ MAX_STEPS: Final = 100_000
 
 
 def find_log_level(level: object) -> LogLevel | None:
-    """The level that somebody means by a name, in either case, or by a number of `logging`.
+    """The level of a name, in either case, or of a number of `logging`.
 
     Returns:
         None for what is neither. A number between two levels is the lower one; less than 10 is
@@ -214,10 +214,10 @@ def make_folder(folder: Path) -> None:
 
 @contextmanager
 def whole_file(file: Path) -> Generator[Path]:
-    """A file beside it to write to, of its owner alone, which takes its place when it is whole.
+    """A file next to it to write to, private to its owner, which replaces it when it is complete.
 
     Raises:
-        OSError: It cannot be written; nothing is left beside it.
+        OSError: It cannot be written; no part of it is left.
     """
     aside = file.with_name(f"{file.name}.part")
     aside.touch(PRIVATE_FILE)
@@ -233,7 +233,7 @@ def full_path(path: str | os.PathLike[str]) -> Path:
     """The path with `~` and links followed.
 
     Raises:
-        OSError: `~` is nobody's home, links lead round in a circle, or no file has such a name.
+        OSError: `~` is no user's home, links form a circle, or the name is not valid.
     """
     try:
         return Path(path).expanduser().resolve()
@@ -242,7 +242,7 @@ def full_path(path: str | os.PathLike[str]) -> Path:
 
 
 def bundled(name: str) -> Path:
-    """The folder `name` (migrations, examples): in the package in a wheel, beside it in a checkout.
+    """The folder `name` (migrations, examples): in the package, or in a checkout next to it.
 
     Raises:
         FileNotFoundError: It is in neither place; the installation is broken.

@@ -9,7 +9,7 @@ of its own.
     │   ├── ForeignDatabaseError    the file is not a recording of this package
     │   ├── ForkedProcessError      a parent process has the file open
     │   ├── MalformedRowError       a row holds a value that no bridge has written
-    │   ├── SessionGoneError        somebody deleted the session that is being recorded
+    │   ├── SessionGoneError        the session that is being recorded was deleted
     │   ├── SchemaTooNewError       a newer webots-mcp wrote it
     │   └── SchemaTooOldError       an older webots-mcp wrote it: migrate first
     ├── PoolError                   the store of many recordings is the problem
@@ -32,7 +32,7 @@ of its own.
 
 Each message names the value that was wrong and the next step to take.
 
-What keeps nobody from going on is no error: `warn` says it in a line on stderr.
+A condition that stops no work is not an error: `warn` writes it as a line on stderr.
 
 Standard library only, because the bridge imports it inside a robot's controller.
 """
@@ -154,7 +154,7 @@ class ControllerEndedError(InterruptedCommandError):
 
 
 def warn(text: str) -> None:
-    """Write a line for whoever runs the controller or the server.
+    """Write a line for the person who runs the controller or the server.
 
     A stderr that is full, closed or (under pythonw) not there costs the line, nothing else.
     """

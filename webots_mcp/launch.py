@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from webots_mcp.console.console_follower import said
+from webots_mcp.console.console_follower import as_row
 from webots_mcp.contract import (
     WORLD_ENDING,
     find_project,
@@ -62,7 +62,7 @@ def require_world(path: str | Path, project: Path | None = None) -> tuple[Path, 
 
 
 def _found(path: Path, project: Path | None) -> Path:
-    """The file that is meant: in a project, a name alone is that of one of its worlds."""
+    """The file of a world: in a project, a name alone is that of one of its worlds."""
     around = project or find_project(Path.cwd())
     folders = [project or Path(), *([] if around is None else [around / "worlds"])]
     places = [full_path(folder / path) for folder in folders]
@@ -71,8 +71,8 @@ def _found(path: Path, project: Path | None) -> Path:
             return place
     folder = next((each.parent for each in reversed(places) if each.parent.is_dir()), Path())
     there = [world.name for world in sorted(folder.glob(f"*{WORLD_ENDING}"))]
-    beside = f"; in {folder} there is {', '.join(there[:20])}" if there else ""
-    raise InvalidInputError(f"there is no world {places[0]}{beside}")
+    others = f"; in {folder} there is {', '.join(there[:20])}" if there else ""
+    raise InvalidInputError(f"there is no world {places[0]}{others}")
 
 
 class SessionStart(NamedTuple):
@@ -99,7 +99,7 @@ class Launch:
     Args:
         recording: Where its controllers record.
         start: How it is started.
-        environment: What its controllers get beside the environment of this process.
+        environment: Variables for its controllers, in addition to those of this process.
         show: Called with each line of its console, in a thread of its own.
 
     Attributes:
@@ -137,7 +137,7 @@ class Launch:
         return "; ".join(reasons) or "no controller has recorded yet"
 
     def record_last_words(self) -> None:
-        """Record what a Webots has said that ended before its console was followed.
+        """Record the output of a Webots that ended before its console was followed.
 
         Raises:
             DatabaseError: It cannot be recorded.
@@ -146,7 +146,7 @@ class Launch:
         rows = ConsoleRows(f"{host_name()}:{port}", self._began_s)
         with self._recording.writer() as connection, transaction(connection):
             if not rows.is_recorded(connection):
-                rows.write(connection, [said(line) for line in self.webots.lines])
+                rows.write(connection, [as_row(line) for line in self.webots.lines])
 
     def _begun(self) -> list[SessionStart]:
         asked = WebotsAddress("127.0.0.1", self.start.port)
@@ -155,7 +155,7 @@ class Launch:
         return [each for each in found if each.pid in pids or address_of(each.instance) == address]
 
     def _of_webots(self) -> list[str]:
-        told = [line.text for line in self.webots.lines if _is_of_trouble(line)]
+        printed = [line.text for line in self.webots.lines if _is_problem(line)]
         reasons = list[str]()
         if self.webots.is_over:
             reasons.append(f"Webots ended with exit code {self.webots.exit_code}")
@@ -163,8 +163,8 @@ class Launch:
             reasons.append(f"Webots does not listen at port {self.start.port} yet: it is starting")
         elif self.start.mode == "pause":
             reasons.append("it begins paused: controllers are started when it is played")
-        if told:
-            reasons.append(f"its console said: {' | '.join(told[-_SHOWN_LINES:])}")
+        if printed:
+            reasons.append(f"its console has: {' | '.join(printed[-_SHOWN_LINES:])}")
         return reasons
 
     def _of_controllers(self) -> list[str]:
@@ -174,8 +174,8 @@ class Launch:
         return list(_without_record(self.world))
 
 
-def _is_of_trouble(line: WebotsLine) -> bool:
-    """What came on stderr; also what looks so, as `xvfb-run` may put both into one."""
+def _is_problem(line: WebotsLine) -> bool:
+    """Whether a line is from stderr, or looks so: `xvfb-run` may mix both streams."""
     if line.stream == "stderr":
         return bool(line.text.strip()) and not line.text.startswith(_NO_NEWS)
     return bool(_TROUBLE.search(line.text))

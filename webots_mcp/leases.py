@@ -53,7 +53,7 @@ class Lease(NamedTuple):
     lasts_s: float = LEASE_S
 
     def latest_s(self, now_s: float) -> float:
-        """The wall time up to which one that somebody holds may last."""
+        """The latest wall time up to which a held lease may last."""
         return now_s + _TIMES * self.lasts_s
 
 
@@ -63,7 +63,7 @@ def lease_of(name: str) -> Lease:
 
 
 def holder_of(connection: sqlite3.Connection, name: str) -> str | None:
-    """Who renewed the lease of that job lately; None where nobody did."""
+    """Who renewed the lease of that job lately; None where no process did."""
     now_s = time.time()
     row = connection.execute(_HOLDER, (name, now_s, now_s + _TIMES * LEASE_S)).fetchone()
     return row and str(row[0])
@@ -76,13 +76,13 @@ def take(
     forced: bool = False,
     outranked: str | None = None,
 ) -> bool:
-    """Take a lease, or renew it; False where somebody else has it.
+    """Take a lease, or renew it; False where another process has it.
 
     Args:
         connection: In the role "writer".
-        lease: Which, and for whom.
-        forced: Take it from its holder, who is known to be gone.
-        outranked: Holders from which it may be taken although they live, as SQL's LIKE has them.
+        lease: The lease, and its holder.
+        forced: Take it from its holder, whose process is known to have ended.
+        outranked: Live holders from which it may be taken, as a pattern of SQL's LIKE.
     """
     now_s = time.time()
     times = {"now": now_s, "until": now_s + lease.lasts_s, "latest": lease.latest_s(now_s)}

@@ -47,9 +47,9 @@ END_SESSION: Final = (
     "UPDATE session SET ended_wall_time_s = last_seen_wall_time_s, end_reason = :reason "
     "WHERE id = :id AND ended_wall_time_s IS NULL"
 )
-# Judged from outside: the rows are counted, because the dead process could not say how many; and
-# its last row may be younger than its last heartbeat. Counting takes long, and so comes first: no
-# robot waits for it, and what it found stays true, since nobody else writes to these runs.
+# For sessions of dead processes: the rows are counted, since the process cannot report them, and
+# the last row may be younger than the last heartbeat. Counting takes long, so it comes first, when
+# no robot waits for it; its result stays true, since no other process writes to these runs.
 _LAST_ROW: Final = (
     "coalesce((SELECT {0} FROM state WHERE run_id = run.id ORDER BY sim_time_s DESC LIMIT 1), {1})"
 )
@@ -65,7 +65,7 @@ END_RUN: Final = (
     "last_sim_time_s = :last_sim_s, end_reason = :reason, rows = :rows "
     "WHERE id = :id AND ended_wall_time_s IS NULL"
 )
-EXTERN: Final = "nobody starts an extern controller again: start it by hand"
+EXTERN: Final = "Webots does not restart an extern controller: start it by hand"
 _OPEN_SESSIONS: Final = (
     "SELECT id, pid, CAST(process AS BLOB), last_seen_wall_time_s, EXISTS (SELECT 1 FROM command "
     "WHERE session_id = session.id AND action = 'reload' AND issued_wall_time_s IS NOT NULL) "
@@ -94,7 +94,7 @@ def process_alive(pid: int, process: str | None, last_seen_wall_time_s: float) -
         pid: Its id, which another process may have by now.
         process: Its `process_identity`, which no other has, whatever clocks are set to.
         last_seen_wall_time_s: Its newest sign of life, Unix time: what there is to go by where the
-            identity is not known. Where the system does not tell either when a process started
+            identity is not known. Where the system does not show either when a process started
             (macOS), any process of that pid counts.
     """
     if not (_is_pid(pid) and isinstance(last_seen_wall_time_s, (int, float))):  # pyright: ignore[reportUnnecessaryIsInstance]
@@ -120,7 +120,7 @@ def process_identity(pid: int) -> str | None:
 
     A pid comes back; its boot and its start within that boot do not. On Windows the creation
     time, which setting the clock does not change afterwards. None where no such process runs, or
-    the system does not tell (macOS).
+    the system does not show it (macOS).
     """
     if sys.platform == "win32":
         created = _windows_creation(pid)
@@ -136,7 +136,7 @@ def process_identity(pid: int) -> str | None:
 
 
 def _posix_start(pid: int) -> float | None:
-    """Unix time of the process' start, 0 where it is not told, None where there is no process."""
+    """Unix time of the process' start; 0 where it is not shown, None where there is no process."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -171,7 +171,7 @@ def _windows_start(pid: int) -> float | None:
 
 
 def _windows_creation(pid: int) -> int | None:
-    """In 100 ns since 1601; 0 where it is not told, None where there is no process.
+    """In 100 ns since 1601; 0 where it is not shown, None where there is no process.
 
     os.kill(pid, 0) would end the process on Windows, asking does not.
     """
@@ -184,11 +184,11 @@ def _windows_creation(pid: int) -> int | None:
         return None
     code, times = ctypes.c_ulong(), (ctypes.c_ulonglong * 4)()  # created, ended, kernel, user
     kernel.GetExitCodeProcess(handle, ctypes.byref(code))
-    told = kernel.GetProcessTimes(handle, *(ctypes.byref(times, 8 * i) for i in range(4)))
+    known = kernel.GetProcessTimes(handle, *(ctypes.byref(times, 8 * i) for i in range(4)))
     kernel.CloseHandle(handle)
     if code.value != still_active:
         return None
-    return int(times[0]) if told else 0
+    return int(times[0]) if known else 0
 
 
 class LoopStatus(NamedTuple):
@@ -235,14 +235,14 @@ def write_heartbeat(
 
 
 def reap(connection: sqlite3.Connection, now_s: float) -> None:
-    """Say what became of everything that nobody alive will finish.
+    """Settle everything that no live process will finish.
 
     Pending commands past their time become `expired`. Open sessions whose process on this host is
     gone are ended (`reload` if they asked for one, else `crashed`). Commands claimed by an ended
     session become `lost`, and are never run again by themselves; only one that asked Webots for a
     reload gets a minute for the next session to confirm it, where Webots starts one. Where a file
-    of the session waits beside the database, the command's result may be in it: who takes that
-    in settles the rest.
+    of the session waits next to the database, the command's result may be in it: the process that
+    takes the file in settles the rest.
 
     The caller opens the transaction, or accepts that each statement is one of its own.
     """
@@ -264,7 +264,7 @@ def reap(connection: sqlite3.Connection, now_s: float) -> None:
 
 
 def _may_wait(connection: sqlite3.Connection, session_uuid: str | None) -> bool:
-    """Whether entries of that session may still wait beside the database."""
+    """Whether entries of that session may still wait next to the database."""
     ((file,),) = connection.execute(_FILE).fetchall()
     return bool(file and session_uuid) and waiting_path(Path(file), f"{session_uuid}").exists()
 
@@ -290,5 +290,5 @@ def end_session(connection: sqlite3.Connection, session_id: int, reason: str) ->
     for run_id, last_s, last_sim_s, rows in connection.execute(_FOUND, (session_id,)).fetchall():
         times = {"last_s": last_s, "last_sim_s": last_sim_s}
         connection.execute(END_RUN, {"id": run_id, "reason": reason, "rows": rows, **times})
-    # Last: whoever is killed before leaves a session that is settled again.
+    # Last: a process that is killed before this leaves a session that will be settled again.
     connection.execute(END_SESSION, {"id": session_id, "reason": reason})

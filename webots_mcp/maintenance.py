@@ -2,7 +2,7 @@
 
 The log of a WAL database grows until a checkpoint copies it back. An automatic checkpoint would
 be the slowest step of a control loop (5 ms at p99.9, measured), so the bridge's connection makes
-none. Exactly one maintainer does: whoever holds the lease.
+none. Exactly one maintainer does: the holder of the lease.
 
 Nearly all is copied without the write lock (a PASSIVE checkpoint), and only what is left when the
 log is long is copied with it, to begin the log anew (RESTART). In SQLite before 3.51.3 a checkpoint
@@ -106,7 +106,7 @@ class Maintainer(threading.Thread):
         self._ending.set()
         if self.is_alive():
             self.join(timeout=2)
-        elif self.ident is None:  # never started: whoever called `tick` had no thread end for it
+        elif self.ident is None:  # never started: `tick` was called without a thread that ends it
             self._give_back()
 
     def tick(self) -> bool:
@@ -199,7 +199,7 @@ class Maintainer(threading.Thread):
         try:
             give_back(self._connection, self._lease)
         except sqlite3.Error as error:
-            warn(f"the lease runs out by itself: {error}")
+            warn(f"the lease will expire by itself: {error}")
         self._disconnect()
 
     def _disconnect(self) -> None:

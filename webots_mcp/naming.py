@@ -36,7 +36,7 @@ _ANGLES_IF_UNIT: Final = (*_ANGLES, "course")  # a course without a unit may be 
 _HUMP: Final = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
 _KEPT: Final = 4096  # names whose units are remembered
 
-LONGEST_SPREAD_ARRAY: Final = 16  # a longer one is reduced: nobody asks for lidar.117
+LONGEST_SPREAD_ARRAY: Final = 16  # a longer one is reduced: lidar.117 is of no interest
 REDUCTIONS: Final = ("count", "min", "max", "mean", "argmin")
 
 INDEXES: Final = tuple(str(index) for index in range(LONGEST_SPREAD_ARRAY))
@@ -54,7 +54,7 @@ ELSEWHERE: Final = frozenset((
     "destination", "goal", "image", "item", "marker", "object", "obstacle", "pixel",
     "reference", "setpoint", "solid", "target", "waypoint",
 ))  # fmt: skip
-# Words beside an x that leave it the robot's own, as in robot_x and currentPosX.
+# Words next to an x that leave it the robot's own, as in robot_x and currentPosX.
 OWN: Final = frozenset((*BRANCHES, *METRES, "robot", "rover", "current", "actual", "own", "self"))
 _SEEN: Final = f"{WORLD}."
 PAST_OR_FUTURE: Final = frozenset(("last", "previous", "prev", "old", "next", "desired", "target"))
@@ -152,8 +152,8 @@ def find_position(numeric: Collection[str]) -> tuple[str, str] | None:
     this order), or `x` and `y` at the top, or else the first branch by name that has an x and y:
     one with such a word in its name before others (`currentPosition.x`, `posX`, `robotPose.0`), and
     none of what is elsewhere (`goal`, `ball`) or no place (`velocity`). The views robot_now and
-    robot_trajectory have the same rule, row by row. Of several robots that an observer sees none
-    is meant.
+    robot_trajectory have the same rule, row by row. Where an observer sees several robots, none
+    of their positions is taken.
     """
     for x, y in USUAL_POSITIONS:
         if x in numeric and y in numeric:
@@ -220,7 +220,7 @@ def _subject_words(name: str) -> frozenset[str]:
 
 
 def is_seen_speed(name: str) -> bool:
-    """Whether it is how fast an observer sees a body to be, which nobody was told to be."""
+    """Whether it is the speed of a body as an observer sees it, which no command set."""
     branch, _, rest = name.partition(".")
     return branch in (WORLD, SOLIDS) and rest.endswith(f".{SEEN_SPEED}")
 
@@ -228,7 +228,7 @@ def is_seen_speed(name: str) -> bool:
 def find_mode(texts: Collection[str], choices: Collection[str] = ()) -> str | None:
     """The name of what a robot is doing, among those of its texts; None without any.
 
-    Where no text tells it, a choice does: a whole number of which there are few values.
+    Without such a text it is one of `choices`: whole numbers with few different values.
 
     It is `mode`, `behaviour`, `behavior`, `action`, `task` or `phase` (in this order), or else the
     shortest name that ends in one of these words, as `nav.mode`, `driveMode` and `mode_name` do;
@@ -295,8 +295,8 @@ def nearest_first(name: str, known: Iterable[str]) -> list[str]:
     Alike is who has the same letters, whatever their case, as a whole or in the last part of a
     dotted name: `front` is near `sensors.front`.
     """
-    meant = name[:_LONGEST_COMPARED].lower()
-    return sorted(known, key=lambda each: -_likeness(meant, each[:_LONGEST_COMPARED].lower()))
+    wanted = name[:_LONGEST_COMPARED].lower()
+    return sorted(known, key=lambda each: -_likeness(wanted, each[:_LONGEST_COMPARED].lower()))
 
 
 def _likeness(name: str, other: str) -> float:

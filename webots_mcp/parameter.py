@@ -74,11 +74,13 @@ class Declaration(NamedTuple):
         """
         found = _as_kind(self.kind, as_plain(value))
         if found is None or not self._is_allowed(found):
-            raise InvalidInputError(f"parameter {self.name!r} is {self.meant}, not {_shown(value)}")
+            raise InvalidInputError(
+                f"parameter {self.name!r} is {self.expected}, not {_shown(value)}"
+            )
         return found
 
     @property
-    def meant(self) -> str:
+    def expected(self) -> str:
         """What it may be set to, in words."""
         if self.choices is not None:
             return f"one of {', '.join(map(repr, self.choices))}"

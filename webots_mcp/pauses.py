@@ -1,12 +1,13 @@
 """Pauses of a simulation: who paused it, since when, how that ends, and how it is reported.
 
-Webots has one simulation mode `pause`. Who set it decides what is known of it:
+Webots has one simulation mode `pause`. What is known of a pause depends on who set it:
 
 - A command (`pause`, the end of a `step`, that of a `run` whose `then` is "pause") or a breakpoint:
   the bridge stays in the loop and serves commands there. The event `pause` has the cause and the
   moment, the heartbeat has `PAUSED` in `session.hold` with the mode to go back to. A session that
-  comes after a reload goes on with the pause of the one before. It ends with a command that lets
-  time go on, with a person who presses play, or with the bridge: the event `resume` says which.
+  comes after a reload continues the pause of the one before. It ends with a command that lets the
+  simulation continue, with a person who presses play, or with the bridge: the event `resume` says
+  which.
 - A person in Webots, another controller, or the controller's own code: its bridge is not asked and
   may not get to run. Only an observer sees it (the event `mode`); press play, or ask the observer.
 
@@ -21,7 +22,7 @@ import math
 import sqlite3
 from typing import Final, NamedTuple
 
-PAUSED: Final = "paused"  # what a command does to the loop, as the column session.hold tells it
+PAUSED: Final = "paused"  # how a command controls the loop: the column session.hold
 STEPPING: Final = "stepping"
 PAUSE: Final = "pause"  # the kinds of the events
 RESUME: Final = "resume"
@@ -30,22 +31,22 @@ IN_WEBOTS: Final = "a person or another controller, in Webots"
 SESSION_BEFORE: Final = "the controller's session before this one"
 BRIDGE_CLOSED: Final = "the bridge, which was closed"
 
-# What a status says of a pause that no bridge of ours holds.
+# The texts of a status for a pause that no bridge has begun.
 SEEN_PAUSED: Final = "paused in Webots, as robot"
 SEEN_RUNNING: Final = "not paused, as robot"
-SEEN_PAUSED_BY: Final = f"{SEEN_PAUSED} {{!r}} sees; webots_simulation_control('resume') goes on"
+SEEN_PAUSED_BY: Final = f"{SEEN_PAUSED} {{!r}} sees; webots_simulation_control('resume') resumes it"
 SEEN_RUNNING_BY: Final = (
-    f"{SEEN_RUNNING} {{!r}} sees, and yet time stands still: a controller hangs, or an extern "
-    "one is missing"
+    f"{SEEN_RUNNING} {{!r}} sees, but simulation time stands still: a controller hangs, or an "
+    "extern one has not been started"
 )
-HELD_ELSEWHERE: Final = "the simulation is held by robot {!r}: resume it there"
+HELD_ELSEWHERE: Final = "robot {!r} has paused the simulation: resume it there"
 LEFT_PAUSED: Final = (
     "robot {0!r} paused the simulation, and its controller has ended since: press play in Webots, "
     "or start that controller again and resume it there"
 )
 
-# A pause is noted as an event at the instant; the heartbeat tells of it only at its next beat.
-# What came after the beat has at least its simulation time, which bounds the search to the index.
+# A pause is recorded as an event at once, but the heartbeat shows it only at its next beat. Events
+# after that beat have at least its simulation time, which limits the search to the index.
 _CHANGE_SINCE: Final = (
     "SELECT e.kind FROM run r JOIN event e ON e.run_id = r.id AND e.sim_time_s >= :sim_time_s "
     "WHERE r.session_id = :session_id AND e.wall_time_s > :wall_time_s "

@@ -115,7 +115,7 @@ def webots_bridge(
 
 @pytest.fixture
 def webots_recording(webots_database: MemoryDatabase) -> RobotRecording:
-    """What was recorded in `webots_database`, and the way to send commands."""
+    """The recording in `webots_database`, with functions to send commands."""
     from webots_mcp.testing import RobotRecording
 
     return RobotRecording(webots_database)
@@ -134,11 +134,11 @@ def webots_simulation(
     """
     from webots_mcp.testing import RecordedSimulation, SimulationFactory
 
-    def tell(simulation: RecordedSimulation) -> None:
+    def report(simulation: RecordedSimulation) -> None:
         node: pytest.Item = request.node
         node.add_report_section("call", "recording", f"{simulation.recording.database}\n")
 
-    factory = SimulationFactory(tmp_path, request.config.rootpath, tell)
+    factory = SimulationFactory(tmp_path, request.config.rootpath, report)
     yield factory
     factory.close()
     if webots_parameters and (databases := factory.databases):
@@ -180,4 +180,4 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
             line = entry
     if is_own and entry.tb_frame.f_code.co_filename.startswith(own_frames):
         line.tb_next = None
-        error.__cause__, error.__suppress_context__ = None, True  # the message tells of it
+        error.__cause__, error.__suppress_context__ = None, True  # the message includes it

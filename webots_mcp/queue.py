@@ -1,9 +1,9 @@
 """The command queue: the rows of `command`, and every statement that changes one.
 
-Who asks puts a command in as `pending`. The controller that it is for makes it `claimed`, in one
-statement and before anything runs, and then `done` or `failed`. What nobody claims in time is
-`expired`, what its asker takes back before that is `cancelled`, and what its claimer's process did
-not live to answer is `lost`. So a command runs at most once, and what became of it is final once:
+A client adds a command as `pending`. The controller that it is for makes it `claimed`, in one
+statement and before anything runs, and then `done` or `failed`. A command that is not claimed in
+time is `expired`, one that its client cancels before that is `cancelled`, and one whose claimer's
+process ended without an answer is `lost`. So a command runs at most once, and its outcome is final:
 each statement names the status that it expects, which holds for any number of processes.
 
 Standard library only, because the bridge imports it inside a robot's controller.
@@ -27,7 +27,7 @@ _ATTEMPTS: Final = 3
 
 
 class Command(NamedTuple):
-    """A request and its fate; `params` and `result` are JSON text. Columns as in `store.models`."""
+    """A command and its outcome; `params` and `result` are JSON. Columns as in `store.models`."""
 
     id: int
     robot_id: int
@@ -90,7 +90,7 @@ _NOTE: Final = "UPDATE command SET error = :note WHERE id = :id AND status = 'cl
 # -- the controller that it is for -------------------------------------------------------------
 
 # An indexed read takes no lock. An UPDATE takes the write lock even where it matches nothing, so
-# it is made only after this said that there is something. The texts come as bytes: one that is no
+# it is made only after this has found a command. The texts are read as bytes: one that is not
 # UTF-8 would fail the statement after it claimed the command.
 PEEK: Final = (
     "SELECT 1 FROM command WHERE robot_id = ? AND status = 'pending' "
@@ -127,7 +127,7 @@ CONFIRM_RELOAD: Final = (
     "AND status = 'claimed' AND issued_wall_time_s IS NOT NULL"
 )
 
-# -- whoever sees that nobody will finish it (`liveness.reap`) --------------------------------
+# -- processes that see that none will finish it (`liveness.reap`) ----------------------------
 
 EXPIRE: Final = (
     "UPDATE command SET status = 'expired', finished_wall_time_s = :now, "
@@ -208,18 +208,18 @@ class CommandQueue:
         return command
 
     def leave(self, command_id: int, why: str) -> bool:
-        """Nobody waits any more: it is taken back, or goes on where it has begun, with a note.
+        """The caller has stopped waiting: cancel it, or note that where it is already running.
 
         Returns:
-            Whether it goes on.
+            Whether it is running.
         """
         if self.cancel(command_id, why):
             return False
-        values = {"id": command_id, "note": f"{why}; it goes on"}
+        values = {"id": command_id, "note": f"{why}; the command continues"}
         return _while_busy(lambda: self._connection.execute(_NOTE, values)).rowcount == 1
 
     def cancel(self, command_id: int, why: str) -> bool:
-        """Take back a command that nobody has claimed; True if it will now never run."""
+        """Cancel a command that is not claimed yet; True if it will now never run."""
         values = {"id": command_id, "now": self._clock(), "why": why}
         return _while_busy(lambda: self._connection.execute(_CANCEL, values)).rowcount == 1
 

@@ -1,6 +1,6 @@
 """Which packages webots-mcp needs, which of them are missing, and the line that installs them.
 
-A package of that name is on no index yet, and whoever registers it first would be installed. So no
+A package of that name is on no index yet, and pip would install whatever is registered first. So no
 advice names it there: it names the packages that are missing, or where this one was installed from.
 Standard library only: a controller's Python has nothing but the bridge.
 """
@@ -64,14 +64,14 @@ def checkout() -> str:
 
     The word CHECKOUT, for a person to replace, where that is not known or not there any more.
     """
-    beside = Path(__file__).parents[1]
-    if (beside / "pyproject.toml").is_file():
-        return str(beside)
+    above = Path(__file__).parents[1]
+    if (above / "pyproject.toml").is_file():
+        return str(above)
     try:
-        told = metadata.distribution("webots-mcp").read_text("direct_url.json")
+        text = metadata.distribution("webots-mcp").read_text("direct_url.json")
     except metadata.PackageNotFoundError:
-        told = None
-    origin = json.loads(told or "{}")
+        text = None
+    origin = json.loads(text or "{}")
     url = str(origin.get("url", ""))
     if "vcs_info" in origin:
         return f"{origin['vcs_info']['vcs']}+{url}@{origin['vcs_info']['commit_id']}"

@@ -7,7 +7,7 @@ importing anything but the standard library.
 A file of foreign origin may hold anything: a view under the name of a table of ours, or a trigger
 on one, would run its author's SQL in every process that opens the file, and a recursion in it need
 never end. So what has a name of ours must be what we ship under it, and nothing that runs may hang
-on it. What a person has added beside is left alone.
+on it. Further objects that a person has added are left alone.
 
 Standard library only, because the bridge imports it inside a robot's controller.
 """
@@ -174,7 +174,7 @@ def _file(connection: sqlite3.Connection, schema: str) -> str:
 def _why_refused(
     kind: str, name: str, table: str, sql: str, shipped: dict[str, str], referring: set[str]
 ) -> str | None:
-    """What an object does that nobody may; None where it is harmless, or ours in other spelling."""
+    """Why an object is refused; None where it is harmless, or ours in another spelling."""
     if (ours := shipped.get(name.lower())) is not None:
         return None if _spelled(sql) == _spelled(ours) else "stands where another is in recordings"
     if _OF_SQLITE.match(name.lower()) and not sql.startswith(_OF_SQLITE_MADE):

@@ -94,7 +94,7 @@ def in_transaction(connection: sqlite3.Connection, act: Callable[[], Result]) ->
 
 
 def roll_back(connection: sqlite3.Connection) -> None:
-    """End the transaction, if one is open: a full disk ends it by itself."""
+    """End the transaction, if one is still open: on a full disk SQLite has ended it already."""
     if connection.in_transaction:
         connection.execute("ROLLBACK")
 
@@ -145,12 +145,12 @@ class ShortWrites:
 class Step:
     """Statements that SQLite runs as one: one short transaction in one call.
 
-    Work that goes on beside control loops holds the write lock for a millisecond at most. In a
+    Work done while control loops run holds the write lock for a millisecond at most. In a
     process with several threads a `transaction` cannot promise that: between any two of its
     statements another thread may run for 5 ms and more, while every robot waits for the lock.
     Statements in the body of a trigger run without Python in between.
 
-    What a step writes is prepared before it, in temporary tables, which lock nobody out.
+    What a step writes is prepared before it, in temporary tables, which lock no other process out.
 
     Args:
         name: Of the step, unlike that of any table.

@@ -1,12 +1,12 @@
 """The file in which writes of a controller wait for the database, and how they come into it.
 
 A row that meets a lock for longer than a control loop may wait is appended, as one line with one
-`write()`, to a file of its session beside the database (`webots.db-waiting-<session uuid>.jsonl`).
-It survives a killed process; whoever opens the database next adopts it: exactly once, in order, in
-short transactions. How far that came stands in `session.adopted_rows`, the number of the last
-entry, which is written in the same transaction as the rows. So nothing hangs on what happens to the
-file afterwards: who finds it again, after a kill or an interrupt at any place, passes over what is
-in already.
+`write()`, to a file of its session next to the database (`webots.db-waiting-<session uuid>.jsonl`).
+It survives a killed process; the next process that opens the database adopts it: exactly once, in
+order, in short transactions. The progress is in `session.adopted_rows`, the number of the last
+entry, which is written in the same transaction as the rows. So it does not matter what happens to
+the file afterwards: a process that finds it again, after a kill or an interrupt at any place, skips
+the entries that are already in the database.
 
 The first line says who records. Each further one is an `Entry` as a JSON array: its number, its
 kind, the UUID of its run and its values. A line that was cut off by a kill in the middle of its
@@ -34,7 +34,7 @@ from webots_mcp.errors import SessionGoneError, warn
 from webots_mcp.transactions import in_transaction
 
 ENTRIES_AT_ONCE: Final = 100  # read, or written in one transaction
-FORMAT: Final = 1  # of the file; whoever knows another one leaves the file alone
+FORMAT: Final = 1  # of the file; versions that know another one leave the file alone
 MAX_FILE_BYTES: Final = 1_000_000_000
 _VERSION: Final = "webots_mcp_waiting"
 _NO_NUMBER: Final = 1 << 63  # SQLite's integers end there
@@ -107,7 +107,7 @@ def waiting_paths(database: Path) -> list[Path]:
 
 
 class WaitingFile:
-    """The entries of one session that wait beside its database, written by that session.
+    """The entries of one session that wait next to its database, written by that session.
 
     The file is made with the first entry and stays locked while it is open: a file that is not
     locked belongs to a process that is gone. All calls come from one thread at a time.
@@ -133,7 +133,7 @@ class WaitingFile:
         file = former = self._file
         if file is None or os.fstat(file.fileno()).st_nlink == 0:
             file = self._file = self._made()
-            if former is not None:  # somebody deleted it
+            if former is not None:  # the file was deleted
                 former.close()
         self._write(file, b"".join(encoded(entry) for entry in entries))
 
@@ -145,13 +145,13 @@ class WaitingFile:
             return next_entries(file, max(offset, len(self._header)))
 
     def empty(self) -> None:
-        """Forget the entries; who records stays."""
+        """Forget the entries; the header with robot and session stays."""
         if self._file is not None:
             self._file.truncate(len(self._header))
             self._is_whole = True
 
     def close(self, *, remove: bool) -> None:
-        """Without `remove` it stays for whoever opens the database next."""
+        """Close the file; without `remove` it is left for the next opener of the database."""
         file, self._file = self._file, None
         if file is None:
             return
@@ -307,7 +307,7 @@ def take_in(connection: sqlite3.Connection, session_id: int, piece: Sequence[Ent
 
     Raises:
         sqlite3.Error: Nothing was written.
-        SessionGoneError: Somebody deleted the session.
+        SessionGoneError: The session was deleted.
     """
 
     def act() -> Taken:
@@ -347,15 +347,15 @@ def _write(connection: sqlite3.Connection, session_id: int, entry: Entry) -> str
 
 
 def adopt(connection: sqlite3.Connection, database: Path) -> int:
-    """Take in what sessions left behind whose process is gone; that of the living is theirs.
+    """Take in what sessions of dead processes left behind; files of live sessions are left alone.
 
     Args:
         connection: A writer in autocommit mode and in no transaction.
         database: Its file.
 
     Returns:
-        How many rows and other writes that was. A file that cannot be taken in stays, is said
-        once, and keeps nobody from recording.
+        How many rows and other writes that was. A file that cannot be taken in is left in place and
+        reported once; recording continues without it.
 
     Raises:
         sqlite3.Error: The database is locked; what is in is in, the rest waits.

@@ -151,7 +151,7 @@ def test_webots_that_ends_at_its_start_is_told_with_what_it_said(
     process = launch(world)
     _, said = process.communicate(timeout=60)
     assert process.returncode == 1
-    assert "webots-mcp: Webots ended with exit code 1; its console said: " in said
+    assert "webots-mcp: Webots ended with exit code 1; its console has: " in said
     asking = [sys.executable, "-m", "webots_mcp", "logs", "--data-dir"]
     asking += [str(world.parent.parent / "mcp_data")]
     told = subprocess.run(asking, capture_output=True, text=True, check=False).stdout

@@ -112,7 +112,7 @@ def test_where_nobody_records_it_is_said_since_when(look: Look, recorded: Record
     gone(recorded)
     now = look("Recording now")
     assert now.verdict == "warning"
-    assert "heard of 0." in now.seen
+    assert "the last sign of life was 0." in now.seen
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="kills by signal")

@@ -145,7 +145,7 @@ async def test_webots_that_ends_at_its_start_is_an_error_with_what_it_said(
     async with begin() as client:
         (project / "worlds" / "arena.wbt").write_text("no world", "utf-8")
         text = await fail(client, "webots_launch_world", world="arena.wbt")
-        assert "Webots ended with exit code 1; its console said: " in text
+        assert "Webots ended with exit code 1; its console has: " in text
         rows = (await ask(client, "webots_get_logs"))["lines"]["rows"]
         assert sum("a world begins with" in row[2] for row in rows) == 1
         assert (await ask(client, "webots_launch_world", world="field.wbt"))["outcome"] == "done"

@@ -119,7 +119,7 @@ async def test_a_command_whose_asker_went_away_says_that_it_goes_on(
                 (row,) = rows_of((await ask(client, "webots_list_commands"))["commands"])
                 if row.get("error"):
                     break
-        assert (row["outcome"], row["error"]) == ("claimed", "the client disconnected; it goes on")
+        assert (row["outcome"], row["error"]) == ("claimed", "the client disconnected; the command continues")
 
 
 async def test_resume_and_reset_say_at_which_pace_it_goes_on_and_why(

@@ -78,7 +78,7 @@ def test_an_answer_that_is_not_known_is_told_and_is_no_sign_of_a_start_without_s
         reply = give_order(at(server), "pause", 5)
         told = why_not_obeyed(at(server), reply)
         assert (reply.text, server.mode) == (None, "pause")
-        assert "answered 'state: changed', which does not tell whether it obeyed" in told
+        assert "answered 'state: changed', which does not show whether it obeyed" in told
         assert "--stream" not in told
 
 

@@ -186,8 +186,8 @@ def parse_condition(text: str) -> Condition:
     tree = parse(scanned)
     compiled = Compiler(scanned, tree, _as_it_is)
     asks_position = compiled.position is not None
-    told = (tuple(compiled.readers), asks_position, compiled.remembers_s)
-    return Condition(scanned.original, *told, scanned, tree)
+    read = (tuple(compiled.readers), asks_position, compiled.remembers_s)
+    return Condition(scanned.original, *read, scanned, tree)
 
 
 def _nearest(name: str, known: Collection[str]) -> str:
@@ -270,7 +270,7 @@ class Compiler(Nodes):
             try:
                 return compare(a, b)
             except TypeError:
-                raise self._failure(column, f"{_said(a)} {sign} {_said(b)}?") from None
+                raise self._failure(column, f"{_shown(a)} {sign} {_shown(b)}?") from None
 
         return holds
 
@@ -299,7 +299,7 @@ class Compiler(Nodes):
         def holds(state: State) -> bool:
             value = read(state)
             if value.__class__ is str:
-                raise self._failure(column, f"{_said(value)} by itself is no condition")
+                raise self._failure(column, f"{_shown(value)} by itself is no condition")
             return bool(value)
 
         return holds
@@ -341,7 +341,7 @@ class Compiler(Nodes):
         def number(state: State) -> Number | None:
             value = read(state)
             if value.__class__ is str:
-                raise self._failure(column, f"{_said(value)} is no number")
+                raise self._failure(column, f"{_shown(value)} is no number")
             return value  # pyright: ignore[reportReturnType]
 
         return number
@@ -453,7 +453,7 @@ class Compiler(Nodes):
         return f"there is no {name}(); there are {offer}"
 
 
-def _said(value: Value) -> str:
+def _shown(value: Value) -> str:
     if isinstance(value, bool):
         return f"the flag {str(value).lower()}"
     return f"the text {value[:50]!r}" if isinstance(value, str) else f"the number {value}"

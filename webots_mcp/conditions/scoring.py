@@ -30,7 +30,7 @@ _MISPLACED_FOR: Final = "`for` belongs to a condition, as in time(x < 1 for 2)"
 
 
 class Facts(NamedTuple):
-    """What is known of a run beside its states.
+    """Facts about a run in addition to its states.
 
     Attributes:
         duration_s: Simulated seconds.

@@ -1,4 +1,4 @@
-"""What a condition knows of the states of a robot: values of the newest, and what came before.
+"""What a condition remembers of a robot's states: the newest values, and earlier ones.
 
 A signal's value is what `flatten` of the recorded row gives under its name. A whole state is not
 flattened for that: a condition has two microseconds. What is kept of the states before (the last
@@ -294,7 +294,7 @@ class Changed(_Holding[Value]):
         self._holds = False
 
     def _take_in(self, answer: Value, sim_time_s: float) -> None:
-        """A missing value is no change, and neither is its return as it was."""
+        """A missing value is not a change, and neither is the return of the value before."""
         self._holds = answer is not None and self._last is not None and answer != self._last
         if answer is not None:
             self._last = answer

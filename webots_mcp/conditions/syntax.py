@@ -64,7 +64,7 @@ class Scanned:
     """A text that Python's parser takes.
 
     Attributes:
-        original: As it was given, without the spaces around it.
+        original: The text as it was given, without the spaces around it.
         source: For the parser: a comma stands in the place of each `for`.
         columns: For each sign of `source`, and its end, the place in the original; from 0.
         durations: The places in `source` of the words `for`.

@@ -34,7 +34,7 @@ from webots_mcp.webots.stream import (
 )
 
 MOST_LINES_PER_S: Final = 500  # of wall time
-MOST_OLD_LINES: Final = 2_000  # of those that were said before somebody listened, the newest
+MOST_OLD_LINES: Final = 2_000  # of those printed before the console was followed, the newest
 
 _LEVELS: Final[dict[str, LogLevel]] = {"stdout": "info", "stderr": "warning"}
 # How Webots' own lines begin, by the stream that they come on.
@@ -52,7 +52,7 @@ _SHORTEST_PAUSE_S: Final = 0.5
 _LONGEST_PAUSE_S: Final = 8.0
 _RENEW_S: Final = 5.0
 _WAITING_LOOK_S: Final = 2.0
-_YOUNG_S: Final = 5.0  # a Webots that has just started has said nothing old
+_YOUNG_S: Final = 5.0  # a Webots that has just started has printed nothing old
 _MOST_HELD: Final = 5_000  # while the database is locked
 _FIRST_LOOK_S: Final = 1.0  # a server that has just started has answers to give
 _LOOK_EVERY_S: Final = 5.0
@@ -61,7 +61,7 @@ _UNSURE: Final = "; it was started without --stream: if no lines appear, start i
 
 
 def job_of(instance: Instance) -> str:
-    """The name of the lease of whoever follows the console of that Webots."""
+    """The name of the lease for following the console of that Webots."""
     return f"console of {instance.name}"
 
 
@@ -69,7 +69,7 @@ def job_of(instance: Instance) -> str:
 def follow_console(instance: Instance, recording: Recording) -> Generator[ConsoleFollower]:
     """While this lasts, what that Webots says in its console is recorded, by one process of many.
 
-    It begins as soon as there is a database. Where nobody can speak to Webots, `problem` says why.
+    It begins as soon as there is a database. Where Webots cannot be reached, `problem` says why.
     """
     follower = ConsoleFollower(instance, recording)
     follower.start()
@@ -227,7 +227,7 @@ class ConsoleWatch(threading.Thread):
             pause_s = _LOOK_EVERY_S
             try:
                 self.look()
-            except Exception as error:  # noqa: BLE001  (it is told)
+            except Exception as error:  # noqa: BLE001  (it is reported)
                 if str(error) != self._warned_of:
                     self._warned_of = str(error)
                     warn(f"no console of Webots is followed: {error}")
@@ -262,7 +262,7 @@ class ConsoleLines:
     """Takes Webots' messages as they come, gives its lines.
 
     Args:
-        old: Whether what waited until somebody listened may have been said long before.
+        old: Whether the first lines may have been printed long before they were read.
     """
 
     def __init__(self, *, old: bool) -> None:
@@ -286,39 +286,39 @@ class ConsoleLines:
 
     def _that_waited(self, lines: list[WebotsLine]) -> Iterator[Said]:
         newest = lines[-MOST_OLD_LINES:]
-        told = f"the next {len(newest)} lines were printed before the console was followed"
+        text = f"the next {len(newest)} lines were printed before the console was followed"
         if len(newest) < len(lines):
-            told += f", the last of {len(lines)}"
+            text += f", the last of {len(lines)}"
         if self._is_old or len(newest) < len(lines):
-            yield _about(f"({told}: when they were printed is not known)")
+            yield _about(f"({text}: when they were printed is not known)")
         for line in newest:
-            yield said(line)._replace(is_old=True)
+            yield as_row(line)._replace(is_old=True)
 
     def idle(self) -> Iterator[Said]:
-        """What is to be said although nothing came."""
+        """Notes that are due although no line came."""
         if int(time.monotonic()) != self._second:
-            yield from self._tell_left_out()
+            yield from self._note_left_out()
 
     def _within_limit(self, line: WebotsLine) -> Iterator[Said]:
         second = int(time.monotonic())
         if second != self._second:
-            yield from self._tell_left_out()
+            yield from self._note_left_out()
             self._second, self._lines_in_second = second, 0
         self._lines_in_second += 1
         if self._lines_in_second > MOST_LINES_PER_S:
             self._left_out += 1
         else:
-            yield said(line)
+            yield as_row(line)
 
-    def _tell_left_out(self) -> Iterator[Said]:
+    def _note_left_out(self) -> Iterator[Said]:
         if self._left_out:
             lost = f"{self._left_out} lines of the console"
             yield note(f"{lost}: more than {MOST_LINES_PER_S} in a second")
             self._left_out = 0
 
 
-def said(line: WebotsLine) -> Said:
-    """A line as a row, now: who said it, and how grave it is."""
+def as_row(line: WebotsLine) -> Said:
+    """A line as a row of this moment: its source, and its severity."""
     # What a terminal shows of a line that was written over, as by a progress bar.
     text = line.text.rstrip("\r").rpartition("\r")[2].replace("\0", "�")
     level, source = _judged(line.stream, text)

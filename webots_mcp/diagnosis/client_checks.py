@@ -101,7 +101,7 @@ def server(subject: Examined) -> Finding:
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as complaints:
         try:
             tools, refused = anyio.run(_converse, line, complaints)
-        except Exception as error:  # noqa: BLE001  (it is told)
+        except Exception as error:  # noqa: BLE001  (it is reported)
             seen = f"'{' '.join(line)}' did not answer: {_why(error)}{_last_line(complaints)}"
             return Finding("wrong", seen, _FIX)
     started = f"started over stdio, {tools} tools that only read"  # by --read-only

@@ -1,7 +1,7 @@
-"""Each link between a controller and its asker, looked at by itself: checks, and how they are run.
+"""Checks of each link between a controller and its client, and how they are run.
 
 A check is one function of what is `Examined` that returns a `Finding`, declared by `@check(NAME)`
-in one of the modules of this package. What it says goes on in docs/troubleshooting.md, under a
+in one of the modules of this package. Its finding is explained in docs/troubleshooting.md, under a
 heading of its name. A diagnosis changes nothing.
 """
 
@@ -116,7 +116,7 @@ class Check:
 
     @property
     def page(self) -> str:
-        """Where more is said about it."""
+        """Where it is explained further."""
         return f"{PAGE}#{self.name.lower().replace(' ', '-')}"
 
 
@@ -154,14 +154,14 @@ def all_checks(*, with_server: bool = False) -> list[Check]:
 def worst(findings: Sequence[Finding]) -> Finding:
     """Several findings of one check as one; what is well is left out where something is not."""
     verdict = _WORST_FIRST[min(_WORST_FIRST.index(finding.verdict) for finding in findings)]
-    told = [finding for finding in findings if verdict == "ok" or finding.verdict != "ok"]
-    fixes = list(dict.fromkeys(finding.fix for finding in told if finding.fix))
-    seen = "; ".join(dict.fromkeys(finding.seen for finding in told))
+    shown = [finding for finding in findings if verdict == "ok" or finding.verdict != "ok"]
+    fixes = list(dict.fromkeys(finding.fix for finding in shown if finding.fix))
+    seen = "; ".join(dict.fromkeys(finding.seen for finding in shown))
     return Finding(verdict, seen, "; ".join(fixes) or None)
 
 
 def last_seen_s(view: View) -> float:
-    """When a robot was heard of last, Unix time."""
+    """When a robot last gave a sign of life, Unix time."""
     seen_s = view.robot.last_seen_wall_time_s
     return max(seen_s, view.session.last_seen_wall_time_s) if view.session else seen_s
 
@@ -186,14 +186,14 @@ def diagnose(subject: Examined, checks: Sequence[Check] | None = None) -> list[C
 
 
 def _look(check: Check, subject: Examined) -> Finding:
-    """One check that fails says so, and the others go on."""
+    """Run one check; one that fails reports that, and the others still run."""
     if check.needs_recording and subject.connection is None:
         return Finding("not looked at", "there is no recording that can be read")
     try:
         return check.look(subject)
     except ModuleNotFoundError as error:
         return Finding("not looked at", f"the Python package {error.name!r} is missing")
-    except Exception as error:  # noqa: BLE001  (it is told)
+    except Exception as error:  # noqa: BLE001  (it is reported)
         if is_damage(error):
             return Finding("wrong", f"the database is damaged: {text_of(error)}", _RECOVER)
         return Finding("not looked at", f"{type(error).__name__}: {error}")

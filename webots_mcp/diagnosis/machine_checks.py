@@ -27,7 +27,7 @@ _WAL_RESET_MENDED_IN_BRANCH: Final = {(3, 44): 6, (3, 50): 7}
 
 @check("Python")
 def python(_: Examined) -> Finding:
-    """The Python that runs this; that of the controllers is said by `Recording now`."""
+    """The Python that runs this; `Recording now` has that of the controllers."""
     seen = f"{platform.python_version()} at {sys.executable}"
     if sys.version_info[:2] < _OLDEST_PYTHON:
         return Finding("wrong", seen, "use Python 3.10 or newer")
@@ -70,7 +70,7 @@ def judge_sqlite(version: tuple[int, ...]) -> Finding:
 
 
 def has_wal_reset_bug(version: tuple[int, ...]) -> bool:
-    """Whether a checkpoint beside a commit can damage a file."""
+    """Whether a checkpoint during a commit can damage a file."""
     mended = _WAL_RESET_MENDED_IN_BRANCH.get((version[0], version[1]))
     return version < _WAL_RESET_MENDED and (mended is None or version[2] < mended)
 
@@ -92,7 +92,7 @@ _LOCAL: Final = (
 
 
 class Mount(NamedTuple):
-    """A file system and where it begins, as psutil tells them."""
+    """A file system and its mount point, as psutil lists them."""
 
     point: str
     kind: str
@@ -126,7 +126,7 @@ def data_folder(subject: Examined) -> Finding:
 
 
 def _why_unwritable(folder: Path) -> str | None:
-    """By trying: rights alone do not tell of a file system that is mounted read-only."""
+    """Whether a folder can be written, by trying: a read-only file system ignores its rights."""
     try:
         with tempfile.TemporaryFile(dir=folder):
             return None
@@ -158,7 +158,7 @@ def judge_file_system(folder: str, mounts: Iterable[Mount], *, is_wsl: bool) -> 
         return _on_the_network(folder, "a network drive")
     mount = _mount_of(path, mounts)
     if mount is None:
-        return Finding("not looked at", f"the system does not tell what {folder} lies on")
+        return Finding("not looked at", f"the system does not show on which drive {folder} is")
     kind = mount.kind.lower()
     if is_wsl and kind in _WINDOWS_FROM_WSL:
         return _across_the_border(folder, f"a drive of Windows, seen from WSL ({kind})")
@@ -206,7 +206,7 @@ def free_space(subject: Examined) -> Finding:
     folder = next(folder for folder in subject.file.parents if folder.exists())
     free = shutil.disk_usage(folder).free
     seen = f"{free / 1e9:.1f} GB free"
-    fix = "make room: 'webots-mcp prune --dry-run' tells what could go"
+    fix = "make room: 'webots-mcp prune --dry-run' lists what could be deleted"
     if free < _FULL_BYTES:
         return Finding("wrong", f"{seen}: the disk is full", fix)
     return Finding(

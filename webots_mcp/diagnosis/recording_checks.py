@@ -80,7 +80,7 @@ def recording_now(subject: Examined) -> Finding:
     newest_s = max(last_seen_s(view) for view in subject.views)
     return Finding(
         "warning",
-        f"no controller is recording; the last one was heard of {ago(subject.now_s - newest_s)}",
+        f"no controller is recording; the last sign of life was {ago(subject.now_s - newest_s)}",
         "start the simulation in Webots; if its controllers record elsewhere, name that folder "
         "with --data-dir",
     )
@@ -91,8 +91,8 @@ def _described(view: View) -> str:
     assert session is not None
     python = session.versions.get("python")
     return (
-        f"{view.robot.name} (process {session.pid}{f', Python {python}' if python else ''}), heard "
-        f"of {ago(session.silent_s(view.now_s))}"
+        f"{view.robot.name} (process {session.pid}{f', Python {python}' if python else ''}), last "
+        f"sign of life {ago(session.silent_s(view.now_s))}"
     )
 
 
@@ -110,7 +110,7 @@ def rows(subject: Examined) -> Finding:
 def _lost(view: View) -> Finding:
     session = view.session
     assert session is not None
-    told = rows_waiting(view.connection, session) if view.robot.live else {"rows_waiting": 0}
+    waiting = rows_waiting(view.connection, session) if view.robot.live else {"rows_waiting": 0}
     name, error = view.robot.name, session.last_error
     why = f" ({error[:200]})" if error else ""
     if session.rows_dropped:
@@ -119,10 +119,10 @@ def _lost(view: View) -> Finding:
             f"{session.rows_dropped} rows of {name} were dropped{why}",
             "see free space and the folder's rights; what was dropped is lost",
         )
-    if told["rows_waiting"]:
+    if waiting["rows_waiting"]:
         return Finding(
             "warning",
-            f"{told['rows_waiting']} rows of {name} wait in {told['waiting_in']}{why}",
+            f"{waiting['rows_waiting']} rows of {name} wait in {waiting['waiting_in']}{why}",
             "free the database: a full disk, or a program that holds a lock (a sqlite3 shell?); "
             "they are taken in with the next row",
         )
@@ -183,7 +183,7 @@ def _judged(command: _Unfinished, view: View) -> Finding:
     if view.session is not None and view.session.last_poll_wall_time_s is None:
         return Finding("wrong", f"{seen}; its loop never calls get_command()", _GET_COMMAND)
     why = view.status.why or view.status.text
-    return Finding("wrong", f"{seen}: {why}", "let the simulation go on, see Simulation")
+    return Finding("wrong", f"{seen}: {why}", "let the simulation continue, see Simulation")
 
 
 def _claimed(command: _Unfinished, view: View, what: str) -> Finding:
@@ -213,6 +213,6 @@ def _polled(view: View, session: Session) -> Finding:
         return Finding("warning", seen, _GET_COMMAND)
     silent_s = 0.0 if polled_s is None else session.age_s(polled_s, view.now_s)
     if view.status.is_moving and silent_s > _NOT_POLLED_S + HEARTBEAT_LATE_S:
-        seen = f"{view.robot.name}'s loop called get_command() last {ago(silent_s)}, and goes on"
+        seen = f"{view.robot.name}'s loop called get_command() last {ago(silent_s)}, and still runs"
         return Finding("warning", seen, _GET_COMMAND)
     return Finding("ok", f"{view.robot.name}'s loop asks for commands")

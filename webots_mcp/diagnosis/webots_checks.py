@@ -1,8 +1,8 @@
-"""Which Webots there are, and why a simulation does not go on.
+"""Which Webots run, and why a simulation does not advance.
 
-What a status tells from inside is narrowed down from outside. A loop that is silent inside `step`
-looks the same whoever keeps it there. The machine tells more: which controller's process computes,
-and how many robots of the world wait for a controller that somebody has to start.
+The reason for a status is narrowed down from outside. A loop that is silent inside `step` looks the
+same whatever keeps it there. The machine shows more: which controller's process is computing, and
+how many robots of the world wait for a controller that a person has to start.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def _judged(subject: Examined, view: View) -> Finding:
 
 
 def _is_unclear(view: View) -> bool:
-    """Whether only a look from outside can tell which controller holds up the world."""
+    """Whether only the machine's processes can show which controller blocks the world."""
     return (view.status.why or "").startswith((SILENT, SEEN_RUNNING))
 
 
@@ -162,7 +162,7 @@ def _busy_controllers(
 
 
 def _wants_processor(process: psutil.Process) -> bool:
-    """Whether it would go on if a processor were free; only Linux tells."""
+    """Whether it would continue if a processor were free; only Linux shows it."""
     import psutil
 
     try:
@@ -221,7 +221,7 @@ def _missing_externs(subject: Examined, view: View, webots: Instance | None) -> 
         return None
     return (
         f"{count} robots of {Path(str(world)).name} have the controller <extern> and {here} record "
-        "here: one that nobody has started stops the whole simulation"
+        "here: one that has not been started stops the whole simulation"
     )
 
 
@@ -280,7 +280,7 @@ def _reachable(webots: Instance) -> Finding:
         return Finding(
             "warning",
             f"{seen} was not seen to listen there",
-            "wait until it has started; of another user's process this is not told",
+            "wait until it has started; the system does not show another user's processes",
         )
     obeys = "obeys" if webots.streams else "was started without --stream and does not obey"
     return Finding("ok", f"{seen} {obeys} orders from outside")

@@ -172,7 +172,7 @@ class ObservedWorld:
     Args:
         robot: The observer's own Supervisor.
         period_ms: How often poses are to be sent, in simulation time.
-        warn: Is told what could not be done.
+        warn: Receives each thing that could not be done.
 
     Attributes:
         bodies: By the words that they are called in signals.
@@ -197,7 +197,7 @@ class ObservedWorld:
 
     @property
     def is_new(self) -> bool:
-        """A walk has found something else than `describe` has said."""
+        """Whether a walk has found something that `describe` has not recorded yet."""
         return self._is_new and self._is_walked
 
     def look(self, sim_time_s: float) -> Seen:

@@ -1,9 +1,9 @@
 """The observer's controller: its loop, and what it answers when it is asked.
 
 The loop must neither hold up the world nor hang in a pause. `step(n)` of a paused simulation does
-not return, so that whoever waits in it cannot resume. A robot without synchronization need not
-wait: it asks `step(0)`, which is answered at once, again and again. That Webots tells the time in
-these answers is tried, not assumed; where it does not, and in fast mode, where a moment would be
+not return, so a controller waiting in it cannot resume. A robot without synchronization need not
+wait: it asks `step(0)`, which is answered at once, again and again. Whether these answers have the
+time is tested, not assumed; where it does not, and in fast mode, where a moment would be
 long in simulation time, the loop makes steps like any other.
 """
 
@@ -85,7 +85,7 @@ class StepPace:
         return time.monotonic() - self._stood_since_s > _TRIAL_S
 
     def _try_step(self) -> bool:
-        """Where more time passed than a step takes, it went on unseen."""
+        """Make one step; where time advances by more, `step(0)` is no longer trusted to show it."""
         before_s, self._stood_since_s = self._time_s, time.monotonic()
         answer = self._robot.step(self._period_ms)
         self._time_s = float(self._robot.getTime())
@@ -104,7 +104,7 @@ class ObserverBridge(MCPBridge):
         self._session.context.journal.event(WORLD_EVENT, world)
 
     def count_steps_by_time(self) -> None:
-        """The world goes on between two rounds of the loop."""
+        """Count steps by time, since the world advances between two rounds of this loop."""
         self._session.context.clock.step_s = self._session.context.simulation.basic_time_step_s
 
     def record_mode(self) -> None:
@@ -186,7 +186,7 @@ class Observer:
             return False
         try:
             self._look()
-        except Exception as error:  # noqa: BLE001  (it goes on to steer, and looks again)
+        except Exception as error:  # noqa: BLE001  (it still steers, and looks again later)
             self.bridge.failed(error)
         self.bridge.get_command()
         return True
@@ -241,7 +241,7 @@ def _looked_at(body: ObservedBody, robot: Any) -> dict[str, Any]:
 
 
 def _standing(node: Any, robot: Any) -> dict[str, Any]:
-    """What Webots tells of a Solid that stands on its own, as far as this one does."""
+    """Contacts, centre of mass and balance of a Solid; a note where Webots has none for it."""
     try:
         contacts = node.getContactPoints(True)
         return {

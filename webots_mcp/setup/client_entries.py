@@ -1,4 +1,4 @@
-"""The files in which MCP clients are told of servers, and our entry in them."""
+"""The files in which MCP clients configure servers, and our entry in them."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """The bridge's two lines put into a controller, and taken out again.
 
 The syntax tree says where they belong; the bytes of the file stay as they are everywhere else. What
-cannot be told for certain is refused. Each result is proven before it is given: its tree is that of
-the original with the two statements more, so that nothing else has changed its meaning.
+cannot be determined for certain is refused. Each result is checked before it is returned: its tree
+is that of the original with the two statements added, so nothing else has changed its meaning.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def attach_line(source: bytes) -> str:
 
     Raises:
         AlreadyPatchedError: It, or another of the kind, is there.
-        InvalidInputError: It cannot be told for certain; the message says why.
+        InvalidInputError: It cannot be determined for certain; the message says why.
     """
     return _placed(source)[0].attach
 
@@ -65,7 +65,7 @@ def patch(source: bytes) -> bytes:
 
     Raises:
         AlreadyPatchedError: They, or others of the kind, are there.
-        InvalidInputError: It cannot be told for certain where they belong.
+        InvalidInputError: It cannot be determined for certain where they belong.
     """
     place, import_after = _placed(source)
     lines = _split(source)

@@ -41,7 +41,7 @@ def with_observer(world: bytes, *, extern: bool = False) -> bytes:
 
     Args:
         world: What its file holds.
-        extern: Its controller is started by somebody else, as by `webots-mcp observe`.
+        extern: Its controller is started by a person, as by `webots-mcp observe`.
 
     Raises:
         InvalidInputError: It is no world of Webots.
@@ -75,7 +75,7 @@ def has_observer(world: bytes) -> bool:
 
 
 def copy_of(world: Path) -> Path:
-    """Where the copy with the observer belongs: beside the world, which finds its files there."""
+    """Where the copy with the observer belongs: next to the world, which finds its files there."""
     return world.with_name(f"{world.stem}{COPY_SUFFIX}{world.suffix}")
 
 

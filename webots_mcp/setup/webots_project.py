@@ -266,12 +266,12 @@ def _of_registry() -> dict[str, str]:
 def look_into(controller: Path, timeout_s: float = PROBE_TIMEOUT_S) -> Interpreter:
     """Start the Python of a controller as Webots would, and import the bridge there."""
     by_rule = chosen(controller)
-    told = {"command": " ".join(by_rule.command), "chosen_by": by_rule.by}
+    settings = {"command": " ".join(by_rule.command), "chosen_by": by_rule.by}
     line = [*by_rule.command, "-B", "-c", _PROBE]
     program = shutil.which(line[0], path=_desktop_path())
     if program is None:
         return Interpreter(
-            **told,
+            **settings,
             error=f"there is no program {line[0]!r}",
             fix="set the right one in Webots (Preferences, General, Python command)"
             if "preferences" in by_rule.by or "default" in by_rule.by
@@ -283,16 +283,16 @@ def look_into(controller: Path, timeout_s: float = PROBE_TIMEOUT_S) -> Interpret
             capture_output=True, stdin=subprocess.DEVNULL, env=_environment(),
         )  # fmt: skip
     except subprocess.TimeoutExpired:
-        return Interpreter(**told, error=f"it did not end within {timeout_s:g} s", fix=_BY_HAND)
+        return Interpreter(**settings, error=f"it did not end within {timeout_s:g} s", fix=_BY_HAND)
     except OSError as error:
-        return Interpreter(**told, error=f"it cannot be started: {error}", fix=_BY_HAND)
-    return _judge(told, ended)
+        return Interpreter(**settings, error=f"it cannot be started: {error}", fix=_BY_HAND)
+    return _judge(settings, ended)
 
 
 _BY_HAND: Final = "start it in a terminal, or choose another in Webots' preferences"
 
 
-def _judge(told: dict[str, str], ended: subprocess.CompletedProcess[bytes]) -> Interpreter:
+def _judge(settings: dict[str, str], ended: subprocess.CompletedProcess[bytes]) -> Interpreter:
     lines = ended.stdout.decode("utf-8", "replace").strip().splitlines() or [""]
     try:
         said: dict[str, Any] = json.loads(lines[-1])
@@ -300,10 +300,10 @@ def _judge(told: dict[str, str], ended: subprocess.CompletedProcess[bytes]) -> I
     except (ValueError, KeyError, TypeError):
         last = (ended.stderr.decode("utf-8", "replace").strip().splitlines() or ["nothing"])[-1]
         why = f"it is no Python that works: exit code {ended.returncode}, {last:.200}"
-        return Interpreter(**told, error=why, fix=_BY_HAND)
+        return Interpreter(**settings, error=why, fix=_BY_HAND)
     error = said.get("error")
     fix = _fix(said) if error else None
-    return Interpreter(**told, executable=executable, python=python, bridge=said.get("bridge"),
+    return Interpreter(**settings, executable=executable, python=python, bridge=said.get("bridge"),
                        error=error, fix=fix)  # fmt: skip
 
 

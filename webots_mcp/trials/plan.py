@@ -93,7 +93,7 @@ class TrialPlan:
         until: ... or when this condition holds, whichever comes first.
         prune: A trial in which this condition holds is ended early, without a score.
         repeats: How often each set is tried.
-        robot: Whose signals, events and parameters are meant, where a world has several.
+        robot: The robot whose signals, events and parameters to use, where a world has several.
         timeout_s: A trial that takes longer, in wall time, has failed.
         ranges: What is searched, by parameter.
         search: Who says which sets are tried: a sampler of Optuna.
@@ -155,8 +155,8 @@ class TrialPlan:
     @property
     def text(self) -> str:
         """All of it, always written alike: by it a set is found again."""
-        said = asdict(self) | {"ranges": _as_plain(self.ranges)}
-        return json.dumps(said, sort_keys=True, ensure_ascii=False)
+        plain = asdict(self) | {"ranges": _as_plain(self.ranges)}
+        return json.dumps(plain, sort_keys=True, ensure_ascii=False)
 
     @property
     def trials(self) -> list[dict[str, Any]]:
@@ -217,7 +217,7 @@ def stored_world_plan(text: str) -> tuple[WorldPlan, bool]:
     """What the text of a plan says whose trials have simulators of their own.
 
     Returns:
-        The plan, and whether the stand-in is meant.
+        The plan, and whether its trials run on the stand-in.
 
     Raises:
         InvalidInputError: Its world file is not there any more.

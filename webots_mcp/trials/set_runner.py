@@ -1,11 +1,11 @@
 """Runs the trials of a set, each in a simulator of its own, and merges what they recorded.
 
-Whoever works on a set may be killed at any moment: the next one ends its simulators, scores a trial
-that had come to its end from its recording, and runs any other again.
+A process that works on a set may be killed at any moment: the next one ends its simulators, scores
+trials that had ended from their recordings, and runs the others again.
 
-In a search, samplers of Optuna (the extra `search`) say what is tried next. A sampler is asked for
-one set at a time, and knows what the trial table says: the study is made anew for each question, in
-memory. So a search that was killed goes on as if it had not been.
+In a search, samplers of Optuna (the extra `search`) propose what is tried next. A sampler is asked
+for one set at a time, and knows the trial table only: the study is built again for each proposal,
+in memory. So a search that was killed continues as if it had not been.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 FOLDER: Final = "trials"
 _MOST_THREADS: Final = 1000  # each waits for one trial
-_PATIENCE_S: Final = 0.5  # between two looks at whether somebody wants to stop
+_PATIENCE_S: Final = 0.5  # between two checks whether the caller wants to stop
 _STATES: Final = {"done": "COMPLETE", "failed": "FAIL", "pruned": "PRUNED"}
 _UNDER_WAY: Final = "RUNNING"
 
@@ -102,10 +102,10 @@ def run_trials(set_run: SetRun, set_id: int, report: Report) -> None:
         report: Is called in this thread with each trial that is over.
 
     Raises:
-        CommandRefusedError: Another process works on the set, somebody cancelled it, or there is
+        CommandRefusedError: Another process works on the set, the set was cancelled, or there is
             nowhere to run a trial any more.
         InvalidInputError: No trial of the set can succeed; nothing else is tried.
-        StoppedError: Somebody wanted them to stop; what ran waits to be run again.
+        StoppedError: The caller wanted to stop; running trials will be run again.
     """
     run_taken_up(taken_up(set_run, set_id), set_id, report)
 
@@ -123,7 +123,7 @@ def taken_up(set_run: SetRun, set_id: int) -> SetRun:
 
 
 def run_taken_up(set_run: SetRun, set_id: int, report: Report) -> None:
-    """The rest of `run_trials`; why a set does not go on is noted in it."""
+    """The rest of `run_trials`; it stores why a set stops."""
     job = set_run.job
     assert job is not None
     try:
@@ -156,10 +156,10 @@ def _run_left(set_run: SetRun, set_id: int, report: Report) -> None:
 
 
 def _require_wanted(set_run: SetRun, set_id: int) -> None:
-    """See that nobody, in whatever process, has cancelled the set.
+    """Check that the set was not cancelled, by whatever process.
 
     Raises:
-        CommandRefusedError: Somebody has.
+        CommandRefusedError: It was.
     """
     with set_run.recording.reader() as connection:
         reason = fetch_trial_set(connection, set_id).stop_reason
@@ -304,7 +304,7 @@ def _suggested(plan: TrialPlan, trials: Sequence[Trial]) -> dict[str, Any]:
 
 
 def _sampler(plan: TrialPlan, number: int) -> optuna.samplers.BaseSampler:
-    """With a seed of its own for each trial: what it says hangs on nothing but the trials."""
+    """A sampler seeded by the trial's number, so that a proposal depends on the trials only."""
     import optuna
 
     seed = random.Random(f"{plan.seed} {number}").getrandbits(32)

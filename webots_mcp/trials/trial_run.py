@@ -53,14 +53,14 @@ Ending: TypeAlias = Literal["for_s", "until", "prune"]
 
 
 class StoppedError(Exception):
-    """Somebody wants the trials to stop."""
+    """The caller wants the trials to stop."""
 
 
 class Stopping(Protocol):
-    """Whether somebody wants a trial to stop: a `threading.Event`, or what looks like one."""
+    """Whether the caller wants a trial to stop: a `threading.Event`, or an object like one."""
 
     def wait(self, timeout: float | None = None, /) -> bool:
-        """Wait until somebody does, or the time is over; returns which."""
+        """Wait until the caller does, or the time is over; returns which."""
         ...
 
 
@@ -96,7 +96,7 @@ class Simulators(Protocol):
         """Run a trial; its recording is in its folder then, and the result has its run's id there.
 
         Raises:
-            StoppedError: Somebody wanted it to stop.
+            StoppedError: The caller wanted it to stop.
             InvalidInputError: No trial of the set can succeed.
             CommandRefusedError: No trial can be run there any more.
         """
@@ -159,7 +159,7 @@ def run_attempt(attempt: TrialAttempt, command: Command) -> Result:
     """Run a trial in a simulator of this machine.
 
     Raises:
-        StoppedError: Somebody wanted it to stop.
+        StoppedError: The caller wanted it to stop.
         InvalidInputError: No trial of the set can succeed.
     """
     folder, plan, values = attempt.folder, attempt.plan, attempt.values
@@ -177,7 +177,7 @@ def run_attempt(attempt: TrialAttempt, command: Command) -> Result:
 
 
 def recorded_result(plan: TrialPlan, values: dict[str, Any], folder: Path) -> Result | None:
-    """Of a trial that had come to its end before somebody was killed; None where it had not."""
+    """The result of a trial that had ended before its process was killed; None where it had not."""
     watch = TrialWatch(plan)
     recording = _settled(folder)
     if recording is None:
@@ -209,8 +209,8 @@ def _watched(
             return None, f"its simulator ended ({simulator.last_line()})"
         if time.monotonic() > until_s:
             last = simulator.last_line() if watch.run_id is None else ""
-            said = f" (its simulator printed last: {last})" if last else ""
-            return None, f"it took longer than {timeout_s:g} s of wall time{said}"
+            text = f" (its simulator printed last: {last})" if last else ""
+            return None, f"it took longer than {timeout_s:g} s of wall time{text}"
         if attempt.stopping.wait(_LOOK_EVERY_S):
             raise StoppedError
         ended = _ended(recording, watch)
@@ -219,7 +219,7 @@ def _watched(
 
 
 def _ended(recording: Recording, watch: TrialWatch) -> str | None:
-    """Why the run cannot go on: its controller's process is gone."""
+    """Why the run cannot continue: its controller's process has ended."""
     if watch.run_id is None:
         return None
     with recording.reader() as connection:
@@ -232,10 +232,10 @@ def _ended(recording: Recording, watch: TrialWatch) -> str | None:
 def _concluded(attempt: TrialAttempt, watch: TrialWatch, end: End | None, why: str) -> Result:
     recording = _settled(attempt.folder)
     if recording is None:
-        said = "the controller recorded nothing in its data folder: does it name another one?"
-        return Result(None, None, f"{why}; {said}" if why else said)
+        text = "the controller recorded nothing in its data folder: does it name another one?"
+        return Result(None, None, f"{why}; {text}" if why else text)
     with recording.reader() as connection:
-        end = end or watch.look(connection)  # what waited beside the database is in it now
+        end = end or watch.look(connection)  # rows that waited next to the database are in it now
         if end is not None:
             return _scored(connection, attempt.plan, attempt.values, watch, end)
         why = _ending_line(connection, watch.run_id) or why
@@ -271,7 +271,7 @@ def _scored(
 
 
 def _settled(folder: Path) -> Recording | None:
-    """The recording of a trial whose processes are gone, with all that waited beside it."""
+    """The recording of a trial whose processes have ended, with all rows that waited next to it."""
     try:
         return settled(folder / DATABASE_NAME)
     except NoDatabaseError:
@@ -308,7 +308,7 @@ class TrialWatch:
         """Its end, as far as it is recorded; None before.
 
         Raises:
-            InvalidInputError: Nobody can tell which robot is meant, or its controller does not
+            InvalidInputError: It is not clear which robot to use, or its controller does not
                 have the parameters that are to be tried.
             ConditionFailedError: `until` or `prune` cannot be asked of the signals.
         """

@@ -118,7 +118,7 @@ def _of_program(program: Path, platform: str) -> Installation:
 
 
 def _snap_home(program: Path, platform: str) -> list[Path]:
-    """A snap's program is a link to `snap` itself, which tells nothing of where Webots is."""
+    """A snap's program is a link to `snap` itself, which does not show where Webots is."""
     is_snap = program.resolve().name == "snap" or "snap" in program.parts
     return [home for home in _default_homes(platform) if is_snap and "snap" in home.parts]
 

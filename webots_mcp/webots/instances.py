@@ -27,12 +27,12 @@ class Instance:
 
     Attributes:
         pid: Its process.
-        port: Where it listens; where the system does not tell, the one it was asked for.
+        port: Where it listens; where the system does not show it, the port in its command line.
         is_listening: Whether it was seen to listen there.
         mode: Of `--mode`; None where its preferences decide.
         streams: Whether it was started with `--stream`, so that it obeys orders from outside.
         world: The world file that it was started with.
-        started_wall_time_s: When; 0 where the system does not tell.
+        started_wall_time_s: When it started; 0 where the system does not show it.
     """
 
     pid: int
@@ -134,7 +134,7 @@ def _options(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
 
 
 def _ports(process: psutil.Process) -> Iterator[int]:
-    """Where it listens; nothing where the system does not tell of another user's process."""
+    """The ports where it listens; none where the system hides another user's process."""
     import psutil
 
     try:
@@ -155,7 +155,7 @@ def _started_s(process: psutil.Process) -> float:
 
 
 def _world(process: psutil.Process, arguments: Sequence[str]) -> Path | None:
-    """Relative to the folder that it was started in, where the system tells it."""
+    """Its world; a relative path is resolved by its working folder, where that is shown."""
     import psutil
 
     named = next((word for word in arguments if word.endswith(".wbt")), None)

@@ -46,7 +46,7 @@ def press(order: Order, pid: int | None, platform: str = sys.platform) -> None:
 
     Args:
         order: What Webots is to do.
-        pid: The process of the Webots that is meant; None where only one can be.
+        pid: The process of the wanted Webots; None where there can be only one.
         platform: As `sys.platform` names it.
 
     Raises:
@@ -79,9 +79,9 @@ def macos_command(key: Key, pid: int | None) -> list[str]:
 
 def windows_command(key: Key, pid: int | None) -> list[str]:
     """The command that presses a key on Windows; its exit code is 3 where no one window is it."""
-    meant = f"$_.MainWindowTitle -like '*{_TITLE}*'" + (f" -and $_.Id -eq {pid}" if pid else "")
+    wanted = f"$_.MainWindowTitle -like '*{_TITLE}*'" + (f" -and $_.Id -eq {pid}" if pid else "")
     script = (
-        f"$found = @(Get-Process | Where-Object {{ {meant} }}); "
+        f"$found = @(Get-Process | Where-Object {{ {wanted} }}); "
         "if ($found.Count -ne 1) { exit 3 }; "
         "$shell = New-Object -ComObject WScript.Shell; "
         "if (-not $shell.AppActivate($found[0].Id)) { exit 4 }; "
@@ -115,18 +115,18 @@ def _press_in_x11(key: Key, pid: int | None) -> None:
 
 
 def _x11_window(pid: int | None) -> str:
-    """The one window of Webots, of that process where windows tell theirs.
+    """The only window of Webots, of that process where windows have a process id.
 
     Raises:
-        CommandRefusedError: There is none, or it cannot be told which of several.
+        CommandRefusedError: There is none, or it is not clear which of several.
     """
     found = _attempt(["xdotool", "search", "--onlyvisible", "--name", f" - {_TITLE}"])
     windows = found.stdout.split()
-    meant = [each for each in windows if pid is None or _owner(each) in (pid, None)]
-    if len(meant) == 1:
-        return meant[0]
-    if meant:
-        raise CommandRefusedError(f"{len(meant)} windows could be the one of Webots that is meant")
+    found = [each for each in windows if pid is None or _owner(each) in (pid, None)]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise CommandRefusedError(f"{len(found)} windows could be that of the wanted Webots")
     where = f"on the display {os.environ.get('DISPLAY') or '(DISPLAY is not set)'}"
     if os.environ.get("WAYLAND_DISPLAY"):
         where += "; this is a Wayland session, which hides windows from xdotool"
@@ -134,15 +134,15 @@ def _x11_window(pid: int | None) -> str:
 
 
 def _owner(window: str) -> int | None:
-    told = _attempt(["xdotool", "getwindowpid", window]).stdout.strip()
-    return int(told) if told.isdecimal() else None
+    printed = _attempt(["xdotool", "getwindowpid", window]).stdout.strip()
+    return int(printed) if printed.isdecimal() else None
 
 
 def _run(command: Sequence[str], advice: str) -> None:
     ended = _attempt(command)
     if ended.returncode:
-        said = ended.stderr.strip()[:300] or f"exit code {ended.returncode}"
-        raise CommandRefusedError(f"{command[0]} did not press the keys ({said}): {advice}")
+        reason = ended.stderr.strip()[:300] or f"exit code {ended.returncode}"
+        raise CommandRefusedError(f"{command[0]} did not press the keys ({reason}): {advice}")
 
 
 def _attempt(command: Sequence[str]) -> subprocess.CompletedProcess[str]:

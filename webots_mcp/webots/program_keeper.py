@@ -1,4 +1,4 @@
-"""Runs a simulator for as long as whoever started it lives: `python program_keeper.py COMMAND...`.
+"""Runs a simulator for as long as its starter lives: `python program_keeper.py COMMAND...`.
 
 It starts the command when it reads a byte from its standard input, and ends it when that input
 ends: it is closed by who holds the other end, or with him, however he dies. It runs in a Python of
@@ -22,7 +22,7 @@ GRACE_S = 5.0  # Webots gives its controllers 1 s, and ends them after another
 
 
 def main(command: list[str]) -> int:
-    """Keep a command; returns its exit code, and 0 where it was never told to start it."""
+    """Keep a command; returns its exit code, or 0 where it was never asked to start it."""
     signal.signal(signal.SIGTERM, _leave_it_to_the_simulator)
     _lead_a_group()
     if not os.read(_STDIN, 1):

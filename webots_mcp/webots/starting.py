@@ -37,7 +37,7 @@ Show = Callable[[WebotsLine], None]
 _HEADLESS: Final = ("--no-rendering", "--minimize")
 _LAST_PORT: Final = (1 << 16) - 1
 _HARD: Final = signal.SIGTERM if sys.platform == "win32" else signal.SIGKILL
-# Ctrl-C in a console is for us alone: elsewhere a session of its own sees to that.
+# Ctrl-C in a Windows console must reach this process only; elsewhere a new session ensures that.
 _GROUP_OF_ITS_OWN: Final = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
 _KEPT_LINES: Final = 200
 _LOOK_EVERY_S: Final = 0.5  # at all processes of this machine
@@ -94,7 +94,7 @@ class Start:
 
 
 def free_port(first: int = DEFAULT_PORT) -> int:
-    """The first port from there on that nobody listens at.
+    """The first free port from there on.
 
     Raises:
         CommandRefusedError: All are taken.
@@ -136,8 +136,8 @@ def _virtual_display() -> list[str]:
 class KeptProgram:
     """A program that ends with this process, however that ends.
 
-    Nothing runs before `start`, but its process is there: whoever notes its pid in between leaves
-    no program behind that nobody knows.
+    Nothing runs before `start`, but the process exists: a caller that stores its pid in between
+    leaves no unknown program behind.
 
     Attributes:
         pid: Of the process around it, whose group it is in where it needs no display.
@@ -165,7 +165,7 @@ class KeptProgram:
     def start(self) -> None:
         """Let it run."""
         assert self._process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # somebody has ended it already
+        with contextlib.suppress(BrokenPipeError):  # it was ended already
             self._process.stdin.write(b"!")
             self._process.stdin.flush()
 
@@ -198,7 +198,7 @@ class LaunchedWebots(KeptProgram):
 
     Args:
         start: How it is started.
-        environment: What it gets beside this process' environment.
+        environment: Variables in addition to those of this process.
         show: Called with each line of its console, in a thread of its own.
 
     Raises:
@@ -227,7 +227,7 @@ class LaunchedWebots(KeptProgram):
 
     @property
     def instance(self) -> Instance | None:
-        """As the system sees it; None before it listens, and where the system does not tell."""
+        """The instance as the system shows it; None before it listens, or where it is not shown."""
         if self._instance is None and time.monotonic() > self._look_again_s:
             self._look_again_s = time.monotonic() + _LOOK_EVERY_S
             pids = self.pids
@@ -237,7 +237,7 @@ class LaunchedWebots(KeptProgram):
 
     @property
     def address(self) -> WebotsAddress | None:
-        """Where it listens; None before it does, and where the system does not tell."""
+        """Its address; None before it listens, or where the system does not show it."""
         return self.instance.address if self.instance else None
 
     def address_now(self) -> WebotsAddress | None:
@@ -270,7 +270,7 @@ class LaunchedWebots(KeptProgram):
             for data in pipe:
                 line = WebotsLine(name, data.decode("utf-8", "replace").rstrip("\r\n"))
                 self._lines.append(line)
-                with contextlib.suppress(OSError, ValueError):  # nobody looks any more
+                with contextlib.suppress(OSError, ValueError):  # the reader has closed it
                     self._show(line)
 
 

@@ -79,12 +79,12 @@ class WebotsLine(NamedTuple):
 
 
 class OrderReply(NamedTuple):
-    """What came of an order.
+    """Webots' reply to an order.
 
     Attributes:
         text: Webots' own words; None where it did not reply.
         is_alive: Whether its main thread answered at all, so that it is not busy.
-        other: What it said instead, which only one that obeys orders does.
+        other: Another message of Webots, which only a Webots that accepts orders sends.
     """
 
     text: str | None
@@ -93,7 +93,7 @@ class OrderReply(NamedTuple):
 
 
 def address_of(instance: str) -> WebotsAddress | None:
-    """Where the Webots of a session listens, from its `instance`; None where that is not told."""
+    """Where the Webots of a session listens, by its `instance`; None where that is not known."""
     host, _, port = instance.rpartition(":")
     if not (host and port.isascii() and port.isdecimal() and 0 < int(port) < 1 << 16):
         return None
@@ -312,7 +312,7 @@ def connected(address: WebotsAddress, timeout_s: float) -> Generator[Stream]:
     """A connection to Webots.
 
     Raises:
-        CommandRefusedError: Nobody listens there, or it is no Webots, or it does not answer, or it
+        CommandRefusedError: Nothing listens there, it is not Webots, it does not answer, or it
             hung up.
     """
     try:
@@ -378,13 +378,13 @@ def why_not_obeyed(address: WebotsAddress, reply: OrderReply) -> str:
     """Why Webots did not answer an order, as far as that is known."""
     if reply.other is not None:
         return (
-            f"Webots at {address} answered {reply.other!r}, which does not tell whether it obeyed: "
-            "look at its window, or at what is recorded"
+            f"Webots at {address} answered {reply.other!r}, which does not show whether it obeyed: "
+            "check its window, or the recording"
         )
     if reply.is_alive:
         return (
-            f"Webots at {address} hears but does not obey: it was started without --stream (only a "
-            "start with it opens this way)"
+            f"Webots at {address} receives orders but does not obey them: it was started without "
+            "--stream; restart it with that option"
         )
     return (
         f"Webots at {address} did not answer within {ANSWER_S:g} s: it was started without "

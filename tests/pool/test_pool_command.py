@@ -112,3 +112,10 @@ def test_what_is_not_there_is_refused_with_what_is_and_makes_no_recording(
     assert "nearest are 'rover'" in ask(*words, "--robot", "rovr", code=2)
     assert "which runs?" in ask(*words, code=2)
     assert not (tmp_path / "new").exists()
+
+
+@files
+def test_a_select_that_is_no_text_is_refused_in_one_line(ask: Ask) -> None:
+    said = ask("pool", "POOL", "--sql", "SELECT '\udcff'", code=2)
+    assert "cannot be written as utf-8" in said
+    assert said.count("\n") == 1

@@ -47,7 +47,7 @@ class Statement:
 
     def encoded(self) -> bytes:
         """The request as the process takes it."""
-        return json.dumps(asdict(self)).encode()
+        return json.dumps(asdict(self), ensure_ascii=False).encode()  # what is no text fails here
 
 
 def decode(answer: bytes, exit_code: int, asked: Statement, slow: str | None = None) -> Result:

@@ -40,6 +40,8 @@ Standard library only, because the bridge imports it inside a robot's controller
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
+from types import MappingProxyType
 
 
 class WebotsMCPError(Exception):
@@ -142,7 +144,13 @@ class ConditionFailedError(WebotsMCPError):
 
 
 class CommandRefusedError(WebotsMCPError):
-    """The simulation or the robot cannot do what a command asked for."""
+    """The simulation or the robot cannot do what a command asked for.
+
+    Attributes:
+        answer: What became of the command, where one was sent.
+    """
+
+    answer: Mapping[str, object] = MappingProxyType({})
 
 
 class InterruptedCommandError(CommandRefusedError):

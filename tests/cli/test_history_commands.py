@@ -206,7 +206,7 @@ def test_an_id_that_no_row_can_have_is_refused(
     assert f"'{number}' is no id" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("asked", ["compare 1 {}", "label {} x", "trends --run {}"])
+@pytest.mark.parametrize("asked", ["compare 1 {}", "label {} x", "trends --run {}", "wait {}"])
 @pytest.mark.parametrize("number", [str(2**63), "1.5", "x"])
 def test_an_id_that_no_row_can_have_is_named(
     capsys: pytest.CaptureFixture[str], say: Say, story: Path, asked: str, number: str

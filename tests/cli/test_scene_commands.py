@@ -30,22 +30,22 @@ def test_the_scene_is_a_table(database: Path, capsys: pytest.CaptureFixture[str]
     where = ["--database", str(database)]
     assert main(["scene", *where, "--depth", "1", "--field", "translation"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].split() == ["depth", "path", "type", "name", "translation"]
+    assert lines[3].split() == ["depth", "path", "type", "name", "translation"]
     assert "[-1.2, 0.0, 0.04]" in next(line for line in lines if "ROVER" in line)
     assert main(["scene", *where, "--type", "Robot", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["rows"] == [[1, "ROVER", "Robot", "rover"]]
+    assert json.loads(capsys.readouterr().out)["result"]["rows"] == [[1, "ROVER", "Robot", "rover"]]
 
 
 @pytest.mark.usefixtures("driver")
 def test_a_field_is_shown_and_set(database: Path, capsys: pytest.CaptureFixture[str]) -> None:
     where = ["--database", str(database)]
     assert main(["field", *where, "BALL.physics.mass"]) == 0
-    assert "value: 0.05" in capsys.readouterr().out
+    assert "value 0.05" in capsys.readouterr().out
     assert main(["field", *where, "ROVER.translation", "[0, 1, 0.04]", "--stop"]) == 0
-    assert "to: [0.0, 1.0, 0.04]" in capsys.readouterr().out
+    assert "to [0.0, 1.0, 0.04]" in capsys.readouterr().out
     assert main(["field", *where, "ROVER.customData", "a text"]) == 0
     assert main(["field", *where, "ROVER", "--json"]) == 0
-    rows = json.loads(capsys.readouterr().out.splitlines()[-1])["rows"]
+    rows = json.loads(capsys.readouterr().out.splitlines()[-1])["result"]["rows"]
     assert ["customData", "SFString", "a text"] in rows
     assert main(["field", *where, "ROVER.children"]) == 0
     assert 'lidar"]' in capsys.readouterr().out, "all entries"
@@ -55,6 +55,6 @@ def test_a_field_is_shown_and_set(database: Path, capsys: pytest.CaptureFixture[
         capsys.readouterr()
     )
     assert main(["field", *where, "ROVER.customData", "NaN"]) == 0
-    assert "to: NaN" in capsys.readouterr().out
+    assert "to NaN" in capsys.readouterr().out
     assert main(["field", *where, "ROVER.nothing"]) == 2
     assert "has no field 'nothing'" in capsys.readouterr().err

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -41,15 +42,22 @@ def wait_for(condition: Callable[[], bool]) -> None:
         moment.wait(0.02)
 
 
+def listed_in(table: dict[str, Any]) -> dict[str, Any]:
+    """The only row of a table, by its columns."""
+    (row,) = table["rows"]
+    return dict(zip(table["columns"], row, strict=True))
+
+
 def test_a_run_says_why_it_stopped_and_what_happened(
     file: Path, driver: Driver, capsys: pytest.CaptureFixture[str]
 ) -> None:
     where = ("--database", str(file))
     assert main(["run", *where, "--for", "0.48", "--reset", "--until", "steps < 0"]) == 0
     said = capsys.readouterr().out
-    assert said.startswith("time over at 0.48 s of run 2: 0.48 s simulated")
+    assert "stopped time over" in said
+    assert "ran: run_id 2, from_s 0, to_s 0.48, advanced_s 0.48" in said
     assert "mode pause" in said
-    assert "last rows:" in said
+    assert "\nrows:\n  sim_time_s  steps\n" in said
     assert main(["run", *where, "--for", "0.16", "--then", "go_on", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["ran"]["advanced_s"] == pytest.approx(0.16)
 
@@ -58,7 +66,7 @@ def test_send_pause_step_and_resume(
     file: Path, driver: Driver, capsys: pytest.CaptureFixture[str]
 ) -> None:
     where = ("--database", str(file))
-    assert main(["send", *where, "set_speed", "speed=3.5"]) == 0
+    assert main(["send", *where, "set_speed", "speed=3.5", "--timeout", "3600"]) == 0
     assert driver.speed == 3.5
     assert "speed 3.5" in capsys.readouterr().out
     assert main(["pause", *where]) == 0
@@ -77,9 +85,11 @@ def test_send_pause_step_and_resume(
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["run"], "give --until CONDITION"),
-        (["run", "--for", "nan"], "--for must be simulated seconds above 0"),
-        (["run", "--for", "inf"], "at most 1000000, not inf"),
+        (["run"], "give --until CONDITION (a condition), --for S (simulated seconds)"),
+        (["run", "--for", "nan"], "--for must be less than or equal to 1000000, not nan"),
+        (["run", "--for", "0"], "--for must be greater than 0, not 0"),
+        (["run", "--for", "inf"], "--for must be less than or equal to 1000000, not inf"),
+        (["run", "--for", "1", "--timeout", "0"], "--timeout must be greater than or equal to 0.1"),
         (["run", "--for", "1", "--set", "kp"], "names no value"),
         (["run", "--for", "1", "--set", "kp=1"], "declares no parameters"),
         (["run", "--until", "stepz > 1000"], "steps"),
@@ -87,7 +97,7 @@ def test_send_pause_step_and_resume(
             ["run", "--for", "900", "--pace", "real_time", "--timeout", "0.5"],
             "webots-mcp wait 1",
         ),
-        (["step", "many"], "whole number"),
+        (["step", "many"], "Invalid value for N: 'many' is no whole number"),
         (["breakpoint", "steps <"], "column"),
         (["breakpoint", "steps < 3", "--remove", "1"], "not both"),
     ],
@@ -121,7 +131,11 @@ def test_a_run_that_takes_longer_is_waited_for_or_ended_with_the_lines_that_it_n
     assert "time over" in capsys.readouterr().out
     assert main([*line[:1], "999", *line[2:]]) == 2
     assert "no command 999" in capsys.readouterr().err
-    assert main(["run", "--database", str(file), *far]) == 2
+    capsys.readouterr()
+    assert main(["run", "--database", str(file), *far, "--json"]) == 2
+    told = json.loads(capsys.readouterr().out)
+    assert (told["command_id"], told["outcome"]) == (2, "claimed")
+    assert "webots-mcp wait 2" in told["error"]
     assert main(end) == 0
     assert recording.fate(2)[1]["ended"] == "interrupted"
 
@@ -145,17 +159,17 @@ def test_breakpoints_are_set_listed_hit_and_removed(
     recording, where = Recording(file), ("--database", str(file))
     wait_for(lambda: recording.states() != [])
     assert main(["breakpoint", *where]) == 0
-    assert capsys.readouterr().out == "no breakpoints\n"
+    assert "this robot has none: 'webots-mcp breakpoint' sets one" in capsys.readouterr().out
     assert main(["breakpoint", *where, "steps > 3", "--action", "log", "--after-hits", "1"]) == 0
-    assert capsys.readouterr().out == "breakpoint 1: steps > 3 (log), armed\n"
+    assert "breakpoint_id 1, condition steps > 3, action log, armed true" in capsys.readouterr().out
     wait_for(lambda: recording.rows("SELECT hits FROM breakpoint") == [1])
     assert main(["breakpoint", *where, "--json"]) == 0
-    (listed,) = json.loads(capsys.readouterr().out)
+    listed = listed_in(json.loads(capsys.readouterr().out)["breakpoints"])
     assert (listed["condition"], listed["hits"], listed["set_by"]) == ("steps > 3", 1, "cli")
     assert main(["breakpoint", *where]) == 0
     assert "steps > 3" in capsys.readouterr().out
     assert main(["breakpoint", *where, "--remove", "1"]) == 0
-    assert capsys.readouterr().out == "breakpoint 1: removed\n"
+    assert "breakpoint_id 1, armed false" in capsys.readouterr().out
     assert main(["breakpoint", *where, "--remove", "1"]) == 2
     assert "no breakpoint 1; it has none" in capsys.readouterr().err
 
@@ -170,7 +184,9 @@ def test_a_breakpoint_of_a_robot_that_is_gone_is_stored_and_says_so(
     gone.stop()
     assert main(["breakpoint", "--database", str(file), "stepz > 3"]) == 0
     said = capsys.readouterr().out
-    assert "breakpoint 1: stepz > 3 (pause), not armed yet" in said
+    said = " ".join(said.split())
+    assert "breakpoint_id 1, condition stepz > 3, action pause, armed false" in said
+    assert "it is stored, but not armed yet" in said
     assert "stepz is missing as long as it is not published; there is steps" in said
     assert "reads them when it starts" in said
 
@@ -209,6 +225,5 @@ def test_ctrl_c_ends_steps_and_leaves_the_simulation_paused(file: Path, driver: 
 
 
 def test_send_needs_an_action_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["send"])
-    assert capsys.readouterr().err.endswith("arguments are required: ACTION\n")
+    assert main(["send"]) == 2
+    assert 'Command "send" parameter ACTION requires an argument' in capsys.readouterr().err

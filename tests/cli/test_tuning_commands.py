@@ -31,17 +31,17 @@ def test_parameters_are_shown_and_set(
     line = ["parameters", "--database", str(database)]
     assert main([*line, "kp=3.5", "gait=walk"]) == 0
     out = capsys.readouterr().out
-    assert out.startswith('gait: "trot" -> "walk"\nkp: 2.0 -> 3.5\nfrom ')
-    assert " s of run 1 on" in out
+    assert "gait: old trot, new walk\n    kp: old 2, new 3.5\n  since_sim_time_s 0." in out
     assert (tunable.kp.value, tunable.gait.value) == (3.5, "walk")
     assert main(line) == 0
     rows = capsys.readouterr().out.splitlines()
-    assert rows[0].split()[:4] == ["name", "value", "unit", "default"]
-    assert rows[1].split()[:4] == ["kp", "3.5", "1/s", "2"]
+    assert rows[2].split()[:4] == ["name", "value", "unit", "default"]
+    assert rows[3].split()[:4] == ["kp", "3.5", "1/s", "2"]
     assert main([*line, "laps=4", "--from-reset"]) == 0
-    assert capsys.readouterr().out == "laps: 3 -> 4\nfrom the next reset on\n"
+    assert "laps: now 3, next 4\n  since the next reset\n" in capsys.readouterr().out
     assert main([*line, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)[1]["next"] == 4
+    told = json.loads(capsys.readouterr().out)["parameters"]
+    assert told["rows"][1][told["columns"].index("next")] == 4
 
 
 def test_a_text_that_looks_like_a_number_stays_a_text(

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from tests.recordings.rows import Recorded
-from webots_mcp.cli import main, names, registered
+from webots_mcp.cli import main, names
 from webots_mcp.cli.commands import app_for
-from webots_mcp.cli.wording import BY_TOOL, as_typed, speak_of
+from webots_mcp.cli.wording import BY_TOOL, as_typed
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def data_dir(tmp_path: Path) -> Iterator[Path]:
         ("trends --robot rover --start 9 --end 3", "--start 9 must be less than --end 3"),
         ("trends --robot rover --last 3 --since 0", "use --start and --end (simulation time)"),
         ("trends --robot rover --last 3 --since 0", "or --since and --until"),
-        ("trends", "say which one with --robot ROBOT"),
+        ("trends", "say which one with --robot NAME"),
         ("trends --run 77", "no run 77: the newest runs are"),
         ("compare 77 78", "no run 77"),
         (
@@ -59,12 +59,11 @@ def test_a_hint_names_what_can_be_typed(data_dir: Path, capsys: pytest.CaptureFi
 
 
 def test_a_hint_names_commands_instead_of_tools() -> None:
-    (send,) = (command for command in registered() if command.name == "send")
-    speak_of(send.arguments)
+    app_for(["send"])
     waits = 'webots_list_commands(what="outcome", command_id=7)'
     hint = f"wait for it with {waits}, or ask with a longer timeout_s"
     assert as_typed(hint) == "wait for it with 'webots-mcp wait 7', or ask with a longer --timeout"
-    assert as_typed("webots_list_commands has it") == "'webots-mcp status' has it"
+    assert as_typed("webots_list_commands has it") == "'webots-mcp commands' has it"
 
 
 def test_each_command_that_stands_for_a_tool_exists() -> None:

@@ -61,9 +61,11 @@ async def test_out_of_wall_time_it_goes_on_and_a_second_call_gives_the_same_answ
     connect: Connect, driver: Driver
 ) -> None:
     async with connect() as client:
-        first = await ask(client, "webots_run", for_s=1.2, pace=None, timeout_s=0.3)
+        first = await ask(client, "webots_run", for_s=1.2, pace="as_it_is", timeout_s=0.3)
         assert (first["outcome"], first["stopped"]) == ("claimed", "out of wall time")
         number = first["command_id"]
+        (sent,) = rows_of((await ask(client, "webots_list_commands"))["commands"])
+        assert "pace" not in sent["params"], "no mode is set where it goes on as it runs"
         assert f"command_id={number}" in first["hint"]
         assert 0 <= first["ran"]["advanced_s"] < 1.2
         then = await ask(client, "webots_wait_for_command", command_id=number, timeout_s=30)

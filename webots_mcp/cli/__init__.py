@@ -13,8 +13,9 @@ import inspect
 import json
 import os
 import sys
-from collections.abc import Sequence
-from typing import Any, Final
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.cli.ending import ended_by, ending_by_signals
 from webots_mcp.cli.terminal import spelling_out
@@ -22,9 +23,13 @@ from webots_mcp.cli.wording import Typed, as_typed, speak_of
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.naming import spelled_out
 
+if TYPE_CHECKING:
+    from cyclopts import CycloptsError
+
 __all__ = ["main"]
+_NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
 _FAMILIES: Final = (
-    "trials", "tuning", "steering", "scene", "breakpoints",
+    "trials",
 )  # fmt: skip
 EXIT_SYSTEM: Final = 1
 EXIT_BAD_INPUT: Final = 2
@@ -69,7 +74,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                 sys.stdout.flush()
             return code
     except WebotsMCPError as error:
-        return _fail(EXIT_BAD_INPUT, as_typed(str(error)), given)
+        answer = getattr(error, "answer", {})
+        return _fail(EXIT_BAD_INPUT, as_typed(str(error)), given, answer)
     except UnicodeEncodeError as error:  # bytes of the command line that are no text
         said = f"{error.object!r} cannot be written as {error.encoding}: {error.reason}"
         return _fail(EXIT_BAD_INPUT, said, given)
@@ -95,13 +101,17 @@ def _run(argv: Sequence[str]) -> tuple[int] | None:
     """Call the command that was given; None where it is none of `commands`."""
     from cyclopts import CycloptsError, UnusedCliTokensError
 
-    from webots_mcp.cli.commands import COMMANDS, app_for
+    from webots_mcp.cli.commands import COMMANDS, app_for, called_value
 
     if not argv or argv[0] not in COMMANDS:
         return None
     app = app_for(argv)
     speak_of(
-        Typed(each.field_info.name, each.names[0], each.field_info.name.upper())
+        Typed(
+            each.field_info.name,
+            each.names[0],
+            called_value(each),
+        )
         for each in app[argv[0]].assemble_argument_collection()
         if each.names
     )
@@ -113,16 +123,24 @@ def _run(argv: Sequence[str]) -> tuple[int] | None:
             unused = " ".join(map(repr, error.unused_tokens or ()))
             raise InvalidInputError(f"{argv[0]} takes no further argument: {unused}") from error
         except CycloptsError as error:
-            raise InvalidInputError(str(error)) from error
+            raise InvalidInputError(_named(error)) from error
         sys.stdout.flush()
     return (code or 0,)
 
 
-def _fail(code: int, text: str, given: Sequence[str]) -> int:
-    """End with an error, which programs read as JSON."""
+def _named(error: CycloptsError) -> str:
+    """What is wrong, and of what; of a value without an option cyclopts leaves its name out."""
+    text, argument = str(error), error.argument
+    if argument is None or any(name in text for name in argument.names):
+        return text
+    return f"Invalid value for {argument.names[0]}: {text}"
+
+
+def _fail(code: int, text: str, given: Sequence[str], answer: Mapping[str, Any] = _NOTHING) -> int:
+    """End with an error, which programs read as JSON beside what became of a command."""
     if "--json" in given and is_declared(given[0]):
         with contextlib.suppress(OSError):
-            print(spelled_out(json.dumps({"error": text}, ensure_ascii=False)))
+            print(spelled_out(json.dumps({**answer, "error": text}, ensure_ascii=False)))
     return _end(code, text)
 
 

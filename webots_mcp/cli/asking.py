@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import shlex
 import sys
 import types
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
@@ -23,9 +24,10 @@ from webots_mcp.cli.recordings import Json, Range, Where, sum_up_first
 from webots_mcp.cli.rendering import print_answer, text_of
 from webots_mcp.cli.terminal import wait
 from webots_mcp.cli.values import refuse_options, settings_of, value_of, whole_number
-from webots_mcp.cli.wording import Typed, as_typed, speak_of
+from webots_mcp.cli.wording import Typed, as_typed, speak_of, value_name
+from webots_mcp.contract import LOOPING
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
-from webots_mcp.questions.argument_types import SCOPE
+from webots_mcp.questions.argument_types import FOR_A_PERSON, SCOPE
 from webots_mcp.questions.declaring import Caller, Question, Reply
 from webots_mcp.questions.faults import faults_of
 from webots_mcp.store.recording import Recording
@@ -53,6 +55,8 @@ _VALUE_NAMES: Final = {
     "signals": "SIGNAL", "position": "X Y", "mode": "SIGNAL",
     "where": "CONDITION", "until": "CONDITION",
 }  # fmt: skip
+# What a person does not give, where a model's client would soon give up waiting.
+_DEFAULTS: Final[Mapping[str, Any]] = types.MappingProxyType({"timeout_s": 600.0})
 _OF_SIGNALS: Final = frozenset({"signals", "pattern"})  # of what summaries are made of
 _FOLLOW: Final = Annotated[
     bool,
@@ -62,6 +66,11 @@ _FOLLOW: Final = Annotated[
 ]
 _LOOK_EVERY_S: Final = 0.5
 _NOT_DONE: Final = ("failed", "expired", "cancelled", "lost", "claimed")
+_UNDER_WAY: Final = (
+    "the controller is still busy with it and goes on: do not send it again, but go on waiting "
+    "with\n\n    {}\n"
+)
+_END_IT: Final = "\nor end it with\n\n    {}\n"
 
 
 def command_of(question: Question) -> Callable[..., None]:
@@ -78,12 +87,12 @@ def command_of(question: Question) -> Callable[..., None]:
         given = _named(question, positional) | options | (vars(span) if span else {})
         if follow:
             return _follow(question, given, recorded or Where(), as_json=json)
-        reply = ask(question, given, recorded or Where())
-        show(question, reply, as_json=json)
+        ask_and_show(question, given, recorded or Where(), as_json=json)
 
     speak_of(
-        Typed(each.name, option_of(question, each.name), each.name.upper())
+        Typed(each.name, option, _value_name(each.name) or value_name(option))
         for each in question.parameters
+        for option in [option_of(question, each.name)]
     )
     in_range = SCOPE if question.has_scope else ()
     parameters = [
@@ -120,7 +129,8 @@ def _named(question: Question, positional: Sequence[Any]) -> dict[str, Any]:
 
 def _is_list(question: Question, argument: str) -> bool:
     (declared,) = (each for each in question.parameters if each.name == argument)
-    return get_origin(_without_none(_plain(declared.annotation))) is list
+    kind = _plain(declared.annotation)
+    return get_origin(_without_none(kind)) is list or _is_mapping(kind)
 
 
 def _without_none(kind: Any) -> Any:
@@ -128,6 +138,17 @@ def _without_none(kind: Any) -> Any:
     kinds = [each for each in get_args(kind) if each is not type(None)]
     is_optional = get_origin(kind) in (Union, types.UnionType) and len(kinds) == 1
     return kinds[0] if is_optional else kind
+
+
+def ask_and_show(
+    question: Question, given: Mapping[str, Any], where: Where, *, as_json: bool
+) -> None:
+    """Ask a question and print its answer.
+
+    Raises:
+        WebotsMCPError: As `ask`, and as `show`.
+    """
+    show(question, ask(question, given, where), where, as_json=as_json)
 
 
 def ask(question: Question, given: Mapping[str, Any], where: Where) -> Reply:
@@ -138,7 +159,8 @@ def ask(question: Question, given: Mapping[str, Any], where: Where) -> Reply:
         NothingRecordedError: There is nothing to ask about.
         WebotsMCPError: As the question says.
     """
-    recording = where.recording(read_only=question.effect.reads)
+    asks_controllers = question.has_caller  # which takes a row in the queue, also to read
+    recording = where.recording(read_only=question.effect.reads and not asks_controllers)
     valid = _valid(question, given, recording)
     if not _OF_SIGNALS.isdisjoint(each.name for each in question.parameters):
         sum_up_first(recording)
@@ -166,16 +188,18 @@ def _valid(question: Question, given: Mapping[str, Any], recording: Recording) -
     """The arguments as the question takes them; what was not given is left to their defaults."""
     meant: dict[str, Any] = {}
     for parameter in question.parameters:
-        if parameter.name not in given or given[parameter.name] is None:
+        value, kind = given.get(parameter.name), _plain(parameter.annotation)
+        if value is None:
+            value = _DEFAULTS.get(parameter.name)
+        if value is None:
             continue
-        value, kind = given[parameter.name], _plain(parameter.annotation)
-        if _is_mapping(kind):
-            value = settings_of(value, _kinds_in(recording))
+        if _is_mapping(kind) and not isinstance(value, Mapping):
+            value = settings_of(value, _kinds_in(recording) if _is_of_parameters(kind) else {})
         elif _is_json(kind) and isinstance(value, str):
             value = value_of(value)
         meant[parameter.name] = value
     try:
-        model = question.arguments.model_validate(meant)
+        model = question.arguments.model_validate(meant, context=FOR_A_PERSON)
     except ValidationError as error:
         raise InvalidInputError(
             faults_of(
@@ -193,7 +217,7 @@ def _kinds_in(recording: Recording) -> Mapping[str, str]:
         return kinds_of(connection)
 
 
-def show(question: Question, reply: Reply, *, as_json: bool) -> None:
+def show(question: Question, reply: Reply, where: Where, *, as_json: bool) -> None:
     """Print an answer.
 
     Raises:
@@ -205,13 +229,30 @@ def show(question: Question, reply: Reply, *, as_json: bool) -> None:
         return print(*(each for each in reply.shown if isinstance(each, str)), sep="\n")
     _require_recorded(data)
     if data.get("outcome") in _NOT_DONE:
-        why = "; ".join(filter(None, (data.get("error"), data.get("hint")))) or "no answer in time"
-        action = data.get("action") or question.name
-        raise CommandRefusedError(f"{action} is not done ({data['outcome']}): {why}")
+        refused = CommandRefusedError(_not_done(question, data, where))
+        refused.answer = {name: value for name, value in data.items() if name != "hint"}
+        raise refused
     if as_json:
         print(json.dumps(data, ensure_ascii=False))
     else:
         print_answer(data)
+
+
+def _not_done(question: Question, answer: Mapping[str, Any], where: Where) -> str:
+    """What became of a command, and what to do next."""
+    is_under_way = answer["outcome"] == "claimed" and "command_id" in answer
+    hint = _under_way(answer, where) if is_under_way else answer.get("hint")
+    why = "; ".join(filter(None, (answer.get("error"), hint))) or "no answer in time"
+    return f"{answer.get('action') or question.name} is not done ({answer['outcome']}): {why}"
+
+
+def _under_way(answer: Mapping[str, Any], where: Where) -> str:
+    """The command lines that go on waiting, and that end what lets the loop come round."""
+    wait = shlex.join(["webots-mcp", "wait", str(answer["command_id"]), *where.typed()])
+    robot = ["--robot", answer["robot"]] if "robot" in answer else []
+    end = shlex.join(["webots-mcp", "pause", *robot, *where.typed()])
+    is_loop = answer.get("action") in LOOPING
+    return _UNDER_WAY.format(wait) + (_END_IT.format(end) if is_loop else "")
 
 
 def _require_recorded(data: Mapping[str, Any]) -> None:
@@ -236,7 +277,7 @@ def _follow(question: Question, given: dict[str, Any], where: Where, *, as_json:
     newest: dict[bool, int] = {}
     reply = ask(question, given, where)
     if not as_json:
-        show(question, reply, as_json=False)
+        show(question, reply, where, as_json=False)
         sys.stdout.flush()
     is_shown = not as_json
     while True:
@@ -289,8 +330,8 @@ def _parameter(question: Question, declared: inspect.Parameter) -> inspect.Param
     default = declared.default if isinstance(declared.default, bool) else None
     if declared.default is inspect.Parameter.empty:
         default = inspect.Parameter.empty
-    elif declared.default not in (None, "", False, True):
-        text = f"{text} ({declared.default})"
+    elif (usual := _DEFAULTS.get(name, declared.default)) not in (None, "", False, True):
+        text = f"{text} ({usual:g})" if isinstance(usual, float) else f"{text} ({usual})"
     if default is None and type(None) not in get_args(kind):
         kind = Union[kind, None]  # noqa: UP007
     option = option_of(question, name)
@@ -362,6 +403,11 @@ def _is_mapping(kind: Any) -> bool:
     each = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
     kinds = [one for one in each if one is not type(None)]
     return len(kinds) == 1 and get_origin(kinds[0]) is dict
+
+
+def _is_of_parameters(kind: Any) -> bool:
+    """Whether the values of a mapping are those of parameters, which have declared kinds."""
+    return get_args(_without_none(kind))[1] is not Any
 
 
 def _is_json(kind: Any) -> bool:

@@ -12,6 +12,7 @@ from typing import Any, Final, NamedTuple
 
 from cyclopts import App, Argument, Group, Parameter
 
+from webots_mcp.cli.wording import value_name
 from webots_mcp.plugins import plugin_commands
 
 
@@ -41,6 +42,7 @@ NOW, PAST, STEER, DATA, SETUP = (
 )  # fmt: skip
 GROUPS: Final = (SETUP, NOW, PAST, STEER, DATA)
 _Q: Final = "webots_mcp.questions"
+_STEERING: Final = "webots_mcp.cli.steering"
 _OF_THE_CORE: Final = {
     "events": Command(PAST, f"{_Q}.find_events", "webots_find_events"),
     "compare": Command(PAST, f"{_Q}.compare_runs", "webots_compare_runs"),
@@ -62,6 +64,18 @@ _OF_THE_CORE: Final = {
     "migrate": Command(SETUP, "webots_mcp.cli.serving", "migrate"),
     "observe": Command(SETUP, "webots_mcp.cli.serving", "observe"),
     "serve": Command(SETUP, "webots_mcp.cli.serving", "serve"),
+    "run": Command(STEER, f"{_Q}.run_simulation", "webots_run"),
+    "send": Command(STEER, f"{_Q}.send_command", "webots_send_command"),
+    "wait": Command(STEER, f"{_Q}.send_command", "webots_wait_for_command"),
+    "scene": Command(NOW, f"{_Q}.edit_scene", "webots_get_scene"),
+    "commands": Command(NOW, f"{_Q}.send_command", "webots_list_commands"),
+    "field": Command(NOW, _STEERING, "field"),
+    "parameters": Command(NOW, _STEERING, "parameters"),
+    "pause": Command(STEER, _STEERING, "pause"),
+    "resume": Command(STEER, _STEERING, "resume"),
+    "step": Command(STEER, _STEERING, "step"),
+    "keep": Command(STEER, _STEERING, "keep"),
+    "breakpoint": Command(STEER, _STEERING, "breakpoint_"),
     "launch": Command(SETUP, "webots_mcp.cli.launching", "launch"),
     "plot": Command(PAST, "webots_mcp.cli.looking", "plot"),
     "tail": Command(NOW, "webots_mcp.cli.looking", "tail"),
@@ -120,11 +134,16 @@ def described() -> dict[str, Described]:
     }
 
 
+def called_value(argument: Argument) -> str:
+    """The word for its value."""
+    metavar = argument.parameter.metavar
+    return metavar if isinstance(metavar, str) else value_name(argument.names[-1])
+
+
 def _typed(argument: Argument) -> str:
     """All names of an option, with a word for its value."""
     names = argument.names
     if argument.hint is bool or not names[0].startswith("-"):
         return ", ".join(names)
-    called = argument.parameter.metavar or names[-1].lstrip("-").replace("-", "_").upper()
-    value = "|".join(argument.get_choices() or [called])
+    value = "|".join(argument.get_choices() or [called_value(argument)])
     return ", ".join(f"{name} {value}" for name in names)

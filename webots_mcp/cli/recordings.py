@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final, ParamSpec, TypeAlias
 
 from cyclopts import Parameter
 
-from webots_mcp.cli.values import Id
+from webots_mcp.cli.values import Id, whole_number
 from webots_mcp.errors import MalformedRowError, WebotsMCPError
 
 if TYPE_CHECKING:
@@ -63,6 +63,11 @@ class Where:
         where = resolve_database(self.database, self.data_dir)
         return Recording(*where, read_only=read_only, asker="cli")
 
+    def typed(self) -> list[str]:
+        """The options that name it in another command line."""
+        given = (("--data-dir", self.data_dir), ("--database", self.database))
+        return [text for option, value in given if value for text in (option, str(value))]
+
     @contextmanager
     def reader(self) -> Generator[sqlite3.Connection]:
         """A connection that reads; how the file is read is said on stderr where that matters."""
@@ -84,6 +89,41 @@ class Where:
 
 
 HERE: Final = Where()
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ToRobot(Where):
+    """Whom a command asks."""
+
+    robot: Robot = None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Waiting(ToRobot):
+    """Whom a command asks, and how long it waits for the answer."""
+
+    timeout_s: Annotated[
+        float | None,
+        Parameter("--timeout", metavar="S", help="Wait up to so many wall seconds (600)."),
+    ] = None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ToWebots(Waiting):
+    """The same, where Webots itself can be asked as well."""
+
+    force: Annotated[
+        bool, Parameter("--force", help="Press Webots' keys where nothing else works.")
+    ] = False
+    port: Annotated[
+        int | None,
+        Parameter(
+            "--port", metavar="PORT", converter=whole_number, help="Of a Webots of another project."
+        ),
+    ] = None
 
 
 @Parameter(name="*")

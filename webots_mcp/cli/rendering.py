@@ -33,7 +33,8 @@ _HEAD: Final = {
 }
 _TIMES: Final = ("sim_time_s", "since_s")  # lists of them
 _CALLED_ALIKE: Final = ("numbers", "signals")  # what they hold has names of its own
-_AS_READ: Final = "result"  # rows of a database, where null is a value
+_AS_READ: Final = "result"  # rows of a database, where null is a value; or of a command
+_OF_TABLE: Final = ("columns", "rows", "in_every_row")
 _NOTES: Final = ("why", "storage", "notes", "hint", "left_out")
 
 
@@ -53,7 +54,7 @@ def answer_lines(
         width: Of the lines, characters.
         most_rows: Of tables; it is said how many more there are. None for all.
     """
-    layout = _Layout(width, most_rows)
+    layout = _Layout(width, most_rows, is_of_command="outcome" in answer)
     head = [text.format(text_of(answer[name])) for name, text in _HEAD.items() if name in answer]
     if head:
         yield ", ".join(head)
@@ -195,10 +196,11 @@ def _number_text(value: float) -> str:
 class _Layout:
     """How the parts of an answer stand below each other."""
 
-    def __init__(self, width: int, most_rows: int | None) -> None:
+    def __init__(self, width: int, most_rows: int | None, *, is_of_command: bool) -> None:
         self._width = width
         self._paragraph = min(width, _PARAGRAPH)
         self._most_rows = most_rows
+        self._is_of_command = is_of_command
 
     def members(self, members: Mapping[str, Any]) -> Iterator[str]:
         """Short members stand together in a paragraph, each other one on lines of its own."""
@@ -230,7 +232,7 @@ class _Layout:
                 yield line
                 continue
             yield f"{name}:"
-            if name == _AS_READ and "rows" in part:
+            if name == _AS_READ and "rows" in part and not self._is_of_command:
                 part = part | {
                     "rows": [["NULL" if v is None else v for v in row] for row in part["rows"]]
                 }
@@ -238,10 +240,14 @@ class _Layout:
 
     def _inside(self, part: Mapping[str, Any]) -> Iterator[str]:
         if {"columns", "rows"} <= part.keys():
-            return self._table(part)
+            return self._table_with_rest(part)
         if any(isinstance(part.get(name), list) for name in _TIMES):
             return self._series(part)
         return self.members(part)
+
+    def _table_with_rest(self, part: Mapping[str, Any]) -> Iterator[str]:
+        yield from self._table(part)
+        yield from self.members({k: v for k, v in part.items() if k not in _OF_TABLE})
 
     def _table(self, table: Mapping[str, Any]) -> Iterator[str]:
         rows = table["rows"]

@@ -1,260 +1,180 @@
-"""Commands that steer a simulation: what an assistant can ask for, a person can."""
+"""Commands that steer a simulation, where one asks several questions or a part of one.
+
+What an assistant can ask for, a person can: each is answered as the MCP tool answers it.
+"""
 
 from __future__ import annotations
 
-import argparse
-import json
-import shlex
-import sys
-from collections.abc import Generator
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from webots_mcp.cli.command import (
-    DATA_DIR,
-    DATABASE,
-    JSON,
-    ROBOT,
-    argument,
-    command,
-    row_id,
-    settings_of,
-)
-from webots_mcp.cli.tables import print_table, text_of
-from webots_mcp.cli.terminal import rewrite
-from webots_mcp.cli.tuning import parameters_of
-from webots_mcp.contract import LOOPING
-from webots_mcp.errors import CommandRefusedError
+from cyclopts import Parameter
+
+from webots_mcp.cli.recordings import Json, RunId, ToRobot, ToWebots, Waiting
+from webots_mcp.cli.values import Count, Id, whole_number
+from webots_mcp.contract import BreakpointAction
+from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from webots_mcp.questions.answers import CommandAnswer, Table
-    from webots_mcp.questions.history_answers import RunAnswer
-    from webots_mcp.store.recording import Recording
-
-_WHERE: Final = (DATA_DIR, DATABASE, ROBOT, JSON)
-_UNDER_WAY: Final = (
-    "the controller is still at it and goes on: do not send it again, but go on waiting with\n\n"
-    "    {}\n{}"
-)
-_END_IT: Final = "\nor end it with\n\n    {}\n"
-TIMEOUT: Final = argument(
-    "--timeout",
-    type=float,
-    default=600.0,
-    dest="timeout_s",
-    metavar="S",
-    help="wait up to S wall seconds (600)",
-)
+    from webots_mcp.questions.declaring import Question
 
 
-@command(
-    "run",
-    *_WHERE,
-    TIMEOUT,
-    argument("--until", metavar="CONDITION", help="such as 'front_m < 0.1 for 0.5'"),
-    argument("--for", dest="for_s", type=float, metavar="S", help="for S simulated seconds"),
-    argument("--reset", action="store_true", help="reset the world first"),
-    argument("--pace", choices=["fast", "real_time", "as_it_is"], default="fast"),
-    argument("--then", choices=["pause", "go_on", "as_before"], default="pause"),
-    argument(
-        "--set",
-        dest="settings",
-        action="extend",
-        nargs="+",
-        default=[],
-        metavar="NAME=VALUE",
-        help="set this parameter first; may be given several times",
-    ),
-)
-def run(arguments: argparse.Namespace) -> None:
-    """Let the simulation run until a condition holds or a simulated time is over, then pause it.
-
-    It pauses at that very step, or does what --then says; Ctrl-C ends it the same way.
-
-    webots-mcp run --until 'front_m < 0.1' --for 20 --reset --set kp=2
-    """
-    import anyio
-
-    from webots_mcp.steering.running import require_possible
-
-    recording, until, for_s = writable(arguments), arguments.until, arguments.for_s
-    require_possible(recording, arguments.robot, until, for_s, reset=arguments.reset)
-    wanted: dict[str, Any] = {
-        "until": until,
-        "for_s": for_s,
-        "reset": arguments.reset,
-        "pace": None if arguments.pace == "as_it_is" else arguments.pace,
-        "parameters": parameters_of(recording, arguments) if arguments.settings else None,
-        "then": arguments.then,
-    }
-    params = {name: value for name, value in wanted.items() if value is not None}
-    _conclude(anyio.run(_ask, recording, arguments, "run", params), arguments)
+_ROBOT: Final = ToRobot()
+_WAITING: Final = Waiting()
+_WEBOTS: Final = ToWebots()
 
 
-@command(
-    "send", *_WHERE, TIMEOUT,
-    argument("action", metavar="ACTION", help="of the controller's own, or built in"),
-    argument(
-        "settings", nargs="*", default=[], metavar="NAME=VALUE", help="its parameters"
-    ),
-)  # fmt: skip
-def send(arguments: argparse.Namespace) -> None:
-    """Have a controller run an action, and print its answer.
-
-    webots-mcp send set_speed speed=3.5
-    """
-    import anyio
-
-    params = settings_of(arguments.settings)
-    answer = anyio.run(_ask, writable(arguments), arguments, arguments.action, params)
-    _conclude(answer, arguments)
+def pause(*, asked: ToWebots = _WEBOTS, json: Json = False) -> None:
+    """Pause the simulation; its controller goes on answering."""
+    _control("pause", asked, as_json=json)
 
 
-@command(
-    "keep", *_WHERE, TIMEOUT,
-    argument("reason", metavar="REASON", help="why, as it is told with the stretch"),
-)  # fmt: skip
-def keep(arguments: argparse.Namespace) -> None:
+def resume(*, asked: ToWebots = _WEBOTS, json: Json = False) -> None:
+    """Let a paused simulation go on, in real time."""
+    _control("resume", asked, as_json=json)
+
+
+def step(
+    steps: Annotated[
+        int, Parameter("N", converter=whole_number, help="Rounds of its loop (1).")
+    ] = 1,
+    /,
+    *,
+    asked: ToWebots = _WEBOTS,
+    json: Json = False,
+) -> None:
+    """Let the controller's own loop come round N times, then pause."""
+    _control("step", asked, as_json=json, steps=steps)
+
+
+def _control(command: str, asked: ToWebots, *, as_json: bool, **given: Any) -> None:
+    from webots_mcp.questions.control_simulation import webots_simulation_control
+
+    _show(webots_simulation_control, asked, as_json=as_json, command=command, **given)
+
+
+def keep(
+    reason: Annotated[str, Parameter("REASON", help="Why, as it is shown with the stretch.")],
+    /,
+    *,
+    asked: Waiting = _WAITING,
+    json: Json = False,
+) -> None:
     """Keep the last seconds of a running controller at full rate, and the two that follow.
 
     Each call of publish in them becomes a row, also those that the throttle drops.
     """
-    arguments.action, arguments.settings = "keep", [f"reason={json.dumps(arguments.reason)}"]
-    send(arguments)
+    from webots_mcp.questions.send_command import webots_send_command
+
+    params = {"reason": reason}
+    _show(webots_send_command, asked, as_json=json, action="keep", params=params)
 
 
-@command("pause", *_WHERE, TIMEOUT)
-def pause(arguments: argparse.Namespace) -> None:
-    """Pause the simulation; its controller goes on answering."""
-    arguments.action, arguments.settings = "pause", []
-    send(arguments)
+def parameters(
+    *settings: Annotated[str, Parameter("NAME=VALUE", help="Set these, all or none.")],
+    asked: Waiting = _WAITING,
+    run_id: RunId = None,
+    from_reset: Annotated[
+        bool, Parameter("--from-reset", help="Not now, but from the next reset on.")
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Show the parameters that a controller declares, or set some while it runs.
 
+    All are set between two rounds of its loop, or none. A reset keeps them; a reload begins with
+    those in the code.
 
-@command("resume", *_WHERE, TIMEOUT)
-def resume(arguments: argparse.Namespace) -> None:
-    """Let a paused simulation go on, in real time."""
-    arguments.action, arguments.settings = "resume", []
-    send(arguments)
-
-
-@command(
-    "step", *_WHERE, TIMEOUT,
-    argument("steps", nargs="?", default="1", metavar="N", help="N rounds of its loop (1)"),
-)  # fmt: skip
-def step(arguments: argparse.Namespace) -> None:
-    """Let the controller's own loop come round N times, then pause."""
-    arguments.action, arguments.settings = "step", [f"steps={arguments.steps}"]
-    send(arguments)
-
-
-@command(
-    "wait", DATA_DIR, DATABASE, JSON, TIMEOUT,
-    argument("command_id", type=row_id, metavar="COMMAND",
-             help="its number, as 'run' and 'send' say"),
-)  # fmt: skip
-def wait(arguments: argparse.Namespace) -> None:
-    """Go on waiting for a command that was still under way when --timeout was over.
-
-    Ctrl-C ends the waiting, not the command.
+    webots-mcp parameters kp=3.5 gait=trot
     """
-    import anyio
+    from webots_mcp.questions.set_parameters import webots_get_parameters, webots_set_parameters
 
-    _conclude(anyio.run(_wait, writable(arguments), arguments), arguments)
-
-
-async def _ask(
-    recording: Recording, arguments: argparse.Namespace, action: str, params: dict[str, Any]
-) -> CommandAnswer:
-    from webots_mcp.steering.dispatch import Dispatcher
-
-    with _line_of_progress():
-        dispatcher = Dispatcher(recording, show_progress)
-        return await dispatcher.ask(arguments.robot, action, arguments.timeout_s, params)
+    if not settings:
+        return _show(webots_get_parameters, asked, as_json=json, run_id=run_id)
+    if run_id is not None:
+        raise InvalidInputError("--run shows an earlier run; parameters are set in the current one")
+    when = "reset" if from_reset else "now"
+    _show(webots_set_parameters, asked, as_json=json, values=settings, when=when)
 
 
-async def _wait(recording: Recording, arguments: argparse.Namespace) -> CommandAnswer:
-    from webots_mcp.steering.dispatch import Dispatcher
+def breakpoint_(
+    condition: Annotated[
+        str | None, Parameter("CONDITION", help="Such as 'front_m < 0.1 for 0.5'.")
+    ] = None,
+    /,
+    *,
+    action: Annotated[BreakpointAction, Parameter("--action", help="At a hit (pause).")] = "pause",
+    after_hits: Annotated[
+        Count, Parameter("--after-hits", metavar="N", help="Act from this hit of a run on (1).")
+    ] = 1,
+    breakpoint_id: Annotated[
+        Id | None, Parameter("--remove", metavar="ID", help="Remove the one with this id.")
+    ] = None,
+    asked: ToRobot = _ROBOT,
+    json: Json = False,
+) -> None:
+    """Pause, or take note, when a condition begins to hold; without one, list the breakpoints.
 
-    with _line_of_progress():
-        dispatcher = Dispatcher(recording, show_progress)
-        return await dispatcher.wait(arguments.command_id, arguments.timeout_s)
+        webots-mcp breakpoint 'front_m < 0.1' --action log
 
-
-@contextmanager
-def _line_of_progress() -> Generator[None]:
-    try:
-        yield
-    finally:
-        rewrite(sys.stderr)
-
-
-async def show_progress(progress: float, total: float | None, text: str) -> None:
-    """On a terminal one line that changes; in a pipe nothing, as for all commands."""
-    rewrite(sys.stderr, text)
-
-
-def writable(arguments: argparse.Namespace) -> Recording:
-    """The recording that the commands for a controller go through."""
-    from webots_mcp.contract import resolve_database
-    from webots_mcp.store.recording import Recording
-
-    return Recording(*resolve_database(arguments.database, arguments.data_dir), asker="cli")
-
-
-def _conclude(answer: CommandAnswer | RunAnswer, arguments: argparse.Namespace) -> None:
-    require_done(answer, arguments)
-    if answer.action == "run" and not arguments.json:
-        _print_run(cast("RunAnswer", answer))
-    else:
-        _print(answer, arguments)
-
-
-def require_done(answer: CommandAnswer, arguments: argparse.Namespace) -> None:
-    """Refuse to go on with a command that was not done.
-
-    Raises:
-        CommandRefusedError: With what became of it, and what to do next.
+    It is asked of every published state, stored, and armed again after a reset or reload.
     """
-    if answer.outcome == "done":
-        return
-    under_way = answer.outcome == "claimed"
-    hint = _under_way(answer, arguments) if under_way else answer.hint
-    why = "; ".join(filter(None, (answer.error, hint))) or "no answer in time"
-    raise CommandRefusedError(f"{answer.action} is not done ({answer.outcome}): {why}")
+    from webots_mcp.questions import set_breakpoint as questions
+
+    if condition is not None and breakpoint_id is not None:
+        raise InvalidInputError("give a condition to set, or --remove ID, not both")
+    if breakpoint_id is not None:
+        remove = questions.webots_remove_breakpoint
+        return _show(remove, asked, as_json=json, breakpoint_id=breakpoint_id)
+    if condition is None:
+        return _show(questions.webots_list_breakpoints, asked, as_json=json)
+    given = {"condition": condition, "action": action, "after_hits": after_hits}
+    _show(questions.webots_breakpoint, asked, as_json=json, **given)
 
 
-def _under_way(answer: CommandAnswer, arguments: argparse.Namespace) -> str:
-    """The command lines that go on waiting, and that end what lets the loop come round."""
-    where = [("--data-dir", arguments.data_dir), ("--database", arguments.database)]
-    given = [text for option, value in where if value for text in (option, value)]
-    wait = shlex.join(["webots-mcp", "wait", str(answer.command_id), *given])
-    robot = ["--robot", answer.robot] if answer.robot else []
-    end = shlex.join(["webots-mcp", "pause", *robot, *given])
-    return _UNDER_WAY.format(wait, _END_IT.format(end) if answer.action in LOOPING else "")
+def field(
+    path: Annotated[str, Parameter("PATH", help="Such as ROVER.translation or BALL.physics.mass.")],
+    value: Annotated[
+        str | None,
+        Parameter(
+            "VALUE",
+            help="Set it: '[0, 1, 0.04]', 0.5, true, a text.",
+            allow_leading_hyphen=True,
+        ),
+    ] = None,
+    /,
+    *,
+    start: Annotated[
+        int | None,
+        Parameter(
+            "--start",
+            metavar="N",
+            converter=whole_number,
+            help="Show its entries from this one on.",
+        ),
+    ] = None,
+    stop: Annotated[bool, Parameter("--stop", help="Take the speed of its node too.")] = False,
+    asked: ToRobot = _ROBOT,
+    json: Json = False,
+) -> None:
+    """Show a field of the scene tree, or all fields of a node; or set one.
+
+    What is set is recorded as an event; a reset puts it back.
+
+    webots-mcp field ROVER.translation '[0, 1, 0.04]'
+    """
+    from webots_mcp.questions.edit_scene import webots_get_field, webots_set_field
+
+    if value is None:
+        return _show(webots_get_field, asked, as_json=json, path=path, start=start)
+    _show(webots_set_field, asked, as_json=json, path=path, value=value, stop=stop)
 
 
-def _print(answer: CommandAnswer, arguments: argparse.Namespace) -> None:
-    if arguments.json:
-        print(json.dumps(answer.model_dump(mode="json", exclude_none=True), indent=2))
-    else:
-        print(text_of(answer.result) or "done")
+def _show(question: Question, asked: ToRobot, *, as_json: bool, **given: Any) -> None:
+    """Ask a question, with those options that it has, and print the answer."""
+    from webots_mcp.cli.asking import ask_and_show
+
+    of_options = {name: value for name, value in vars(asked).items() if _has(question, name)}
+    ask_and_show(question, of_options | given, asked, as_json=as_json)
 
 
-def _print_run(answer: RunAnswer) -> None:
-    ran = answer.ran or {}
-    why = f" ({answer.why_stopped})" if answer.why_stopped else ""
-    factor = f", {ran['factor']} times real time" if ran.get("factor") else ""
-    print(
-        f"{answer.stopped}{why} at {ran.get('to_s')} s of run {ran.get('run_id')}: "
-        f"{ran.get('advanced_s')} s simulated{factor}; mode {answer.mode}"
-    )
-    print(f"state: {json.dumps(answer.state, ensure_ascii=False)}")
-    trends = answer.trends.numbers if answer.trends else None
-    for name, table in (("last rows", answer.rows), ("events", answer.events), ("trends", trends)):
-        _print_table(name, table)
-
-
-def _print_table(name: str, table: Table | None) -> None:
-    if table is not None:
-        print(f"\n{name}:")
-        print_table(table.columns, table.rows)
+def _has(question: Question, argument: str) -> bool:
+    return any(each.name == argument for each in question.parameters)

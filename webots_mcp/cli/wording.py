@@ -22,12 +22,15 @@ BY_TOOL: Final = {  # by tool
     "find_events": "events",
     "get_full_state": "tail",
     "get_logs": "logs",
+    "breakpoint": "breakpoint",
+    "get_scene": "scene",
+    "list_commands": "commands",
+    "list_commands breakpoints": "breakpoint",
     "list_commands parameters": "parameters",
     "list_commands outcome": "wait",
     "list_runs trials": "trials",
     "get_robot_state": "tail",
     "get_trends": "trends",
-    "list_commands": "status",
     "list_robots": "status",
     "list_runs": "runs",
     "monitor": "tail",
@@ -58,6 +61,11 @@ class Typed(NamedTuple):
     name: str
     typed: str
     value_name: str
+
+
+def value_name(option: str) -> str:
+    """The word for an option's value, as help shows it."""
+    return option.lstrip("-").replace("-", "_").upper()
 
 
 def as_typed(text: str) -> str:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Annotated, Final
 
-from pydantic import AfterValidator, Field, WithJsonSchema
+from pydantic import AfterValidator, Field, ValidationInfo, WithJsonSchema
 
 from webots_mcp import contract
 
 # Clients put a call aside after two minutes; some of this time is for a busy database.
 MAX_WAIT_S: Final = 90
+FOR_A_PERSON: Final = "person"  # the context of a validation: whoever waits can press Ctrl-C
 LONGEST_NAME: Final = 200
 
 
@@ -23,6 +24,12 @@ def _as_seconds(value: float) -> float:
     if abs(value) > 1e12:
         raise ValueError("be a number of seconds")
     return value
+
+
+def _as_wait(value: float, info: ValidationInfo) -> float:
+    if info.context != FOR_A_PERSON and value > MAX_WAIT_S:
+        raise ValueError(f"be less than or equal to {MAX_WAIT_S}")
+    return _as_seconds(value)
 
 
 # Bounds that only an absurd value meets stay out of the schemas, which every client carries along:
@@ -44,10 +51,12 @@ LastS = Annotated[
 ]
 StartS = Annotated[Seconds | None, Field(description="From this simulation time.")]
 EndS = Annotated[Seconds | None, Field(description="Before this simulation time.")]
-TimeoutS = Annotated[
+WaitS = Annotated[
     float,
-    Field(ge=0.1, le=MAX_WAIT_S, description="Wall seconds."),
+    Field(ge=0.1, json_schema_extra={"maximum": MAX_WAIT_S}),
+    AfterValidator(_as_wait),
 ]
+TimeoutS = Annotated[WaitS, Field(description="Wall seconds.")]
 _CURSOR: Final = "From the last answer."
 Cursor = Annotated[_Place | None, Field(description=_CURSOR)]
 TextCursor = Annotated[str, Field(max_length=2000, description=_CURSOR)]

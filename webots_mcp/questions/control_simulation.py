@@ -11,7 +11,7 @@ from pydantic.json_schema import SkipJsonSchema
 from webots_mcp.contract import MAX_STEPS
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
 from webots_mcp.questions.answers import CommandAnswer
-from webots_mcp.questions.argument_types import MAX_WAIT_S, RobotName, TimeoutS
+from webots_mcp.questions.argument_types import MAX_WAIT_S, RobotName, TimeoutS, WaitS
 from webots_mcp.questions.declaring import DESTROYS, Caller, question
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.steering.routes import Attempt
@@ -42,12 +42,7 @@ async def webots_simulation_control(
     port: Port = None,
     robot: RobotName = None,
     timeout_s: Annotated[
-        float | None,
-        Field(
-            ge=0.1,
-            le=MAX_WAIT_S,
-            description="Wall seconds: 10, for reload 30, for step up to 90.",
-        ),
+        WaitS | None, Field(description="Wall seconds: 10, for reload 30, for step up to 90.")
     ] = None,
 ) -> CommandAnswer:
     """Pause, resume, run fast, step, reset or reload, and wait for the outcome.

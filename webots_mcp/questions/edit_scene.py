@@ -24,7 +24,13 @@ _Count = Annotated[int, Field(ge=1, le=24)]
 _Start = Annotated[int, Field(ge=0)]
 
 
-@question("Get the scene", READS)
+@question(
+    "Get the scene",
+    READS,
+    command="scene",
+    positional=("path",),
+    options={"types": "--type", "names": "--name", "fields": "--field", "cursor": "--cursor"},
+)
 async def webots_get_scene(
     recording: Recording,
     caller: Caller,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final, cast
+from typing import Annotated, Any, Final, Literal, cast
 
 from anyio import to_thread
 from pydantic import Field
@@ -10,7 +10,7 @@ from pydantic import Field
 from webots_mcp.contract import MAX_RUN_S, Pace, Then
 from webots_mcp.errors import CommandRefusedError, WebotsMCPError
 from webots_mcp.questions.answers import ShownPicture
-from webots_mcp.questions.argument_types import RobotName, TimeoutS
+from webots_mcp.questions.argument_types import RobotName, TimeoutS, Value
 from webots_mcp.questions.budget import seconds
 from webots_mcp.questions.declaring import DESTROYS, Caller, question
 from webots_mcp.questions.history_answers import RunAnswer
@@ -25,7 +25,7 @@ _PICTURE_WAIT_S: Final = 8.0
 _SAME_S: Final = 0.001  # times are told to the millisecond
 
 
-@question("Run until", DESTROYS, core=True)
+@question("Run until", DESTROYS, command="run", options={"parameters": "--set"}, core=True)
 async def webots_run(
     recording: Recording,
     caller: Caller,
@@ -40,9 +40,9 @@ async def webots_run(
     reset: Annotated[
         bool, Field(description="Reset the world first; for_s counts from there.")
     ] = False,
-    pace: Annotated[Pace | None, Field(description="null: as it runs now.")] = "fast",
+    pace: Annotated[Literal[Pace, "as_it_is"], Field(description="Of this run.")] = "fast",
     parameters: Annotated[
-        dict[str, Any] | None,
+        dict[str, Value] | None,
         Field(description="Set these first, all or none."),
     ] = None,
     then: Annotated[Then, Field(description="At that step; go_on: at the old pace.")] = "pause",
@@ -60,7 +60,7 @@ async def webots_run(
         "until": until,
         "for_s": for_s,
         "reset": reset,
-        "pace": pace,
+        "pace": None if pace == "as_it_is" else pace,
         "parameters": parameters,
         "then": then,
     }

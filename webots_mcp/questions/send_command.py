@@ -26,7 +26,14 @@ _COMMANDS_TOKENS: Final = 1_100
 _LONGEST_TEXT: Final = 200
 
 
-@question("Send a command", DESTROYS, core=True)
+@question(
+    "Send a command",
+    DESTROYS,
+    command="send",
+    positional=("action", "params"),
+    options={"params": "NAME=VALUE"},
+    core=True,
+)
 async def webots_send_command(
     recording: Recording,
     action: Annotated[
@@ -46,7 +53,13 @@ async def webots_send_command(
     return await dispatcher.ask(robot, action, timeout_s, params)
 
 
-@question("Wait for a command", READS)
+@question(
+    "Wait for a command",
+    READS,
+    command="wait",
+    positional=("command_id",),
+    options={"command_id": "COMMAND"},
+)
 async def webots_wait_for_command(
     recording: Recording,
     command_id: Annotated[Id, Field(description="From its answer.")],
@@ -57,7 +70,7 @@ async def webots_wait_for_command(
     return await Dispatcher(recording, caller.report).wait(command_id, timeout_s)
 
 
-@question("List the commands", READS, core=True)
+@question("List the commands", READS, command="commands", core=True)
 def webots_list_commands(
     recording: Recording,
     limit: Annotated[int, Field(ge=1, le=200, description="Most shown.")] = 10,

@@ -50,6 +50,7 @@ async def webots_breakpoint(
         action=action,
         after_hits=after_hits,
         robot=robot,
+        set_by=caller.client,
     )
 
 

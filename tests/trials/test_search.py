@@ -202,7 +202,7 @@ def test_a_range_that_is_none_is_refused_before_anything_is_written(
     ("options", "text", "said"),
     [
         ((), "sets = 3\n[ranges]\nspeed = { low = 1, high = 2 }", "--search takes tpe, random"),
-        (("--search", "gp"), "sets = 3\n[ranges]\nspeed = { low = 1, high = 2 }", "tpe, random"),
+        (("--search", "gp"), "sets = 3\n[ranges]\nspeed = { low = 1, high = 2 }", 'from: "tpe"'),
         (("--search", "tpe"), "[ranges]\nspeed = { low = 1, high = 2 }", "sets is missing"),
         (("--search", "tpe"), "sets = 3\n[grid]\nspeed = [1.0]", "--search takes [ranges]"),
         (("--search", "tpe"), "seed = -1\nsets = 3\n[ranges]\nspeed = { low = 1, high = 2 }",

@@ -28,9 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 _NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
-_FAMILIES: Final = (
-    "trials",
-)  # fmt: skip
+_FAMILIES: Final[tuple[str, ...]] = ()
 EXIT_SYSTEM: Final = 1
 EXIT_BAD_INPUT: Final = 2
 _DESCRIPTION: Final = (

@@ -76,6 +76,7 @@ _OF_THE_CORE: Final = {
     "step": Command(STEER, _STEERING, "step"),
     "keep": Command(STEER, _STEERING, "keep"),
     "breakpoint": Command(STEER, _STEERING, "breakpoint_"),
+    "trials": Command(STEER, "webots_mcp.cli.trials", "trials"),
     "launch": Command(SETUP, "webots_mcp.cli.launching", "launch"),
     "plot": Command(PAST, "webots_mcp.cli.looking", "plot"),
     "tail": Command(NOW, "webots_mcp.cli.looking", "tail"),

@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import threading
 import time
 from collections.abc import Callable, Generator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from webots_mcp.cli.command import (
-    DATA_DIR,
-    DATABASE,
-    JSON,
-    argument,
-    command,
-    count,
-    open_recording,
-)
+from cyclopts import Parameter
+
 from webots_mcp.cli.ending import ending_by_event
 from webots_mcp.cli.looking import write_picture
-from webots_mcp.cli.tables import print_notes, print_table, text_of
+from webots_mcp.cli.recordings import Json, Where
+from webots_mcp.cli.rendering import print_notes, print_table, text_of
+from webots_mcp.cli.values import Count
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 
 if TYPE_CHECKING:
@@ -39,25 +33,80 @@ _RANK_EVERY_S: Final = 1.0
 _WORDS: Final = {"done": "score", "failed": "failed:", "pruned": "pruned:"}
 
 
-@command(
-    "trials", DATA_DIR, DATABASE, JSON,
-    argument("plan", metavar="PLAN", help="a .toml file: see docs/trials.md"),
-    count("--jobs", "at most N trials at once, each in a simulator of its own (1; with "
-          "--scheduler as many as its workers can run)", default=None, dest="jobs"),
-    argument("--scheduler", metavar="ADDRESS",
-             help="on the workers of a Dask cluster, such as tcp://HOST:8786"),
-    argument("--ship-to", metavar="URL",
-             help="with --scheduler: large recordings come through this pool, and stay in it"),
-    argument("--search", metavar="SAMPLER",
-             help="search the plan's [ranges]: tpe or random, by Optuna (pip install optuna)"),
-    argument("--stand-in", action="store_true", help="on the stand-in instead of Webots"),
-    argument("--plot", metavar="FILE", help="a .png or .svg file: the scores over the parameters"),
-    argument("--again", action="store_true",
-             help="from the start, also where all trials of the plan are done"),
-    argument("--so-far", action="store_true",
-             help="only print what is over, also while another process works on it"),
-)  # fmt: skip
-def trials(arguments: argparse.Namespace) -> None:
+@Parameter(name="*")
+@dataclass(frozen=True)
+class _Options:
+    """Where and how the trials run."""
+
+    jobs: Annotated[
+        Count | None,
+        Parameter(
+            "--jobs",
+            metavar="N",
+            help="At most N trials at once, each in a simulator of its own (1; with --scheduler as "
+            "many as its workers can run).",
+        ),
+    ] = None
+    scheduler: Annotated[
+        str | None,
+        Parameter(
+            "--scheduler",
+            metavar="ADDRESS",
+            help="On the workers of a Dask cluster, such as tcp://HOST:8786.",
+        ),
+    ] = None
+    ship_to: Annotated[
+        str | None,
+        Parameter(
+            "--ship-to",
+            metavar="URL",
+            help="With --scheduler: large recordings come through this pool, and stay in it.",
+        ),
+    ] = None
+    stand_in: Annotated[
+        bool, Parameter("--stand-in", help="On the stand-in instead of Webots.")
+    ] = False
+    again: Annotated[
+        bool,
+        Parameter("--again", help="From the start, also where all trials of the plan are done."),
+    ] = False
+
+
+_DEFAULTS: Final = _Options()
+_WHERE: Final = Where()
+
+
+def trials(
+    plan: Annotated[Path, Parameter("PLAN", help="A .toml file: see docs/trials.md.")],
+    /,
+    *,
+    options: _Options = _DEFAULTS,
+    search: Annotated[
+        Literal["tpe", "random"] | None,
+        Parameter(
+            "--search",
+            metavar="SAMPLER",
+            help="Search the plan's [ranges]: tpe or random, by Optuna (pip install optuna).",
+        ),
+    ] = None,
+    plot: Annotated[
+        Path | None,
+        Parameter(
+            "--plot",
+            metavar="FILE",
+            help="A .png or .svg file: the scores over the parameters.",
+        ),
+    ] = None,
+    so_far: Annotated[
+        bool,
+        Parameter(
+            "--so-far",
+            help="Only print what is over, also while another process works on it.",
+        ),
+    ] = False,
+    recorded: Where = _WHERE,
+    json: Json = False,
+) -> None:
     """Try sets of parameters in runs of their own, score each run, and rank the sets.
 
     webots-mcp trials plan.toml --jobs 4 --search tpe
@@ -72,72 +121,69 @@ def trials(arguments: argparse.Namespace) -> None:
     """
     from webots_mcp.trials.plan import read_plan
 
-    plan = read_plan(Path(arguments.plan), arguments.search)
-    picture = _picture_of(arguments)
-    if arguments.so_far:
-        recording = open_recording(arguments)
-        set_id = _begun_set(recording, plan, arguments)
+    found = read_plan(plan, search)
+    draw = _picture_of(plot)
+    if so_far:
+        recording = recorded.recording()
+        set_id = _begun_set(recording, plan, found, options)
     else:
-        recording, set_id = _run(plan, arguments)
-    _show(recording, set_id, plan, as_json=arguments.json)
-    if picture is not None:
-        picture(recording, set_id)
+        recording = recorded.recording(read_only=False)
+        set_id = _run(recording, found, options)
+    _show(recording, set_id, found, as_json=json)
+    if draw is not None:
+        draw(recording, set_id)
 
 
-def _run(plan: WorldPlan, arguments: argparse.Namespace) -> tuple[Recording, int]:
-    """Run what is left of the plan's set; returns where it is recorded, and its id."""
+def _run(recording: Recording, plan: WorldPlan, options: _Options) -> int:
+    """Run what is left of the plan's set; returns its id."""
     from webots_mcp.trials.set_runner import SetRun, require_optuna, run_trials
 
     if plan.search:
         require_optuna()
-    with _simulators(arguments, plan) as simulators:
-        recording = replace(open_recording(arguments), read_only=False)
+    with _simulators(options, plan) as simulators:
         recording.create()
-        set_id = _set_of(recording, plan, arguments)
+        set_id = _set_of(recording, plan, options)
         set_run = SetRun(recording, plan, simulators, threading.Event())
         with ending_by_event(set_run.stopping):
             run_trials(set_run, set_id, _Progress(recording, set_id, plan).tell)
-    return recording, set_id
+    return set_id
 
 
-def _simulators(
-    arguments: argparse.Namespace, plan: WorldPlan
-) -> AbstractContextManager[Simulators]:
+def _simulators(options: _Options, plan: WorldPlan) -> AbstractContextManager[Simulators]:
     """Where the trials run; that there is such a program is seen before anything is written."""
     from webots_mcp.trials.trial_run import LocalSimulators, stand_in, webots
 
-    if arguments.scheduler is not None:
-        return _cluster(arguments, plan)
-    if arguments.ship_to is not None:
+    if options.scheduler is not None:
+        return _cluster(options, plan)
+    if options.ship_to is not None:
         raise InvalidInputError("--ship-to is for --scheduler: what runs here is merged as it is")
-    command_of = stand_in if arguments.stand_in else webots
+    command_of = stand_in if options.stand_in else webots
     command_of(plan.world)
-    return nullcontext(LocalSimulators(command_of, arguments.jobs or 1))
+    return nullcontext(LocalSimulators(command_of, options.jobs or 1))
 
 
 @contextmanager
-def _cluster(arguments: argparse.Namespace, plan: WorldPlan) -> Generator[Simulators]:
+def _cluster(options: _Options, plan: WorldPlan) -> Generator[Simulators]:
     from webots_mcp.plugins import cluster_offered, load
 
     with load(cluster_offered().simulators)(
-        arguments.scheduler,
+        options.scheduler,
         plan,
-        is_stand_in=arguments.stand_in,
-        most=arguments.jobs,
-        ship_to=arguments.ship_to,
+        is_stand_in=options.stand_in,
+        most=options.jobs,
+        ship_to=options.ship_to,
     ) as simulators:
         for note in simulators.notes:
             print(f"webots-mcp: {note}", file=sys.stderr)
         yield simulators
 
 
-def _picture_of(arguments: argparse.Namespace) -> Callable[[Recording, int], None] | None:
+def _picture_of(file: Path | None) -> Callable[[Recording, int], None] | None:
     """What draws the picture that is asked for; None where none is."""
-    if arguments.plot is None:
+    if file is None:
         return None
     from webots_mcp.plotting import Sheet, image_format_of, plot_trials
 
-    file = Path(arguments.plot)
     sheet = Sheet(image_format=image_format_of(file))
 
     def draw(recording: Recording, set_id: int) -> None:
@@ -149,17 +195,17 @@ def _picture_of(arguments: argparse.Namespace) -> Callable[[Recording, int], Non
     return draw
 
 
-def _set_of(recording: Recording, plan: WorldPlan, arguments: argparse.Namespace) -> int:
+def _set_of(recording: Recording, plan: WorldPlan, options: _Options) -> int:
     """The set that was begun with this plan, or a new one."""
     from webots_mcp.store.trials import create_trial_set, find_trial_set
 
-    text = _text_of(plan, arguments)
+    text = _text_of(plan, options)
     with recording.writer() as connection:
-        known = None if arguments.again else find_trial_set(connection, text)
+        known = None if options.again else find_trial_set(connection, text)
         return known or create_trial_set(connection, text, plan.trials)
 
 
-def _begun_set(recording: Recording, plan: WorldPlan, arguments: argparse.Namespace) -> int:
+def _begun_set(recording: Recording, file: Path, plan: WorldPlan, options: _Options) -> int:
     """The set that was begun with this plan.
 
     Raises:
@@ -168,15 +214,15 @@ def _begun_set(recording: Recording, plan: WorldPlan, arguments: argparse.Namesp
     from webots_mcp.store.trials import find_trial_set
 
     with recording.reader() as connection:
-        known = find_trial_set(connection, _text_of(plan, arguments))
+        known = find_trial_set(connection, _text_of(plan, options))
     if known is None:
-        raise NothingRecordedError(f"no trials of {arguments.plan} were begun with these options")
+        raise NothingRecordedError(f"no trials of {file} were begun with these options")
     return known
 
 
-def _text_of(plan: WorldPlan, arguments: argparse.Namespace) -> str:
+def _text_of(plan: WorldPlan, options: _Options) -> str:
     """By which a set is found again."""
-    return json.dumps({"stand_in": arguments.stand_in, **json.loads(plan.text)}, sort_keys=True)
+    return json.dumps({"stand_in": options.stand_in, **json.loads(plan.text)}, sort_keys=True)
 
 
 class _Progress:

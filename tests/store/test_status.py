@@ -279,7 +279,7 @@ def test_where_the_database_takes_no_rows_it_says_in_which_file_they_wait_and_si
             session = newest_session(connection, 1)
             going, gone = (judge(connection, session, None, began_s + s) for s in (30.5, 60))
     assert going.text == "running"
-    assert f"waits in {waiting.name} beside it, for 30 s now" in (going.why or "")
+    assert f"wait in {waiting.name} next to it, for 30 s now" in (going.why or "")
     assert gone.text == "stopped 30 s ago"
     assert waiting.name in (gone.why or "")
     assert "database or disk is full" in capfd.readouterr().err

@@ -77,7 +77,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="python -m webots_mcp.standin",
         description="Runs a world on a small stand-in for Webots, with its controllers.",
     )
-    parser.add_argument("world", help="a .wbt file, best in a project: worlds/ beside controllers/")
+    parser.add_argument("world", help="a .wbt file, best in worlds/ of a project")
     parser.add_argument(
         "--mode", choices=("pause", "realtime", "fast"), default="realtime", help="as for Webots"
     )

@@ -28,7 +28,7 @@ FieldSet = tuple[FieldReference, int | None, Any]
 
 
 def description(simulator: Simulator, robot: Robot) -> dict[str, Any]:
-    """What a controller is told when it connects."""
+    """The data that a controller receives when it connects."""
     fields = robot.node.fields
     return {
         "name": robot.name,
@@ -314,7 +314,7 @@ class SupervisorRequests:
                 robot.vehicle.stop()
 
     def on_node_set_joint_position(self, node_id: int, position_rad: float) -> None:
-        """Turn a hinge to an angle at once; its motor goes on with what it was told."""
+        """Turn a hinge to an angle at once; its motor continues with its command."""
         node = self._node(node_id)
         for robot in self._simulator.robots:
             for joint in robot.vehicle.joints:

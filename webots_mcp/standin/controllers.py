@@ -49,7 +49,7 @@ class Launch:
     """None before the simulator has started."""
 
     def file_of(self, robot: Robot, simulator: Simulator) -> Path | None:
-        """The controller's file; None if the robot has none or it is started by somebody else.
+        """The controller's file; None if the robot has none or it is started by a person.
 
         Only the world's own name has to be one: links that stand in the project are followed, as
         Webots does, and a file that the caller names may lie anywhere.
@@ -77,15 +77,15 @@ class Launch:
         return merged | self._way_to(robot)
 
     def _way_to(self, robot: Robot) -> dict[str, str]:
-        """As Webots tells a controller that it starts, or a person one that Webots does not."""
+        """The variables that Webots sets for a controller, or a person for an extern one."""
         if self.address is None:
             raise StandInError("start the simulation before you ask how to reach it")
         if robot.node.fields["controller"] == _EXTERN and robot.name not in self.overrides:
             url = f"tcp://127.0.0.1:{self.address.port}/{robot.name}"
             return dict(zip(_EXTERN_VARIABLES, (url, self.address.token), strict=True))
         folder = f"{self.address.folder}{os.sep}"  # Webots writes it so
-        told = dict(zip(_INTERN_VARIABLES, (robot.name, folder), strict=True))
-        return told | {"PYTHONIOENCODING": "UTF-8"}
+        own = dict(zip(_INTERN_VARIABLES, (robot.name, folder), strict=True))
+        return own | {"PYTHONIOENCODING": "UTF-8"}
 
 
 @dataclass
@@ -151,7 +151,7 @@ class Controller:
 
     @property
     def is_leaving(self) -> bool:
-        """Whether it was told to quit and is still there."""
+        """Whether it was asked to quit and is still running."""
         return self._was_told and (self.is_running or self.connection is not None)
 
     def start(self) -> None:
@@ -180,7 +180,7 @@ class Controller:
         )
 
     def _tell_extern(self) -> None:
-        """Nobody starts its controller, and the world may wait for that without end."""
+        """Warn that its controller is not started here, for which the world may wait for ever."""
         waits = "the world waits for it" if self.robot.is_synchronous else "it has none until then"
         self.launch.print_line(
             f"WARNING: {self.name}: the controller is <extern>, so somebody else has to start it; "

@@ -58,7 +58,7 @@ class Device:
         self._wait_ms = 0.0
 
     def description(self) -> dict[str, Any]:
-        """What the controller is told about the device when it connects."""
+        """The data about the device that the controller receives when it connects."""
         return {
             "tag": self.tag,
             "kind": self.kind,
@@ -97,7 +97,7 @@ class Device:
 
 
 def table_of(node: Node) -> dict[str, Any]:
-    """What the controller is told about a sensor's lookup table."""
+    """The data about a sensor's lookup table that the controller receives."""
     return {"lookup_table": [number for row in node.fields["lookupTable"] for number in row]}
 
 

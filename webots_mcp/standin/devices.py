@@ -185,7 +185,7 @@ class Lidar(Device):
 
 
 class Camera(Device):
-    """Renders what it sees when somebody looks at the picture."""
+    """Renders its image when the picture is read."""
 
     kind = "Camera"
     fetched = True

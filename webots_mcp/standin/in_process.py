@@ -162,14 +162,14 @@ class InProcessSimulation:
         """Let time pass until the controller has its answer.
 
         Raises:
-            WouldBlockError: The simulation is paused and nobody resumes it.
+            WouldBlockError: The simulation is paused and nothing can resume it.
         """
         with self._changed:
             while not link.replies:
                 if self.mode is Mode.PAUSE and not self._changed.wait(self._pause_timeout_s):
                     link.robot.remaining_ms = None
                     raise WouldBlockError(
-                        "step() with a time above 0 waits until somebody resumes the simulation, "
+                        "step() with a time above 0 waits until the simulation is resumed, "
                         "which is paused: call step(0), or resume it from another thread within "
                         "pause_timeout_s"
                     )

@@ -1,7 +1,7 @@
 """The node types that the stand-in knows: their fields, types and default values.
 
 Written as Webots writes its own node files. Default sounds and textures are left out: nothing here
-is heard. A world may use other fields of these nodes; they are read over.
+is reported. A world may use other fields of these nodes; they are read over.
 """
 
 from __future__ import annotations

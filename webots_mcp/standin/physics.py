@@ -47,7 +47,7 @@ class Joint:
         return joint
 
     def reset(self) -> None:
-        """Back to the start; the motor holds still until it is told otherwise."""
+        """Back to the start; the motor stands still until its next command."""
         self.position_rad, self.velocity_radps = self.start_rad, 0.0
         self.hold()
 

@@ -21,7 +21,7 @@ _FORMATS: Final = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture that somebody asked for."""
+    """A picture that was asked for."""
 
     path: Path
     quality: int

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import IO, Final
 
 _TERMINATION_S: Final = 1.0
-"""How long a process may take to end after it was told to."""
+"""How long a process may take to end after it was asked to."""
 
 
 class ControllerProcess:

@@ -89,7 +89,7 @@ class Runner:
     # The loop ------------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Run until somebody quits."""
+        """Run until the simulation is quit."""
         try:
             if self.simulator.mode is not Mode.PAUSE:
                 self._start_controllers()

@@ -51,7 +51,7 @@ class Simulation:
         """Load a world; nothing runs before `start` or `with`.
 
         Args:
-            world: A .wbt file, best in a project: `worlds/x.wbt` beside `controllers/`.
+            world: A .wbt file, best in a project: `worlds/x.wbt` next to `controllers/`.
             mode: `pause`, `realtime` or `fast`, as for Webots' `--mode`. A world that is loaded
                 in pause starts its controllers with the first step.
             console: Is called with each line of Webots' console, from one thread at a time.
@@ -101,7 +101,7 @@ class Simulation:
     def close(self) -> None:
         """Quits, if that has not happened yet, and waits until all processes are gone."""
         if self._thread.is_alive():
-            with suppress(StandInError):  # somebody else has quit meanwhile
+            with suppress(StandInError):  # it was quit otherwise meanwhile
                 self.quit()
         if self._thread.ident is not None:
             self._thread.join()

@@ -1,6 +1,6 @@
 """The simulation itself: robots, time and modes; no messages, no processes, no sockets.
 
-Whoever drives a `Simulator` makes the physics steps (`advance`) and carries out what the
+The driver of a `Simulator` makes the physics steps (`advance`) and carries out what the
 simulation wants done to itself (`wanted`).
 """
 
@@ -172,7 +172,7 @@ class Simulator:
             return (
                 f"{self.world.path.name}, line {node.line}: the stand-in has no {node.type_name} "
                 "nodes. If that is the robot: in Webots, right-click it, choose 'Convert Root to "
-                "Base Node(s)' and save the world; docs/standin.md tells what the stand-in has"
+                "Base Node(s)' and save the world; docs/standin.md lists what the stand-in has"
             )
         known = ", ".join(repr(robot.name) for robot in self.robots)
         asked = "no robot" if name is None else f"no robot {name!r}"

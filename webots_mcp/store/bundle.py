@@ -71,12 +71,12 @@ def small_recording(folder: Path) -> Generator[sqlite3.Connection]:
     with closing(connect(folder / DATABASE_NAME, "writer", create=True)) as writer:
         create_schema(writer)
         writer.execute("PRAGMA journal_mode=DELETE")  # all of it in the one file, written once
-        writer.execute("PRAGMA synchronous=OFF")  # whoever is killed leaves nothing to keep
+        writer.execute("PRAGMA synchronous=OFF")  # a killed process leaves nothing worth keeping
         yield writer
 
 
 def pack(folder: Path, file: Path, progress: Progress | None = None) -> None:
-    """Write the database of a folder, which nobody has open, and its pictures, and nothing else.
+    """Write only the database of a folder, which no process has open, and its pictures.
 
     Args:
         folder: Of the recording.
@@ -103,13 +103,13 @@ def _is_packed(path: Path) -> bool:
 
 
 def is_bundle(file: Path) -> bool:
-    """Whether a file is one, or says that it is: a damaged one is told as such."""
+    """Whether a file is one, or says that it is: a damaged one is reported as such."""
     return file.suffix.lower() == ".zip" or zipfile.is_zipfile(file)
 
 
 @contextmanager
 def unpacked(file: Path) -> Generator[Path]:
-    """The database of a bundle with its pictures beside it, as long as the block goes on.
+    """The database of a bundle with its pictures next to it, for the duration of the block.
 
     Nothing is trusted: what is no database of ours and no picture, leads out of the folder, is a
     link or unpacks to far more than it holds is refused before anything is written.
@@ -123,7 +123,7 @@ def unpacked(file: Path) -> Generator[Path]:
 
 
 def unpack(file: Path, folder: Path) -> None:
-    """Unpack a bundle as `unpacked` does; whoever is killed meanwhile leaves no database there.
+    """Unpack a bundle as `unpacked` does; a process killed meanwhile leaves no database there.
 
     Raises:
         InvalidInputError: As there.

@@ -20,7 +20,7 @@ from webots_mcp.contract import LogLevel, LogSource
 
 MOST_WAITING: Final = 500  # of one Webots; the newest are kept
 _KEPT_WAITING_S: Final = 7 * 86_400.0
-_EARLY_S: Final = 1.0  # a run may begin before the line that tells that its controller starts
+_EARLY_S: Final = 1.0  # a run may begin before the line that its controller starts
 _MOST_RUNS: Final = 50
 _MOST_SESSIONS: Final = 500
 _MOST_RECORDED: Final = 2_000  # newest rows of bridges that a line is compared with
@@ -117,7 +117,7 @@ class ConsoleRows:
         connection.execute(_FORGET_PAST, past)
 
     def is_recorded(self, connection: sqlite3.Connection) -> bool:
-        """Whether lines of this Webots wait for a run: then somebody follows its console."""
+        """Whether lines of this Webots wait for a run: then a process follows its console."""
         return bool(
             connection.execute(_IS_FOLLOWED, (self._instance, self._started_s)).fetchone()[0]
         )
@@ -149,7 +149,7 @@ class ConsoleRows:
         return [_Run(*row) for row in found]
 
     def _fitting(self, runs: list[_Run]) -> list[_Run]:
-        """Those that began since, and those that still go on: then the start was told late."""
+        """Runs that began since, and those still running, whose start was reported late."""
         since_s = self._runs_since_s
         return [
             run
@@ -193,9 +193,9 @@ class ConsoleRows:
             if not self._recorded.take(line):
                 self._write(connection, line, runs)
         if self._left_out:
-            told = f"({self._left_out} lines before the first run are not recorded)"
+            text = f"({self._left_out} lines before the first run are not recorded)"
             self._left_out = 0
-            self._write(connection, Said(time.time(), "warning", "console", told, None), runs)
+            self._write(connection, Said(time.time(), "warning", "console", text, None), runs)
 
 
 class _Recorded:
@@ -288,7 +288,7 @@ def _of_named(line: Said, runs: list[_Run]) -> tuple[Said, list[_Run]]:
 
 
 def _is_called(run: _Run, name: str) -> bool:
-    """Whether that is the run's robot or its controller, of which Webots tells the name."""
+    """Whether that is the run's robot or its controller, which Webots names in the line."""
     return name in (run.robot, run.controller and PurePath(run.controller).stem)
 
 

@@ -91,7 +91,7 @@ def inside(data_dir: Path, path: str) -> Path:
 
 @contextlib.contextmanager
 def opened(file: Path, formats: tuple[str, ...] = ("PNG", "JPEG")) -> Generator[Image]:
-    """A picture, not decoded yet; what its user finds wrong inside the block is told alike.
+    """A picture, not decoded yet; errors of its user inside the block are reported alike.
 
     Pillow is imported here, at the first picture: it would add to the server's start.
 

@@ -64,7 +64,7 @@ class Job:
 
     def _renew(self, over: threading.Event) -> None:
         while not over.wait(_RENEW_EVERY_S):
-            with suppress(LeaseLostError):  # whoever works finds out when it writes
+            with suppress(LeaseLostError):  # the worker finds out when it writes
                 self._renew_now()
 
     def _renew_now(self) -> None:

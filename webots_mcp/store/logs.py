@@ -12,7 +12,7 @@ from webots_mcp.store.reading.moments import moment_of
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.run_rows import columns_of
 
-COUNT_LIMIT: Final = 10_000  # beyond it a count would cost more than it tells
+COUNT_LIMIT: Final = 10_000  # beyond it a count would cost more than it is worth
 OF_CONSOLE: Final[tuple[LogSource, ...]] = ("console", "webots")
 
 
@@ -50,8 +50,8 @@ _OF_RUN: Final = f"FROM log WHERE run_id = :run_id {_MATCHING}"
 _OF_ROBOT: Final = (
     f"FROM log WHERE +run_id IN (SELECT id FROM run WHERE robot_id = :robot_id) {_MATCHING}"
 )
-# Of several robots in a simulation Webots does not tell which one printed a line, and nobody's are
-# those of its own: they stand in the run of any of them, and are shown for all.
+# Of several robots in a simulation Webots does not show which one printed a line. Its lines
+# belong to none of them: they stand in the run of any of them, and are shown for all.
 _COMPANIONS: Final = (
     "SELECT id FROM session WHERE robot_id <> :robot_id "
     "AND instance IN (SELECT instance FROM session WHERE robot_id = :robot_id)"
@@ -198,11 +198,13 @@ def count_lines(connection: sqlite3.Connection, asked: LogFilter) -> int:
 
 
 def _rows_of(connection: sqlite3.Connection, asked: LogFilter) -> str:
-    alone, beside = (_OF_ROBOT, _BESIDE_ROBOT) if asked.run_id is None else (_OF_RUN, _BESIDE_RUN)
+    alone, with_others = (
+        (_OF_ROBOT, _BESIDE_ROBOT) if asked.run_id is None else (_OF_RUN, _BESIDE_RUN)
+    )
     if asked.robot_id is None:
         return alone
     found = connection.execute(f"SELECT EXISTS ({_COMPANIONS})", {"robot_id": asked.robot_id})
-    return beside if found.fetchone()[0] else alone
+    return with_others if found.fetchone()[0] else alone
 
 
 def _values(asked: LogFilter) -> dict[str, object]:

@@ -1,4 +1,4 @@
-"""Taking in another recording: its sessions and runs, told from those that are there by UUID.
+"""Taking in another recording: its sessions and runs, distinguished from existing ones by UUID.
 
 Whatever is already there is left as it is, so merging may be repeated, and may be killed anywhere:
 what is new of a session comes in one transaction. Rollups are made anew from the rows; those of a
@@ -132,7 +132,7 @@ def merge(
 
 
 def settled(database: Path) -> Recording:
-    """A recording with all that waited beside it, and its sessions ended that are over.
+    """A recording with all rows that waited next to it, and its sessions ended that are over.
 
     Raises:
         DatabaseError: There is none, or it is none of ours.
@@ -168,7 +168,7 @@ def _require_fit(connection: sqlite3.Connection, source: Path, run_id: int | Non
         raise InvalidInputError(f"a controller still records {where}: merge it when that has ended")
     if nameless:
         raise InvalidInputError(
-            f"{subject} has no UUID, so nobody could tell whether it was merged before"
+            f"{subject} has no UUID, so it is unknown whether it was merged before"
         )
 
 
@@ -206,7 +206,7 @@ def _take_in(
 def _take_in_trials(connection: sqlite3.Connection, run_id: int | None) -> None:
     """Trial sets and trials that are not there, each with its run as it is called here.
 
-    Nobody works on them here: their simulators and the parameters of their controllers are gone.
+    No process works on them here: their simulators and controllers have ended.
     Trials of a set that is here as well keep their results; those that wait take the ones from
     there, unless a process is about to run them.
     """
@@ -249,10 +249,10 @@ def _copy_commands(
     """By their ids there, the ids that the commands have here; a key that is taken stays theirs."""
     own = own | {"idempotency_key": None}
     ids: dict[int, int] = {}
-    for old, *told in connection.execute(_COMMANDS, wanted).fetchall():
+    for old, *facts in connection.execute(_COMMANDS, wanted).fetchall():
         same = None
         if not is_new:
-            same = connection.execute(_SAME_COMMAND, (own["session_id"], *told)).fetchone()
+            same = connection.execute(_SAME_COMMAND, (own["session_id"], *facts)).fetchone()
         ids[old] = same[0] if same else _insert(connection, "command", "id = ?", old, own)
     return ids
 
@@ -312,7 +312,7 @@ def _path_here(path: str, run_uuid: str) -> str:
 def _copy_pictures(
     connection: sqlite3.Connection, data_dir: Path, source_dir: Path, run_id: int, run_uuid: str
 ) -> None:
-    """Before their rows come: whoever is killed in between copies those that lack.
+    """Before their rows come: after a kill in between, the next attempt copies the missing ones.
 
     The other recording says how its pictures are called, which may be a lie: only pictures are
     taken, into this folder, and in no other file's place.

@@ -145,8 +145,8 @@ def notable_parameters(
 ) -> dict[int, dict[str, Value | str]]:
     """Of each run the parameters that are not as declared, or not the same in all these runs.
 
-    Those in which the runs differ come first. A value that changed in the middle of its run is told
-    as a text, with the time.
+    Those in which the runs differ come first. A value that changed within its run is a text with
+    the time.
     """
     found = parameters_of(connection, run_ids)
     unlike = differing(list(found.values()))

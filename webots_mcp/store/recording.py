@@ -157,7 +157,7 @@ class Recording:
             yield look(connection, robot, run_id)
 
     def settle(self) -> None:
-        """Say what became of commands that nobody alive will finish, unless `read_only`."""
+        """Settle the commands that no live process will finish, unless `read_only`."""
         if self.read_only:
             return
         with self.writer() as connection:

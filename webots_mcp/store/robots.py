@@ -108,7 +108,7 @@ def resolve_robot(connection: sqlite3.Connection, name: str | None, now_s: float
 
 
 def without_observers(robots: list[Robot]) -> list[Robot]:
-    """Those that do something; the observers where there is nobody else."""
+    """Those that do something; the observers where there are no others."""
     return [robot for robot in robots if robot.kind != OBSERVER] or robots
 
 
@@ -166,10 +166,10 @@ def world_seen(connection: sqlite3.Connection, run: Run) -> WorldSeen | None:
     if row is None:
         return None
     run_id, observer = row
-    told = connection.execute(_SEEN, (run_id, run_id)).fetchone()
-    if told is None:
+    found = connection.execute(_SEEN, (run_id, run_id)).fetchone()
+    if found is None:
         return None
-    return WorldSeen(observer, json.loads(told[0]), _places(connection, run_id, run))
+    return WorldSeen(observer, json.loads(found[0]), _places(connection, run_id, run))
 
 
 def _places(connection: sqlite3.Connection, run_id: int, run: Run) -> dict[str, Any]:

@@ -106,7 +106,7 @@ _STATES_OF_RUN: Final = (
     f"SELECT {_STATE_COLUMNS} FROM state WHERE run_id = ? ORDER BY sim_time_s, id"
 )
 
-# A blob is greater than any number or text: a time that is no number is met too, and told.
+# A blob is greater than any number or text: a time that is not a number is found too, and reported.
 _LATER_THAN_ANY: Final = b"\xff"
 PACE_ROWS: Final = 6
 PACE_WINDOW_S: Final = 5.0

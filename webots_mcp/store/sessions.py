@@ -50,7 +50,7 @@ class Session:
         return self.ended_wall_time_s is None and is_living(*process, now_s)
 
     def silent_s(self, now_s: float) -> float:
-        """Time since its newest sign of life; of a process here by a clock that nobody sets."""
+        """Time since its newest sign of life; of a process here by a clock that cannot be set."""
         beat_s = self.last_seen_monotonic_s
         if beat_s is None or self.process is None or not self._is_of_this_boot():
             return now_s - self.last_seen_wall_time_s
@@ -65,7 +65,7 @@ class Session:
         return self.silent_s(now_s) <= HEARTBEAT_LATE_S
 
     def _is_of_this_boot(self) -> bool:
-        """A clock that counts from the boot tells nothing of the time before it."""
+        """A clock that counts from the boot knows nothing of the time before it."""
         process = (self.pid, self.process, self.last_seen_wall_time_s)
         return self.host == host_name() and process_alive(*process)
 

@@ -74,8 +74,8 @@ SILENT: Final = (
     "simulation these look alike"
 )
 _WAITING: Final = (
-    "the database takes no rows: what its controller records waits in {0} beside it, for {1:.0f} s "
-    "now (is the disk full, or does another program hold a lock?); what is shown here is older"
+    "the database takes no rows: those of its controller wait in {0} next to it, for {1:.0f} s now "
+    "(is the disk full, or does another program hold a lock?); what is shown here is older"
 )
 _STARTED: Final = "its controller has just started; simulation time has not moved yet"
 _NOT_STARTED: Final = (
@@ -112,7 +112,7 @@ def judge(
     Args:
         connection: An open database.
         session: The robot's latest session.
-        run: Its latest run; the pace of its rows tells how soon silence means anything.
+        run: Its latest run; the pace of its rows decides how soon silence is significant.
         now_s: Unix time.
     """
     if session is None:
@@ -144,7 +144,7 @@ def judge(
 def _moved_wall_time_s(
     connection: sqlite3.Connection, session: Session, run: Run | None
 ) -> float | None:
-    """When simulation time last grew: a row that is further than the heartbeat tells it sooner."""
+    """When simulation time last grew: a row that is newer than the heartbeat shows it sooner."""
     row = newest_state(connection, run.id) if run and run.session_id == session.id else None
     if row is None or row.sim_time_s <= (session.sim_time_s or 0.0):
         return session.moved_wall_time_s
@@ -239,7 +239,7 @@ def handler_at_work(connection: sqlite3.Connection, session: Session, now_s: flo
 
 
 def stopped_for(seconds: float) -> str:
-    """`stopped N s ago`, with a decimal only where it tells something."""
+    """`stopped N s ago`, with a decimal only where it matters."""
     return f"stopped {max(seconds, 0.0):.{1 if seconds < 10 else 0}f} s ago"
 
 
@@ -276,7 +276,7 @@ def _still_moving_s(connection: sqlite3.Connection, run: Run | None) -> float:
 
 
 class FileBacklog(NamedTuple):
-    """Rows that wait in a file beside the database: when the first and the newest came."""
+    """Rows that wait in a file next to the database: when the first and the newest came."""
 
     file_name: str
     oldest_wall_time_s: float
@@ -284,9 +284,9 @@ class FileBacklog(NamedTuple):
 
 
 def rows_waiting(connection: sqlite3.Connection, session: Session | None) -> dict[str, Any]:
-    """`rows_waiting`, and `waiting_in` where there are any: a file beside the database, or memory.
+    """`rows_waiting`, and `waiting_in` where there are any: a file next to the database, or memory.
 
-    The session's row tells what it was at the last heartbeat, which waits for the same lock.
+    The session's row has the number at the last heartbeat, which waits for the same lock.
     """
     if session is None:
         return {"rows_waiting": 0}
@@ -318,7 +318,7 @@ def _path_of(connection: sqlite3.Connection, session: Session) -> Path | None:
 
 
 def _oldest_s(entries: list[tuple[int, Entry]]) -> float:
-    """When the first state, log line or event came; infinite where none of them tells."""
+    """When the first state, log line or event came; infinite where there is none."""
     stamped = ("state", "log", "event")
     times = (entry.values for _, entry in entries if entry.kind in stamped)
     return next((float(values[1]) for values in times if isinstance(values, tuple)), float("inf"))

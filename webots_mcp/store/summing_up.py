@@ -1,4 +1,4 @@
-"""Rolling up for who asks, where no server does it beside.
+"""Rolling up on demand, where no server does it in the background.
 
 What is in no rollup is read row by row until a deadline, and what was not read is left out of the
 answer. A server rolls up what comes; of a recording that none looks after, who asks does it first.
@@ -81,7 +81,7 @@ def sum_up(
 
 @contextmanager
 def _checkpoints(recording: Recording) -> Generator[None]:
-    """With somebody who keeps the log of the database short meanwhile."""
+    """With a maintainer that keeps the database's log short meanwhile."""
     if not isinstance(recording.database, Path):
         yield
         return

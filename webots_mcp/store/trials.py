@@ -66,7 +66,7 @@ class TrialSet:
 
     @property
     def job(self) -> str:
-        """The name of the lease of whoever works on it."""
+        """The name of the lease for working on it."""
         return f"trial set {self.id}"
 
     @property
@@ -223,7 +223,7 @@ def fetch_trial_set(connection: sqlite3.Connection, set_id: int) -> TrialSet:
 
 
 def is_at_work(connection: sqlite3.Connection, found: TrialSet) -> bool:
-    """Whether a process works on a set: it lives, as far as can be told, and renews its lease."""
+    """Whether a process works on a set: it is alive, as far as is known, and renews its lease."""
     return not found.is_left and holder_of(connection, found.job) is not None
 
 
@@ -270,7 +270,7 @@ def take_up(connection: sqlite3.Connection, set_id: int) -> Lease:
                 f"process {found.pid} on {found.host} works on trial set {set_id}: wait for it, "
                 "or end it"
             )
-        if found.host not in (None, host_name()):  # nobody here knows of its simulators
+        if found.host not in (None, host_name()):  # its simulators run on that host
             connection.execute(_FORGET, (set_id,))
         own = os.getpid()
         connection.execute(_WORK, (host_name(), own, process_identity(own), set_id))

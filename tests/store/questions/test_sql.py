@@ -129,7 +129,7 @@ def test_a_value_of_gigabytes_is_refused(rover: sqlite3.Connection) -> None:
         ("SELEC 1", "begins with 'SELEC'"),
         (" ", "the statement is empty: give one"),
         ("SELECT FROM", "syntax error"),
-        ("SELECT * FROM state WHERE run_id = :run", "write them in the SELECT"),
+        ("SELECT * FROM state WHERE run_id = :run", "write values in the SELECT"),
     ],
 )
 def test_an_error_offers_what_was_perhaps_meant(

@@ -12,8 +12,8 @@ from webots_mcp.store.analysis.track import Track
 DRIFT_SHARE: Final = 0.15  # of the radius: who came farther between its first and last third moves
 CERTAIN: Final = 4.0  # standard errors
 SAME_COURSE: Final = 1.25  # times the noise: the residual of a motion that explains all rows
-REST_SHARE: Final = 0.5  # of the speed beside it: what is certainly slower is a rest
-CERTAINLY_SLOWER: Final = 3.0  # standard errors: the ramps beside it are certain already
+REST_SHARE: Final = 0.5  # of the speed next to it: a part that is certainly slower is a rest
+CERTAINLY_SLOWER: Final = 3.0  # standard errors: the ramps next to it are certain already
 # So many times its own length before and after a stretch is looked for the same motion.
 _AROUND: Final = ((1.0, 1.0), (0.5, 0.5), (0.0, 2.0), (2.0, 0.0), (3.0, 3.0))
 _MEANS: Final = 240  # of neighbouring rows, that stand for all of a stretch
@@ -101,14 +101,14 @@ def rest_within(track: Track, start: int, end: int) -> tuple[int, int] | None:
     first, last = _best_rest(times, x, y, CERTAIN * track.noise_m / np.sqrt(counts.mean()))
     rest = int(edges[first]), int(edges[last])
     sides = [slice(start, rest[0]), slice(rest[1], end)]
-    beside = [_line_through(track, side) for side in sides if side.stop > side.start]
+    neighbours = [_line_through(track, side) for side in sides if side.stop > side.start]
     line = _line_through(track, slice(*rest))
-    return rest if all(_is_slower(line, each) for each in beside) else None
+    return rest if all(_is_slower(line, each) for each in neighbours) else None
 
 
-def _is_slower(rest: _Line, beside: _Line) -> bool:
-    error_m_s = np.hypot(rest.error_m_s, REST_SHARE * beside.error_m_s)
-    return bool(REST_SHARE * beside.speed_m_s - rest.speed_m_s > CERTAINLY_SLOWER * error_m_s)
+def _is_slower(rest: _Line, neighbours: _Line) -> bool:
+    error_m_s = np.hypot(rest.error_m_s, REST_SHARE * neighbours.error_m_s)
+    return bool(REST_SHARE * neighbours.speed_m_s - rest.speed_m_s > CERTAINLY_SLOWER * error_m_s)
 
 
 def _best_rest(times: Array, x: Array, y: Array, certain_m: float) -> tuple[int, int]:

@@ -64,7 +64,7 @@ def find_spikes(times: Array, values: Array, turn: float | None = None) -> list[
     where that MAD is 0 by s / (1.2533 * mean |s|): B. Iglewicz, D. C. Hoaglin, How to Detect and
     Handle Outliers (1993). A step is no spike, because its neighbours differ, and no
     turning point, because those differ from the ones beyond them. Where more than one
-    in twenty values (and more than three) stand out, none is told: that is how the signal is.
+    in twenty values (and more than three) stand out, none is reported: that is normal for it.
     Of an angle, a step over the end of its scale is as large as what is left of a whole turn.
     """
     if len(values) < 5:
@@ -132,7 +132,7 @@ def time_effect(times: Array, values: Array, mean: float, squares: float) -> flo
     """The share of the variance that lies between eight equal stretches of time, 0 to 1.
 
     The correlation ratio eta squared (R. A. Fisher, Statistical Methods for Research Workers,
-    1925, section 44): near 0 for steady noise and for a swing that is short beside the stretch,
+    1925, section 44): near 0 for steady noise and for a swing that is short compared to the range,
     1 where all change is slow, whether it goes one way or comes back.
     """
     width_s = float(times[-1] - times[0]) / TIME_BINS

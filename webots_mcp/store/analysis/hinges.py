@@ -1,4 +1,4 @@
-"""Courses of straight pieces: where they bend, found beside a sine that goes on meanwhile."""
+"""Courses of straight pieces: where they bend, found in the presence of a sine."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Final
 
 from webots_mcp.store.analysis.arrays import Array, Indexes, np
 
-MOST_HINGES: Final = 6  # in two to three periods; a sine is no longer told from a zigzag with more
+MOST_HINGES: Final = 6  # in two to three periods; with more, a sine and a zigzag look the same
 CERTAIN_HINGE: Final = 4.0  # deviations of the noise
 PARAMETERS: Final = 2  # of a hinge: where it is, and how far it bends
 _TINY: Final = 1e-9

@@ -16,7 +16,7 @@ LEAST_STEPS: Final = 10
 LONGEST_EXCURSION: Final = 5  # rows that a value which otherwise rests may be elsewhere
 BACK_SHARE: Final = 0.2  # of a step: who comes back to so near where it began is back
 BACK_HALF: Final = 0.5  # of a step: who comes back by so much to where it usually is, as well
-MOTION_SHARE: Final = 0.5  # of a step: the least of one beside it, if both are of one motion
+MOTION_SHARE: Final = 0.5  # of a step: the smallest neighbouring one of the same motion
 POSITION_STEPS: Final = 5.0  # a position jumps by so many times its 99th percentile step
 WHOLE_TURNS: Final = (math.tau, 360.0)
 SWING_PERIOD_S: Final = 5.0  # of a longer one no single step is as a jump
@@ -50,7 +50,7 @@ def find_jumps(times: Array, values: Array, score: float, usual: Array | None = 
 
     Compared is with the steps that are not zero and do not come back at once, of which there have
     to be ten: for counters and commanded values a step is what they do. Of a value that otherwise
-    rests only what comes back at once counts. A step beside one that goes the same way and is at
+    rests only what comes back at once counts. A step next to one in the same direction and is at
     least half as large is part of a motion, however quick, and no jump. After a gap a step may be
     larger by as many times as the gap is longer than the usual interval; and the step of an angle
     over the end of its scale (pi, 180 degrees, 360 degrees) is as large as what is left of a whole
@@ -142,8 +142,8 @@ def _in_motion(values: Array, rows: Indexes) -> Flags:
     """Whether the step after each of those rows goes on as the step before or after it goes."""
     steps = np.pad(np.diff(values), 1)
     here = steps[rows + 1]
-    beside = np.maximum(steps[rows] * np.sign(here), steps[rows + 2] * np.sign(here))
-    return beside >= MOTION_SHARE * np.abs(here)
+    neighbours = np.maximum(steps[rows] * np.sign(here), steps[rows + 2] * np.sign(here))
+    return neighbours >= MOTION_SHARE * np.abs(here)
 
 
 def _without_swings(jumps: Sequence[Jump], times: Array, values: Array) -> list[Jump]:

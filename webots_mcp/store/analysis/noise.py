@@ -56,7 +56,7 @@ def smooth(values: Array, rows: int) -> tuple[Array, float]:
 
     A parabola of least squares through an odd number of rows about each (A. Savitzky, M. Golay,
     Smoothing and differentiation of data by simplified least squares procedures, Analytical
-    Chemistry 36, 1964): a bend that is long beside the window stays as it is. At the ends the
+    Chemistry 36, 1964): a bend that is long compared to the window is kept. At the ends the
     parabola through the first or last window is taken.
     """
     rows = _fitting(rows, len(values))

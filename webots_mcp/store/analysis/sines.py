@@ -80,7 +80,7 @@ def alike_rows(times: Array) -> Array:
 
 
 def _beside(courses: Array, basis: Array) -> Array:
-    """What is left of courses beside those of the basis."""
+    """The residuals of courses after removing those of the basis."""
     return np.asarray(courses - (courses @ np.swapaxes(basis, 1, 2)) @ basis, np.float64)
 
 

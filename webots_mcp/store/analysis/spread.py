@@ -36,7 +36,7 @@ class Verdict(NamedTuple):
     """Whether a group differs from the first by more than like runs do.
 
     Attributes:
-        different: None where that cannot be told yet; False where a difference that matters is
+        different: None where that cannot be decided yet; False where a difference that matters is
             excluded.
         runs_wanted: So many runs of each would tell, if they went on like these; None where they
             need not, or where even 10 would not.
@@ -77,7 +77,7 @@ class _Apart(NamedTuple):
 
 
 def _apart(first: Sequence[float], other: Sequence[float]) -> _Apart | None:
-    """None for one run each: then nothing tells how much like runs differ."""
+    """None for one run each: then it is unknown how much equal runs differ."""
     groups, free = (first, other), len(first) + len(other) - 2
     if free < 1 or not first or not other:
         return None
@@ -101,7 +101,7 @@ def chance_of(first: Sequence[float], other: Sequence[float]) -> float | None:
     """How often two groups of like runs would lie as far apart as these: Student's t test.
 
     Two-sided. 0 where like runs agree to the last digit and the groups do not. None for one run
-    each: then nothing tells how much like runs differ.
+    each: then it is unknown how much equal runs differ.
     """
     apart = _apart(first, other)
     if apart is None:
@@ -176,11 +176,11 @@ def verdicts_on(
     and 7 where the runs of each group agree to the last digit. False where a difference that
     matters is excluded: two one-sided tests at 5 %, which is the same as an interval of 90 % within
     the margin (D. J. Schuirmann, A comparison of the two one-sided tests procedure, J.
-    Pharmacokinetics and Biopharmaceutics 15, 1987). Of a figure whose unit nobody told, the one
+    Pharmacokinetics and Biopharmaceutics 15, 1987). Of a figure whose unit is unknown, the one
     scale there is is how much like runs differ: the margin is `matters_sd` of their standard
     deviations, as far as these runs tell it. Where like runs agree to the last digit and the groups
     do as well, False takes as many runs as True would. The first is False; None where that cannot
-    be told, or a figure of any run is missing.
+    be decided, or a figure of any run is missing.
 
     Args:
         groups: A figure of each run of each group.

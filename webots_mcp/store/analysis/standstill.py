@@ -58,7 +58,7 @@ def find_standstills(track: Track, radius_m: float, least_s: float) -> list[Stan
 
 
 def shortest_seen_s(noise_m: float, interval_s: float, radius_m: float, least_s: float) -> float:
-    """How long a standstill lasts at least that is told from slow motion in spite of the noise.
+    """The shortest standstill that can be distinguished from slow motion despite the noise.
 
     The slope of a line through n positions within t seconds has a deviation of noise * sqrt(12 / n)
     / t. Three of them are not more than the speed of who just leaves the radius in `least_s`.

@@ -311,16 +311,19 @@ def merge(parts: Sequence[Summary]) -> Summary:
     )
 
 
-def with_extremes(whole: Summary, beside: Summary) -> Summary:
+def with_extremes(whole: Summary, recorded: Summary) -> Summary:
     """A summary whose extremes are also those of values that it does not count.
 
     Where it has no value of its own, those are all there is.
     """
-    if beside.min is None or beside.max is None:
+    if recorded.min is None or recorded.max is None:
         return whole
     if whole.min is None or whole.max is None:
-        return beside._replace(rows=max(whole.rows, beside.rows))
-    low, high = min(whole, beside, key=attrgetter("min")), max(whole, beside, key=attrgetter("max"))
+        return recorded._replace(rows=max(whole.rows, recorded.rows))
+    low, high = (
+        min(whole, recorded, key=attrgetter("min")),
+        max(whole, recorded, key=attrgetter("max")),
+    )
     return whole._replace(
         min=low.min,
         min_sim_time_s=low.min_sim_time_s,

@@ -3,7 +3,7 @@
 The search is local: each stretch without recording gaps is looked at by itself, and in it each
 period has a band of its own, in which a swing shows as crossings of zero that come
 regularly and reach equally far. Where the course bends by more than noise makes it, swings are
-looked for beside its bends (`swings_on_bends`). What happens elsewhere in the stretch changes
+looked for next to its bends (`swings_on_bends`). What happens elsewhere in the stretch changes
 nothing, so that asking for more time never finds less.
 """
 
@@ -125,7 +125,7 @@ def _are_two(before: Swing, after: Swing) -> bool:
 
 
 def _together(before: Swing, after: Swing) -> Swing:
-    """Two that overlap; where their periods are unlike, the one that was seen longer is told."""
+    """Merge two that overlap; of different periods the one that lasted longer is reported."""
     if _ratio(before.period_s, after.period_s) > ALIKE[0]:
         return max(before, after, key=lambda each: each.half_swings * each.explained)
     return _counted(_as_one(before, after))
@@ -476,7 +476,7 @@ def _walked(course: Array, rows: float) -> float:
     """How far a random walk beneath a swing of so many rows goes in one of its periods.
 
     In the difference to one period later the swing is gone. How much more that bends over an
-    eighth of a period than over a sixteenth tells of the walk: noise bends both alike.
+    eighth of a period than over a sixteenth shows a random walk: noise bends both alike.
     """
     step = max(1, int(rows / ROWS_PER_PERIOD))
     means, period = _means(course, step), round(rows / step)

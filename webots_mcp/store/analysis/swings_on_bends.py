@@ -207,7 +207,7 @@ def _of_best_period(pieces: Array, period: float, noise: float) -> tuple[Array, 
     places: Array = np.arange(pieces.shape[1], dtype=np.float64)[None]
     tiny = np.finfo(np.float64).tiny
     tried, ratio, passes = np.array(TRIED_PERIODS), 1.0, 2
-    while True:  # bends that were found beside a wrong period hide some of what is wrong
+    while True:  # bends found with a wrong period hide part of its error
         basis, _ = hinged_courses(pieces, period * ratio, noise)
         fit = fit_sines(places, pieces, period * ratio * tried, basis)
         left = fit.of_sines / np.maximum(fit.of_course, tiny)

@@ -82,7 +82,7 @@ def position_noise_m(x: Array, y: Array) -> float:
 def tracks_of(times: Array, x: Array, y: Array, noise_m: float | None = None) -> list[Track]:
     """One track per stretch without a gap.
 
-    A gap is an interval of more than three median ones: nobody knows what happened in it. The
+    A gap is an interval of more than three median ones: what happened in it is unknown. The
     noise is that of the longest stretch, unless it is given.
     """
     ends_s = [gap.end_s for gap in rhythm_of(times).gaps]
@@ -107,7 +107,7 @@ def _smoothing_rows(times: Array, noise_m: float) -> int:
 def _leg_noise(rows: int, smoothed_rows: int) -> float:
     """How many deviations of the smoothed position a leg is longer than.
 
-    Of two places that noise alone tells apart the distance is above d deviations with a probability
+    Of two places that differ by noise alone the distance is above d deviations with a probability
     of exp(-d**2 / 4) (Rayleigh); the more independent places there are, the more pairs are.
     """
     places = rows * min(1.0, _PARABOLA_GAIN / smoothed_rows)
@@ -137,7 +137,7 @@ def path_length(track: Track) -> PathLength:
     deviations of what is left of the noise away from where it began; within half a window of an
     end, where more is left, of that. What is shorter at the end is left out. Bends that are
     narrower than a leg are in none: what the steps within legs that take long tell of them is
-    added, and how much more they may be is said. Of a robot that made no leg nothing is told.
+    added, and how much more they may be is said. Of a robot that made no leg nothing is reported.
     """
     corners = _corners(track)
     shortest_m = _leg_noise(len(track.times), track.smoothed_rows) * track.left_m
@@ -153,7 +153,7 @@ def path_length(track: Track) -> PathLength:
 
 
 def path_length_m(track: Track) -> float:
-    """Metres travelled, as `path_length` tells them."""
+    """Metres travelled, as `path_length` measures them."""
     return path_length(track).length_m
 
 

@@ -1,10 +1,10 @@
 """Whether a robot that stood still should have moved: what shows it, part by part.
 
-No verdict hangs on what a mode is called. What it was told (commanded speeds), what its wheels did,
+No verdict depends on the name of a mode. What was commanded (speeds), what its wheels did,
 and that it moved in the same mode before is evidence; a measured speed of 0 is none against it.
 
-What its rows show is observed first. It can be stored, and is weighed when somebody asks: in which
-modes the robot moves may turn out later.
+The evidence in its rows is collected first. It can be stored, and is weighed at each question,
+since the modes in which the robot moves may become known later.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ SWAY_M: Final = 0.0035  # of 1 cm to and fro; less is how a robot trembles at a 
 SWAY_NOISE: Final = 3.5  # deviations in each coordinate: noise alone comes to 1.4 of them
 MOSTLY: Final = 0.5
 TOLD_SHARE: Final = 0.1  # of the rows: what holds in fewer, at the ends, shows nothing
-_HEADING_ROWS: Final = 5  # at each end, whose median tells where it looked
+_HEADING_ROWS: Final = 5  # at each end, whose median is its heading
 
 
 class Part(NamedTuple):
     """Rows one after the other that show the same.
 
     Attributes:
-        drives: It was told to move, or its wheels drove it.
-        hindered: It was told not to move, turned in place, or went to and fro.
+        drives: It was commanded to move, or its wheels drove it.
+        hindered: It was commanded not to move, turned in place, or moved to and fro.
         commanded: The commanded speed of most rows, and how many these are.
         looked_rad: Where it looked in the first rows and in the last ones, counted on over whole
             turns; None where that is not known.
@@ -118,7 +118,7 @@ def observe(columns: Columns, motion: Motion, min_commanded: float, noise_m: flo
     told, stop, counts = _by_command(columns, motion, min_commanded, counts)
     ahead, spot, counts = _by_wheels(columns, motion, counts)
     turning = turns(columns, motion.heading)
-    # Wheels that turn it on the spot move it nowhere; where it looks tells whether they do.
+    # Wheels that turn it on the spot move it nowhere; its heading shows whether they do.
     turning |= spot if motion.heading is None else False
     swaying, reach_m = sways(columns, motion, noise_m)
     counts = counts._replace(
@@ -173,7 +173,7 @@ def _against_in(counts: Counts, motion: Motion) -> list[str]:
 def _by_command(
     columns: Columns, motion: Motion, min_commanded: float, counts: Counts
 ) -> tuple[Flags, Flags, Counts]:
-    """Rows in which it was told to move, and in which it was told not to.
+    """Rows in which it was commanded to move, and in which it was commanded not to.
 
     A speed whose name leaves open whether it is commanded or measured is a command where it is
     not 0: it stands.

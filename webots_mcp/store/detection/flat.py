@@ -74,7 +74,7 @@ def _event(search: Search, rests: Resting, span: Span) -> Event:
 
 
 def _left_behind(search: Search, rests: Resting, spans: Sequence[Span]) -> list[Span]:
-    """The rests in which its target went on, or in which it was told to move."""
+    """The rests in which its target moved, or in which it was commanded to move."""
     least_s = FROZEN_SHARE * search.options.flat_s
     if not _changes_otherwise(search, search.view.summary(rests.signal), spans):
         return []

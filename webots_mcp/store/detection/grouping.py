@@ -1,4 +1,4 @@
-"""Many events that are alike, told as one: "10 dropouts to 0 m, the first at 3.2 s, ..."."""
+"""Many similar events, reported as one: "10 dropouts to 0 m, the first at 3.2 s, ..."."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ def grouped(events: Sequence[Event], known: dict[str, Signal]) -> list[Event]:
     """The same events; what the items of an array did at once, and many alike, is one of them.
 
     A group begins with its first event and ends with its last one. Its details say what they are,
-    when, and what they have in common. What lasts and still goes on is told by itself.
+    when, and what they have in common. An event that is still going on is reported by itself.
     """
-    told: list[Event] = []
+    grouped: list[Event] = []
     alike: dict[Hashable, list[Event]] = {}
     for event in _of_arrays(events):
         how = kind_named(event.kind).alike
         if how is None or (event.ongoing and kind_named(event.kind).lasts):
-            told.append(event)
+            grouped.append(event)
         else:
             sort = (event.run_id, event.kind, event.name, how.sort(event))
             alike.setdefault(sort, []).append(event)
     for some in alike.values():
         how = kind_named(some[0].kind).alike
         if how is None or len(some) <= how.most_single:
-            told += some
+            grouped += some
         else:
-            told.append(_as_one(sorted(some, key=lambda each: each.start_s), how, known))
-    return told
+            grouped.append(_as_one(sorted(some, key=lambda each: each.start_s), how, known))
+    return grouped
 
 
 def _of_arrays(events: Iterable[Event]) -> list[Event]:
-    """What several items of one array, or parts of one branch, did at once is told as one.
+    """What several items of one array, or parts of one branch, did at once is reported as one.
 
     Its details are those that all of them have.
     """

@@ -1,4 +1,4 @@
-"""What a kind of event is: how it is found, told, counted and drawn, all in one place."""
+"""What a kind of event is: how it is found, reported, counted and drawn, all in one place."""
 
 from __future__ import annotations
 
@@ -57,13 +57,13 @@ def _nothing_more(events: Sequence[Event]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Alike:
-    """How alike events of a kind are told as one.
+    """How similar events of a kind are reported as one.
 
     Attributes:
         says: What they are, in the plural, given them in order and the unit of their signal.
         sort: What they share besides the run and the signal.
         adds: More of their details than what all of them have in common.
-        most_single: As many of a sort are told one by one.
+        most_single: So many of a sort are reported one by one.
         of_arrays: What several items of one array did at once is one event.
     """
 
@@ -79,12 +79,12 @@ class EventKind:
     """A kind of event. One of these, entered in `registry.KINDS`, is all that a new kind takes.
 
     Attributes:
-        name: As it is asked for and told.
+        name: Its name in questions and answers.
         means: What the name leaves open, in a few words; empty where it leaves nothing open.
-        find: Finds the events in the segment of a search. It tells the search what it could not
-            look at (`not_searched`) and what came nearest to an event (`came_near`), and raises
-            `NotSearchableError` where it cannot look at all.
-        stored: It was stored when it happened: nothing is judged, and a timeline tells it.
+        find: Finds the events in the segment of a search. It reports to the search what it could
+            not search (`not_searched`) and what came nearest to an event (`came_near`), and raises
+            `NotSearchableError` where it cannot search at all.
+        stored: It was stored when it happened: nothing is judged, and a timeline shows it.
         usual: Whether it is looked for where no kinds are named.
         lasts: It has a begin and an end, which are followed out of the range.
         least_s: How long it has to last; a shorter range has to be widened by as much.
@@ -95,7 +95,7 @@ class EventKind:
         routine: It happens all the time; it is shown in the room that all other kinds leave.
         counted: Comparisons of runs count it.
         drawn: Its place among the rows below a plot, the least first; None if it has none there.
-        alike: How many alike ones are told as one; None where each is told by itself.
+        alike: How similar ones are reported as one; None where each is reported by itself.
         reads_through: Signals of which it reads all rows, also of a long segment.
         effort: Its rank by what it costs to look for: the least is searched first. Kinds of one
             rank find things together, and share their part of the time.

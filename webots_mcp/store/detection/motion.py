@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from webots_mcp.store.analysis.track import PathLength, Track
 
 TRUE_WITHIN: Final = 0.05  # a distance that may be short by less, or by less than so many metres,
-TRUE_WITHIN_M: Final = 0.1  # is told without a doubt
+TRUE_WITHIN_M: Final = 0.1  # is reported without a doubt
 IMPLAUSIBLE_M_S: Final = 50.0  # a mean speed beyond is hardly that of a robot
 
 _TAIL: Final = r"([._](x|vx|linear|speed|velocity|m_s|mps))*$"
@@ -79,7 +79,7 @@ class Motion:
 
     @property
     def signals(self) -> list[Signal]:
-        """Those that are told with an event."""
+        """The signals that are reported with an event."""
         speed = self.commanded or self.speed
         return [*(self.position or ()), *filter(None, (speed, self.mode))]
 
@@ -128,7 +128,7 @@ def _is_no_wheel(name: str) -> bool:
 
 
 def _height(known: dict[str, Signal], position: tuple[Signal, Signal] | None) -> Signal | None:
-    """The third of the position's numbers, or an altitude beside it or at the top.
+    """The third of the position's numbers, or an altitude next to it or at the top.
 
     The third of a pose or odometry of three is where it looks.
     """
@@ -142,17 +142,17 @@ def _height(known: dict[str, Signal], position: tuple[Signal, Signal] | None) ->
 
 
 def _is_altitude(name: str, branch: str) -> bool:
-    beside, _, last = name.rpartition(".")
-    return beside in (branch, "") and words_of(last)[0] in ("altitude", "alt")
+    nearby, _, last = name.rpartition(".")
+    return nearby in (branch, "") and words_of(last)[0] in ("altitude", "alt")
 
 
 def _heading(known: dict[str, Signal], position: tuple[Signal, Signal] | None) -> Signal | None:
-    """An angle beside the position, or else the one with the shortest name that says so."""
+    """An angle next to the position, or else the one with the shortest name that says so."""
     angles = [name for name, signal in known.items() if signal.turn is not None]
     branch = position[0].name.rpartition(".")[0] if position else ""
-    beside = [name for name in angles if name.rpartition(".")[0] == branch and branch]
+    nearby = [name for name in angles if name.rpartition(".")[0] == branch and branch]
     named = [name for name in angles if _HEADING.search(in_snake_case(name))]
-    found = beside or named
+    found = nearby or named
     return known[min(found, key=len)] if found else None
 
 
@@ -235,7 +235,7 @@ def path_length(
 
 
 def doubt_of_length(way: PathLength) -> str | None:
-    """By how much a way may be longer than it is told; None where that is little."""
+    """By how much a path may be longer than reported; None where that is little."""
     if way.longer_m <= max(TRUE_WITHIN * way.length_m, TRUE_WITHIN_M):
         return None
     noise_mm = float(f"{1000 * way.noise_m:.1g}")
@@ -246,7 +246,7 @@ def doubt_of_length(way: PathLength) -> str | None:
 
 
 def _more(way: PathLength) -> str:
-    """Roughly, so that like runs share a sentence; in metres where it is more than was told."""
+    """Rounded, so that similar runs share a sentence; in metres where it exceeds the distance."""
     if way.longer_m > way.length_m:
         return f"{way.longer_m:.2g} m"
     return f"{10 * math.ceil(10 * way.longer_m / way.length_m)} %"

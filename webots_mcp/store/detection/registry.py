@@ -1,4 +1,4 @@
-"""The registry of event kinds: whoever tells, counts or draws events reads it.
+"""The registry of event kinds: all that reports, counts or draws events reads it.
 
 A new kind is a file that holds an `EventKind`, and a line here.
 """

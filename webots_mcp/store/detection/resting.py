@@ -67,9 +67,9 @@ class Resting:
         return bool(found.fetchone()[0])
 
     def target_went_on(self, span: Span) -> str | None:
-        """That its target went on, or that it was told to move, while it stayed; None without that.
+        """Whether its target moved, or it was commanded to move, while it stayed; None if neither.
 
-        Of a position in the plane `stuck` tells that.
+        For a position in the plane `stuck` reports that.
         """
         target, speed = self._targets
         return (_went(self._search, target, span) if target else None) or (
@@ -124,10 +124,10 @@ def _went(search: Search, target: Signal, span: Span) -> str | None:
 
 def _was_told(search: Search, speed: Signal, span: Span) -> str | None:
     values = _values(search, speed, span)
-    told = values[values != 0]
-    if not len(values) or len(told) < MOSTLY_TOLD * len(values):
+    nonzero = values[values != 0]
+    if not len(values) or len(nonzero) < MOSTLY_TOLD * len(values):
         return None
-    return f"{speed.name} was {float(np.median(told)):.4g}"
+    return f"{speed.name} was {float(np.median(nonzero)):.4g}"
 
 
 def _values(search: Search, signal: Signal, span: Span) -> Array:

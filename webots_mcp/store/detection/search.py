@@ -1,4 +1,4 @@
-"""One search in a stretch of a run: what a detector may look at, and what it tells."""
+"""One search in a stretch of a run: what a detector may read, and what it reports."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from webots_mcp.store.signals.catalogue import other_form
 from webots_mcp.store.signals.registry import Signal
 
 MANY_SILENCES: Final = 10  # of a signal that mostly has no value: it comes so by nature
-_INDEX: Final = re.compile(r"\.\d+$")  # what falls silent together is told as the array
+_INDEX: Final = re.compile(r"\.\d+$")  # items that fall silent at once are reported as the array
 
 # Whether it had a value before, in the rollups or in rows that are not rolled up yet.
 _HAD_VALUE: Final = (
@@ -64,9 +64,11 @@ def silent_events(search: Search) -> Iterator[Event]:
             array = _INDEX.sub(".*", signal.name)
             shorter[array] = max(short, shorter[array])
     if shorter:
-        told = [f"{name} {count} time{'s' * (count > 1)}" for name, count in shorter.most_common()]
+        counts = [
+            f"{name} {count} time{'s' * (count > 1)}" for name, count in shorter.most_common()
+        ]
         limit = f"for less than silent_s={search.options.silent_s:g} s"
-        note = f"without a value {limit}, so not counted as silent: {listed(told, MOST_NAMED)}"
+        note = f"without a value {limit}, so not counted as silent: {listed(counts, MOST_NAMED)}"
         search.ledger.note_of_run(search.segment.run_id, note)
 
 

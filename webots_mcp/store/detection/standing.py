@@ -1,4 +1,4 @@
-"""Standstills: always told as a fact, and as stuck where something shows that it should move."""
+"""Standstills: always reported as a fact, and as stuck where the robot should have moved."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Standings:
 
     Attributes:
         not_searched: What could not be looked at.
-        not_weighed: Why one of them may be `stuck` that is told as `still`.
+        not_weighed: Why one of them may be `stuck` that is reported as `still`.
         nearest: What came near to a standstill: its share of the shortest, and in words.
     """
 
@@ -117,19 +117,19 @@ def _weighed(search: Search, standing: Standing, moved_in: MovedIn) -> list[Even
     @cache
     def exactly() -> list[Event]:
         fine = _from_rows(search, standing)
-        return [event for each in fine for event in _told(search, each, weighed(each))]
+        return [event for each in fine for event in _reported(search, each, weighed(each))]
 
     evidence = weighed(standing)
     if not standing.within_s:
-        return list(_told(search, standing, evidence))
+        return list(_reported(search, standing, evidence))
     if not _is_certain(standing, evidence, search.options.stuck_s):
         return exactly()
-    told = list(_told(search, standing, evidence))
+    found = list(_reported(search, standing, evidence))
 
     def exactly_of(rough: Event) -> list[Event]:
         return [each for each in exactly() if each.kind == rough.kind and _overlap(each, rough)]
 
-    return [replace(each, exactly=partial(exactly_of, each)) for each in told]
+    return [replace(each, exactly=partial(exactly_of, each)) for each in found]
 
 
 def _overlap(one: Event, other: Event) -> bool:
@@ -149,7 +149,7 @@ def _is_certain(standing: Standing, evidence: Evidence, least_s: float) -> bool:
     )
 
 
-def _told(search: Search, standing: Standing, evidence: Evidence) -> Iterator[Event]:
+def _reported(search: Search, standing: Standing, evidence: Evidence) -> Iterator[Event]:
     """What it was stuck for; and the standstill, unless that is the same."""
     least_s, parts = search.options.stuck_s, standing.observed.parts
     all_spans = _spans(parts, evidence.should_move)
@@ -184,7 +184,7 @@ def _stuck(search: Search, standing: Standing, evidence: Evidence, parts: Sequen
 
 
 def _details(search: Search, standing: Standing, parts: Sequence[Part]) -> dict[str, Any]:
-    """What is told of a standstill, whether it was stuck or not."""
+    """The facts reported of a standstill, whether it was stuck or not."""
     details: dict[str, Any] = {"x_m": standing.x_m, "y_m": standing.y_m}
     if search.motion.mode is not None:
         details["mode"] = usual((part.mode, part.rows) for part in parts)

@@ -215,7 +215,7 @@ def _is_same(before: Standing, after: Standing) -> bool:
 
 
 def _together(before: Standing, after: Standing) -> Standing:
-    """Of the time in which both show the same, one tells the first half and one the second."""
+    """Of the time that both cover, one describes the first half and one the second."""
     if after.end_s <= before.end_s:
         return before
     border_s = (max(before.start_s, after.start_s) + before.end_s) / 2

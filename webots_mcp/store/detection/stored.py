@@ -31,7 +31,7 @@ from webots_mcp.store.signals.registry import Signal
 
 MOST_OF_A_KIND: Final = 2000  # newest rows of a table that are looked at, per run
 AROUND_S: Final = 10.0  # before and after: what changes all the time there, measures
-MOST_NAMED: Final = 3  # values of a signal that many changes are told of
+MOST_NAMED: Final = 3  # values that are named where a signal has many changes
 MOST_CHANGES: Final = 500  # of one signal that become events; more become one
 
 _IN_SEGMENT: Final = (
@@ -108,7 +108,7 @@ def gap_events(search: Search) -> Iterator[Event]:
 
 
 def _note_hidden_gaps(search: Search, segment: Segment, interval_s: float | None) -> None:
-    """Of purged rows only how many came in 10 s tells that some were missing."""
+    """For purged rows only the count per 10 s shows that some were missing."""
     until_s = purged_until_s(search.connection, segment.run_id, segment.start_s)
     if until_s is None or interval_s is None:
         return
@@ -134,22 +134,24 @@ def change_events(search: Search) -> Iterator[Event]:
     _note_unread(search, "change", found.unread_from_s)
     for signal in states:
         name, points = signal.name, found.points[signal.name]
-        told = _without_measurements(points)
-        last_s, cut_at_s = _last_ends_s(search, signal, told)
+        points_left = _without_measurements(points)
+        last_s, cut_at_s = _last_ends_s(search, signal, points_left)
         if cut_at_s is not None:
-            last_s = max(cut_at_s, told[-1].sim_time_s)
-            why = f"the one at {told[-1].sim_time_s:.3f} s may last longer: time limit reached"
+            last_s = max(cut_at_s, points_left[-1].sim_time_s)
+            why = (
+                f"the one at {points_left[-1].sim_time_s:.3f} s may last longer: time limit reached"
+            )
             search.not_searched("change", why)
-        ends_s = [*(point.sim_time_s for point in told[2:]), last_s]
+        ends_s = [*(point.sim_time_s for point in points_left[2:]), last_s]
         changes = [
             _Change(before, point, newest_s if end_s is None else end_s, end_s is None)
-            for (before, point), end_s in zip(pairwise(told), ends_s, strict=False)
+            for (before, point), end_s in zip(pairwise(points_left), ends_s, strict=False)
             if segment.start_s <= point.sim_time_s < segment.end_s
         ]
-        if len(told) < len(points):
+        if len(points_left) < len(points):
             why = f"not between numbers of {name}, a measurement: webots_query_history shows them"
             search.not_searched("change", why)
-        yield from _told(search, name, changes)
+        yield from _reported(search, name, changes)
 
 
 def _note_unread(search: Search, kind: str, from_s: float | None) -> None:
@@ -178,7 +180,7 @@ class _Change(NamedTuple):
     ongoing: bool
 
 
-def _told(search: Search, name: str, changes: Sequence[_Change]) -> Iterator[Event]:
+def _reported(search: Search, name: str, changes: Sequence[_Change]) -> Iterator[Event]:
     """Each change; of what flickers all as one."""
     if len(changes) > MOST_CHANGES:
         starts_s = [each.point.sim_time_s for each in changes]
@@ -201,10 +203,10 @@ def _change(search: Search, name: str, change: _Change, details: dict[str, Any])
 
 
 def _last_ends_s(
-    search: Search, signal: Signal, told: Sequence[Point]
+    search: Search, signal: Signal, points_left: Sequence[Point]
 ) -> tuple[float | None, float | None]:
     """As `value_ended_s` of the newest of some values; None where it began elsewhere."""
-    begin_s = told[-1].sim_time_s if told else math.inf
+    begin_s = points_left[-1].sim_time_s if points_left else math.inf
     if not search.segment.start_s <= begin_s < search.segment.end_s:
         return None, None
     after = Segment(search.segment.run_id, begin_s, just_after(search.ended_s))

@@ -1,4 +1,4 @@
-"""What is said of many events that are alike and told as one."""
+"""The text of many similar events that are reported as one."""
 
 from __future__ import annotations
 

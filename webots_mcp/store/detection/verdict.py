@@ -58,10 +58,10 @@ class Verdicts:
         for kind, reasons in self.reasons.items():
             for reason in (*reasons, *self._in_what_was_searched(kind)):
                 sharing.setdefault(reason, []).append(kind)
-        told: dict[str, list[str]] = {}
+        named: dict[str, list[str]] = {}
         for reason, kinds in sharing.items():
-            told.setdefault(", ".join(kinds), []).append(reason)
-        return {kinds: "; ".join(reasons) for kinds, reasons in told.items()}
+            named.setdefault(", ".join(kinds), []).append(reason)
+        return {kinds: "; ".join(reasons) for kinds, reasons in named.items()}
 
     @property
     def _nowhere(self) -> list[str]:
@@ -101,7 +101,7 @@ class Ledger:
         self._reasons.setdefault(kind, {}).update(dict.fromkeys(reasons))
 
     def note_of_run(self, run_id: int, note: str) -> None:
-        """Remark on a run; runs of which the same is to say are told together."""
+        """A remark on a run; runs with the same remark are reported together."""
         self._of_runs.setdefault(note, []).append(run_id)
 
     @property

@@ -135,7 +135,7 @@ def export_for_viewers(
 
 @contextmanager
 def placed(file: Path) -> Generator[Path]:
-    """A file beside it to write to, of its owner alone, which takes its place when it is whole.
+    """A file next to it to write to, private to its owner, which replaces it when complete.
 
     Raises:
         InvalidInputError: It cannot be written.

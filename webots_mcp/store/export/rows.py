@@ -31,7 +31,7 @@ _CHUNK: Final = (
     "ORDER BY sim_time_s, id LIMIT :limit"
 )
 # Where there are kept stretches, with negative ids for what only they have. Of several calls in one
-# step wall time tells the order.
+# step wall time gives the order.
 _AFTER_WALL: Final = "(sim_time_s > :start_s OR wall_time_s > :after_wall_s)"
 _CHUNK_WITH_KEPT: Final = (
     f"SELECT id, sim_time_s, wall_time_s, data, odd FROM state WHERE {_IN_SEGMENT} "
@@ -103,7 +103,7 @@ class Table(ABC):
 
     @abstractmethod
     def rows(self, pass_number: int = 1) -> Iterator[Row]:
-        """All of them; the second pass tells its own progress."""
+        """All of them; the second pass reports its own progress."""
 
     def columns(self) -> list[Column]:
         """What the rows hold, in the order in which it first appears; this reads all of them."""
@@ -121,7 +121,7 @@ class Source(Table):
     """The state rows that were there when the export began; they can be read more than once.
 
     Attributes:
-        passes: How often they will be read, so that progress can be told.
+        passes: How often they will be read, so that progress can be reported.
     """
 
     head: ClassVar[tuple[Column, ...]] = _HEAD

@@ -38,7 +38,7 @@ class FoundState(NamedTuple):
 
 
 class FoundCommand(NamedTuple):
-    """A command that nobody had taken; `params` is JSON text."""
+    """A command that no controller had taken; `params` is JSON text."""
 
     wall_time_s: float
     action: str

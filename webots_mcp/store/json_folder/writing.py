@@ -185,8 +185,8 @@ class _Writer:
         self, instance: str, folder: Path, paths: list[str], progress: Progress | None
     ) -> None:
         session_id = self._begin(instance)
-        told = json.dumps({"folder": str(folder), "note": _NOTE})
-        self._insert("event", **self._at(self._first_s), kind="import", data=told)
+        text = json.dumps({"folder": str(folder), "note": _NOTE})
+        self._insert("event", **self._at(self._first_s), kind="import", data=text)
         if state := self._found.state:
             at = self._at(state.wall_time_s)
             self._insert("state", **at, data=state.data, odd=state.odd)

@@ -103,7 +103,7 @@ def compare_runs(
     """Compare runs, aligned at their start; that of the first one is the reference.
 
     Where some of them have the same robot, code and parameters and others have not, those that
-    have are one group. Of a single run it tells what that came to.
+    have are one group. For a single run it has that run's figures.
 
     Args:
         connection: Any.
@@ -233,13 +233,13 @@ def _compare(
     differences = _differences(connection, cut, asked, deadline)
     shared = [each for each in differences if 0 not in each.count]
     shared.sort(key=size_of, reverse=True)
-    told = _groups(connection, groups)
+    compared = _groups(connection, groups)
     outcomes = outcomes_of(connection, cut, options, deadline, asked.matters_sd)
     unread = any(None in each.count for each in differences)
-    notes = _notes(told) + _cut_notes(durations_s, compared_s)
+    notes = _notes(compared) + _cut_notes(durations_s, compared_s)
     notes += sampling_notes(connection, [part for found in cut for part in found])
     return Comparison(
-        groups=told,
+        groups=compared,
         compared_s=compared_s,
         measures=outcomes.measures,
         not_known=outcomes.not_known | ({"means of signals": OUT_OF_TIME} if unread else {}),
@@ -256,7 +256,7 @@ def _differences(
     asked: _Asked,
     deadline: Deadline,
 ) -> list[Difference]:
-    """The numbers of those names, group beside group; none where a run stands alone."""
+    """The numbers of those names, group by group; none for a single run."""
     parts = [part for group in groups for part in group]
     known = {name: signal for part in reversed(parts) for name, signal in part.known.items()}
     found = resolve_signals(known, asked.names)

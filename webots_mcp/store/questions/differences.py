@@ -29,7 +29,7 @@ class Difference:
             without values, or both constant and not equal. Rows follow each other too closely to
             be independent, so it describes, and proves nothing.
         different: Whether the means or the deviations differ by more than those of like runs do;
-            None where that cannot be told (`analysis.spread`).
+            None where that cannot be decided (`analysis.spread`).
         interval: The difference of the means of the groups lies in it nine times of ten.
     """
 

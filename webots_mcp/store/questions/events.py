@@ -28,7 +28,7 @@ from webots_mcp.store.signals.catalogue import known_signals, resolve_signals
 from webots_mcp.store.signals.flatten import parse
 from webots_mcp.store.signals.registry import Signal
 
-MOST_AROUND: Final = 6  # values that are told with an event
+MOST_AROUND: Final = 6  # values that are reported with an event
 
 _IS_OPEN: Final = "SELECT id, session_id, ended_wall_time_s IS NULL FROM run WHERE id = ?"
 _ROW_AT: Final = (
@@ -63,7 +63,7 @@ class Events:
     Attributes:
         events: In the order of wall time; at most `limit` of all that were found.
         verdicts: What became of each kind: found, absent, or not looked for and why.
-        left_out: Those that are told neither here nor on the pages before.
+        left_out: Events that are reported neither here nor on the pages before.
         cursor: Give it as `after` for those that are left out; None where none are.
         notes: Where the range leaves the recording, and the like.
     """
@@ -86,9 +86,9 @@ class Found:
     """All that happened in a range; an answer shows a part of it.
 
     Attributes:
-        entries: In order, without what the pages before have told.
-        context: The signals whose values are told with each event.
-        borders: By kind, the place before which nothing has been told yet; None: nowhere.
+        entries: In order, without those of the pages before.
+        context: The signals whose values are reported with each event.
+        borders: By kind, the place before which nothing has been reported yet; None: nowhere.
     """
 
     robot: str
@@ -119,18 +119,18 @@ class Found:
             exact: Those that samples of a long run show begin and end to the row.
         """
         chosen = {id(event) for event in choose(self.events, limit)}
-        told = [entry for entry in self.entries if id(entry[1]) in chosen]
+        on_page = [entry for entry in self.entries if id(entry[1]) in chosen]
         rest = [entry for entry in self.entries if id(entry[1]) not in chosen]
-        events = [each for _, event in told for each in (_exactly(event) if exact else (event,))]
+        events = [each for _, event in on_page for each in (_exactly(event) if exact else (event,))]
         found = Counter(self.verdicts.found)
         found.update(count_by_kind(events))
-        found.subtract(count_by_kind([event for _, event in told]))
+        found.subtract(count_by_kind([event for _, event in on_page]))
         return Events(
             self.robot,
             tuple(_with_values(connection, event, self.context) for event in events),
             replace(self.verdicts, found={kind: found[kind] for kind in found if found[kind]}),
             _left_out([event for _, event in rest]),
-            _cursor(told, rest, self.borders),
+            _cursor(on_page, rest, self.borders),
             self.notes,
         )
 
@@ -158,15 +158,15 @@ def find_events(
         time_range: From `find_range`.
         options: What counts as an event; None for the defaults.
         limit: The most events to return: see `choose`.
-        around: Signals whose values are told with each event; None for mode, position and
+        around: Signals whose values are reported with each event; None for mode, position and
             commanded speed.
-        group: Many dropouts, steps or silences of one signal are told as one event, which counts
-            them; else each is one.
+        group: Many dropouts, steps or silences of one signal are reported as one event with their
+            number; else each is one.
         after: The `cursor` of an answer, for the events that it left out.
         deadline_s: After it, what was found so far is the answer, and the verdicts say what was
             not looked at.
         exact: Events that samples of a long run show begin and end to the row, for which the rows
-            about those that are told are read.
+            about those that are reported are read.
 
     Raises:
         UnknownSignalError: A name in the options or in `around` meets nothing.
@@ -271,8 +271,8 @@ def collect(
 def _runs_over(connection: sqlite3.Connection, run_ids: Sequence[int]) -> set[int]:
     """Those in which nothing goes on any more: they have ended, or their process is gone."""
     gone = dict(dead_sessions(connection))
-    told = [connection.execute(_IS_OPEN, (run_id,)).fetchone() for run_id in set(run_ids)]
-    return {run_id for run_id, session_id, is_open in told if not is_open or session_id in gone}
+    sessions = [connection.execute(_IS_OPEN, (run_id,)).fetchone() for run_id in set(run_ids)]
+    return {run_id for run_id, session_id, is_open in sessions if not is_open or session_id in gone}
 
 
 def _context(
@@ -320,15 +320,15 @@ def _left_out(events: Sequence[Event]) -> dict[str, LeftOut]:
 
 
 def _cursor(
-    told: Sequence[tuple[Place, Event]],
+    on_page: Sequence[tuple[Place, Event]],
     rest: Sequence[tuple[Place, Event]],
     borders: dict[str, Place | None],
 ) -> str | None:
     """Of each kind with events left out, before which place they are; null: anywhere.
 
-    Of a kind the newest are told first, so that what is recorded meanwhile moves nothing.
+    Of a kind the newest are reported first, so that newly recorded rows move nothing.
     """
-    firsts = borders | {place[3]: place for place, _ in reversed(told)}
+    firsts = borders | {place[3]: place for place, _ in reversed(on_page)}
     kinds = dict.fromkeys(place[3] for place, _ in rest)
     return json.dumps({kind: firsts.get(kind) for kind in kinds}) if kinds else None
 

@@ -70,7 +70,7 @@ class Measure:
         name: distance_m, mean_speed_m_s, `share of MODE` (of the time), `KIND per min` (events).
         spread: Over the runs of the group; None where it is not known of all of them.
         different: Whether the group differs from the first by more than like runs do; None where
-            that cannot be told, because both groups are one run each, a figure is missing, or
+            that cannot be decided, because both groups are one run each, a figure is missing, or
             more runs are wanted; False where a difference that matters is excluded.
         runs_wanted: So many runs of each group would tell, if they went on like these; None where
             nothing shows that they would.
@@ -181,10 +181,10 @@ def _not_known(runs: Sequence[_Outcome]) -> dict[str, str]:
     for (name, why), run_ids in runs_by_reason.items():
         where = "" if len(run_ids) == len(runs) else f"run {', '.join(run_ids)}: "
         sharing.setdefault(where + why, []).append(name)
-    told: dict[str, list[str]] = {}
+    by_reason: dict[str, list[str]] = {}
     for why, names in sharing.items():
-        told.setdefault(", ".join(names), []).append(why)
-    return {names: "; ".join(reasons) for names, reasons in told.items()}
+        by_reason.setdefault(", ".join(names), []).append(why)
+    return {names: "; ".join(reasons) for names, reasons in by_reason.items()}
 
 
 class _Outcome(NamedTuple):

@@ -75,7 +75,7 @@ class RunInfo:
         notable: How often what needs attention was stored: warnings, errors, dropped rows,
             failed or lost commands, trouble with storage.
         parameters: Those that are not as the code declared them, or differ between the runs that
-            were asked for together; a text tells of changes in the middle of the run.
+            were asked for together; a text names changes in the middle of the run.
     """
 
     run_id: int

@@ -1,4 +1,4 @@
-"""The schema in few words, as the database itself tells it."""
+"""The schema as a short text, read from the database itself."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def describe_schema(connection: sqlite3.Connection) -> str:
     columns = columns_by_table(connection)
     names: dict[frozenset[str], list[str]] = {}
     listed: dict[frozenset[str], str] = {}
-    told = set[tuple[str, str]]()
+    listed_before = set[tuple[str, str]]()
     for name, kind, sql in connection.execute(_OBJECTS).fetchall():
         if name in _BOOKKEEPING or name not in columns:
             continue
@@ -71,8 +71,10 @@ def describe_schema(connection: sqlite3.Connection) -> str:
         names.setdefault(same, []).append(f"{kind} {name}")
         if same not in listed:
             found = dict.fromkeys(_COMMENT.findall(sql) if kind == "table" else ())
-            listed[same] = _listed(columns[name], dict(each for each in found if each not in told))
-            told.update(found)
+            listed[same] = _listed(
+                columns[name], dict(each for each in found if each not in listed_before)
+            )
+            listed_before.update(found)
     lines = (f"{', '.join(alike)}: {listed[same]}" for same, alike in names.items())
     return "\n".join((_RULES, *lines, _bookkeeping()))
 

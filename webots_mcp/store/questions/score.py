@@ -108,9 +108,9 @@ def unseen(connection: sqlite3.Connection, run_ids: Iterable[int | None]) -> lis
     scored = list(filter(None, run_ids))
     for run_id in scored:
         kept = len(kept_parts(connection, run_id, -math.inf, math.inf))
-        told = [unrecorded(connection, run_id)]
-        told += ["rows that only kept stretches have do not count"] if kept else []
-        if said := "; ".join(filter(None, told)):
+        notes = [unrecorded(connection, run_id)]
+        notes += ["rows that only kept stretches have do not count"] if kept else []
+        if said := "; ".join(filter(None, notes)):
             alike.setdefault(said, []).append(str(run_id))
     return [
         f"scores: {said}" if len(runs) == len(scored) else f"scores of run {listed(runs)}: {said}"

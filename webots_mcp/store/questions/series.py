@@ -65,7 +65,7 @@ class ChangeColumns:
             force when the range begins.
         total: How many points there are; `points` are the last of them.
         time_by_value_s: Simulated seconds in each value, the longest first.
-        since_before: The first of all points was in force before the time that it tells.
+        since_before: The first of all points was in force before its time.
         cut_at_s: The deadline passed; what was after that is not in the points.
     """
 

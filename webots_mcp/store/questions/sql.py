@@ -241,7 +241,7 @@ def _explain(connection: sqlite3.Connection, statement: str, error: Exception) -
         return f"only reading is allowed ({text}): no writing, no ATTACH, no PRAGMA"
     if "number of bindings" in text:
         return (
-            "?, :name, @name and $name stand for values that nobody gives: write them in the SELECT"
+            "?, :name, @name and $name are placeholders without values: write values in the SELECT"
         )
     if missing := _MISSING.search(text):
         return f"{text}; {_near(connection, statement, *missing.groups())}"

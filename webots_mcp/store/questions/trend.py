@@ -56,13 +56,13 @@ class Trend:
         mean: Of an angle the circular mean. What is less than a few millionths of the range is
             rounded away: it comes from adding.
         deviation: Standard deviation; of an angle that of the unwrapped angle, or the circular one
-            where turns cannot be counted, beside extremes as they were recorded.
+            where turns cannot be counted, next to extremes as they were recorded.
         turned: How far an angle turned, positive as it grows, turns counted; else None.
         leaps: An angle that changed by more than a quarter turn from row to row, as the bearing to
             the nearest of several things does: its turns cannot be counted.
         monotonic: "rising", "falling" (never the other way, and not constant), or None.
         fast: It varies so fast that the means of buckets do not show its course.
-        swings: Where it went to and fro, as `find_events` tells it, but of any period.
+        swings: Where it moved to and fro, as `find_events` reports it, but of any period.
         resolution_s: Length of the means in which swings were seen; None where rows were.
         flat_since_s: Since when it rests; None if it does not.
         spikes: Values that stand out from both neighbours; None where rows were not looked at.
@@ -100,12 +100,12 @@ class Trend:
 
     @property
     def is_lacking(self) -> bool:
-        """Whether so many rows have no value that it is told."""
+        """Whether so many rows have no value that it is reported."""
         return self.missing > TOLD_MISSING_SHARE * self.summary.rows
 
     @property
     def is_clock(self) -> bool:
-        """Whether it rises with simulation time and its name says so: it tells nothing new.
+        """Whether it rises with simulation time and its name says so: it has no news.
 
         A straight rise alone is not enough: a robot at constant speed has one too.
         """
@@ -126,7 +126,7 @@ def judge(
     *,
     rows_left: bool = True,
 ) -> Trend:
-    """Put together what the summary tells and what the course of the numbers tells.
+    """Combine the summary with the course of the numbers.
 
     Args:
         signal: Whose trend.
@@ -137,7 +137,7 @@ def judge(
         inner_variance: That of the values within the buckets. Where more of it lies there than
             between them, a course of their means is not that of the values (it may be an alias).
         resolution_s: The length of the buckets; None where the numbers are the values.
-        pieces: The buckets, of which ends and extremes are known beside their means.
+        pieces: The buckets, of which ends and extremes are known in addition to the means.
         too_large: How many of the values are beyond 1e100; None where that is not known.
         rows_left: Whether less time would be seen in rows.
     """
@@ -345,7 +345,7 @@ def _remarks(trend: Trend, *, rows_left: bool) -> Iterator[str]:
     if trend.swings and not any(_is_wide(each, summary) for each in trend.swings):
         yield f"also {_swinging(trend, unit)}"
     if trend.flat_since_s is not None and trend.shape != "constant" and summary.changes != 1:
-        yield f"flat at {_told(summary.last, summary)} since {trend.flat_since_s:.6g} s"
+        yield f"flat at {_in_digits(summary.last, summary)} since {trend.flat_since_s:.6g} s"
     if trend.spikes:
         largest = max(trend.spikes, key=lambda spike: abs(spike.value - (trend.mean or 0.0)))
         yield (
@@ -369,26 +369,28 @@ def _course(trend: Trend, unit: str) -> str:
     if any(_is_wide(each, summary) for each in trend.swings):
         return _swinging(trend, unit)
     if trend.step is not None:
-        before, after = (_told(value, summary) for value in (trend.step.before, trend.step.after))
+        before, after = (
+            _in_digits(value, summary) for value in (trend.step.before, trend.step.after)
+        )
         return f"steps from {before} to {after}{unit} at {trend.step.sim_time_s:.6g} s"
     if trend.shape in ("rising", "falling"):
         slope = f" ({_mean_rate(trend):.3g}{unit}/s)" if _is_straight(trend) else ""
         if trend.turned is not None:
             return f"turns by {trend.turned:.3g}{unit}{slope}"
         verb = "rises" if trend.shape == "rising" else "falls"
-        first, last = _told(summary.first, summary), _told(summary.last, summary)
+        first, last = _in_digits(summary.first, summary), _in_digits(summary.last, summary)
         if summary.changes == 1:
             extreme_s = (summary.min_sim_time_s, summary.max_sim_time_s)[trend.shape == "rising"]
             return f"steps from {first} to {last}{unit} at {extreme_s:.6g} s"
         return f"{verb} from {first} to {last}{unit}{slope}"
-    low, high = _told(summary.min, summary), _told(summary.max, summary)
+    low, high = _in_digits(summary.min, summary), _in_digits(summary.max, summary)
     return f"between {low} (at {summary.min_sim_time_s:.6g} s) and {high}{unit} " + (
         f"(at {summary.max_sim_time_s:.6g} s)"
     )
 
 
 def _mean_rate(trend: Trend) -> float:
-    """From the first value to the last, which stand beside it in the sentence."""
+    """From the first value to the last, which are next to it in the sentence."""
     summary = trend.summary
     change = (summary.last or 0.0) - (summary.first or 0.0)
     lasts_s = (summary.last_sim_time_s or 0.0) - (summary.first_sim_time_s or 0.0)
@@ -396,14 +398,14 @@ def _mean_rate(trend: Trend) -> float:
 
 
 def _is_straight(trend: Trend) -> bool:
-    """Whether its slope tells its course: what stepped, or grew ever faster, has none."""
+    """Whether a slope describes its course: a step or an accelerating growth has none."""
     return trend.slope_per_s is not None and (trend.r2 or 0.0) >= STRAIGHT_R2
 
 
 def _beyond_ends(trend: Trend) -> Iterator[str]:
     """The extremes of what rises or falls that are not its ends: it went the other way in between.
 
-    They are told where the spikes do not tell them.
+    They are reported where the spikes do not show them.
     """
     summary = trend.summary
     if trend.shape not in ("rising", "falling") or trend.turned is not None or trend.spikes:
@@ -411,15 +413,15 @@ def _beyond_ends(trend: Trend) -> Iterator[str]:
     ends = (summary.first or 0.0, summary.last or 0.0)
     span = TOLD_BEYOND_ENDS * ((summary.max or 0.0) - (summary.min or 0.0))
     if summary.min is not None and min(ends) - summary.min > span:
-        yield f"min {_told(summary.min, summary)} at {summary.min_sim_time_s:.6g} s"
+        yield f"min {_in_digits(summary.min, summary)} at {summary.min_sim_time_s:.6g} s"
     if summary.max is not None and summary.max - max(ends) > span:
-        yield f"max {_told(summary.max, summary)} at {summary.max_sim_time_s:.6g} s"
+        yield f"max {_in_digits(summary.max, summary)} at {summary.max_sim_time_s:.6g} s"
 
 
-def _told(value: float | None, summary: Summary) -> str:
-    """A value with four digits, or so many that the range is told with two.
+def _in_digits(value: float | None, summary: Summary) -> str:
+    """A value with four digits, or so many that the range is shown with two.
 
-    0 where it is only what adding leaves beside the extremes.
+    0 where it is only a rounding error compared to the extremes.
     """
     largest = max(abs(summary.min or 0.0), abs(summary.max or 0.0))
     if value is None or abs(value) <= _DUST * largest:

@@ -230,7 +230,7 @@ def _state_trends(
     segment = found.segment
     bounds = recorded_bounds(connection, segment.run_id) or (segment.start_s, segment.end_s)
     end_s = min(segment.end_s, bounds[1])
-    told = [
+    of_texts = [
         StateTrend(
             name=signal.name,
             kind=signal.kind,
@@ -243,4 +243,4 @@ def _state_trends(
         if (points := found.points[signal.name])
         for is_open in [len(points) == 1 and signal.name in found.since_before]
     ]
-    return tuple(sorted(told, key=lambda state: -state.changes))
+    return tuple(sorted(of_texts, key=lambda state: -state.changes))

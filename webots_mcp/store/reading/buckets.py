@@ -102,9 +102,9 @@ def _take_in_kept(
         end = start + len(list(group))
         for signal in signals:
             values = columns.values[signal.name][start:end]
-            beside = signal.summarise(columns.times[start:end], values)
+            of_rows = signal.summarise(columns.times[start:end], values)
             if cells := table.cells.get(signal.name):
-                cells[place] = with_extremes(cells[place], beside)
+                cells[place] = with_extremes(cells[place], of_rows)
         start = end
     return columns.cut_at_s
 

@@ -60,7 +60,7 @@ class Changes:
         points: By signal, in order; the first is the value in force when the segment begins, its
             time may lie before. Of a signal whose value then is not known there are only later
             ones, or none.
-        since_before: Those whose first value was in force before the time that its point tells:
+        since_before: Those whose first value was in force before the time of its point:
             since when was not found.
         unread_from_s: The deadline passed: no point lies behind this, and the last of each signal
             need not be its last. None where all was read.

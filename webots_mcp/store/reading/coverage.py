@@ -1,4 +1,4 @@
-"""What a range asks for that the recording does not have, told to the asker."""
+"""Notes on what a range asks for and the recording does not have."""
 
 from __future__ import annotations
 

@@ -51,8 +51,8 @@ class Deadline:
     def interrupting(self, connection: sqlite3.Connection) -> Generator[None]:
         """Interrupt the connection's statements once the time is over.
 
-        An interrupted statement raises `sqlite3.OperationalError`; `passed` tells it from other
-        errors. A connection has one progress handler, so these blocks do not nest.
+        An interrupted statement raises `sqlite3.OperationalError`; `passed` distinguishes it from
+        other errors. A connection has one progress handler, so these blocks do not nest.
         """
         connection.set_progress_handler(lambda: self.passed, _STEPS_PER_LOOK)
         try:

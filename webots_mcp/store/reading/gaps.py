@@ -34,7 +34,7 @@ _BEFORE: Final = (
     "SELECT sim_time_s FROM state WHERE run_id = ? AND sim_time_s < ? "
     "ORDER BY sim_time_s DESC LIMIT ?"
 )
-# The signal that is in most rows tells how many a bucket has, and its first and last time.
+# The signal that is in most rows shows how many a bucket has, and its first and last time.
 _IN_MOST_ROWS: Final = (
     "FROM {table} WHERE run_id = :run AND bucket >= :first AND bucket < :end AND signal_id = "
     "(SELECT id FROM signal s WHERE robot_id = (SELECT robot_id FROM run WHERE id = :run) "

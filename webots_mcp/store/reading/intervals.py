@@ -24,7 +24,7 @@ from webots_mcp.store.signals.flatten import shown
 from webots_mcp.store.signals.registry import Signal
 
 MOSTLY: Final = 0.5  # of the rows
-NO_VALUE: Final = ""  # no number is told so
+NO_VALUE: Final = ""  # no number has this text
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Condition(Protocol):
 
 @dataclass(frozen=True)
 class Beyond:
-    """Above or below a limit, as `holds` tells of a number."""
+    """Above or below a limit, as `holds` decides for a number."""
 
     holds: Callable[[float], bool]
     lasting: bool = False

@@ -93,7 +93,7 @@ def _rest(
 ) -> tuple[Segment | None, int | State]:
     """The part that may have rows after that one, and after what they come.
 
-    At full rate ids do not rise with time: there the row itself tells its place.
+    At full rate ids do not rise with time: there the row itself has its place.
     """
     if segment.full_rate and after_id == 0:
         return segment, 0

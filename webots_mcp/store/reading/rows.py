@@ -393,10 +393,10 @@ def _count_odd(columns: Columns, signals: Sequence[Signal], odds: Sequence[str |
     """Count what was odd in the newest rows, whose values are there."""
     if not any(odds):
         return
-    told = {odd: odd_names(odd) for odd in set(odds)}  # mostly the same in all rows
-    named = {odd: [each.name for each in signals if each.name in told[odd]] for odd in told}
+    replaced = {odd: odd_names(odd) for odd in set(odds)}  # mostly the same in all rows
+    named = {odd: [each.name for each in signals if each.name in replaced[odd]] for odd in replaced}
     for row, odd in enumerate(odds, len(columns.ids) - len(odds)):
-        reasons = told[odd]
+        reasons = replaced[odd]
         for name in named[odd]:
             if is_odd(reasons, name, columns.values[name][row]):
                 columns.odd.setdefault(name, Counter())[reasons[name]] += 1
@@ -420,5 +420,5 @@ def _shown(values: list[Any], types: Collection[type]) -> list[Value]:
     """Each of the texts, of which there are mostly few, is looked at once."""
     if not {str, type(None)}.issuperset(types):
         return [shown(value) for value in values]
-    told = {text: shown(text) for text in set(values)}
-    return [told[text] for text in values]
+    by_text = {text: shown(text) for text in set(values)}
+    return [by_text[text] for text in values]

@@ -17,8 +17,8 @@ def in_one_snapshot(
     """Let a question that takes several statements see one state of the database.
 
     Without it rows could be rolled up between two of its statements, and be counted twice. It
-    waits for nobody and makes nobody wait (write-ahead log); a transaction that is open already
-    is used as it is.
+    neither waits nor makes another process wait (write-ahead log); a transaction that is already
+    open is used as it is.
     """
 
     @functools.wraps(question)

@@ -24,7 +24,7 @@ _COARSE: Final = (
     f"SELECT bucket, {_LARGEST}, first, last, last_sim_time_s FROM coarse_rollup {_OF_SIGNAL} "
     "AND first IS NOT NULL ORDER BY bucket"
 )
-_SELDOM: Final = 2  # changes in a bucket: then its rollup tells what they were
+_SELDOM: Final = 2  # changes in a bucket: then its rollup has all of them
 
 
 @dataclass(frozen=True)

@@ -285,7 +285,7 @@ class LongView:
         self._rolled_until_s = math.inf if late is None else late.start_s
 
     def taken_notes(self) -> list[str]:
-        """Each is told once."""
+        """Each is reported once."""
         taken, self.notes = list(dict.fromkeys(self.notes)), []
         return taken
 

@@ -1,7 +1,7 @@
 """The limits of a database belong to it, not to who maintains it: set once, they hold for all.
 
-`prune` and `retain` set what a person asks for. A server sets what nobody has set, or what an
-earlier server set that no longer runs; beside another server it says what holds instead.
+`prune` and `retain` set what a person asks for. A server sets limits that are not set yet, or that
+a server set which no longer runs; while another server runs, it reports the limits in force.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SERVE: Final = "serve"
 KINDS: Final = ("state", "kept_state", "rollup", "log", "event", "image", "unshipped")
 _KIND_OF: Final = {**{kind: kind for kind in KINDS}, "outlive": "run"}
 _NAME_OF: Final = {kind: name for name, kind in _KIND_OF.items()}
-_SHOWN: Final = {"unshipped": "until_shipped"}  # only where somebody has set it
+_SHOWN: Final = {"unshipped": "until_shipped"}  # only where it was set
 _READ: Final = (
     "SELECT kind, size_bytes, rows, age_s, times, set_by, set_wall_time_s FROM retention_limit"
 )
@@ -42,7 +42,7 @@ _SERVER: Final = (
 
 
 class Setting(NamedTuple):
-    """A limit that somebody set, and when."""
+    """A limit that was set, and when."""
 
     value: Limit | float
     set_by: str
@@ -84,7 +84,7 @@ def in_force(connection: sqlite3.Connection, asked: Asked | None = None) -> Rete
 
 
 def set_limits(connection: sqlite3.Connection, asked: Asked, set_by: str) -> None:
-    """Let these limits hold from now on, whoever maintains the database."""
+    """Put these limits in force, whichever process maintains the database."""
     if not asked:
         return
     now_s = time.time()
@@ -114,7 +114,7 @@ def ask_at_start(connection: sqlite3.Connection, asked: Asked) -> list[str]:
 
 
 def ask_where_unset(connection: sqlite3.Connection, asked: Asked) -> None:
-    """Set what nobody has set: of a database that was not there yet when the server started."""
+    """Set limits that are not set: of a database created after the server started."""
     settings = read_settings(connection)
     if new := {name: value for name, value in asked.items() if name not in settings}:
         set_limits(connection, new, SERVE)

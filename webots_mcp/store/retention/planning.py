@@ -1,4 +1,4 @@
-"""What is beyond the limits: a plan tells it, and is carried out as it is."""
+"""What is beyond the limits: a plan lists it, and is carried out unchanged."""
 
 from __future__ import annotations
 
@@ -371,7 +371,7 @@ class _Planner:
 
 
 def _spared(rows: Mapping[Step, int], why: str) -> Iterator[Spared]:
-    """By table, rows of steps as what is told of them."""
+    """The rows of steps as reported, by table."""
     for table in dict.fromkeys(step.table for step in rows):
         of_table = {step: count for step, count in rows.items() if step.table == table and count}
         if of_table:

@@ -31,7 +31,7 @@ class Limit:
         rows: So many rows.
         age_s: So long after they were written, in wall time.
         spared_rows: So many of the newest rows, of all runs together, do not go because of their
-            age: what nobody went on with does not vanish altogether. Size and rows always hold.
+            age: runs of abandoned work do not all vanish. Size and rows always hold.
     """
 
     size_bytes: int | None = None

@@ -1,4 +1,4 @@
-"""What pools hold of a recording: a small file beside the database, written by `webots-mcp ship`.
+"""What pools hold of a recording: a small file next to the database, written by `webots-mcp ship`.
 
 The progress itself is at the pool. This file only spares what is not there yet: where it is lost or
 cannot be written, rows are kept that need not be, within the limit of `--keep-until-shipped`.
@@ -75,11 +75,11 @@ def write_shipped(database: Path, address: str, shipped: Shipped) -> None:
         OSError: The folder cannot be written.
     """
     file = _file_of(database)
-    told = {**_read(file), address: shipped}
+    stored = {**_read(file), address: shipped}
     aside = file.with_name(f".{file.name}.{os.getpid()}.part")
     try:
         aside.touch(PRIVATE_FILE)
-        aside.write_text(json.dumps({key: asdict(each) for key, each in told.items()}, indent=1))
+        aside.write_text(json.dumps({key: asdict(each) for key, each in stored.items()}, indent=1))
         aside.replace(file)
     except OSError:
         with contextlib.suppress(OSError):
@@ -93,16 +93,16 @@ def _file_of(database: Path) -> Path:
 
 def _read(file: Path) -> dict[str, Shipped]:
     try:
-        told: Any = json.loads(file.read_text("utf-8"))
-        return {str(address): _shipped(each) for address, each in told.items()}
+        stored: Any = json.loads(file.read_text("utf-8"))
+        return {str(address): _shipped(each) for address, each in stored.items()}
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return {}
 
 
-def _shipped(told: Any) -> Shipped:
+def _shipped(stored: Any) -> Shipped:
     return Shipped(
-        str(told["recording"]),
-        {str(name): int(last) for name, last in told["last_ids"].items()},
-        float(told["complete_wall_time_s"]),
-        float(told["wall_time_s"]),
+        str(stored["recording"]),
+        {str(name): int(last) for name, last in stored["last_ids"].items()},
+        float(stored["complete_wall_time_s"]),
+        float(stored["wall_time_s"]),
     )

@@ -29,7 +29,7 @@ class Upkeep:
 
     Args:
         data_dir: The folder that the paths of pictures are relative to.
-        limits: Tells the limits, whenever it is asked.
+        limits: Returns the limits in force.
         interval_s: Between two plans at least; more where planning takes long.
         budget_s: How long a call may last, rests included; a write more at most.
     """

@@ -116,15 +116,15 @@ def holdings(connection: sqlite3.Connection, table: str, runs: Sequence[Run]) ->
     """What these runs have in a table; those that have nothing are left out."""
     rows: dict[int, int] = dict(connection.execute(rows_of(_ROWS_BY_RUN, table)).fetchall())
     row_bytes, usual = _row_bytes(connection, table)
-    beside: dict[int, int] = {}
+    frame_bytes: dict[int, int] = {}
     if table == "kept_state":
-        beside = dict(connection.execute(_FRAMES).fetchall())
+        frame_bytes = dict(connection.execute(_FRAMES).fetchall())
     return [
         Holding(
             run,
             table,
             rows[run.id],
-            row_bytes.get(run.id, usual) + beside.get(run.id, 0) / rows[run.id],
+            row_bytes.get(run.id, usual) + frame_bytes.get(run.id, 0) / rows[run.id],
         )
         for run in runs
         if run.id in rows
@@ -132,7 +132,7 @@ def holdings(connection: sqlite3.Connection, table: str, runs: Sequence[Run]) ->
 
 
 def file_sizes(connection: sqlite3.Connection) -> dict[str, int]:
-    """Bytes of the database on the disk: the file, what of it is free, and the log beside it."""
+    """Bytes of the database on the disk: the file, what of it is free, and the log next to it."""
 
     def pragma(name: str) -> int:
         return int(connection.execute(f"PRAGMA {name}").fetchone()[0])

@@ -1,1 +1,1 @@
-"""Rollups: 10 s of each signal, kept beside the state rows by the maintainer."""
+"""Rollups: 10 s of each signal, kept in addition to the state rows by the maintainer."""

@@ -19,7 +19,7 @@ class BatchColumn:
     """One signal of one run in the rows of the batch.
 
     Attributes:
-        sample: The data of the first row that holds the signal: it tells where its value stands.
+        sample: The data of the first row that holds the signal: it shows where its value is.
     """
 
     robot_id: int
@@ -73,7 +73,7 @@ class Batch:
 def odd_names(odd: str | None) -> dict[str, str]:
     """What was odd (nan, inf, ...) by signal: by its own name, or by an item of its array.
 
-    Of an array in which all nulls are of one kind it is told of every item, and under `name.*`.
+    Of an array in which all nulls are of one kind it is named for every item, and under `name.*`.
     """
     if odd is None:
         return {}

@@ -1,7 +1,7 @@
 """Stretches of simulation time that are summed up: buckets of 10 s, and coarse ones of 500 s.
 
 A coarse bucket holds exactly what the buckets of 10 s in it come to, so that a whole recording is
-read fast. Which coarse buckets of a run are there, its column `coarse_end` tells.
+read fast. The column `coarse_end` of a run shows which coarse buckets exist.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 Swings and standstills are looked for then as well, and stored with them.
 
-The column `coarse_end` of a run tells up to where they are complete. It moves on here, and back
+The column `coarse_end` of a run shows up to where they are complete. It moves on here, and back
 where a row comes late into what was merged already; then that is merged again.
 """
 

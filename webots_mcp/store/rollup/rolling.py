@@ -1,7 +1,7 @@
-"""Rollups: 10 s of simulation time of each signal of each run, kept beside the state rows.
+"""Rollups: 10 s of simulation time of each signal of each run, kept in addition to the state rows.
 
 `roll` is the maintainer's work, never the control loop's. It also keeps the register of signals,
-and the change points of text and boolean signals. How far it came is told by two marks, the id of
+and the change points of text and boolean signals. Its progress is kept in two marks, the id of
 the last state row that is in: the watermark of all runs, and one of each run that is beyond it. Ids
 are given under the write lock, so a row never comes late.
 """
@@ -90,7 +90,7 @@ def roll(connection: sqlite3.Connection, budget_rows: int = 2000, pause_s: float
         connection: Of a maintainer (the role "writer"), in autocommit mode.
         budget_rows: Bounds the time of the call: about 50 us per row of 40 leaves. As many rollups
             of 10 s are merged into coarse ones.
-        pause_s: Between two steps, for others to write; 0 where nobody else does.
+        pause_s: Between two steps, for others to write; 0 where no other process does.
 
     Raises:
         sqlite3.Error: The database is locked or damaged; nothing of the step was stored.
@@ -154,7 +154,7 @@ def _take_in_halves(
 
 
 def _take_in(connection: sqlite3.Connection, rows: Sequence[Any], pause_s: float) -> bool:
-    """Whether all of them are in, run by run; the mark of a run tells which were before."""
+    """Whether all of them are in, run by run; the mark of a run shows which were before."""
     robots = {row[2]: row[1] for row in rows}
     for run_id, robot_id in robots.items():
         mark = run_mark(connection, run_id)

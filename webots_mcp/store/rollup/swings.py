@@ -21,7 +21,7 @@ from webots_mcp.store.rollup.buckets import COARSE_BUCKETS, stored_texts
 from webots_mcp.store.signals.registry import Signal
 
 LONGEST_PERIOD_S: Final = 5.0
-ACROSS_S: Final = 20.0  # of the stretch beside: longer than six half swings of that period
+ACROSS_S: Final = 20.0  # of the stretch next to it: longer than six half swings of that period
 STRETCH_ROWS: Final = 10_000  # that are searched at once
 MOST_SIGNALS: Final = 20  # of which swings are stored
 

@@ -1,7 +1,7 @@
 """The summaries of a run of another recording, whose rows are not all there to make them anew.
 
 The other recording is attached as `source`. Its signals are found here by their names, or entered;
-what names them by their ids is told by those here.
+references to them are translated to the ids here.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from webots_mcp.store.rollup.tables import ADD_COUNTS, IS_ID, fill, run_mark
 from webots_mcp.store.signals.flatten import Kind, unit_of, widen
 from webots_mcp.store.signals.registry import MAX_SIGNALS, Count
 
-# Ids between the first and the last row of a run; more of them no robots beside it could record.
+# Ids between the first and the last row of a run; other robots could not have recorded more.
 _MOST_IDS: Final = 2**40
 _IDS: Final = (
     "SELECT min(id), max(id) FROM (SELECT id FROM source.state WHERE run_id = :run UNION ALL "
@@ -139,7 +139,7 @@ def _copy(connection: sqlite3.Connection, table: str, there: int, here: int, shi
 
 
 def _rename_signals(connection: sqlite3.Connection, here: int) -> None:
-    """In what is stored of standstills; what cannot be told by signals here was not looked for."""
+    """In what is stored of standstills; what needs signals that are not here was not looked for."""
     names = dict(connection.execute("SELECT there, here FROM temp.signal_here").fetchall())
     for signal_id, bucket, text in connection.execute(_STANDSTILLS, (here,)).fetchall():
         connection.execute(_RENAME, (_renamed(text, names), here, signal_id, bucket))

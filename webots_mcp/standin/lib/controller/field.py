@@ -406,7 +406,7 @@ def _fits(kind: str, value: Any) -> bool:
 
 
 field_of = Field._of  # pyright: ignore[reportPrivateUsage]
-"""Makes the object for a field that the simulator has told of."""
+"""Makes the object for a field that the simulator has described."""
 
 
 def inner_field_of(session: Session, node_id: int, name: str, found: tuple[str, int]) -> Field:

@@ -1,4 +1,4 @@
-"""The keyboard: nobody types in the stand-in."""
+"""The keyboard: no keys are pressed in the stand-in."""
 
 # ruff: noqa: N802 - the names are those of Webots
 

@@ -7,7 +7,7 @@ from .device import Device
 
 
 class LED(Device):
-    """A lamp; nobody sees it shine, but it remembers what it was told."""
+    """A lamp; it is not rendered, but it stores its value."""
 
     _c_name = "led"
 
@@ -20,12 +20,12 @@ class LED(Device):
         self._value = integer(v, position=2)
 
     def get(self) -> int:
-        """What it was told last."""
+        """The value that was set last."""
         return self._value
 
     @property
     def value(self) -> int:
-        """What it was told last."""
+        """The value that was set last."""
         return self.get()
 
     @value.setter

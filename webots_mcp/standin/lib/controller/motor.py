@@ -1,4 +1,4 @@
-"""Motors: what they were told, and telling them."""
+"""Motors: setting and reading their commands."""
 
 # ruff: noqa: N802 - the names are those of Webots
 
@@ -62,11 +62,11 @@ class Motor(Device):
         self._session.change(self._tag, "acceleration", acceleration)
 
     def getForceFeedbackSamplingPeriod(self) -> int:
-        """0: the stand-in measures no force, so nobody has enabled that."""
+        """0: the stand-in measures no force, so that is never enabled."""
         return 0
 
     def getTorqueFeedbackSamplingPeriod(self) -> int:
-        """0: the stand-in measures no torque, so nobody has enabled that."""
+        """0: the stand-in measures no torque, so that is never enabled."""
         return 0
 
     def getTargetPosition(self) -> float:

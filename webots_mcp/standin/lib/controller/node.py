@@ -240,4 +240,4 @@ for _name, _number in CONSTANTS.items():
     setattr(Node, _name, _number)
 
 node_of = Node._of  # pyright: ignore[reportPrivateUsage]
-"""Makes the object for a node that the simulator has told of."""
+"""Makes the object for a node that the simulator has described."""

@@ -176,7 +176,7 @@ class Robot:
     getTouchSensor = _deprecated("getTouchSensor")
 
     def getKeyboard(self) -> Keyboard:
-        """The keyboard, on which nobody types."""
+        """The keyboard, on which no keys are pressed."""
         return self.keyboard
 
     def getNumberOfDevices(self) -> int:
@@ -286,7 +286,7 @@ class Robot:
 def _restore_signals() -> None:
     """Signals end the process at once, without KeyboardInterrupt, `finally` or atexit."""
     numbers = [getattr(signal, name) for name in _DEADLY_SIGNALS if hasattr(signal, name)]
-    if os.name == "posix":  # as in Webots it is C that is told: `signal.getsignal` knows nothing
+    if os.name == "posix":  # as in Webots C's handler is set: `signal.getsignal` knows nothing
         c_signal = ctypes.CDLL(None).signal
         c_signal.argtypes, c_signal.restype = (ctypes.c_int, ctypes.c_void_p), ctypes.c_void_p
         for number in numbers:

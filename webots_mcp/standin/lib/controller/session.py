@@ -1,4 +1,4 @@
-"""The state of the controller library: what it was told, and what it has yet to send."""
+"""The state of the controller library: what it received, and what it has yet to send."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Link(Protocol):
     """A connection to a simulator, through a socket or within one process."""
 
     description: dict[str, Any]
-    """What the simulator told about the robot and its devices."""
+    """The data about the robot and its devices from the simulator."""
 
     def send(self, message: Message) -> None:
         """Send a request."""

@@ -12,8 +12,6 @@ import anyio
 
 import webots_mcp
 from webots_mcp import MemoryDatabase, pytest_plugin, testing
-from webots_mcp.cli import registered
-from webots_mcp.cli.command import Argument
 from webots_mcp.cli.commands import described
 from webots_mcp.connection import connect
 from webots_mcp.schema import create_schema
@@ -82,31 +80,11 @@ def commands(_page: str = "") -> str:
             [[f"`{typed}`", said] for typed, said in each.arguments.items()],
         )
         for name, each in described().items()
-    } | {
-        each.name: (inspect.getdoc(each.run) or "", list(map(_argument, each.arguments)))
-        for each in registered()
     }
     return "## Reference\n\n" + "\n".join(
         f"### {name}\n\n{as_markdown(text)}\n\n{_table(['argument', 'meaning'], rows)}"
         for name, (text, rows) in sorted(shown.items())
     )
-
-
-def _argument(argument: Argument) -> list[str]:
-    flags, options = argument
-    if not flags[0].startswith("-"):
-        return [f"`{argument.value_name}`", _help(options)]
-    value = "" if options.get("action") == "store_true" else f" {_value(argument)}"
-    return [", ".join(f"`{flag}{value}`" for flag in flags), _help(options)]
-
-
-def _value(argument: Argument) -> str:
-    choices = argument.options.get("choices")
-    return "|".join(map(str, choices)) if choices else argument.value_name
-
-
-def _help(options: dict[str, Any]) -> str:
-    return str(options.get("help", "")).replace("%%", "%")
 
 
 def tables(_page: str = "") -> str:

@@ -1,15 +1,13 @@
 """The console commands.
 
-A command is one function under `@command`; what it needs is imported inside it, so that
-`webots-mcp --help` answers at once. Our own errors end it with one line on stderr and exit code 2,
+The commands are a table in `commands`; what one needs is imported inside it, so that each answers
+at once. Our own errors end it with one line on stderr and exit code 2,
 what the system refuses (a full disk) or lacks (a package) with 1, Ctrl-C and SIGTERM with 130, 143.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
-import inspect
 import json
 import os
 import sys
@@ -28,49 +26,22 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 _NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
-_FAMILIES: Final[tuple[str, ...]] = ()
 EXIT_SYSTEM: Final = 1
 EXIT_BAD_INPUT: Final = 2
-_DESCRIPTION: Final = (
-    "Flight recorder and remote control for Webots simulations: controllers record into one "
-    "SQLite database, an AI assistant reads it and steers the simulation over MCP."
-)
-_EPILOG: Final = "'webots-mcp COMMAND --help' explains a command. Try 'webots-mcp demo' first."
-
-
-def registered() -> list[Any]:
-    """The commands that register themselves."""
-    import importlib
-
-    from webots_mcp.cli.command import COMMANDS
-    from webots_mcp.plugins import command_modules
-
-    for name in _FAMILIES:
-        importlib.import_module(f"webots_mcp.cli.{name}")
-    list(command_modules())
-    return COMMANDS
 
 
 def names() -> list[str]:
     """Of all commands."""
     from webots_mcp.cli import commands
 
-    return sorted({*commands.COMMANDS, *(each.name for each in registered())})
+    return sorted(commands.COMMANDS)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     given = list(sys.argv[1:] if argv is None else argv)
     try:
-        if found := _run(given):
-            return found[0]
-        with ending_by_signals():
-            arguments = _parser(given).parse_args(argv)
-            speak_of(arguments.arguments)
-            with spelling_out():
-                code = arguments.run(arguments) or 0
-                sys.stdout.flush()
-            return code
+        return _run(given)
     except WebotsMCPError as error:
         answer = getattr(error, "answer", {})
         return _fail(EXIT_BAD_INPUT, as_typed(str(error)), given, answer)
@@ -95,24 +66,19 @@ def is_declared(name: str) -> bool:
     return name in COMMANDS
 
 
-def _run(argv: Sequence[str]) -> tuple[int] | None:
-    """Call the command that was given; None where it is none of `commands`."""
+def _run(argv: Sequence[str]) -> int:
+    """Call the command that was given; without one, show which there are."""
     from cyclopts import CycloptsError, UnusedCliTokensError
 
     from webots_mcp.cli.commands import COMMANDS, app_for, called_value
 
-    if not argv or argv[0] not in COMMANDS:
-        return None
     app = app_for(argv)
-    speak_of(
-        Typed(
-            each.field_info.name,
-            each.names[0],
-            called_value(each),
+    if argv and argv[0] in COMMANDS:
+        speak_of(
+            Typed(each.field_info.name, each.names[0], called_value(each))
+            for each in app[argv[0]].assemble_argument_collection()
+            if each.names
         )
-        for each in app[argv[0]].assemble_argument_collection()
-        if each.names
-    )
     is_help = not {"--help", "-h"}.isdisjoint(argv)  # nothing of a recording, and may have colours
     with ending_by_signals(), contextlib.nullcontext() if is_help else spelling_out():
         try:
@@ -123,7 +89,7 @@ def _run(argv: Sequence[str]) -> tuple[int] | None:
         except CycloptsError as error:
             raise InvalidInputError(_named(error)) from error
         sys.stdout.flush()
-    return (code or 0,)
+    return code or (0 if argv else EXIT_BAD_INPUT)
 
 
 def _named(error: CycloptsError) -> str:
@@ -164,58 +130,3 @@ def _explain_missing(error: ModuleNotFoundError) -> str:
 
 def _discard_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
-    from webots_mcp import __version__
-
-    parser = argparse.ArgumentParser("webots-mcp", description=_DESCRIPTION, epilog=_EPILOG)
-    parser.add_argument("--version", action="version", version=f"webots-mcp {__version__}")
-    subparsers = parser.add_subparsers(
-        metavar="COMMAND", required=True, parser_class=_AnyOrderParser
-    )
-    if not given or given[0] not in {
-        each.name for each in registered()
-    }:  # for the list of commands
-        from webots_mcp.cli.commands import COMMANDS as DECLARED
-
-        for name, command in DECLARED.items():
-            text = inspect.getdoc(command.load()) or ""
-            subparsers.add_parser(name, help=text.partition("\n")[0].rstrip("."))
-    for name, run, arguments in sorted(registered()):
-        text = run.__doc__ or ""
-        subparser = subparsers.add_parser(
-            name,
-            help=text.partition("\n")[0].rstrip("."),
-            description=inspect.cleandoc(text),
-            formatter_class=_Paragraphs,
-        )
-        subparser.set_defaults(run=run, arguments=arguments)
-        for flags, options in arguments:
-            subparser.add_argument(*flags, **options)
-    return parser
-
-
-class _AnyOrderParser(argparse.ArgumentParser):
-    """Takes options between arguments too: `send aim --robot rover angle=1`."""
-
-    _options_first = False
-
-    def parse_known_args(self, *args: Any, **options: Any) -> Any:
-        """Read the options, then the arguments, which `argparse` by itself takes in one piece."""
-        if self._options_first:
-            return super().parse_known_args(*args, **options)
-        self._options_first = True
-        try:
-            return self.parse_known_intermixed_args(*args, **options)
-        finally:
-            self._options_first = False
-
-
-class _Paragraphs(argparse.HelpFormatter):
-    """Fills each paragraph by itself; an indented one is a command to copy, and stays as it is."""
-
-    def _fill_text(self, text: str, width: int, indent: str) -> str:
-        fill = super()._fill_text
-        paragraphs = text.split("\n\n")
-        return "\n\n".join(p if p.startswith(" ") else fill(p, width, indent) for p in paragraphs)

@@ -10,10 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Final, NamedTuple
-
-if TYPE_CHECKING:
-    from webots_mcp.cli.command import Argument
+from typing import Final, NamedTuple
 
 _UNQUOTED: Final = r"(?<![\w'\".-])"  # a quoted name is somebody's data
 _NOT_ON: Final = r"(?![\w'\"])"
@@ -47,10 +44,10 @@ BY_TOOL: Final = {  # by tool
 _TOOL: Final = re.compile(
     r"webots_(?P<tool>\w+)(?:\(what=.(?P<what>\w+).(?:, \w+=(?P<id>\d+))?\))?"
 )
-_running: ContextVar[tuple[Argument | Typed, ...]] = ContextVar("running", default=())
+_running: ContextVar[tuple[Typed, ...]] = ContextVar("running", default=())
 
 
-def speak_of(arguments: Iterable[Argument | Typed]) -> None:
+def speak_of(arguments: Iterable[Typed]) -> None:
     """Let `as_typed` speak of these arguments: those of the command that runs."""
     _running.set(tuple(arguments))
 

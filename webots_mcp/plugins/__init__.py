@@ -69,7 +69,6 @@ class Plugin(NamedTuple):
 
     Attributes:
         commands: For the command line.
-        command_modules: Modules that register commands (`cli.command`).
         questions: Modules that declare questions (`questions.declaring`), which are MCP tools.
         formats: Of exports.
         cluster: Where else trials can run.
@@ -78,7 +77,6 @@ class Plugin(NamedTuple):
     """
 
     commands: tuple[PluginCommand, ...] = ()
-    command_modules: tuple[str, ...] = ()
     questions: tuple[str, ...] = ()
     formats: tuple[ExportFormat, ...] = ()
     cluster: Cluster | None = None
@@ -100,11 +98,6 @@ def load(name: str) -> Any:
 def plugin_commands() -> tuple[PluginCommand, ...]:
     """The commands of all plugins."""
     return tuple(each for plugin in plugins() for each in plugin.commands)
-
-
-def command_modules() -> Iterator[ModuleType]:
-    """Import the plugins' commands, which registers them."""
-    return (import_module(name) for plugin in plugins() for name in plugin.command_modules)
 
 
 def question_modules() -> Iterator[ModuleType]:

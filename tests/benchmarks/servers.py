@@ -14,7 +14,7 @@ from mcp import Client, StdioServerParameters
 from tests.benchmarks.processes import environment
 
 _LOOK_INTERVAL_S: Final = 1.0
-_LOOK: Final = {"robot": "rover 0", "lookback_s": 60}
+_LOOK: Final = {"robot": "rover 0", "lookback_wall_s": 60}
 
 
 def our_server(database: Path) -> StdioServerParameters:

@@ -109,7 +109,7 @@ def test_serving_ends_at_sigterm_with_a_word(folder: Path) -> None:
 
 
 def test_serving_ends_without_a_word_when_its_client_is_gone(folder: Path) -> None:
-    ask = {"name": "webots_monitor", "arguments": {"duration_s": 90}}
+    ask = {"name": "webots_monitor", "arguments": {"duration_wall_s": 90}}
     call = {"jsonrpc": "2.0", "id": 2, "method": "tools/call", "params": ask}
     with run("serve", "--data-dir", str(folder)) as process:
         assert process.stdin is not None

@@ -61,7 +61,7 @@ def test_a_hint_names_what_can_be_typed(data_dir: Path, capsys: pytest.CaptureFi
 def test_a_hint_names_commands_instead_of_tools() -> None:
     app_for(["send"])
     waits = 'webots_list_commands(what="outcome", command_id=7)'
-    hint = f"wait for it with {waits}, or ask with a longer timeout_s"
+    hint = f"wait for it with {waits}, or ask with a longer timeout_wall_s"
     assert as_typed(hint) == "wait for it with 'webots-mcp wait 7', or ask with a longer --timeout"
     assert as_typed("webots_list_commands has it") == "'webots-mcp commands' has it"
 

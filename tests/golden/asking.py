@@ -55,7 +55,7 @@ TOOLS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     "a part of the full state": ("webots_get_full_state", {"path": "pose"}),
     "newest logs": ("webots_get_logs", {}),
     "warnings": ("webots_get_logs", {"level": "warning", "lines": 5}),
-    "what just happened": ("webots_monitor", {"lookback_s": 60}),
+    "what just happened": ("webots_monitor", {"lookback_wall_s": 60}),
     "signals": ("webots_list_signals", {}),
     "signals of a pattern": ("webots_list_signals", {"pattern": "pose*"}),
     "history": ("webots_query_history", {"signals": ["*"], "max_points": 6}),

@@ -63,7 +63,7 @@ READING: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
     ("webots_get_camera", {}),
     ("webots_get_camera", {"at_s": 1.0}),
     ("webots_get_logs", {}),
-    ("webots_monitor", {"lookback_s": 3600}),
+    ("webots_monitor", {"lookback_wall_s": 3600}),
     ("webots_list_commands", {}),
     ("webots_get_parameters", {}),
     ("webots_list_signals", {}),
@@ -84,8 +84,8 @@ DRAWING: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
 )
 ACTING: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
     ("webots_annotate_run", {"note": "x"}),
-    ("webots_send_command", {"action": "dance", "timeout_s": 0.1}),
-    ("webots_simulation_control", {"command": "pause", "timeout_s": 0.1}),
+    ("webots_send_command", {"action": "dance", "timeout_wall_s": 0.1}),
+    ("webots_simulation_control", {"command": "pause", "timeout_wall_s": 0.1}),
 )
 _ACTED_ON: Final = ("robot", "session", "run", "command")
 _DRAWN: Final = ("state", "rollup", "run", "signal", "change")

@@ -48,8 +48,8 @@ DEFAULTS: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
     ("webots_get_trends", {}),
     ("webots_find_events", {}),
     ("webots_get_timeline", {}),
-    ("webots_monitor", {"lookback_s": 10}),
-    ("webots_monitor", {"lookback_s": 3600}),
+    ("webots_monitor", {"lookback_wall_s": 10}),
+    ("webots_monitor", {"lookback_wall_s": 3600}),
     ("webots_list_runs", {}),
     ("webots_compare_runs", {"run_ids": [1, 2]}),
     ("webots_plot", {}),
@@ -97,7 +97,7 @@ async def test_robots_that_do_the_same_again_and_again_are_told_in_1500_tokens(
             ("webots_find_events", {"kinds": ["still", "change", "command"]}),
             ("webots_find_events", {"kinds": ["still"], "group": False}),
             ("webots_get_timeline", {}),
-            ("webots_monitor", {"lookback_s": 900}),
+            ("webots_monitor", {"lookback_wall_s": 900}),
         ):
             result = await client.call_tool(tool, {"robot": "rover0", **arguments})
             assert not result.is_error, (tool, text_of(result))
@@ -200,7 +200,7 @@ def wide(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("webots_get_trends", {"robot": "rover"}, "of 399 numbers"),
         ("webots_find_events", {"robot": "rover"}, ""),
         ("webots_get_timeline", {"robot": "rover"}, ""),
-        ("webots_monitor", {"robot": "rover", "lookback_s": 60}, "of 399 numbers"),
+        ("webots_monitor", {"robot": "rover", "lookback_wall_s": 60}, "of 399 numbers"),
         ("webots_query_sql", {"sql": "SELECT * FROM state"}, "long values are cut"),
         (
             "webots_query_sql",

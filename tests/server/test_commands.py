@@ -102,7 +102,7 @@ async def test_a_failure_is_an_error_whose_words_stay_in_a_data_field(
         ({"last_poll_wall_time_s": None}, "never calls bridge.get_command()"),
         ({"last_poll_wall_time_s": time.time() - 60}, "last called bridge.get_command()"),
         ({"last_seen_wall_time_s": time.time() - 2.5}, "press play in Webots"),
-        ({}, "longer timeout_s"),
+        ({}, "longer timeout_wall_s"),
     ],
     ids=["never polls", "stopped polling", "silent", "busy"],
 )
@@ -111,7 +111,7 @@ async def test_what_nobody_claims_is_taken_back_and_the_reason_told(
 ) -> None:
     robot = recorded.robot(**session)
     async with connect() as client:
-        text = await fail(client, "webots_simulation_control", command="pause", timeout_s=0.2)
+        text = await fail(client, "webots_simulation_control", command="pause", timeout_wall_s=0.2)
     answer = json.loads(text)
     assert answer["outcome"] == "cancelled"
     assert "will not run" in answer["error"]
@@ -136,7 +136,7 @@ async def test_a_robot_whose_world_is_being_reloaded_is_waited_for(
 ) -> None:
     recorded.robot(ended_wall_time_s=time.time(), end_reason="reload")
     async with connect() as client:
-        text = await fail(client, "webots_send_command", action="go", timeout_s=0.2)
+        text = await fail(client, "webots_send_command", action="go", timeout_wall_s=0.2)
     assert json.loads(text)["outcome"] == "cancelled"
 
 
@@ -217,7 +217,7 @@ async def test_a_command_behind_a_handler_that_is_at_work_is_told_which(
     slow = CommandQueue(recorded.connection).enqueue(robot.id, "slow")
     assert claim(recorded.connection, robot.id, robot.session_id) == [slow.id]
     async with connect() as client:
-        text = await fail(client, "webots_send_command", action="go", timeout_s=0.2)
+        text = await fail(client, "webots_send_command", action="go", timeout_wall_s=0.2)
     answer = json.loads(text)
     assert f"inside the handler of command {slow.id} (slow)" in answer["why"]
     assert "until that handler has returned" in answer["hint"]
@@ -228,7 +228,7 @@ async def test_what_is_under_way_at_the_deadline_is_left_alone(
 ) -> None:
     controller(None)
     async with connect() as client:
-        answer = await ask(client, "webots_send_command", action="go", timeout_s=0.5)
+        answer = await ask(client, "webots_send_command", action="go", timeout_wall_s=0.5)
     assert answer["outcome"] == "claimed"
     assert "do not send it again" in answer["hint"]
     assert fetch_command(recorded.connection, answer["command_id"]).status == "claimed"
@@ -272,7 +272,7 @@ async def test_waiting_reports_progress_every_second(connect: Connect, recorded:
         messages.append(message or "")
 
     async with connect() as client:
-        arguments = {"action": "go", "timeout_s": 2.5}
+        arguments = {"action": "go", "timeout_wall_s": 2.5}
         await client.call_tool("webots_send_command", arguments, progress_callback=on_progress)
     assert messages == [f"go: waiting for the controller for {n} s" for n in (1, 2)]
 

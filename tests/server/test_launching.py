@@ -82,7 +82,7 @@ async def test_a_world_is_started_changed_and_ended(begin: Begin, project: Path)
         text = await fail(client, "webots_launch_world", world="field.wbt")
         assert "still running with arena.wbt: action=load opens another world in it" in text
 
-        loaded = await ask(client, "webots_load_world", world="field.wbt", timeout_s=60)
+        loaded = await ask(client, "webots_load_world", world="field.wbt", timeout_wall_s=60)
         assert (loaded["outcome"], loaded["route"]) == ("done", "bridge")
         assert loaded["run_id"] > answer["run_id"]
         assert loaded["proof"] == (
@@ -106,7 +106,7 @@ async def test_webots_ends_with_the_server_that_started_it(begin: Begin) -> None
 
 async def test_where_nobody_records_the_answer_comes_in_time_and_says_why(begin: Begin) -> None:
     async with begin("from controller import Robot\nRobot().step(16)\n") as client:
-        answer = await ask(client, "webots_launch_world", world="arena.wbt", timeout_s=4)
+        answer = await ask(client, "webots_launch_world", world="arena.wbt", timeout_wall_s=4)
         assert answer["outcome"] == "claimed"
         assert "without a bridge: rover (attach one: webots-mcp init --patch" in answer["hint"]
         assert "run_id" not in answer
@@ -119,13 +119,13 @@ async def test_a_start_in_pause_says_how_to_go_on_also_beside_robots_of_the_past
 ) -> None:
     async with begin() as client:
         _two_robots_of_the_past(project / "mcp_data")
-        start = {"world": "arena.wbt", "mode": "pause", "timeout_s": 2}
+        start = {"world": "arena.wbt", "mode": "pause", "timeout_wall_s": 2}
         alone = await ask(client, "webots_launch_world", **start)
         assert "quit it and start it in another mode or with stream" in alone["hint"]
         await ask(client, "webots_quit")
         answer = await ask(client, "webots_launch_world", **start, stream=True)
         assert answer["hint"].endswith('. webots_simulation_control("resume") plays it')
-        played = await ask(client, "webots_simulation_control", command="resume", timeout_s=30)
+        played = await ask(client, "webots_simulation_control", command="resume", timeout_wall_s=30)
         assert (played["outcome"], played["route"]) == ("done", "websocket")
 
 
@@ -184,7 +184,7 @@ async def test_a_robot_that_is_no_supervisor_has_another_world_by_webots_itself(
 ) -> None:
     async with begin(PLAIN) as client:
         first = await ask(client, "webots_launch_world", world="arena.wbt", stream=True)
-        loaded = await ask(client, "webots_load_world", world="field.wbt", timeout_s=60)
+        loaded = await ask(client, "webots_load_world", world="field.wbt", timeout_wall_s=60)
         assert loaded["route"] == "websocket"
         assert loaded["proof"].startswith("Webots replied 'delete world'; run ")
         assert loaded["proof"].endswith(" of rover began in field.wbt")
@@ -227,7 +227,7 @@ async def test_an_observer_opens_another_world_for_a_robot_that_is_no_supervisor
             while len((await ask(client, "webots_list_robots"))["robots"]["rows"]) < 2:
                 await anyio.sleep(0.05)
         loaded = await ask(
-            client, "webots_load_world", world="field.wbt", robot="rover", timeout_s=60
+            client, "webots_load_world", world="field.wbt", robot="rover", timeout_wall_s=60
         )
         assert (loaded["route"], loaded["outcome"]) == ("observer", "done")
         assert "its controller has ended; run " in loaded["proof"]
@@ -251,7 +251,7 @@ async def test_a_webots_that_somebody_else_started_is_ended_by_a_supervisor_alon
             assert "bridge: quit needs a Supervisor" in text and "(Ctrl+Q)" in text
             assert process.poll() is None
             return
-        answer = await ask(client, "webots_quit", timeout_s=60)
+        answer = await ask(client, "webots_quit", timeout_wall_s=60)
         assert (answer["outcome"], answer["route"]) == ("done", "bridge")
         assert answer["proof"] == f"no Webots listens at port {port} any more"
     assert process.wait(30) == 0

@@ -146,7 +146,7 @@ async def test_a_controller_that_hangs_is_told_from_a_pause_and_ended_by_a_reloa
         assert "computes" in simulation["seen"]
         assert "rover" in simulation["seen"]
         answer = await ask(
-            client, "webots_simulation_control", command="reload", robot="rover", timeout_s=60
+            client, "webots_simulation_control", command="reload", robot="rover", timeout_wall_s=60
         )
         assert (answer["outcome"], answer["route"]) == ("done", "observer")
 

@@ -52,7 +52,7 @@ async def test_a_person_who_pauses_in_webots_is_one_of_the_reasons_told(
     async with Client(create_server(data_dir / "webots.db", data_dir)) as client:
         simulation.pause()
         await _until_nothing_comes(filed)
-        text = await fail(client, "webots_simulation_control", command="resume", timeout_s=3)
+        text = await fail(client, "webots_simulation_control", command="resume", timeout_wall_s=3)
         answer = json.loads(text)
         assert answer["outcome"] == "cancelled"
         assert "paused by hand in Webots" in answer["why"]

@@ -72,13 +72,13 @@ async def test_a_robot_that_is_no_supervisor_is_steered_by_webots_itself(in_proj
         assert (paused["outcome"], paused["route"]) == ("done", "websocket")
         assert paused["proof"] == "Webots replied 'paused by client'"
         assert wait_for_line(process, "pause") == "pause\n"
-        stepped = await control(client, "step", steps=3, timeout_s=30)
+        stepped = await control(client, "step", steps=3, timeout_wall_s=30)
         assert stepped["proof"].startswith("Webots made 3 of 3 basic time steps; ")
-        resumed = await control(client, "resume", timeout_s=30)
+        resumed = await control(client, "resume", timeout_wall_s=30)
         assert resumed["proof"].startswith(
             "Webots replied 'real-time'; simulation time advanced to "
         )
-        fast = await control(client, "fast", timeout_s=30)
+        fast = await control(client, "fast", timeout_wall_s=30)
         assert fast["proof"].startswith("Webots replied 'fast'; simulation time advanced")
 
 
@@ -87,12 +87,12 @@ async def test_a_controller_that_hangs_is_freed_by_a_reload_of_webots(in_project
     async with client:
         state = await ask(client, "webots_get_robot_state")
         await _until_its_loop_is_silent(client)
-        answer = await control(client, "reload", timeout_s=60)
+        answer = await control(client, "reload", timeout_wall_s=60)
         assert (answer["outcome"], answer["route"]) == ("done", "websocket")
         assert answer["proof"].endswith(f"run {answer['run_id']} began")
         assert answer["run_id"] > state["run_id"]
         await _until_its_loop_is_silent(client)
-        again = await ask(client, "webots_world_reset", timeout_s=60)
+        again = await ask(client, "webots_world_reset", timeout_wall_s=60)
         assert again["proof"].endswith(f"run {again['run_id']} began")
         assert again["run_id"] > answer["run_id"]
 
@@ -118,7 +118,7 @@ async def test_a_loop_that_turns_is_asked_itself(in_project: Any) -> None:
 async def test_without_stream_each_way_says_why_it_does_not_work(in_project: Any) -> None:
     _, client = in_project(PLAIN)
     async with client:
-        text = await fail(client, "webots_simulation_control", command="resume", timeout_s=5)
+        text = await fail(client, "webots_simulation_control", command="resume", timeout_wall_s=5)
     assert "bridge: resume needs a Supervisor" in text
     assert "websocket: Webots at 127.0.0.1:" in text
     assert "was started without --stream" in text
@@ -172,7 +172,7 @@ async def test_a_webots_that_took_the_port_of_a_session_that_is_over_is_not_take
     robot = recorded.robot(instance=f"{host_name()}:{port}")
     robot.beat(ended_wall_time_s=robot.now, end_reason="finished")
     async with connect() as client:
-        text = await fail(client, "webots_simulation_control", command="pause", timeout_s=5)
+        text = await fail(client, "webots_simulation_control", command="pause", timeout_wall_s=5)
     assert "is not of this recording's project" in text
 
 
@@ -203,7 +203,7 @@ async def test_a_reset_that_webots_says_nothing_of_is_proven_by_the_run_that_beg
             "UPDATE session SET instance = ?", (f"{host_name()}:{server.port}",)
         )
         async with connect() as client:
-            answer = await ask(client, "webots_world_reset", timeout_s=20)
+            answer = await ask(client, "webots_world_reset", timeout_wall_s=20)
     assert (answer["route"], answer["proof"]) == ("websocket", "run 2 began")
 
 
@@ -218,7 +218,7 @@ async def test_forced_keys_without_a_window_say_so(
             "UPDATE session SET instance = ?", (f"{host_name()}:{server.port}",)
         )
         async with connect() as client:
-            text = await fail(client, "webots_world_reset", force=True, timeout_s=1)
+            text = await fail(client, "webots_world_reset", force=True, timeout_wall_s=1)
     assert "keyboard: no Webots of this machine listens at" in text
     assert json.dumps(text).count("keyboard: ") == 1
 
@@ -233,5 +233,5 @@ async def test_a_webots_of_another_machine_is_not_taken_for_one_here_on_the_same
     recorded.robot(supervisor=False)
     recorded.connection.execute("UPDATE session SET instance = ?", (f"127.0.0.2:{port}",))
     async with connect() as client:
-        text = await fail(client, "webots_world_reset", force=True, timeout_s=1)
+        text = await fail(client, "webots_world_reset", force=True, timeout_wall_s=1)
     assert f"keyboard: no Webots of this machine listens at 127.0.0.2:{port}" in text

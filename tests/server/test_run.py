@@ -61,14 +61,14 @@ async def test_out_of_wall_time_it_goes_on_and_a_second_call_gives_the_same_answ
     connect: Connect, driver: Driver
 ) -> None:
     async with connect() as client:
-        first = await ask(client, "webots_run", for_s=1.2, pace="as_it_is", timeout_s=0.3)
+        first = await ask(client, "webots_run", for_s=1.2, pace="as_it_is", timeout_wall_s=0.3)
         assert (first["outcome"], first["stopped"]) == ("claimed", "out of wall time")
         number = first["command_id"]
         (sent,) = rows_of((await ask(client, "webots_list_commands"))["commands"])
         assert "pace" not in sent["params"], "no mode is set where it goes on as it runs"
         assert f"command_id={number}" in first["hint"]
         assert 0 <= first["ran"]["advanced_s"] < 1.2
-        then = await ask(client, "webots_wait_for_command", command_id=number, timeout_s=30)
+        then = await ask(client, "webots_wait_for_command", command_id=number, timeout_wall_s=30)
         assert then["stopped"] == "time over"
         assert then["ran"]["advanced_s"] == pytest.approx(1.2)
         assert then["state"]
@@ -256,7 +256,7 @@ async def test_a_run_that_ended_before_its_row_was_written_is_told_of_all_the_sa
 
 async def test_two_at_once_are_refused(connect: Connect, driver: Driver) -> None:
     async with connect() as client:
-        first = await ask(client, "webots_run", until="steps < 0", then="go_on", timeout_s=0.3)
+        first = await ask(client, "webots_run", until="steps < 0", then="go_on", timeout_wall_s=0.3)
         said = await fail(client, "webots_run", for_s=1)
         assert f"command {first['command_id']} (run) is still running" in said
         await paused(client)

@@ -126,7 +126,7 @@ async def test_watching_reports_what_was_recorded_meanwhile(
     answer: dict[str, Any] = {}
     async with connect() as client, anyio.create_task_group() as tasks:
         tasks.start_soon(_steer, client, driver)
-        arguments = {"duration_s": 2}
+        arguments = {"duration_wall_s": 2}
         watch = client.call_tool("webots_monitor", arguments, progress_callback=on_progress)
         answer |= json.loads(text_of(await watch))
     assert answer["rows"] > 10
@@ -161,7 +161,7 @@ async def test_watching_a_paused_robot_says_that_nothing_was_recorded_and_why(
 ) -> None:
     async with connect() as client:
         await control(client, "pause")
-        answer = await ask(client, "webots_monitor", duration_s=1)
+        answer = await ask(client, "webots_monitor", duration_wall_s=1)
         assert answer["rows"] == 0
         assert "paused" in answer["hint"]
         assert driver.is_alive()

@@ -52,7 +52,7 @@ ACTING = {
     "webots_edit_scene",
     "webots_launch_world",
 }
-SHARED = ("robot", "run_id", "last_s", "start_s", "end_s", "timeout_s", "cursor")
+SHARED = ("robot", "run_id", "last_s", "start_s", "end_s", "timeout_wall_s", "cursor")
 
 
 def serve(file: Path, *options: str) -> StdioServerParameters:
@@ -201,7 +201,7 @@ async def test_arguments_out_of_bounds_are_refused_with_the_bound(connect: Conne
     async with connect() as client:
         for tool, arguments in [
             ("webots_get_logs", {"lines": 0}),
-            ("webots_monitor", {"duration_s": 500}),
+            ("webots_monitor", {"duration_wall_s": 500}),
             ("webots_simulation_control", {"command": "fly"}),
             ("webots_simulation_control", {"command": "step", "steps": 10**9}),
         ]:

@@ -40,7 +40,7 @@ def claim_soon(file: Path, robot: RecordedRobot) -> threading.Thread:
 async def under_way(client: Client, file: Path, robot: RecordedRobot) -> int:
     """The id of a command that is still at it when its call is answered."""
     thread = claim_soon(file, robot)
-    answer = await ask(client, "webots_send_command", action="go", timeout_s=0.5)
+    answer = await ask(client, "webots_send_command", action="go", timeout_wall_s=0.5)
     thread.join()
     assert answer["outcome"] == "claimed"
     assert 'webots_list_commands(what="outcome", command_id=' in answer["hint"]
@@ -54,7 +54,9 @@ async def test_a_second_call_goes_on_waiting_for_what_is_under_way(
     robot = recorded.robot()
     async with connect() as client:
         command_id = await under_way(client, file, robot)
-        again = await ask(client, "webots_wait_for_command", command_id=command_id, timeout_s=0.2)
+        again = await ask(
+            client, "webots_wait_for_command", command_id=command_id, timeout_wall_s=0.2
+        )
         assert (again["outcome"], again["command_id"]) == ("claimed", command_id)
         recorded.connection.execute("UPDATE command SET status = 'done', result = '{\"way_m\": 2}'")
         done = await ask(client, "webots_wait_for_command", command_id=command_id)
@@ -70,7 +72,7 @@ async def test_what_only_waited_takes_nothing_back(connect: Connect, recorded: R
         (robot.id,),
     )
     async with connect() as client:
-        answer = await ask(client, "webots_wait_for_command", command_id=1, timeout_s=0.2)
+        answer = await ask(client, "webots_wait_for_command", command_id=1, timeout_wall_s=0.2)
         assert answer["outcome"] == "pending"
     assert recorded.connection.execute("SELECT status FROM command").fetchone() == ("pending",)
 
@@ -89,7 +91,7 @@ async def test_no_call_waits_longer_than_clients_do(
 ) -> None:
     recorded.robot()
     async with connect() as client:
-        assert "90" in await fail(client, tool, **arguments, timeout_s=101)
+        assert "90" in await fail(client, tool, **arguments, timeout_wall_s=101)
 
 
 async def test_no_tool_may_be_asked_to_wait_for_longer(connect: Connect) -> None:
@@ -99,7 +101,7 @@ async def test_no_tool_may_be_asked_to_wait_for_longer(connect: Connect) -> None
         f"{tool.name} {name}": options.get("maximum")
         for tool in tools
         for name, options in tool.input_schema["properties"].items()
-        if name in ("timeout_s", "duration_s")
+        if name in ("timeout_wall_s", "duration_wall_s")
     }
     assert len(waits) > 10
     assert {name: longest for name, longest in waits.items() if longest != 90} == {}
@@ -112,14 +114,17 @@ async def test_a_command_whose_asker_went_away_says_that_it_goes_on(
     async with connect() as client:
         claiming = claim_soon(file, robot)
         with anyio.move_on_after(1):
-            await client.call_tool("webots_send_command", {"action": "go", "timeout_s": 60})
+            await client.call_tool("webots_send_command", {"action": "go", "timeout_wall_s": 60})
         claiming.join()
         with anyio.fail_after(60):
             while True:
                 (row,) = rows_of((await ask(client, "webots_list_commands"))["commands"])
                 if row.get("error"):
                     break
-        assert (row["outcome"], row["error"]) == ("claimed", "the client disconnected; the command continues")
+        assert (row["outcome"], row["error"]) == (
+            "claimed",
+            "the client disconnected; the command continues",
+        )
 
 
 async def test_resume_and_reset_say_at_which_pace_it_goes_on_and_why(

@@ -33,7 +33,7 @@ async def test_a_way_there_and_back_has_a_distance_and_no_displacement(
 ) -> None:
     drive(rover, [0, 0], [3, 4], [0, 0])
     async with connect() as client:
-        answer = await ask(client, "webots_monitor", lookback_s=60)
+        answer = await ask(client, "webots_monitor", lookback_wall_s=60)
     assert answer["movement"]["distance_m"] == 10.0
     assert answer["movement"]["displacement_m"] == 0.0
     assert answer["rows"] == 3
@@ -44,7 +44,7 @@ async def test_a_way_in_metres_that_no_robot_drives_is_doubted(
 ) -> None:
     drive(rover, [0, 0], [300, 400], [0, 0])
     async with connect() as client:
-        answer = await ask(client, "webots_monitor", lookback_s=60)
+        answer = await ask(client, "webots_monitor", lookback_wall_s=60)
     assert answer["movement"]["distance_m"] == 1000.0
     assert "pose.0 is taken as metres" in answer["movement"]["unit"]
 
@@ -55,7 +55,7 @@ async def test_a_slow_way_under_noise_is_told_with_how_much_longer_it_may_be(
     noise = np.random.default_rng(1).normal(0, 0.03, (60, 2)).tolist()
     drive(rover, *([0.015 * step + x, y] for step, (x, y) in enumerate(noise)))
     async with connect() as client:
-        answer = await ask(client, "webots_monitor", lookback_s=60)
+        answer = await ask(client, "webots_monitor", lookback_wall_s=60)
     assert answer["movement"]["distance_m"] < 1.0
     assert "the path may be up to" in answer["movement"]["distance_note"]
 
@@ -65,7 +65,7 @@ async def test_a_lost_position_does_not_count_as_a_way(
 ) -> None:
     drive(rover, [0, 0], [None, 1], [0, 1])
     async with connect() as client:
-        answer = await ask(client, "webots_monitor", lookback_s=60)
+        answer = await ask(client, "webots_monitor", lookback_wall_s=60)
     assert answer["movement"]["distance_m"] == 1.0
 
 
@@ -75,7 +75,7 @@ async def test_a_robot_without_a_position_has_no_movement(
     rover.state(0.0, {"joints": [1, 2]})
     rover.state(1.0, {"joints": [3, 4]}, at=rover.now + 1)
     async with connect() as client:
-        answer = await ask(client, "webots_monitor", lookback_s=60)
+        answer = await ask(client, "webots_monitor", lookback_wall_s=60)
     assert "movement" not in answer
     assert answer["rows"] == 2
 
@@ -86,7 +86,7 @@ async def test_rows_before_the_window_do_not_count_even_at_the_same_simulation_t
     for second in range(10):
         rover.state(5.0, {"count": second}, at=rover.now + second)
     async with connect() as client:
-        answer = await ask(client, "webots_monitor", lookback_s=3)
+        answer = await ask(client, "webots_monitor", lookback_wall_s=3)
     (trend,) = answer["trends"]
     (count,) = rows_of(trend["numbers"])
     assert answer["rows"] == 4
@@ -99,7 +99,7 @@ async def test_what_was_logged_after_the_last_row_is_told(
     rover.state(1.0, {"x": 1})
     rover.log(2.0, "the arm is blocked", level="error")
     async with connect() as client:
-        answer = await ask(client, "webots_monitor", lookback_s=5)
+        answer = await ask(client, "webots_monitor", lookback_wall_s=5)
     (event,) = [row for row in rows_of(answer["events"]) if row["kind"] == "log"]
     assert event["details"]["message"] == "the arm is blocked"
 
@@ -112,7 +112,7 @@ async def test_what_began_before_the_window_and_goes_on_is_told_with_its_begin(
         state = {"pose": [x, 0.0], "commanded_m_s": 1.0}
         rover.state(step * 0.1, state, at=rover.now + step * 0.1)
     async with connect() as client:
-        answer = await ask(client, "webots_monitor", lookback_s=4)
+        answer = await ask(client, "webots_monitor", lookback_wall_s=4)
     (stuck,) = [row for row in rows_of(answer["events"]) if row["kind"] == "stuck"]
     assert (stuck["start_s"], stuck["duration_s"]) == (pytest.approx(5.0, abs=0.2), 14.9)
     assert stuck["ongoing"]
@@ -126,7 +126,7 @@ async def test_over_a_reset_the_movement_is_told_run_by_run(
     rover.begin_run("reset")
     drive(rover, [0, 0], [0, 1])
     async with connect() as client:
-        answer = await ask(client, "webots_monitor", lookback_s=60)
+        answer = await ask(client, "webots_monitor", lookback_wall_s=60)
     first, second = answer["movement"]["runs"]
     assert (first["to_m"], first["distance_m"], first["displacement_m"]) == ([3, 4], 5.0, 5.0)
     assert (second["to_m"], second["distance_m"], second["displacement_m"]) == ([0, 1], 1.0, 1.0)
@@ -170,7 +170,7 @@ async def test_a_robot_that_ended_is_not_waited_for_and_nothing_is_absent(
         rover.state(step * 0.5, {"pose": [step, 0]}, at=rover.now - 5 + step)
     recorded.connection.execute("UPDATE session SET ended_wall_time_s = last_seen_wall_time_s")
     async with connect() as client:
-        answer = await ask(client, "webots_monitor", duration_s=60)
+        answer = await ask(client, "webots_monitor", duration_wall_s=60)
     assert (answer["rows"], answer["window_s"] < 30) == (0, True)
     (kinds,) = (k for k, why in answer["verdicts"]["not_searched"].items() if "no row" in why)
     assert {"gap", "silent", "flat", "jump", "still", "stuck"} <= set(kinds.split(", "))

@@ -212,7 +212,7 @@ async def test_who_handed_them_out_may_be_ended_and_an_assistant_goes_on_and_can
     found(lambda: any(each.recording for each in dask_cluster.workers))
     async with Client(create_server(data_dir / "webots.db", data_dir)) as client:
         assert (await ask(client, "webots_get_trials"))["state"] == "under way"
-        await ask(client, "webots_run_trials", trial_set=1, cancel=True, timeout_s=60)
+        await ask(client, "webots_run_trials", trial_set=1, cancel=True, timeout_wall_s=60)
         _, said = await to_thread.run_sync(process.communicate)
         assert said.endswith("webots-mcp: trial set 1 stopped: it was cancelled\n")
         left = await ask(client, "webots_get_trials")
@@ -221,7 +221,7 @@ async def test_who_handed_them_out_may_be_ended_and_an_assistant_goes_on_and_can
         )
 
         release.touch()
-        again: dict[str, Any] = {"trial_set": 1, "scheduler": address, "timeout_s": 90}
+        again: dict[str, Any] = {"trial_set": 1, "scheduler": address, "timeout_wall_s": 90}
         refused = await fail(client, "webots_run_trials", **again)
         assert f"scheduler '{address}' is not allowed, none is" in refused
         monkeypatch.setenv("DASK_SCHEDULER_ADDRESS", address)

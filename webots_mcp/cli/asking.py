@@ -42,7 +42,7 @@ OPTIONS: Final[Mapping[str, str]] = types.MappingProxyType(
         "since_wall_time": "--since",
         "until_wall_time": "--until",
         "for_s": "--for",
-        "timeout_s": "--timeout",
+        "timeout_wall_s": "--timeout",
         "kinds": "--kind",
         "signals": "--signal",
         "limit": "-n",
@@ -56,7 +56,7 @@ _VALUE_NAMES: Final = {
     "where": "CONDITION", "until": "CONDITION",
 }  # fmt: skip
 # What a person does not give, where a model's client would soon give up waiting.
-_DEFAULTS: Final[Mapping[str, Any]] = types.MappingProxyType({"timeout_s": 600.0})
+_DEFAULTS: Final[Mapping[str, Any]] = types.MappingProxyType({"timeout_wall_s": 600.0})
 _OF_SIGNALS: Final = frozenset({"signals", "pattern"})  # of what summaries are made of
 _FOLLOW: Final = Annotated[
     bool,

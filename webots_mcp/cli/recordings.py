@@ -104,7 +104,7 @@ class ToRobot(Where):
 class Waiting(ToRobot):
     """Whom a command asks, and how long it waits for the answer."""
 
-    timeout_s: Annotated[
+    timeout_wall_s: Annotated[
         float | None,
         Parameter("--timeout", metavar="S", help="Wait up to so many wall seconds (600)."),
     ] = None

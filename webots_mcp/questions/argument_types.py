@@ -56,7 +56,7 @@ WaitS = Annotated[
     Field(ge=0.1, json_schema_extra={"maximum": MAX_WAIT_S}),
     AfterValidator(_as_wait),
 ]
-TimeoutS = Annotated[WaitS, Field(description="Wall seconds.")]
+TimeoutS = Annotated[WaitS, Field(description="At most.")]
 _CURSOR: Final = "From the last answer."
 Cursor = Annotated[_Place | None, Field(description=_CURSOR)]
 TextCursor = Annotated[str, Field(max_length=2000, description=_CURSOR)]

@@ -41,8 +41,8 @@ async def webots_simulation_control(
     force: Force = False,
     port: Port = None,
     robot: RobotName = None,
-    timeout_s: Annotated[
-        WaitS | None, Field(description="Wall seconds: 10, for reload 30, for step up to 90.")
+    timeout_wall_s: Annotated[
+        WaitS | None, Field(description="10, for reload 30, for step up to 90.")
     ] = None,
 ) -> CommandAnswer:
     """Pause, resume, run fast, step, reset or reload, and wait for the outcome.
@@ -56,7 +56,7 @@ async def webots_simulation_control(
         raise InvalidInputError(f"steps is for command='step', not for {command!r}: leave it out")
     steps = steps or 1
     params = {"steps": steps} if command == "step" else {}
-    waiting_s = timeout_s or await to_thread.run_sync(
+    waiting_s = timeout_wall_s or await to_thread.run_sync(
         _usual_wait_s, recording, command, steps, robot
     )
     dispatcher = Dispatcher(recording, caller.report)
@@ -70,11 +70,11 @@ async def webots_world_reload(
     caller: Caller,
     force: SkipJsonSchema[Force] = False,
     robot: RobotName = None,
-    timeout_s: TimeoutS = _RELOAD_WAIT_S,
+    timeout_wall_s: TimeoutS = _RELOAD_WAIT_S,
 ) -> CommandAnswer:
     """Load world and code anew, as webots_simulation_control("reload")."""
     dispatcher = Dispatcher(recording, caller.report)
-    return await Attempt(recording, dispatcher, robot, timeout_s, "reload", {}, force).steer()
+    return await Attempt(recording, dispatcher, robot, timeout_wall_s, "reload", {}, force).steer()
 
 
 @question("Reset the world", DESTROYS)
@@ -83,22 +83,25 @@ async def webots_world_reset(
     caller: Caller,
     force: Force = False,
     robot: RobotName = None,
-    timeout_s: TimeoutS = _WAIT_S,
+    timeout_wall_s: TimeoutS = _WAIT_S,
 ) -> CommandAnswer:
     """Back to time 0: webots_simulation_control("reset"), and with force for a stuck controller."""
     dispatcher = Dispatcher(recording, caller.report)
-    return await Attempt(recording, dispatcher, robot, timeout_s, "reset", {}, force).steer()
+    return await Attempt(recording, dispatcher, robot, timeout_wall_s, "reset", {}, force).steer()
 
 
 @question("Reset the controller's state", DESTROYS)
 async def webots_reset_controller_state(
-    recording: Recording, caller: Caller, robot: RobotName = None, timeout_s: TimeoutS = _WAIT_S
+    recording: Recording,
+    caller: Caller,
+    robot: RobotName = None,
+    timeout_wall_s: TimeoutS = _WAIT_S,
 ) -> CommandAnswer:
     """Put the controller's own variables back; world and time go on as they are.
 
     Runs its action reset_state, else the callbacks of bridge.on_reload().
     """
-    return await Dispatcher(recording, caller.report).ask(robot, "reset_state", timeout_s)
+    return await Dispatcher(recording, caller.report).ask(robot, "reset_state", timeout_wall_s)
 
 
 def _usual_wait_s(recording: Recording, command: Order, steps: int, robot: str | None) -> float:

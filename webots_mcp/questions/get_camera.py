@@ -124,11 +124,11 @@ async def webots_take_screenshot(
     caller: Caller,
     quality: Annotated[int, Field(ge=1, le=100, description="Of the file.")] = 90,
     robot: RobotName = None,
-    timeout_s: TimeoutS = _WAIT_S,
+    timeout_wall_s: TimeoutS = _WAIT_S,
 ) -> list[str | ShownPicture]:
     """The simulation's main view, now, within 1,000 pixels; needs a Supervisor."""
     dispatcher = Dispatcher(recording, caller.report)
-    answer = await dispatcher.ask(robot, "screenshot", timeout_s, {"quality": quality})
+    answer = await dispatcher.ask(robot, "screenshot", timeout_wall_s, {"quality": quality})
     return await to_thread.run_sync(_show, recording, answer)
 
 

@@ -39,7 +39,7 @@ async def webots_launch_world(
     stream: Annotated[
         bool, Field(description="Obey without a controller; opens the project to the net.")
     ] = False,
-    timeout_s: TimeoutS = _STARTING_S,
+    timeout_wall_s: TimeoutS = _STARTING_S,
 ) -> CommandAnswer:
     """Start Webots and wait until the first controller records, or say why none does.
 
@@ -52,7 +52,7 @@ async def webots_launch_world(
     start = Start(file, mode, headless, stream, port)
     started_s = time.monotonic()
     launched = await to_thread.run_sync(launcher.begin, start)
-    first = await _wait(launched, caller, started_s + timeout_s)
+    first = await _wait(launched, caller, started_s + timeout_wall_s)
     return await to_thread.run_sync(_answer, recording, launched, first, started_s)
 
 
@@ -62,7 +62,7 @@ async def webots_load_world(
     world: World,
     caller: Caller,
     robot: RobotName = None,
-    timeout_s: TimeoutS = _WAIT_S,
+    timeout_wall_s: TimeoutS = _WAIT_S,
 ) -> CommandAnswer:
     """Open another world in the running Webots; all controllers end.
 
@@ -70,22 +70,25 @@ async def webots_load_world(
     """
     project = await to_thread.run_sync(project_of, recording)
     file, _ = await to_thread.run_sync(require_world, world, project)
-    return await _request(recording, caller, robot, timeout_s).load(file)
+    return await _request(recording, caller, robot, timeout_wall_s).load(file)
 
 
 @question("Quit Webots", DESTROYS)
 async def webots_quit(
-    recording: Recording, caller: Caller, robot: RobotName = None, timeout_s: TimeoutS = _WAIT_S
+    recording: Recording,
+    caller: Caller,
+    robot: RobotName = None,
+    timeout_wall_s: TimeoutS = _WAIT_S,
 ) -> CommandAnswer:
     """End Webots: the one of webots_launch_world; another only by a robot that is a Supervisor."""
-    return await _request(recording, caller, robot, timeout_s).quit()
+    return await _request(recording, caller, robot, timeout_wall_s).quit()
 
 
 def _request(
-    recording: Recording, caller: Caller, robot: str | None, timeout_s: float
+    recording: Recording, caller: Caller, robot: str | None, timeout_wall_s: float
 ) -> WorldRequest:
     dispatcher = Dispatcher(recording, caller.report)
-    return WorldRequest(recording, dispatcher, robot, timeout_s, caller.companions.webots)
+    return WorldRequest(recording, dispatcher, robot, timeout_wall_s, caller.companions.webots)
 
 
 async def _wait(launched: Launch, caller: Caller, until_s: float) -> SessionStart | None:

@@ -44,8 +44,8 @@ _WatchS = Annotated[float, Field(ge=1, le=MAX_WAIT_S)] | None
 async def webots_monitor(
     recording: Recording,
     caller: Caller,
-    duration_s: Annotated[_WatchS, Field(description="Wall seconds to watch; 10.")] = None,
-    lookback_s: Annotated[
+    duration_wall_s: Annotated[_WatchS, Field(description="To watch; 10.")] = None,
+    lookback_wall_s: Annotated[
         float | None,
         Field(
             gt=0,
@@ -61,18 +61,19 @@ async def webots_monitor(
     Movement, trends and events of that window. Of longer ago: webots_get_trends and
     webots_find_events.
     """
-    if sum(each is not None for each in (duration_s, lookback_s, duration)) > 1:
+    if sum(each is not None for each in (duration_wall_s, lookback_wall_s, duration)) > 1:
         raise InvalidInputError(
-            "give either duration_s, to watch from now on, or lookback_s, to look back at once"
+            "give either duration_wall_s, to watch from now on, or lookback_wall_s, to look back "
+            "at once"
         )
-    duration_s = duration_s or duration or USUAL_DURATION_S
-    if lookback_s is not None:
-        return await to_thread.run_sync(look_back, recording, robot, lookback_s)
+    duration_wall_s = duration_wall_s or duration or USUAL_DURATION_S
+    if lookback_wall_s is not None:
+        return await to_thread.run_sync(look_back, recording, robot, lookback_wall_s)
     name, started_s, is_live = await to_thread.run_sync(_start, recording, robot)
-    for second in range(1, math.ceil(duration_s) + 1) if is_live else ():
-        await anyio.sleep(min(_REPORT_INTERVAL_S, duration_s - second + 1))
+    for second in range(1, math.ceil(duration_wall_s) + 1) if is_live else ():
+        await anyio.sleep(min(_REPORT_INTERVAL_S, duration_wall_s - second + 1))
         doing = await to_thread.run_sync(_doing, recording, name)
-        await caller.report(min(second, duration_s), duration_s, doing)
+        await caller.report(min(second, duration_wall_s), duration_wall_s, doing)
     return await to_thread.run_sync(_watched, recording, name, started_s)
 
 
@@ -95,12 +96,12 @@ def _watched(recording: Recording, robot: str, started_s: float) -> MonitorAnswe
         return _report(view, started_s, view.now_s - started_s)
 
 
-def look_back(recording: Recording, robot: str | None, lookback_s: float) -> MonitorAnswer:
+def look_back(recording: Recording, robot: str | None, lookback_wall_s: float) -> MonitorAnswer:
     """A report of the wall seconds before the newest row."""
     with recording.view(robot) as view:
         run = view.require_run()
         newest_s = view.state.wall_time_s if view.state else run.last_wall_time_s
-        return _report(view, newest_s - lookback_s, lookback_s)
+        return _report(view, newest_s - lookback_wall_s, lookback_wall_s)
 
 
 def _report(view: View, wall_start_s: float, window_s: float) -> MonitorAnswer:
@@ -174,4 +175,6 @@ def _why_nothing(view: View) -> str:
         )
     if view.status.why is None:
         return "nothing was recorded because the simulation is paused: resume it and watch again"
-    return "nothing was recorded, for the reason that stands under why; lookback_s tells the past"
+    return (
+        "nothing was recorded, for the reason that stands under why; lookback_wall_s tells the past"
+    )

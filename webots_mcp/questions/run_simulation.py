@@ -48,7 +48,7 @@ async def webots_run(
     then: Annotated[Then, Field(description="At that step; go_on: at the old pace.")] = "pause",
     picture: Annotated[bool, Field(description="A screenshot of the end, too.")] = False,
     robot: RobotName = None,
-    timeout_s: TimeoutS = _WAIT_S,
+    timeout_wall_s: TimeoutS = _WAIT_S,
 ) -> RunAnswer:
     """Let the simulation run until a condition holds or a simulated time is over, then pause it.
 
@@ -66,7 +66,7 @@ async def webots_run(
     }
     dispatcher = Dispatcher(recording, caller.report)
     asked = {name: value for name, value in params.items() if value is not None}
-    answer = cast("RunAnswer", await dispatcher.ask(robot, ACTION, timeout_s, asked))
+    answer = cast("RunAnswer", await dispatcher.ask(robot, ACTION, timeout_wall_s, asked))
     if picture and answer.outcome == "done":
         await _add_picture(recording, dispatcher, answer)
     return answer

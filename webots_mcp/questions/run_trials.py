@@ -80,19 +80,19 @@ async def webots_run_trials(
         str | None, Field(max_length=500, description="Or, unscored, when this holds.")
     ] = None,
     repeats: Annotated[int, Field(ge=1, le=1000, description="Of each set.")] = 1,
-    trial_timeout_s: Annotated[float, Field(gt=0, description="Wall seconds.")] = _TRIAL_S,
+    trial_timeout_wall_s: Annotated[float, Field(gt=0, description="At most.")] = _TRIAL_S,
     trial_set: TrialSetId = None,
     cancel: Annotated[bool, Field(description="Stop it after this trial.")] = False,
     scheduler: Annotated[
         str | None, Field(description="tcp://HOST:8786: on a Dask cluster, a simulator each.")
     ] = None,
     robot: RobotName = None,
-    timeout_s: TimeoutS = _WAIT_S,
+    timeout_wall_s: TimeoutS = _WAIT_S,
 ) -> TrialsAnswer:
     """Which parameters are best? Each trial resets the world, sets them, runs fast, is scored.
 
-    After timeout_s they go on: trial_set alone waits on, or resumes. At the end parameters are set
-    back.
+    After timeout_wall_s they go on: trial_set alone waits on, or resumes. At the end parameters are
+    set back.
     """
     given = parameters is not None or score is not None
     if (trial_set is None) != given:
@@ -104,7 +104,7 @@ async def webots_run_trials(
         if cancel:
             raise InvalidInputError("cancel needs trial_set: which one is to stop?")
         asked = {"score": score, "best": best, "for_s": for_s, "until": until, "repeats": repeats}
-        asked |= {"timeout_s": trial_timeout_s, "prune": prune}
+        asked |= {"timeout_s": trial_timeout_wall_s, "prune": prune}
         number = await to_thread.run_sync(
             lambda: _begin(recording, workers, parameters, robot, scheduler, asked)
         )
@@ -112,7 +112,7 @@ async def webots_run_trials(
         number = trial_set
         await to_thread.run_sync(_take_up, recording, workers, number, scheduler, cancel)
     try:
-        await _wait(recording, caller, number, timeout_s)
+        await _wait(recording, caller, number, timeout_wall_s)
     except anyio.get_cancelled_exc_class():
         with anyio.CancelScope(shield=True):
             await to_thread.run_sync(_end, recording, workers, number)
@@ -192,9 +192,9 @@ def _end(recording: Recording, workers: TrialWorkers, set_id: int) -> None:
     workers.end(set_id)
 
 
-async def _wait(recording: Recording, caller: Caller, set_id: int, timeout_s: float) -> None:
+async def _wait(recording: Recording, caller: Caller, set_id: int, timeout_wall_s: float) -> None:
     """Until nobody works on the set any more, or the time is over."""
-    until_s, report_s = time.monotonic() + timeout_s, time.monotonic() + _REPORT_EVERY_S
+    until_s, report_s = time.monotonic() + timeout_wall_s, time.monotonic() + _REPORT_EVERY_S
     with recording.reader() as connection:
         while time.monotonic() < until_s:
             if not is_at_work(connection, fetch_trial_set(connection, set_id)):

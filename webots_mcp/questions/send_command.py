@@ -43,14 +43,14 @@ async def webots_send_command(
     caller: Caller,
     params: Annotated[dict[str, Any] | None, Field(description="As its docstring says.")] = None,
     robot: RobotName = None,
-    timeout_s: TimeoutS = _WAIT_S,
+    timeout_wall_s: TimeoutS = _WAIT_S,
 ) -> CommandAnswer:
     """Have the controller run one of its own actions, at most once, and wait for its answer.
 
     webots_list_commands lists them.
     """
     dispatcher = Dispatcher(recording, caller.report)
-    return await dispatcher.ask(robot, action, timeout_s, params)
+    return await dispatcher.ask(robot, action, timeout_wall_s, params)
 
 
 @question(
@@ -64,10 +64,10 @@ async def webots_wait_for_command(
     recording: Recording,
     command_id: Annotated[Id, Field(description="From its answer.")],
     caller: Caller,
-    timeout_s: TimeoutS = _WAIT_S,
+    timeout_wall_s: TimeoutS = _WAIT_S,
 ) -> CommandAnswer:
     """Go on waiting for a command that was still under way when its call was answered."""
-    return await Dispatcher(recording, caller.report).wait(command_id, timeout_s)
+    return await Dispatcher(recording, caller.report).wait(command_id, timeout_wall_s)
 
 
 @question("List the commands", READS, command="commands", core=True)

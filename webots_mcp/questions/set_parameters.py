@@ -65,7 +65,7 @@ async def webots_set_parameters(
     caller: Caller,
     when: Annotated[When, Field(description="reset: from the next one on.")] = "now",
     robot: RobotName = None,
-    timeout_s: TimeoutS = SET_WAIT_S,
+    timeout_wall_s: TimeoutS = SET_WAIT_S,
 ) -> CommandAnswer:
     """Set parameters of a running controller, all or none, between two rounds of its loop.
 
@@ -73,7 +73,7 @@ async def webots_set_parameters(
     begins with those in the code.
     """
     return await set_parameters(
-        recording, caller.report, values, when=when, robot=robot, timeout_s=timeout_s
+        recording, caller.report, values, when=when, robot=robot, timeout_s=timeout_wall_s
     )
 
 

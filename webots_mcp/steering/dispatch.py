@@ -258,4 +258,4 @@ def _after_no_answer(view: View) -> str:
     silent_s = session.age_s(session.last_poll_wall_time_s, view.now_s)
     if silent_s > HEARTBEAT_LATE_S:
         return f"its loop runs, but last called bridge.get_command() {silent_s:.0f} s ago"
-    return "its loop runs but did not claim it in time: ask again with a longer timeout_s"
+    return "its loop runs but did not claim it in time: ask again with a longer timeout_wall_s"

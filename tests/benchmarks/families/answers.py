@@ -29,7 +29,7 @@ _TOKENS: Final = 2000
 _OF_WEBOTS: Final = ("webots_launch_world", "webots_load_world", "webots_quit")
 _PLOT: Final = "webots_plot"
 _ARGUMENTS: Final[dict[str, dict[str, Any]]] = {
-    "webots_monitor": {"lookback_s": 10},
+    "webots_monitor": {"lookback_wall_s": 10},
     "webots_query_history": {"signals": ["*"]},
     "webots_query_sql": {"sql": "SELECT * FROM state"},
     "webots_send_command": {"action": "set_speed", "params": {"speed": 6.0}},

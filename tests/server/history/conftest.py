@@ -17,7 +17,7 @@ EVERY: tuple[tuple[str, dict[str, Any]], ...] = (
     ("webots_get_trends", {}),
     ("webots_find_events", {}),
     ("webots_get_timeline", {}),
-    ("webots_monitor", {"lookback_s": 5}),
+    ("webots_monitor", {"lookback_wall_s": 5}),
     ("webots_compare_runs", {}),
     ("webots_list_runs", {}),
     ("webots_query_sql", {"sql": "SELECT 1"}),

@@ -103,7 +103,7 @@ async def test_the_timeline_goes_on_page_by_page(story: Path) -> None:
 
 
 async def test_looking_back_reports_at_once_on_exactly_those_rows(story: Path) -> None:
-    answer = await tell(story, "webots_monitor", lookback_s=15)
+    answer = await tell(story, "webots_monitor", lookback_wall_s=15)
     (trend,) = answer["trends"]
     assert answer["rows"] == trend["rows"] == 301
     assert (trend["start_s"], trend["end_s"]) == (29.9, 59.9)
@@ -118,7 +118,7 @@ async def test_looking_back_over_a_reset_tells_of_both_runs_and_no_way_between(
     with connect(file, "writer") as connection:
         connection.execute("DELETE FROM run WHERE id = 3")
     connection.close()
-    answer = await tell(file, "webots_monitor", lookback_s=20)
+    answer = await tell(file, "webots_monitor", lookback_wall_s=20)
     assert [trend["run_id"] for trend in answer["trends"]] == [1, 2]
     ways = answer["movement"]["runs"]
     assert sum(way["distance_m"] for way in ways) < 12  # the jump back would add 12.8

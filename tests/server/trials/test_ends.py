@@ -64,7 +64,7 @@ async def test_a_set_whose_server_was_killed_is_gone_on_with_by_another(
         said = await fail(client, "webots_run_trials", parameters=SPEEDS, score="duration", for_s=1)
         assert "trial set 1 of this robot is not over (its server ended)" in said
         release.touch()
-        answer = await ask(client, "webots_run_trials", trial_set=1, timeout_s=90)
+        answer = await ask(client, "webots_run_trials", trial_set=1, timeout_wall_s=90)
         assert (answer["state"], answer["over"]) == ("done", 5)
         assert "failed" not in answer
         assert await value_of(client, "speed") == 1.0
@@ -88,7 +88,7 @@ async def test_a_set_whose_server_was_stopped_is_taken_over_and_never_run_by_bot
     told: list[dict[str, Any]] = []
 
     async def ask_the_stopped_one(client: Client) -> None:
-        told.append(await ask(client, "webots_run_trials", **asked, timeout_s=90))
+        told.append(await ask(client, "webots_run_trials", **asked, timeout_wall_s=90))
 
     async with Client(server) as client, anyio.create_task_group() as tasks:
         tasks.start_soon(ask_the_stopped_one, client)
@@ -98,10 +98,10 @@ async def test_a_set_whose_server_was_stopped_is_taken_over_and_never_run_by_bot
             assert (await ask(other, "webots_get_trials"))["state"] == "under way"
             let_leases_run_out(file)
             assert (await ask(other, "webots_get_trials"))["state"] == "left by a server that ended"
-            await ask(other, "webots_run_trials", trial_set=1, timeout_s=0.1)
+            await ask(other, "webots_run_trials", trial_set=1, timeout_wall_s=0.1)
             os.kill(int(pid.read_text()), signal.SIGCONT)
             release.touch()
-            answer = await ask(other, "webots_run_trials", trial_set=1, timeout_s=90)
+            answer = await ask(other, "webots_run_trials", trial_set=1, timeout_wall_s=90)
             assert (answer["state"], answer["over"]) == ("done", 5)
             assert await value_of(other, "speed") == 1.0
     assert (told[0]["state"], told[0]["over"]) == ("done", 5)
@@ -121,7 +121,9 @@ async def test_a_set_at_work_on_another_host_is_its_own_as_long_as_it_renews_the
             until_s = time.time() + (20 if renewed else -1)
             values = ("trial set 1", "elsewhere 1", until_s)
             connection.execute("INSERT INTO lease VALUES (?, ?, ?)", values)
-        answer = await ask(client, "webots_run_trials", trial_set=1, timeout_s=1 if renewed else 60)
+        answer = await ask(
+            client, "webots_run_trials", trial_set=1, timeout_wall_s=1 if renewed else 60
+        )
         assert answer["state"] == ("under way" if renewed else "done")
 
 
@@ -130,13 +132,13 @@ async def test_a_server_that_ends_leaves_the_parameters_as_they_were(
 ) -> None:
     asked = {"parameters": {"speed": [3.0]}, "score": "last(released)", "until": "released > 0"}
     async with Client(create_server(data_dir / "webots.db", data_dir)) as client:
-        await ask(client, "webots_run_trials", timeout_s=0.1, **asked)
+        await ask(client, "webots_run_trials", timeout_wall_s=0.1, **asked)
         await _until(filed, "SELECT count(*) FROM command WHERE status = 'claimed'", 1)
     async with Client(create_server(data_dir / "webots.db", data_dir)) as client:
         assert await value_of(client, "speed") == 1.0
         assert (await ask(client, "webots_get_trials"))["state"] == "left by a server that ended"
         release.touch()
-        answer = await ask(client, "webots_run_trials", trial_set=1, timeout_s=60)
+        answer = await ask(client, "webots_run_trials", trial_set=1, timeout_wall_s=60)
         assert (answer["state"], answer["over"]) == ("done", 1)
 
 
@@ -145,11 +147,11 @@ async def test_a_killed_controller_fails_its_trial_and_the_set_says_why_it_stops
 ) -> None:
     asked = {"parameters": SPEEDS, "score": "last(released)", "until": "released > 0"}
     async with Client(create_server(data_dir / "webots.db", data_dir)) as client:
-        await ask(client, "webots_run_trials", timeout_s=0.1, **asked)
+        await ask(client, "webots_run_trials", timeout_wall_s=0.1, **asked)
         await _until(filed, "SELECT count(*) FROM command WHERE status = 'claimed'", 1)
         await _until(filed, "SELECT max(id) FROM run", 2)
         simulation.controller("rover").kill()
-        answer = await ask(client, "webots_run_trials", trial_set=1, timeout_s=60)
+        answer = await ask(client, "webots_run_trials", trial_set=1, timeout_wall_s=60)
         assert "no live controller" in answer["state"]
         assert (answer["over"], answer["failed"]) == (1, 1)
         (row,) = rows_of(answer["ranked"])
@@ -160,5 +162,5 @@ async def test_a_killed_controller_fails_its_trial_and_the_set_says_why_it_stops
         with anyio.fail_after(30):
             while (await ask(client, "webots_get_robot_state"))["status"].startswith("stopped"):
                 await anyio.sleep(0.05)
-        answer = await ask(client, "webots_run_trials", trial_set=1, timeout_s=60)
+        answer = await ask(client, "webots_run_trials", trial_set=1, timeout_wall_s=60)
         assert (answer["state"], answer["over"], answer["failed"]) == ("done", 5, 1)

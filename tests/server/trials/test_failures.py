@@ -84,7 +84,11 @@ async def test_a_trial_without_a_score_or_an_end_failed_and_is_not_zero(
         assert (failed["scored"], failed["failed"]) == (0, 1)
         assert "division by zero" in failed["why"]
         late = await trials(
-            client, parameters={"kp": [1.0]}, until="distance < 0", for_s=None, trial_timeout_s=0.05
+            client,
+            parameters={"kp": [1.0]},
+            until="distance < 0",
+            for_s=None,
+            trial_timeout_wall_s=0.05,
         )
         (row,) = rows_of(late["ranked"])
         assert row["failed"] == 1
@@ -97,7 +101,7 @@ async def test_a_loop_that_hangs_fails_its_trial_with_the_time_that_it_reached(
 ) -> None:
     monkeypatch.setattr("webots_mcp.steering.trial_worker._PATIENCE_S", 0.1)
     async with connect() as client:
-        answer = await trials(client, parameters={"kp": [HANGS_AT]}, trial_timeout_s=1)
+        answer = await trials(client, parameters={"kp": [HANGS_AT]}, trial_timeout_wall_s=1)
         (row,) = rows_of(answer["ranked"])
         assert row["why"].startswith("did not reach its end, only 0.112 s: it took longer than 1 s")
         assert "does not call bridge.get_command() any more" in answer["state"]
@@ -108,7 +112,11 @@ async def test_a_pause_by_somebody_else_stops_the_set_and_it_can_go_on(
 ) -> None:
     async with connect() as client:
         first = await trials(
-            client, parameters={"kp": [1.0]}, until="distance < 0", for_s=100_000, timeout_s=0.2
+            client,
+            parameters={"kp": [1.0]},
+            until="distance < 0",
+            for_s=100_000,
+            timeout_wall_s=0.2,
         )
         await ask(client, "webots_simulation_control", command="pause")
         with anyio.fail_after(60):
@@ -126,7 +134,7 @@ async def test_a_parameter_that_somebody_else_sets_stops_the_set(
     async with connect() as client:
         await ask(client, "webots_set_parameters", values={"kp": 3.0})
         plan = {"parameters": {"kp": [1.0]}, "until": "gait == 'walk'", "for_s": 100_000}
-        await trials(client, **plan, timeout_s=0.2)
+        await trials(client, **plan, timeout_wall_s=0.2)
         await ask(client, "webots_set_parameters", values={"gait": "walk"})
         with anyio.fail_after(60):
             while "stopped" not in (told := await ask(client, "webots_get_trials"))["state"]:

@@ -114,7 +114,7 @@ async def test_out_of_wall_time_they_go_on_and_a_second_call_waits(
         reports.append((progress, total, message or ""))
 
     async with connect() as client:
-        first = await trials(client, parameters={"kp": [1.0, 2.0]}, repeats=8, timeout_s=0.1)
+        first = await trials(client, parameters={"kp": [1.0, 2.0]}, repeats=8, timeout_wall_s=0.1)
         assert first["state"] == "under way"
         assert first["over"] < first["trials"] == 16
         assert f"trial_set={first['trial_set']}" in first["hint"]
@@ -122,7 +122,7 @@ async def test_out_of_wall_time_they_go_on_and_a_second_call_waits(
             client, "webots_run_trials", parameters={"kp": [1]}, score="duration", for_s=1
         )
         assert f"trial set {first['trial_set']} of this robot is under way" in refused
-        arguments = {"trial_set": first["trial_set"], "timeout_s": 60}
+        arguments = {"trial_set": first["trial_set"], "timeout_wall_s": 60}
         result = await client.call_tool(
             "webots_run_trials", arguments, progress_callback=on_progress
         )
@@ -136,9 +136,13 @@ async def test_cancel_stops_after_the_current_trial_and_sets_the_parameters_back
     connect: Connect, tunable: TunableDriver
 ) -> None:
     async with connect() as client:
-        first = await trials(client, parameters={"kp": [5.0]}, repeats=500, timeout_s=0.1)
+        first = await trials(client, parameters={"kp": [5.0]}, repeats=500, timeout_wall_s=0.1)
         ended = await ask(
-            client, "webots_run_trials", trial_set=first["trial_set"], cancel=True, timeout_s=30
+            client,
+            "webots_run_trials",
+            trial_set=first["trial_set"],
+            cancel=True,
+            timeout_wall_s=30,
         )
         assert ended["state"] == "stopped: it was cancelled"
         assert ended["over"] < 500
@@ -173,7 +177,7 @@ async def test_wheels_that_were_told_once_to_turn_without_end_turn_in_every_tria
     arena.wait_for(lambda: has_states(filed), 30)
     async with Client(create_server(data_dir / "webots.db", data_dir)) as client:
         asked = {"parameters": {"speed": [2.0, 4.0]}, "score": DISTANCE, "for_s": 1, "repeats": 2}
-        answer = await trials(client, **asked, timeout_s=90)
+        answer = await trials(client, **asked, timeout_wall_s=90)
         fast, slow = rows_of(answer["ranked"])
         assert (fast["speed"], slow["speed"]) == (4.0, 2.0)
         assert fast["score"] > 1.8 * slow["score"] > 0.05
@@ -276,11 +280,11 @@ async def test_a_trial_that_nobody_ran_because_the_controller_ended_says_why(
         bridge.parameter("kp", 2.0, low=0, high=100)
         bridge.publish({"distance": 1.0})
         async with connect() as client:
-            await trials(client, parameters={"kp": [1.0]}, timeout_s=0.1)
+            await trials(client, parameters={"kp": [1.0]}, timeout_wall_s=0.1)
             bridge.close()
             with closing(database(file, "writer")) as connection:
                 connection.execute("UPDATE command SET expires_wall_time_s = 1.0")
-            answer = await ask(client, "webots_run_trials", trial_set=1, timeout_s=30)
+            answer = await ask(client, "webots_run_trials", trial_set=1, timeout_wall_s=30)
             assert "no live controller" in answer["state"]
             assert (answer["over"], answer["trials"]) == (0, 1)
 
@@ -290,9 +294,9 @@ async def test_a_hundred_trials_are_told_in_a_short_answer(
 ) -> None:
     grid = {"kp": [0.37 * n for n in range(1, 51)], "gait": ["trot", "walk"]}
     async with connect() as client:
-        answer = await trials(client, parameters=grid, for_s=0.032, timeout_s=90)
+        answer = await trials(client, parameters=grid, for_s=0.032, timeout_wall_s=90)
         while answer["state"] == "under way":
-            answer = await ask(client, "webots_run_trials", trial_set=1, timeout_s=90)
+            answer = await ask(client, "webots_run_trials", trial_set=1, timeout_wall_s=90)
         assert answer["over"] == 100
         assert tokens_of(answer) < 2_000
         kps = [row["kp"] for row in rows_of(answer["ranked"])]
@@ -307,9 +311,9 @@ async def test_of_many_trials_that_fail_the_first_are_told_and_how_many_more(
     grid = {"kp": [float(n) for n in range(100)]}
     async with connect() as client:
         score = "1 / (last(distance) * 0)"
-        answer = await trials(client, parameters=grid, score=score, for_s=0.02, timeout_s=90)
+        answer = await trials(client, parameters=grid, score=score, for_s=0.02, timeout_wall_s=90)
         while answer["state"] == "under way":
-            answer = await ask(client, "webots_run_trials", trial_set=1, timeout_s=90)
+            answer = await ask(client, "webots_run_trials", trial_set=1, timeout_wall_s=90)
         assert answer["failed"] == 100, answer
         assert answer["verdict"] == "no trial has a score"
         assert tokens_of(answer) < 2_000
@@ -323,7 +327,7 @@ async def test_five_speeds_of_the_rover_three_times_each(
 ) -> None:
     async with Client(create_server(data_dir / "webots.db", data_dir)) as client:
         answer = await trials(
-            client, parameters=SPEEDS, repeats=3, score=DISTANCE, for_s=1, timeout_s=90
+            client, parameters=SPEEDS, repeats=3, score=DISTANCE, for_s=1, timeout_wall_s=90
         )
         assert (answer["state"], answer["over"]) == ("done", 15)
         rows = rows_of(answer["ranked"])

@@ -19,7 +19,7 @@ from webots_mcp.contract import (
 )
 from webots_mcp.errors import InvalidInputError, NoDatabaseError
 from webots_mcp.setup.webots_project import controllers_in, has_bridge
-from webots_mcp.store.console import ConsoleRows
+from webots_mcp.store.console_lines import ConsoleRows
 from webots_mcp.store.recording import Recording
 from webots_mcp.transactions import transaction
 from webots_mcp.webots.starting import LaunchedWebots, Show, Start

@@ -32,7 +32,7 @@ from tests.bridge.monsters import (
 )
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import cleaning, encoding
-from webots_mcp.bridge.changes import Changes
+from webots_mcp.bridge.change_detector import Changes
 from webots_mcp.bridge.cleaning import MAX_NAMED
 from webots_mcp.bridge.encoding import MAX_ROW_BYTES, Encoded
 

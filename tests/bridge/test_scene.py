@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from webots_mcp.bridge.scene import SceneNode, find_field, find_inner_field, read_value, walk
+from webots_mcp.bridge.scene_tree import SceneNode, find_field, find_inner_field, read_value, walk
 from webots_mcp.standin import InProcessSupervisor
 
 CROWD = Path(__file__).parent / "worlds" / "crowd.wbt"

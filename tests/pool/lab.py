@@ -11,8 +11,8 @@ from typing import Any
 from tests.recordings.runs import Recorded
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, new_uuid
-from webots_mcp.plugins.pool.catalogue import Choice, meant
 from webots_mcp.plugins.pool.fetching import Fetched, fetch
+from webots_mcp.plugins.pool.pool_contents import Choice, meant
 from webots_mcp.plugins.pool.report import Report
 from webots_mcp.plugins.pool.shipping import Order, ship
 from webots_mcp.plugins.pool.target import Pool, Target

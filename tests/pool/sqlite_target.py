@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from webots_mcp.errors import PoolBusyError, PoolError, PoolUnavailableError
-from webots_mcp.plugins.pool.batch import Batch, batches
-from webots_mcp.plugins.pool.tables import SQLValue, Table, tables
+from webots_mcp.plugins.pool.row_batch import Batch, batches
+from webots_mcp.plugins.pool.shipped_tables import SQLValue, Table, tables
 from webots_mcp.plugins.pool.target import PooledRecording, PooledRun, PooledSize, PooledTrialSet
 from webots_mcp.store.questions.sql import Result, query_sql
 

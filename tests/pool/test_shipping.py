@@ -23,10 +23,10 @@ from webots_mcp.errors import (
     PoolUnavailableError,
     SchemaTooOldError,
 )
-from webots_mcp.plugins.pool.batch import BATCH_BYTES
 from webots_mcp.plugins.pool.following import follow
 from webots_mcp.plugins.pool.report import Report
-from webots_mcp.plugins.pool.tables import table
+from webots_mcp.plugins.pool.row_batch import BATCH_BYTES
+from webots_mcp.plugins.pool.shipped_tables import table
 from webots_mcp.plugins.pool.target import is_whole
 from webots_mcp.schema import create_schema
 from webots_mcp.store.merging import merge

@@ -6,7 +6,7 @@ import pytest
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.pool.engines import open_target
-from webots_mcp.plugins.pool.tables import tables
+from webots_mcp.plugins.pool.shipped_tables import tables
 from webots_mcp.plugins.pool.target import redacted
 
 SECRET = "hunter2"

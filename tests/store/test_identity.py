@@ -20,7 +20,7 @@ from webots_mcp.contract import new_uuid
 from webots_mcp.liveness import process_identity
 from webots_mcp.schema import create_schema
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.json_folder.writing import import_folder
+from webots_mcp.store.json_folder.folder_import import import_folder
 from webots_mcp.store.migrate import downgrade, upgrade
 
 OLD_ROWS = (

@@ -12,11 +12,11 @@ from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any, Final, cast
 
-from webots_mcp.bridge.commands import ClaimedCommand, Progress
+from webots_mcp.bridge.command_queue import ClaimedCommand, Progress
 from webots_mcp.bridge.context import Context
+from webots_mcp.bridge.declared_parameters import SETTERS, Setter
 from webots_mcp.bridge.goal import Goal, read_goal
-from webots_mcp.bridge.parameters import SETTERS, Setter
-from webots_mcp.bridge.pictures import complete_png_size
+from webots_mcp.bridge.picture_files import complete_png_size
 from webots_mcp.bridge.picturing import find_pictured, take_picture
 from webots_mcp.bridge.text import describe
 from webots_mcp.contract import (

@@ -12,10 +12,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from webots_mcp.bridge.commands import ClaimedCommand
+from webots_mcp.bridge.command_queue import ClaimedCommand
+from webots_mcp.bridge.controller_session import Session
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.gate import QUIT, Step
-from webots_mcp.bridge.session import Session
 
 _WHAT: Final = "the attached step"
 

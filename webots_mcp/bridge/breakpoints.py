@@ -13,8 +13,8 @@ from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
 from webots_mcp.bridge.run import Run
-from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.bridge.text import cut, describe, storable
+from webots_mcp.bridge.webots_api import Simulation
 from webots_mcp.contract import BREAKPOINT_ACTIONS, MAX_BREAKPOINTS
 from webots_mcp.errors import ConditionFailedError, InvalidConditionError, InvalidInputError
 from webots_mcp.pauses import Cause

@@ -6,7 +6,7 @@ import time
 from typing import Final
 
 from webots_mcp.bridge.run import Run
-from webots_mcp.bridge.simulation import Simulation
+from webots_mcp.bridge.webots_api import Simulation
 
 _EPSILON_S: Final = 1e-9
 

@@ -6,7 +6,7 @@ import time
 from typing import Final
 
 from webots_mcp.bridge import actions
-from webots_mcp.bridge.commands import ClaimedCommand, Progress
+from webots_mcp.bridge.command_queue import ClaimedCommand, Progress
 from webots_mcp.bridge.context import Context
 from webots_mcp.bridge.handlers import Handlers
 from webots_mcp.bridge.pause import PUMP_INTERVAL_S

@@ -11,7 +11,7 @@ from typing import Final
 from webots_mcp.bridge.devices import read_devices
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.journal import Journal
-from webots_mcp.bridge.simulation import Simulation
+from webots_mcp.bridge.webots_api import Simulation
 
 MOST_READING_US: Final = 100.0  # per call, on average, for rows that go to the ring buffer only
 _READINGS: Final = 9  # their median counts, so that a single interrupted reading does not

@@ -8,7 +8,7 @@ from collections import deque
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.bridge.journal import Journal
-from webots_mcp.bridge.pictures import image_of
+from webots_mcp.bridge.picture_files import image_of
 from webots_mcp.bridge.text import describe
 
 LONGEST_SIDE_PX: Final = 160

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final
 
-from webots_mcp.bridge.commands import ClaimedCommand
+from webots_mcp.bridge.command_queue import ClaimedCommand
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.recorder import Recorder

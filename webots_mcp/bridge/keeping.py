@@ -20,7 +20,7 @@ from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.encoding import copy_or_encode
 from webots_mcp.bridge.frames import MOST_FRAMES, CameraFrames, Frame
 from webots_mcp.bridge.journal import Journal
-from webots_mcp.bridge.pictures import Album
+from webots_mcp.bridge.picture_files import Album
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.ring import Ring, RingRow
 from webots_mcp.bridge.run import Run

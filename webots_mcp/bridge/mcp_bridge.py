@@ -12,18 +12,18 @@ from typing import TYPE_CHECKING, Any, Final
 from webots_mcp.bridge import open_bridges
 from webots_mcp.bridge.attachment import Attachment
 from webots_mcp.bridge.capture import Capture
-from webots_mcp.bridge.commands import ClaimedCommand
+from webots_mcp.bridge.command_queue import ClaimedCommand
+from webots_mcp.bridge.controller_session import Session
+from webots_mcp.bridge.declared_parameters import Parameter, V
 from webots_mcp.bridge.encoding import text_of
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.handlers import Handler
 from webots_mcp.bridge.open_bridges import OpenBridge
-from webots_mcp.bridge.parameters import Parameter, V
-from webots_mcp.bridge.pictures import MOST_FRAMES
-from webots_mcp.bridge.session import Session
-from webots_mcp.bridge.simulation import Simulation
+from webots_mcp.bridge.picture_files import MOST_FRAMES
 from webots_mcp.bridge.stats import BridgeStats
 from webots_mcp.bridge.text import describe
 from webots_mcp.bridge.throttle import Throttle
+from webots_mcp.bridge.webots_api import Simulation
 from webots_mcp.contract import (
     ENDED_BY,
     KEEP_LAST_S,

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from webots_mcp.bridge.journal import Journal
-from webots_mcp.bridge.simulation import Simulation
+from webots_mcp.bridge.webots_api import Simulation
 
 
 class Motors:

@@ -6,11 +6,11 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import Final, Protocol
 
-from webots_mcp.bridge.commands import ClaimedCommand
+from webots_mcp.bridge.command_queue import ClaimedCommand
 from webots_mcp.bridge.gate import QUIT, Step
 from webots_mcp.bridge.heartbeat import Heartbeat
 from webots_mcp.bridge.journal import Journal
-from webots_mcp.bridge.simulation import Simulation
+from webots_mcp.bridge.webots_api import Simulation
 from webots_mcp.pauses import (
     BRIDGE_CLOSED,
     IN_WEBOTS,

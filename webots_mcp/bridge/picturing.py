@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.bridge.pictures import image_of
+from webots_mcp.bridge.picture_files import image_of
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
 _MOST_NAMED: Final = 10

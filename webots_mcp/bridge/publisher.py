@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from itertools import islice
 from typing import Any, cast
 
-from webots_mcp.bridge.changes import Changes
+from webots_mcp.bridge.change_detector import Changes
 from webots_mcp.bridge.context import Context
 from webots_mcp.bridge.device_reader import DeviceReader
 from webots_mcp.bridge.encoding import encode
-from webots_mcp.bridge.runs import Runs
+from webots_mcp.bridge.run_starts import Runs
 from webots_mcp.bridge.stats import PublishCost
 
 

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, Final
 
-from webots_mcp.bridge.canvas import (
+from webots_mcp.bridge.raster import (
     BLACK,
     GREY,
     LETTER_PX,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from webots_mcp.bridge.commands import ClaimedCommand
+from webots_mcp.bridge.command_queue import ClaimedCommand
 
 Callback = Callable[[], object]
 

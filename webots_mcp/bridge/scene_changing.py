@@ -14,7 +14,7 @@ from collections.abc import Generator
 from dataclasses import replace
 from typing import Any, Final
 
-from webots_mcp.bridge.commands import ClaimedCommand, Progress
+from webots_mcp.bridge.command_queue import ClaimedCommand, Progress
 from webots_mcp.bridge.context import Context
 from webots_mcp.bridge.scene_edits import MOST_EDITS
 from webots_mcp.bridge.scene_path import Place, children, find, find_node, label

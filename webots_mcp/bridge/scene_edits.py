@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.journal import Journal
-from webots_mcp.bridge.simulation import Simulation
+from webots_mcp.bridge.webots_api import Simulation
 
 if TYPE_CHECKING:
     from webots_mcp.bridge.scene_restoring import FieldEdit, Removal, Restoration

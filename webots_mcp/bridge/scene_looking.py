@@ -10,10 +10,10 @@ from collections.abc import Generator, Iterable
 from fnmatch import fnmatchcase
 from typing import Any, Final, cast
 
-from webots_mcp.bridge.commands import ClaimedCommand, Progress
+from webots_mcp.bridge.command_queue import ClaimedCommand, Progress
 from webots_mcp.bridge.context import Context
-from webots_mcp.bridge.scene import DEEPEST, WALKED, SceneNode, find_field, holds_solids, walk
 from webots_mcp.bridge.scene_path import Pace, Place, children, fields_of, find, find_node, label
+from webots_mcp.bridge.scene_tree import DEEPEST, WALKED, SceneNode, find_field, holds_solids, walk
 from webots_mcp.bridge.scene_values import read, read_entries
 from webots_mcp.bridge.text import cut
 from webots_mcp.errors import InvalidInputError

@@ -13,7 +13,7 @@ from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from webots_mcp.bridge.scene import SceneNode, find_inner_field, read_value, walk
+from webots_mcp.bridge.scene_tree import SceneNode, find_inner_field, read_value, walk
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.naming import nearest_first
 

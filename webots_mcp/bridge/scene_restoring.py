@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Generator
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.bridge.scene import entries
 from webots_mcp.bridge.scene_path import Pace, children, fields_of
+from webots_mcp.bridge.scene_tree import entries
 from webots_mcp.bridge.scene_values import is_same, read, write
 
 # Physics has changed these since a command set them, and Webots' own reset restores them.

@@ -19,7 +19,7 @@ from webots_mcp.console.ownership import own_webots
 from webots_mcp.contract import LogLevel, LogSource
 from webots_mcp.errors import CommandRefusedError, DatabaseError, WebotsMCPError, warn
 from webots_mcp.leases import give_back, holder_of, lease_of, take
-from webots_mcp.store.console import ConsoleRows, Said
+from webots_mcp.store.console_lines import ConsoleRows, Said
 from webots_mcp.store.jobs import Job
 from webots_mcp.store.recording import Recording
 from webots_mcp.webots.instances import Instance

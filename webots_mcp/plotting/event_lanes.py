@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
-from webots_mcp.plotting.intervals import Interval, Lane
 from webots_mcp.plotting.parts import Part
+from webots_mcp.plotting.plotted_intervals import Interval, Lane
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.registry import drawn_kinds
 from webots_mcp.store.detection.verdict import Verdicts

@@ -9,7 +9,7 @@ from typing import Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plotting.canvas import short
-from webots_mcp.plotting.intervals import Interval
+from webots_mcp.plotting.plotted_intervals import Interval
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.parameters import differing, parameters_of

@@ -11,7 +11,6 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.naming import listed
 from webots_mcp.plotting.canvas import Picture, Sheet, draw, media_type
 from webots_mcp.plotting.event_lanes import stuck_mark
-from webots_mcp.plotting.intervals import Lane, lane_of, merged_notes
 from webots_mcp.plotting.parts import (
     Known,
     Part,
@@ -22,6 +21,7 @@ from webots_mcp.plotting.parts import (
     title_of,
 )
 from webots_mcp.plotting.path import read_path
+from webots_mcp.plotting.plotted_intervals import Lane, lane_of, merged_notes
 from webots_mcp.plotting.trajectory_axes import Track, TrajectoryAxes, paint_trajectory
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import find_motion

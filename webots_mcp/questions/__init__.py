@@ -15,7 +15,7 @@ MODULES: Final = (
     "query_history", "get_trends", "find_events", "get_timeline", "compare_runs", "draw_plot",
     "query_sql", "control_simulation", "launch_world", "run_simulation",
     "run_trials", "set_breakpoint", "send_command", "set_parameters", "edit_scene",
-    "merging",
+    "merged_questions",
 )  # fmt: skip
 
 

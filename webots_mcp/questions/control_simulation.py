@@ -15,7 +15,7 @@ from webots_mcp.questions.argument_types import MAX_WAIT_S, RobotName, TimeoutS,
 from webots_mcp.questions.declaring import DESTROYS, Caller, question
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.steering.routes import Attempt
-from webots_mcp.steering.target import find_target
+from webots_mcp.steering.target_robot import find_target
 from webots_mcp.store.recording import Recording, look
 from webots_mcp.webots.stream import Order
 

@@ -9,7 +9,7 @@ from pydantic import Field, WithJsonSchema
 from webots_mcp.questions.answers import CommandAnswer
 from webots_mcp.questions.argument_types import AnyNames, Cursor, RobotName
 from webots_mcp.questions.declaring import CHANGES, DESTROYS, READS, Caller, question
-from webots_mcp.steering.scene import ask_scene
+from webots_mcp.steering.scene_requests import ask_scene
 from webots_mcp.store.recording import Recording
 
 Path = Annotated[

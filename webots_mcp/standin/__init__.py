@@ -19,12 +19,6 @@ in their processes. Importing this package makes it importable here as well.
 from __future__ import annotations
 
 from webots_mcp.standin.controller_path import LIBRARY  # first: the others import `controller`
-from webots_mcp.standin.errors import (
-    ControllerEndedError,
-    StandInError,
-    WorldError,
-    WouldBlockError,
-)
 from webots_mcp.standin.in_process import (
     InProcessRobot,
     InProcessSimulation,
@@ -32,6 +26,12 @@ from webots_mcp.standin.in_process import (
 )
 from webots_mcp.standin.simulation import Simulation
 from webots_mcp.standin.simulator import Mode
+from webots_mcp.standin.standin_errors import (
+    ControllerEndedError,
+    StandInError,
+    WorldError,
+    WouldBlockError,
+)
 
 __all__ = [
     "LIBRARY",

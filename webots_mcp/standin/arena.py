@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from math import cos, hypot, pi, sin
 from typing import Final
 
-from webots_mcp.standin.camera import SceneColors
+from webots_mcp.standin.camera_rendering import SceneColors
 from webots_mcp.standin.frame import Frame, frame_of
 from webots_mcp.standin.shapes import Block, Color, Disc, Shape
 from webots_mcp.standin.vrml import Node, children_of, descendants_of

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from webots_mcp.standin.connection import Connection
-from webots_mcp.standin.errors import StandInError
+from webots_mcp.standin.controller_socket import Connection
 from webots_mcp.standin.process import ControllerProcess
 from webots_mcp.standin.simulator import Robot, Simulator
+from webots_mcp.standin.standin_errors import StandInError
 
 _NOBODY: Final = ("", "<none>", "void", "<generic>")
 _EXTERN: Final = "<extern>"

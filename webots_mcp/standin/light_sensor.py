@@ -5,9 +5,9 @@ from __future__ import annotations
 from math import acos, hypot
 from typing import Any
 
-from webots_mcp.standin.device import Device, resolved, table_of
 from webots_mcp.standin.frame import Vector
 from webots_mcp.standin.shapes import targets_from
+from webots_mcp.standin.simulated_device import Device, resolved, table_of
 from webots_mcp.standin.vrml import Node
 from webots_mcp.standin.world import World
 

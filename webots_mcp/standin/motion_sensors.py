@@ -6,8 +6,8 @@ from abc import ABC, abstractmethod
 from math import nan
 from typing import Any
 
-from webots_mcp.standin.device import Device, Site, resolved, table_of
 from webots_mcp.standin.frame import Vector
+from webots_mcp.standin.simulated_device import Device, Site, resolved, table_of
 from webots_mcp.standin.vrml import Node
 
 

@@ -17,11 +17,11 @@ from typing import Any, Final, cast
 
 from controller.wire import Message
 
-from webots_mcp.standin.answers import answer, description, step_over
-from webots_mcp.standin.connection import Connection
+from webots_mcp.standin.controller_answers import answer, description, step_over
+from webots_mcp.standin.controller_socket import Connection
 from webots_mcp.standin.controllers import Controller
-from webots_mcp.standin.errors import StandInError, WorldError
 from webots_mcp.standin.simulator import Mode, Simulator
+from webots_mcp.standin.standin_errors import StandInError, WorldError
 from webots_mcp.standin.world import load_world
 
 _PATIENCE_S: Final = 1.0

@@ -18,9 +18,9 @@ from controller.wire import ADDRESS_FILE
 
 from webots_mcp.standin.controller_path import LIBRARY
 from webots_mcp.standin.controllers import Address, Controller, Launch, controllers_of
-from webots_mcp.standin.errors import StandInError
 from webots_mcp.standin.runner import Runner
 from webots_mcp.standin.simulator import Mode, Robot, Simulator
+from webots_mcp.standin.standin_errors import StandInError
 from webots_mcp.standin.world import load_world
 
 _MODES: Final = {"pause": Mode.PAUSE, "realtime": Mode.REAL_TIME, "fast": Mode.FAST}

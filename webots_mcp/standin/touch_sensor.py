@@ -8,7 +8,7 @@ from math import atan2, hypot, pi
 from typing import Any, Final
 
 from webots_mcp.standin.arena import Part, bounding_parts
-from webots_mcp.standin.device import Device, Site, resolved, table_of
+from webots_mcp.standin.simulated_device import Device, Site, resolved, table_of
 from webots_mcp.standin.vrml import Node
 
 _TYPES: Final = {"bumper": 0, "force": 1, "force-3d": 2}

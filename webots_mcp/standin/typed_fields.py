@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from copy import deepcopy
 from typing import Any, cast
 
-from webots_mcp.standin.errors import WorldError
 from webots_mcp.standin.nodes import NUMBERS_IN, FieldDefinition
+from webots_mcp.standin.standin_errors import WorldError
 from webots_mcp.standin.vrml import Node, Value
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple, TypeAlias, cast
 
-from webots_mcp.standin.errors import WorldError
+from webots_mcp.standin.standin_errors import WorldError
 
 Value: TypeAlias = "bool | str | Node | list[float] | list[Value] | None"
 """A field as written: numbers are always a list of floats, `[...]` is a list of anything."""

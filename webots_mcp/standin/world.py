@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, cast
 
-from webots_mcp.standin.errors import WorldError
 from webots_mcp.standin.frame import Frame, frame_of
 from webots_mcp.standin.nodes import DEFAULT_NAME_OF, NODE_TYPES
 from webots_mcp.standin.protos import PROTOS, build
+from webots_mcp.standin.standin_errors import WorldError
 from webots_mcp.standin.typed_fields import give_types
 from webots_mcp.standin.vrml import Node, children_of, descendants_of, parse
 

@@ -18,7 +18,7 @@ from webots_mcp.questions.shortening import RESULT_BUDGET_TOKENS, WHOLE, cut_tex
 from webots_mcp.queue import Command, CommandQueue, fetch_command
 from webots_mcp.steering.running import ACTION as RUN
 from webots_mcp.steering.running import progress_of, run_facts
-from webots_mcp.steering.target import find_target
+from webots_mcp.steering.target_robot import find_target
 from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.robots import robot_name
 from webots_mcp.store.status import handler_at_work

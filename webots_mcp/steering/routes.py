@@ -24,7 +24,7 @@ from webots_mcp.errors import (
 )
 from webots_mcp.questions.answers import CommandAnswer
 from webots_mcp.steering.request import CLAIMING_S, LEAST_S, UNCLAIMED, Request
-from webots_mcp.steering.target import find_target
+from webots_mcp.steering.target_robot import find_target
 from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.robots import list_robots, live_observer
 from webots_mcp.store.sessions import Session

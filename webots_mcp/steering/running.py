@@ -24,7 +24,7 @@ from webots_mcp.questions.find_events import fitting_events, not_shown_of
 from webots_mcp.questions.get_trends import MOST_SIGNALS, trend_tables
 from webots_mcp.questions.shortening import shorten
 from webots_mcp.queue import Command
-from webots_mcp.steering.target import find_target
+from webots_mcp.steering.target_robot import find_target
 from webots_mcp.steering.watching import movement
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.questions.events import search_events

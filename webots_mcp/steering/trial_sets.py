@@ -22,7 +22,7 @@ from webots_mcp.questions.budget import (
 )
 from webots_mcp.questions.shortening import cut_text
 from webots_mcp.steering.running import ACTION, known_names, require_possible
-from webots_mcp.steering.target import find_target
+from webots_mcp.steering.target_robot import find_target
 from webots_mcp.steering.tuning import settable
 from webots_mcp.store.analysis.ranking import Ranked, Ranking
 from webots_mcp.store.parameters import Declared, declared_for

@@ -19,7 +19,7 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError, LeaseLostE
 from webots_mcp.plugins import cluster_offered, load
 from webots_mcp.queue import Command, CommandQueue, fetch_command, find_command
 from webots_mcp.steering.running import ACTION
-from webots_mcp.steering.target import find_target
+from webots_mcp.steering.target_robot import find_target
 from webots_mcp.store.jobs import Job
 from webots_mcp.store.parameters import described, parameters_of
 from webots_mcp.store.questions.score import score_run

@@ -16,7 +16,7 @@ from webots_mcp.connection import FrozenConnection, connect
 from webots_mcp.contract import DATABASE_NAME, PRIVATE_FILE
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.schema import create_schema
-from webots_mcp.store.export.rows import Progress
+from webots_mcp.store.export.export_rows import Progress
 from webots_mcp.store.images import MAX_FILE_BYTES, PICTURES
 from webots_mcp.store.merging import merge
 

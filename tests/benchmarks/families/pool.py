@@ -15,11 +15,11 @@ from tests.benchmarks.states import make_states
 from tests.benchmarks.table import Line, Target
 from tests.postgres import NoServerError, Server, running_server
 from webots_mcp.contract import new_uuid
-from webots_mcp.plugins.pool.batch import Batch, batches
 from webots_mcp.plugins.pool.postgres.connecting import Connection, connect
-from webots_mcp.plugins.pool.postgres.schema import prepare
-from webots_mcp.plugins.pool.postgres.writing import PostgresShipment
-from webots_mcp.plugins.pool.tables import Table, table
+from webots_mcp.plugins.pool.postgres.postgres_schema import prepare
+from webots_mcp.plugins.pool.postgres.postgres_writing import PostgresShipment
+from webots_mcp.plugins.pool.row_batch import Batch, batches
+from webots_mcp.plugins.pool.shipped_tables import Table, table
 
 _ROWS: Final = 20_000
 _BLOCKS: Final = 5

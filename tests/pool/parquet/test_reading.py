@@ -17,10 +17,10 @@ from tests.pool.parquet.conftest import RECORDINGS, Many
 from tests.pool.parquet.rows import batch, pooled, rows_of, ship, shipping, uuid_of
 from webots_mcp.connection import connect
 from webots_mcp.errors import InvalidInputError, PoolError
-from webots_mcp.plugins.pool.parquet import asking
-from webots_mcp.plugins.pool.parquet.reading import ParquetPool
+from webots_mcp.plugins.pool.parquet import duckdb_statement as asking
+from webots_mcp.plugins.pool.parquet.parquet_reading import ParquetPool
 from webots_mcp.plugins.pool.parquet.storage import Storage
-from webots_mcp.plugins.pool.tables import table
+from webots_mcp.plugins.pool.shipped_tables import table
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.questions.runs import list_runs

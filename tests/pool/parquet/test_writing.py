@@ -38,19 +38,19 @@ from tests.pool.parquet.rows import (
     uuid_of,
 )
 from webots_mcp.errors import InvalidInputError, PoolBusyError, PoolError, PoolUnavailableError
-from webots_mcp.plugins.pool.batch import Batch, Row
-from webots_mcp.plugins.pool.parquet import rows as arrow_rows
+from webots_mcp.plugins.pool.parquet import arrow_rows
 from webots_mcp.plugins.pool.parquet.lease import LEASE_S
-from webots_mcp.plugins.pool.parquet.reading import ParquetPool
-from webots_mcp.plugins.pool.parquet.writing import PART_BYTES, ParquetTarget
-from webots_mcp.plugins.pool.tables import SQLValue, table, tables
+from webots_mcp.plugins.pool.parquet.parquet_reading import ParquetPool
+from webots_mcp.plugins.pool.parquet.parquet_writing import PART_BYTES, ParquetTarget
+from webots_mcp.plugins.pool.row_batch import Batch, Row
+from webots_mcp.plugins.pool.shipped_tables import SQLValue, table, tables
 
 DAY_S = 86_400.0
 MIDNIGHT_S = 19_700 * DAY_S
 
 HOLDER = """
 import os, sys
-from webots_mcp.plugins.pool.parquet.writing import ParquetTarget
+from webots_mcp.plugins.pool.parquet.parquet_writing import ParquetTarget
 with ParquetTarget(sys.argv[1]) as target:
     target.prepare()
     with target.shipment(sys.argv[2]):

@@ -9,9 +9,9 @@ from typing import Any
 from uuid import UUID
 
 from tests.postgres import Server
-from webots_mcp.plugins.pool.batch import Batch, batches
-from webots_mcp.plugins.pool.postgres.writing import PostgresTarget
-from webots_mcp.plugins.pool.tables import Table, tables
+from webots_mcp.plugins.pool.postgres.postgres_writing import PostgresTarget
+from webots_mcp.plugins.pool.row_batch import Batch, batches
+from webots_mcp.plugins.pool.shipped_tables import Table, tables
 
 
 def uuid_of(recording: sqlite3.Connection) -> str:

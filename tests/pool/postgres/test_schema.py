@@ -12,9 +12,9 @@ import pytest
 from tests.postgres import Server
 from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.errors import PoolError, PoolUnavailableError
-from webots_mcp.plugins.pool.postgres.schema import prepare
-from webots_mcp.plugins.pool.postgres.views import VIEWS
-from webots_mcp.plugins.pool.tables import Table, tables
+from webots_mcp.plugins.pool.postgres.postgres_schema import prepare
+from webots_mcp.plugins.pool.postgres.postgres_views import VIEWS
+from webots_mcp.plugins.pool.shipped_tables import Table, tables
 
 COLUMNS = (
     "SELECT column_name, data_type, is_nullable = 'YES' FROM information_schema.columns "

@@ -20,7 +20,7 @@ from tests.recordings.rover import Recorder, record_rover, start_run
 from tests.store.test_views import CHOICES, MODES, PLACES, POSES
 from webots_mcp.connection import connect
 from webots_mcp.naming import find_mode, find_position, flatten, metres_in
-from webots_mcp.plugins.pool.postgres.views import VIEWS
+from webots_mcp.plugins.pool.postgres.postgres_views import VIEWS
 from webots_mcp.store.rollup.rolling import roll
 
 # Whole states, each other than those of `tests/store/test_views.py`.

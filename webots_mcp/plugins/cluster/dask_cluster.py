@@ -299,8 +299,8 @@ class ClusterSimulators:
 
     def _fetched(self, result: Result, recording_uuid: str, folder: Path) -> Result:
         """The result, with its runs in a recording in the folder, as if it had been returned."""
-        from webots_mcp.plugins.pool.catalogue import Meant
         from webots_mcp.plugins.pool.fetching import fetch
+        from webots_mcp.plugins.pool.pool_contents import Meant
 
         assert self._needs.ship_to is not None
         recording = Recording(folder / DATABASE_NAME, folder)

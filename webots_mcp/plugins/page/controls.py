@@ -12,8 +12,8 @@ from bokeh.models import Checkbox as Switch
 
 from webots_mcp.naming import spelled_out
 from webots_mcp.parameter import Value
-from webots_mcp.plugins.page.looking import Look, Surroundings, run_title
 from webots_mcp.plugins.page.style import STATUS, sheet
+from webots_mcp.plugins.page.tab_data import Look, Surroundings, run_title
 from webots_mcp.webots.stream import Order
 
 NEWEST: Final = "newest"

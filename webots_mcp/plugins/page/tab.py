@@ -35,15 +35,12 @@ from webots_mcp.plugins.page.controls import (
     buttons,
 )
 from webots_mcp.plugins.page.growing import grow_signals, grow_way
-from webots_mcp.plugins.page.looking import (
-    Drawing,
-    Look,
-    RunKey,
-    Surroundings,
-    gather,
-    look,
-    look_around,
-    rows_after,
+from webots_mcp.plugins.page.markup import (
+    log_markup,
+    notes_markup,
+    picture_markup,
+    problem_markup,
+    status_markup,
 )
 from webots_mcp.plugins.page.pacing import Beat
 from webots_mcp.plugins.page.style import (
@@ -57,19 +54,22 @@ from webots_mcp.plugins.page.style import (
     sheet,
 )
 from webots_mcp.plugins.page.summing import Summing
-from webots_mcp.plugins.page.words import (
-    log_markup,
-    notes_markup,
-    picture_markup,
-    problem_markup,
-    status_markup,
+from webots_mcp.plugins.page.tab_data import (
+    Drawing,
+    Look,
+    RunKey,
+    Surroundings,
+    gather,
+    look,
+    look_around,
+    rows_after,
 )
 from webots_mcp.plugins.report.charts import SignalsChart, WayChart, draw_signals, draw_way
 from webots_mcp.store.recording import Recording
 from webots_mcp.webots.stream import Order
 
 if TYPE_CHECKING:
-    from webots_mcp.plugins.page.steering import Told
+    from webots_mcp.plugins.page.steering_buttons import Told
 
 _log: Final = logging.getLogger(__name__)
 _PERIOD_MS: Final = 100
@@ -294,13 +294,13 @@ class Tab:
         self._choice = replace(self._choice, names=names or None)
 
     def _steer(self, order: Order) -> None:
-        from webots_mcp.plugins.page.steering import steer
+        from webots_mcp.plugins.page.steering_buttons import steer
 
         if self._shown is not None:
             self._command(order, partial(steer, self._steered, self._shown.robot, order))
 
     def _tune(self, name: str, value: Value) -> None:
-        from webots_mcp.plugins.page.steering import tune
+        from webots_mcp.plugins.page.steering_buttons import tune
 
         if self._shown is not None:
             self._command(name, partial(tune, self._steered, self._shown.robot, name, value))
@@ -347,7 +347,7 @@ class Tab:
         title = Div(text="<h1>webots-mcp</h1>", stylesheets=sheet(STATUS), align="center")
         orders: list[Any] = []
         if not self._read_only:
-            from webots_mcp.plugins.page.steering import ORDERS
+            from webots_mcp.plugins.page.steering_buttons import ORDERS
 
             orders = [buttons(ORDERS, self._steer)]
         head = row(title, *self._selectors.all, *orders, sizing_mode="stretch_width")

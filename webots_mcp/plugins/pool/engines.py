@@ -28,10 +28,10 @@ def open_target(url: str) -> Target:
         PoolError: The packages of an extra are missing.
     """
     if _is_postgres(url):
-        from webots_mcp.plugins.pool.postgres.writing import PostgresTarget
+        from webots_mcp.plugins.pool.postgres.postgres_writing import PostgresTarget
 
         return PostgresTarget(url)
-    from webots_mcp.plugins.pool.parquet.writing import ParquetTarget
+    from webots_mcp.plugins.pool.parquet.parquet_writing import ParquetTarget
 
     return ParquetTarget(url)
 
@@ -39,10 +39,10 @@ def open_target(url: str) -> Target:
 def open_pool(url: str) -> Pool:
     """The pool of a URL, to read from; as `open_target`."""
     if _is_postgres(url):
-        from webots_mcp.plugins.pool.postgres.reading import PostgresPool
+        from webots_mcp.plugins.pool.postgres.postgres_reading import PostgresPool
 
         return PostgresPool(url)
-    from webots_mcp.plugins.pool.parquet.reading import ParquetPool
+    from webots_mcp.plugins.pool.parquet.parquet_reading import ParquetPool
 
     return ParquetPool(url)
 

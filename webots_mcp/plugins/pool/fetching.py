@@ -23,10 +23,10 @@ from typing import Final
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.errors import PoolError
 from webots_mcp.liveness import process_alive
-from webots_mcp.plugins.pool.batch import Batch
-from webots_mcp.plugins.pool.catalogue import Meant
 from webots_mcp.plugins.pool.key_order import Order, in_order, order_of
-from webots_mcp.plugins.pool.tables import SQLValue, table
+from webots_mcp.plugins.pool.pool_contents import Meant
+from webots_mcp.plugins.pool.row_batch import Batch
+from webots_mcp.plugins.pool.shipped_tables import SQLValue, table
 from webots_mcp.plugins.pool.target import Pool, PooledRun, is_whole
 from webots_mcp.store.bundle import END_SESSIONS, small_recording
 from webots_mcp.store.images import PICTURES

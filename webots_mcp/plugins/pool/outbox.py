@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Final
 
-from webots_mcp.plugins.pool.batch import Batch, row_bytes
 from webots_mcp.plugins.pool.report import Report
+from webots_mcp.plugins.pool.row_batch import Batch, row_bytes
 from webots_mcp.plugins.pool.target import Shipment
 
 WRITE_BYTES: Final = 8_000_000

@@ -16,7 +16,7 @@ from webots_mcp.cli.recordings import HERE, Json, Where
 from webots_mcp.cli.rendering import clock_text, id_ranges, print_json, print_notes, print_table
 from webots_mcp.cli.values import Count
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
-from webots_mcp.plugins.pool.catalogue import (
+from webots_mcp.plugins.pool.pool_contents import (
     Choice,
     chosen_runs,
     chosen_trial_sets,

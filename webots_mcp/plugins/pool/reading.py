@@ -13,8 +13,15 @@ from hashlib import blake2b
 from typing import Any, Final, NamedTuple, TypeGuard
 
 from webots_mcp.errors import DatabaseError
-from webots_mcp.plugins.pool.batch import BATCH_BYTES, BATCH_ROWS, Batch, Row, batches, row_bytes
-from webots_mcp.plugins.pool.tables import SQLValue, Table
+from webots_mcp.plugins.pool.row_batch import (
+    BATCH_BYTES,
+    BATCH_ROWS,
+    Batch,
+    Row,
+    batches,
+    row_bytes,
+)
+from webots_mcp.plugins.pool.shipped_tables import SQLValue, Table
 from webots_mcp.store.rollup.buckets import COARSE_BUCKETS, bucket_of
 from webots_mcp.store.rollup.rolling import watermark
 

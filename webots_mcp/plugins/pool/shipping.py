@@ -24,8 +24,8 @@ from webots_mcp.errors import (
     PoolError,
 )
 from webots_mcp.liveness import dead_sessions
-from webots_mcp.plugins.pool.batch import Batch
-from webots_mcp.plugins.pool.kept import Kept
+from webots_mcp.plugins.pool.kept_states import Kept
+from webots_mcp.plugins.pool.missing_rollups import Summaries
 from webots_mcp.plugins.pool.outbox import WRITE_BYTES, Outbox
 from webots_mcp.plugins.pool.reading import (
     ROLLED,
@@ -34,8 +34,8 @@ from webots_mcp.plugins.pool.reading import (
     digest,
 )
 from webots_mcp.plugins.pool.report import Report
-from webots_mcp.plugins.pool.summaries import Summaries
-from webots_mcp.plugins.pool.tables import Table, table, tables
+from webots_mcp.plugins.pool.row_batch import Batch
+from webots_mcp.plugins.pool.shipped_tables import Table, table, tables
 from webots_mcp.plugins.pool.target import Shipment, Target, whole_runs
 from webots_mcp.store.images import MAX_FILE_BYTES, PICTURES, inside
 from webots_mcp.store.merging import settled

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Final, Protocol
 from urllib.parse import parse_qsl
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plugins.pool.batch import Batch
-from webots_mcp.plugins.pool.tables import Table
+from webots_mcp.plugins.pool.row_batch import Batch
+from webots_mcp.plugins.pool.shipped_tables import Table
 
 if TYPE_CHECKING:
     from webots_mcp.store.questions.sql import Result

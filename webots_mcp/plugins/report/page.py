@@ -12,7 +12,7 @@ from webots_mcp.naming import spelled_out
 from webots_mcp.plugins.report.chapter import Chapter
 from webots_mcp.plugins.report.comparison import Beside
 from webots_mcp.plugins.report.figures import Figures, moment_key
-from webots_mcp.plugins.report.pictures import Pictures
+from webots_mcp.plugins.report.run_pictures import Pictures
 from webots_mcp.plugins.report.words import clock, counted, size
 
 _TEMPLATES: Final = Path(__file__).parent / "templates"

@@ -52,13 +52,13 @@ def report(
     file needs nothing else and opens without a network.
     """
     from webots_mcp.plugins.report.making import make_report
-    from webots_mcp.plugins.report.words import size
-    from webots_mcp.plugins.report.writing import (
+    from webots_mcp.plugins.report.report_file import (
         file_name,
         require_folder,
         require_free,
         write_report,
     )
+    from webots_mcp.plugins.report.words import size
     from webots_mcp.store.reading.subject import find_subject
 
     recording = recorded.recording()

@@ -12,9 +12,9 @@ from typing import BinaryIO, Final, NamedTuple
 from webots_mcp.contract import whole_file
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins import ExportFormat, export_formats, load
-from webots_mcp.store.export.rows import Progress, Source
-from webots_mcp.store.export.text import write_csv
-from webots_mcp.store.export.trials import TrialTable
+from webots_mcp.store.export.export_rows import Progress, Source
+from webots_mcp.store.export.text_formats import write_csv
+from webots_mcp.store.export.trial_table import TrialTable
 from webots_mcp.store.reading.ranges import TimeRange
 
 
@@ -31,11 +31,13 @@ class Exported(NamedTuple):
 
 
 _OWN: Final = (
-    ExportFormat("csv", ("csv",), "webots_mcp.store.export.text:write_csv", passes=2, is_text=True),
+    ExportFormat(
+        "csv", ("csv",), "webots_mcp.store.export.text_formats:write_csv", passes=2, is_text=True
+    ),
     ExportFormat(
         "jsonl",
         ("jsonl", "json", "ndjson"),
-        "webots_mcp.store.export.text:write_json_lines",
+        "webots_mcp.store.export.text_formats:write_json_lines",
         is_text=True,
     ),
 )

@@ -9,7 +9,7 @@ Such a folder has no simulation times: they are counted in seconds of wall time 
 thing in it. `reading` checks everything before `import_folder` writes the first row.
 """
 
-from webots_mcp.store.json_folder.reading import read_folder
-from webots_mcp.store.json_folder.writing import Imported, import_folder
+from webots_mcp.store.json_folder.folder_import import Imported, import_folder
+from webots_mcp.store.json_folder.folder_reading import read_folder
 
 __all__ = ["Imported", "import_folder", "read_folder"]

@@ -28,8 +28,8 @@ from pathlib import PurePosixPath
 from typing import Final
 
 from webots_mcp.errors import PoolError
-from webots_mcp.plugins.pool.batch import Row
-from webots_mcp.plugins.pool.tables import SQLValue, Table
+from webots_mcp.plugins.pool.row_batch import Row
+from webots_mcp.plugins.pool.shipped_tables import SQLValue, Table
 
 POOL: Final = "_pool"
 RUNS: Final = "_runs"

@@ -8,7 +8,7 @@ Importing this package imports Bokeh, which takes a while.
 """
 
 from webots_mcp.plugins.report.charts.chart import Chart
-from webots_mcp.plugins.report.charts.signals import SignalsChart, draw_signals, signals_chart
+from webots_mcp.plugins.report.charts.signal_panels import SignalsChart, draw_signals, signals_chart
 from webots_mcp.plugins.report.charts.way import WayChart, draw_way, way_chart
 
 __all__ = [

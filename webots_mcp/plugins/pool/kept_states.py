@@ -11,10 +11,10 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from webots_mcp.plugins.pool.batch import Batch, Row
 from webots_mcp.plugins.pool.outbox import Put
 from webots_mcp.plugins.pool.reading import Source, Stretch, is_finite
-from webots_mcp.plugins.pool.tables import SQLValue, Table, table
+from webots_mcp.plugins.pool.row_batch import Batch, Row
+from webots_mcp.plugins.pool.shipped_tables import SQLValue, Table, table
 
 _NEVER: Final = -1
 # Names of the progress: the wall time of the newest state that was shipped at full rate, and up to

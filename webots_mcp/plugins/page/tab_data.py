@@ -24,7 +24,7 @@ from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plotting.trajectory_axes import TrajectoryAxes
 from webots_mcp.plugins.page.choice import Choice
 from webots_mcp.plugins.report.charts.obstacles import Obstacle, obstacles_of
-from webots_mcp.plugins.report.charts.signals import ROOM
+from webots_mcp.plugins.report.charts.signal_panels import ROOM
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.images import StoredImage, newest_image

@@ -8,7 +8,7 @@ import json
 import math
 from typing import Any, BinaryIO, Final
 
-from webots_mcp.store.export.rows import Table, as_text
+from webots_mcp.store.export.export_rows import Table, as_text
 
 _SPELLED: Final = ("bool", "text", "numbers")
 _FORMULAS: Final = ("=", "+", "-", "@", "\t", "\r")

@@ -15,11 +15,11 @@ from contextlib import closing, suppress
 from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plugins.pool.asking import Kind, answered, bounded
 from webots_mcp.plugins.pool.parquet.layout import files_of
 from webots_mcp.plugins.pool.parquet.packages import package
 from webots_mcp.plugins.pool.parquet.storage import Storage
-from webots_mcp.plugins.pool.tables import Table, tables
+from webots_mcp.plugins.pool.pool_statement import Kind, answered, bounded
+from webots_mcp.plugins.pool.shipped_tables import Table, tables
 from webots_mcp.store.questions.sql import MAX_BYTES, Result, require_max_rows
 from webots_mcp.store.questions.sql_process import FOLDER, Statement, decode, main
 

@@ -15,7 +15,15 @@ from contextlib import contextmanager, suppress
 from typing import Any, Final
 
 from webots_mcp.errors import PoolError, PoolUnavailableError
-from webots_mcp.plugins.pool.batch import Batch, Row
+from webots_mcp.plugins.pool.parquet.arrow_rows import (
+    as_arrow,
+    decoded,
+    encoded,
+    footer_of,
+    joined,
+    replaced,
+    span,
+)
 from webots_mcp.plugins.pool.parquet.layout import (
     LEASE,
     RUNS,
@@ -28,7 +36,7 @@ from webots_mcp.plugins.pool.parquet.layout import (
 )
 from webots_mcp.plugins.pool.parquet.lease import Lease
 from webots_mcp.plugins.pool.parquet.packages import package
-from webots_mcp.plugins.pool.parquet.progress import (
+from webots_mcp.plugins.pool.parquet.pool_state import (
     Part,
     Progress,
     make_pool,
@@ -36,17 +44,9 @@ from webots_mcp.plugins.pool.parquet.progress import (
     read_progress,
     require_pool,
 )
-from webots_mcp.plugins.pool.parquet.rows import (
-    as_arrow,
-    decoded,
-    encoded,
-    footer_of,
-    joined,
-    replaced,
-    span,
-)
 from webots_mcp.plugins.pool.parquet.storage import Storage
-from webots_mcp.plugins.pool.tables import Table, tables
+from webots_mcp.plugins.pool.row_batch import Batch, Row
+from webots_mcp.plugins.pool.shipped_tables import Table, tables
 
 # A part is over when its file is so large, or its rows in memory are, or when what comes at a time
 # is so little beside it that it would be written again for almost nothing.

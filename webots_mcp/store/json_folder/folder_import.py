@@ -22,7 +22,7 @@ from webots_mcp.contract import (
     new_uuid,
 )
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.store.json_folder.reading import (
+from webots_mcp.store.json_folder.folder_reading import (
     COMMANDS,
     LOG,
     STATUS,

@@ -8,12 +8,12 @@ from typing import Any, Final, cast
 from controller.wire import Message
 
 from webots_mcp.standin.arena import Body
-from webots_mcp.standin.errors import WorldError
 from webots_mcp.standin.export import as_text
 from webots_mcp.standin.nodes import NODE_TYPES, FieldDefinition
 from webots_mcp.standin.picture import Label
 from webots_mcp.standin.protos import shown_definitions
 from webots_mcp.standin.simulator import Mode, Robot, Simulator, Wanted
+from webots_mcp.standin.standin_errors import WorldError
 from webots_mcp.standin.vrml import Node, Parser, descendants_of
 
 CUSTOM_DATA_TAG: Final = 0

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
 from webots_mcp.store.analysis.ranking import Ranked
-from webots_mcp.store.export.rows import Column, Row, Table
+from webots_mcp.store.export.export_rows import Column, Row, Table
 from webots_mcp.store.trials import (
     Trial,
     best_of,

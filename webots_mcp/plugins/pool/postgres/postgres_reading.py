@@ -16,11 +16,11 @@ from psycopg.abc import Buffer
 from psycopg.adapt import Loader
 
 from webots_mcp.errors import InvalidInputError, PoolError
-from webots_mcp.plugins.pool.asking import Kind, answered, bounded
-from webots_mcp.plugins.pool.batch import Batch, Row, batches
+from webots_mcp.plugins.pool.pool_statement import Kind, answered, bounded
 from webots_mcp.plugins.pool.postgres.connecting import Connection, clear_errors, connect, one_line
-from webots_mcp.plugins.pool.postgres.schema import OWNER, require_current
-from webots_mcp.plugins.pool.tables import Table, tables
+from webots_mcp.plugins.pool.postgres.postgres_schema import OWNER, require_current
+from webots_mcp.plugins.pool.row_batch import Batch, Row, batches
+from webots_mcp.plugins.pool.shipped_tables import Table, tables
 from webots_mcp.plugins.pool.target import (
     PooledRecording,
     PooledRun,

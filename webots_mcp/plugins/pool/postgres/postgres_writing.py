@@ -20,10 +20,16 @@ import psycopg
 from psycopg.adapt import Buffer, Dumper
 
 from webots_mcp.errors import PoolBusyError, PoolError
-from webots_mcp.plugins.pool.batch import Batch, Row
 from webots_mcp.plugins.pool.postgres.connecting import Connection, clear_errors, connect
-from webots_mcp.plugins.pool.postgres.schema import END_S, FIRST_S, OWNER, prepare, require_current
-from webots_mcp.plugins.pool.tables import SQLValue, Table
+from webots_mcp.plugins.pool.postgres.postgres_schema import (
+    END_S,
+    FIRST_S,
+    OWNER,
+    prepare,
+    require_current,
+)
+from webots_mcp.plugins.pool.row_batch import Batch, Row
+from webots_mcp.plugins.pool.shipped_tables import SQLValue, Table
 from webots_mcp.plugins.pool.target import redacted
 
 _T = TypeVar("_T")

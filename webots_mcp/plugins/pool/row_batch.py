@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from webots_mcp.plugins.pool.tables import SQLValue, Table
+from webots_mcp.plugins.pool.shipped_tables import SQLValue, Table
 
 BATCH_BYTES: Final = 4_000_000
 BATCH_ROWS: Final = 20_000

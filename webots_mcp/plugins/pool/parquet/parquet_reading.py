@@ -9,14 +9,14 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.errors import PoolUnavailableError
-from webots_mcp.plugins.pool.batch import Batch, Row, batches
-from webots_mcp.plugins.pool.parquet.asking import ask
+from webots_mcp.plugins.pool.parquet.arrow_rows import as_rows, decoded, footer_of, pieces_of, span
+from webots_mcp.plugins.pool.parquet.duckdb_statement import ask
 from webots_mcp.plugins.pool.parquet.layout import files_of, folder_of, picture_file, uuid_in
 from webots_mcp.plugins.pool.parquet.packages import package
-from webots_mcp.plugins.pool.parquet.progress import read_progress, require_pool
-from webots_mcp.plugins.pool.parquet.rows import as_rows, decoded, footer_of, pieces_of, span
+from webots_mcp.plugins.pool.parquet.pool_state import read_progress, require_pool
 from webots_mcp.plugins.pool.parquet.storage import Storage
-from webots_mcp.plugins.pool.tables import Table, table, tables
+from webots_mcp.plugins.pool.row_batch import Batch, Row, batches
+from webots_mcp.plugins.pool.shipped_tables import Table, table, tables
 from webots_mcp.plugins.pool.target import PooledRecording, PooledRun, PooledSize, PooledTrialSet
 from webots_mcp.store.questions.sql import Result
 

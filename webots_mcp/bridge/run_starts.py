@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from webots_mcp.bridge.clock import Clock
+from webots_mcp.bridge.declared_parameters import Parameters
 from webots_mcp.bridge.heartbeat import Heartbeat
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.motors import Motors
-from webots_mcp.bridge.parameters import Parameters
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.reloads import Reloads
 from webots_mcp.bridge.scene_edits import SceneEdits

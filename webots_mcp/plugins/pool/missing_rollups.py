@@ -12,7 +12,7 @@ from typing import Final
 
 from webots_mcp.plugins.pool.outbox import Put
 from webots_mcp.plugins.pool.reading import NOT_YET, Mark, Source, coarse_after, digest
-from webots_mcp.plugins.pool.tables import table
+from webots_mcp.plugins.pool.shipped_tables import table
 
 _ROLLED: Final = "rolled"  # up to that state row, the rollups of all runs are shipped
 # Of a first time, which may be long: up to that run they are shipped up to another state row.

@@ -28,8 +28,8 @@ from sqlalchemy.pool import StaticPool
 from webots_mcp.contract import SCHEMA_VERSION, bundled
 from webots_mcp.errors import PoolError
 from webots_mcp.plugins.pool.postgres.connecting import Connection, clear_errors, connect
-from webots_mcp.plugins.pool.postgres.views import VIEWS, make_views
-from webots_mcp.plugins.pool.tables import Table, table, tables
+from webots_mcp.plugins.pool.postgres.postgres_views import VIEWS, make_views
+from webots_mcp.plugins.pool.shipped_tables import Table, table, tables
 
 OWNER: Final = "recording_uuid"
 VERSION: Final = "pool_version"  # Alembic's, under a name that says whose tables these are

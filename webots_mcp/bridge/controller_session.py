@@ -10,9 +10,10 @@ from typing import Any, Final
 
 from webots_mcp.bridge.breakpoints import Breakpoints
 from webots_mcp.bridge.clock import Clock
-from webots_mcp.bridge.commands import ClaimedCommand, ClaimedCommands
+from webots_mcp.bridge.command_queue import ClaimedCommand, ClaimedCommands
 from webots_mcp.bridge.context import Context
 from webots_mcp.bridge.control import Control
+from webots_mcp.bridge.declared_parameters import CODE, Parameters
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.goal import Watch
 from webots_mcp.bridge.heartbeat import Heartbeat
@@ -20,18 +21,17 @@ from webots_mcp.bridge.identity import identify
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.keeping import Keeper
 from webots_mcp.bridge.motors import Motors
-from webots_mcp.bridge.parameters import CODE, Parameters
 from webots_mcp.bridge.pause import Pause
-from webots_mcp.bridge.pictures import Album
+from webots_mcp.bridge.picture_files import Album
 from webots_mcp.bridge.publisher import Publisher
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
 from webots_mcp.bridge.reloads import Reloads
-from webots_mcp.bridge.runs import Runs
+from webots_mcp.bridge.run_starts import Runs
 from webots_mcp.bridge.scene_edits import SceneEdits
-from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.bridge.start_values import StartValues
 from webots_mcp.bridge.throttle import Throttle
+from webots_mcp.bridge.webots_api import Simulation
 from webots_mcp.contract import (
     PARAMETERS_VARIABLE,
     UNMOVED,

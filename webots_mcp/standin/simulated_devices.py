@@ -6,15 +6,15 @@ from collections.abc import Callable
 from math import cos, inf, nan, pi, sin
 from typing import Any, Final
 
-from webots_mcp.standin import camera
+from webots_mcp.standin import camera_rendering as camera
 from webots_mcp.standin.arena import Arena
-from webots_mcp.standin.device import Device, Site, looked_up, table_of
 from webots_mcp.standin.frame import Frame
 from webots_mcp.standin.light_sensor import LightSensor
 from webots_mcp.standin.motion_sensors import Accelerometer, Compass, Gyro
 from webots_mcp.standin.nodes import DEVICE_TYPES
 from webots_mcp.standin.physics import Vehicle
 from webots_mcp.standin.shapes import Shape, nearest_m, targets_from
+from webots_mcp.standin.simulated_device import Device, Site, looked_up, table_of
 from webots_mcp.standin.touch_sensor import TouchSensor
 from webots_mcp.standin.vrml import Node, children_of
 from webots_mcp.standin.world import own_frame

@@ -13,9 +13,9 @@ from typing import Any, Final
 from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.errors import PoolError
 from webots_mcp.naming import unit_in
-from webots_mcp.plugins.pool.batch import Row
 from webots_mcp.plugins.pool.parquet.packages import package
-from webots_mcp.plugins.pool.tables import SQLValue, Table
+from webots_mcp.plugins.pool.row_batch import Row
+from webots_mcp.plugins.pool.shipped_tables import SQLValue, Table
 
 _APPENDED_GROUP_ROWS: Final = 20_000
 _CHANGING_GROUP_ROWS: Final = 4_000  # those of many files are read side by side

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from webots_mcp.errors import NoDatabaseError, NothingRecordedError, WebotsMCPError
 from webots_mcp.naming import spelled_out
-from webots_mcp.plugins.page.looking import Look
+from webots_mcp.plugins.page.tab_data import Look
 from webots_mcp.store.images import StoredImage, opened
 from webots_mcp.store.logs import LogLine
 from webots_mcp.store.status import RUNNING

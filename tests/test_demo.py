@@ -11,12 +11,15 @@ from pathlib import Path
 
 import pytest
 
+from webots_mcp.errors import WebotsMCPError
 from webots_mcp.plugins.demo import conversation as demo
+from webots_mcp.questions import all_questions
 from webots_mcp.setup.client_entries import can_be_started, is_ours, words_of
 
 TURNS = tuple(
     turn for turn in demo.CONVERSATION if turn[1] in ("webots_list_commands", "webots_plot")
 )
+QUESTIONS = {each.name: each for each in all_questions()}
 CLIENTS = (Path(__file__).parents[1] / "docs" / "clients.md").read_text("utf-8")
 
 
@@ -50,6 +53,21 @@ def test_the_last_lines_connect_a_client(printed: str) -> None:
     assert shown is not None
     assert line == shown[0] + shlex.join(command)
     assert "webots-mcp init" in end.splitlines()[-1]
+
+
+def test_everything_that_it_asks_can_be_asked() -> None:
+    for _, tool, arguments in demo.CONVERSATION:
+        assert arguments.keys() <= QUESTIONS[tool].arguments.model_fields.keys()
+        QUESTIONS[tool].arguments.model_validate(arguments)
+
+
+def test_an_answer_that_is_an_error_ends_it_with_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = (("What next?", "webots_get_robot_state", {"robot": "nobody"}), *TURNS)
+    with pytest.raises(WebotsMCPError, match="answered with an error, see above"):
+        demo.run(tmp_path, conversation=asked)
+    assert "'nobody'" in capsys.readouterr().out.partition(asked[0][1])[2]
 
 
 def test_as_json_its_answers_are_one_object(

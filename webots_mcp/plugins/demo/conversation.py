@@ -60,7 +60,7 @@ CONVERSATION: Final[tuple[Turn, ...]] = (
         "webots_run",
         {"until": "changed(mode)", "for_s": 20, "then": "as_before"},
     ),
-    ("Watch it for five seconds.", "webots_monitor", {"duration_s": 5}),
+    ("Watch it for five seconds.", "webots_monitor", {"duration_wall_s": 5}),
     ("What has each signal done since the start?", "webots_get_trends", {}),
     (
         "Since when, and how often, was it avoiding something or stuck?",
@@ -145,7 +145,7 @@ async def converse(data_dir: Path, conversation: tuple[Turn, ...]) -> list[dict[
             took_s = time.monotonic() - started_s
             _say(f"  ({took_s:.2f} s)")
             if result.is_error:
-                raise WebotsMCPError("the demo's server answered with an error, see above")
+                break
             answers.append(
                 {
                     "question": question,
@@ -157,7 +157,10 @@ async def converse(data_dir: Path, conversation: tuple[Turn, ...]) -> list[dict[
             )
             if tool == "webots_plot":
                 _save_plot(result, data_dir / f"{arguments.get('kind', 'signals')}.png")
-    return answers
+        else:
+            return answers
+    # only here: what is raised before the client has ended comes out as a group of exceptions
+    raise WebotsMCPError("the demo's server answered with an error, see above")
 
 
 @contextlib.asynccontextmanager

@@ -120,12 +120,26 @@ def _end(code: int, text: str) -> int:
 
 
 def _explain_missing(error: ModuleNotFoundError) -> str:
-    """Raises the error again where it is a defect of ours."""
+    """Which packages are missing, and the line that installs them: a bridge does without any.
+
+    Raises:
+        ModuleNotFoundError: Again, where it is a defect of ours.
+    """
     if (error.name or "").partition(".")[0] == "webots_mcp":
         raise error
-    from webots_mcp.cli.missing import explain_missing
+    from webots_mcp.requirements import checkout, install_line, missing_requirements, package_of
 
-    return explain_missing(error)
+    wanted = missing_requirements()
+    if not wanted:
+        return (
+            f"the Python package {error.name!r} is missing: install webots-mcp with what it "
+            f"depends on, by {install_line([checkout()])}"
+        )
+    names = ", ".join(map(package_of, wanted))
+    return (
+        f"this command needs packages that a bridge does without, and they are missing: {names}. "
+        f"Install them with\n\n    {install_line(wanted)}\n"
+    )
 
 
 def _discard_output() -> None:

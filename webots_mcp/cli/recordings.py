@@ -200,7 +200,7 @@ def past_invalid_rows(run: Callable[[], None]) -> None:
 
 def sum_up_first(recording: Recording) -> None:
     """Roll up what no server has rolled up, so that a question of any length is answered."""
-    from webots_mcp.cli.progress import shown_progress
+    from webots_mcp.cli.terminal import shown_progress
     from webots_mcp.store.summing_up import sum_up
 
     with shown_progress("summing up what was recorded") as progress:

@@ -1,5 +1,7 @@
 """What a command writes, which a terminal may show: nothing of a recording that it would obey.
 
+It is shown how far long work has come; in a pipe that is silent.
+
 Names, texts and log lines come from controllers and from recordings of others. Whatever a command
 prints goes through one stream, in which control characters and such as turn the direction of
 writing are spelled out; as JSON escapes, so that JSON stays the same data.
@@ -13,10 +15,12 @@ import io
 import select
 import sys
 import time
-from collections.abc import Generator
-from typing import Any, TextIO, cast
+from collections.abc import Callable, Generator
+from typing import Any, Final, TextIO, cast
 
 from webots_mcp.naming import spelled_out
+
+_INTERVAL_S: Final = 0.1  # between two lines of progress
 
 
 class _SpelledOut:
@@ -87,3 +91,40 @@ def rewrite(stream: TextIO, text: str = "") -> None:
         raw = stream.stream if isinstance(stream, _SpelledOut) else stream
         raw.write(f"\r{spelled_out(text)}\x1b[K")
         raw.flush()
+
+
+@contextlib.contextmanager
+def shown_progress(doing: str) -> Generator[Callable[[int, int], None]]:
+    """A function to call with how much is done and how much there is; the line vanishes at the end.
+
+    It is written to stderr, because stdout may be the data.
+    """
+    next_s = 0.0
+
+    def show(done: int, of: int) -> None:
+        nonlocal next_s
+        if time.monotonic() >= next_s:
+            next_s = time.monotonic() + _INTERVAL_S
+            rewrite(sys.stderr, f"{doing}: {100 * done // max(of, 1)} %")
+
+    if not sys.stderr.isatty():
+        yield lambda done, of: None
+        return
+    try:
+        yield show
+    finally:
+        rewrite(sys.stderr)
+
+
+@contextlib.contextmanager
+def line_of_progress() -> Generator[None]:
+    """Inside, `show_progress` has a line, which vanishes at the end."""
+    try:
+        yield
+    finally:
+        rewrite(sys.stderr)
+
+
+async def show_progress(progress: float, total: float | None, text: str) -> None:
+    """On a terminal one line that changes; in a pipe nothing, as for all commands."""
+    rewrite(sys.stderr, text)

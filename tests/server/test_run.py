@@ -16,6 +16,7 @@ from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail, pictures_
 from tests.server.story import rows_of
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.steering.dispatch import Dispatcher
+from webots_mcp.steering.request import CLAIMING_S
 from webots_mcp.steering.running import require_possible
 from webots_mcp.store.recording import Recording
 
@@ -123,6 +124,26 @@ async def test_a_cancelled_step_ends_and_leaves_the_simulation_paused(
         assert (await ask(client, "webots_get_robot_state"))["status"] == "paused"
         again = await ask(client, "webots_simulation_control", command="step", steps=2)
         assert (again["outcome"], again["result"]["steps"]) == ("done", 2)
+
+
+async def test_a_step_whose_asker_leaves_long_after_it_was_claimed_ends_too(
+    connect: Connect, driver: Driver
+) -> None:
+    async with connect() as client:
+        async with anyio.create_task_group() as tasks:
+
+            async def leave_at_last(progress: float, total: float | None, message: str | None):
+                reports.append(progress)
+                if len(reports) > CLAIMING_S + 1:  # one comes each second
+                    tasks.cancel_scope.cancel()
+
+            reports: list[float] = []
+            arguments = {"command": "step", "steps": 5000}
+            await client.call_tool(
+                "webots_simulation_control", arguments, progress_callback=leave_at_last
+            )
+        ended = await _until_run_is(client, "done", "step")
+        assert ended["result"]["why"] == "it was cancelled before the last step"
 
 
 async def test_an_interrupt_that_meets_the_waiting_itself_ends_the_run(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Awaitable, Callable, Mapping
@@ -48,11 +49,20 @@ class Dispatcher:
         action: str,
         timeout_s: float,
         params: Mapping[str, Any] | None = None,
+        *,
+        claiming_s: float = math.inf,
     ) -> CommandAnswer:
         """Send a command, wait until it is final or the time is up, and report its outcome.
 
         A command that is not claimed at the deadline is cancelled, so that it cannot run when its
         caller has stopped waiting; the same happens when the caller disconnects.
+
+        Args:
+            robot: Whose controller is asked; None where only one can be meant.
+            action: A built-in or registered action.
+            timeout_s: How long to wait for the outcome, in wall seconds.
+            params: Its parameters, plain JSON.
+            claiming_s: How long to wait for a controller to claim it, if less, in wall seconds.
 
         Raises:
             InvalidInputError: The robot, the action or its parameters are invalid.
@@ -60,8 +70,9 @@ class Dispatcher:
             NothingRecordedError: There is no robot to ask.
         """
         started_s = time.monotonic()
-        sent = await self._send(robot, action, params or {}, timeout_s)
-        command = await self._outcome(sent, timeout_s)
+        claiming_s = min(claiming_s, timeout_s)
+        sent = await self._send(robot, action, params or {}, claiming_s)
+        command = await self._outcome(sent, claiming_s, started_s + timeout_s)
         waited_s = round(time.monotonic() - started_s, 3)
         return await to_thread.run_sync(self._answer, command, waited_s)
 
@@ -91,10 +102,13 @@ class Dispatcher:
                     await to_thread.run_sync(self._leave, sent)
             raise
 
-    async def _outcome(self, command: Command, timeout_s: float) -> Command:
+    async def _outcome(self, command: Command, claiming_s: float, until_s: float) -> Command:
         try:
-            command = await self._watch(command.id, timeout_s)
-            return await to_thread.run_sync(self._at_the_deadline, command)
+            command = await self._watch(command.id, claiming_s)
+            command = await to_thread.run_sync(self._at_the_deadline, command)
+            if command.is_final:
+                return command
+            return await self._watch(command.id, until_s - time.monotonic())
         except (anyio.get_cancelled_exc_class(), KeyboardInterrupt):
             # A KeyboardInterrupt is raised wherever the main thread is, which may be in this task.
             with anyio.CancelScope(shield=True):

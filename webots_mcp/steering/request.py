@@ -38,10 +38,9 @@ class Request:
         self, robot: str | None, action: str, params: Mapping[str, Any], claiming_s: float
     ) -> CommandAnswer:
         """The outcome of a command, which the controller must claim within `claiming_s`."""
-        wait_s = min(self._left_s, claiming_s)
-        answer = await self.dispatcher.ask(robot, action, wait_s, params)
-        if answer.outcome == "claimed" and answer.command_id is not None:
-            answer = await self.dispatcher.wait(answer.command_id, self._left_s)
+        answer = await self.dispatcher.ask(
+            robot, action, self._left_s, params, claiming_s=claiming_s
+        )
         answer.waited_s = self._waited_s
         return answer
 

@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 from tests.bridge.conftest import Recording
+from tests.recordings.rows import Recorded
 from tests.server.conftest import Driver
 from webots_mcp.cli import main
 
@@ -189,6 +190,19 @@ def test_a_breakpoint_of_a_robot_that_is_gone_is_stored_and_says_so(
     assert "it is stored, but not armed yet" in said
     assert "stepz is missing as long as it is not published; there is steps" in said
     assert "reads them when it starts" in said
+
+
+def test_a_command_that_no_route_could_do_says_why_each_failed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recorded = Recorded(tmp_path / "webots.db")
+    recorded.robot(supervisor=True, last_seen_wall_time_s=time.time() - 30)
+    assert main(["pause", "--timeout", "0.2", "--data-dir", str(tmp_path)]) == 2
+    said = capsys.readouterr().err
+    assert "pause is not done (cancelled)" in said
+    assert "websocket: " in said
+    assert "keyboard: not tried: it presses keys in Webots' window, which needs --force\n" in said
+    recorded.close()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -43,6 +43,7 @@ def data_dir(tmp_path: Path) -> Iterator[Path]:
         ("plot -o p.png --robot rover --width 5000", "--width 5000 must be from 400 to 2000"),
         ("plot -o p.png --robot rover --height 5", "--height 5 must be from 300 to 2000"),
         ("trends lost_s --robot rover", "'lost_s'"),
+        ("history mode --robot rover --after 3", "give it together with --raw\n"),
     ],
 )
 def test_an_error_names_what_was_typed(
@@ -50,6 +51,19 @@ def test_an_error_names_what_was_typed(
 ) -> None:
     assert main([*typed.split(), "--data-dir", str(data_dir)]) == 2
     assert answered in capsys.readouterr().err
+
+
+def test_a_flag_that_is_to_be_turned_off_is_named_by_the_option_that_does(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = Recorded(tmp_path / "webots.db")
+    rover = recording.robot("rover")
+    for row in range(1200):
+        rover.state(row * 0.1, {"front_m": None if row % 40 > 19 else 1.0})
+    recording.close()
+    assert main(["events", "--kind", "silent", "--data-dir", str(tmp_path)]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "--one-by-one tells alike events one by one" in said
 
 
 def test_a_hint_names_what_can_be_typed(data_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -75,7 +75,12 @@ def _run(argv: Sequence[str]) -> int:
     app = app_for(argv)
     if argv and argv[0] in COMMANDS:
         speak_of(
-            Typed(each.field_info.name, each.names[0], called_value(each))
+            Typed(
+                each.field_info.name,
+                each.names[0],
+                called_value(each),
+                next(iter(each.negatives), ""),
+            )
             for each in app[argv[0]].assemble_argument_collection()
             if each.names
         )

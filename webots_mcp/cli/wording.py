@@ -53,11 +53,16 @@ def speak_of(arguments: Iterable[Typed]) -> None:
 
 
 class Typed(NamedTuple):
-    """An argument, as a person types it."""
+    """An argument, as a person types it.
+
+    Attributes:
+        turned_off: Of a flag, the option that turns it off; empty where there is none.
+    """
 
     name: str
     typed: str
     value_name: str
+    turned_off: str = ""
 
 
 def value_name(option: str) -> str:
@@ -76,6 +81,8 @@ def as_typed(text: str) -> str:
     for each in _running.get():
         shown = f"{each.typed} {each.value_name}" if each.typed.startswith("-") else each.typed
         text = re.sub(rf"{_UNQUOTED}{each.name}=(\[['.]+\]|\.\.\.)", shown, text)
+        text = re.sub(rf"{_UNQUOTED}{each.name}=true\b", each.typed, text)
+        text = re.sub(rf"{_UNQUOTED}{each.name}=false\b", each.turned_off or each.typed, text)
         text = re.sub(rf"{_UNQUOTED}{each.name}=", f"{each.typed} ", text)
         if "_" in each.name:
             text = re.sub(rf"{_UNQUOTED}{each.name}{_NOT_ON}", each.typed, text)

@@ -154,4 +154,6 @@ def test_unknown_signals_are_told_with_the_nearest_ones() -> None:
     (told,) = condition.describe_unknown(["front_m", "mode", "speed"])
 
     assert told.startswith("frnt_m is missing as long as it is not published; there is front_m")
+    (short,) = condition.describe_unknown(["front_m", "mode", "speed", "x", "y"])
+    assert short.endswith("(the nearest of 5)") and "nearest" not in told
     assert "there is nothing yet" in condition.describe_unknown([])[0]

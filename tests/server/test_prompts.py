@@ -91,7 +91,8 @@ async def test_the_calls_of_a_prompt_can_be_made_as_they_stand(story: Path) -> N
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"start_s": "soon", "end_s": "2"}, "start_s must be a valid number"),
+        ({"start_s": "soon", "end_s": "2"}, "start_s must be a valid number, not 'soon'"),
+        ({"start_s": "1", "end_s": "2", "speed": "3"}, "there is no argument 'speed'"),
         ({"start_s": "1"}, "end_s"),
         ({"start_s": "1", "end_s": "2", "run_id": "1.5"}, "run_id must be a valid integer"),
     ],
@@ -105,3 +106,9 @@ async def test_an_argument_that_a_prompt_cannot_use_is_refused_by_its_name(
         assert "run_id" not in await read(
             client, "explain_stretch", {"start_s": "1", "end_s": "2", "run_id": ""}
         )
+
+
+async def test_a_stretch_may_be_given_from_its_end(story: Path) -> None:
+    async with client_on(story) as client:
+        said = await read(client, "explain_stretch", {"start_s": "9", "end_s": "3"})
+        assert "from 3 to 9 s" in said and "start_s=3, end_s=9" in said

@@ -95,7 +95,16 @@ async def test_a_tool_that_is_not_listed_answers_when_it_is_called(
     async with connect(core=True, read_only=True) as client:
         assert (await ask(client, "webots_get_sensors"))["hint"]
         with pytest.raises(AssertionError, match="Unknown tool"):
-            await ask(client, "webots_world_reset")
+            await ask(client, "webots_world_resets")
+
+
+async def test_a_tool_that_steers_says_that_the_server_only_reads(
+    connect: Connect, recorded: Recorded
+) -> None:
+    recorded.robot().state(1.0, {"x": 1})
+    async with connect(read_only=True) as client:
+        for name in ("webots_world_reset", "webots_set_field"):
+            assert "this server is --read-only" in await fail(client, name)
 
 
 @pytest.mark.parametrize(

@@ -191,7 +191,8 @@ def parse_condition(text: str) -> Condition:
 
 
 def _nearest(name: str, known: Collection[str]) -> str:
-    return ", ".join(nearest_first(name, known)[:_MOST_OFFERED]) or "nothing yet"
+    near = ", ".join(nearest_first(name, known)[:_MOST_OFFERED]) or "nothing yet"
+    return near + (f" (the nearest of {len(known)})" if len(known) > _MOST_OFFERED else "")
 
 
 class Compiler(Nodes):

@@ -62,7 +62,7 @@ Cursor = Annotated[_Place | None, Field(description=_CURSOR)]
 TextCursor = Annotated[str, Field(max_length=2000, description=_CURSOR)]
 # A number is as good; one type that holds both is shorter than two.
 _WallTime = Annotated[float | str | None, WithJsonSchema({"type": "string"})]
-Since = Annotated[_WallTime, Field(description="From, ISO 8601.")]
+Since = Annotated[_WallTime, Field(description="From, ISO 8601 with zone.")]
 Until = Annotated[_WallTime, Field(description="Before.")]
 Names = Annotated[
     list[str],

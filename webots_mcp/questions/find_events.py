@@ -140,7 +140,10 @@ def _kinds(
 ) -> tuple[str, ...]:
     """Who gives a threshold or a condition asks about that, unless other kinds are named."""
     if kinds and "threshold" in kinds and not thresholds:
-        raise InvalidInputError("kinds=['threshold'] needs signals, and above or below")
+        raise InvalidInputError(
+            "kinds=['threshold'] needs signals, and above or below; where='pose.x > 1' finds the "
+            "same stretches as kind 'condition'"
+        )
     given = ("threshold",) * bool(thresholds) + ("condition",) * (where is not None)
     return tuple(kinds or ()) or given
 

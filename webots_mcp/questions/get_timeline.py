@@ -40,7 +40,9 @@ def webots_get_timeline(
     nobody noted: webots_find_events.
     """
     if "threshold" in (kinds or ()):
-        raise InvalidInputError("a threshold has no place here: ask webots_find_events(above)")
+        raise InvalidInputError(
+            "a threshold has no place here: ask webots_find_events(where='pose.x > 1')"
+        )
     options = EventOptions(kinds=tuple(kinds or stored_kinds()), log_level=log_level)
     with recording.view(scope.robot, scope.run_id) as view:
         return answer_about(

@@ -79,6 +79,7 @@ def create_server(
             for each in possible
             if each not in shown
         },
+        withheld={each.name for each in all_questions()} - {each.name for each in possible},
         cache_hints={"tools/list": _KEPT, "prompts/list": _KEPT, "resources/list": _KEPT},
         lifespan=_lifespan(recording, Upkeep(data_dir), asked),
     )

@@ -68,6 +68,7 @@ def explain_stretch(
     robot: Robot = "",
 ) -> str:
     """What happened from one simulation time to another, and what led to it."""
+    start_s, end_s = sorted((start_s, end_s))
     run = f", run_id={run_id}" if run_id else ""
     stretch = f"start_s={start_s:.12g}, end_s={end_s:.12g}{run}{_too(robot)}"
     return (

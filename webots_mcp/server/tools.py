@@ -169,10 +169,15 @@ class ToolServer(MCPServer):
     """A server that answers to more names than it lists: those of questions that were merged."""
 
     def __init__(
-        self, *arguments: Any, unlisted: Mapping[str, Callable[[], Tool]], **options: Any
+        self,
+        *arguments: Any,
+        unlisted: Mapping[str, Callable[[], Tool]],
+        withheld: Collection[str],
+        **options: Any,
     ) -> None:
         super().__init__(*arguments, **options)
         self._unlisted = unlisted
+        self._withheld = withheld
 
     async def call_tool(
         self, name: str, arguments: dict[str, Any], context: Context[Any, Any] | None = None
@@ -182,6 +187,11 @@ class ToolServer(MCPServer):
         Raises:
             ToolError: There is no such tool, or it refused.
         """
+        if name in self._withheld:
+            raise ToolError(
+                f"{name} changes the simulation or the recording, and this server is --read-only: "
+                "ask for a server that was started without"
+            )
         if self._tool_manager.get_tool(name) is None and (make := self._unlisted.get(name)):
             context = context or Context(mcp_server=self)
             return await make().run(arguments, context, convert_result=True)

@@ -87,6 +87,25 @@ async def test_a_threshold_holds_for_at_least_so_long(story: Path) -> None:
     assert "need signals" in await refuse(story, "webots_find_events", above=1)
 
 
+async def test_lines_below_the_level_that_was_asked_for_are_not_absent(
+    recorded: Recorded, connect: Connect
+) -> None:
+    robot = recorded.robot()
+    robot.state(0.0, {"x": 1})
+    robot.state(1.0, {"x": 1})
+    robot.log(1.0, "left", "debug")
+    robot.log(1.0, "right")
+    asked = {"kinds": ["log"]}
+    async with connect(read_only=True) as client:
+        below = await ask(client, "webots_find_events", **asked)
+        none = await ask(client, "webots_find_events", **asked, log_level="info", end_s=0.5)
+        found = await ask(client, "webots_find_events", **asked, log_level="info")
+    said = "there are lines of level info, none of warning or above"
+    assert below["verdicts"] == {"came_near": {"log": said}}
+    assert none["verdicts"] == {"absent": "log"}
+    assert found["verdicts"] == {"found": {"log": 1}}
+
+
 async def test_the_timeline_goes_on_page_by_page(story: Path) -> None:
     seen: list[tuple[Any, ...]] = []
     cursor = ""

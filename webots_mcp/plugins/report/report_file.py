@@ -30,7 +30,7 @@ def require_free(file: Path, *, overwrite: bool) -> None:
         raise InvalidInputError(f"{file.name!r} is no page's name: end it in .html")
     if is_there and not overwrite:
         raise InvalidInputError(
-            f"{file} is there already: name another one, or let it be overwritten"
+            f"{file} is there already: name another one, or give overwrite (--overwrite)"
         )
 
 

@@ -234,12 +234,24 @@ def _is_number(value: object) -> bool:
 
 
 def log_events(search: Search) -> Iterator[Event]:
-    """Log lines of the level and above."""
-    levels = LEVELS[LEVELS.index(search.options.log_level) :]
+    """Log lines of the level and above; where there are only lower ones, this is noted."""
+    wanted = search.options.log_level
+    lower, levels = LEVELS[: LEVELS.index(wanted)], LEVELS[LEVELS.index(wanted) :]
     query = f"{_LOGS} AND level IN ({', '.join('?' * len(levels))}) "
-    for time_s, wall_s, level, source, message in _newest(search, "log", query, *levels):
+    rows = _newest(search, "log", query, *levels)
+    for time_s, wall_s, level, source, message in rows:
         details = {"source": source, "message": message}
         yield Event("log", search.segment.run_id, time_s, time_s, wall_s, level, details)
+    if rows:
+        return
+    for rank, level in reversed([*enumerate(lower, 1)]):
+        line = search.connection.execute(
+            f"{_LOGS} AND level = ? LIMIT 1", (*_bounds(search.segment), level)
+        )
+        if line.fetchone():
+            what = f"there are lines of level {level}, none of {wanted} or above"
+            search.came_near("log", rank / len(LEVELS), what)
+            return
 
 
 def noticed_events(search: Search) -> Iterator[Event]:

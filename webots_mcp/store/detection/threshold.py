@@ -78,7 +78,7 @@ def _for_s(options: EventOptions) -> float:
 
 THRESHOLD: Final = EventKind(
     "threshold",
-    "see above, below",
+    "",
     threshold_events,
     usual=lambda options: bool(options.thresholds),
     lasts=True,

@@ -272,6 +272,10 @@ def _in_simulation_time(
     start = first_s if start_s is None else _bound(connection, subject, start_s)
     # An end that is left out holds the newest row, also where the start lies beyond it.
     end = just_after(max(newest_s, start)) if end_s is None else _bound(connection, subject, end_s)
+    if start_s is None and end <= first_s:
+        raise InvalidRangeError(
+            f"run {run_id} has no row before end_s={_told(end)}: its first is at {_told(first_s)} s"
+        )
     _require_order(start, end, "start_s", "end_s")
     segment = Segment(run_id, start, end, open_start=start_s is None, open_end=end_s is None)
     notes = [*coverage_notes(connection, run_id, (start, end), bounds)]

@@ -311,6 +311,13 @@ def test_arrays_that_there_is_no_room_for_are_not_read() -> None:
 
 
 @pytest.mark.usefixtures("encoder")
+def test_values_that_are_few_enough_are_bounded_by_the_bytes_of_their_row() -> None:
+    texts = {"\U0001f600" * 56 + f"{number:04}": "\U0001f600" * 15 for number in range(3_900)}
+    assert MAX_ROW_BYTES < sum(len(f"{key}{text}".encode()) for key, text in texts.items())
+    assert_bounded(encoding.encode(texts))
+
+
+@pytest.mark.usefixtures("encoder")
 def test_an_array_of_few_but_long_items_is_not_read() -> None:
     Counted.read = 0
     assert encoding.encode({"a": Counted(10, 40_000_000)}).replaced == {

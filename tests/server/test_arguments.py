@@ -27,7 +27,7 @@ HUGE = 2**63
         ("list_robots", {"x": 1}, "no parameter 'x': there is none"),
         ("query_history", {}, "signals is missing"),
         ("query_history", {"signals": ["x"], "max_points": 501}, "max_points must be less than"),
-        ("query_history", {"signals": []}, "signals must have at least 1 item"),
+        ("query_history", {"signals": []}, "signals must have at least 1 item, not []"),
         ("get_trends", {"last_s": 0}, "last_s must be greater than 0, not 0"),
         ("get_trends", {"start_s": 1e308}, "start_s must be a number of seconds, not 1e+308"),
         (

@@ -40,7 +40,7 @@ def _fault(error: ErrorDetails, typed: Mapping[str, str]) -> str:
     if error["type"] == "unexpected_keyword_argument":
         return f"there is no argument {shown_value(name)}"
     asked = re.sub(r"^(Value error, |\w+ should )", "must ", error["msg"])
-    asked = re.sub(r", unable to parse .*| after validation$", "", asked)
+    asked = re.sub(r", unable to parse .*| after validation, not \d+", "", asked)
     if error["type"] == "int_parsing_size":
         asked = "must be a smaller number"
     return f"{name} {asked}, not {shown_value(error['input'])}{_near(error)}"

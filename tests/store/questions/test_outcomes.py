@@ -75,6 +75,16 @@ def test_what_no_run_has_is_told_as_not_known(empty: sqlite3.Connection) -> None
     assert names.split(", ") == ["distance_m", "mean_speed_m_s", "still per min", "stuck per min"]
 
 
+def test_runs_that_are_too_short_for_a_kind_share_one_reason(empty: sqlite3.Connection) -> None:
+    record(empty, "a", driving)
+    for seconds in (0.5, 0.9, 2.0):
+        record(empty, "b", driving, end_s=seconds)
+    found = compare_runs(empty, [1, 2, 3, 4]).not_known
+    (why,) = (why for names, why in found.items() if "stuck per min" in names)
+    assert why.startswith("run 2 lasted only") and why.endswith("; likewise run 3, 4")
+    assert "run 2: run 2" not in str(found)
+
+
 def with_names_of_its_own(time_s: float) -> dict[str, Any]:
     """In millimetres, with a mode that is a number; it stands from 10 to 16 and 28 to 34 s."""
     x, y = stuck_twice(time_s)["pose"]

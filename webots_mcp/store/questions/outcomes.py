@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
 from collections import Counter
 from collections.abc import Sequence
@@ -35,6 +36,7 @@ from webots_mcp.store.signals.registry import Signal
 
 _SHARE: Final = "share of "
 _DUST: Final = 1e-9  # of a figure
+_OF_THIS_RUN: Final = re.compile(r"^run \d+ lasted only [^;,]*|(?<=a period is over )\S+")
 _RATE: Final = " per min"
 NO_MODE: Final = (
     "no mode is known: publish one as a text, such as mode, or name the signal of one: mode=NAME"
@@ -173,18 +175,29 @@ def _counted(
 
 def _not_known(runs: Sequence[_Outcome]) -> dict[str, str]:
     """Why figures are not known: those that share a reason under one key, reasons in one text."""
-    runs_by_reason: dict[tuple[str, str], list[str]] = {}
+    alike: dict[tuple[str, str], dict[int, str]] = {}
     for run in runs:
-        for name, why in run.not_known.items():
-            runs_by_reason.setdefault((name, why), []).append(str(run.run_id))
+        for name, reasons in run.not_known.items():
+            for why in reasons:
+                key = (name, _OF_THIS_RUN.sub("", why))
+                alike.setdefault(key, {})[run.run_id] = why
     sharing: dict[str, list[str]] = {}
-    for (name, why), run_ids in runs_by_reason.items():
-        where = "" if len(run_ids) == len(runs) else f"run {', '.join(run_ids)}: "
-        sharing.setdefault(where + why, []).append(name)
+    for (name, _), reasons in alike.items():
+        sharing.setdefault(_reason_of_runs(reasons, len(runs)), []).append(name)
     by_reason: dict[str, list[str]] = {}
     for why, names in sharing.items():
         by_reason.setdefault(", ".join(names), []).append(why)
     return {names: "; ".join(reasons) for names, reasons in by_reason.items()}
+
+
+def _reason_of_runs(reasons: dict[int, str], of: int) -> str:
+    """One sentence for runs that share a reason; where their figures differ, those of the first."""
+    first, *others = reasons.items()
+    if any(why != first[1] for _, why in others):
+        return f"{first[1]}; likewise run {', '.join(str(run_id) for run_id, _ in others)}"
+    if len(reasons) == of or first[1].startswith(f"run {first[0]} "):
+        return first[1]
+    return f"run {', '.join(map(str, reasons))}: {first[1]}"
 
 
 class _Outcome(NamedTuple):
@@ -203,7 +216,7 @@ class _Outcome(NamedTuple):
     figures: dict[str, float | None]
     has_mode: bool
     events: Counter[str]
-    not_known: dict[str, str]
+    not_known: dict[str, tuple[str, ...]]
     unlooked: frozenset[str]
     complete: bool
 
@@ -223,10 +236,10 @@ def _outcome(
     run_id, duration_s = part.segment.run_id, part.segment.end_s - part.segment.start_s
     purged = run_info(connection, run_id).purged_rows > 0
     figures: dict[str, float | None] = {}
-    not_known: dict[str, str] = {}
+    not_known: dict[str, tuple[str, ...]] = {}
     position = part.motion.position
     if position is None:
-        not_known["distance_m, mean_speed_m_s"] = NAME_POSITION
+        not_known["distance_m, mean_speed_m_s"] = (NAME_POSITION,)
     else:
         read = None if purged else read_way(connection, part.segment, position, deadline)
         way = None if read is None or deadline.passed else read.length
@@ -235,19 +248,19 @@ def _outcome(
         doubt = doubt_of_unit(position, speed or 0.0)
         doubt = OUT_OF_TIME if deadline.passed else doubt
         if doubt := doubt or (way and doubt_of_length(way)):
-            not_known["distance_m, mean_speed_m_s"] = doubt
+            not_known["distance_m, mean_speed_m_s"] = (doubt,)
     modes = _mode_times(connection, part, deadline)
     if deadline.passed:
         modes = {}
     figures |= {f"{_SHARE}{mode}": seconds / duration_s for mode, seconds in modes.items()}
     if not modes:
-        not_known["share of each mode"] = OUT_OF_TIME if deadline.passed else NO_MODE
+        not_known["share of each mode"] = (OUT_OF_TIME if deadline.passed else NO_MODE,)
     found = _events(connection, part, options, deadline)
     verdicts = found.ledger.verdicts(found.kinds, found.events)
     if deadline.passed:
-        not_known[f"events{_RATE}"] = OUT_OF_TIME
+        not_known[f"events{_RATE}"] = (OUT_OF_TIME,)
     else:
-        not_known |= {f"{kind}{_RATE}": why for kind, why in verdicts.not_searched.items()}
+        not_known |= {f"{kind}{_RATE}": reasons for kind, reasons in verdicts.reasons.items()}
     return _Outcome(
         run_id,
         duration_s,

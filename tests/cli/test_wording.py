@@ -29,7 +29,7 @@ def data_dir(tmp_path: Path) -> Iterator[Path]:
         ("trends --robot rover --start 9 --end 3", "--start 9 must be less than --end 3"),
         ("trends --robot rover --last 3 --since 0", "use --start and --end (simulation time)"),
         ("trends --robot rover --last 3 --since 0", "or --since and --until"),
-        ("trends", "say which one with --robot NAME"),
+        ("trends", "say which one with --robot "),
         ("trends --run 77", "no run 77: the newest runs are"),
         ("compare 77 78", "no run 77"),
         (

@@ -15,14 +15,13 @@ from contextlib import contextmanager
 from typing import Annotated, Any, Final, Literal, Union, cast, get_args, get_origin
 
 import anyio
-from cyclopts import Parameter
 from pydantic import ValidationError
 from pydantic.json_schema import SkipJsonSchema
 
 from webots_mcp.cli.recordings import Json, Range, Where, sum_up_first
 from webots_mcp.cli.rendering import print_answer, text_of
 from webots_mcp.cli.terminal import line_of_progress, show_progress, wait
-from webots_mcp.cli.values import refuse_options, settings_of, value_of, whole_number
+from webots_mcp.cli.values import Parameter, refuse_options, settings_of, value_of, whole_number
 from webots_mcp.cli.wording import Typed, as_typed, speak_of, value_name
 from webots_mcp.contract import LOOPING
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError

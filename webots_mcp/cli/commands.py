@@ -137,7 +137,7 @@ def described() -> dict[str, Described]:
 
 def called_value(argument: Argument) -> str:
     """The word for its value."""
-    metavar = argument.parameter.metavar
+    metavar = getattr(argument.parameter, "metavar", None)  # cyclopts 4 has none
     return metavar if isinstance(metavar, str) else value_name(argument.names[-1])
 
 

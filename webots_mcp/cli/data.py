@@ -7,13 +7,11 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple
 
-from cyclopts import Parameter
-
 from webots_mcp.cli.limits import Limits
 from webots_mcp.cli.recordings import HERE, Json, Range, Where, past_invalid_rows, past_wrong_values
 from webots_mcp.cli.rendering import id_ranges, print_json, print_notes, print_table
 from webots_mcp.cli.terminal import binary_stdout, shown_progress
-from webots_mcp.cli.values import Id, refuse_options
+from webots_mcp.cli.values import Id, Parameter, refuse_options
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins import export_formats
 

@@ -19,8 +19,12 @@ _WORDS: Final = {signal.SIGINT: "ended by Ctrl-C", signal.SIGTERM: "ended by SIG
 
 @contextlib.contextmanager
 def ending_by_signals() -> Generator[None]:
-    """Let SIGTERM clean up as Ctrl-C does: by a KeyboardInterrupt, which carries the signal."""
-    with _handling(_interrupt, signal.SIGTERM):
+    """Let SIGTERM clean up as Ctrl-C does: by a KeyboardInterrupt, which carries the signal.
+
+    Before Python 3.11 anyio's own handling of Ctrl-C ends with a CancelledError.
+    """
+    as_well = (signal.SIGINT,) if sys.version_info < (3, 11) else ()
+    with _handling(_interrupt, signal.SIGTERM, *as_well):
         yield
 
 

@@ -10,9 +10,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
-from cyclopts import Parameter
 from cyclopts.validators import Number
 
+from webots_mcp.cli.values import Parameter
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins import stand_in_simulator
 

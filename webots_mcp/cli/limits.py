@@ -6,8 +6,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Annotated, Final
 
-from cyclopts import Parameter
-
+from webots_mcp.cli.values import Parameter
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.retention.limits import Asked
 from webots_mcp.store.retention.notation import NO_LIMIT, limit_text, option_of, parse_limit

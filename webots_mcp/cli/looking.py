@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from webots_mcp.cli.recordings import (
@@ -23,7 +22,7 @@ from webots_mcp.cli.recordings import (
 )
 from webots_mcp.cli.rendering import print_json, print_notes, printable
 from webots_mcp.cli.terminal import wait
-from webots_mcp.cli.values import Count, Id, whole_number
+from webots_mcp.cli.values import Count, Id, Parameter, whole_number
 from webots_mcp.contract import whole_file
 from webots_mcp.errors import InvalidInputError
 

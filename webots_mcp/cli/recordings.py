@@ -10,9 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, ParamSpec, TypeAlias
 
-from cyclopts import Parameter
-
-from webots_mcp.cli.values import Id, whole_number
+from webots_mcp.cli.values import Id, Parameter, whole_number
 from webots_mcp.errors import MalformedRowError, WebotsMCPError
 
 if TYPE_CHECKING:

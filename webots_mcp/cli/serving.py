@@ -10,13 +10,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
-from cyclopts import Parameter
-
 from webots_mcp.cli.ending import ending_in_time
 from webots_mcp.cli.limits import Limits
 from webots_mcp.cli.recordings import HERE, DataDir, Json, Where
 from webots_mcp.cli.rendering import print_json
-from webots_mcp.cli.values import whole_number
+from webots_mcp.cli.values import Parameter, whole_number
 from webots_mcp.contract import OBSERVER_NAME
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 

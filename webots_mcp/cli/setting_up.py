@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from cyclopts import Parameter
-
 from webots_mcp.cli.recordings import HERE, Json, Where
 from webots_mcp.cli.rendering import (
     print_json,
@@ -18,6 +16,7 @@ from webots_mcp.cli.rendering import (
     printable,
     terminal_width,
 )
+from webots_mcp.cli.values import Parameter
 from webots_mcp.cli.wording import as_typed
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 
@@ -488,6 +487,8 @@ def completion(
         shell = shell or detect_shell()
     except ShellDetectionError as error:
         raise InvalidInputError("which shell this is cannot be told: name it") from error
+    if shell == "powershell" and sys.version_info < (3, 11):  # cyclopts 4 knows none
+        raise InvalidInputError("the script for PowerShell needs Python 3.11 or newer")
     app = app_for([])
     if install:
         file = app.install_completion(shell=shell, add_to_startup=shell != "fish")

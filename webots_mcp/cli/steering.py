@@ -7,10 +7,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from cyclopts import Parameter
-
 from webots_mcp.cli.recordings import Json, RunId, ToRobot, ToWebots, Waiting
-from webots_mcp.cli.values import Count, Id, whole_number
+from webots_mcp.cli.values import Count, Id, Parameter, whole_number
 from webots_mcp.contract import BreakpointAction
 from webots_mcp.errors import InvalidInputError
 

@@ -12,13 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from cyclopts import Parameter
-
 from webots_mcp.cli.ending import ending_by_event
 from webots_mcp.cli.looking import write_picture
 from webots_mcp.cli.recordings import Json, Where
 from webots_mcp.cli.rendering import print_notes, print_table, text_of
-from webots_mcp.cli.values import Count
+from webots_mcp.cli.values import Count, Parameter
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 
 if TYPE_CHECKING:

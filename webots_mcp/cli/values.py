@@ -7,12 +7,22 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
 
-from cyclopts import Parameter, Token
+import cyclopts
+from cyclopts import Token
 from cyclopts.validators import Number
 
 from webots_mcp.errors import InvalidInputError
+
+if TYPE_CHECKING or hasattr(cyclopts.Parameter(), "metavar"):
+    Parameter = cyclopts.Parameter
+else:  # cyclopts 4, the last for Python 3.10: options have no words for their values
+
+    def Parameter(*names: str, metavar: str | None = None, **given: Any) -> cyclopts.Parameter:  # noqa: N802
+        """How an argument is typed, without the word for its value."""
+        return cyclopts.Parameter(*names, **given)
+
 
 _NO_KINDS: Final[Mapping[str, str]] = MappingProxyType({})
 

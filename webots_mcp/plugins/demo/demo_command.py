@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from cyclopts import Parameter
-
 from webots_mcp.cli.recordings import Json
+from webots_mcp.cli.values import Parameter
 
 
 def demo(

@@ -5,14 +5,13 @@ from __future__ import annotations
 import sys
 from typing import Annotated, Final
 
-from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from webots_mcp.cli.ending import ending_in_time
 from webots_mcp.cli.launching import MAX_PORT
 from webots_mcp.cli.recordings import HERE, Json, Where
 from webots_mcp.cli.rendering import print_json
-from webots_mcp.cli.values import whole_number
+from webots_mcp.cli.values import Parameter, whole_number
 
 _PORT: Final = 5006
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from cyclopts import Parameter
-
 from webots_mcp.cli.recordings import HERE, Json, Robot, Where, only_reading, sum_up_first
 from webots_mcp.cli.rendering import print_json, print_notes, printable
 from webots_mcp.cli.terminal import shown_progress
-from webots_mcp.cli.values import Id
+from webots_mcp.cli.values import Id, Parameter
 
 
 @only_reading

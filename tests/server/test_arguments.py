@@ -48,7 +48,7 @@ HUGE = 2**63
         ("get_trends", {"signal": ["x"]}, "no parameter 'signal': there is signals, "),
         ("find_events", {"strt_s": 1}, "no parameter 'strt_s': there is start_s, "),
         ("find_events", {"for_s": 2.0}, "for_s=2 needs a limit: give above or below"),
-        ("query_history", {"signals": ["x"], "cursor": 3}, "cursor goes on with rows"),
+        ("query_history", {"signals": ["x"], "cursor": 3}, "only rows go on with cursor"),
         ("get_timeline", {"kinds": ["threshold"]}, "a threshold has no place here"),
         ("monitor", {"duration_wall_s": 2, "lookback_wall_s": 9}, "give either duration_wall_s"),
         ("monitor", {"duration_wall_s": 2, "duration": 9}, "give either duration_wall_s"),

@@ -59,13 +59,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def is_declared(name: str) -> bool:
-    """Whether a command is one of `commands`."""
-    from webots_mcp.cli.commands import COMMANDS
-
-    return name in COMMANDS
-
-
 def _run(argv: Sequence[str]) -> int:
     """Call the command that was given; without one, show which there are."""
     from cyclopts import CycloptsError, UnusedCliTokensError
@@ -107,7 +100,7 @@ def _named(error: CycloptsError) -> str:
 
 def _fail(code: int, text: str, given: Sequence[str], answer: Mapping[str, Any] = _NOTHING) -> int:
     """End with an error, which programs read as JSON beside what became of a command."""
-    if "--json" in given and is_declared(given[0]):
+    if "--json" in given:
         with contextlib.suppress(OSError):
             print(spelled_out(json.dumps({**answer, "error": text}, ensure_ascii=False)))
     return _end(code, text)

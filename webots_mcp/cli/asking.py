@@ -22,7 +22,7 @@ from webots_mcp.cli.recordings import Json, Range, Where, sum_up_first
 from webots_mcp.cli.rendering import print_answer, text_of
 from webots_mcp.cli.terminal import line_of_progress, show_progress, wait
 from webots_mcp.cli.values import Parameter, refuse_options, settings_of, value_of, whole_number
-from webots_mcp.cli.wording import Typed, as_typed, speak_of, value_name
+from webots_mcp.cli.wording import Typed, as_typed, running, speak_of, value_name
 from webots_mcp.contract import LOOPING
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
 from webots_mcp.questions.argument_types import FOR_A_PERSON, SCOPE
@@ -112,6 +112,8 @@ def command_of(question: Question) -> Callable[..., None]:
     run.__annotations__ = {each.name: each.annotation for each in parameters}
     run.__name__ = question.command or question.name
     run.__doc__ = as_typed(inspect.getdoc(question.function) or "")
+    if question.example:
+        run.__doc__ += f"\n\n    webots-mcp {question.command} {question.example}"
     return run
 
 
@@ -201,7 +203,9 @@ def _valid(question: Question, given: Mapping[str, Any], recording: Recording) -
     except ValidationError as error:
         raise InvalidInputError(
             faults_of(
-                error, {each.name: option_of(question, each.name) for each in question.parameters}
+                error,
+                {each.name: option_of(question, each.name) for each in question.parameters}
+                | {each.name: each.typed for each in running()},
             )
         ) from error
     return {name: getattr(model, name) for name in question.arguments.model_fields}
@@ -331,6 +335,7 @@ def _parameter(question: Question, declared: inspect.Parameter) -> inspect.Param
         default = inspect.Parameter.empty
     elif (usual := _DEFAULTS.get(name, declared.default)) not in (None, "", False, True):
         text = f"{text} ({usual:g})" if isinstance(usual, float) else f"{text} ({usual})"
+    text = text.replace("*", r"\*")  # help is Markdown, where two of them would be emphasis
     if default is None and type(None) not in get_args(kind):
         kind = Union[kind, None]  # noqa: UP007
     option = option_of(question, name)
@@ -350,9 +355,12 @@ def _parameter(question: Question, declared: inspect.Parameter) -> inspect.Param
         shown = Parameter(f"--{name.replace('_', '-')}", help=text, negative=option)
     else:
         converter = whole_number if _without_none(kind) is int else None
+        is_text = _without_none(kind) is str
         shown = Parameter(
-            option, help=text, negative=(), converter=converter, metavar=_value_name(name)
-        )
+            option, help=text, negative=(), converter=converter,
+            metavar="NAME=VALUE" if _is_mapping(_plain(declared.annotation)) else _value_name(name),
+            allow_leading_hyphen=is_text, validator=refuse_options if is_text else None,
+        )  # fmt: skip
     return inspect.Parameter(name, place, default=default, annotation=Annotated[kind, shown])
 
 

@@ -155,6 +155,8 @@ def migrate(
     from webots_mcp.connection import is_there
     from webots_mcp.contract import MemoryDatabase
 
+    if not revision:
+        raise InvalidInputError("--revision is empty: leave it out for the newest")
     recording = recorded.recording(read_only=False)
     database = recording.database
     if isinstance(database, MemoryDatabase) or not is_there(database):

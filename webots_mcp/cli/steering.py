@@ -81,10 +81,12 @@ def parameters(
     All are set between two rounds of its loop, or none. A reset keeps them; a reload begins with
     those in the code.
 
-    webots-mcp parameters kp=3.5 gait=trot
+        webots-mcp parameters kp=3.5 gait=trot
     """
     from webots_mcp.questions.set_parameters import webots_get_parameters, webots_set_parameters
 
+    if from_reset and not settings:
+        raise InvalidInputError("--from-reset needs what is set then: NAME=VALUE")
     if not settings:
         return _show(webots_get_parameters, asked, as_json=json, run_id=run_id)
     if run_id is not None:
@@ -157,7 +159,7 @@ def field(
 
     What is set is recorded as an event; a reset puts it back.
 
-    webots-mcp field ROVER.translation '[0, 1, 0.04]'
+        webots-mcp field ROVER.translation '[0, 1, 0.04]'
     """
     from webots_mcp.questions.edit_scene import webots_get_field, webots_set_field
 

@@ -107,7 +107,7 @@ def trials(
 ) -> None:
     """Try sets of parameters in runs of their own, score each run, and rank the sets.
 
-    webots-mcp trials plan.toml --jobs 4 --search tpe
+        webots-mcp trials plan.toml --jobs 4 --search tpe
 
     Each trial runs in a simulator and a data folder of its own; what it recorded is merged into
     the recording, where its run can be looked at like any other.

@@ -24,6 +24,7 @@ else:  # cyclopts 4, the last for Python 3.10: options have no words for their v
         return cyclopts.Parameter(*names, **given)
 
 
+_TOO_LARGE: Final = 2**63  # for SQLite, and no id that it has given
 _NO_KINDS: Final[Mapping[str, str]] = MappingProxyType({})
 
 
@@ -31,28 +32,31 @@ def whole_number(_kind: Any, tokens: Sequence[Token]) -> int:
     """What was typed; cyclopts by itself would round 1.5.
 
     Raises:
-        ValueError: It is no whole number.
+        ValueError: It is no whole number, or one that SQLite cannot hold.
     """
     text = tokens[0].value
     if not re.fullmatch(r"[+-]?[0-9]+", text):
         raise ValueError(f"{text!r} is no whole number")
+    if abs(int(text)) >= _TOO_LARGE:
+        raise ValueError(f"{text} is too large")
     return int(text)
 
 
 def refuse_options(_kind: Any, value: Any) -> None:
-    """Of what begins with a hyphen only the hyphen itself is a value.
+    """A hyphen alone is a value, and so is a condition such as '-x > 3'.
 
     Raises:
         ValueError: It is an option, and nobody knows it.
     """
-    is_text = isinstance(value, (str, Path))
-    if is_text and str(value).startswith("-") and str(value) != "-":
+    if isinstance(value, (str, Path)) and re.match(r"--?\w[\w-]*(=|$)", str(value)):
         raise ValueError(f"unknown option {value}")
 
 
 def _row_id(_kind: Any, tokens: Sequence[Token]) -> int:
     text = tokens[0].value
-    if text.isascii() and text.isdecimal() and int(text) < 2**63:  # what SQLite could have given
+    if (
+        text.isascii() and text.isdecimal() and int(text) < _TOO_LARGE
+    ):  # what SQLite could have given
         return int(text)
     raise ValueError(f"{text!r} is no id: it is a number from an answer")
 

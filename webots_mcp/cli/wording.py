@@ -36,10 +36,15 @@ BY_TOOL: Final = {  # by tool
     "query_sql": "sql",
     "report": "report",
     "run": "run",
+    "run_trials": "trials",
     "send_command": "send",
     "set_parameters": "parameters",
     "simulation_control": "send",
     "world_reset": "send reset",
+}
+_FOR_A_CLIENT: Final = {  # what only one who asks by MCP can do, and what a person does
+    "start the server with --data-dir or --database": "give --data-dir or --database",
+    "the resource webots://schema": "'.schema' in the sqlite3 shell",
 }
 _TOOL: Final = re.compile(
     r"webots_(?P<tool>\w+)(?:\(what=.(?P<what>\w+).(?:, \w+=(?P<id>\d+))?\))?"
@@ -50,6 +55,11 @@ _running: ContextVar[tuple[Typed, ...]] = ContextVar("running", default=())
 def speak_of(arguments: Iterable[Typed]) -> None:
     """Let `as_typed` speak of these arguments: those of the command that runs."""
     _running.set(tuple(arguments))
+
+
+def running() -> tuple[Typed, ...]:
+    """The arguments of the command that runs."""
+    return _running.get()
 
 
 class Typed(NamedTuple):
@@ -76,6 +86,8 @@ def as_typed(text: str) -> str:
     A name that is a common word (`since`) is meant only where a value follows it, or where it is
     joined to another one ("since and until").
     """
+    for of_a_client, of_a_person in _FOR_A_CLIENT.items():
+        text = text.replace(of_a_client, of_a_person)
     text = _TOOL.sub(_command_for, text)
     typed = {each.name: each.typed for each in _running.get()}
     for each in _running.get():
@@ -91,6 +103,7 @@ def as_typed(text: str) -> str:
         return text
     for form in (
         rf"(?<=\bwith )(?:this )?({words}){_NOT_ON}",
+        rf"(?<=\bsee )({words}){_NOT_ON}",
         rf"{_UNQUOTED}({words})(?= for more)",
     ):
         text = re.sub(form, lambda found: typed[found[1]], text)

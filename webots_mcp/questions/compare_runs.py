@@ -83,7 +83,14 @@ _GOING_ON: Final = "going on"
 _TAKE_AWAY: Final = "-"
 
 
-@question("List the runs", READS, command="runs", options={"parameters": "--parameter"}, core=True)
+@question(
+    "List the runs",
+    READS,
+    command="runs",
+    options={"parameters": "--parameter"},
+    core=True,
+    example="--parameter kp=3.5 -n 5",
+)
 def webots_list_runs(
     recording: Recording,
     limit: Limit = 20,
@@ -92,7 +99,7 @@ def webots_list_runs(
         dict[str, Value] | None,
         Field(
             max_length=20,
-            description='Only runs with these values: {"kp": 3.0}.',
+            description="Only runs with these values.",
         ),
     ] = None,
     robot: RobotName = None,
@@ -127,6 +134,7 @@ def webots_list_runs(
     positional=("run_ids",),
     options={"run_ids": "RUN", "matters_sd": "--matters"},
     core=True,
+    example="3 4 --signal 'pose*'",
 )
 def webots_compare_runs(
     recording: Recording,
@@ -172,6 +180,7 @@ def _first_run(recording: Recording, set_id: int) -> int:
     command="label",
     positional=("run_id", "label"),
     options={"run_id": "RUN", "label": "TEXT"},
+    example="4 baseline --note 'before the new gait'",
 )
 def webots_annotate_run(
     recording: Recording,

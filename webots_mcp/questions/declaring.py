@@ -102,6 +102,7 @@ class Question:
         follows: The table of the answer, oldest row first, that `--follow` goes on with as rows
             come. A row has an `id` for a person, and a `run_id`. The argument of that name says how
             many rows there may be.
+        example: What a person types behind the command's name, for its help alone.
     """
 
     function: Callable[..., Any]
@@ -112,6 +113,7 @@ class Question:
     options: Mapping[str, str] | None = None
     core: bool = False
     follows: str | None = None
+    example: str | None = None
 
     @property
     def name(self) -> str:
@@ -261,10 +263,11 @@ def question(
     options: Mapping[str, str] | None = None,
     core: bool = False,
     follows: str | None = None,
+    example: str | None = None,
 ) -> Callable[[Callable[..., Any]], Question]:
     """Declare a function as a question; see `Question`."""
     return lambda function: Question(
-        function, title, effect, command, positional, options, core, follows
+        function, title, effect, command, positional, options, core, follows, example
     )
 
 

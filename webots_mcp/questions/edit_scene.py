@@ -30,6 +30,7 @@ _Start = Annotated[int, Field(ge=0)]
     command="scene",
     positional=("path",),
     options={"types": "--type", "names": "--name", "fields": "--field", "cursor": "--cursor"},
+    example="--type 'Solid*' --field translation",
 )
 async def webots_get_scene(
     recording: Recording,

@@ -75,6 +75,7 @@ _GROUP_BUDGET_TOKENS: Final = 200
     command="events",
     options={"group": "--one-by-one", "cursor": "--after", "silent_s": "--silent"},
     core=True,
+    example="--where 'front_m < 0.1 for 0.5' --last 60",
 )
 def webots_find_events(
     recording: Recording,
@@ -89,7 +90,7 @@ def webots_find_events(
     ] = None,
     signals: AnyNames = None,
     above: Annotated[
-        float | None, Field(description="Short for where: the signals were above this ...")
+        float | None, Field(description="As with where: the signals were above this ...")
     ] = None,
     below: Annotated[float | None, Field(description="... or below this")] = None,
     for_s: Annotated[float, Field(ge=0, description="... for at least so long.")] = 0,
@@ -112,7 +113,7 @@ def webots_find_events(
     """What went wrong, since when, how often: searches the values, by default of the whole run.
 
     verdicts: what was found, what is absent, what was not looked for and why. What is not shown is
-    counted; cursor shows it.
+    counted; the next are seen with cursor.
     """
     thresholds = thresholds_on(signals or (), above, below, for_s)
     options = EventOptions(

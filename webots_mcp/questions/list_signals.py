@@ -25,7 +25,7 @@ from webots_mcp.store.signals.catalogue import SignalInfo, list_signals
 SIGNAL_COLUMNS: Final = ("signal", "kind", "unit", "last", "min", "max", "missing")
 
 
-@question("List the signals", READS, command="signals", positional=("pattern",))
+@question("List the signals", READS, command="signals", positional=("pattern",), example="'front*'")
 def webots_list_signals(
     recording: Recording,
     pattern: Annotated[

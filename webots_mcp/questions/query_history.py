@@ -61,6 +61,7 @@ _SIGNAL_TOKENS: Final = 60  # of a signal, beside its buckets
     positional=("signals",),
     options={"signals": "SIGNAL", "max_points": "--points"},
     core=True,
+    example="pose.x 'front*' --last 10",
 )
 def webots_query_history(
     recording: Recording,
@@ -76,7 +77,7 @@ def webots_query_history(
     they changed. webots_get_trends first: in words, which signals matter.
     """
     if cursor is not None and not raw:
-        raise InvalidInputError("cursor goes on with rows: give it together with raw=true")
+        raise InvalidInputError("only rows go on with cursor: ask for them with raw=true")
     with recording.view(scope.robot, scope.run_id) as view:
 
         def find() -> dict[str, Any]:

@@ -41,13 +41,20 @@ _PROCESS_TIMEOUT_S: Final = 20.0  # its own deadline counts from when it has sta
 _turns: Final[RunVar[anyio.Semaphore]] = RunVar("statements that may run at once")
 
 
-@question("Query by SQL", READS, command="sql", positional=("sql",), options={"sql": "STATEMENT"})
+@question(
+    "Query by SQL",
+    READS,
+    command="sql",
+    positional=("sql",),
+    options={"sql": "STATEMENT"},
+    example='"SELECT sim_time_s, data FROM state ORDER BY id DESC LIMIT 5"',
+)
 async def webots_query_sql(
     recording: Recording,
     sql: Annotated[str, Field(min_length=1, max_length=10_000, description="One SELECT.")],
     limit: ShownLimit = None,
 ) -> SqlAnswer:
-    """Read by SQL (SQLite) what the other tools do not cover.
+    """Read by SQL (SQLite) what the others do not cover.
 
     Tables: robot, session, run(id, robot_id, session_id, rows, label,
     last_sim_time_s), state(run_id, sim_time_s, wall_time_s, data: JSON), signal(name, path),

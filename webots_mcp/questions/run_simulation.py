@@ -25,7 +25,14 @@ _PICTURE_WAIT_S: Final = 8.0
 _SAME_S: Final = 0.001  # times are told to the millisecond
 
 
-@question("Run until", DESTROYS, command="run", options={"parameters": "--set"}, core=True)
+@question(
+    "Run until",
+    DESTROYS,
+    command="run",
+    options={"parameters": "--set"},
+    core=True,
+    example="--until 'front_m < 0.1' --for 20 --reset --set kp=2",
+)
 async def webots_run(
     recording: Recording,
     caller: Caller,
@@ -35,7 +42,7 @@ async def webots_run(
     ] = None,
     for_s: Annotated[
         float | None,
-        Field(gt=0, le=MAX_RUN_S, description="Simulated seconds, or until, if before."),
+        Field(gt=0, le=MAX_RUN_S, description="Simulated seconds; at most, with until."),
     ] = None,
     reset: Annotated[
         bool, Field(description="Reset the world first; for_s counts from there.")

@@ -32,6 +32,7 @@ _LONGEST_TEXT: Final = 200
     command="send",
     positional=("action", "params"),
     options={"params": "NAME=VALUE"},
+    example="go_to x=1.5 y=-0.5",
     core=True,
 )
 async def webots_send_command(

@@ -163,6 +163,6 @@ def format_of(file: Path) -> str:
             return each.name
     endings = ", ".join(f".{each.name}" for each in _ALL)
     raise InvalidInputError(
-        f"{file.name} does not tell its format: end it in {endings} or .{BUNDLE}, or give the "
-        "format"
+        f"{file.name} does not tell its format: end it in {endings} or .{BUNDLE}, or say it "
+        "with --format"
     )

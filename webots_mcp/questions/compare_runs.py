@@ -51,6 +51,7 @@ from webots_mcp.store.questions.compare import (
     compare_runs,
     compare_trials,
 )
+from webots_mcp.store.questions.outcomes import Measure
 from webots_mcp.store.questions.runs import (
     MOST_RUNS,
     RunInfo,
@@ -79,6 +80,9 @@ DIFFERENCE_COLUMNS: Final = (
 DEFAULT_DIFFERENCES: Final = 15
 _SHOWN_HASH: Final = 10
 _MOST_ONLY_IN: Final = 10
+_OF_MEASURES: Final = (
+    0.75  # of the room beside groups and notes; the differing signals have the rest
+)
 _GOING_ON: Final = "going on"
 _TAKE_AWAY: Final = "-"
 
@@ -279,22 +283,24 @@ def _compared(
     else:
         found = compare_code(view.connection, robot=view.robot.name, **asked)
     differing = [each for each in found.differences if _differs(each)]
-    groups, measures = _groups(found), _measures(found)
-    notes, only_in = notes_of(found.notes), list(found.only_in.items())
+    groups, notes, only_in = _groups(found), notes_of(found.notes), list(found.only_in.items())
     most = len(only_in) if is_for_a_person() else _MOST_ONLY_IN
-    beside = [*(table.rows for table in (groups, measures) if table), found.not_known, notes]
+    beside: list[Any] = [groups and groups.rows, found.not_known, notes]
+    of_measures = int(_OF_MEASURES * room_tokens(limit, beside))
+    measures = fitting(list(map(_measure_row, found.measures)), of_measures)
+    beside.append(measures)
     rows = [_difference_row(each, with_extremes=names is not None) for each in differing]
     rows = fitting(rows, room_tokens(limit, [*beside, only_in[:most]]))
     return {
         "groups": groups,
         "compared_s": seconds(found.compared_s),
-        "measures": measures,
+        "measures": without_empty(MEASURE_COLUMNS, measures),
         "not_known": found.not_known or None,
         "differences": without_empty(DIFFERENCE_COLUMNS, rows),
         "total": found.total,
         "only_in": {name: list(groups) for name, groups in only_in[:most]} or None,
         "notes": notes,
-        "hint": _hint(found, len(rows), len(differing), len(only_in) - most),
+        "hint": _hint(found, len(measures), len(rows), len(differing), len(only_in) - most),
     }
 
 
@@ -304,19 +310,15 @@ def _differs(difference: Difference) -> bool:
     return any(each != 0 for each in difference.effect[1:]) or any(each != first for each in others)
 
 
-def _measures(found: Comparison) -> Table | None:
-    rows = [
-        [
-            short_name(each.name),
-            _medians(each.spread),
-            _ranges(each.spread),
-            _told(each.different),
-            _intervals(each.interval),
-            _told(each.runs_wanted),
-        ]
-        for each in found.measures
+def _measure_row(measure: Measure) -> list[Any]:
+    return [
+        short_name(measure.name),
+        _medians(measure.spread),
+        _ranges(measure.spread),
+        _told(measure.different),
+        _intervals(measure.interval),
+        _told(measure.runs_wanted),
     ]
-    return without_empty(MEASURE_COLUMNS, rows)
 
 
 def _medians(spreads: Sequence[Spread | None]) -> list[float | None]:
@@ -385,11 +387,14 @@ def _intervals(found: Sequence[tuple[float, float] | None]) -> Any:
     return _told([None if each is None else figures(each) for each in found])
 
 
-def _hint(found: Comparison, told: int, differing: int, only_in: int) -> str | None:
+def _hint(found: Comparison, measures: int, told: int, differing: int, only_in: int) -> str | None:
     if len(found.groups) == 1:
         return "what its signals did: webots_get_trends; what happened: webots_find_events"
     more = told < differing or differing == len(found.differences) < found.total
-    hints = [f"the {told} that differ most of {found.total}: limit or signals for others"] * more
+    hints = [f"{measures} of {len(found.measures)} measures: limit shows the others"] * (
+        measures < len(found.measures)
+    )
+    hints += [f"the {told} that differ most of {found.total}: limit or signals for others"] * more
     hints += ["no numeric signal differs"] * (differing == 0)
     equal = 0 if more else found.total - differing
     hints += [f"mean and deviation of the other {equal} are equal"] * (equal > 0 and differing > 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import sqlite3
 import subprocess
 import sys
@@ -350,6 +351,21 @@ async def test_commands_are_listed_with_their_outcome_and_the_actions_with_docst
         page = await ask(client, "webots_list_commands", limit=1)
         older = await ask(client, "webots_list_commands", cursor=page["cursor"])
         assert [row[0] for row in older["commands"]["rows"]] == [first.id]
+
+
+async def test_of_many_actions_with_long_docstrings_each_is_named_as_it_is_called(
+    connect: Connect, recorded: Recorded
+) -> None:
+    names = [f"go_to_position_and_wait_{number:02d}" for number in range(30)]
+    recorded.robot(actions=json.dumps(dict.fromkeys(names, "Drive to x and y. " * 20)))
+    async with connect() as client:
+        answer = await ask(client, "webots_list_commands")
+        assert list(answer["actions"]) == names
+        (statement,) = re.findall(
+            r'docstrings are cut: webots_query_sql\("(.*)"\) has more of one', answer["hint"]
+        )
+        whole = await ask(client, "webots_query_sql", sql=statement.replace("NAME", names[29]))
+        assert "".join(whole["result"]["rows"][0]) == "Drive to x and y. " * 20
 
 
 async def test_a_read_only_server_settles_nothing(connect: Connect, recorded: Recorded) -> None:

@@ -45,6 +45,19 @@ async def test_odd_values_are_recognisable(connect: Connect, recorded: Recorded)
     assert answer["devices_not_named_in_state"] == "eye (Camera)"
 
 
+async def test_of_many_replaced_values_the_number_of_those_not_shown_is_said(
+    connect: Connect, recorded: Recorded
+) -> None:
+    names = [f"at_{number}" for number in range(50)]
+    odd = {f"front.{name}": "nan" for name in names}
+    recorded.robot().state(1.0, {"front": dict.fromkeys(names)}, odd=odd)
+    async with connect() as client:
+        for tool in ("webots_get_full_state", "webots_get_sensors"):
+            replaced = (await ask(client, tool))["replaced"]
+            assert len(replaced) == 21
+            assert replaced["…"].startswith("30 more: ")
+
+
 def test_a_device_is_named_in_the_state_however_its_words_are_arranged() -> None:
     names = ("ds0", "ds7", "front left sonar", "leftEncoder", "range_finder", "gps")
     devices: dict[str, str] = dict.fromkeys(names, "DistanceSensor")

@@ -136,15 +136,17 @@ def _trend_row(trend: Trend) -> list[Any]:
 
 def _state_row(state: StateTrend) -> list[Any]:
     """A text or a flag as a row under `STATE_COLUMNS`."""
-    times = [
-        (shown(value), round(duration_s, 3)) for value, duration_s in state.time_by_value_s.items()
-    ]
+    longest_first = [*state.time_by_value_s.items()]
+    most = len(longest_first) if is_for_a_person() else _SHOWN_VALUES
+    times = {shown(value): round(duration_s, 3) for value, duration_s in longest_first[:most]}
+    if rest := longest_first[most:]:
+        times[f"… {len(rest)} more values"] = round(sum(duration_s for _, duration_s in rest), 3)
     return [
         short_name(state.name),
         state.changes,
         shown(state.last),
         seconds(state.since_s),
-        dict(times[: None if is_for_a_person() else _SHOWN_VALUES]),
+        times,
     ]
 
 

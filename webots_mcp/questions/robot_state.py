@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Annotated, Any, Final, cast
 
 from pydantic import Field
@@ -129,8 +129,7 @@ def webots_get_full_state(
             raise InvalidInputError(f"offset: {path!r:.80} is a single value, not in pages")
         beside: dict[str, Any] = view.header()
         if not (path or offset):
-            replaced = list(view.state.odd_paths().items())[:_SHOWN_REPLACED]
-            beside |= {"replaced": dict(replaced) or None}
+            beside |= {"replaced": _some_replaced(view.state.odd_paths())}
             beside |= {"events": _events(view), "recorder": _recorder(view)}
         most_tokens = ANSWER_TOKENS if limit is None else LARGE_ANSWER_TOKENS
         told = {
@@ -289,7 +288,15 @@ def _replaced_in(state: State, part: dict[str, Any]) -> dict[str, str] | None:
         for path, kind in state.odd_paths().items()
         if any(path == key or path.startswith(f"{key}.") for key in part)
     }
-    return dict(list(replaced.items())[:_SHOWN_REPLACED]) or None
+    return _some_replaced(replaced)
+
+
+def _some_replaced(replaced: Mapping[str, str]) -> dict[str, str] | None:
+    """The first of them, and how many more there are; None without any."""
+    shown = dict(list(replaced.items())[:_SHOWN_REPLACED])
+    if more := len(replaced) - len(shown):
+        shown["…"] = f"{more} more: webots_query_sql has all in column odd of table state"
+    return shown or None
 
 
 def _no_sensors(state: dict[str, Any]) -> str:

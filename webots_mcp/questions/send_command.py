@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import Annotated, Any, Final
 
 from pydantic import Field
@@ -10,9 +11,9 @@ from pydantic import Field
 from webots_mcp.contract import BUILT_IN_ACTIONS, CommandStatus
 from webots_mcp.questions.answers import CommandAnswer, CommandsAnswer
 from webots_mcp.questions.argument_types import Cursor, Id, RobotName, TimeoutS
-from webots_mcp.questions.budget import condensed, fitting
-from webots_mcp.questions.declaring import DESTROYS, READS, Caller, question
-from webots_mcp.questions.shortening import DETAIL_BUDGET_TOKENS, cut_text, shorten
+from webots_mcp.questions.budget import condensed, fitting, short_name
+from webots_mcp.questions.declaring import DESTROYS, READS, Caller, is_for_a_person, question
+from webots_mcp.questions.shortening import DETAIL_BUDGET_TOKENS, cut_text, shorten, tokens_of
 from webots_mcp.queue import Command, list_commands
 from webots_mcp.steering.dispatch import Dispatcher, shown_result
 from webots_mcp.store.recording import Recording, View
@@ -22,6 +23,11 @@ COMMAND_COLUMNS: Final = (
 )  # fmt: skip
 _WAIT_S: Final = 10.0
 _ACTIONS_TOKENS: Final = 500
+_DOCSTRINGS: Final = (2_000, 400, 200, 100, 50, 25)  # characters of each
+_MORE_OF_ONE: Final = (  # in pieces as long as one cell of an answer may be
+    'docstrings are cut: webots_query_sql("SELECT substr(value, 1, 200), substr(value, 201, 200) '
+    "FROM session, json_each(actions) WHERE session.id = {} AND key = 'NAME'\") has more of one"
+)
 _COMMANDS_TOKENS: Final = 1_100
 _LONGEST_TEXT: Final = 200
 
@@ -112,17 +118,31 @@ def _answer(view: View, commands: list[Command], limit: int) -> CommandsAnswer:
     rows = [_command_row(command, view.now_s) for command in commands]
     rows = fitting(rows, _COMMANDS_TOKENS)
     more = len(rows) < len(commands) or len(commands) == limit
+    actions = view.session.actions if view.session else {}
+    shown = _shown_actions(actions)
+    hints = ["no such command was sent to this robot yet"] * (not commands)
+    hints += [_MORE_OF_ONE.format(view.session.id)] if view.session and shown != actions else []
+    hints += [f"{len(shown)} of {len(actions)} actions are shown"] * (len(shown) < len(actions))
     return CommandsAnswer(
         **view.header(),
         commands=condensed(COMMAND_COLUMNS, rows),
         cursor=commands[len(rows) - 1].id if more else None,
-        actions=_actions(view),
+        actions=shown,
         built_in=list(BUILT_IN_ACTIONS),
-        hint=None if commands else "no such command was sent to this robot yet",
+        hint="; ".join(hints) or None,
     )
 
 
-def _actions(view: View) -> dict[str, Any]:
-    """The registered actions; a controller that registers none sees commands in its loop."""
-    actions = view.session.actions if view.session else {}
-    return dict(shorten(actions, _ACTIONS_TOKENS).value)
+def _shown_actions(actions: Mapping[str, str]) -> dict[str, str]:
+    """The registered actions with as much of their docstrings as fits beside all the names.
+
+    A controller that registers none sees commands in its loop.
+    """
+    if is_for_a_person():
+        return dict(actions)
+    for longest in _DOCSTRINGS:
+        shown = {name: cut_text(text, longest) for name, text in actions.items()}
+        if tokens_of(shown) <= _ACTIONS_TOKENS:
+            return shown
+    named = [(short_name(name) or "", "…" if text else "") for name, text in actions.items()]
+    return dict(fitting(named, _ACTIONS_TOKENS))

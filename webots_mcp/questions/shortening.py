@@ -155,10 +155,10 @@ class _Shortener:
         if depth >= self._limits.depth and members:
             self.cut = True
             return f"{{{len(members)} keys}}"
-        shown = {
-            self._text(key): self.shorten(item, depth + 1)
-            for key, item in list(members.items())[: self._limits.keys]
-        }
+        shown: dict[str, Any] = {}
+        for key, item in list(members.items())[: self._limits.keys]:
+            name = self._text(key)
+            shown[key if name in shown else name] = self.shorten(item, depth + 1)
         if len(members) > len(shown):
             self.cut = True
             first, last = [*members][len(shown)], [*members][-1]

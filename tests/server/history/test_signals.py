@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.recordings.rover import GAP_S, WALL_START_S
+from tests.recordings.rows import Recorded
 from tests.server.conftest import ask
 from tests.server.history.conftest import EVERY, STORY, tell
 from tests.server.story import client_on, copy_of, rows_of
@@ -136,6 +137,21 @@ async def test_trends_say_in_one_line_what_a_person_would_notice(story: Path) ->
     told = run["constant"].split(", ")
     assert "target 3" in told and len(told) == 4
     assert not says.keys() & {each.split(" ")[0] for each in told}
+
+
+async def test_the_times_in_more_values_than_are_shown_are_told_together(
+    tmp_path: Path,
+) -> None:
+    recorded = Recorded(tmp_path / "webots.db")
+    robot = recorded.robot()
+    for row in range(301):
+        robot.state(row * 0.1, {"mode": f"mode {row // 10 % 10}"})
+    recorded.close()
+    async with client_on(tmp_path / "webots.db") as client:
+        (run,) = (await ask(client, "webots_get_trends"))["runs"]
+    (mode,) = rows_of(run["states"])
+    assert mode["time_by_value_s"].keys() >= {"mode 0", "mode 5", "… 4 more values"}
+    assert sum(mode["time_by_value_s"].values()) == pytest.approx(30.0)
 
 
 async def test_answers_are_the_same_before_and_after_rolling_up(

@@ -43,7 +43,6 @@ LOG_LEVELS: Final[tuple[LogLevel, ...]] = get_args(LogLevel)  # rising; in `logg
 # Who logged a line. Those of Webots' console: what Webots says itself is of `webots`, what a
 # controller printed, and it does not say which, of `console`.
 LogSource = Literal["controller", "bridge", "console", "webots"]
-LOG_SOURCES: Final[tuple[LogSource, ...]] = get_args(LogSource)
 _LEVEL_ALIASES: Final[dict[str, LogLevel]] = {
     **{level: level for level in LOG_LEVELS},
     "warn": "warning",

@@ -99,9 +99,7 @@ class Keeper:
         self._run = clock.run
         self._ring.begin(clock.sim_time_s)
         self._kept_s = 0.0
-        self._left_out: tuple[float, str] | None = (
-            None  # the last call of this run that was not held
-        )
+        self._left_out: tuple[float, str] | None = None  # this run's last call that was not held
         self._stretch: Stretch | None = None
         self._going_on = False
         self._asked: deque[str] = deque(maxlen=_MOST_REASONS)

@@ -115,7 +115,7 @@ def _follow(launched: Launch, patience_s: float, console: _Console, recorder: _R
     webots, first = launched.webots, None
     until_s = time.monotonic() + patience_s
     while (code := webots.exit_code) is None:
-        first = first or _told(launched)
+        first = first or _announce_first(launched)
         if first is None and time.monotonic() > until_s:
             until_s = math.inf
             _say(f"no controller has recorded within {patience_s:g} s: {launched.silence()}")
@@ -123,14 +123,14 @@ def _follow(launched: Launch, patience_s: float, console: _Console, recorder: _R
         recorder.begin()
         time.sleep(_LOOK_EVERY_S)
     webots.wait_for_output()
-    if first is None and _told(launched) is None:
+    if first is None and _announce_first(launched) is None:
         launched.record_last_words()
         _say(launched.silence())
     return code
 
 
-def _told(launched: Launch) -> SessionStart | None:
-    """The first controller that records, once there is one."""
+def _announce_first(launched: Launch) -> SessionStart | None:
+    """Say which controller records first, once there is one."""
     first = launched.first_record()
     if first is not None:
         address = launched.webots.address_now()

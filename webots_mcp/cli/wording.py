@@ -1,7 +1,7 @@
 """Texts about a recording in the words of the command line: `last_s=-3` is `--last -3` there.
 
-The questions call their arguments as the MCP tools do. The `dest` of an option is that name, so the
-options of the command that runs say what a person has typed. Hints that name a tool name the
+The questions call their arguments as the MCP tools do. Of the command that runs it is known by
+which option each is typed. Hints that name a tool name the
 command that answers the same.
 """
 

@@ -1,8 +1,9 @@
 """One declaration per question: from it come the MCP tool, the command, its help and its output.
 
 A question is a function whose annotated parameters are its arguments and whose answer is an
-`Answer`. It knows neither MCP nor a terminal: the server and the command line ask it through `ask`,
-and show what it answers. A new question is one module, and its name in `ask.MODULES`.
+`Answer`. It knows neither MCP nor a terminal: the server and the command line ask it through
+`Question.ask`, and show what it answers. A new question is one module, and its name in
+`questions.MODULES`.
 """
 
 from __future__ import annotations

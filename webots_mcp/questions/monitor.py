@@ -170,8 +170,8 @@ def _hint(recorded: bool, left_out: bool, wall_start_s: float, view: View) -> st
 def _why_nothing(view: View) -> str:
     if view.status.is_moving:
         return (
-            "time moves but no state was recorded: is bridge.publish() called in the loop? Every "
-            "5th call is recorded (throttle_interval)"
+            "time moves but no state was recorded: is bridge.publish() called in the loop? By "
+            "default every 5th call is recorded (throttle_interval)"
         )
     if view.status.why is None:
         return "nothing was recorded because the simulation is paused: resume it and watch again"

@@ -18,6 +18,7 @@ from webots_mcp.questions.budget import (
     some,
 )
 from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.sensing import sensor_part, unnamed_devices
 from webots_mcp.questions.shortening import (
     STATE_BUDGET_TOKENS,
     WHOLE,
@@ -28,7 +29,6 @@ from webots_mcp.questions.shortening import (
     tokens_in,
     tokens_of,
 )
-from webots_mcp.steering.sensing import sensor_part, unnamed_devices
 from webots_mcp.store.reading.kept import newest_kept
 from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.run_rows import State, newest_events, select
@@ -37,7 +37,7 @@ from webots_mcp.store.status import rows_waiting
 
 _PUBLISH: Final = (
     "nothing was recorded in this run yet: of the calls of bridge.publish({...}) in the "
-    "controller's loop every 5th is (throttle_interval), or each one with force=True"
+    "controller's loop every 5th is by default (throttle_interval), or each one with force=True"
 )
 _EARLIER: Final = "SELECT max(id) FROM run WHERE robot_id = ? AND id < ? AND rows > 0"
 _PURGED: Final = "SELECT purged_rows FROM run WHERE id = ?"

@@ -156,16 +156,6 @@ def _as_declared(
     ]
 
 
-def plan_of(recording: Recording, set_id: int) -> str:
-    """The text of a set's plan.
-
-    Raises:
-        InvalidInputError: There is no such set.
-    """
-    with recording.reader() as connection:
-        return fetch_trial_set(connection, set_id).plan
-
-
 def names_world(plan: str) -> bool:
     """Whether the trials of a plan each have a simulator of their own."""
     return "world" in json.loads(plan)

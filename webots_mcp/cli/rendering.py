@@ -57,7 +57,7 @@ def answer_lines(
     layout = _Layout(width, most_rows, is_of_command="outcome" in answer)
     head = [text.format(text_of(answer[name])) for name, text in _HEAD.items() if name in answer]
     if head:
-        yield ", ".join(head)
+        yield from textwrap.wrap(", ".join(head), width, subsequent_indent=_INDENT)
     apart = (*_HEAD, *_NOTES)
     yield from layout.members({k: v for k, v in answer.items() if k not in apart})
     for name in _NOTES:

@@ -163,6 +163,8 @@ def field(
     """
     from webots_mcp.questions.edit_scene import webots_get_field, webots_set_field
 
+    if stop and value is None:
+        raise InvalidInputError("--stop goes with a VALUE that is set")
     if value is None:
         return _show(webots_get_field, asked, as_json=json, path=path, start=start)
     _show(webots_set_field, asked, as_json=json, path=path, value=value, stop=stop)

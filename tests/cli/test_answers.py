@@ -14,7 +14,10 @@ def test_whom_and_when_it_is_about_stands_in_one_line() -> None:
 
 
 def test_that_line_too_is_wrapped_where_the_terminal_is_narrow() -> None:
-    assert list(answer_lines(HEAD, width=30)) == ["rover, run 3, at 1.5 s,", "  running, 0.02 s old"]
+    assert list(answer_lines(HEAD, width=30)) == [
+        "rover, run 3, at 1.5 s,",
+        "  running, 0.02 s old",
+    ]
 
 
 def test_short_members_stand_together_and_objects_by_themselves() -> None:

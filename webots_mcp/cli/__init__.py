@@ -46,7 +46,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         answer = getattr(error, "answer", {})
         return _fail(EXIT_BAD_INPUT, as_typed(str(error)), given, answer)
     except UnicodeEncodeError as error:  # bytes of the command line that are no text
-        said = f"{error.object[error.start : error.end]!r} cannot be written as {error.encoding}: {error.reason}"
+        no_text = error.object[error.start : error.end]
+        said = f"{no_text!r} cannot be written as {error.encoding}: {error.reason}"
         return _fail(EXIT_BAD_INPUT, said, given)
     except ModuleNotFoundError as error:
         return _fail(EXIT_SYSTEM, _explain_missing(error), given)

@@ -203,8 +203,15 @@ def verdicts_of(verdicts: Verdicts) -> KindVerdicts:
 
 
 def not_shown_of(told: Events) -> dict[str, str] | None:
-    """How many of each kind are not shown, and from when to when they are."""
-    return {kind: f"{each.count} {each.span}" for kind, each in told.left_out.items()} or None
+    """How many of each kind are not shown, and from when to when they are.
+
+    Of log lines the newest are shown, so an error that many warnings follow is named here.
+    """
+    return {
+        kind: f"{each.count} {each.span}"
+        + f", errors among them: {each.errors}" * bool(each.errors)
+        for kind, each in told.left_out.items()
+    } or None
 
 
 def events_table(events: Sequence[Event], view: View) -> Table | None:

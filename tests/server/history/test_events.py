@@ -181,6 +181,22 @@ async def test_what_is_left_out_of_several_runs_is_named_by_run_because_each_has
     assert one["not_shown"] == {"log": "3 from 1.5 to 4.5 s"}
 
 
+async def test_an_error_that_many_warnings_follow_is_counted_among_what_is_not_shown(
+    recorded: Recorded, connect: Connect
+) -> None:
+    robot = recorded.robot()
+    robot.state(0.0, {"n": 0})
+    robot.log(1.0, "the motor driver failed", "error")
+    for number in range(60):
+        letters = chr(97 + number % 26) * 5 + chr(97 + number // 26)
+        robot.log(2.0 + number, f"{letters} is not what {letters} was {letters * 3}", "warning")
+    robot.state(70.0, {"n": 1})
+    async with connect(read_only=True) as client:
+        for tool, asked in (("webots_find_events", {}), ("webots_monitor", {"lookback_wall_s": 9})):
+            not_shown = (await ask(client, tool, **asked))["not_shown"]
+            assert not_shown["log"].endswith(" s, errors among them: 1")
+
+
 async def test_what_find_events_does_not_show_is_named_by_time_and_a_cursor_shows_it(
     story: Path,
 ) -> None:

@@ -28,6 +28,7 @@ from webots_mcp.store.signals.catalogue import known_signals, resolve_signals
 from webots_mcp.store.signals.flatten import parse
 from webots_mcp.store.signals.registry import Signal
 
+_ERRORS: Final = ("error", "critical")  # levels of log lines
 MOST_AROUND: Final = 6  # values that are reported with an event
 
 _IS_OPEN: Final = "SELECT id, session_id, ended_wall_time_s IS NULL FROM run WHERE id = ?"
@@ -39,11 +40,16 @@ _ROW_AT: Final = (
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Events of one kind that were found and left out: how many, and the first and the last."""
+    """Events of one kind that were found and left out: how many, and the first and the last.
+
+    Attributes:
+        errors: How many of them are log lines of level error or critical.
+    """
 
     count: int
     first: Event
     last: Event
+    errors: int = 0
 
     @property
     def span(self) -> str:
@@ -314,7 +320,12 @@ def _left_out(events: Sequence[Event]) -> dict[str, LeftOut]:
     for event in events:
         by_kind.setdefault(event.kind, []).append(event)
     return {
-        kind: LeftOut(sum(e.count for e in each), each[0], each[-1])
+        kind: LeftOut(
+            sum(event.count for event in each),
+            each[0],
+            each[-1],
+            sum(event.count for event in each if kind == "log" and event.name in _ERRORS),
+        )
         for kind, each in by_kind.items()
     }
 

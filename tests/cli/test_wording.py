@@ -65,6 +65,14 @@ def test_an_error_names_what_was_typed(
     assert answered in capsys.readouterr().err
 
 
+def test_a_line_for_the_controller_stays_python(
+    data_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["logs", "--robot", "rover", "--data-dir", str(data_dir)]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "bridge.log('text', level='info') records one" in said
+
+
 def test_a_flag_that_is_to_be_turned_off_is_named_by_the_option_that_does(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -196,7 +196,8 @@ def test_a_command_that_no_route_could_do_says_why_each_failed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recorded = Recorded(tmp_path / "webots.db")
-    recorded.robot(supervisor=True, last_seen_wall_time_s=time.time() - 30)
+    oldest = 1  # a process that began after a session was seen last is another one
+    recorded.robot(supervisor=True, pid=oldest, last_seen_wall_time_s=time.time() - 30)
     assert main(["pause", "--timeout", "0.2", "--data-dir", str(tmp_path)]) == 2
     said = capsys.readouterr().err
     assert "pause is not done (cancelled)" in said

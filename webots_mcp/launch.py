@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sqlite3
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -133,7 +133,7 @@ class Launch:
 
     def silence(self) -> str:
         """Why no controller has recorded yet, as far as that shows."""
-        reasons = [*self._of_webots(), *self._of_controllers()]
+        reasons = [*self._of_webots(), *why_silent(self._begun(), self.world)]
         return "; ".join(reasons) or "no controller has recorded yet"
 
     def record_last_words(self) -> None:
@@ -167,12 +167,6 @@ class Launch:
             reasons.append(f"its console has: {' | '.join(printed[-_SHOWN_LINES:])}")
         return reasons
 
-    def _of_controllers(self) -> list[str]:
-        begun = [each.robot for each in self._begun()]
-        if begun:
-            return [f"{', '.join(begun)} has a bridge and has published nothing yet"]
-        return list(_without_record(self.world))
-
 
 def _is_problem(line: WebotsLine) -> bool:
     """Whether a line is from stderr, or looks so: `xvfb-run` may mix both streams."""
@@ -181,8 +175,19 @@ def _is_problem(line: WebotsLine) -> bool:
     return bool(_TROUBLE.search(line.text))
 
 
-def _without_record(world: Path) -> list[str]:
-    """What the world and its controllers say of it."""
+def why_silent(
+    begun: Sequence[SessionStart], world: Path, extern: str = "start it with webots-controller"
+) -> list[str]:
+    """Why no controller of a world has recorded yet: what its sessions, or its files, say of it.
+
+    Args:
+        begun: The sessions of its controllers.
+        world: The file.
+        extern: What is to be done about an extern controller.
+    """
+    if begun:
+        names = ", ".join(each.robot for each in begun)
+        return [f"{names} has a bridge and has published nothing yet"]
     folder = (find_project(world.parent) or world.parent.parent) / "controllers"
     names = controllers_in(world)
     own = [name for name in names if name not in _NOBODYS and (folder / name).is_dir()]
@@ -190,7 +195,7 @@ def _without_record(world: Path) -> list[str]:
     without = [name for name in own if not has_bridge(folder / name)]
     reasons = list[str]()
     if _EXTERN in names:
-        reasons.append("a robot has the controller <extern>: start it with webots-controller")
+        reasons.append(f"a robot has the controller <extern>: {extern}")
     if missing:
         reasons.append(f"not in {folder}: {', '.join(missing)}")
     if without:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -258,8 +259,7 @@ def test_the_stand_in_runs_a_world_where_no_webots_is(
     launch: Launch, project: Callable[..., Path], number: signal.Signals, tmp_path: Path
 ) -> None:
     process = launch(project(), "--stand-in", "--mode", "fast")
-    assert process.stdout is not None
-    assert any("ready" in line for line in process.stdout)  # printed when it records already
+    assert re.search(r": \w+ records: run 1$", _told(process, "records"))
     family = psutil.Process(process.pid).children(recursive=True)
     process.send_signal(number)
     out, rest = process.communicate(timeout=60)
@@ -267,6 +267,13 @@ def test_the_stand_in_runs_a_world_where_no_webots_is(
     assert process.returncode == 0
     assert "Traceback" not in out + rest
     assert (tmp_path / "project" / "mcp_data" / "webots.db").exists()
+
+
+def test_the_stand_in_says_why_no_controller_records(
+    launch: Launch, project: Callable[..., Path]
+) -> None:
+    process = launch(project(PLAIN), "--stand-in", "--patience", "0")
+    assert "(attach one: webots-mcp init --patch " in _told(process, "no controller has recorded")
 
 
 def test_what_only_webots_has_is_refused_for_the_stand_in(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import sys
+import threading
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 from cyclopts.validators import Number
 
 from webots_mcp.cli.values import Parameter
-from webots_mcp.errors import InvalidInputError
+from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.plugins import stand_in_simulator
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from webots_mcp.webots.stream import WebotsLine
 
 _LOOK_EVERY_S: Final = 0.2
+_EXTERN_HERE: Final = "python -m webots_mcp.standin --robot runs one"
 MAX_PORT: Final = 65_535
 
 
@@ -78,7 +80,7 @@ def launch(
         webots-mcp launch worlds/arena.wbt --headless --mode fast
     """
     from webots_mcp.contract import DATA_DIR_VARIABLE
-    from webots_mcp.launch import Launch, require_world
+    from webots_mcp.launch import Launch, newest_in, require_world
     from webots_mcp.webots.starting import Start, free_port
 
     file, project = require_world(world)
@@ -87,6 +89,8 @@ def launch(
         if stream or port is not None:
             raise InvalidInputError("--stream and --port are Webots' own: leave them out")
         os.environ[DATA_DIR_VARIABLE] = str(recording.data_dir)
+        watched = recording, newest_in(recording), file, patience_s
+        threading.Thread(target=_watch, args=watched, daemon=True).start()
         return stand_in_simulator()(file, mode or "realtime")
     start = Start(file, mode, headless, stream, port or free_port())
     environment = {DATA_DIR_VARIABLE: str(recording.data_dir)}
@@ -99,6 +103,28 @@ def launch(
             if not launched.webots.is_over:
                 _say("ending Webots")
             launched.webots.end()
+
+
+def _watch(recording: Recording, before: int, world: Path, patience_s: float) -> None:
+    """Say which controller in the stand-in records first, after the session `before`; or why none."""
+    from webots_mcp.launch import starts_since, why_silent
+
+    until_s = time.monotonic() + patience_s
+    while True:
+        try:
+            begun = starts_since(recording, before)
+        except WebotsMCPError as error:
+            return _say(str(error))
+        if begun and begun[0].run_id is not None:  # those that have recorded come first
+            return _say(f"{begun[0].robot} records: run {begun[0].run_id}")
+        if time.monotonic() > until_s:
+            until_s = math.inf
+            reasons = why_silent(
+                begun, world, extern="python -m webots_mcp.standin --robot runs it"
+            )
+            why = "; ".join(reasons) or "no robot has published yet"
+            _say(f"no controller has recorded within {patience_s:g} s: {why}")
+        time.sleep(_LOOK_EVERY_S)
 
 
 def _recording(data_dir: Path | None, project: Path) -> Recording:

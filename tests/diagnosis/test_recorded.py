@@ -17,6 +17,7 @@ from tests.recordings.rows import Recorded, RecordedRobot
 from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.queue import CommandQueue
 from webots_mcp.store.migrate import upgrade
+from webots_mcp.waiting_file import waiting_path
 
 KILLED = """
 import os, signal, sys
@@ -124,6 +125,16 @@ def test_rows_that_wait_for_a_killed_writer_are_counted_and_named(look: Look, fi
     assert rows.verdict == "warning"
     assert "7 rows of a controller that is gone wait in webots.db-waiting-" in rows.seen
     assert "webots-mcp serve" in (rows.fix or "")
+
+
+def test_where_not_even_a_waiting_file_could_be_begun_rows_may_be_lost(
+    look: Look, recorded: Recorded, file: Path
+) -> None:
+    gone(recorded)
+    waiting_path(file, "d3").touch()  # as a full disk leaves it
+    rows = look("Rows")
+    assert rows.verdict == "warning"
+    assert "rows may be lost that nothing counts" in rows.seen
 
 
 def test_dropped_rows_of_a_living_controller_are_wrong(look: Look, recorded: Recorded) -> None:

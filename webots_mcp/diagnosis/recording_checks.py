@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from pathlib import Path
 from typing import Final, NamedTuple
 
 from webots_mcp.connection import connect, is_there, journal_mode
@@ -135,7 +136,17 @@ def _left_waiting(subject: Examined) -> list[Finding]:
         return []
     waiting_in = [rows_waiting(v.connection, v.session).get("waiting_in") for v in subject.live]
     left = [path for path in waiting_paths(subject.file) if path.name not in waiting_in]
-    return [
+    unbegun = [
+        Finding(
+            "warning",
+            f"{path.name} is empty: a controller could write neither to the database nor there, so "
+            "rows may be lost that nothing counts",
+            "see free space and the folder's rights; delete that file when no controller runs",
+        )
+        for path in left
+        if _is_empty(path)
+    ]
+    return unbegun + [
         Finding(
             "warning",
             f"{count} rows of a controller that is gone wait in {path.name}",
@@ -144,6 +155,14 @@ def _left_waiting(subject: Examined) -> list[Finding]:
         for path in left
         if (count := count_rows(path))
     ]
+
+
+def _is_empty(path: Path) -> bool:
+    """Whether not even its header could be written, which is left where rows were taken in."""
+    try:
+        return path.stat().st_size == 0
+    except OSError:  # another process has just deleted it
+        return False
 
 
 class _Unfinished(NamedTuple):

@@ -202,6 +202,21 @@ def test_what_is_one_fact_or_the_same_in_all_runs_makes_no_other_figure_less_cer
     assert {"distance_m", "mean_speed_m_s"} <= claimed(compare_code(empty))
 
 
+def test_a_run_of_one_moment_is_named_as_what_the_others_are_cut_to(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    for rows in (100, 1):
+        recorder.run(recorder.session(robot_id, "x"), robot_id)
+        for step in range(rows):
+            recorder.publish(step * 0.1, {"front_m": step * 0.01})
+    assert (
+        "all figures are about the first moment of each run, for run 2 has no other: ask again "
+        "without it"
+    ) in compare_runs(empty, [1, 2]).notes
+
+
 def test_a_swing_that_was_cut_comes_first(empty: sqlite3.Connection) -> None:
     recorder = Recorder(empty)
     robot_id = recorder.robot("r")

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
+from webots_mcp.conditions.signal_values import SAME_TIME_S
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.parameter import Value
 from webots_mcp.store.analysis.spread import MATTERS_SD
@@ -290,6 +291,12 @@ def _cut_notes(durations_s: dict[int, float], compared_s: float) -> list[str]:
     longer = [run_id for run_id, each_s in durations_s.items() if each_s > _AS_LONG * compared_s]
     if not longer:
         return []
+    moments = [str(run_id) for run_id, each_s in durations_s.items() if each_s < SAME_TIME_S]
+    if moments:
+        return [
+            f"all figures are about the first moment of each run, for run {', '.join(moments)} has "
+            "no other: ask again without it"
+        ]
     which = ", ".join(f"{run_id} ({durations_s[run_id]:.4g} s)" for run_id in longer)
     return [
         f"all figures are about the first {compared_s:.4g} s; for the rest of run {which} ask "

@@ -106,7 +106,7 @@ def launch(
 
 
 def _watch(recording: Recording, before: int, world: Path, patience_s: float) -> None:
-    """Say which controller in the stand-in records first, after the session `before`; or why none."""
+    """Say which controller records in the stand-in, after the session `before`; or why none."""
     from webots_mcp.launch import starts_since, why_silent
 
     until_s = time.monotonic() + patience_s
@@ -119,9 +119,7 @@ def _watch(recording: Recording, before: int, world: Path, patience_s: float) ->
             return _say(f"{begun[0].robot} records: run {begun[0].run_id}")
         if time.monotonic() > until_s:
             until_s = math.inf
-            reasons = why_silent(
-                begun, world, extern="python -m webots_mcp.standin --robot runs it"
-            )
+            reasons = why_silent(begun, world, extern=_EXTERN_HERE)
             why = "; ".join(reasons) or "no robot has published yet"
             _say(f"no controller has recorded within {patience_s:g} s: {why}")
         time.sleep(_LOOK_EVERY_S)

@@ -66,5 +66,6 @@ def test_no_word_of_a_table_is_lost_however_narrow_the_terminal_is(width: int) -
         [f"2026-11-22T23:40:{row:02}Z", *(f"a{row} b c{n}" for n in range(5))] for row in (1, 2)
     ]
     lines = list(table_lines(columns, rows, width))
-    told = {word for line in lines for word in line.split()}
+    assert width < 24 or max(map(len, lines)) <= width
+    told = {word.rstrip(",") for line in lines for word in line.split()}
     assert told == {*columns, *(word for row in rows for cell in row for word in cell.split())}

@@ -91,7 +91,10 @@ def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
 def table_lines(
     columns: Sequence[str], rows: Sequence[Sequence[Any]], width: int = _ENDLESS
 ) -> Iterator[str]:
-    """The lines of a table that is no wider than so many characters; what is longer is folded."""
+    """The lines of a table that is no wider than so many characters; what is longer is folded.
+
+    Where not even the longest words of its columns fit beside each other, each row is a paragraph.
+    """
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -103,6 +106,8 @@ def table_lines(
         headers = {index: header.replace("_", "_\n") for index, header in headers.items()}
     least = {i: _longest([*headers[i].split(), *words[i]]) for i in kept}
     full = {i: max(len(headers[i]), *(len(text_of(row[i])) for row in rows), 1) for i in kept}
+    if sum(least.values()) + _GAP * len(kept) > width:
+        return (line for row in rows for line in _row_in_words(columns, row, width))
     widths = _shared_out(width - _GAP * len(kept), least, full)
     table = Table(box=None, pad_edge=False, padding=(0, _GAP, 0, 0), show_edge=False)
     for index in kept:
@@ -122,11 +127,26 @@ def table_lines(
     return (line.rstrip() for line in captured.get().splitlines())
 
 
+def _row_in_words(columns: Sequence[str], row: Sequence[Any], width: int) -> list[str]:
+    """A row as a paragraph that names its columns."""
+    named = (
+        f"{printable(column)} {text_of(value)}"
+        for column, value in zip(columns, row, strict=True)
+        if value is not None
+    )
+    return textwrap.wrap(
+        ", ".join(named),
+        width,
+        subsequent_indent=_INDENT,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
 def _shared_out(room: int, least: Mapping[int, int], full: Mapping[int, int]) -> dict[int, int]:
     """The width of each column: what its words need, and what is left for those that want more.
 
-    Those that want little more come first. Words are never cut: where there is too little room,
-    lines are longer than the terminal is wide, and wrapped by it.
+    Those that want little more come first.
     """
     widths = dict(least)
     spare = max(room - sum(least.values()), 0)

@@ -217,5 +217,5 @@ def test_a_world_whose_only_robot_is_unknown_is_refused_with_what_to_do(
     assert str(caught.value) == (
         "foreign_robot_r2023b.wbt, line 10: the stand-in has no Pioneer3dx nodes. If that is the "
         "robot: in Webots, right-click it, choose 'Convert Root to Base Node(s)' and save the "
-        "world; docs/standin.md tells what the stand-in has"
+        "world; docs/standin.md lists what the stand-in has"
     )

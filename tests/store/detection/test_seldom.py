@@ -91,7 +91,7 @@ def test_the_rest_of_a_stretch_that_is_being_read_when_time_ends_is_named(
     monkeypatch.setattr(rows, "_CHUNK_ROWS", 50)
     monkeypatch.setattr(views, "STRETCH_ROWS", 2000)
     asked = find_range(empty, Scope())
-    options = EventOptions(kinds=("oscillation",), signals=("level",), oscillation_turns=8)
+    options = EventOptions(kinds=("oscillation",), signals=("level",), min_half_periods=8)
     kinds, cut = asked_kinds(options), set[str]()
     for limit in range(4, 120):
         ticks, ledger = count(), Ledger()

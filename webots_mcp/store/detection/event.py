@@ -108,7 +108,7 @@ class EventOptions:
             is noisy otherwise 0.15 of that are enough.
         jump_score: How many times larger than the usual step (modified z-score) a jump is.
         jump_m: A position jumps by at least so much between two rows.
-        oscillation_turns: Turning points in a row; with a period of more than 5 s at least 12.
+        min_half_periods: Half periods in a row; with a period of more than 5 s at least 12.
         oscillation_period_s: The longest period that counts; None for as long a one as fits in
             the stretch, and for 5 s where that is too long to be read row by row.
         log_level: Log lines of this level and above.
@@ -129,7 +129,7 @@ class EventOptions:
     flat_s: float = 20.0
     jump_score: float = 12.0
     jump_m: float = 0.3
-    oscillation_turns: int = LEAST_HALF_SWINGS
+    min_half_periods: int = LEAST_HALF_SWINGS
     oscillation_period_s: float | None = None
     log_level: str = "warning"
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import tempfile
 
 APPLICATION_ID: Final = 0x57424D43  # "WBMC", shown by the `file` command
-SCHEMA_VERSION: Final = 9  # PRAGMA user_version of a database that this version reads and writes
+SCHEMA_VERSION: Final = 10  # PRAGMA user_version of a database that this version reads and writes
 
 DATABASE_NAME: Final = "webots.db"
 WORLD_ENDING: Final = ".wbt"

@@ -1,14 +1,13 @@
 PRAGMA application_id = 1463962947;
-PRAGMA user_version = 9;
+PRAGMA user_version = 10;
 CREATE TABLE alembic_version (
 	version_num VARCHAR(32) NOT NULL, 
 	CONSTRAINT alembic_version_pkc PRIMARY KEY (version_num)
 );
-CREATE TABLE lease (
-	name TEXT NOT NULL, 
-	holder TEXT NOT NULL, 
-	until_wall_time_s FLOAT NOT NULL, 
-	PRIMARY KEY (name)
+CREATE TABLE recording (
+	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
+	created_wall_time_s FLOAT NOT NULL, 
+	PRIMARY KEY (uuid)
 );
 CREATE TABLE robot (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
@@ -41,34 +40,18 @@ CREATE TABLE session (
 	rows_dropped INTEGER DEFAULT 0 NOT NULL /* rows that could never be written */, 
 	last_error TEXT /* newest thing that could not be recorded, and why */, 
 	ended_wall_time_s FLOAT, 
-	end_reason TEXT /* finished, reload, crashed, replaced */, uuid TEXT /* random (version 4); names the row among those of all machines */ NULL, process TEXT /* which process of that pid; null where the system does not tell */ NULL, last_seen_monotonic_s FLOAT /* the host's monotonic clock at last_seen_wall_time_s */ NULL, extern INTEGER /* 1 where nobody starts the controller again */ NULL, hold_mode TEXT /* simulation mode to go back to when the hold ends */ NULL, adopted_rows INTEGER DEFAULT 0 /* number of the last entry taken in from its file beside */ NOT NULL, throttle_interval INTEGER /* of so many publish() calls one is recorded */ NULL, 
+	end_reason TEXT /* finished, reload, crashed, replaced */, 
+	uuid TEXT /* random (version 4); names the row among those of all machines */, 
+	process TEXT /* which process of that pid; null where the system does not tell */, 
+	last_seen_monotonic_s FLOAT /* the host's monotonic clock at last_seen_wall_time_s */, 
+	extern INTEGER /* 1 where nobody starts the controller again */, 
+	hold_mode TEXT /* simulation mode to go back to when the hold ends */, 
+	adopted_rows INTEGER DEFAULT 0 NOT NULL /* number of the last entry taken in from its file beside */, 
+	throttle_interval INTEGER /* of so many publish() calls one is recorded */, 
 	CONSTRAINT fk_session_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE
 );
 CREATE INDEX ix_session_robot_id_id ON session (robot_id, id);
-CREATE TABLE command (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	robot_id INTEGER NOT NULL, 
-	action TEXT NOT NULL, 
-	params TEXT NOT NULL /* JSON object */, 
-	status TEXT NOT NULL /* pending, claimed, then one of done, failed, expired, cancelled, lost */, 
-	requested_by TEXT, 
-	idempotency_key TEXT /* the same key makes no second command */, 
-	created_wall_time_s FLOAT NOT NULL, 
-	expires_wall_time_s FLOAT NOT NULL /* if not claimed by then, never run */, 
-	claimed_wall_time_s FLOAT, 
-	claimed_sim_time_s FLOAT, 
-	session_id INTEGER, 
-	issued_wall_time_s FLOAT /* when a reset or reload was asked of Webots */, 
-	finished_wall_time_s FLOAT, 
-	finished_sim_time_s FLOAT, 
-	result TEXT /* JSON value */, 
-	error TEXT, 
-	CONSTRAINT fk_command_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
-	CONSTRAINT fk_command_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE SET NULL, 
-	CONSTRAINT uq_command_idempotency_key UNIQUE (idempotency_key)
-);
-CREATE INDEX ix_command_claimed ON command (robot_id, id) WHERE status = 'claimed';
-CREATE INDEX ix_command_pending ON command (robot_id, id) WHERE status = 'pending';
+CREATE UNIQUE INDEX ix_session_uuid ON session (uuid);
 CREATE TABLE run (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
 	session_id INTEGER NOT NULL, 
@@ -84,48 +67,18 @@ CREATE TABLE run (
 	end_reason TEXT /* finished, reset, reload, crashed, replaced */, 
 	rows INTEGER DEFAULT 0 NOT NULL /* state rows, as of last_wall_time_s */, 
 	label TEXT, 
-	note TEXT, keep INTEGER /* 1: retention deletes nothing of this run */ DEFAULT 0 NOT NULL, purged_rows INTEGER /* of the rows, those that retention has deleted */ DEFAULT 0 NOT NULL, uuid TEXT /* random (version 4); names the row among those of all machines */ NULL, rolled_state_id INTEGER DEFAULT 0 /* last state.id in the rollups, where beyond the watermark */ NOT NULL, coarse_end INTEGER /* buckets of coarse_rollup below it are complete; null before the first */ NULL, 
-	CONSTRAINT fk_run_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
-	CONSTRAINT fk_run_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE CASCADE
+	note TEXT, 
+	keep INTEGER DEFAULT 0 NOT NULL /* 1: retention deletes nothing of this run */, 
+	purged_rows INTEGER DEFAULT 0 NOT NULL /* of the rows, those that retention has deleted */, 
+	uuid TEXT /* random (version 4); names the row among those of all machines */, 
+	rolled_state_id INTEGER DEFAULT 0 NOT NULL /* last state.id in the rollups, where beyond the watermark */, 
+	coarse_end INTEGER /* buckets of coarse_rollup below it are complete; null before the first */, 
+	CONSTRAINT fk_run_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE CASCADE, 
+	CONSTRAINT fk_run_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE
 );
 CREATE INDEX ix_run_robot_id_id ON run (robot_id, id);
 CREATE INDEX ix_run_session_id ON run (session_id);
-CREATE TABLE event (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	run_id INTEGER NOT NULL, 
-	sim_time_s FLOAT NOT NULL, 
-	wall_time_s FLOAT NOT NULL, 
-	kind TEXT NOT NULL /* change, start, reset, reload, pause, resume, dropped, storage, ... */, 
-	name TEXT /* the signal that changed, where one did */, 
-	data TEXT /* JSON object */, 
-	CONSTRAINT fk_event_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
-);
-CREATE INDEX ix_event_run_id_sim_time_s ON event (run_id, sim_time_s);
-CREATE TABLE image (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	run_id INTEGER NOT NULL, 
-	sim_time_s FLOAT NOT NULL, 
-	wall_time_s FLOAT NOT NULL, 
-	kind TEXT NOT NULL /* camera or screenshot */, 
-	device TEXT /* name of the camera */, 
-	path TEXT NOT NULL /* relative to the data folder */, 
-	width INTEGER NOT NULL /* pixels */, 
-	height INTEGER NOT NULL /* pixels */, 
-	bytes INTEGER NOT NULL /* size of the file */, 
-	CONSTRAINT fk_image_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
-);
-CREATE INDEX ix_image_run_id_sim_time_s ON image (run_id, sim_time_s);
-CREATE TABLE log (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	run_id INTEGER NOT NULL, 
-	sim_time_s FLOAT NOT NULL, 
-	wall_time_s FLOAT NOT NULL, 
-	level TEXT NOT NULL /* debug, info, ... critical */, 
-	source TEXT NOT NULL /* controller or bridge */, 
-	message TEXT NOT NULL, logger TEXT /* name of the Python logger, where one logged it */ NULL, 
-	CONSTRAINT fk_log_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
-);
-CREATE INDEX ix_log_run_id_sim_time_s ON log (run_id, sim_time_s);
+CREATE UNIQUE INDEX ix_run_uuid ON run (uuid);
 CREATE TABLE state (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
 	run_id INTEGER NOT NULL, 
@@ -151,13 +104,10 @@ CREATE TABLE signal (
 	odd_rows INTEGER DEFAULT 0 NOT NULL /* of them with a value that JSON cannot hold (nan, inf, ...) */, 
 	min FLOAT, 
 	max FLOAT, 
-	CONSTRAINT fk_signal_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
-	CONSTRAINT uq_signal_robot_id UNIQUE (robot_id, name)
+	CONSTRAINT uq_signal_robot_id UNIQUE (robot_id, name), 
+	CONSTRAINT fk_signal_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE
 );
 CREATE TABLE rollup (
-	run_id INTEGER NOT NULL, 
-	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
-	bucket INTEGER NOT NULL /* floor(sim_time_s / 10) */, 
 	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held the signal */, 
 	present INTEGER DEFAULT 0 NOT NULL /* of them with a value */, 
 	changes INTEGER DEFAULT 0 NOT NULL /* of the values, those unlike the one before in the bucket */, 
@@ -172,9 +122,69 @@ CREATE TABLE rollup (
 	sum FLOAT, 
 	squares FLOAT /* sum of squared deviations from sum / count */, 
 	sines FLOAT /* angles only: sum of sines */, 
-	cosines FLOAT /* angles only: sum of cosines */, largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */ NULL, first_until_sim_time_s FLOAT /* up to then it had its first number; null in older versions */ NULL, last_since_sim_time_s FLOAT /* from then on it had its last number; null in older versions */ NULL, 
+	cosines FLOAT /* angles only: sum of cosines */, 
+	largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */, 
+	first_until_sim_time_s FLOAT /* up to then it had its first number; null in older versions */, 
+	last_since_sim_time_s FLOAT /* from then on it had its last number; null in older versions */, 
+	run_id INTEGER NOT NULL, 
+	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
+	bucket INTEGER NOT NULL /* floor(sim_time_s / 10) */, 
 	PRIMARY KEY (run_id, signal_id, bucket), 
 	CONSTRAINT fk_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+)
+ WITHOUT ROWID;
+CREATE TABLE recent_rollup (
+	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held the signal */, 
+	present INTEGER DEFAULT 0 NOT NULL /* of them with a value */, 
+	changes INTEGER DEFAULT 0 NOT NULL /* of the values, those unlike the one before in the bucket */, 
+	first FLOAT /* of numbers and flags (0, 1); null for text, as all that follows */, 
+	first_sim_time_s FLOAT, 
+	last FLOAT, 
+	last_sim_time_s FLOAT, 
+	min FLOAT, 
+	min_sim_time_s FLOAT /* of the first such extreme */, 
+	max FLOAT, 
+	max_sim_time_s FLOAT /* of the first such extreme */, 
+	sum FLOAT, 
+	squares FLOAT /* sum of squared deviations from sum / count */, 
+	sines FLOAT /* angles only: sum of sines */, 
+	cosines FLOAT /* angles only: sum of cosines */, 
+	largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */, 
+	first_until_sim_time_s FLOAT /* up to then it had its first number; null in older versions */, 
+	last_since_sim_time_s FLOAT /* from then on it had its last number; null in older versions */, 
+	run_id INTEGER NOT NULL, 
+	bucket INTEGER NOT NULL /* floor(sim_time_s / 10) */, 
+	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
+	PRIMARY KEY (run_id, bucket, signal_id), 
+	CONSTRAINT fk_recent_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+)
+ WITHOUT ROWID;
+CREATE TABLE coarse_rollup (
+	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held the signal */, 
+	present INTEGER DEFAULT 0 NOT NULL /* of them with a value */, 
+	changes INTEGER DEFAULT 0 NOT NULL /* of the values, those unlike the one before in the bucket */, 
+	first FLOAT /* of numbers and flags (0, 1); null for text, as all that follows */, 
+	first_sim_time_s FLOAT, 
+	last FLOAT, 
+	last_sim_time_s FLOAT, 
+	min FLOAT, 
+	min_sim_time_s FLOAT /* of the first such extreme */, 
+	max FLOAT, 
+	max_sim_time_s FLOAT /* of the first such extreme */, 
+	sum FLOAT, 
+	squares FLOAT /* sum of squared deviations from sum / count */, 
+	sines FLOAT /* angles only: sum of sines */, 
+	cosines FLOAT /* angles only: sum of cosines */, 
+	largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */, 
+	first_until_sim_time_s FLOAT /* up to then it had its first number; null in older versions */, 
+	last_since_sim_time_s FLOAT /* from then on it had its last number; null in older versions */, 
+	run_id INTEGER NOT NULL, 
+	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
+	bucket INTEGER NOT NULL /* floor(sim_time_s / 500) */, 
+	swings TEXT /* JSON: the swings of what a robot swings with, each as [begin, end, half swings, period in s, amplitude, explained share]; null where they were not looked for */, 
+	standstills TEXT /* JSON, at the signal of x: where the robot stood still, and what shows whether it should have moved; null where that was not looked for */, 
+	PRIMARY KEY (run_id, signal_id, bucket), 
+	CONSTRAINT fk_coarse_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 )
  WITHOUT ROWID;
 CREATE TABLE change (
@@ -191,6 +201,204 @@ CREATE TABLE watermark (
 	name TEXT NOT NULL /* rollup */, 
 	state_id INTEGER NOT NULL, 
 	PRIMARY KEY (name)
+);
+CREATE TABLE log (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	run_id INTEGER NOT NULL, 
+	sim_time_s FLOAT NOT NULL, 
+	wall_time_s FLOAT NOT NULL, 
+	level TEXT NOT NULL /* debug, info, ... critical */, 
+	source TEXT NOT NULL /* controller, bridge, console or webots */, 
+	message TEXT NOT NULL, 
+	logger TEXT /* name of the Python logger, where one logged it */, 
+	CONSTRAINT fk_log_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+);
+CREATE INDEX ix_log_run_id_sim_time_s ON log (run_id, sim_time_s);
+CREATE TABLE console_line (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	instance TEXT NOT NULL /* session.instance of who said it */, 
+	wall_time_s FLOAT NOT NULL, 
+	level TEXT NOT NULL, 
+	source TEXT NOT NULL /* webots, or console: a controller, not told which; as in log later on */, 
+	message TEXT NOT NULL, 
+	logger TEXT /* stdout or stderr */
+);
+CREATE TABLE event (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	run_id INTEGER NOT NULL, 
+	sim_time_s FLOAT NOT NULL, 
+	wall_time_s FLOAT NOT NULL, 
+	kind TEXT NOT NULL /* change, start, reset, reload, pause, resume, dropped, storage, ... */, 
+	name TEXT /* the signal that changed, where one did */, 
+	data TEXT /* JSON object */, 
+	CONSTRAINT fk_event_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+);
+CREATE INDEX ix_event_run_id_sim_time_s ON event (run_id, sim_time_s);
+CREATE TABLE command (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	robot_id INTEGER NOT NULL, 
+	action TEXT NOT NULL, 
+	params TEXT NOT NULL /* JSON object */, 
+	status TEXT NOT NULL /* pending, claimed, then one of done, failed, expired, cancelled, lost */, 
+	requested_by TEXT, 
+	idempotency_key TEXT /* the same key makes no second command */, 
+	created_wall_time_s FLOAT NOT NULL, 
+	expires_wall_time_s FLOAT NOT NULL /* if not claimed by then, never run */, 
+	claimed_wall_time_s FLOAT, 
+	claimed_sim_time_s FLOAT, 
+	session_id INTEGER, 
+	issued_wall_time_s FLOAT /* when a reset or reload was asked of Webots */, 
+	finished_wall_time_s FLOAT, 
+	finished_sim_time_s FLOAT, 
+	result TEXT /* JSON value */, 
+	error TEXT, 
+	CONSTRAINT fk_command_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
+	CONSTRAINT uq_command_idempotency_key UNIQUE (idempotency_key), 
+	CONSTRAINT fk_command_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE SET NULL
+);
+CREATE INDEX ix_command_claimed ON command (robot_id, id) WHERE status = 'claimed';
+CREATE INDEX ix_command_pending ON command (robot_id, id) WHERE status = 'pending';
+CREATE INDEX ix_command_session_id ON command (session_id);
+CREATE TABLE breakpoint (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	robot_id INTEGER NOT NULL, 
+	session_id INTEGER, 
+	condition TEXT NOT NULL /* see docs/conditions.md */, 
+	action TEXT NOT NULL /* pause, log or keep */, 
+	after_hits INTEGER DEFAULT 1 NOT NULL /* the action is taken from this hit of a run on */, 
+	enabled INTEGER DEFAULT 1 NOT NULL /* 0 once the condition failed */, 
+	hits INTEGER DEFAULT 0 NOT NULL /* how often it began to hold, in all runs */, 
+	created_wall_time_s FLOAT NOT NULL, 
+	created_by TEXT /* mcp, cli or controller: its code, for session_id only */, 
+	error TEXT /* why the condition failed */, 
+	CONSTRAINT fk_breakpoint_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
+	CONSTRAINT fk_breakpoint_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE SET NULL
+);
+CREATE INDEX ix_breakpoint_robot_id ON breakpoint (robot_id);
+CREATE INDEX ix_breakpoint_session_id ON breakpoint (session_id);
+CREATE TABLE kept_stretch (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	run_id INTEGER NOT NULL, 
+	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
+	start_sim_time_s FLOAT NOT NULL, 
+	end_sim_time_s FLOAT NOT NULL /* ahead of the newest row while it goes on */, 
+	wall_time_s FLOAT NOT NULL /* when it was asked for */, 
+	reason TEXT NOT NULL /* why it is kept */, 
+	CONSTRAINT fk_kept_stretch_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+);
+CREATE INDEX ix_kept_stretch_run_id_start_sim_time_s ON kept_stretch (run_id, start_sim_time_s);
+CREATE UNIQUE INDEX ix_kept_stretch_uuid ON kept_stretch (uuid);
+CREATE TABLE kept_state (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	run_id INTEGER NOT NULL, 
+	call INTEGER /* its number in the session; null where retention moved it here from state */, 
+	sim_time_s FLOAT NOT NULL, 
+	wall_time_s FLOAT NOT NULL, 
+	data TEXT NOT NULL /* JSON object */, 
+	odd TEXT /* as in state */, 
+	CONSTRAINT uq_kept_state_run_id UNIQUE (run_id, call), 
+	CONSTRAINT fk_kept_state_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+);
+CREATE INDEX ix_kept_state_run_id_sim_time_s ON kept_state (run_id, sim_time_s);
+CREATE TABLE image (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	run_id INTEGER NOT NULL, 
+	sim_time_s FLOAT NOT NULL, 
+	wall_time_s FLOAT NOT NULL, 
+	kind TEXT NOT NULL /* camera or screenshot */, 
+	device TEXT /* name of the camera */, 
+	path TEXT NOT NULL /* relative to the data folder */, 
+	width INTEGER NOT NULL /* pixels */, 
+	height INTEGER NOT NULL /* pixels */, 
+	bytes INTEGER NOT NULL /* size of the file */, 
+	CONSTRAINT fk_image_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+);
+CREATE INDEX ix_image_run_id_sim_time_s ON image (run_id, sim_time_s);
+CREATE TABLE parameter (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	robot_id INTEGER NOT NULL, 
+	session_id INTEGER NOT NULL /* session.id of the controller that did */, 
+	name TEXT NOT NULL, 
+	kind TEXT NOT NULL /* float, int, bool or str */, 
+	default_value TEXT NOT NULL /* JSON value */, 
+	low FLOAT /* least value */, 
+	high FLOAT /* greatest value */, 
+	choices TEXT /* JSON array: the only values that it may have */, 
+	doc TEXT NOT NULL, 
+	unit TEXT, 
+	next_value TEXT /* JSON value that it takes with the next reset of the world */, 
+	declared_wall_time_s FLOAT NOT NULL, 
+	CONSTRAINT uq_parameter_robot_id UNIQUE (robot_id, name), 
+	CONSTRAINT fk_parameter_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE
+);
+CREATE TABLE parameter_value (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	run_id INTEGER NOT NULL, 
+	name TEXT NOT NULL, 
+	sim_time_s FLOAT NOT NULL, 
+	wall_time_s FLOAT NOT NULL, 
+	value TEXT NOT NULL /* JSON value */, 
+	is_default INTEGER NOT NULL /* 1 where the code declared it */, 
+	set_by TEXT NOT NULL /* code, environment, command or trial */, 
+	command_id INTEGER /* command.id that set it, which may have been deleted since */, 
+	CONSTRAINT fk_parameter_value_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+);
+CREATE INDEX ix_parameter_value_run_id_name_id ON parameter_value (run_id, name, id);
+CREATE TABLE trial_set (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
+	"plan" TEXT NOT NULL /* JSON object */, 
+	created_wall_time_s FLOAT NOT NULL, 
+	host TEXT /* of the process at work */, 
+	pid INTEGER, 
+	process TEXT /* which process of that pid; null where the system does not tell */, 
+	robot_id INTEGER /* in whose simulation the trials run; null: each in one of its own */, 
+	session_id INTEGER /* of the controller that was tried */, 
+	former_values TEXT /* JSON object: its parameters before, until they are set back */, 
+	stop_reason TEXT /* why it does not go on although trials wait */, 
+	CONSTRAINT fk_trial_set_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE SET NULL, 
+	CONSTRAINT fk_trial_set_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE SET NULL
+);
+CREATE INDEX ix_trial_set_robot_id ON trial_set (robot_id);
+CREATE INDEX ix_trial_set_session_id ON trial_set (session_id);
+CREATE UNIQUE INDEX ix_trial_set_uuid ON trial_set (uuid);
+CREATE TABLE trial (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	trial_set_id INTEGER NOT NULL, 
+	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
+	number INTEGER NOT NULL /* its place in the set, from 1 */, 
+	parameters TEXT NOT NULL /* JSON object */, 
+	status TEXT NOT NULL /* waiting, running, then done, failed or pruned */, 
+	run_id INTEGER, 
+	score FLOAT /* if it is done */, 
+	ended_by TEXT /* for_s, until or prune */, 
+	ended_sim_time_s FLOAT /* the end */, 
+	error TEXT /* why it failed */, 
+	started_wall_time_s FLOAT, 
+	finished_wall_time_s FLOAT, 
+	pid INTEGER /* of its simulator, while it runs */, 
+	process TEXT /* which process of that pid; null where the system does not tell */, 
+	CONSTRAINT uq_trial_trial_set_id UNIQUE (trial_set_id, number), 
+	CONSTRAINT fk_trial_trial_set_id FOREIGN KEY(trial_set_id) REFERENCES trial_set (id) ON DELETE CASCADE, 
+	CONSTRAINT fk_trial_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE SET NULL
+);
+CREATE INDEX ix_trial_run_id ON trial (run_id);
+CREATE UNIQUE INDEX ix_trial_uuid ON trial (uuid);
+CREATE TABLE lease (
+	name TEXT NOT NULL, 
+	holder TEXT NOT NULL, 
+	until_wall_time_s FLOAT NOT NULL, 
+	PRIMARY KEY (name)
+);
+CREATE TABLE retention_limit (
+	kind TEXT NOT NULL /* state, rollup, log, event, image or run */, 
+	size_bytes BIGINT /* on the disk; of pictures their files */, 
+	rows BIGINT, 
+	age_s FLOAT /* since it was recorded, in wall time */, 
+	times FLOAT /* run only: what is left of one stays so many times longer than its states; 0 for ever */, 
+	set_by TEXT NOT NULL /* serve, prune or retain */, 
+	set_wall_time_s FLOAT NOT NULL, 
+	PRIMARY KEY (kind)
 );
 CREATE VIEW robot_run AS
 /* Runs: how long in simulation and in wall time, how fast, what is left of the rows. */
@@ -224,47 +432,6 @@ SELECT (
   strftime('%Y-%m-%d %H:%M:%f', e.wall_time_s, 'unixepoch') AS utc, e.kind, e.name,
   json_extract(j, '$.from') AS from_value, json_extract(j, '$.to') AS to_value, e.data
 FROM (SELECT *, CASE WHEN json_valid(data) THEN data END AS j FROM event) e;
-CREATE TABLE recording (
-	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
-	created_wall_time_s FLOAT NOT NULL, 
-	PRIMARY KEY (uuid)
-);
-CREATE TABLE retention_limit (
-	kind TEXT NOT NULL /* state, rollup, log, event, image or run */, 
-	size_bytes BIGINT /* on the disk; of pictures their files */, 
-	rows BIGINT, 
-	age_s FLOAT /* since it was recorded, in wall time */, 
-	times FLOAT /* run only: what is left of one stays so many times longer than its states; 0 for ever */, 
-	set_by TEXT NOT NULL /* serve, prune or retain */, 
-	set_wall_time_s FLOAT NOT NULL, 
-	PRIMARY KEY (kind)
-);
-CREATE UNIQUE INDEX ix_session_uuid ON session (uuid);
-CREATE UNIQUE INDEX ix_run_uuid ON run (uuid);
-CREATE INDEX ix_command_session_id ON command (session_id);
-CREATE TABLE recent_rollup (
-	run_id INTEGER NOT NULL, 
-	bucket INTEGER NOT NULL /* floor(sim_time_s / 10) */, 
-	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
-	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held the signal */, 
-	present INTEGER DEFAULT 0 NOT NULL /* of them with a value */, 
-	changes INTEGER DEFAULT 0 NOT NULL /* of the values, those unlike the one before in the bucket */, 
-	first FLOAT /* of numbers and flags (0, 1); null for text, as all that follows */, 
-	first_sim_time_s FLOAT, 
-	last FLOAT, 
-	last_sim_time_s FLOAT, 
-	min FLOAT, 
-	min_sim_time_s FLOAT /* of the first such extreme */, 
-	max FLOAT, 
-	max_sim_time_s FLOAT /* of the first such extreme */, 
-	sum FLOAT, 
-	squares FLOAT /* sum of squared deviations from sum / count */, 
-	sines FLOAT /* angles only: sum of sines */, 
-	cosines FLOAT /* angles only: sum of cosines */, largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */ NULL, first_until_sim_time_s FLOAT /* up to then it had its first number; null in older versions */ NULL, last_since_sim_time_s FLOAT /* from then on it had its last number; null in older versions */ NULL, 
-	PRIMARY KEY (run_id, bucket, signal_id), 
-	CONSTRAINT fk_recent_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
-)
- WITHOUT ROWID;
 CREATE VIEW robot_period AS
 /* How long a text or flag of the state kept a value. Signals that never changed have none. */
 SELECT (
@@ -293,108 +460,6 @@ SELECT (
   l.run_id, l.id AS log_id, l.sim_time_s,
   strftime('%Y-%m-%d %H:%M:%f', l.wall_time_s, 'unixepoch') AS utc, l.level, l.source, l.logger, l.message
 FROM log l;
-CREATE TABLE coarse_rollup (
-	run_id INTEGER NOT NULL, 
-	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
-	bucket INTEGER NOT NULL /* floor(sim_time_s / 500) */, 
-	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held the signal */, 
-	present INTEGER DEFAULT 0 NOT NULL /* of them with a value */, 
-	changes INTEGER DEFAULT 0 NOT NULL /* of the values, those unlike the one before in the bucket */, 
-	first FLOAT /* of numbers and flags (0, 1); null for text, as all that follows */, 
-	first_sim_time_s FLOAT, 
-	last FLOAT, 
-	last_sim_time_s FLOAT, 
-	min FLOAT, 
-	min_sim_time_s FLOAT /* of the first such extreme */, 
-	max FLOAT, 
-	max_sim_time_s FLOAT /* of the first such extreme */, 
-	sum FLOAT, 
-	squares FLOAT /* sum of squared deviations from sum / count */, 
-	sines FLOAT /* angles only: sum of sines */, 
-	cosines FLOAT /* angles only: sum of cosines */, largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */ NULL, first_until_sim_time_s FLOAT /* up to then it had its first number; null in older versions */ NULL, last_since_sim_time_s FLOAT /* from then on it had its last number; null in older versions */ NULL, swings TEXT /* JSON: the swings of what a robot swings with, each as [begin, end, half swings, period in s, amplitude, explained share]; null where they were not looked for */ NULL, standstills TEXT /* JSON, at the signal of x: where the robot stood still, and what shows whether it should have moved; null where that was not looked for */ NULL, 
-	PRIMARY KEY (run_id, signal_id, bucket), 
-	CONSTRAINT fk_coarse_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
-)
- WITHOUT ROWID;
-CREATE TABLE breakpoint (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	robot_id INTEGER NOT NULL, 
-	session_id INTEGER, 
-	condition TEXT NOT NULL /* see docs/conditions.md */, 
-	action TEXT NOT NULL /* pause, log or keep */, 
-	after_hits INTEGER DEFAULT 1 NOT NULL /* the action is taken from this hit of a run on */, 
-	enabled INTEGER DEFAULT 1 NOT NULL /* 0 once the condition failed */, 
-	hits INTEGER DEFAULT 0 NOT NULL /* how often it began to hold, in all runs */, 
-	created_wall_time_s FLOAT NOT NULL, 
-	created_by TEXT /* mcp, cli or controller: its code, for session_id only */, 
-	error TEXT /* why the condition failed */, 
-	CONSTRAINT fk_breakpoint_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
-	CONSTRAINT fk_breakpoint_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE SET NULL
-);
-CREATE INDEX ix_breakpoint_robot_id ON breakpoint (robot_id);
-CREATE INDEX ix_breakpoint_session_id ON breakpoint (session_id);
-CREATE TABLE parameter (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	robot_id INTEGER NOT NULL, 
-	session_id INTEGER NOT NULL /* session.id of the controller that did */, 
-	name TEXT NOT NULL, 
-	kind TEXT NOT NULL /* float, int, bool or str */, 
-	default_value TEXT NOT NULL /* JSON value */, 
-	low FLOAT /* least value */, 
-	high FLOAT /* greatest value */, 
-	choices TEXT /* JSON array: the only values that it may have */, 
-	doc TEXT NOT NULL, 
-	unit TEXT, 
-	next_value TEXT /* JSON value that it takes with the next reset of the world */, 
-	declared_wall_time_s FLOAT NOT NULL, 
-	CONSTRAINT fk_parameter_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
-	CONSTRAINT uq_parameter_robot_id UNIQUE (robot_id, name)
-);
-CREATE TABLE parameter_value (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	run_id INTEGER NOT NULL, 
-	name TEXT NOT NULL, 
-	sim_time_s FLOAT NOT NULL, 
-	wall_time_s FLOAT NOT NULL, 
-	value TEXT NOT NULL /* JSON value */, 
-	is_default INTEGER NOT NULL /* 1 where the code declared it */, 
-	set_by TEXT NOT NULL /* code, environment, command or trial */, 
-	command_id INTEGER /* command.id that set it, which may have been deleted since */, 
-	CONSTRAINT fk_parameter_value_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
-);
-CREATE INDEX ix_parameter_value_run_id_name_id ON parameter_value (run_id, name, id);
-CREATE TABLE trial_set (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
-	"plan" TEXT NOT NULL /* JSON object */, 
-	created_wall_time_s FLOAT NOT NULL, 
-	host TEXT /* of the process at work */, 
-	pid INTEGER, 
-	process TEXT /* which process of that pid; null where the system does not tell */
-, robot_id INTEGER /* in whose simulation the trials run; null: each in one of its own */ CONSTRAINT fk_trial_set_robot_id REFERENCES robot (id) ON DELETE SET NULL, session_id INTEGER /* of the controller that was tried */ CONSTRAINT fk_trial_set_session_id REFERENCES session (id) ON DELETE SET NULL, former_values TEXT /* JSON object: its parameters before, until they are set back */ NULL, stop_reason TEXT /* why it does not go on although trials wait */ NULL);
-CREATE UNIQUE INDEX ix_trial_set_uuid ON trial_set (uuid);
-CREATE TABLE trial (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	trial_set_id INTEGER NOT NULL, 
-	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
-	number INTEGER NOT NULL /* its place in the set, from 1 */, 
-	parameters TEXT NOT NULL /* JSON object */, 
-	status TEXT NOT NULL /* waiting, running, then done, failed or pruned */, 
-	run_id INTEGER, 
-	score FLOAT /* if it is done */, 
-	ended_by TEXT /* for_s, until or prune */, 
-	ended_sim_time_s FLOAT /* the end */, 
-	error TEXT /* why it failed */, 
-	started_wall_time_s FLOAT, 
-	finished_wall_time_s FLOAT, 
-	pid INTEGER /* of its simulator, while it runs */, 
-	process TEXT /* which process of that pid; null where the system does not tell */, 
-	CONSTRAINT fk_trial_trial_set_id FOREIGN KEY(trial_set_id) REFERENCES trial_set (id) ON DELETE CASCADE, 
-	CONSTRAINT fk_trial_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE SET NULL, 
-	CONSTRAINT uq_trial_trial_set_id UNIQUE (trial_set_id, number)
-);
-CREATE INDEX ix_trial_run_id ON trial (run_id);
-CREATE UNIQUE INDEX ix_trial_uuid ON trial (uuid);
 CREATE VIEW robot_parameter AS
 /* The values that parameters had in each run, each from a time on; true and false as text. */
 SELECT r.name AS robot, v.run_id, v.name,
@@ -404,32 +469,6 @@ SELECT r.name AS robot, v.run_id, v.name,
 FROM (SELECT *, CASE WHEN json_valid(value) THEN value END AS j FROM parameter_value) v
 JOIN run u ON u.id = v.run_id JOIN robot r ON r.id = u.robot_id
 LEFT JOIN parameter p ON p.robot_id = u.robot_id AND p.name = v.name;
-CREATE INDEX ix_trial_set_robot_id ON trial_set (robot_id);
-CREATE INDEX ix_trial_set_session_id ON trial_set (session_id);
-CREATE TABLE kept_stretch (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	run_id INTEGER NOT NULL, 
-	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
-	start_sim_time_s FLOAT NOT NULL, 
-	end_sim_time_s FLOAT NOT NULL /* ahead of the newest row while it goes on */, 
-	wall_time_s FLOAT NOT NULL /* when it was asked for */, 
-	reason TEXT NOT NULL /* why it is kept */, 
-	CONSTRAINT fk_kept_stretch_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
-);
-CREATE INDEX ix_kept_stretch_run_id_start_sim_time_s ON kept_stretch (run_id, start_sim_time_s);
-CREATE UNIQUE INDEX ix_kept_stretch_uuid ON kept_stretch (uuid);
-CREATE TABLE kept_state (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	run_id INTEGER NOT NULL, 
-	call INTEGER /* its number in the session; null where retention moved it here from state */, 
-	sim_time_s FLOAT NOT NULL, 
-	wall_time_s FLOAT NOT NULL, 
-	data TEXT NOT NULL /* JSON object */, 
-	odd TEXT /* as in state */, 
-	CONSTRAINT fk_kept_state_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE, 
-	CONSTRAINT uq_kept_state_run_id UNIQUE (run_id, call)
-);
-CREATE INDEX ix_kept_state_run_id_sim_time_s ON kept_state (run_id, sim_time_s);
 CREATE VIEW every_state AS
 /* All states of a run, those that only kept stretches have included: they have no state_id. */
 SELECT id AS state_id, run_id, sim_time_s, wall_time_s, data, odd FROM state
@@ -447,15 +486,6 @@ CREATE VIEW all_rollup AS
 /* Rollups, those of buckets that are over and the newest. */
 SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step, first_until_sim_time_s, last_since_sim_time_s FROM rollup
 UNION ALL SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step, first_until_sim_time_s, last_since_sim_time_s FROM recent_rollup;
-CREATE TABLE console_line (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	instance TEXT NOT NULL /* session.instance of who said it */, 
-	wall_time_s FLOAT NOT NULL, 
-	level TEXT NOT NULL, 
-	source TEXT NOT NULL /* webots, or console: a controller, not told which; as in log later on */, 
-	message TEXT NOT NULL, 
-	logger TEXT /* stdout or stderr */
-);
 CREATE VIEW robot_now AS
 /* The newest state of each robot and how old it is. Lengths and angles as published. */
 SELECT robot, run_id, end_reason, sim_time_s, round((julianday('now') - 2440587.5) * 86400.0 - wall_time_s, 1) AS age_s,
@@ -631,4 +661,4 @@ SELECT (
         CASE WHEN name = '$' || words THEN rank ELSE 56 END, length(name), name
       LIMIT 1)) AS mode, s.odd
 FROM (SELECT *, CASE WHEN json_valid(data) THEN data END AS j FROM state) s;
-INSERT INTO alembic_version (version_num) VALUES ('0009');
+INSERT INTO alembic_version (version_num) VALUES ('0010');

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import sqlite3
 from collections.abc import Iterator
-from contextlib import closing
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,12 +12,9 @@ import pytest
 
 from tests.memory import memory_connection
 from tests.recordings.rover import Recorder, start_run
-from webots_mcp.connection import connect
-from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.naming import USUAL_POSITIONS, flatten
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import find_motion, in_metres
-from webots_mcp.store.migrate import downgrade, upgrade
 from webots_mcp.store.reading.subject import Subject
 from webots_mcp.store.signals.catalogue import catalogue
 
@@ -260,25 +255,3 @@ def test_the_shell_shows_what_each_view_is_for(reader: sqlite3.Connection) -> No
     views = dict(rows(reader, "SELECT name, sql FROM sqlite_master WHERE type = 'view'"))
     assert set(views) == VIEWS
     assert all("\n/* " in sql for sql in views.values())
-
-
-def test_the_views_come_and_go_with_their_revision_and_the_data_stays(tmp_path: Path) -> None:
-    file = tmp_path / "webots.db"
-    upgrade(file, "0002")
-    with closing(connect(file, "writer")) as connection:
-        recorder = start_run(connection)
-        recorder.publish(0.0, {"pose": [1, 2, 3]})
-
-        assert upgrade(file, "0003") == (2, 3)
-        assert rows(connection, "SELECT x_m FROM robot_now") == [(1,)]
-        assert rows(connection, "SELECT keep, purged_rows FROM run") == [(0, 0)]
-
-        assert upgrade(file) == (3, SCHEMA_VERSION)
-        assert rows(connection, "SELECT x_m FROM robot_now") == [(1,)]
-        assert downgrade(file, "0003") == (SCHEMA_VERSION, 3)
-        assert rows(connection, "SELECT x_m FROM robot_now") == [(1,)]
-
-        assert downgrade(file, "0002") == (3, 2)
-        assert rows(connection, "SELECT name FROM sqlite_master WHERE type = 'view'") == []
-        assert rows(connection, "SELECT count(*) FROM state") == [(1,)]
-        assert rows(connection, "SELECT count(*) FROM pragma_table_info('run')") == [(15,)]

@@ -10,7 +10,7 @@ from webots_mcp.connection import connect, is_there, journal_mode
 from webots_mcp.contract import HEARTBEAT_LATE_S, SCHEMA_VERSION
 from webots_mcp.diagnosis.doctor import Examined, Finding, ago, check, last_seen_s, worst
 from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
-from webots_mcp.schema import schema_version
+from webots_mcp.schema import require_current, schema_version
 from webots_mcp.store.recording import GETTING_STARTED, View, name_of
 from webots_mcp.store.sessions import Session, fetch_session
 from webots_mcp.store.status import handler_at_work, rows_waiting
@@ -58,12 +58,11 @@ def schema(subject: Examined) -> Finding:
         return Finding("ok", f"{SCHEMA_VERSION}")
     with closing(connect(subject.file, "reader")) as connection:
         version = schema_version(connection)
-    seen = f"{version}, this webots-mcp needs {SCHEMA_VERSION}"
-    if version < SCHEMA_VERSION:
-        fix = "run 'webots-mcp migrate'; a server that may write, or a controller, does it as well"
-        return Finding("wrong", seen, fix)
-    if version > SCHEMA_VERSION:
-        return Finding("wrong", seen, "upgrade webots-mcp: a newer one has written this file")
+        try:
+            require_current(connection)
+        except (SchemaTooOldError, SchemaTooNewError) as error:
+            seen = f"{version}, this webots-mcp needs {SCHEMA_VERSION}"
+            return Finding("wrong", seen, str(error))
     return Finding("ok", f"{version}")
 
 

@@ -108,7 +108,12 @@ ENDING: Final = ("load_world", "quit")  # actions that are done when the control
 Pace = Literal["fast", "real_time"]  # of a `run` command
 Then = Literal["pause", "go_on", "as_before"]  # what it does at its end
 RunEnd = Literal[
-    "condition held", "time over", "pruned", "run ended", "interrupted", "condition failed"
+    "condition held",
+    "simulation time reached",
+    "pruned",
+    "run ended",
+    "interrupted",
+    "condition failed",
 ]
 SEE_STEPS: Final = (
     "call bridge.publish({...}) and bridge.get_command() in every round of the loop, or "

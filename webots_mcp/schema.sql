@@ -45,8 +45,8 @@ CREATE TABLE session (
 	process TEXT /* which process of that pid; null where the system does not tell */, 
 	last_seen_monotonic_s FLOAT /* the host's monotonic clock at last_seen_wall_time_s */, 
 	extern INTEGER /* 1 where nobody starts the controller again */, 
-	hold_mode TEXT /* simulation mode to go back to when the hold ends */, 
-	adopted_rows INTEGER DEFAULT 0 NOT NULL /* number of the last entry taken in from its file beside */, 
+	mode_before_pause TEXT /* simulation mode to go back to when the hold ends */, 
+	last_adopted_entry INTEGER DEFAULT 0 NOT NULL /* number of the last entry taken in from its file beside */, 
 	throttle_interval INTEGER /* of so many publish() calls one is recorded */, 
 	CONSTRAINT fk_session_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE
 );
@@ -100,8 +100,8 @@ CREATE TABLE signal (
 	first_seen_wall_time_s FLOAT NOT NULL, 
 	last_seen_wall_time_s FLOAT NOT NULL, 
 	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held it, up to the watermark */, 
-	null_rows INTEGER DEFAULT 0 NOT NULL /* of them without a value */, 
-	odd_rows INTEGER DEFAULT 0 NOT NULL /* of them with a value that JSON cannot hold (nan, inf, ...) */, 
+	null_row_count INTEGER DEFAULT 0 NOT NULL /* of them without a value */, 
+	replaced_row_count INTEGER DEFAULT 0 NOT NULL /* of them with a value that JSON cannot hold (nan, inf, ...) */, 
 	min FLOAT, 
 	max FLOAT, 
 	CONSTRAINT uq_signal_robot_id UNIQUE (robot_id, name), 
@@ -469,7 +469,7 @@ SELECT r.name AS robot, v.run_id, v.name,
 FROM (SELECT *, CASE WHEN json_valid(value) THEN value END AS j FROM parameter_value) v
 JOIN run u ON u.id = v.run_id JOIN robot r ON r.id = u.robot_id
 LEFT JOIN parameter p ON p.robot_id = u.robot_id AND p.name = v.name;
-CREATE VIEW every_state AS
+CREATE VIEW all_state AS
 /* All states of a run, those that only kept stretches have included: they have no state_id. */
 SELECT id AS state_id, run_id, sim_time_s, wall_time_s, data, odd FROM state
 UNION ALL
@@ -478,7 +478,7 @@ CREATE VIEW robot_kept AS
 /* Stretches that are kept at full rate: from when to when, why, how many states each has. */
 SELECT r.name AS robot, k.run_id, k.id AS stretch_id, k.start_sim_time_s AS start_s,
   min(k.end_sim_time_s, max(u.last_sim_time_s, k.start_sim_time_s)) AS end_s,
-  (SELECT count(*) FROM every_state s WHERE s.run_id = k.run_id
+  (SELECT count(*) FROM all_state s WHERE s.run_id = k.run_id
     AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s) AS states,
   strftime('%Y-%m-%d %H:%M:%f', k.wall_time_s, 'unixepoch') AS utc, k.reason
 FROM kept_stretch k JOIN run u ON u.id = k.run_id JOIN robot r ON r.id = u.robot_id;

@@ -55,7 +55,7 @@ def test_where_nothing_was_recorded_the_lines_that_record_are_shown(look: Look) 
     database = look("Database")
     assert (database.verdict, "nothing was recorded" in database.seen) == ("warning", True)
     assert "MCPBridge.attach(robot)" in (database.fix or "")
-    assert look("Rows").verdict == look("Schema").verdict == "not looked at"
+    assert look("Rows").verdict == look("Schema").verdict == "not checked"
 
 
 def test_an_older_schema_names_the_command_that_takes_it_over(look: Look, file: Path) -> None:

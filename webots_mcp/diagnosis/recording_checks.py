@@ -53,7 +53,7 @@ def database(subject: Examined) -> Finding:
 def schema(subject: Examined) -> Finding:
     """Whether the database has the tables of this version."""
     if subject.unread is not None and not _is_about_schema(subject):
-        return Finding("not looked at", "there is no recording that can be read")
+        return Finding("not checked", "there is no recording that can be read")
     if subject.file is None or not is_there(subject.file):
         return Finding("ok", f"{SCHEMA_VERSION}")
     with closing(connect(subject.file, "reader")) as connection:

@@ -125,8 +125,8 @@ class Session(SQLModel, table=True):
         "the host's monotonic clock at last_seen_wall_time_s"
     )
     extern: bool | None = _column(Integer, "1 where nobody starts the controller again")
-    hold_mode: str | None = _text("simulation mode to go back to when the hold ends")
-    adopted_rows: int = _count("number of the last entry taken in from its file beside")
+    mode_before_pause: str | None = _text("simulation mode to go back to when the hold ends")
+    last_adopted_entry: int = _count("number of the last entry taken in from its file beside")
     throttle_interval: int | None = _column(Integer, "of so many publish() calls one is recorded")
 
 
@@ -189,8 +189,8 @@ class Signal(SQLModel, table=True):
     first_seen_wall_time_s: float = _number(nullable=False)
     last_seen_wall_time_s: float = _number(nullable=False)
     rows: int = _count("state rows that held it, up to the watermark")
-    null_rows: int = _count("of them without a value")
-    odd_rows: int = _count("of them with a value that JSON cannot hold (nan, inf, ...)")
+    null_row_count: int = _count("of them without a value")
+    replaced_row_count: int = _count("of them with a value that JSON cannot hold (nan, inf, ...)")
     min: float | None = _number()
     max: float | None = _number()
 

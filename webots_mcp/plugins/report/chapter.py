@@ -440,7 +440,7 @@ def _travelled(connection: sqlite3.Connection, run_id: int) -> tuple[list[str], 
     distance, speed = known.get("distance_m"), known.get("mean_speed_m_s")
     why_not = [
         f"not known: {figures}: {why}"
-        for figures, why in found.not_known.items()
+        for figures, why in found.unknown.items()
         if "distance_m" in figures
     ]
     if distance is None or speed is None:

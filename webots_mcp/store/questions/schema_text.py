@@ -24,9 +24,9 @@ _BOOKKEEPING: Final = (
 _BOOKKEEPING_COLUMNS: Final = (
     "uuid",
     "process",
-    "adopted_rows",
+    "last_adopted_entry",
     "last_seen_monotonic_s",
-    "hold_mode",
+    "mode_before_pause",
     "rolled_state_id",
     "coarse_end",
     "first_until_sim_time_s",

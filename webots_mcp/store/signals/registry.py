@@ -212,8 +212,8 @@ class Count(NamedTuple):
     kind: Kind
     unit: str | None
     rows: int
-    null_rows: int
-    odd_rows: int
+    null_row_count: int
+    replaced_row_count: int
     seen_wall_time_s: float
     min: float | None
     max: float | None
@@ -229,7 +229,7 @@ def count(signal: Signal, column: BatchColumn) -> Count:
         signal.unit,
         len(values),
         values.count(None),
-        column.odd_rows,
+        column.replaced_row_count,
         column.last_wall_time_s,
         min(numbers, default=None),
         max(numbers, default=None),

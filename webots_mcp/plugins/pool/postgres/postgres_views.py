@@ -205,7 +205,7 @@ _POSITION: Final = "CROSS JOIN LATERAL (SELECT position_of(s.data) AS xy OFFSET 
 
 # In the order in which they are made: what a view asks comes before it.
 _QUERIES: Final = {
-    "every_state": f"""SELECT {_KEY}, id AS state_id, run_id, sim_time_s, wall_time_s, data, odd
+    "all_state": f"""SELECT {_KEY}, id AS state_id, run_id, sim_time_s, wall_time_s, data, odd
 FROM state
 UNION ALL
 SELECT {_KEY}, NULL, run_id, sim_time_s, wall_time_s, data, odd FROM kept_state""",
@@ -283,7 +283,7 @@ LEFT JOIN LATERAL (SELECT unit FROM parameter WHERE {_KEY} = u.{_KEY} AND robot_
     "robot_kept": f"""SELECT k.{_KEY}, r.name AS robot, k.run_id, k.id AS stretch_id,
   k.start_sim_time_s AS start_s,
   least(k.end_sim_time_s, greatest(u.last_sim_time_s, k.start_sim_time_s)) AS end_s,
-  (SELECT count(*) FROM every_state s WHERE s.{_KEY} = k.{_KEY} AND s.run_id = k.run_id
+  (SELECT count(*) FROM all_state s WHERE s.{_KEY} = k.{_KEY} AND s.run_id = k.run_id
     AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s) AS states,
   utc_text(k.wall_time_s) AS utc, k.reason
 FROM kept_stretch k JOIN run u ON u.{_KEY} = k.{_KEY} AND u.id = k.run_id

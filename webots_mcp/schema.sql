@@ -70,6 +70,7 @@ CREATE TABLE run (
 	note TEXT, 
 	keep INTEGER DEFAULT 0 NOT NULL /* 1: retention deletes nothing of this run */, 
 	purged_rows INTEGER DEFAULT 0 NOT NULL /* of the rows, those that retention has deleted */, 
+	is_chunked INTEGER DEFAULT 0 NOT NULL /* 1 once it has ended and none of its rows wait for a chunk */, 
 	uuid TEXT /* random (version 4); names the row among those of all machines */, 
 	rolled_state_id INTEGER DEFAULT 0 NOT NULL /* last state.id in the rollups, where beyond the watermark */, 
 	coarse_end INTEGER /* buckets of coarse_rollup below it are complete; null before the first */, 
@@ -187,6 +188,42 @@ CREATE TABLE coarse_rollup (
 	CONSTRAINT fk_coarse_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 )
  WITHOUT ROWID;
+CREATE TABLE row_group (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	run_id INTEGER NOT NULL, 
+	start_sim_time_s FLOAT NOT NULL /* of the first row */, 
+	end_sim_time_s FLOAT NOT NULL /* of the last row */, 
+	last_state_id INTEGER NOT NULL /* state.id of the last row */, 
+	max_state_id INTEGER NOT NULL /* the greatest state.id among them */, 
+	row_count INTEGER NOT NULL, 
+	is_complete INTEGER NOT NULL /* 1 once all of its chunks are there */, 
+	CONSTRAINT fk_row_group_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+);
+CREATE INDEX ix_row_group_run_id_start_sim_time_s ON row_group (run_id, start_sim_time_s);
+CREATE TABLE chunk (
+	id INTEGER NOT NULL, 
+	group_id INTEGER NOT NULL, 
+	run_id INTEGER NOT NULL, 
+	signal_id INTEGER NOT NULL /* signal.id; 0: simulation times, -1: wall times, -2: ids of the state rows */, 
+	row_count INTEGER NOT NULL /* rows whose state has the signal */, 
+	value_count INTEGER NOT NULL /* of them with a value */, 
+	change_count INTEGER NOT NULL /* values unlike the one before */, 
+	first FLOAT /* of numbers and flags (0, 1), as all that follows */, 
+	last FLOAT, 
+	min FLOAT, 
+	max FLOAT, 
+	sum FLOAT, 
+	squared_deviations FLOAT /* sum of squared deviations from the mean */, 
+	largest_step FLOAT /* largest difference of values that follow each other */, 
+	codec TEXT NOT NULL /* how numbers are compressed */, 
+	numbers BLOB /* CRC-32, then the numbers compressed */, 
+	codes BLOB /* zlib: for each row 0 a number, 1 no such key, else 2 + the place of its label */, 
+	labels TEXT /* JSON array; an item that is an array says what was replaced */, 
+	PRIMARY KEY (id), 
+	CONSTRAINT fk_chunk_group_id FOREIGN KEY(group_id) REFERENCES row_group (id) ON DELETE CASCADE
+);
+CREATE INDEX ix_chunk_group_id ON chunk (group_id);
+CREATE INDEX ix_chunk_statistics ON chunk (run_id, signal_id, group_id, row_count, value_count, change_count, first, last, min, max, sum, squared_deviations, largest_step);
 CREATE TABLE change (
 	run_id INTEGER NOT NULL, 
 	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
@@ -661,4 +698,11 @@ SELECT (
         CASE WHEN name = '$' || words THEN rank ELSE 56 END, length(name), name
       LIMIT 1)) AS mode, s.odd
 FROM (SELECT *, CASE WHEN json_valid(data) THEN data END AS j FROM state) s;
+CREATE VIEW robot_statistics AS
+/* What the numbers of a signal come to in each group of about 1,024 rows, also of purged rows. */
+SELECT r.name AS robot, g.run_id, s.name AS signal, g.start_sim_time_s AS start_s,
+  g.end_sim_time_s AS end_s, c.row_count, c.value_count, c.min, c.max,
+  c.sum / nullif(c.value_count, 0) AS mean, c.first, c.last, c.largest_step, c.change_count
+FROM chunk c JOIN row_group g ON g.id = c.group_id AND g.is_complete
+JOIN signal s ON s.id = c.signal_id JOIN robot r ON r.id = s.robot_id;
 INSERT INTO alembic_version (version_num) VALUES ('0010');

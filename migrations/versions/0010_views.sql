@@ -259,3 +259,10 @@ SELECT (
         CASE WHEN name = '$' || words THEN rank ELSE 56 END, length(name), name
       LIMIT 1)) AS mode, s.odd
 FROM (SELECT *, CASE WHEN json_valid(data) THEN data END AS j FROM state) s;
+CREATE VIEW robot_statistics AS
+/* What the numbers of a signal come to in each group of about 1,024 rows, also of purged rows. */
+SELECT r.name AS robot, g.run_id, s.name AS signal, g.start_sim_time_s AS start_s,
+  g.end_sim_time_s AS end_s, c.row_count, c.value_count, c.min, c.max,
+  c.sum / nullif(c.value_count, 0) AS mean, c.first, c.last, c.largest_step, c.change_count
+FROM chunk c JOIN row_group g ON g.id = c.group_id AND g.is_complete
+JOIN signal s ON s.id = c.signal_id JOIN robot r ON r.id = s.robot_id

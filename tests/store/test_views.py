@@ -34,7 +34,7 @@ POSES: list[tuple[dict[str, Any], tuple[Any, ...]]] = [
 ]
 VIEWS = {
     "robot_now", "robot_trajectory", "robot_run", "robot_command", "robot_event", "robot_log",
-    "robot_period", "all_rollup", "robot_parameter", "all_state", "robot_kept",
+    "robot_period", "robot_statistics", "all_rollup", "robot_parameter", "all_state", "robot_kept",
 }  # fmt: skip
 
 

@@ -66,6 +66,7 @@ def test_chunks_and_rows_say_the_same(
         made = make_chunks(connection, 1000)
         after = framed(connection)
         assert made.rows == len(states) // 8 * 8
+        assert after.places([start / 10]) == np.searchsorted(before.times, [start / 10])
         pairs = [
             (before, after),
             (before.rows(start, stop), after.rows(start, stop)),

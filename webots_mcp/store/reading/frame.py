@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import math
 import sqlite3
-from bisect import bisect_left
 from collections import Counter, OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, NamedTuple
@@ -44,6 +43,7 @@ from webots_mcp.store.reading.ranges import Segment
 
 MOST_KEPT_BYTES: Final = 64_000_000  # of values that a frame keeps for who asks again
 _ROWS_AT_ONCE: Final = 1024  # between two looks at the deadline
+_FEW: Final = 4  # times that few chunks are opened one by one; else all of them at once
 _OTHER: Final = 0  # code of null and of a key that is not there
 _FIRST_LABEL: Final = 2  # of the codes of a chunk
 
@@ -143,6 +143,14 @@ class _Part(NamedTuple):
     group: Group | None
     columns: StateColumns | None
 
+    @property
+    def bounds_s(self) -> tuple[float, float]:
+        """Simulation time of its first and last row."""
+        if self.group is not None:
+            return self.group.start_s, self.group.end_s
+        assert self.columns is not None
+        return self.columns.times[0], self.columns.times[-1]
+
 
 class _Source:
     """Where the values come from, before a range and an order are laid over them."""
@@ -168,6 +176,21 @@ class _Source:
         self._kept: OrderedDict[object, Any] = OrderedDict()
         self._kept_bytes = 0
 
+    @cached_property
+    def bounds_s(self) -> tuple[Array, Array]:
+        """Simulation times of the first rows of all parts, and of the last ones."""
+        bounds = [part.bounds_s for part in self.parts]
+        return np.array([each[0] for each in bounds]), np.array([each[1] for each in bounds])
+
+    @cached_property
+    def is_in_order(self) -> bool:
+        """Whether simulation time never falls from row to row."""
+        starts_s, ends_s = self.bounds_s
+        columns = [part.columns.times for part in self.parts if part.columns is not None]
+        return bool((starts_s[1:] >= ends_s[:-1]).all()) and all(
+            (np.diff(times) >= 0).all() for times in columns
+        )
+
     def decoded(self, name: str, start: int, stop: int) -> list[tuple[_Part, Decoded | None]]:
         """The values of a signal in the parts that touch rows [start, stop); None: it has none."""
         wanted = [p for p in self.parts if p.start < stop and p.start + p.rows > start]
@@ -182,17 +205,22 @@ class _Source:
                 found.append((part, None if values is None else decoded_of(values)))
         return found
 
-    def places(self, signal_id: int, attribute: str) -> Array:
-        """Times or ids of all rows."""
-        stored = self._stored(signal_id, attribute, self.parts)
-        whole = np.full(self.rows, np.nan)
-        for part in self.parts:
-            inside = slice(part.start, part.start + part.rows)
+    def of_rows(self, signal_id: int, attribute: str, start: int, stop: int) -> Array:
+        """Times or ids of rows [start, stop)."""
+        wanted = [p for p in self.parts if p.start < stop and p.start + p.rows > start]
+        first = wanted[0].start if wanted else start
+        stored = self._stored(signal_id, attribute, wanted)
+        whole = np.full(max(stop, start) - first, np.nan)
+        for part in wanted:
+            inside = slice(part.start - first, part.start - first + part.rows)
             if part.columns is not None:
-                whole[inside] = getattr(part.columns, attribute)
-            elif part.group is not None and (values := stored.get(part.group.id)) is not None:
-                whole[inside] = values.numbers
-        return whole
+                values: Any = getattr(part.columns, attribute)
+            elif part.group is not None and part.group.id in stored:
+                values = stored[part.group.id].numbers
+            else:
+                continue
+            whole[inside] = values[: len(whole) - inside.start]
+        return whole[start - first :]
 
     def _stored(
         self, signal_id: int | None, name: str, parts: Sequence[_Part]
@@ -228,9 +256,10 @@ class _Source:
         self.unread[Unread(group.start_s, group.end_s, f"the chunk of {name} is {error}")] = None
         return None
 
-    def zones(self, name: str) -> list[tuple[_Part, Statistics | None]]:
+    def zones(
+        self, signal_id: int | None, values_of: Callable[[StateColumns], Sequence[Any] | None]
+    ) -> list[tuple[_Part, Statistics | None]]:
         """What a signal comes to in each part."""
-        signal_id = self.ids.get(name)
         stored: dict[int, Statistics] = {}
         if signal_id is not None and self.connection is not None and self._groups:
             stored = statistics_in(self.connection, self.run_id, signal_id, self._groups)
@@ -240,7 +269,7 @@ class _Source:
                 found.append((part, stored.get(part.group.id)))
             else:
                 assert part.columns is not None
-                values = part.columns.values.get(name)
+                values = values_of(part.columns)
                 found.append((part, statistics_of(decoded_of(values)) if values else None))
         return found
 
@@ -373,43 +402,93 @@ class Frame:
     def zones(self, name: str) -> Zones:
         """What the chunks of a signal come to; those that the frame cuts come to what is in it."""
         if self._source.order is not None:
-            return _zones(self._cut_zones(name))
-        stored = self._source.zones(name)
-        found: list[tuple[int, int, Statistics | None]] = []
+            return _zones(self._cut_zones(self._in_order(name)))
+        stored = self._source.zones(
+            self._source.ids.get(name), lambda columns: columns.values.get(name)
+        )
+        return self._zones_within(
+            stored, lambda start, stop: _slice_of(self._source, name, start, stop)
+        )
+
+    def time_zones(self) -> Zones:
+        """The same of the simulation times: the largest step shows whether rows are missing."""
+        if self._source.order is not None:
+            return _zones(self._cut_zones(Decoded(self.times, None, ())))
+        stored = self._source.zones(SIM_TIMES, lambda columns: columns.times)
+        return self._zones_within(stored, lambda start, stop: Decoded(
+            self._source.of_rows(SIM_TIMES, "times", start, stop), None, ()
+        ))  # fmt: skip
+
+    def _zones_within(
+        self,
+        stored: Sequence[tuple[_Part, Statistics | None]],
+        values_in: Callable[[int, int], Decoded],
+    ) -> Zones:
+        found: list[_Zone] = []
         for part, statistics in stored:
             start, stop = max(part.start, self._start), min(part.start + part.rows, self._stop)
             if start >= stop:
                 continue
+            bounds_s = part.bounds_s
             if stop - start < part.rows:
-                statistics = statistics_of(_slice_of(self._source, name, start, stop))
-            found.append((start - self._start, stop - start, statistics))
-        return _zones([(first, rows, each, self.times) for first, rows, each in found])
+                statistics = statistics_of(values_in(start, stop))
+                times = self._source.of_rows(SIM_TIMES, "times", start, stop)
+                bounds_s = float(times[0]), float(times[-1])
+            found.append(_Zone(start - self._start, stop - start, statistics, *bounds_s))
+        return _zones(found)
+
+    @property
+    def bounds_s(self) -> tuple[float, float]:
+        """Simulation time of its first and last row; only of a frame that has rows."""
+        first, last = self.rows(0, 1), self.rows(len(self) - 1, len(self))
+        return float(first.times[0]), float(last.times[0])
+
+    def places(self, times_s: Array | Sequence[float]) -> Indexes:
+        """The places of the first rows at or after some times; few chunks of times are opened."""
+        wanted: Array = np.asarray(times_s, np.float64)
+        source = self._source
+        starts_s, ends_s = source.bounds_s
+        if source.order is None and "times" not in self.__dict__ and len(starts_s):
+            parts = np.searchsorted(ends_s, wanted)
+            inside = (parts < len(starts_s)) & (
+                starts_s[np.minimum(parts, len(ends_s) - 1)] < wanted
+            )
+            opened: list[int] = np.unique(parts[inside]).tolist()
+            if len(opened) * _FEW < len(starts_s):
+                first_rows = np.array(
+                    [part.start for part in source.parts] + [source.rows], np.intp
+                )
+                found = first_rows[parts]
+                for at in opened:
+                    part = source.parts[at]
+                    times = source.of_rows(SIM_TIMES, "times", part.start, part.start + part.rows)
+                    here = inside & (parts == at)
+                    found[here] += np.searchsorted(times, wanted[here])
+                return np.maximum(0, np.minimum(found - self._start, len(self)))
+        return np.searchsorted(self.times, wanted)
 
     def rows(self, start: int, stop: int) -> Frame:
         """Some of its rows by their places; only the chunks that they touch are opened."""
         start, stop = max(0, start), min(len(self), stop)
         part = Frame(self._source, self._start + start, self._start + max(start, stop))
-        part.__dict__["times"] = self.times[start : max(start, stop)]
+        if "times" in self.__dict__:
+            part.__dict__["times"] = self.times[start : max(start, stop)]
         return part
 
     def between(self, start_s: float, end_s: float) -> Frame:
         """Its rows in [start_s, end_s) of simulation time."""
-        start, stop = np.searchsorted(self.times, [start_s, end_s]).tolist()
+        start, stop = self.places([start_s, end_s]).tolist()
         return self.rows(start, stop)
 
-    def _cut_zones(self, name: str) -> list[tuple[int, int, Statistics | None, Array]]:
+    def _cut_zones(self, values: Decoded) -> list[_Zone]:
         """Of rows that lie among each other in several chunks, in parts of their own."""
-        coded = self._in_order(name)
-        return [
-            (
-                first,
-                len(part.numbers),
-                statistics_of(part),
-                self.times,
-            )
-            for first in range(0, len(self), GROUP_ROWS)
-            for part in [_cut(coded, first, min(first + GROUP_ROWS, len(self)))]
-        ]
+        found: list[_Zone] = []
+        for first in range(0, len(self), GROUP_ROWS):
+            stop = min(first + GROUP_ROWS, len(self))
+            bounds_s = float(self.times[first]), float(self.times[stop - 1])
+            statistics = statistics_of(_cut(values, first, stop))
+            found.append(_Zone(first, stop - first, statistics, *bounds_s))
+        return found
 
     def _in_order(self, name: str) -> Decoded:
         numbers, (codes, labels) = self.numbers(name), self.coded(name)
@@ -419,15 +498,12 @@ class Frame:
         return Decoded(numbers, other, [None, *labels])
 
     def _of_rows(self, signal_id: int, attribute: str) -> Array:
-        whole = self._source.kept(
-            signal_id,
-            lambda: self._ordered(self._source.places(signal_id, attribute)),
-            8 * self._source.rows,
+        bounds = self._bounds()
+        return self._source.kept(
+            (signal_id, self._start, self._stop),
+            lambda: self._within(self._source.of_rows(signal_id, attribute, *bounds)),
+            8 * len(self),
         )
-        return whole[self._start : self._stop]
-
-    def _ordered(self, values: Any) -> Any:
-        return values if self._source.order is None else values[self._source.order]
 
     def _parts(self, name: str) -> list[tuple[_Part, Decoded | None, slice]]:
         """The parts that the frame touches, and which of their rows are in it."""
@@ -508,16 +584,13 @@ def read_frame(
 def _framed(source: _Source, segment: Segment, cut_at_s: float | None) -> Frame:
     """The rows of a source that lie in a segment, in order."""
     whole = Frame(source, 0, source.rows, cut_at_s)
-    times = whole.times
-    if len(times) and (np.diff(times) < 0).any():
+    if not source.is_in_order:
         ids = whole.ids
-        source.order = np.lexsort(
-            (np.abs(ids), whole.wall_times if (ids < 0).any() else ids, times)
-        )
-        whole = Frame(source, 0, source.rows, cut_at_s)
+        order = np.lexsort((np.abs(ids), whole.wall_times if (ids < 0).any() else ids, whole.times))
+        source.order = order
         source.forget()
-        times = whole.times
-    start, stop = bisect_left(times, segment.start_s), bisect_left(times, segment.end_s)
+        whole = Frame(source, 0, source.rows, cut_at_s)
+    start, stop = whole.places([segment.start_s, segment.end_s]).tolist()
     if math.isfinite(segment.wall_start_s) or math.isfinite(segment.wall_end_s):
         walls = whole.wall_times[start:stop]
         inside = np.flatnonzero((walls >= segment.wall_start_s) & (walls < segment.wall_end_s))
@@ -596,18 +669,27 @@ def _number(value: float) -> float:
     return int(value) if value.is_integer() and abs(value) < 2**53 else value
 
 
-def _zones(parts: Sequence[tuple[int, int, Statistics | None, Array]]) -> Zones:
+class _Zone(NamedTuple):
+    """What rows of a frame come to that are in one chunk."""
+
+    first_row: int
+    row_count: int
+    statistics: Statistics | None
+    start_s: float
+    end_s: float
+
+
+def _zones(parts: Sequence[_Zone]) -> Zones:
     nothing = Statistics(0, 0)
     table: Array = np.reshape(
-        np.array([tuple(statistics or nothing) for _, _, statistics, _ in parts], np.float64),
+        np.array([tuple(part.statistics or nothing) for part in parts], np.float64),
         (len(parts), len(Statistics._fields)),
     )
     figures: dict[str, Array] = dict(zip(Statistics._fields, np.transpose(table), strict=True))
-    first: Indexes = np.array([first for first, *_ in parts], np.intp)
-    rows: Indexes = np.array([rows for _, rows, *_ in parts], np.intp)
-    times: Array = parts[0][3] if parts else np.empty(0)
+    places: Array = np.reshape(np.array([(*part[:2], *part[3:]) for part in parts]), (-1, 4))
+    first, rows, starts_s, ends_s = np.transpose(places)
     held: Indexes = figures.pop("row_count").astype(np.intp)
     present: Indexes = figures.pop("value_count").astype(np.intp)
     changed: Indexes = figures.pop("change_count").astype(np.intp)
-    starts, ends = times[first], times[first + rows - 1]
-    return Zones(first, rows, held, present, changed, starts, ends, **figures)
+    where = first.astype(np.intp), rows.astype(np.intp)
+    return Zones(*where, held, present, changed, starts_s, ends_s, **figures)

@@ -98,6 +98,7 @@ CREATE TABLE signal (
 	unit TEXT /* where the name tells it */, 
 	path TEXT NOT NULL /* for json_extract(state.data, path) */, 
 	reduce TEXT /* count, min, max, mean or argmin of the long array at path */, 
+	role TEXT /* x, y, z, yaw, mode, speed, commanded_speed or wheel; x2 where a run has no x */, 
 	first_seen_wall_time_s FLOAT NOT NULL, 
 	last_seen_wall_time_s FLOAT NOT NULL, 
 	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held it, up to the watermark */, 
@@ -108,6 +109,7 @@ CREATE TABLE signal (
 	CONSTRAINT uq_signal_robot_id UNIQUE (robot_id, name), 
 	CONSTRAINT fk_signal_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE
 );
+CREATE INDEX ix_signal_robot_id_role ON signal (robot_id, role) WHERE role IS NOT NULL;
 CREATE TABLE rollup (
 	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held the signal */, 
 	present INTEGER DEFAULT 0 NOT NULL /* of them with a value */, 
@@ -524,180 +526,71 @@ CREATE VIEW all_rollup AS
 SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step, first_until_sim_time_s, last_since_sim_time_s FROM rollup
 UNION ALL SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step, first_until_sim_time_s, last_since_sim_time_s FROM recent_rollup;
 CREATE VIEW robot_now AS
-/* The newest state of each robot and how old it is. Lengths and angles as published. */
+/* The newest state of each robot, how old it is and how the robot moves. Speeds as published. */
 SELECT robot, run_id, end_reason, sim_time_s, round((julianday('now') - 2440587.5) * 86400.0 - wall_time_s, 1) AS age_s,
-  coalesce(
-    (SELECT json_extract(j, '$.' || p.key) * CASE WHEN replace(replace(replace(p.key, '"', ''), '[', '.'), ']', '') || '.' GLOB '*_mm.*' THEN 0.001 WHEN replace(replace(replace(p.key, '"', ''), '[', '.'), ']', '') || '.' GLOB '*_cm.*' THEN 0.01 ELSE 1 END
-      FROM json_each('{"pose[0]": "pose[1]", "pose.x": "pose.y", "pose.x_m": "pose.y_m", "pose.x_cm": "pose.y_cm", "pose.x_mm": "pose.y_mm", "position[0]": "position[1]", "position.x": "position.y", "position.x_m": "position.y_m", "position.x_cm": "position.y_cm", "position.x_mm": "position.y_mm", "pos[0]": "pos[1]", "pos.x": "pos.y", "pos.x_m": "pos.y_m", "pos.x_cm": "pos.y_cm", "pos.x_mm": "pos.y_mm", "gps[0]": "gps[1]", "gps.x": "gps.y", "gps.x_m": "gps.y_m", "gps.x_cm": "gps.y_cm", "gps.x_mm": "gps.y_mm", "odometry[0]": "odometry[1]", "odometry.x": "odometry.y", "odometry.x_m": "odometry.y_m", "odometry.x_cm": "odometry.y_cm", "odometry.x_mm": "odometry.y_mm", "odom[0]": "odom[1]", "odom.x": "odom.y", "odom.x_m": "odom.y_m", "odom.x_cm": "odom.y_cm", "odom.x_mm": "odom.y_mm", "location[0]": "location[1]", "location.x": "location.y", "location.x_m": "location.y_m", "location.x_cm": "location.y_cm", "location.x_mm": "location.y_mm", "pose_m[0]": "pose_m[1]", "pose_cm[0]": "pose_cm[1]", "pose_mm[0]": "pose_mm[1]", "position_m[0]": "position_m[1]", "position_cm[0]": "position_cm[1]", "position_mm[0]": "position_mm[1]", "pos_m[0]": "pos_m[1]", "pos_cm[0]": "pos_cm[1]", "pos_mm[0]": "pos_mm[1]", "gps_m[0]": "gps_m[1]", "gps_cm[0]": "gps_cm[1]", "gps_mm[0]": "gps_mm[1]", "odometry_m[0]": "odometry_m[1]", "odometry_cm[0]": "odometry_cm[1]", "odometry_mm[0]": "odometry_mm[1]", "odom_m[0]": "odom_m[1]", "odom_cm[0]": "odom_cm[1]", "odom_mm[0]": "odom_mm[1]", "location_m[0]": "location_m[1]", "location_cm[0]": "location_cm[1]", "location_mm[0]": "location_mm[1]", "x": "y", "x_m": "y_m", "x_cm": "y_cm", "x_mm": "y_mm"}') p
-      WHERE json_type(j, '$.' || p.key) IN ('integer', 'real') AND json_type(j, '$.' || p.value) IN ('integer', 'real')
-      LIMIT 1),
-    (WITH s0 AS MATERIALIZED (SELECT x.value AS x, y.value AS y, replace(replace(replace(x.fullkey, '"', ''), '[', '.'), ']', '') AS name,
-          CASE WHEN x.key = upper(x.key) THEN lower(x.key) ELSE x.key END AS x_key,
-          CASE WHEN y.key = upper(y.key) THEN lower(y.key) ELSE y.key END AS y_key, replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') AS way
-        FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
-        WHERE x.type IN ('integer', 'real') AND y.type IN ('integer', 'real')
-          AND (x.key = 0 AND y.key = 1 OR x.key GLOB '*[xX]*' AND y.key GLOB '*[yY]*')),
-        s1 AS MATERIALIZED (SELECT x, y, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(x_key, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS x_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(y_key, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS y_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(way, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS way FROM s0),
-        s2 AS MATERIALIZED (SELECT x, y, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(x_key, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS x_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(y_key, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS y_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(way, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS way FROM s1),
-        s3 AS MATERIALIZED (SELECT x, y, name, '.' || replace(ltrim(x_key, '_'), '_', '..') || '.' AS x_key, '.' || replace(ltrim(y_key, '_'), '_', '..') || '.' AS y_key,
-        '.' || replace(way, '_', '.') || '.' AS way, '.' || replace(substr(way, length(rtrim(way, replace(way, '.', ''))) + 1), '_', '.') || '.' AS branch FROM s2),
-        s4 AS MATERIALIZED (SELECT *, way || x_key AS named, x_key AS rest FROM s3),
-        s5 AS MATERIALIZED (SELECT x, y, name, x_key, y_key, way, branch, named, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(rest, '.pose.', ''), '.position.', ''), '.pos.', ''), '.gps.', ''), '.odometry.', ''), '.odom.', ''), '.location.', ''), '.m.', ''), '.cm.', ''), '.mm.', ''), '.km.', ''), '.robot.', ''), '.rover.', ''), '.current.', '') AS rest FROM s4),
-        s6 AS MATERIALIZED (SELECT x, y, name, x_key, y_key, way, branch, named, replace(replace(replace(rest, '.actual.', ''), '.own.', ''), '.self.', '') AS rest FROM s5)
-      SELECT x * CASE WHEN instr(named, '.mm.') THEN 0.001 WHEN instr(named, '.cm.') THEN 0.01 WHEN instr(named, '.km.') THEN 1000 ELSE 1 END FROM s6
-      WHERE NOT EXISTS (SELECT 1 FROM json_each('["accel", "acceleration", "accelerometer", "angular", "axis", "cmd", "command", "compass", "error", "force", "gravity", "gyro", "imu", "linear", "magnetometer", "offset", "speed", "torque", "twist", "vel", "velocity", "wind", "ball", "blob", "box", "desired", "destination", "goal", "image", "item", "marker", "object", "obstacle", "pixel", "reference", "setpoint", "target", "waypoint"]') w WHERE instr(way, '.' || w.value || '.'))
-        AND (x_key = '.0.' AND y_key = '.1.' AND EXISTS (SELECT 1 FROM json_each('["pose", "position", "pos", "gps", "odometry", "odom", "location"]') w WHERE instr(branch, '.' || w.value || '.'))
-          OR rest = '.x.' AND y_key = replace(x_key, '.x.', '.y.'))
-      ORDER BY NOT EXISTS (SELECT 1 FROM json_each('["pose", "position", "pos", "gps", "odometry", "odom", "location"]') w WHERE instr(branch || x_key, '.' || w.value || '.')), name LIMIT 1)) AS x_m,
-  coalesce(
-    (SELECT json_extract(j, '$.' || p.value) * CASE WHEN replace(replace(replace(p.key, '"', ''), '[', '.'), ']', '') || '.' GLOB '*_mm.*' THEN 0.001 WHEN replace(replace(replace(p.key, '"', ''), '[', '.'), ']', '') || '.' GLOB '*_cm.*' THEN 0.01 ELSE 1 END
-      FROM json_each('{"pose[0]": "pose[1]", "pose.x": "pose.y", "pose.x_m": "pose.y_m", "pose.x_cm": "pose.y_cm", "pose.x_mm": "pose.y_mm", "position[0]": "position[1]", "position.x": "position.y", "position.x_m": "position.y_m", "position.x_cm": "position.y_cm", "position.x_mm": "position.y_mm", "pos[0]": "pos[1]", "pos.x": "pos.y", "pos.x_m": "pos.y_m", "pos.x_cm": "pos.y_cm", "pos.x_mm": "pos.y_mm", "gps[0]": "gps[1]", "gps.x": "gps.y", "gps.x_m": "gps.y_m", "gps.x_cm": "gps.y_cm", "gps.x_mm": "gps.y_mm", "odometry[0]": "odometry[1]", "odometry.x": "odometry.y", "odometry.x_m": "odometry.y_m", "odometry.x_cm": "odometry.y_cm", "odometry.x_mm": "odometry.y_mm", "odom[0]": "odom[1]", "odom.x": "odom.y", "odom.x_m": "odom.y_m", "odom.x_cm": "odom.y_cm", "odom.x_mm": "odom.y_mm", "location[0]": "location[1]", "location.x": "location.y", "location.x_m": "location.y_m", "location.x_cm": "location.y_cm", "location.x_mm": "location.y_mm", "pose_m[0]": "pose_m[1]", "pose_cm[0]": "pose_cm[1]", "pose_mm[0]": "pose_mm[1]", "position_m[0]": "position_m[1]", "position_cm[0]": "position_cm[1]", "position_mm[0]": "position_mm[1]", "pos_m[0]": "pos_m[1]", "pos_cm[0]": "pos_cm[1]", "pos_mm[0]": "pos_mm[1]", "gps_m[0]": "gps_m[1]", "gps_cm[0]": "gps_cm[1]", "gps_mm[0]": "gps_mm[1]", "odometry_m[0]": "odometry_m[1]", "odometry_cm[0]": "odometry_cm[1]", "odometry_mm[0]": "odometry_mm[1]", "odom_m[0]": "odom_m[1]", "odom_cm[0]": "odom_cm[1]", "odom_mm[0]": "odom_mm[1]", "location_m[0]": "location_m[1]", "location_cm[0]": "location_cm[1]", "location_mm[0]": "location_mm[1]", "x": "y", "x_m": "y_m", "x_cm": "y_cm", "x_mm": "y_mm"}') p
-      WHERE json_type(j, '$.' || p.key) IN ('integer', 'real') AND json_type(j, '$.' || p.value) IN ('integer', 'real')
-      LIMIT 1),
-    (WITH s0 AS MATERIALIZED (SELECT x.value AS x, y.value AS y, replace(replace(replace(x.fullkey, '"', ''), '[', '.'), ']', '') AS name,
-          CASE WHEN x.key = upper(x.key) THEN lower(x.key) ELSE x.key END AS x_key,
-          CASE WHEN y.key = upper(y.key) THEN lower(y.key) ELSE y.key END AS y_key, replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') AS way
-        FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
-        WHERE x.type IN ('integer', 'real') AND y.type IN ('integer', 'real')
-          AND (x.key = 0 AND y.key = 1 OR x.key GLOB '*[xX]*' AND y.key GLOB '*[yY]*')),
-        s1 AS MATERIALIZED (SELECT x, y, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(x_key, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS x_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(y_key, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS y_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(way, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS way FROM s0),
-        s2 AS MATERIALIZED (SELECT x, y, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(x_key, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS x_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(y_key, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS y_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(way, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS way FROM s1),
-        s3 AS MATERIALIZED (SELECT x, y, name, '.' || replace(ltrim(x_key, '_'), '_', '..') || '.' AS x_key, '.' || replace(ltrim(y_key, '_'), '_', '..') || '.' AS y_key,
-        '.' || replace(way, '_', '.') || '.' AS way, '.' || replace(substr(way, length(rtrim(way, replace(way, '.', ''))) + 1), '_', '.') || '.' AS branch FROM s2),
-        s4 AS MATERIALIZED (SELECT *, way || x_key AS named, x_key AS rest FROM s3),
-        s5 AS MATERIALIZED (SELECT x, y, name, x_key, y_key, way, branch, named, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(rest, '.pose.', ''), '.position.', ''), '.pos.', ''), '.gps.', ''), '.odometry.', ''), '.odom.', ''), '.location.', ''), '.m.', ''), '.cm.', ''), '.mm.', ''), '.km.', ''), '.robot.', ''), '.rover.', ''), '.current.', '') AS rest FROM s4),
-        s6 AS MATERIALIZED (SELECT x, y, name, x_key, y_key, way, branch, named, replace(replace(replace(rest, '.actual.', ''), '.own.', ''), '.self.', '') AS rest FROM s5)
-      SELECT y * CASE WHEN instr(named, '.mm.') THEN 0.001 WHEN instr(named, '.cm.') THEN 0.01 WHEN instr(named, '.km.') THEN 1000 ELSE 1 END FROM s6
-      WHERE NOT EXISTS (SELECT 1 FROM json_each('["accel", "acceleration", "accelerometer", "angular", "axis", "cmd", "command", "compass", "error", "force", "gravity", "gyro", "imu", "linear", "magnetometer", "offset", "speed", "torque", "twist", "vel", "velocity", "wind", "ball", "blob", "box", "desired", "destination", "goal", "image", "item", "marker", "object", "obstacle", "pixel", "reference", "setpoint", "target", "waypoint"]') w WHERE instr(way, '.' || w.value || '.'))
-        AND (x_key = '.0.' AND y_key = '.1.' AND EXISTS (SELECT 1 FROM json_each('["pose", "position", "pos", "gps", "odometry", "odom", "location"]') w WHERE instr(branch, '.' || w.value || '.'))
-          OR rest = '.x.' AND y_key = replace(x_key, '.x.', '.y.'))
-      ORDER BY NOT EXISTS (SELECT 1 FROM json_each('["pose", "position", "pos", "gps", "odometry", "odom", "location"]') w WHERE instr(branch || x_key, '.' || w.value || '.')), name LIMIT 1)) AS y_m,
-  CASE json_array_length(j, '$.pose')
-    WHEN 3 THEN json_extract(j, '$.pose[2]')
-    WHEN 4 THEN json_extract(j, '$.pose[3]')
-    WHEN 6 THEN json_extract(j, '$.pose[5]')
-    ELSE coalesce(
-    json_extract(j, '$.pose.yaw'),
-    json_extract(j, '$.pose.theta'),
-    json_extract(j, '$.pose.heading'),
-    json_extract(j, '$.yaw'),
-    json_extract(j, '$.theta'),
-    json_extract(j, '$.heading'))
-  END AS yaw_rad,
-  coalesce(
-    CASE WHEN json_type(j, '$.mode') = 'text' THEN json_extract(j, '$.mode') END,
-    CASE WHEN json_type(j, '$.behaviour') = 'text' THEN json_extract(j, '$.behaviour') END,
-    CASE WHEN json_type(j, '$.behavior') = 'text' THEN json_extract(j, '$.behavior') END,
-    CASE WHEN json_type(j, '$.action') = 'text' THEN json_extract(j, '$.action') END,
-    CASE WHEN json_type(j, '$.task') = 'text' THEN json_extract(j, '$.task') END,
-    CASE WHEN json_type(j, '$.phase') = 'text' THEN json_extract(j, '$.phase') END,
-    (WITH s0 AS MATERIALIZED (SELECT value, type, replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') AS name FROM json_tree(j)
-        WHERE type IN ('text', 'integer') AND (key LIKE '%mode' OR key LIKE '%behaviour' OR key LIKE '%behavior' OR key LIKE '%action' OR key LIKE '%task' OR key LIKE '%phase' OR key LIKE '%state' OR key LIKE '%status' OR key LIKE '%name' OR key LIKE '%label' OR key LIKE '%str')),
-        s1 AS MATERIALIZED (SELECT *, substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) AS last FROM s0),
-        s2 AS MATERIALIZED (SELECT value, type, name, CASE WHEN last = upper(last) THEN lower(last) ELSE last END AS last FROM s1),
-        s3 AS MATERIALIZED (SELECT value, type, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS last FROM s2),
-        s4 AS MATERIALIZED (SELECT value, type, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS last FROM s3),
-        s5 AS MATERIALIZED (SELECT *, CASE WHEN '.' || replace(last, '_', '.') IN ('.name', '.label', '.str') THEN '.' || replace(last, '_', '.') ELSE rtrim(replace(replace(replace('.' || replace(last, '_', '.') || '|', '.name|', '|'), '.label|', '|'), '.str|', '|'), '|') END AS words FROM s4),
-        s6 AS MATERIALIZED (SELECT *, instr('.mode.behaviour.behavior.action.task.phase.state.status.', substr(words, length(rtrim(words, replace(words, '.', '')))) || '.') AS rank FROM s5)
-      SELECT value FROM s6
-      WHERE rank > 0 AND NOT EXISTS (SELECT 1 FROM json_each('["last", "previous", "prev", "old", "next", "desired", "target"]') w WHERE instr(words || '.', '.' || w.value || '.'))
-      ORDER BY type = 'integer', rank >= 43,
-        CASE WHEN name = '$' || words THEN rank ELSE 56 END, length(name), name
-      LIMIT 1)) AS mode,
+  (SELECT json_extract(j, p.path) * CASE p.unit WHEN 'mm' THEN 0.001 WHEN 'cm' THEN 0.01 WHEN 'km' THEN 1000 ELSE 1 END
+    FROM signal p JOIN signal o
+      ON o.robot_id = p.robot_id AND o.role = 'y' || substr(p.role, 2)
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'x' AND 'x9'
+      AND json_type(j, p.path) IN ('integer', 'real') AND json_type(j, o.path) IN ('integer', 'real')
+    ORDER BY p.role LIMIT 1) AS x_m,
+  (SELECT json_extract(j, p.path) * CASE p.unit WHEN 'mm' THEN 0.001 WHEN 'cm' THEN 0.01 WHEN 'km' THEN 1000 ELSE 1 END
+    FROM signal p JOIN signal o
+      ON o.robot_id = p.robot_id AND o.role = 'x' || substr(p.role, 2)
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'y' AND 'y9'
+      AND json_type(j, p.path) IN ('integer', 'real') AND json_type(j, o.path) IN ('integer', 'real')
+    ORDER BY p.role LIMIT 1) AS y_m,
+  (SELECT json_extract(j, p.path) * CASE p.unit WHEN 'deg' THEN 0.017453292519943295 ELSE 1 END FROM signal p
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'yaw' AND 'yaw9'
+      AND json_type(j, p.path) IN ('integer', 'real') ORDER BY p.role LIMIT 1) AS yaw_rad,
+  (SELECT json_extract(j, p.path) FROM signal p
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'mode' AND 'mode9'
+      AND json_type(j, p.path) IN ('text', 'integer') ORDER BY p.role LIMIT 1) AS mode,
+  (SELECT json_extract(j, p.path) FROM signal p
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'speed' AND 'speed9'
+      AND json_type(j, p.path) IN ('integer', 'real') ORDER BY p.role LIMIT 1) AS speed,
+  (SELECT json_extract(j, p.path) FROM signal p
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'commanded_speed' AND 'commanded_speed9'
+      AND json_type(j, p.path) IN ('integer', 'real') ORDER BY p.role LIMIT 1) AS commanded_speed,
   data, odd
 FROM (
-  SELECT r.name AS robot, u.id AS run_id, s.sim_time_s, s.wall_time_s, s.data, s.odd,
-    u.end_reason, CASE WHEN json_valid(s.data) THEN s.data END AS j
+  SELECT r.id AS robot_id, r.name AS robot, u.id AS run_id, u.end_reason, s.sim_time_s,
+    s.wall_time_s, s.data, s.odd, CASE WHEN json_valid(s.data) THEN s.data END AS j
   FROM robot r
   LEFT JOIN run u ON u.id = (SELECT max(id) FROM run WHERE robot_id = r.id)
   LEFT JOIN state s ON s.id = (
     SELECT id FROM state WHERE run_id = u.id ORDER BY sim_time_s DESC, id DESC LIMIT 1)
-);
+) s;
 CREATE VIEW robot_trajectory AS
-/* Where each robot was and in which mode, row by row: ask with run_id = ... and a time. */
-SELECT (
-  SELECT r.name FROM run u JOIN robot r ON r.id = u.robot_id WHERE u.id = s.run_id) AS robot,
+/* How each robot moved, row by row: ask with run_id = ... and a time. Speeds as published. */
+SELECT (SELECT r.name FROM robot r WHERE r.id = s.robot_id) AS robot,
   s.run_id, s.id AS state_id, s.sim_time_s,
   strftime('%Y-%m-%d %H:%M:%f', s.wall_time_s, 'unixepoch') AS utc,
-  coalesce(
-    (SELECT json_extract(j, '$.' || p.key) * CASE WHEN replace(replace(replace(p.key, '"', ''), '[', '.'), ']', '') || '.' GLOB '*_mm.*' THEN 0.001 WHEN replace(replace(replace(p.key, '"', ''), '[', '.'), ']', '') || '.' GLOB '*_cm.*' THEN 0.01 ELSE 1 END
-      FROM json_each('{"pose[0]": "pose[1]", "pose.x": "pose.y", "pose.x_m": "pose.y_m", "pose.x_cm": "pose.y_cm", "pose.x_mm": "pose.y_mm", "position[0]": "position[1]", "position.x": "position.y", "position.x_m": "position.y_m", "position.x_cm": "position.y_cm", "position.x_mm": "position.y_mm", "pos[0]": "pos[1]", "pos.x": "pos.y", "pos.x_m": "pos.y_m", "pos.x_cm": "pos.y_cm", "pos.x_mm": "pos.y_mm", "gps[0]": "gps[1]", "gps.x": "gps.y", "gps.x_m": "gps.y_m", "gps.x_cm": "gps.y_cm", "gps.x_mm": "gps.y_mm", "odometry[0]": "odometry[1]", "odometry.x": "odometry.y", "odometry.x_m": "odometry.y_m", "odometry.x_cm": "odometry.y_cm", "odometry.x_mm": "odometry.y_mm", "odom[0]": "odom[1]", "odom.x": "odom.y", "odom.x_m": "odom.y_m", "odom.x_cm": "odom.y_cm", "odom.x_mm": "odom.y_mm", "location[0]": "location[1]", "location.x": "location.y", "location.x_m": "location.y_m", "location.x_cm": "location.y_cm", "location.x_mm": "location.y_mm", "pose_m[0]": "pose_m[1]", "pose_cm[0]": "pose_cm[1]", "pose_mm[0]": "pose_mm[1]", "position_m[0]": "position_m[1]", "position_cm[0]": "position_cm[1]", "position_mm[0]": "position_mm[1]", "pos_m[0]": "pos_m[1]", "pos_cm[0]": "pos_cm[1]", "pos_mm[0]": "pos_mm[1]", "gps_m[0]": "gps_m[1]", "gps_cm[0]": "gps_cm[1]", "gps_mm[0]": "gps_mm[1]", "odometry_m[0]": "odometry_m[1]", "odometry_cm[0]": "odometry_cm[1]", "odometry_mm[0]": "odometry_mm[1]", "odom_m[0]": "odom_m[1]", "odom_cm[0]": "odom_cm[1]", "odom_mm[0]": "odom_mm[1]", "location_m[0]": "location_m[1]", "location_cm[0]": "location_cm[1]", "location_mm[0]": "location_mm[1]", "x": "y", "x_m": "y_m", "x_cm": "y_cm", "x_mm": "y_mm"}') p
-      WHERE json_type(j, '$.' || p.key) IN ('integer', 'real') AND json_type(j, '$.' || p.value) IN ('integer', 'real')
-      LIMIT 1),
-    (WITH s0 AS MATERIALIZED (SELECT x.value AS x, y.value AS y, replace(replace(replace(x.fullkey, '"', ''), '[', '.'), ']', '') AS name,
-          CASE WHEN x.key = upper(x.key) THEN lower(x.key) ELSE x.key END AS x_key,
-          CASE WHEN y.key = upper(y.key) THEN lower(y.key) ELSE y.key END AS y_key, replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') AS way
-        FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
-        WHERE x.type IN ('integer', 'real') AND y.type IN ('integer', 'real')
-          AND (x.key = 0 AND y.key = 1 OR x.key GLOB '*[xX]*' AND y.key GLOB '*[yY]*')),
-        s1 AS MATERIALIZED (SELECT x, y, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(x_key, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS x_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(y_key, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS y_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(way, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS way FROM s0),
-        s2 AS MATERIALIZED (SELECT x, y, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(x_key, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS x_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(y_key, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS y_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(way, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS way FROM s1),
-        s3 AS MATERIALIZED (SELECT x, y, name, '.' || replace(ltrim(x_key, '_'), '_', '..') || '.' AS x_key, '.' || replace(ltrim(y_key, '_'), '_', '..') || '.' AS y_key,
-        '.' || replace(way, '_', '.') || '.' AS way, '.' || replace(substr(way, length(rtrim(way, replace(way, '.', ''))) + 1), '_', '.') || '.' AS branch FROM s2),
-        s4 AS MATERIALIZED (SELECT *, way || x_key AS named, x_key AS rest FROM s3),
-        s5 AS MATERIALIZED (SELECT x, y, name, x_key, y_key, way, branch, named, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(rest, '.pose.', ''), '.position.', ''), '.pos.', ''), '.gps.', ''), '.odometry.', ''), '.odom.', ''), '.location.', ''), '.m.', ''), '.cm.', ''), '.mm.', ''), '.km.', ''), '.robot.', ''), '.rover.', ''), '.current.', '') AS rest FROM s4),
-        s6 AS MATERIALIZED (SELECT x, y, name, x_key, y_key, way, branch, named, replace(replace(replace(rest, '.actual.', ''), '.own.', ''), '.self.', '') AS rest FROM s5)
-      SELECT x * CASE WHEN instr(named, '.mm.') THEN 0.001 WHEN instr(named, '.cm.') THEN 0.01 WHEN instr(named, '.km.') THEN 1000 ELSE 1 END FROM s6
-      WHERE NOT EXISTS (SELECT 1 FROM json_each('["accel", "acceleration", "accelerometer", "angular", "axis", "cmd", "command", "compass", "error", "force", "gravity", "gyro", "imu", "linear", "magnetometer", "offset", "speed", "torque", "twist", "vel", "velocity", "wind", "ball", "blob", "box", "desired", "destination", "goal", "image", "item", "marker", "object", "obstacle", "pixel", "reference", "setpoint", "target", "waypoint"]') w WHERE instr(way, '.' || w.value || '.'))
-        AND (x_key = '.0.' AND y_key = '.1.' AND EXISTS (SELECT 1 FROM json_each('["pose", "position", "pos", "gps", "odometry", "odom", "location"]') w WHERE instr(branch, '.' || w.value || '.'))
-          OR rest = '.x.' AND y_key = replace(x_key, '.x.', '.y.'))
-      ORDER BY NOT EXISTS (SELECT 1 FROM json_each('["pose", "position", "pos", "gps", "odometry", "odom", "location"]') w WHERE instr(branch || x_key, '.' || w.value || '.')), name LIMIT 1)) AS x_m,
-  coalesce(
-    (SELECT json_extract(j, '$.' || p.value) * CASE WHEN replace(replace(replace(p.key, '"', ''), '[', '.'), ']', '') || '.' GLOB '*_mm.*' THEN 0.001 WHEN replace(replace(replace(p.key, '"', ''), '[', '.'), ']', '') || '.' GLOB '*_cm.*' THEN 0.01 ELSE 1 END
-      FROM json_each('{"pose[0]": "pose[1]", "pose.x": "pose.y", "pose.x_m": "pose.y_m", "pose.x_cm": "pose.y_cm", "pose.x_mm": "pose.y_mm", "position[0]": "position[1]", "position.x": "position.y", "position.x_m": "position.y_m", "position.x_cm": "position.y_cm", "position.x_mm": "position.y_mm", "pos[0]": "pos[1]", "pos.x": "pos.y", "pos.x_m": "pos.y_m", "pos.x_cm": "pos.y_cm", "pos.x_mm": "pos.y_mm", "gps[0]": "gps[1]", "gps.x": "gps.y", "gps.x_m": "gps.y_m", "gps.x_cm": "gps.y_cm", "gps.x_mm": "gps.y_mm", "odometry[0]": "odometry[1]", "odometry.x": "odometry.y", "odometry.x_m": "odometry.y_m", "odometry.x_cm": "odometry.y_cm", "odometry.x_mm": "odometry.y_mm", "odom[0]": "odom[1]", "odom.x": "odom.y", "odom.x_m": "odom.y_m", "odom.x_cm": "odom.y_cm", "odom.x_mm": "odom.y_mm", "location[0]": "location[1]", "location.x": "location.y", "location.x_m": "location.y_m", "location.x_cm": "location.y_cm", "location.x_mm": "location.y_mm", "pose_m[0]": "pose_m[1]", "pose_cm[0]": "pose_cm[1]", "pose_mm[0]": "pose_mm[1]", "position_m[0]": "position_m[1]", "position_cm[0]": "position_cm[1]", "position_mm[0]": "position_mm[1]", "pos_m[0]": "pos_m[1]", "pos_cm[0]": "pos_cm[1]", "pos_mm[0]": "pos_mm[1]", "gps_m[0]": "gps_m[1]", "gps_cm[0]": "gps_cm[1]", "gps_mm[0]": "gps_mm[1]", "odometry_m[0]": "odometry_m[1]", "odometry_cm[0]": "odometry_cm[1]", "odometry_mm[0]": "odometry_mm[1]", "odom_m[0]": "odom_m[1]", "odom_cm[0]": "odom_cm[1]", "odom_mm[0]": "odom_mm[1]", "location_m[0]": "location_m[1]", "location_cm[0]": "location_cm[1]", "location_mm[0]": "location_mm[1]", "x": "y", "x_m": "y_m", "x_cm": "y_cm", "x_mm": "y_mm"}') p
-      WHERE json_type(j, '$.' || p.key) IN ('integer', 'real') AND json_type(j, '$.' || p.value) IN ('integer', 'real')
-      LIMIT 1),
-    (WITH s0 AS MATERIALIZED (SELECT x.value AS x, y.value AS y, replace(replace(replace(x.fullkey, '"', ''), '[', '.'), ']', '') AS name,
-          CASE WHEN x.key = upper(x.key) THEN lower(x.key) ELSE x.key END AS x_key,
-          CASE WHEN y.key = upper(y.key) THEN lower(y.key) ELSE y.key END AS y_key, replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') AS way
-        FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
-        WHERE x.type IN ('integer', 'real') AND y.type IN ('integer', 'real')
-          AND (x.key = 0 AND y.key = 1 OR x.key GLOB '*[xX]*' AND y.key GLOB '*[yY]*')),
-        s1 AS MATERIALIZED (SELECT x, y, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(x_key, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS x_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(y_key, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS y_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(way, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS way FROM s0),
-        s2 AS MATERIALIZED (SELECT x, y, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(x_key, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS x_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(y_key, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS y_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(way, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS way FROM s1),
-        s3 AS MATERIALIZED (SELECT x, y, name, '.' || replace(ltrim(x_key, '_'), '_', '..') || '.' AS x_key, '.' || replace(ltrim(y_key, '_'), '_', '..') || '.' AS y_key,
-        '.' || replace(way, '_', '.') || '.' AS way, '.' || replace(substr(way, length(rtrim(way, replace(way, '.', ''))) + 1), '_', '.') || '.' AS branch FROM s2),
-        s4 AS MATERIALIZED (SELECT *, way || x_key AS named, x_key AS rest FROM s3),
-        s5 AS MATERIALIZED (SELECT x, y, name, x_key, y_key, way, branch, named, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(rest, '.pose.', ''), '.position.', ''), '.pos.', ''), '.gps.', ''), '.odometry.', ''), '.odom.', ''), '.location.', ''), '.m.', ''), '.cm.', ''), '.mm.', ''), '.km.', ''), '.robot.', ''), '.rover.', ''), '.current.', '') AS rest FROM s4),
-        s6 AS MATERIALIZED (SELECT x, y, name, x_key, y_key, way, branch, named, replace(replace(replace(rest, '.actual.', ''), '.own.', ''), '.self.', '') AS rest FROM s5)
-      SELECT y * CASE WHEN instr(named, '.mm.') THEN 0.001 WHEN instr(named, '.cm.') THEN 0.01 WHEN instr(named, '.km.') THEN 1000 ELSE 1 END FROM s6
-      WHERE NOT EXISTS (SELECT 1 FROM json_each('["accel", "acceleration", "accelerometer", "angular", "axis", "cmd", "command", "compass", "error", "force", "gravity", "gyro", "imu", "linear", "magnetometer", "offset", "speed", "torque", "twist", "vel", "velocity", "wind", "ball", "blob", "box", "desired", "destination", "goal", "image", "item", "marker", "object", "obstacle", "pixel", "reference", "setpoint", "target", "waypoint"]') w WHERE instr(way, '.' || w.value || '.'))
-        AND (x_key = '.0.' AND y_key = '.1.' AND EXISTS (SELECT 1 FROM json_each('["pose", "position", "pos", "gps", "odometry", "odom", "location"]') w WHERE instr(branch, '.' || w.value || '.'))
-          OR rest = '.x.' AND y_key = replace(x_key, '.x.', '.y.'))
-      ORDER BY NOT EXISTS (SELECT 1 FROM json_each('["pose", "position", "pos", "gps", "odometry", "odom", "location"]') w WHERE instr(branch || x_key, '.' || w.value || '.')), name LIMIT 1)) AS y_m,
-  CASE json_array_length(j, '$.pose')
-    WHEN 3 THEN json_extract(j, '$.pose[2]')
-    WHEN 4 THEN json_extract(j, '$.pose[3]')
-    WHEN 6 THEN json_extract(j, '$.pose[5]')
-    ELSE coalesce(
-    json_extract(j, '$.pose.yaw'),
-    json_extract(j, '$.pose.theta'),
-    json_extract(j, '$.pose.heading'),
-    json_extract(j, '$.yaw'),
-    json_extract(j, '$.theta'),
-    json_extract(j, '$.heading'))
-  END AS yaw_rad,
-  coalesce(
-    CASE WHEN json_type(j, '$.mode') = 'text' THEN json_extract(j, '$.mode') END,
-    CASE WHEN json_type(j, '$.behaviour') = 'text' THEN json_extract(j, '$.behaviour') END,
-    CASE WHEN json_type(j, '$.behavior') = 'text' THEN json_extract(j, '$.behavior') END,
-    CASE WHEN json_type(j, '$.action') = 'text' THEN json_extract(j, '$.action') END,
-    CASE WHEN json_type(j, '$.task') = 'text' THEN json_extract(j, '$.task') END,
-    CASE WHEN json_type(j, '$.phase') = 'text' THEN json_extract(j, '$.phase') END,
-    (WITH s0 AS MATERIALIZED (SELECT value, type, replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') AS name FROM json_tree(j)
-        WHERE type IN ('text', 'integer') AND (key LIKE '%mode' OR key LIKE '%behaviour' OR key LIKE '%behavior' OR key LIKE '%action' OR key LIKE '%task' OR key LIKE '%phase' OR key LIKE '%state' OR key LIKE '%status' OR key LIKE '%name' OR key LIKE '%label' OR key LIKE '%str')),
-        s1 AS MATERIALIZED (SELECT *, substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) AS last FROM s0),
-        s2 AS MATERIALIZED (SELECT value, type, name, CASE WHEN last = upper(last) THEN lower(last) ELSE last END AS last FROM s1),
-        s3 AS MATERIALIZED (SELECT value, type, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS last FROM s2),
-        s4 AS MATERIALIZED (SELECT value, type, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS last FROM s3),
-        s5 AS MATERIALIZED (SELECT *, CASE WHEN '.' || replace(last, '_', '.') IN ('.name', '.label', '.str') THEN '.' || replace(last, '_', '.') ELSE rtrim(replace(replace(replace('.' || replace(last, '_', '.') || '|', '.name|', '|'), '.label|', '|'), '.str|', '|'), '|') END AS words FROM s4),
-        s6 AS MATERIALIZED (SELECT *, instr('.mode.behaviour.behavior.action.task.phase.state.status.', substr(words, length(rtrim(words, replace(words, '.', '')))) || '.') AS rank FROM s5)
-      SELECT value FROM s6
-      WHERE rank > 0 AND NOT EXISTS (SELECT 1 FROM json_each('["last", "previous", "prev", "old", "next", "desired", "target"]') w WHERE instr(words || '.', '.' || w.value || '.'))
-      ORDER BY type = 'integer', rank >= 43,
-        CASE WHEN name = '$' || words THEN rank ELSE 56 END, length(name), name
-      LIMIT 1)) AS mode, s.odd
-FROM (SELECT *, CASE WHEN json_valid(data) THEN data END AS j FROM state) s;
+  (SELECT json_extract(j, p.path) * CASE p.unit WHEN 'mm' THEN 0.001 WHEN 'cm' THEN 0.01 WHEN 'km' THEN 1000 ELSE 1 END
+    FROM signal p JOIN signal o
+      ON o.robot_id = p.robot_id AND o.role = 'y' || substr(p.role, 2)
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'x' AND 'x9'
+      AND json_type(j, p.path) IN ('integer', 'real') AND json_type(j, o.path) IN ('integer', 'real')
+    ORDER BY p.role LIMIT 1) AS x_m,
+  (SELECT json_extract(j, p.path) * CASE p.unit WHEN 'mm' THEN 0.001 WHEN 'cm' THEN 0.01 WHEN 'km' THEN 1000 ELSE 1 END
+    FROM signal p JOIN signal o
+      ON o.robot_id = p.robot_id AND o.role = 'x' || substr(p.role, 2)
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'y' AND 'y9'
+      AND json_type(j, p.path) IN ('integer', 'real') AND json_type(j, o.path) IN ('integer', 'real')
+    ORDER BY p.role LIMIT 1) AS y_m,
+  (SELECT json_extract(j, p.path) * CASE p.unit WHEN 'deg' THEN 0.017453292519943295 ELSE 1 END FROM signal p
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'yaw' AND 'yaw9'
+      AND json_type(j, p.path) IN ('integer', 'real') ORDER BY p.role LIMIT 1) AS yaw_rad,
+  (SELECT json_extract(j, p.path) FROM signal p
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'mode' AND 'mode9'
+      AND json_type(j, p.path) IN ('text', 'integer') ORDER BY p.role LIMIT 1) AS mode,
+  (SELECT json_extract(j, p.path) FROM signal p
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'speed' AND 'speed9'
+      AND json_type(j, p.path) IN ('integer', 'real') ORDER BY p.role LIMIT 1) AS speed,
+  (SELECT json_extract(j, p.path) FROM signal p
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'commanded_speed' AND 'commanded_speed9'
+      AND json_type(j, p.path) IN ('integer', 'real') ORDER BY p.role LIMIT 1) AS commanded_speed, s.odd
+FROM (SELECT *, CASE WHEN json_valid(data) THEN data END AS j, (SELECT robot_id FROM run WHERE id = run_id) AS robot_id FROM state) s;
 CREATE VIEW robot_statistics AS
 /* What the numbers of a signal come to in each group of about 1,024 rows, also of purged rows. */
 SELECT r.name AS robot, g.run_id, s.name AS signal, g.start_sim_time_s AS start_s,

@@ -181,10 +181,17 @@ class State(SQLModel, table=True):
     odd: str | None = _text("JSON object: path of a replaced value to what it was (nan, inf, ...)")
 
 
+_HAS_ROLE = text("role IS NOT NULL")
+
+
 class Signal(SQLModel, table=True):
     """A number, flag or text that a robot's states hold, by its dotted name."""
 
-    __table_args__ = (UniqueConstraint("robot_id", "name"), _KEEP_IDS)
+    __table_args__ = (
+        UniqueConstraint("robot_id", "name"),
+        Index(None, "robot_id", "role", sqlite_where=_HAS_ROLE, postgresql_where=_HAS_ROLE),
+        _KEEP_IDS,
+    )
     id: int | None = _id()
     robot_id: int = _to("robot")
     name: str = _text("dotted: pose.0, sensors.front, lidar.min", nullable=False)
@@ -192,6 +199,9 @@ class Signal(SQLModel, table=True):
     unit: str | None = _text("where the name tells it")
     path: str = _text("for json_extract(state.data, path)", nullable=False)
     reduce: str | None = _text("count, min, max, mean or argmin of the long array at path")
+    role: str | None = _text(
+        "x, y, z, yaw, mode, speed, commanded_speed or wheel; x2 where a run has no x"
+    )
     first_seen_wall_time_s: float = _number(nullable=False)
     last_seen_wall_time_s: float = _number(nullable=False)
     rows: int = _count("state rows that held it, up to the watermark")

@@ -11,9 +11,10 @@ import sqlite3
 from typing import Any, Final, NamedTuple, get_args
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.signal_kinds import Kind, unit_of, widen
+from webots_mcp.signal_register import MAX_SIGNALS
 from webots_mcp.store.rollup.tables import ADD_COUNTS, IS_ID, fill, run_mark
-from webots_mcp.store.signals.flatten import Kind, unit_of, widen
-from webots_mcp.store.signals.registry import MAX_SIGNALS, Count
+from webots_mcp.store.signals.registry import Count, enter_signals
 
 # Ids between the first and the last row of a run; other robots could not have recorded more.
 _MOST_IDS: Final = 2**40
@@ -30,7 +31,9 @@ _USED: Final = " OR ".join(
     f"EXISTS (SELECT 1 FROM source.{table} WHERE run_id = :run AND signal_id = s.id)"
     for table in ("rollup", "recent_rollup", "change")
 )
-_DESCRIBED: Final = "name, kind, unit, path, reduce, first_seen_wall_time_s, last_seen_wall_time_s"
+_DESCRIBED: Final = (
+    "name, kind, unit, path, reduce, role, first_seen_wall_time_s, last_seen_wall_time_s"
+)
 _ENTER: Final = (
     f"INSERT INTO main.signal (robot_id, {_DESCRIBED}) SELECT :here, {_DESCRIBED} "
     "FROM source.signal s WHERE robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
@@ -102,6 +105,7 @@ def take_in_summaries(connection: sqlite3.Connection, there: int, here: int, rob
     _rename_signals(connection, here)
     fill(connection, "new_count", _counts(connection, here))
     connection.execute(ADD_COUNTS)
+    enter_signals(connection, robot_id, ())
     mark = min(run_mark(connection, there, "source.") or 0, ids.last) + ids.shift
     (coarse_end,) = connection.execute(_COARSE_END, (there,)).fetchone()
     connection.execute(_MARK, (max(0, mark), coarse_end, here))

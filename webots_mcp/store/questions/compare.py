@@ -23,16 +23,15 @@ from webots_mcp.store.questions.outcomes import (
     Measure,
     RunPart,
     outcomes_of,
-    sampling_notes,
 )
 from webots_mcp.store.questions.runs import RunInfo, run_infos
 from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.frame import read_frame
+from webots_mcp.store.reading.frame_summary import summary_of
 from webots_mcp.store.reading.ranges import whole_run
-from webots_mcp.store.reading.rollups import read_pieces
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.reading.subject import Subject
 from webots_mcp.store.robots import resolve_robot
-from webots_mcp.store.rollup.buckets import COARSE_S
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.signals.catalogue import catalogue, resolve_signals
 from webots_mcp.store.signals.registry import Signal
@@ -238,7 +237,6 @@ def _compare(
     outcomes = outcomes_of(connection, cut, options, deadline, asked.min_effect_sd)
     unread = any(None in each.count for each in differences)
     notes = _notes(compared) + _cut_notes(durations_s, compared_s)
-    notes += sampling_notes(connection, [part for found in cut for part in found])
     return Comparison(
         groups=compared,
         compared_s=compared_s,
@@ -317,11 +315,13 @@ def _summarise(
     connection: sqlite3.Connection, part: RunPart, signals: Sequence[Signal], deadline: Deadline
 ) -> dict[str, Summary] | None:
     """Each signal that the run has over its compared stretch; None where not all was read."""
-    own = [part.known[signal.name] for signal in signals if signal.name in part.known]
-    pieces = read_pieces(connection, part.segment, own, deadline, COARSE_S)
-    if pieces.cut_at_s is not None:
-        return None
-    return {signal.name: pieces.summaries(signal.name).whole() for signal in own}
+    frame = read_frame(connection, part.segment, deadline)
+    found: dict[str, Summary] = {}
+    for signal in (part.known[each.name] for each in signals if each.name in part.known):
+        if deadline.passed:
+            return None
+        found[signal.name] = summary_of(frame, signal)
+    return None if frame.cut_at_s is not None else found
 
 
 def _groups(connection: sqlite3.Connection, groups: dict[str, list[int]]) -> tuple[Group, ...]:

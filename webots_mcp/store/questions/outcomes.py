@@ -28,7 +28,7 @@ from webots_mcp.store.detection.motion import (
 from webots_mcp.store.detection.registry import asked_kinds
 from webots_mcp.store.questions.events import Collected, collect
 from webots_mcp.store.questions.runs import run_info
-from webots_mcp.store.questions.ways import read_way, sampling_interval_s
+from webots_mcp.store.questions.ways import read_way
 from webots_mcp.store.reading.changes import change_points
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment, TimeRange
@@ -241,8 +241,8 @@ def _outcome(
     if position is None:
         unknown["distance_m, mean_speed_m_s"] = (NAME_POSITION,)
     else:
-        read = None if purged else read_way(connection, part.segment, position, deadline)
-        way = None if read is None or deadline.passed else read.length
+        read = read_way(connection, part.segment, position, deadline)
+        way = None if deadline.passed or read.cut_at_s is not None else read.length
         speed = None if way is None else way.length_m / duration_s
         figures |= {"distance_m": way and way.length_m, _SPEED: speed}
         doubt = doubt_of_unit(position, speed or 0.0)
@@ -271,16 +271,6 @@ def _outcome(
         frozenset(kind for kind in verdicts.not_searched if verdicts.unlooked(kind)),
         not purged and not deadline.passed,
     )
-
-
-def sampling_notes(connection: sqlite3.Connection, parts: Sequence[RunPart]) -> list[str]:
-    """Says of which runs the distance comes from samples."""
-    return [
-        f"the distance of run {part.segment.run_id} is from one position every {every_s:.2g} s"
-        for part in parts
-        if (position := part.motion.position)
-        if (every_s := sampling_interval_s(connection, part.segment, position))
-    ]
 
 
 def _mode_times(

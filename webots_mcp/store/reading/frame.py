@@ -39,6 +39,7 @@ from webots_mcp.store.chunks.stored import (
     values_in,
 )
 from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.kept import MOST_ROWS, kept_parts
 from webots_mcp.store.reading.ranges import Segment
 
 MOST_KEPT_BYTES: Final = 64_000_000  # of values that a frame keeps for who asks again
@@ -579,6 +580,21 @@ def read_frame(
         reached_s = max(cut_at_s, segment.start_s)
         source.unread[Unread(reached_s, segment.end_s, "time limit reached")] = None
     return _framed(source, segment, cut_at_s)
+
+
+def read_kept(connection: sqlite3.Connection, segment: Segment, deadline: Deadline) -> Frame | None:
+    """The rows of a segment that only kept stretches have; None where there are none.
+
+    Of a segment that is at full rate itself none: `read_frame` has them among the others.
+    """
+    if segment.full_rate:
+        return None
+    bounds = (segment.run_id, segment.start_s, segment.end_s)
+    if not kept_parts(connection, *bounds):
+        return None
+    columns, cut_at_s = _read(connection, deadline, (f"{_KEPT} LIMIT {MOST_ROWS}", bounds))
+    source = _Source(connection, segment.run_id, _rows_in_parts(columns, 0), {}, deadline)
+    return _framed(source, segment, cut_at_s) if len(columns) else None
 
 
 def _framed(source: _Source, segment: Segment, cut_at_s: float | None) -> Frame:

@@ -277,10 +277,7 @@ def _notes(groups: Sequence[Group]) -> list[str]:
         notes.append(f"these are runs of different robots: {', '.join(robots)}")
     purged = [str(run.run_id) for run in runs if run.purged_rows]
     if purged:
-        notes.append(
-            f"rows of run {', '.join(purged)} were purged: their events are missing, and the "
-            "distance is unknown (null)"
-        )
+        notes.append(f"rows of run {', '.join(purged)} were purged: their events are missing")
     return notes
 
 

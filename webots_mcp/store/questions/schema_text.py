@@ -18,6 +18,7 @@ _BOOKKEEPING: Final = (
     "lease",
     "watermark",
     "recording",
+    "recent_rollup",
     "retention_limit",
     "kept_state",
     "row_group",

@@ -12,7 +12,7 @@ from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S, start_run
 from webots_mcp.store.analysis.spread import Spread
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.questions.compare import Comparison, compare_code, compare_runs
+from webots_mcp.store.questions.compare import Comparison, compare_runs
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.questions.series import RunHistory, query_history
 from webots_mcp.store.questions.trends import trends

@@ -18,6 +18,8 @@ _BOOKKEEPING: Final = (
     "lease",
     "watermark",
     "recording",
+    "rollup",
+    "all_rollup",
     "recent_rollup",
     "retention_limit",
     "kept_state",

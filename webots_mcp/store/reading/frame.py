@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import sqlite3
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,10 +20,8 @@ from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
 from webots_mcp.store.chunks.codec import (
     IS_ABSENT,
     IS_NUMBER,
-    DamagedChunkError,
     Decoded,
     Replaced,
-    decoded_of,
 )
 from webots_mcp.store.chunks.columns import STATE_COLUMNS, StateColumns
 from webots_mcp.store.chunks.making import GROUP_ROWS
@@ -32,54 +30,29 @@ from webots_mcp.store.chunks.stored import (
     SIM_TIMES,
     STATE_IDS,
     WALL_TIMES,
-    Group,
     groups_in,
     reached,
-    statistics_in,
-    values_in,
 )
 from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.frame_source import FrameSource, Part, Unread
 from webots_mcp.store.reading.kept import MOST_ROWS, kept_parts
+from webots_mcp.store.reading.newest_rows import read_rows, rows_in_no_chunk
 from webots_mcp.store.reading.ranges import Segment
 
-MOST_KEPT_BYTES: Final = 64_000_000  # of values that a frame keeps for who asks again
-_ROWS_AT_ONCE: Final = 1024  # between two looks at the deadline
 _FEW: Final = 4  # times that few chunks are opened one by one; else all of them at once
 _OTHER: Final = 0  # code of null and of a key that is not there
 _FIRST_LABEL: Final = 2  # of the codes of a chunk
 
-_IN: Final = "sim_time_s >= ? AND sim_time_s < ?"
-_TAIL: Final = (
-    f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND {_IN} AND (sim_time_s, id) > (?, ?) "
-    "ORDER BY sim_time_s, id"
-)
-_LATE: Final = (
-    f"SELECT {STATE_COLUMNS} FROM state WHERE id > ? AND +run_id = ? AND {_IN} "
-    "AND (sim_time_s, id) <= (?, ?) ORDER BY sim_time_s, id"
-)
+_IN: Final = "run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
+_STATES: Final = f"SELECT {STATE_COLUMNS} FROM state WHERE {_IN} ORDER BY sim_time_s, id"
 _KEPT: Final = (
     "SELECT -id, sim_time_s, wall_time_s, data, odd FROM kept_state "
-    f"WHERE run_id = ? AND {_IN} ORDER BY sim_time_s, id"
-)
-_ROWS_OF: Final = (
-    f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s <= ? "
-    "ORDER BY sim_time_s, id"
+    f"WHERE {_IN} ORDER BY sim_time_s, id LIMIT ?"
 )
 _SIGNALS: Final = (
     "SELECT s.name, s.id FROM run r JOIN signal s ON s.robot_id = r.robot_id WHERE r.id = ? "
     "AND typeof(s.name) = 'text'"
 )
-
-
-class Unread(NamedTuple):
-    """A part of what was asked for that is not in a frame: [start_s, end_s], and why."""
-
-    start_s: float
-    end_s: float
-    why: str
-
-    def __str__(self) -> str:
-        return f"not read from {self.start_s:.3f} to {self.end_s:.3f} s: {self.why}"
 
 
 class Coded(NamedTuple):
@@ -136,163 +109,6 @@ class Zones:
         ]
 
 
-class _Part(NamedTuple):
-    """Rows of a frame that are decoded together: a group, or rows that are in none."""
-
-    start: int  # place of the first row
-    rows: int
-    group: Group | None
-    columns: StateColumns | None
-
-    @property
-    def bounds_s(self) -> tuple[float, float]:
-        """Simulation time of its first and last row."""
-        if self.group is not None:
-            return self.group.start_s, self.group.end_s
-        assert self.columns is not None
-        return self.columns.times[0], self.columns.times[-1]
-
-
-class _Source:
-    """Where the values come from, before a range and an order are laid over them."""
-
-    def __init__(
-        self,
-        connection: sqlite3.Connection | None,
-        run_id: int,
-        parts: Sequence[_Part],
-        ids: Mapping[str, int],
-        deadline: Deadline | None,
-    ) -> None:
-        self.connection = connection
-        self.run_id = run_id
-        self.parts = parts
-        self.ids = ids
-        self.deadline = deadline
-        self.rows = parts[-1].start + parts[-1].rows if parts else 0
-        self.unread: dict[Unread, None] = {}
-        self.order: Indexes | None = None
-        self._groups = [part.group for part in parts if part.group is not None]
-        self._of_group = {part.group.id: part for part in parts if part.group is not None}
-        self._kept: OrderedDict[object, Any] = OrderedDict()
-        self._kept_bytes = 0
-
-    @cached_property
-    def bounds_s(self) -> tuple[Array, Array]:
-        """Simulation times of the first rows of all parts, and of the last ones."""
-        bounds = [part.bounds_s for part in self.parts]
-        return np.array([each[0] for each in bounds]), np.array([each[1] for each in bounds])
-
-    @cached_property
-    def is_in_order(self) -> bool:
-        """Whether simulation time never falls from row to row."""
-        starts_s, ends_s = self.bounds_s
-        columns = [part.columns.times for part in self.parts if part.columns is not None]
-        return bool((starts_s[1:] >= ends_s[:-1]).all()) and all(
-            (np.diff(times) >= 0).all() for times in columns
-        )
-
-    def decoded(self, name: str, start: int, stop: int) -> list[tuple[_Part, Decoded | None]]:
-        """The values of a signal in the parts that touch rows [start, stop); None: it has none."""
-        wanted = [p for p in self.parts if p.start < stop and p.start + p.rows > start]
-        stored = self._stored(self.ids.get(name), name, wanted)
-        found: list[tuple[_Part, Decoded | None]] = []
-        for part in wanted:
-            if part.group is not None:
-                found.append((part, stored.get(part.group.id)))
-            else:
-                assert part.columns is not None
-                values = part.columns.values.get(name)
-                found.append((part, None if values is None else decoded_of(values)))
-        return found
-
-    def of_rows(self, signal_id: int, attribute: str, start: int, stop: int) -> Array:
-        """Times or ids of rows [start, stop)."""
-        wanted = [p for p in self.parts if p.start < stop and p.start + p.rows > start]
-        first = wanted[0].start if wanted else start
-        stored = self._stored(signal_id, attribute, wanted)
-        whole = np.full(max(stop, start) - first, np.nan)
-        for part in wanted:
-            inside = slice(part.start - first, part.start - first + part.rows)
-            if part.columns is not None:
-                values: Any = getattr(part.columns, attribute)
-            elif part.group is not None and part.group.id in stored:
-                values = stored[part.group.id].numbers
-            else:
-                continue
-            whole[inside] = values[: len(whole) - inside.start]
-        return whole[start - first :]
-
-    def _stored(
-        self, signal_id: int | None, name: str, parts: Sequence[_Part]
-    ) -> dict[int, Decoded]:
-        groups = [part.group for part in parts if part.group is not None]
-        if signal_id is None or self.connection is None or not groups:
-            return {}
-        found: dict[int, Decoded] = {}
-        for group_id, values in values_in(self.connection, self.run_id, signal_id, groups):
-            if isinstance(values, DamagedChunkError):
-                again = self._from_rows(self._of_group[group_id], name, signal_id, values)
-                if again is None:
-                    continue
-                values = again
-            found[group_id] = values
-        return found
-
-    def _from_rows(
-        self, part: _Part, name: str, signal_id: int, error: DamagedChunkError
-    ) -> Decoded | None:
-        """What the rows of a damaged chunk say, where they are all there; else it is not read."""
-        assert self.connection is not None and part.group is not None
-        group = part.group
-        columns = StateColumns()
-        asked = (self.run_id, group.start_s, group.end_s)
-        columns.add(self.connection.execute(_ROWS_OF, asked).fetchall())
-        if len(columns) == group.row_count:
-            values: Sequence[Any] | None = {
-                SIM_TIMES: columns.times, WALL_TIMES: columns.wall_times, STATE_IDS: columns.ids
-            }.get(signal_id, columns.values.get(name))  # fmt: skip
-            if values is not None:
-                return decoded_of(values)
-        self.unread[Unread(group.start_s, group.end_s, f"the chunk of {name} is {error}")] = None
-        return None
-
-    def zones(
-        self, signal_id: int | None, values_of: Callable[[StateColumns], Sequence[Any] | None]
-    ) -> list[tuple[_Part, Statistics | None]]:
-        """What a signal comes to in each part."""
-        stored: dict[int, Statistics] = {}
-        if signal_id is not None and self.connection is not None and self._groups:
-            stored = statistics_in(self.connection, self.run_id, signal_id, self._groups)
-        found: list[tuple[_Part, Statistics | None]] = []
-        for part in self.parts:
-            if part.group is not None:
-                found.append((part, stored.get(part.group.id)))
-            else:
-                assert part.columns is not None
-                values = values_of(part.columns)
-                found.append((part, statistics_of(decoded_of(values)) if values else None))
-        return found
-
-    def forget(self) -> None:
-        """Forget what was made."""
-        self._kept.clear()
-        self._kept_bytes = 0
-
-    def kept(self, key: object, make: Any, size: int) -> Any:
-        """What was made before, or is made now; the oldest makes room for it."""
-        if key in self._kept:
-            self._kept.move_to_end(key)
-            return self._kept[key][0]
-        made = make()
-        self._kept[key] = (made, size)
-        self._kept_bytes += size
-        while self._kept_bytes > MOST_KEPT_BYTES and len(self._kept) > 1:
-            _, (_, freed) = self._kept.popitem(last=False)
-            self._kept_bytes -= freed
-        return made
-
-
 class Frame:
     """Rows of one run in order of simulation time; equal times in the order of their ids.
 
@@ -303,7 +119,7 @@ class Frame:
     """
 
     def __init__(
-        self, source: _Source, start: int, stop: int, cut_at_s: float | None = None
+        self, source: FrameSource, start: int, stop: int, cut_at_s: float | None = None
     ) -> None:
         self._source = source
         self._start = start
@@ -333,7 +149,7 @@ class Frame:
         values = {name: _plain(column) for name, column in columns.items()}
         ids = list(range(1, len(listed) + 1))
         rows = StateColumns(ids, listed, walls, [""] * len(listed), values)
-        return cls(_Source(None, run_id, _rows_in_parts(rows, 0), {}, None), 0, len(listed))
+        return cls(FrameSource(None, run_id, _rows_in_parts(rows, 0), {}), 0, len(listed))
 
     def __len__(self) -> int:
         return self._stop - self._start
@@ -422,7 +238,7 @@ class Frame:
 
     def _zones_within(
         self,
-        stored: Sequence[tuple[_Part, Statistics | None]],
+        stored: Sequence[tuple[Part, Statistics | None]],
         values_in: Callable[[int, int], Decoded],
     ) -> Zones:
         found: list[_Zone] = []
@@ -506,7 +322,7 @@ class Frame:
             8 * len(self),
         )
 
-    def _parts(self, name: str) -> list[tuple[_Part, Decoded | None, slice]]:
+    def _parts(self, name: str) -> list[tuple[Part, Decoded | None, slice]]:
         """The parts that the frame touches, and which of their rows are in it."""
         start, stop = self._bounds()
         return [
@@ -559,27 +375,32 @@ def read_frame(
         deadline: Rows that are in no chunk yet are read until then; the frame says what is left.
         full_rate: Of a segment that is kept at full rate, each call of `publish` is a row.
     """
-    run_id, bounds = segment.run_id, (segment.start_s, segment.end_s)
-    at = reached(connection, run_id)
-    parts: list[_Part] = []
+    run_id, span = segment.run_id, (segment.start_s, segment.end_s)
+    parts: list[Part] = []
     if full_rate and segment.full_rate:
-        whole = (run_id, *bounds, -math.inf, 0)
-        rows = _read(connection, deadline, (_TAIL, whole), (_KEPT, (run_id, *bounds)))
+        columns = StateColumns()
+        cut_at_s = read_rows(connection, _STATES, (run_id, *span), columns, deadline)
+        if cut_at_s is None:
+            cut_at_s = read_rows(connection, _KEPT, (run_id, *span, -1), columns, deadline)
     else:
-        for group in groups_in(connection, run_id, *bounds):
+        at = reached(connection, run_id)
+        columns, cut_at_s = rows_in_no_chunk(connection, run_id, span, at, deadline)
+        for group in groups_in(connection, run_id, *span):
             start = parts[-1].start + parts[-1].rows if parts else 0
-            parts.append(_Part(start, group.row_count, group, None))
-        here = (at.end_s, at.last_state_id)
-        late = (at.max_state_id, run_id, *bounds, *here)
-        rows = _read(connection, deadline, (_LATE, late), (_TAIL, (run_id, *bounds, *here)))
-    columns, cut_at_s = rows
+            parts.append(Part(start, group.row_count, group, None))
     parts += _rows_in_parts(columns, parts[-1].start + parts[-1].rows if parts else 0)
     names = dict(connection.execute(_SIGNALS, (run_id,)).fetchall())
-    source = _Source(connection, run_id, parts, names, deadline)
-    if cut_at_s is not None:
-        reached_s = max(cut_at_s, segment.start_s)
-        source.unread[Unread(reached_s, segment.end_s, "time limit reached")] = None
-    return _framed(source, segment, cut_at_s)
+    source = FrameSource(connection, run_id, parts, names)
+    return _framed(source, segment, _said(source, segment, cut_at_s))
+
+
+def _said(source: FrameSource, segment: Segment, cut_at_s: float | None) -> float | None:
+    """Where the deadline cut a segment, if it did; the frame names what is not in it."""
+    if cut_at_s is None or cut_at_s >= segment.end_s:
+        return None
+    reached_s = max(cut_at_s, segment.start_s)
+    source.unread[Unread(reached_s, segment.end_s, "time limit reached")] = None
+    return reached_s
 
 
 def read_kept(connection: sqlite3.Connection, segment: Segment, deadline: Deadline) -> Frame | None:
@@ -592,12 +413,14 @@ def read_kept(connection: sqlite3.Connection, segment: Segment, deadline: Deadli
     bounds = (segment.run_id, segment.start_s, segment.end_s)
     if not kept_parts(connection, *bounds):
         return None
-    columns, cut_at_s = _read(connection, deadline, (f"{_KEPT} LIMIT {MOST_ROWS}", bounds))
-    source = _Source(connection, segment.run_id, _rows_in_parts(columns, 0), {}, deadline)
+    columns = StateColumns()
+    cut_at_s = read_rows(connection, _KEPT, (*bounds, MOST_ROWS), columns, deadline)
+    source = FrameSource(connection, segment.run_id, _rows_in_parts(columns, 0), {})
+    cut_at_s = _said(source, segment, cut_at_s)
     return _framed(source, segment, cut_at_s) if len(columns) else None
 
 
-def _framed(source: _Source, segment: Segment, cut_at_s: float | None) -> Frame:
+def _framed(source: FrameSource, segment: Segment, cut_at_s: float | None) -> Frame:
     """The rows of a source that lie in a segment, in order."""
     whole = Frame(source, 0, source.rows, cut_at_s)
     if not source.is_in_order:
@@ -615,27 +438,13 @@ def _framed(source: _Source, segment: Segment, cut_at_s: float | None) -> Frame:
     return Frame(source, start, stop, cut_at_s)
 
 
-def _read(
-    connection: sqlite3.Connection, deadline: Deadline, *queries: tuple[str, tuple[object, ...]]
-) -> tuple[StateColumns, float | None]:
-    """The rows of queries, and the time of the last one where the deadline passed."""
-    columns = StateColumns()
-    for query, values in queries:
-        cursor = connection.execute(query, values)
-        while rows := cursor.fetchmany(_ROWS_AT_ONCE):
-            columns.add(rows)
-            if deadline.passed and len(rows) == _ROWS_AT_ONCE:
-                return columns, columns.times[-1]
-    return columns, None
-
-
-def _rows_in_parts(columns: StateColumns, start: int) -> list[_Part]:
+def _rows_in_parts(columns: StateColumns, start: int) -> list[Part]:
     """Rows that are in no chunk, as if they were."""
     rows = len(columns)
     if rows <= GROUP_ROWS:
-        return [_Part(start, rows, None, columns)] if rows else []
+        return [Part(start, rows, None, columns)] if rows else []
     return [
-        _Part(start + first, min(GROUP_ROWS, rows - first), None, columns.part(first, GROUP_ROWS))
+        Part(start + first, min(GROUP_ROWS, rows - first), None, columns.part(first, GROUP_ROWS))
         for first in range(0, rows, GROUP_ROWS)
     ]
 
@@ -650,7 +459,7 @@ def _cut(values: Decoded, start: int, stop: int) -> Decoded:
     return Decoded(values.numbers[start:stop], codes, values.labels)
 
 
-def _slice_of(source: _Source, name: str, start: int, stop: int) -> Decoded:
+def _slice_of(source: FrameSource, name: str, start: int, stop: int) -> Decoded:
     """The values of a signal in some rows of one part."""
     ((part, values),) = source.decoded(name, start, stop)
     if values is None:

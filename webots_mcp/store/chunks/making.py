@@ -68,6 +68,10 @@ _TAIL: Final = (
     f"SELECT {STATE_COLUMNS} FROM {{state}} WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
     "AND id <= ? ORDER BY sim_time_s, id LIMIT ?"
 )
+_COUNT: Final = (  # answered by the index alone
+    "SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
+    "AND id <= ? LIMIT ?)"
+)
 _LATE: Final = (
     f"SELECT {STATE_COLUMNS} FROM {{state}} WHERE id > ? AND id <= ? AND +run_id = ? "
     "AND (sim_time_s, id) <= (?, ?) ORDER BY sim_time_s, id LIMIT ?"
@@ -189,8 +193,8 @@ class _RunChunks:
             rows += len(late)
             at = reached(self._connection, self._run_id)
         while rows < budget_rows:
-            tail = self._tail(at, last_id)
-            if len(tail) < least_rows:
+            tail = self._tail(at, last_id) if self._has_tail(at, last_id, least_rows) else None
+            if tail is None or not len(tail):
                 self.done = True
                 if has_ended:
                     self._connection.execute(_SET_CHUNKED, (self._run_id,))
@@ -207,6 +211,12 @@ class _RunChunks:
             return StateColumns()
         place = (at.end_s, at.last_state_id)
         return _read(self._connection, _LATE, (at.max_state_id, last_id, self._run_id, *place))
+
+    def _has_tail(self, at: Reached, last_id: int, least_rows: int) -> bool:
+        """Whether there are so many rows after those that are in chunks."""
+        place = (at.end_s, at.last_state_id)
+        asked = (self._run_id, *place, last_id, max(1, least_rows))
+        return bool(self._connection.execute(_COUNT, asked).fetchone()[0] >= max(1, least_rows))
 
     def _tail(self, at: Reached, last_id: int) -> StateColumns:
         """The first rows after those that are in chunks."""

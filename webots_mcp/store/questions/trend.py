@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from webots_mcp.naming import words_of
 from webots_mcp.store.analysis.arrays import Array, Indexes, np
@@ -118,25 +118,64 @@ class Course:
 
     Attributes:
         times: In s.
-        numbers: The values, or the means of chunks; at least one.
-        inner_variance: That of the values within the chunks. Where more of it lies there than
-            between them, the course of their means is not that of the values.
-        resolution_s: The usual length of the chunks; None where the numbers are the values.
-        rest_s: Since when the values rest, where the numbers are means; None if they do not.
-        monotonic: Whether each chunk goes one way, and from one to the next, as far as their ends
-            and extremes tell.
+        numbers: The values, of an angle with turns counted; or the means of many of them.
+        inner: What these come to.
+        counted: What the values of an angle come to whose turns are counted; else None.
+        leaps: An angle whose turns cannot be counted.
+        monotonic: Whether the values go one way; of chunks as far as their ends and extremes tell.
+        rest_s: Since when the values rest; None if they do not.
+        inner_variance: That of the values within what the means are of. Where more of it lies there
+            than between them, the course of the means is not that of the values.
+        resolution_s: The usual length of what the means are of; None where the numbers are values.
     """
 
     times: Array
     numbers: Array
+    inner: Summary
+    counted: Summary | None = None
+    leaps: bool = False
+    monotonic: Monotonic | None = None
+    rest_s: float | None = None
     inner_variance: float = 0.0
     resolution_s: float | None = None
-    rest_s: float | None = None
-    monotonic: Monotonic | None = None
+
+
+def course_of_values(times: Array, recorded: Array, turn: float | None, summary: Summary) -> Course:
+    """The course of a signal of which every value is looked at.
+
+    Args:
+        times: In s, one at least.
+        recorded: The usable values.
+        turn: A whole turn of an angle, in its unit; None of what is none.
+        summary: What the values come to.
+    """
+    leaps = turn is not None and leaps_in(recorded, turn)
+    counts = turn is not None and not leaps
+    numbers = _unwrapped(recorded, summary, turn) if turn is not None and counts else recorded
+    counted = summarise_numbers(times, numbers) if counts else None
+    monotonic, rest_s = _monotonic(numbers), flat_since(times, numbers)
+    return Course(times, numbers, counted or summary, counted, leaps, monotonic, rest_s)
+
+
+def in_means(course: Course, rows: int) -> Course:
+    """A course in the means of so many values each, for what takes long to find in all of them."""
+    starts = np.arange(0, len(course.times), rows)
+    counts = np.diff(starts, append=len(course.times))
+    means = np.add.reduceat(course.numbers, starts) / counts
+    off = course.numbers - np.repeat(means, counts)
+    times = np.add.reduceat(course.times, starts) / counts
+    return replace(
+        course,
+        times=times,
+        numbers=means,
+        inner=summarise_numbers(times, means),
+        inner_variance=float(np.mean(off * off)),
+        resolution_s=_digits(np.median(np.diff(times))) if len(times) > 1 else None,
+    )
 
 
 def course_of_means(frame: Frame, name: str, zones: Zones) -> Course:
-    """The course of a signal with numbers, of many rows."""
+    """The course of a signal with numbers, of many rows, from what its chunks come to."""
     held = np.flatnonzero(~np.isnan(zones.sum))
     counts, means = zones.value_count[held], zones.sum[held] / zones.value_count[held]
     variances = np.where(
@@ -146,14 +185,20 @@ def course_of_means(frame: Frame, name: str, zones: Zones) -> Course:
     )
     starts = zones.start_s[held]
     lengths = np.diff(starts) if len(held) > 1 else zones.end_s[held] - starts
+    times = (starts + zones.end_s[held]) / 2
     return Course(
-        (starts + zones.end_s[held]) / 2,
+        times,
         means,
-        math.fsum(variances.tolist()) / len(held),
-        float(f"{float(np.median(lengths)):.3g}"),
-        _rest_of_chunks(frame, name, zones, held),
-        _monotonic_chunks(zones, held),
+        summarise_numbers(times, means),
+        monotonic=_monotonic_chunks(zones, held),
+        rest_s=_rest_of_chunks(frame, name, zones, held),
+        inner_variance=math.fsum(variances.tolist()) / len(held),
+        resolution_s=_digits(np.median(lengths)),
     )
+
+
+def _digits(length_s: Any) -> float:
+    return float(f"{float(length_s):.3g}")
 
 
 def _rest_of_chunks(frame: Frame, name: str, zones: Zones, held: Indexes) -> float | None:
@@ -190,32 +235,24 @@ def judge(
     """Combine the summary with the course of the numbers.
 
     Args:
-        signal: Whose trend; of an angle the course is that of the values.
+        signal: Whose trend.
         summary: Of the whole range.
         course: How it went.
-        spikes: None where only the means of chunks were looked at.
+        spikes: None where not every value was looked at.
         too_large: How many of the values are beyond 1e100; None where that is not known.
     """
-    times, recorded, of_rows = course.times, course.numbers, course.resolution_s is None
-    turn = signal.turn if of_rows else None
-    leaps = turn is not None and leaps_in(recorded, turn)
-    numbers = _unwrapped(recorded, summary, turn) if turn and not leaps else recorded
-    counted = numbers is not recorded
-    inner = summarise_numbers(times, numbers) if counted or not of_rows else summary
+    times, numbers, inner = course.times, course.numbers, course.inner
+    turn = signal.turn if summary.sines is not None else None
     slow = _slow_share(inner, course.inner_variance)
-    fast = slow < SLOW_SHARE or leaps
-    line = None if leaps else _of_all(fit_line(times, numbers, inner.mean or 0.0), slow)
-    monotonic = None
-    if not fast:
-        monotonic = _monotonic(numbers) if of_rows else course.monotonic
+    fast = slow < SLOW_SHARE or course.leaps
+    line = None if course.leaps else _of_all(fit_line(times, numbers, inner.mean or 0.0), slow)
+    monotonic, rest_s = (None, None) if fast else (course.monotonic, course.rest_s)
     swings = () if fast or monotonic else _swings(times, numbers, course.resolution_s)
-    rest_s = None
-    if not fast:
-        rest_s = flat_since(times, numbers) if of_rows else course.rest_s
     mean = summary.mean if turn is None else summary.centre(turn)
-    deviation = inner.deviation if counted and not fast else summary.deviation_in(turn)
-    if counted and not fast:
-        summary = _with_extremes_of(inner, summary)
+    counted = None if fast else course.counted
+    deviation = summary.deviation_in(turn) if counted is None else counted.deviation
+    if counted is not None:
+        summary = _with_extremes_of(counted, summary)
     shape = _shape(summary, line, monotonic, swings, rest_s, float(times[-1] - times[0]))
     trend = Trend(
         name=signal.name,
@@ -224,8 +261,8 @@ def judge(
         summary=summary,
         mean=_rounded(mean, inner),
         deviation=deviation,
-        turned=_turned(summary, recorded, turn) if turn and not fast else None,
-        leaps=leaps,
+        turned=None if counted is None else (counted.last or 0.0) - (counted.first or 0.0),
+        leaps=course.leaps,
         slope_per_s=line.slope_per_s if line else None,
         r2=line.r2 if line else None,
         shape=shape,
@@ -235,7 +272,7 @@ def judge(
         resolution_s=course.resolution_s,
         flat_since_s=rest_s,
         spikes=None if spikes is None else tuple(spikes),
-        step=None if spikes is None or turn else find_step(times, numbers),
+        step=None if spikes is None or turn is not None else find_step(times, numbers),
         missing=summary.rows - summary.present - (too_large or 0),
         too_large=too_large,
         change=time_effect(times, numbers, inner.mean or 0.0, inner.squares or 0.0)
@@ -287,11 +324,6 @@ def _with_extremes_of(course: Summary, summary: Summary) -> Summary:
         max=course.max,
         max_sim_time_s=course.max_sim_time_s,
     )
-
-
-def _turned(summary: Summary, numbers: Array, turn: float) -> float:
-    turned = np.unwrap([summary.first or 0.0, *numbers, summary.last or 0.0], period=turn)
-    return float(turned[-1] - turned[0])
 
 
 def _rounded(mean: float | None, inner: Summary) -> float | None:

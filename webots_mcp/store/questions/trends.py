@@ -12,8 +12,16 @@ from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.analysis.features import find_spikes
 from webots_mcp.store.analysis.summary import LARGEST, Summary, with_extremes
 from webots_mcp.store.analysis.swings import SHORTEST_PERIOD_ROWS
+from webots_mcp.store.chunks import making
 from webots_mcp.store.questions.series import STATES_SHARE
-from webots_mcp.store.questions.trend import Course, Trend, course_of_means, judge
+from webots_mcp.store.questions.trend import (
+    Trend,
+    course_of_means,
+    course_of_values,
+    in_means,
+    judge,
+)
+from webots_mcp.store.reading import frame_summary
 from webots_mcp.store.reading.changes import Changes, change_points
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.frame import Frame, read_frame, read_kept
@@ -181,22 +189,29 @@ def _without_value(frame: Frame, found: Mapping[str, Trend | None]) -> Iterator[
 
 
 def _trend(frame: Frame, signal: Signal, kept: Frame | None) -> Trend | None:
-    """That of every value, or of many rows that of the means of their chunks."""
-    name = signal.name
-    if reads_values(frame, signal):
-        times, numbers = frame.usable(name)
-        if not len(numbers):
-            return None
-        summary = _with_kept(signal, summary_of(frame, signal), kept)
-        too_large = int(np.count_nonzero(np.abs(frame.numbers(name)) > LARGEST))
-        spikes = find_spikes(times, numbers, signal.turn)
-        return judge(signal, summary, Course(times, numbers), spikes, too_large)
-    zones = frame.zones(name)
-    summary = summary_of_zones(frame, name, zones)
+    """That of every value; of many rows that of means."""
+    if not reads_values(frame, signal):
+        return _trend_of_chunks(frame, signal, kept)
+    times, numbers = frame.usable(signal.name)
+    if not len(numbers):
+        return None
+    summary = summary_of(frame, signal)
+    course = course_of_values(times, numbers, signal.turn, summary)
+    is_long = len(frame) > frame_summary.FULL_ROWS
+    spikes = None if is_long else find_spikes(times, numbers, signal.turn)
+    if is_long:
+        course = in_means(course, making.GROUP_ROWS)
+    too_large = int(np.count_nonzero(np.abs(frame.numbers(signal.name)) > LARGEST))
+    return judge(signal, _with_kept(signal, summary, kept), course, spikes, too_large)
+
+
+def _trend_of_chunks(frame: Frame, signal: Signal, kept: Frame | None) -> Trend | None:
+    zones = frame.zones(signal.name)
+    summary = summary_of_zones(frame, signal.name, zones)
     if summary.sum is None:
         return None
-    summary = _with_kept(signal, summary, kept)
-    return judge(signal, summary, course_of_means(frame, name, zones))
+    course = course_of_means(frame, signal.name, zones)
+    return judge(signal, _with_kept(signal, summary, kept), course)
 
 
 def _with_kept(signal: Signal, summary: Summary, kept: Frame | None) -> Summary:

@@ -86,7 +86,9 @@ def rows_in_no_chunk(
     is_short = connection.execute(_FEWER_THAN, asked).fetchone()[0] <= MOST_ROWS_KEPT
     key = _key(connection, run_id) if is_short else None
     if key is None or len(columns):
-        cut_s = read_rows(connection, _NEWEST_IN, (run_id, *span, *place), columns, deadline)
+        # SQLite would go through all rows from the start of the range rather than from the place.
+        after = (max(span[0], at.end_s), span[1])
+        cut_s = read_rows(connection, _NEWEST_IN, (run_id, *after, *place), columns, deadline)
         return columns, cut_s
     with _lock:
         return _kept_rows(connection, run_id, key, place, deadline)

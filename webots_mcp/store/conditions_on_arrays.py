@@ -1,4 +1,4 @@
-"""Conditions over the past: the parsed tree asked of all rows at once, as arrays.
+"""Conditions and scores over the past: the parsed tree asked of all rows at once, as arrays.
 
 In each row the outcome is that of the closures that the controller asks of each state; see
 docs/conditions.md. A value is NaN where a row has no number. Integers beyond 2^53 are those of
@@ -15,8 +15,10 @@ from itertools import starmap
 from typing import Any, Final, NamedTuple, Protocol, TypeAlias, cast
 
 from webots_mcp.conditions.compiler import ARITHMETIC, COMPARISONS
+from webots_mcp.conditions.scoring import Aggregate
 from webots_mcp.conditions.signal_values import PLACES_KEPT, SAME_TIME_S
 from webots_mcp.conditions.syntax import FLAGS, Nodes, Scanned, function_of, is_signal
+from webots_mcp.errors import ConditionFailedError
 from webots_mcp.naming import FARTHEST_M, Value, metres_in
 from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
 
@@ -351,6 +353,43 @@ def first_failure(failures: Failures) -> Failed | None:
     first = min(found, key=lambda failure: int(failure.rows.argmax()))
     row = int(first.rows.argmax())
     return Failed(row, f"{first.place}: {first.why(row)}")
+
+
+def aggregated(
+    aggregate: Aggregate, frame: Frame, position: tuple[str, str] | None = None
+) -> float | None:
+    """What the values of a run come to; None where no row has a value.
+
+    Rows count for as long as they last, up to the next one, in means and times, so that a stretch
+    with more rows than others does not count more. Where no time has passed, rows count alike.
+
+    Raises:
+        ConditionFailedError: The values are not of the kinds that it can be asked of.
+    """
+    rows, lasts_s = OnArrays(aggregate.scanned, frame, position), np.diff(frame.times)
+    if aggregate.function == "time":
+        holds, failures = rows.condition(aggregate.tree)
+        _raise_first(failures)
+        return float(lasts_s[holds[:-1]].sum()) if len(frame) else None
+    numbers, _, failures = rows.number(aggregate.tree)
+    _raise_first(failures)
+    there = ~np.isnan(numbers)
+    found = numbers[there]
+    if not len(found):
+        return None
+    if aggregate.function in ("first", "last"):
+        return float(found[0 if aggregate.function == "first" else -1])
+    if aggregate.function != "mean":
+        return float(found.min() if aggregate.function == "min" else found.max())
+    known_s = lasts_s[there[:-1]]
+    if known_s.sum() > 0:
+        return float((numbers[:-1][there[:-1]] * known_s).sum() / known_s.sum())
+    return float(found.mean())
+
+
+def _raise_first(failures: Failures) -> None:
+    if failed := first_failure(failures):
+        raise ConditionFailedError(failed.why)
 
 
 # -- of the rows before ------------------------------------------------------------------------

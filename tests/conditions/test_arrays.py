@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import operator
 import re
 from itertools import accumulate
+from typing import Any
 
+import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -14,8 +18,13 @@ from webots_mcp.conditions import parse_condition
 from webots_mcp.errors import ConditionFailedError
 from webots_mcp.naming import find_position
 from webots_mcp.store.conditions_on_arrays import OnArrays, first_failure
+from webots_mcp.store.reading.frame import Frame
 
 Failing = tuple[int, str]
+COMPARISON: dict[str, Any] = {
+    "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge,
+    "==": operator.eq, "!=": operator.ne,
+}  # fmt: skip
 
 
 def by_closures(text: str, history: Rows) -> tuple[list[bool], Failing | None]:
@@ -100,3 +109,19 @@ def test_texts_among_numbers_and_time_that_stands_still_are_judged_alike(
     text: str, history: Rows
 ) -> None:
     agree(text, history)
+
+
+@pytest.mark.parametrize("sign", ["<", "<=", ">", ">=", "==", "!="])
+@pytest.mark.parametrize("limit", [-60, 0, 30, 31, 1e150])
+def test_rows_are_judged_alike_where_chunks_are_left_closed(sign: str, limit: float) -> None:
+    course = np.repeat([0.0, 40.0, 30.0, 31.0, -50.0], 1500)
+    course[100], course[3000] = 31.0, np.nan
+    course[4000:5500] = np.nan
+    course[7000] = 1e200
+    condition = parse_condition(f"x {sign} {limit}")
+
+    frame = Frame.of(np.arange(len(course)) / 10, {"x": course})
+    held = OnArrays(condition.scanned, frame).condition(condition.tree).holds
+
+    expected = COMPARISON[sign](course, limit) & ~np.isnan(course)
+    assert (held == expected).all()

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import starmap
-from typing import Any, Final, NamedTuple, Protocol, TypeAlias, cast
+from typing import Any, Final, NamedTuple, TypeAlias, cast
 
 from webots_mcp.conditions.compiler import ARITHMETIC, COMPARISONS
 from webots_mcp.conditions.scoring import Aggregate
@@ -21,54 +21,13 @@ from webots_mcp.conditions.syntax import FLAGS, Nodes, Scanned, function_of, is_
 from webots_mcp.errors import ConditionFailedError
 from webots_mcp.naming import FARTHEST_M, Value, metres_in
 from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
+from webots_mcp.store.reading.frame import Frame
 
 _FOLDING: Final = {"min": "minimum", "max": "maximum"}
 _MIRRORED: Final[dict[type[ast.cmpop], type[ast.cmpop]]] = {
     ast.Lt: ast.Gt, ast.LtE: ast.GtE, ast.Gt: ast.Lt, ast.GtE: ast.LtE,
     ast.Eq: ast.Eq, ast.NotEq: ast.NotEq,
 }  # fmt: skip
-
-
-class Zones(Protocol):
-    """What is known of each chunk of a signal without its values."""
-
-    first_row: Indexes
-    value_count: Indexes
-    min: Array
-    max: Array
-
-
-class Coded(Protocol):
-    """A signal as places of its values in a list."""
-
-    codes: Indexes
-    labels: Sequence[Value]
-
-
-class Frame(Protocol):
-    """Rows of one run."""
-
-    times: Array
-
-    def __len__(self) -> int: ...
-
-    def __contains__(self, name: str) -> bool: ...
-
-    def numbers(self, name: str) -> Array:
-        """NaN where a row has none."""
-        ...
-
-    def coded(self, name: str) -> Coded:
-        """Any signal."""
-        ...
-
-    def zones(self, name: str) -> Zones:
-        """Of each chunk."""
-        ...
-
-    def rows(self, start: int, stop: int) -> Frame:
-        """A part."""
-        ...
 
 
 class Failure(NamedTuple):
@@ -90,10 +49,10 @@ class Outcome(NamedTuple):
 
 
 class Texts(NamedTuple):
-    """The texts of a value: per row a number in the labels, or -1 for none."""
+    """The texts of a value: per row the place of its label, or one for all; 0 for none."""
 
     codes: Any
-    labels: Sequence[str]
+    labels: Sequence[Value]
 
 
 class Values(NamedTuple):
@@ -107,12 +66,12 @@ class Values(NamedTuple):
     def missing(self) -> Flags:
         """Where it is neither a number nor a text."""
         lacking = np.isnan(self.numbers)
-        return lacking if self.texts is None else lacking & (self.texts.codes < 0)
+        return lacking if self.texts is None else lacking & (self.texts.codes == 0)
 
     def shown(self, row: int) -> str:
         """In one row, for messages."""
-        if self.texts is not None and (code := int(_at(self.texts.codes, row))) >= 0:
-            return f"the text {self.texts.labels[code][:50]!r}"
+        if self.texts is not None and (code := int(_at(self.texts.codes, row))) > 0:
+            return f"the text {str(self.texts.labels[code])[:50]!r}"
         return f"the number {float(_at(self.numbers, row)):.15g}"
 
 
@@ -174,7 +133,7 @@ class OnArrays(Nodes):
             return _outcome(asked.missing, asked.failures)
         if function_of(node) == "changed":
             asked = self._value(cast("ast.Call", node).args[0])
-            codes = asked.texts.codes if asked.texts else np.intp(-1)
+            codes = asked.texts.codes if asked.texts else np.intp(0)
             ways = self._in_each_row(asked.numbers), self._in_each_row(codes)
             return self._remembered(asked.failures, changed, *ways)
         return self._flag(node)
@@ -219,8 +178,8 @@ class OnArrays(Nodes):
         if left.texts is None and right.texts is None:
             return _outcome(holds, failures)
         one, other = _ranked(left.texts, right.texts)
-        holds = holds | (compare(one, other) & (one >= 0) & (other >= 0))
-        mixed = (one >= 0) & ~np.isnan(right.numbers) | (other >= 0) & ~np.isnan(left.numbers)
+        holds = holds | (compare(one, other) & (one > 0) & (other > 0))
+        mixed = (one > 0) & ~np.isnan(right.numbers) | (other > 0) & ~np.isnan(left.numbers)
         if op is ast.NotEq:
             holds = holds | mixed
         elif op is not ast.Eq:
@@ -238,23 +197,10 @@ class OnArrays(Nodes):
         number = right.value if isinstance(right, ast.Constant) else None
         if not is_signal(left) or type(number) not in (int, float):
             return None
-        limit, name = float(cast("float", number)), self._signal_name(left)
-        if name not in self._frame:
+        name = self._signal_name(left)
+        if name not in self._frame or self._texts(name) is not None:
             return None
-        zones = self._frame.zones(name)
-        always, never = _verdicts(op, zones.min, zones.max, limit)
-        ends = np.append(zones.first_row[1:], len(self._frame))
-        full = zones.value_count == ends - zones.first_row
-        always, never = always & full, never & full
-        if not full.all() and self._texts(name) is not None:
-            return None
-        holds = np.repeat(always, ends - zones.first_row)
-        for first, last in _stretches(~(always | never)):
-            part = slice(int(zones.first_row[first]), int(ends[last - 1]))
-            numbers = self._frame.rows(part.start, part.stop).numbers(name)
-            found = COMPARISONS[op][1](numbers, limit)
-            holds[part] = found & ~np.isnan(numbers) if op is ast.NotEq else found
-        return Outcome(holds)
+        return Outcome(compared(self._frame, name, op, float(cast("float", number))))
 
     # -- values --------------------------------------------------------------------------------
 
@@ -262,7 +208,7 @@ class OnArrays(Nodes):
         if isinstance(node, ast.Name) and node.id in FLAGS:
             return Values(np.float64(FLAGS[node.id]))
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
-            return Values(np.float64(math.nan), Texts(np.intp(0), [node.value]))
+            return Values(np.float64(math.nan), Texts(np.intp(1), (None, node.value)))
         return self._signal(node) if is_signal(node) else self._number(node)
 
     def _number(self, node: ast.expr) -> Values:
@@ -318,15 +264,11 @@ class OnArrays(Nodes):
         return self._frame.numbers(name)
 
     def _texts(self, name: str) -> Texts | None:
-        if name not in self._frame or not np.isnan(self._frame.numbers(name)).any():
+        zones = self._frame.zones(name)
+        if not ((zones.value_count < zones.held_count) | np.isnan(zones.min)).any():
             return None
-        coded = self._frame.coded(name)
-        labels = [label for label in coded.labels if isinstance(label, str)]
-        if not labels:
-            return None
-        places = {label: place for place, label in enumerate(labels)}
-        own = [places[each] if isinstance(each, str) else -1 for each in coded.labels]
-        return Texts(np.array(own, np.intp)[coded.codes], labels)
+        texts = Texts(*self._frame.texts(name))
+        return texts if len(texts.labels) > 1 else None
 
     # -- failures ------------------------------------------------------------------------------
 
@@ -337,12 +279,29 @@ class OnArrays(Nodes):
         def said(row: int) -> str:
             return f"{value.shown(row)} {why}"
 
-        return value.failures + self._failing(value.texts.codes >= 0, node, said)
+        return value.failures + self._failing(value.texts.codes > 0, node, said)
 
     def _failing(self, rows: Any, node: ast.expr, why: Callable[[int], str]) -> Failures:
         rows = self._in_each_row(rows)
         place = self._scanned.place(self._column(node))
         return (Failure(rows, place, why),) if rows.any() else ()
+
+
+def compared(frame: Frame, name: str, op: type[ast.cmpop], limit: float) -> Flags:
+    """In which rows the number of a signal compares so with a limit.
+
+    Decoded is only where the extremes of a chunk leave it open.
+    """
+    zones = frame.zones(name)
+    is_full = zones.value_count == zones.row_count
+    always, never = _verdicts(op, zones.min, zones.max, limit)
+    holds = np.repeat(always & is_full, zones.row_count)
+    never = never & is_full | (zones.held_count == 0)
+    for start, stop in zones.spans(~(always & is_full | never)):
+        numbers = frame.rows(start, stop).numbers(name)
+        found = COMPARISONS[op][1](numbers, limit)
+        holds[start:stop] = found & ~np.isnan(numbers) if op is ast.NotEq else found
+    return holds
 
 
 def first_failure(failures: Failures) -> Failed | None:
@@ -409,11 +368,11 @@ def changed(times: Array, numbers: Array, codes: Indexes) -> Flags:
     Args:
         times: Of the rows.
         numbers: NaN where there is none.
-        codes: Of texts; -1 where there is none.
+        codes: Of texts; 0 where there is none.
     """
-    there = np.flatnonzero(~np.isnan(numbers) | (codes >= 0))
+    there = np.flatnonzero(~np.isnan(numbers) | (codes > 0))
     of_texts = codes[there]
-    own = np.where(of_texts < 0, numbers[there], 0.0)
+    own = np.where(of_texts == 0, numbers[there], 0.0)
     others = (own[1:] != own[:-1]) | (of_texts[1:] != of_texts[:-1])
     found = np.zeros(len(times), np.bool_)
     found[there[1:]] = others
@@ -507,16 +466,16 @@ def _is_minus(node: ast.UnaryOp) -> bool:
 
 
 def _ranked(left: Texts | None, right: Texts | None) -> tuple[Any, Any]:
-    """Codes of both whose order is that of the texts; -1 for none."""
-    ordered = sorted({label for each in (left, right) if each for label in each.labels})
-    ranks = {label: rank for rank, label in enumerate(ordered)}
+    """Codes of both whose order is that of the texts; 0 for none."""
+    labels = {str(label) for each in (left, right) if each for label in each.labels[1:]}
+    ranks = {label: rank for rank, label in enumerate(sorted(labels), 1)}
     return _ranks(left, ranks), _ranks(right, ranks)
 
 
 def _ranks(texts: Texts | None, ranks: dict[str, int]) -> Any:
     if texts is None:
-        return np.intp(-1)
-    return np.array([*(ranks[label] for label in texts.labels), -1], np.intp)[texts.codes]
+        return np.intp(0)
+    return np.array([0, *(ranks[str(label)] for label in texts.labels[1:])], np.intp)[texts.codes]
 
 
 def _verdicts(op: type[ast.cmpop], low: Array, high: Array, limit: float) -> tuple[Any, Any]:
@@ -529,12 +488,6 @@ def _verdicts(op: type[ast.cmpop], low: Array, high: Array, limit: float) -> tup
     compare = COMPARISONS[op][1]
     least, most = (low, high) if op in (ast.Gt, ast.GtE) else (high, low)
     return compare(least, limit), ~(compare(most, limit) | np.isnan(most))
-
-
-def _stretches(flags: Flags) -> list[tuple[int, int]]:
-    """From and up to where they are set, one after the other."""
-    edges = np.flatnonzero(np.diff(flags, prepend=False, append=False))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def _at(values: Any, row: int) -> Any:

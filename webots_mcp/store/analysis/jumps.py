@@ -5,14 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
+from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, median, np
 from webots_mcp.store.analysis.rhythm import gap_borders, usual_interval_s
 from webots_mcp.store.analysis.swings import LEAST_HALF_SWINGS, Swing, find_swings
+from webots_mcp.store.reading.frame import Frame, Zones
 
 MOST_JUMPS_SHARE: Final = 0.1  # of the rows: more of them are how the signal is
 LEAST_STEPS: Final = 10
+SAMPLED_CHUNKS: Final = 16  # that tell what is usual
+MARGIN_ROWS: Final = 10  # around steps: what an excursion takes, and the motion next to it
 LONGEST_EXCURSION: Final = 5  # rows that a value which otherwise rests may be elsewhere
 BACK_SHARE: Final = 0.2  # of a step: who comes back to so near where it began is back
 BACK_HALF: Final = 0.5  # of a step: who comes back by so much to where it usually is, as well
@@ -45,7 +49,7 @@ class Jump:
     back: float | None = None
 
 
-def find_jumps(times: Array, values: Array, score: float, usual: Array | None = None) -> list[Jump]:
+def find_jumps(frame: Frame, name: str, score: float) -> list[Jump]:
     """Steps whose modified z-score (see `features.find_spikes`) is above the score.
 
     Compared is with the steps that are not zero and do not come back at once, of which there have
@@ -56,63 +60,116 @@ def find_jumps(times: Array, values: Array, score: float, usual: Array | None = 
     over the end of its scale (pi, 180 degrees, 360 degrees) is as large as what is left of a whole
     turn. The steps of a swing are no jumps.
 
+    What is usual is that of 16 chunks at most, at equal shares of all changes. Opened besides are
+    the chunks alone that have a step that is large enough, by their statistics.
+
     Args:
-        times: Of the values.
-        values: In order.
+        frame: The rows.
+        name: Of the signal.
         score: How much larger than usual a step has to be.
-        usual: Values one after the other whose steps and level to compare with; None for the same.
     """
-    steps = np.abs(np.diff(values))
-    backs = _come_back(times, values, steps)
-    sizes = steps[_stay(backs, len(steps))] if usual is None else np.abs(np.diff(usual))
-    sizes = sizes[sizes > 0]
+    zones = frame.zones(name)
+    changes, largest = _steps_of(zones)
+    parts = _sample(frame, name, zones, changes)
+    interval_s = _interval_s([times for times, _ in parts])
+    sizes = np.concatenate([np.zeros(0), *(_staying(*part, interval_s) for part in parts)])
     if len(sizes) < LEAST_STEPS:
-        away = [_excursion(times, values, row, back) for row, back in backs.items()]
-        return _without_swings(away, times, values)
+        away = [
+            jump
+            for span in zones.spans(changes > 0)
+            for jump in _excursions(*_with_margin(frame, name, span), interval_s)
+        ]
+        jumps = list({jump.sim_time_s: jump for jump in away}.values())
+        return _without_swings(jumps, frame, name)
     limit = _limit(sizes, score)
-    wide = np.flatnonzero(steps > limit)
-    far = _step(values[wide], values[wide + 1]) > limit * _intervals(times, wide)
-    alone = far & ~_in_motion(values, wide)
-    jumps = [_jump(times, values, row) for row in wide[alone].tolist()]
-    jumps = _without_swings(jumps, times, values)
+    jumps = [
+        jump
+        for span in zones.spans(largest > limit)
+        for jump in _wide(*_with_margin(frame, name, span), limit, interval_s)
+    ]
+    jumps = _without_swings(jumps, frame, name)
     if len(jumps) < 2:
         return jumps
-    return list(_with_return(jumps, float(np.median(values if usual is None else usual))))
+    levels = [values for _, values in _sample(frame, name, zones, zones.value_count)]
+    return list(_with_return(jumps, float(np.median(np.concatenate(levels)))))
 
 
-def least_jump(usual: Array, score: float) -> float:
-    """How large a step has to be at least to be a jump among such values; 0 where they rest."""
-    sizes = np.abs(np.diff(usual))
-    return _limit(sizes[sizes > 0], score)
+def _sample(frame: Frame, name: str, zones: Zones, weights: Indexes) -> list[tuple[Array, Array]]:
+    """Times and values of some of the chunks."""
+    return [frame.rows(*span).usable(name) for span in zones.spans(_sampled(weights))]
+
+
+def _interval_s(parts: Sequence[Array]) -> float:
+    """The usual one between the times of several stretches."""
+    intervals: Array = np.concatenate([np.zeros(0), *map(np.diff, parts)])
+    moving = intervals[intervals > 0]
+    return median(moving) if len(moving) else math.inf
+
+
+def _steps_of(zones: Zones) -> tuple[Indexes, Array]:
+    """How often a signal changes in each chunk, and its largest step, with those into the chunk."""
+    changes: Indexes = np.array(zones.change_count)
+    largest = np.nan_to_num(zones.largest_step)
+    there = np.flatnonzero(~np.isnan(zones.first))
+    into = np.abs(zones.first[there[1:]] - zones.last[there[:-1]])
+    changes[there[1:]] += into > 0
+    largest[there[1:]] = np.maximum(largest[there[1:]], into)
+    return changes, largest
+
+
+def _sampled(weights: Array | Indexes) -> Flags:
+    """Some of the chunks, at equal shares of all weights; all that have one, if these are few."""
+    sampled = weights > 0
+    if np.count_nonzero(sampled) > SAMPLED_CHUNKS:
+        reached = np.cumsum(weights)
+        shares = (np.arange(SAMPLED_CHUNKS) + 0.5) / SAMPLED_CHUNKS * reached[-1]
+        sampled = np.zeros(len(weights), np.bool_)
+        sampled[np.searchsorted(reached, shares)] = True
+    return sampled
+
+
+def _with_margin(frame: Frame, name: str, span: tuple[int, int]) -> tuple[Array, Array]:
+    """Times and values of some rows, and of a few before and after them."""
+    start, stop = span
+    return frame.rows(start - MARGIN_ROWS, stop + MARGIN_ROWS).usable(name)
+
+
+def _wide(times: Array, values: Array, limit: float, interval_s: float) -> Iterator[Jump]:
+    """The steps above a limit that are no part of a motion."""
+    wide = np.flatnonzero(np.abs(np.diff(values)) > limit)
+    far = _step(values[wide], values[wide + 1]) > limit * _intervals(times, wide, interval_s)
+    for row in wide[far & ~_in_motion(values, wide)].tolist():
+        yield Jump(float(times[row + 1]), float(values[row]), float(values[row + 1]))
 
 
 def _limit(sizes: Array, score: float) -> float:
-    """The modified z-score as a size; 0 of too few sizes."""
-    if len(sizes) < LEAST_STEPS:
-        return 0.0
-    median = float(np.partition(sizes, len(sizes) // 2)[len(sizes) // 2])
-    return median + score * median / 0.6745
+    """The modified z-score as a size."""
+    middle = float(np.partition(sizes, len(sizes) // 2)[len(sizes) // 2])
+    return middle + score * middle / 0.6745
 
 
-def are_usual(jumps: Sequence[Jump], rows: int) -> bool:
-    """Whether there are so many of them that they are how the signal is."""
-    return len(jumps) > max(3, MOST_JUMPS_SHARE * rows)
+def _staying(times: Array, values: Array, interval_s: float) -> Array:
+    """The sizes of the steps that are not zero and are no part of an excursion."""
+    steps = np.abs(np.diff(values))
+    stays = steps > 0
+    for left, back in zip(*_come_back(times, values, steps, interval_s), strict=True):
+        stays[left:back] = False
+    return steps[stays]
 
 
-def _jump(times: Array, values: Array, row: int) -> Jump:
-    """The one after that row."""
-    return Jump(float(times[row + 1]), float(values[row]), float(values[row + 1]))
+def _excursions(times: Array, values: Array, interval_s: float) -> Iterator[Jump]:
+    """The values that left one that had rested and came back soon."""
+    lefts, backs = _come_back(times, values, np.abs(np.diff(values)), interval_s)
+    for row, back in zip(lefts.tolist(), backs.tolist(), strict=True):
+        away = values[row + 1 : back]
+        farthest = float(away[np.abs(away - values[row]).argmax()])
+        ends = float(times[back]), float(values[back])
+        yield Jump(float(times[row + 1]), float(values[row]), farthest, *ends)
 
 
-def _excursion(times: Array, values: Array, row: int, back: int) -> Jump:
-    """The one after that row, from which it was back in a later one."""
-    away = values[row + 1 : back]
-    farthest = float(away[np.abs(away - values[row]).argmax()])
-    ends = float(times[back]), float(values[back])
-    return Jump(float(times[row + 1]), float(values[row]), farthest, *ends)
-
-
-def _come_back(times: Array, values: Array, steps: Array) -> dict[int, int]:
+def _come_back(
+    times: Array, values: Array, steps: Array, interval_s: float
+) -> tuple[Indexes, Indexes]:
     """Rows after which a value that had rested left, and rows in which it was back soon after.
 
     What was recorded on the other side of a gap is not soon after.
@@ -120,22 +177,20 @@ def _come_back(times: Array, values: Array, steps: Array) -> dict[int, int]:
     # At the turn of a swing two rows may meet the same value; three are a rest.
     left = np.flatnonzero((steps[2:] > 0) & (steps[1:-1] == 0) & (steps[:-2] == 0)) + 2
     left = left[_step(values[left], values[left + 1]) > 0]
-    backs: dict[int, int] = {}
+    backs = np.zeros(len(left), np.intp)
     for later in range(LONGEST_EXCURSION + 1, 1, -1):
-        within = left[left + later < len(values)]
-        back = within[values[within + later] == values[within]]
-        backs.update(zip(back.tolist(), (back + later).tolist(), strict=True))
-    gaps = gap_borders(times, usual_interval_s(times) or math.inf)
-    passed: list[int] = np.searchsorted(gaps, np.arange(len(times)), "right").tolist()
-    return {row: backs[row] for row in sorted(backs) if passed[backs[row]] == passed[row]}
+        after = np.minimum(left + later, len(values) - 1)
+        is_back = (values[after] == values[left]) & (after == left + later)
+        backs[is_back] = after[is_back]
+    gaps = gap_borders(times, interval_s)
+    is_soon = np.searchsorted(gaps, left, "right") == np.searchsorted(gaps, backs, "right")
+    is_soon &= backs > 0
+    return left[is_soon], backs[is_soon]
 
 
-def _stay(backs: dict[int, int], steps: int) -> Flags:
-    """Which steps are no part of an excursion."""
-    stays = np.ones(steps, np.bool_)
-    for left, back in backs.items():
-        stays[left:back] = False
-    return stays
+def are_usual(jumps: Sequence[Jump], rows: int) -> bool:
+    """Whether there are so many of them that they are how the signal is."""
+    return len(jumps) > max(3, MOST_JUMPS_SHARE * rows)
 
 
 def _in_motion(values: Array, rows: Indexes) -> Flags:
@@ -146,21 +201,30 @@ def _in_motion(values: Array, rows: Indexes) -> Flags:
     return neighbours >= MOTION_SHARE * np.abs(here)
 
 
-def _without_swings(jumps: Sequence[Jump], times: Array, values: Array) -> list[Jump]:
+def _without_swings(jumps: Sequence[Jump], frame: Frame, name: str) -> list[Jump]:
     """Those that are no steps of a swing: fast for its rows, or switched from side to side."""
-    if not jumps:
-        return []
-    ends_s = jumps[0].sim_time_s - BESIDE_SWINGS_S, jumps[-1].sim_time_s + BESIDE_SWINGS_S
-    part = slice(*np.searchsorted(times, ends_s))
-    if not any(_has_its_like(jump, values[part]) for jump in jumps):
-        return list(jumps)
-    interval_s = usual_interval_s(times[part]) or 0.0
+    left: list[Jump] = []
+    for near in _near_each_other(jumps):
+        ends_s = near[0].sim_time_s - BESIDE_SWINGS_S, near[-1].sim_time_s + BESIDE_SWINGS_S
+        left += _none_of_swings(near, *frame.between(*ends_s).usable(name))
+    return left
+
+
+def _near_each_other(jumps: Sequence[Jump]) -> Iterator[Sequence[Jump]]:
+    """Groups of them, so far apart that no swing reaches from one to the next."""
+    times_s = np.array([jump.sim_time_s for jump in jumps])
+    ends = np.flatnonzero(np.diff(times_s) > 2 * BESIDE_SWINGS_S) + 1
+    for start, stop in pairwise([0, *ends.tolist(), len(jumps)] if jumps else ()):
+        yield jumps[start:stop]
+
+
+def _none_of_swings(jumps: Sequence[Jump], times: Array, values: Array) -> Sequence[Jump]:
+    if not any(_has_its_like(jump, values) for jump in jumps):
+        return jumps
+    interval_s = usual_interval_s(times) or 0.0
     left = list(jumps)
     for swing in find_swings(
-        times[part],
-        values[part],
-        least_half_swings=LEAST_HALF_SWINGS,
-        longest_period_s=SWING_PERIOD_S,
+        times, values, least_half_swings=LEAST_HALF_SWINGS, longest_period_s=SWING_PERIOD_S
     ):
         own = [jump for jump in left if _may_be_of(swing, jump)]
         if len(own) < SWITCHED_SHARE * swing.half_swings:
@@ -184,10 +248,9 @@ def _may_be_of(swing: Swing, jump: Jump) -> bool:
     return inside and abs(jump.after - jump.before) < SWING_HEIGHTS * swing.amplitude
 
 
-def _intervals(times: Array, rows: Indexes) -> Array:
+def _intervals(times: Array, rows: Indexes, interval_s: float) -> Array:
     """How many usual intervals, at least one, lie between each of those rows and the next."""
-    usual_s = usual_interval_s(times) if len(rows) else None
-    return np.maximum(1.0, (times[rows + 1] - times[rows]) / (usual_s or math.inf))
+    return np.maximum(1.0, (times[rows + 1] - times[rows]) / interval_s)
 
 
 def _step(before: Array, after: Array) -> Array:
@@ -235,20 +298,49 @@ def _is_excursion(jump: Jump, following: Jump, usual: float) -> bool:
 
 
 def find_leaps(
-    times: Array, x: Array, y: Array, at_least_m: float, rows: int | None = None
+    frame: Frame, x: str, y: str, metres: tuple[float, float], at_least_m: float
 ) -> list[tuple[float, float]]:
     """Times and lengths of steps of a position that no driving explains.
 
     Longer than `at_least_m`, and than five times the 99th percentile of all steps; after a gap, by
     as many times as it is longer than the usual interval.
+
+    Args:
+        frame: The rows.
+        x: The name of one direction.
+        y: That of the other.
+        metres: What one of the unit of each is in metres.
+        at_least_m: Shorter ones are none.
     """
-    if len(times) < 2:
+    zones = frame.zones(x), frame.zones(y)
+    along_x, along_y = (_steps_of(each)[1] * unit for each, unit in zip(zones, metres, strict=True))
+    has_gaps = (zones[0].value_count + zones[1].value_count) < 2 * zones[0].row_count
+    # After a row that lacks one of them, the step is that of several rows.
+    has_gaps |= np.append(False, has_gaps[:-1])
+    long = zones[0].spans((np.hypot(along_x, along_y) > at_least_m) | has_gaps)
+    if not long:
         return []
-    steps = np.hypot(np.diff(x), np.diff(y))
-    count = len(steps) if rows is None else max(rows - 1, len(steps))
-    place = len(steps) - count + min(count - 1, int(0.99 * count))
-    usual_m = float(np.partition(steps, place)[place]) if place >= 0 else 0.0
-    limit_m = max(at_least_m, POSITION_STEPS * usual_m if count > 100 else 0.0)
-    long = np.flatnonzero(steps > limit_m)
-    long = long[steps[long] > limit_m * _intervals(times, long)]
-    return list(zip(times[long + 1].tolist(), steps[long].tolist(), strict=True))
+    sample = [
+        _way(frame.rows(*span), x, y, metres)
+        for span in zones[0].spans(_sampled(zones[0].value_count))
+    ]
+    interval_s = _interval_s([times for times, _ in sample])
+    steps = np.concatenate([np.zeros(0), *(steps for _, steps in sample)])
+    place = min(len(steps) - 1, int(0.99 * len(steps)))
+    usual_m = float(np.partition(steps, place)[place]) if len(steps) > 100 else 0.0
+    limit_m = max(at_least_m, POSITION_STEPS * usual_m)
+    leaps: dict[float, float] = {}
+    for start, stop in long:
+        times, steps = _way(frame.rows(start - MARGIN_ROWS, stop), x, y, metres)
+        rows = np.flatnonzero(steps > limit_m)
+        far = rows[steps[rows] > limit_m * _intervals(times, rows, interval_s)]
+        leaps |= zip(times[far + 1].tolist(), steps[far].tolist(), strict=True)
+    return sorted(leaps.items())
+
+
+def _way(frame: Frame, x: str, y: str, metres: tuple[float, float]) -> tuple[Array, Array]:
+    """Times of the rows that have a position, and the steps between them in metres."""
+    along_x, along_y = frame.numbers(x) * metres[0], frame.numbers(y) * metres[1]
+    there = np.isfinite(along_x) & np.isfinite(along_y)
+    steps = np.hypot(np.diff(along_x[there]), np.diff(along_y[there]))
+    return frame.times[there], steps

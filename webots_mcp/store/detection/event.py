@@ -63,10 +63,6 @@ class Threshold:
         if (self.above is None) == (self.below is None):
             raise InvalidInputError(f"threshold on {self.signal!r}: give either above or below")
 
-    def holds(self, value: float) -> bool:
-        """Whether the value is beyond the threshold."""
-        return value > self.above if self.above is not None else value < (self.below or 0.0)
-
 
 def both_of(names: Sequence[str] | None) -> tuple[str, str] | None:
     """The signals of x and y that were named, if any.

@@ -9,13 +9,10 @@ import functools
 import math
 import sqlite3
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import groupby, pairwise
+from dataclasses import replace
+from itertools import pairwise
 from typing import Final, Protocol
 
-from webots_mcp.store.analysis.arrays import Array, Flags, np
-from webots_mcp.store.analysis.jumps import least_jump
-from webots_mcp.store.analysis.rhythm import usual_interval_s
 from webots_mcp.store.analysis.summary import Summary, summarise_numbers
 from webots_mcp.store.analysis.swings import SLOW_HALF_SWINGS, Swing
 from webots_mcp.store.reading.coverage import less_time
@@ -39,7 +36,6 @@ from webots_mcp.store.reading.rows import (
     read_numbers,
 )
 from webots_mcp.store.reading.sampling import MOST_SAMPLES, newest_part, read_sampled
-from webots_mcp.store.reading.steps import BucketSteps, read_steps
 from webots_mcp.store.rollup.buckets import BUCKET_S, FINE, bucket_of, totals
 from webots_mcp.store.rollup.swings import (
     ACROSS_S,
@@ -51,8 +47,6 @@ from webots_mcp.store.rollup.tables import watermark
 from webots_mcp.store.signals.registry import Signal
 
 READING_SHARE: Final = 0.5  # of the time: what is read has to be searched as well
-JUMP_ROWS: Final = 40_000  # of each signal of a long segment that are read, about as of a short one
-BACK_INTERVALS: Final = 8  # before and after a jump: an excursion of five rows, and what rested
 SAMPLES_PER_STAY: Final = 5
 SAMPLE_ROWS: Final = 3000  # newest rows that tell the usual interval and the usual steps
 MOST_KEPT: Final = 10_000_000  # numbers of 8 bytes, of stretches that are asked for again
@@ -77,19 +71,6 @@ _RESTING: Final = (
     "AND EXISTS (SELECT 1 FROM all_rollup WHERE run_id = r.id AND signal_id = s.id "
     "AND bucket >= ? AND bucket < ? AND min = max AND present = rows)"
 )
-
-
-@dataclass(frozen=True)
-class Course:
-    """Numbers of a signal in which jumps are looked for.
-
-    Attributes:
-        usual: Numbers one after the other to compare with; None for the same.
-    """
-
-    times: Array
-    numbers: Array
-    usual: Array | None = None
 
 
 class View(Protocol):
@@ -126,12 +107,6 @@ class View(Protocol):
 
     def spans(self, signal: Signal, condition: Condition) -> list[Span]:
         """Where the condition holds in every row; across a recording gap it is taken to go on."""
-        ...
-
-    def courses(
-        self, signals: Sequence[Signal], score: float
-    ) -> Iterator[tuple[Signal, Iterator[Course]]]:
-        """Where a jump of each signal may be."""
         ...
 
     def stored_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
@@ -230,13 +205,6 @@ class RowView:
         """From all rows."""
         values = self._columns.values[signal.name]
         return list(spans_in_rows(self._columns.times, values, condition))
-
-    def courses(
-        self, signals: Sequence[Signal], score: float
-    ) -> Iterator[tuple[Signal, Iterator[Course]]]:
-        """All of each."""
-        for signal in signals:
-            yield signal, iter([Course(*self._columns.numbers(signal.name))])
 
     def stored_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
         """None: all rows are there to look in."""
@@ -382,69 +350,6 @@ class LongView:
                 self._read[part] = kept
         return kept
 
-    def courses(
-        self, signals: Sequence[Signal], score: float
-    ) -> Iterator[tuple[Signal, Iterator[Course]]]:
-        """The buckets with a step that may be a jump, each with the rows before and after it."""
-        self._note_late()
-        self._note_purged()
-        suspects = [
-            [] if self._deadline.passed else list(self._suspects(signal, score))
-            for signal in signals
-        ]
-        alike: dict[range, list[Signal]] = {}  # what is asked of several signals is read at once
-        for signal, found in zip(signals, suspects, strict=True):
-            for _, stretches in found:
-                for buckets in stretches:
-                    alike.setdefault(buckets, []).append(signal)
-        for signal, found in zip(signals, suspects, strict=True):
-            yield signal, self._courses_in(signal, found, alike, score)
-
-    def _suspects(self, signal: Signal, score: float) -> Iterator[tuple[Array, list[range]]]:
-        """What the steps of a signal are compared with, and the buckets that may hold a jump."""
-        times, usual = self._sample.numbers(signal.name)
-        limit, span = least_jump(usual, score), range(*self._span[1:])
-        steps = read_steps(self._connection, self._span[0], signal.id or 0, span, limit)
-        if limit:
-            yield usual, self._largest(signal, steps, steps.largest > limit)
-            return
-        # It rests in the sample: what leaves and comes back at once is looked for everywhere.
-        interval_s = usual_interval_s(times) or math.inf
-        yield usual, self._largest(signal, steps, steps.excursions(interval_s))
-        seldom = steps.usual() if steps.seldom else usual
-        if limit := least_jump(seldom, score):
-            yield seldom, self._largest(signal, steps, steps.largest > limit)
-
-    def _largest(self, signal: Signal, steps: BucketSteps, wide: Flags) -> list[range]:
-        """Some of the buckets; where they are too many those with the largest steps."""
-        places = np.flatnonzero(wide)
-        largest = places[np.argsort(-steps.largest[places], kind="stable")]
-        rows = np.cumsum(steps.rows[largest])
-        taken = largest[: max(1, int(np.searchsorted(rows, JUMP_ROWS, "right")))]
-        if len(taken) < len(places):
-            self.notes.append(
-                f"of {signal.name} only in {len(taken)} of {len(places)} stretches of 10 s, those "
-                f"with the largest steps: {less_time(self._connection, self._segment)}"
-            )
-        return list(_runs_of(sorted(steps.buckets[taken].tolist())))
-
-    def _courses_in(
-        self,
-        signal: Signal,
-        suspects: Sequence[tuple[Array, list[range]]],
-        alike: dict[range, list[Signal]],
-        score: float,
-    ) -> Iterator[Course]:
-        for usual, stretches in suspects:
-            limit = least_jump(usual, score)
-            for buckets in stretches:
-                if self._deadline.passed:
-                    self._cut()
-                    return
-                times, numbers = self._numbers(buckets, alike[buckets]).of(signal.name)
-                livelier = least_jump(numbers, score) > limit
-                yield Course(times, numbers, None if livelier else usual)
-
     def stored_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
         """Those of the coarse rollups that lie inside."""
         return stored_swings(self._connection, self._segment, self.inside, signals)
@@ -568,15 +473,6 @@ class LongView:
         return max((each.rows for each in self._totals.values()), default=0)
 
     @functools.cached_property
-    def _sample(self) -> Columns:
-        return self.sample(self._signals)
-
-    @functools.cached_property
-    def _interval_s(self) -> float | None:
-        """The usual one between the newest rows."""
-        return usual_interval_s(self._sample.moments)
-
-    @functools.cached_property
     def _resting(self) -> list[Signal]:
         """Those that have the same value throughout a bucket."""
         resting = {signal_id for (signal_id,) in self._connection.execute(_RESTING, self._span)}
@@ -609,13 +505,6 @@ class LongView:
     def _cut(self) -> None:
         self.notes.append("time limit reached before all was searched: ask for less time or kinds")
 
-    def _numbers(self, buckets: range, signals: Sequence[Signal]) -> Numbers:
-        """The rows of some buckets, and a few before and after them."""
-        before_s = BACK_INTERVALS * (self._interval_s or 0.0)
-        start_s = max(self._segment.start_s, buckets.start * BUCKET_S - before_s)
-        end_s = min(self._segment.end_s, buckets.stop * BUCKET_S + before_s)
-        return self._read_once(replace(self._segment, start_s=start_s, end_s=end_s), signals)
-
 
 def _around(segment: Segment, buckets: range) -> list[Segment]:
     """What of a segment is not in some buckets inside of it, the newest first."""
@@ -638,10 +527,3 @@ def _above(
         if step > limit and bucket not in outside
     ]
     return range(min(large), max(large) + 1) if large else _NOTHING
-
-
-def _runs_of(buckets: Sequence[int]) -> Iterator[range]:
-    """Those that follow each other as one."""
-    for _, group in groupby(enumerate(buckets), lambda each: each[1] - each[0]):
-        numbers = [bucket for _, bucket in group]
-        yield range(numbers[0], numbers[-1] + 1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ast
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import starmap
 from typing import Any, Final, NamedTuple, TypeAlias, cast
@@ -19,9 +19,10 @@ from webots_mcp.conditions.scoring import Aggregate
 from webots_mcp.conditions.signal_values import PLACES_KEPT, SAME_TIME_S
 from webots_mcp.conditions.syntax import FLAGS, Nodes, Scanned, function_of, is_signal
 from webots_mcp.errors import ConditionFailedError
-from webots_mcp.naming import FARTHEST_M, Value, metres_in
+from webots_mcp.naming import FARTHEST_M, Value, find_position, metres_in
 from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
 from webots_mcp.store.reading.frame import Frame
+from webots_mcp.store.signals.registry import Signal
 
 _FOLDING: Final = {"min": "minimum", "max": "maximum"}
 _MIRRORED: Final[dict[type[ast.cmpop], type[ast.cmpop]]] = {
@@ -312,6 +313,17 @@ def first_failure(failures: Failures) -> Failed | None:
     first = min(found, key=lambda failure: int(failure.rows.argmax()))
     row = int(first.rows.argmax())
     return Failed(row, f"{first.place}: {first.why(row)}")
+
+
+def position_in(frame: Frame, known: Mapping[str, Signal]) -> tuple[str, str] | None:
+    """The names of x and y of a robot, as far as they have values in a frame; None without any."""
+    numbers = [name for name, signal in known.items() if signal.is_number]
+    while (found := find_position(numbers)) is not None:
+        lacking = [name for name in found if not frame.zones(name).value_count.any()]
+        if not lacking:
+            return found
+        numbers = [name for name in numbers if name not in lacking]
+    return None
 
 
 def aggregated(

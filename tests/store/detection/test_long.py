@@ -8,10 +8,7 @@ from itertools import count
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from tests.memory import memory_connection
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.extent import Detection
@@ -56,73 +53,6 @@ def test_swings_and_leaps_are_searched_in_the_whole_of_a_long_run(long: sqlite3.
     (leap,) = (each for each in found.events if each.kind == "jump")
     assert leap.start_s == pytest.approx(LEAP_S)
     assert "not before" not in str(found.verdicts.not_searched)
-
-
-def test_stretches_that_are_read_for_leaps_are_not_read_again_for_swings(
-    long: sqlite3.Connection,
-) -> None:
-    long.execute("UPDATE rollup SET largest_step = NULL")  # else only parts of them are read
-    assert 0 < reads(long, "jump", "oscillation") < reads(long, "jump") + reads(long, "oscillation")
-
-
-def test_leaps_are_looked_for_only_where_the_rollups_do_not_rule_them_out(
-    long: sqlite3.Connection,
-) -> None:
-    found, few = leaps(long), reads(long, "jump")
-    long.execute("UPDATE rollup SET largest_step = NULL")  # as older versions left them
-    assert leaps(long) == found
-    assert reads(long, "jump") > few
-
-
-def leaps(connection: sqlite3.Connection) -> list[tuple[float, Any]]:
-    asked = EventOptions(kinds=("jump",), signals=("pose.*",))
-    found = find_events(connection, find_range(connection, Scope()), asked, limit=1000, group=False)
-    return [(each.start_s, each.details["distance_m"]) for each in found.events]
-
-
-course = st.lists(
-    st.tuples(
-        st.sampled_from([0.0, 0.1, 0.1, 0.1, 25.0]),
-        st.sampled_from([0.0, 0.02, 0.02, 0.2, 0.25, 5.0]) | st.none(),
-        st.sampled_from([0.0, 0.0, 0.22, -5.0]) | st.none(),
-    ),
-    min_size=30,
-    max_size=120,
-)
-
-
-@settings(max_examples=30, deadline=None)
-@given(course, st.integers(10, 60))
-def test_ruling_leaps_out_changes_none_that_are_found(
-    steps: list[tuple[float, float | None, float | None]], budget: int
-) -> None:
-    with memory_connection() as connection, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rows, "RAW_ROWS", 20)
-        patch.setattr(views, "STRETCH_ROWS", 15)
-        recorder = start_run(connection)
-        time_s, place = 0.0, [0.0, 0.0]
-        for index, (later_s, *moves) in enumerate(steps):
-            time_s += later_s
-            place = [at + (move or 0.0) for at, move in zip(place, moves, strict=True)]
-            told = [None if move is None else at for at, move in zip(place, moves, strict=True)]
-            recorder.publish(time_s, {"pose": told if index else place})
-        while not roll(connection, budget).done:
-            pass
-        found = leaps(connection)
-        connection.execute("UPDATE rollup SET largest_step = NULL")
-        connection.execute("UPDATE recent_rollup SET largest_step = NULL")
-        assert leaps(connection) == found
-
-
-def reads(connection: sqlite3.Connection, *kinds: str) -> int:
-    """How many statements read values of rows."""
-    statements: list[str] = []
-    connection.set_trace_callback(statements.append)
-    find_events(connection, find_range(connection, Scope()), EventOptions(kinds=kinds))
-    connection.set_trace_callback(None)
-    return sum(
-        "json_extract(data" in each and "ORDER BY sim_time_s, row_id" in each for each in statements
-    )
 
 
 def test_what_there_was_no_time_for_is_told_by_time(long: sqlite3.Connection) -> None:
@@ -239,19 +169,3 @@ def test_standstills_of_a_long_run_that_are_told_begin_and_end_to_the_row(
     assert all("within_s" not in each.details for each in found.events)
     rough = find_events(stopping, asked, options, group=False, exact=False)
     assert [each.details["within_s"] for each in rough.events] == [0.6] * 10
-
-
-def test_no_rows_are_read_for_the_ends_of_rests_that_the_rollups_tell(
-    stopping: sqlite3.Connection,
-) -> None:
-    def flat() -> list[tuple[float, float]]:
-        asked = EventOptions(kinds=("flat",), signals=("ticks",))
-        found = find_events(stopping, find_range(stopping, Scope()), asked, group=False)
-        return [(each.start_s, each.end_s) for each in found.events]
-
-    told, few = flat(), reads(stopping, "flat")
-    assert few < len(told)  # what shows at other times is read once for all
-    stopping.execute("UPDATE rollup SET last_since_sim_time_s = NULL")  # as older versions left it
-    assert flat() == told
-    assert len(told) == 10
-    assert reads(stopping, "flat") > few

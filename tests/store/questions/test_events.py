@@ -20,6 +20,7 @@ from webots_mcp.store.detection.registry import asked_kinds
 from webots_mcp.store.detection.verdict import Ledger
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.signals.catalogue import known_signals
@@ -276,7 +277,7 @@ def test_options_without_sense_are_refused(rover: sqlite3.Connection) -> None:
 @pytest.mark.parametrize("seed", range(10))
 def test_noise_neither_jumps_nor_swings(seed: int) -> None:
     noise = np.random.default_rng(seed).normal(size=2000)
-    assert find_jumps(np.arange(2000.0), noise, 12.0) == []
+    assert find_jumps(Frame.of(np.arange(2000.0), {"x": noise}), "x", 12.0) == []
 
 
 def test_a_wall_range_over_several_runs_knows_the_signals_of_each(

@@ -232,4 +232,5 @@ FLAT: Final = EventKind(
     of_numbers=True,
     drawn=7,
     alike=Alike(_alike, of_arrays=True),
+    of_frame=True,
 )

@@ -89,4 +89,5 @@ JUMP: Final = EventKind(
     drawn=1,
     alike=Alike(_alike, sort=_is_back),
     effort=2,
+    of_frame=True,
 )

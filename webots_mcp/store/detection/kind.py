@@ -99,6 +99,7 @@ class EventKind:
         reads_through: Signals of which it reads all rows, also of a long segment.
         effort: Its rank by what it costs to look for: the least is searched first. Kinds of one
             rank find things together, and share their part of the time.
+        of_frame: It reads the frame of a search alone.
     """
 
     name: str
@@ -117,3 +118,4 @@ class EventKind:
     alike: Alike | None = None
     reads_through: Callable[[Search], Sequence[Signal]] = _nothing
     effort: int = 0
+    of_frame: bool = False

@@ -9,6 +9,7 @@ from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.naming import flatten, listed
+from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.analysis.summary import LARGEST
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import EventKind, NotSearchableError
@@ -176,8 +177,32 @@ class Search:
 
     @cached_property
     def frame(self) -> Frame:
-        """The rows of the segment."""
-        return read_frame(self.connection, self.segment, self.deadline)
+        """The rows of the segment.
+
+        Raises:
+            NotSearchableError: They were purged.
+        """
+        frame = read_frame(self.connection, self.segment, self.deadline)
+        self.require_read(frame)
+        return frame
+
+    def require_read(self, frame: Frame) -> None:
+        """See that something is left of what was recorded.
+
+        Raises:
+            NotSearchableError: It was purged.
+        """
+        if not len(frame):
+            self.require_rows()
+
+    def unread(self) -> list[str]:
+        """What of the segment is not in its frame."""
+        run_id, start_s = self.segment.run_id, self.segment.start_s
+        notes = [str(each) for each in self.frame.unread]
+        until_s = purged_until_s(self.connection, run_id, start_s)
+        if until_s is not None and len(self.frame) and self.frame.times[0] >= until_s:
+            notes.append(f"not before {until_s:.3f} s, whose rows were purged")
+        return notes
 
     @cached_property
     def whole(self) -> Frame:
@@ -190,12 +215,9 @@ class Search:
     @cached_property
     def view(self) -> View:
         """The values of all signals that the kinds look at; read at the first use."""
-        limits = [
-            signal
-            for threshold in self.options.thresholds
-            for signal in resolve_signals(self.known, [threshold.signal])
-        ]
-        needed = {each.name: each for each in (*self.numbers, *self.motion.evidence, *limits)}
+        wanted = any(kind.of_numbers and not kind.of_frame for kind in self.kinds)
+        numbers = self.numbers if wanted else []
+        needed = {each.name: each for each in (*numbers, *self.motion.evidence)}
         through = [each for kind in self.kinds for each in kind.reads_through(self)]
         return view_of(self.connection, self.segment, list(needed.values()), self.deadline, through)
 
@@ -245,9 +267,14 @@ class Search:
 
     @cached_property
     def _too_large(self) -> list[str]:
-        """Those with such numbers in their newest rows."""
-        values = {each.name: self.view.sample([each]).aligned(each.name) for each in self.numbers}
-        return [name for name, found in values.items() if (abs(found) > LARGEST).any()]
+        """Those with such numbers."""
+        return [each.name for each in self.numbers if self._is_too_large(each.name)]
+
+    def _is_too_large(self, name: str) -> bool:
+        zones = self.frame.zones(name)
+        spans = zones.spans(zones.value_count < zones.held_count)
+        parts = (self.frame.rows(*span).numbers(name) for span in spans)
+        return any((np.abs(part) > LARGEST).any() for part in parts)
 
     def came_near(self, kind: str, share: float, what: str) -> None:
         """Note what came near to an event, as a share of what would be one."""

@@ -199,10 +199,40 @@ class Frame:
             ("coded", name, self._start, self._stop), lambda: self._coded(name), 8 * len(self)
         )
 
+    def texts(self, name: str) -> Coded:
+        """As `coded`, of texts alone: numbers and flags have the code of None."""
+        return self._source.kept(
+            ("texts", name, self._start, self._stop),
+            lambda: self._coded(name, numbers=False),
+            8 * len(self),
+        )
+
+    def held(self, name: str) -> Flags:
+        """In which rows the state has the signal, be it null."""
+        start, stop = self._bounds()
+        whole = np.zeros(stop - start, np.bool_)
+        for part, values, inside in self._parts(name):
+            if values is not None:
+                codes = np.zeros(1) if values.codes is None else values.codes[inside]
+                first, rows = max(0, part.start - start), len(values.numbers[inside])
+                whole[first : first + rows] = codes != IS_ABSENT
+        return self._within(whole)
+
     def values(self, name: str) -> list[Value]:
         """The values as Python has them; slow, for a few rows. What was replaced is None."""
         codes, labels = self.coded(name)
         return [labels[code] for code in codes.tolist()]
+
+    def values_at(self, name: str, rows: Indexes) -> list[Value]:
+        """The values in some rows, in order, of which each chunk is opened once."""
+        zones = self.zones(name)
+        chunks = np.searchsorted(zones.first_row, rows, "right") - 1
+        found: list[Value] = []
+        for chunk in np.unique(chunks).tolist():
+            first = int(zones.first_row[chunk])
+            codes, labels = self.rows(first, first + int(zones.row_count[chunk])).coded(name)
+            found += [labels[code] for code in codes[rows[chunks == chunk] - first].tolist()]
+        return found
 
     def replaced(self, name: str) -> Counter[str]:
         """How often each value that JSON cannot hold (nan, inf, ...) stood there."""
@@ -218,6 +248,11 @@ class Frame:
 
     def zones(self, name: str) -> Zones:
         """What the chunks of a signal come to; those that the frame cuts come to what is in it."""
+        size = 8 * len(Zones.__annotations__) * len(self._source.parts)
+        key = ("zones", name, self._start, self._stop)
+        return self._source.kept(key, lambda: self._made_zones(name), size)
+
+    def _made_zones(self, name: str) -> Zones:
         if self._source.order is not None:
             return _zones(self._cut_zones(self._in_order(name)))
         stored = self._source.zones(
@@ -351,21 +386,26 @@ class Frame:
                 whole[first : first + len(numbers)] = numbers
         return self._within(whole)
 
-    def _coded(self, name: str) -> Coded:
+    def _coded(self, name: str, *, numbers: bool = True) -> Coded:
         start, stop = self._bounds()
         whole = np.full(stop - start, _OTHER, np.intp)
         known: dict[object, int] = {}
         labels: list[Value] = [None]
         for part, values, inside in self._parts(name):
             if values is not None:
-                codes = _relabelled(values, known, labels)[inside]
+                codes = _relabelled(values, known, labels, numbers=numbers)[inside]
                 first = max(0, part.start - start)
                 whole[first : first + len(codes)] = codes
         return Coded(self._within(whole), labels)
 
 
 def read_frame(
-    connection: sqlite3.Connection, segment: Segment, deadline: Deadline, *, full_rate: bool = True
+    connection: sqlite3.Connection,
+    segment: Segment,
+    deadline: Deadline,
+    *,
+    full_rate: bool = True,
+    every_call: bool = False,
 ) -> Frame:
     """Read a segment of a run; values are read when they are asked for.
 
@@ -374,6 +414,7 @@ def read_frame(
         segment: Which rows.
         deadline: Rows that are in no chunk yet are read until then; the frame says what is left.
         full_rate: Of a segment that is kept at full rate, each call of `publish` is a row.
+        every_call: Of any segment each call is a row that is in a kept stretch.
     """
     run_id, span = segment.run_id, (segment.start_s, segment.end_s)
     parts: list[Part] = []
@@ -388,6 +429,8 @@ def read_frame(
         for group in groups_in(connection, run_id, *span):
             start = parts[-1].start + parts[-1].rows if parts else 0
             parts.append(Part(start, group.row_count, group, None))
+        if every_call and cut_at_s is None:
+            cut_at_s = read_rows(connection, _KEPT, (run_id, *span, -1), columns, deadline)
     parts += _rows_in_parts(columns, parts[-1].start + parts[-1].rows if parts else 0)
     names = dict(connection.execute(_SIGNALS, (run_id,)).fetchall())
     source = FrameSource(connection, run_id, parts, names)
@@ -467,8 +510,10 @@ def _slice_of(source: FrameSource, name: str, start: int, stop: int) -> Decoded:
     return _cut(values, start - part.start, stop - part.start)
 
 
-def _relabelled(values: Decoded, known: dict[object, int], labels: list[Value]) -> Indexes:
-    """Codes that several chunks share; numbers get labels as well."""
+def _relabelled(
+    values: Decoded, known: dict[object, int], labels: list[Value], *, numbers: bool
+) -> Indexes:
+    """Codes that several chunks share; numbers get labels as well, where they are wanted."""
 
     def code_of(value: Value) -> int:
         key = (type(value), value)
@@ -478,14 +523,16 @@ def _relabelled(values: Decoded, known: dict[object, int], labels: list[Value]) 
         return known[key]
 
     codes = np.full(len(values.numbers), _OTHER, np.intp)
-    held = np.ones(len(codes), np.bool_) if values.codes is None else values.codes == IS_NUMBER
-    held &= ~np.isnan(values.numbers)
-    unique, places = np.unique(values.numbers[held], return_inverse=True)
-    numbers = [code_of(_number(each)) for each in unique.tolist()]
-    codes[held] = np.array(numbers, np.intp)[places] if numbers else _OTHER
+    if numbers:
+        held = np.ones(len(codes), np.bool_) if values.codes is None else values.codes == IS_NUMBER
+        held &= ~np.isnan(values.numbers)
+        unique, places = np.unique(values.numbers[held], return_inverse=True)
+        found = [code_of(_number(each)) for each in unique.tolist()]
+        codes[held] = np.array(found, np.intp)[places] if found else _OTHER
     if values.codes is not None:
         for code, label in enumerate(values.labels, _FIRST_LABEL):
-            if label is not None and not isinstance(label, Replaced):
+            wanted = numbers or isinstance(label, str)
+            if wanted and label is not None and not isinstance(label, Replaced):
                 codes[values.codes == code] = code_of(label)
     return codes
 

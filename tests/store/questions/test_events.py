@@ -13,9 +13,9 @@ import pytest
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from tests.store.questions.asking import ask, spans
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
-from webots_mcp.store.analysis.jumps import find_jumps
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold
 from webots_mcp.store.detection.extent import Detection
+from webots_mcp.store.detection.jump_search import find_jumps
 from webots_mcp.store.detection.registry import asked_kinds
 from webots_mcp.store.detection.verdict import Ledger
 from webots_mcp.store.questions.events import Events, find_events

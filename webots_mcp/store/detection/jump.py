@@ -6,13 +6,13 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 from webots_mcp.naming import metres_in
-from webots_mcp.store.analysis.jumps import (
+from webots_mcp.store.detection.event import Event
+from webots_mcp.store.detection.jump_search import (
     Jump,
     are_usual,
     find_jumps,
     find_leaps,
 )
-from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import Alike, EventKind
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.signals.registry import Signal

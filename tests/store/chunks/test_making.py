@@ -197,3 +197,29 @@ def test_a_row_that_no_bridge_wrote_costs_only_itself(
     make_chunks(empty, 100_000)
     assert sum(groups(empty)) == ROWS - 2
     assert "state 20: data holds no valid JSON" in capsys.readouterr().err
+
+
+def test_a_signal_is_what_all_rows_tell_though_its_name_was_entered_before(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = start_run(empty)
+    recorder.publish(0.0, {"pose": [None, None], "heading": 0.5, "mode": 3})
+    recorder.end_run("finished")
+    chunk_whole_run(empty, 1)
+    kinds = "SELECT name, kind, role FROM signal ORDER BY name"
+    assert empty.execute(kinds).fetchall() == [
+        ("heading", "angle", "yaw"),
+        ("mode", "num", "mode"),
+        ("pose.0", "null", "x"),
+        ("pose.1", "null", "y"),
+    ]
+    recorder.run(1, 1)
+    recorder.publish(0.0, {"pose": [1.5, 2], "heading": 90, "mode": 3.5})
+    recorder.end_run("finished")
+    chunk_whole_run(empty, 2)
+    assert empty.execute(kinds).fetchall() == [
+        ("heading", "num", None),
+        ("mode", "num", None),
+        ("pose.0", "num", "x"),
+        ("pose.1", "num", "y"),
+    ]

@@ -28,7 +28,7 @@ from webots_mcp.store.chunks.stored import (
 )
 from webots_mcp.store.invalid_rows import is_over_a_value, valid_rows
 from webots_mcp.store.rollup.batch import BatchColumn
-from webots_mcp.store.signals.registry import enter_signals, registered
+from webots_mcp.store.signals.registry import enter_signals, registered, tell_more
 from webots_mcp.transactions import LONGEST_WRITE_S, Step
 
 GROUP_ROWS: Final = 1024
@@ -277,12 +277,12 @@ def _read(connection: sqlite3.Connection, query: str, values: tuple[object, ...]
 def _signal_ids(
     connection: sqlite3.Connection, robot_id: int, run_id: int, columns: StateColumns
 ) -> dict[str, int]:
-    """The ids of the signals of some rows, by name; those that are new are entered."""
+    """The ids of the signals of some rows, by name; what the rows tell of them is entered."""
     known = registered(connection, robot_id)
     fresh = [
         BatchColumn(robot_id, run_id, name, columns.sample(name), columns.points(name))
-        for name in columns.values
-        if name not in known
+        for name, values in columns.values.items()
+        if tell_more(known.get(name), values)
     ]
     if fresh:
         for column in fresh:

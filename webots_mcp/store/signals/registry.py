@@ -24,6 +24,7 @@ from webots_mcp.signal_kinds import (
 from webots_mcp.signal_register import MOST_CHOICES, Seen, find_changes, write_changes
 from webots_mcp.signal_roles import decide_roles
 from webots_mcp.store.analysis.summary import Summary, summarise, usable_numbers
+from webots_mcp.store.chunks.codec import Absent, Replaced
 from webots_mcp.store.rollup.batch import BatchColumn
 from webots_mcp.store.signals.flatten import parse
 
@@ -31,6 +32,13 @@ _OF_ROBOT: Final = (
     "SELECT id, robot_id, name, kind, unit, path, reduce, role FROM signal "
     "WHERE robot_id = ? AND typeof(name) = 'text' AND typeof(path) = 'text' ORDER BY id"
 )
+
+_NO_VALUES: Final = frozenset((type(None), Absent, Replaced))
+_TYPES: Final[dict[Kind, frozenset[type]]] = {  # of values that leave a kind as it is
+    "null": _NO_VALUES,
+    "bool": _NO_VALUES | {bool},
+    "num": _NO_VALUES | {int, float, bool},
+}
 
 
 @dataclass(frozen=True)
@@ -168,6 +176,13 @@ def enter_signals(
     seen = {column.name: each for column in columns if (each := _seen(column))}
     write_changes(connection, robot_id, find_changes(connection, robot_id, seen))
     return registered(connection, robot_id)
+
+
+def tell_more(signal: Signal | None, values: Iterable[object]) -> bool:
+    """Whether values may widen what is known of their signal; of most a look at types shows it."""
+    if signal is None or signal.kind == "angle" or signal.is_choice:
+        return True
+    return signal.kind != "text" and not _TYPES[signal.kind].issuperset(map(type, values))
 
 
 def _seen(column: BatchColumn) -> Seen | None:

@@ -98,7 +98,7 @@ CREATE TABLE signal (
 	unit TEXT /* where the name tells it */, 
 	path TEXT NOT NULL /* for json_extract(state.data, path) */, 
 	reduce TEXT /* count, min, max, mean or argmin of the long array at path */, 
-	role TEXT /* x, y, z, yaw, mode, speed, commanded_speed or wheel; x2 where a run has no x */, 
+	role TEXT /* x, y, z, yaw, mode, speed, commanded_speed, wheel or commanded_wheel; x2 without an x */, 
 	first_seen_wall_time_s FLOAT NOT NULL, 
 	last_seen_wall_time_s FLOAT NOT NULL, 
 	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held it, up to the watermark */, 
@@ -185,7 +185,6 @@ CREATE TABLE coarse_rollup (
 	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
 	bucket INTEGER NOT NULL /* floor(sim_time_s / 500) */, 
 	swings TEXT /* JSON: the swings of what a robot swings with, each as [begin, end, half swings, period in s, amplitude, explained share]; null where they were not looked for */, 
-	standstills TEXT /* JSON, at the signal of x: where the robot stood still, and what shows whether it should have moved; null where that was not looked for */, 
 	PRIMARY KEY (run_id, signal_id, bucket), 
 	CONSTRAINT fk_coarse_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 )

@@ -8,6 +8,7 @@ The outcome stands in `signal.role`, where tools, views and pools read it:
     commanded_speed   how fast it shall be
     speed             how fast it is; the name leaves open whether it is commanded or measured
     wheel             how fast one of its wheels or driving motors turns, of which there are several
+    commanded_wheel   how fast one of them shall turn
 
 The robot's other names decide as well: `pose.0` is x only beside `pose.1`. Where several signals
 fit, a run may have the second alone, as its code was another: so each has a place in line, `x`
@@ -47,10 +48,15 @@ _NO_SPEED: Final = re.compile(  # of a wheel or a motor; and motors that move no
     r"|temp\w*|radius|base|track|width|slip|contact|max|min|limit|gain|count|volt\w*"
     r"|arm|gripper|hand|head|neck|joint|finger|lidar|camera|mast|lift)([._]|$)",
 )
+_SIDE: Final = r"(\d|[lr]|(front|rear|back)?_?(left|right))"
+_COMMANDED_WHEEL: Final = re.compile(
+    rf"(^|[._])(commands?|cmds?|commanded|target_speeds?)[._]{_SIDE}([._](speed|velocity|rad_s))*$"
+)
 _ANGLES: Final = ("rad", "deg", *METRES)  # units of where a wheel is, not of how fast it turns
 _THIRD_AXES: Final = {"0": "2", "x": "z", "x_m": "z_m", "x_cm": "z_cm", "x_mm": "z_mm"}
 _HEADING: Final = re.compile(r"(^|\.)(deg\w*_)?(heading|yaw|theta|bearing)[^.]*")
 _ALTITUDE: Final = ("altitude", "alt")
+_MOTIONS: Final = ("commanded_speed", "speed", "wheel", "commanded_wheel")
 _KEPT: Final = 4096  # names whose motion is remembered
 
 
@@ -157,7 +163,7 @@ def _says_heading(name: str) -> bool:
 
 def _add_speeds(roles: dict[str, str], numbers: Iterable[str]) -> None:
     """The first commanded speed is no wheel; of the others, a wheel is rather that."""
-    by_motion: dict[str, list[str]] = {"commanded_speed": [], "speed": [], "wheel": []}
+    by_motion: dict[str, list[str]] = {each: [] for each in _MOTIONS}
     for name in numbers:
         for motion in _motions_of(name):
             by_motion[motion].append(name)
@@ -166,6 +172,7 @@ def _add_speeds(roles: dict[str, str], numbers: Iterable[str]) -> None:
     _line_up(roles, "commanded_speed", [name for name in commanded if name not in wheels])
     _line_up(roles, "speed", sorted(by_motion["speed"], key=_shortest))
     roles.update(dict.fromkeys(wheels, "wheel"))
+    roles.update(dict.fromkeys(by_motion["commanded_wheel"], "commanded_wheel"))
 
 
 @lru_cache(maxsize=_KEPT)
@@ -175,6 +182,8 @@ def _motions_of(name: str) -> tuple[str, ...]:
         return ()
     words = in_snake_case(name)
     is_wheel = _WHEEL.search(words) is not None
+    if _COMMANDED_WHEEL.search(words) and not _NO_SPEED.search(words):
+        return ("commanded_wheel",)
     if _COMMANDED.search(words):
         found = ["commanded_speed"]
     else:

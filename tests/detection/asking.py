@@ -21,7 +21,7 @@ _ALL: Final = 1_000_000
 
 # The kinds of events that tell each measure.
 _KINDS: Final[dict[Measure, tuple[str, ...]]] = {
-    "standstill": ("still", "stuck"),
+    "standstill": ("standstill", "stuck"),
     "stuck": ("stuck",),
     "silent": ("silent",),
     "flat": ("flat",),

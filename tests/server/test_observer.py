@@ -98,7 +98,7 @@ async def test_a_controller_that_knows_nothing_of_us_is_seen_and_asked_about(beg
         position = ["world.ROVER.x_m", "world.ROVER.y_m"]
         trends = await ask(client, "webots_get_trends", signals=[*position])
         assert trends["robot"] == "mcp_observer"
-        both = {"kinds": ["stuck", "still"], "position": position}
+        both = {"kinds": ["stuck", "standstill"], "position": position}
         events = await ask(client, "webots_find_events", **both)
         assert "found" not in events["verdicts"]  # it drives in circles
         assert len(json.dumps(world)) < 6000

@@ -200,7 +200,7 @@ class Signal(SQLModel, table=True):
     path: str = _text("for json_extract(state.data, path)", nullable=False)
     reduce: str | None = _text("count, min, max, mean or argmin of the long array at path")
     role: str | None = _text(
-        "x, y, z, yaw, mode, speed, commanded_speed or wheel; x2 where a run has no x"
+        "x, y, z, yaw, mode, speed, commanded_speed, wheel or commanded_wheel; x2 without an x"
     )
     first_seen_wall_time_s: float = _number(nullable=False)
     last_seen_wall_time_s: float = _number(nullable=False)
@@ -287,10 +287,6 @@ class CoarseRollup(_Summary, table=True):
     swings: str | None = _text(
         "JSON: the swings of what a robot swings with, each as [begin, end, half swings, period "
         "in s, amplitude, explained share]; null where they were not looked for",
-    )
-    standstills: str | None = _text(
-        "JSON, at the signal of x: where the robot stood still, and what shows whether it should "
-        "have moved; null where that was not looked for",
     )
 
 

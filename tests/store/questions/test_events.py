@@ -45,7 +45,9 @@ def test_a_robot_that_should_move_and_does_not_is_stuck(
 
 
 def test_standing_in_a_mode_that_rests_is_not_stuck(rover: sqlite3.Connection) -> None:
-    moving = ask(rover, "stuck", commanded="target", moving_modes=("back_up",), min_commanded=9.0)
+    moving = ask(
+        rover, "stuck", commanded="target", moving_modes=("back_up",), min_commanded_m_s=9.0
+    )
     assert moving.events == ()
 
 

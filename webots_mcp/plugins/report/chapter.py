@@ -341,7 +341,7 @@ def _timeline(connection: sqlite3.Connection, stored: Found) -> Grid:
     if len(stored.events) > MOST_ENTRIES:
         stored = stored.only([e for e in stored.events if e.kind != "log" or _mark(e)])
         notes = ["Of the log only warnings and errors stand here."]
-    answer = stored.told(connection, MOST_ENTRIES, exact=False)
+    answer = stored.told(connection, MOST_ENTRIES)
     rows = [
         Row([time_at(each.start_s), _lasted(each), each.kind, told(each)], _mark(each))
         for each in answer.events

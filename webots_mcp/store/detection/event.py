@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -28,8 +28,6 @@ class Event:
         details: What there is to say about it, by kind.
         around: Values of a few signals when it began.
         count: How many alike events it stands for; it begins with the first, ends with the last.
-        exactly: What all rows about it tell, where it was found in samples of a long run: mostly
-            one event, which begins and ends to the row.
     """
 
     kind: str
@@ -42,7 +40,6 @@ class Event:
     ongoing: bool = False
     around: dict[str, Value] = field(default_factory=dict[str, Value])
     count: int = 1
-    exactly: Callable[[], Sequence[Event]] | None = field(default=None, repr=False, compare=False)
 
     @property
     def duration_s(self) -> float:
@@ -93,9 +90,9 @@ class EventOptions:
             seen moving, in this run or an earlier one.
         commanded: The signal of the commanded speed; None finds it by name (`commanded`, `cmd`,
             `target_speed`). Of `speed` and `velocity` it is open whether they are commanded.
-        min_commanded: A commanded speed of at least this should move the robot.
-        stuck_m: Still is who stays within this distance (more where the noise of the position is
-            more), stuck who should move besides, ...
+        min_commanded_m_s: A commanded speed of at least this should move the robot.
+        stuck_m: Who stays within this distance (more where the noise of the position is more) is at
+            a standstill, and stuck who should move besides, ...
         stuck_s: ... for so long.
         thresholds: For the kind "threshold".
         where: For the kind "condition"; see docs/conditions.md.
@@ -116,7 +113,7 @@ class EventOptions:
     mode: str | None = None
     moving_modes: tuple[str, ...] | None = None
     commanded: str | None = None
-    min_commanded: float = 0.01
+    min_commanded_m_s: float = 0.01
     stuck_m: float = 0.05
     stuck_s: float = 3.0
     thresholds: tuple[Threshold, ...] = ()

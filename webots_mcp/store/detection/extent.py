@@ -187,7 +187,6 @@ def _longer(event: Event, others: Sequence[Event]) -> Event:
         if alike and other.start_s <= event.end_s and event.start_s <= other.end_s:
             first = min(event, other, key=attrgetter("start_s"))
             last = max(other, event, key=attrgetter("end_s"))
-            details, exactly = other.details, other.exactly
             ends = {"end_s": last.end_s, "ongoing": last.ongoing}
-            return replace(first, **ends, details=details, exactly=exactly)
+            return replace(first, **ends, details=other.details)
     return event

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from webots_mcp.naming import FARTHEST_M, metres_in, unit_in
 from webots_mcp.signal_roles import first_in, pair_in
-from webots_mcp.store.analysis.arrays import Array, np
+from webots_mcp.store.analysis.arrays import Array, Indexes, np
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.signals.catalogue import one_signal
@@ -20,6 +20,7 @@ from webots_mcp.store.signals.registry import Signal, roles_of, stored_roles
 
 if TYPE_CHECKING:
     from webots_mcp.store.analysis.track import PathLength, Track
+    from webots_mcp.store.reading.frame import Frame
 
 TRUE_WITHIN: Final = 0.05  # a distance that may be short by less, or by less than so many metres,
 TRUE_WITHIN_M: Final = 0.1  # is reported without a doubt
@@ -36,7 +37,8 @@ class Motion:
             it is commanded or measured.
         mode: What it is doing.
         heading: Where it looks; an angle.
-        wheels: Speeds of its wheels or driving motors, commanded or measured.
+        wheels: Speeds of its wheels or driving motors, commanded or measured; `wheel_commands`
+            are speeds that these should have.
         height: z: a robot that climbs does not stand still.
     """
 
@@ -47,6 +49,7 @@ class Motion:
     heading: Signal | None = None
     wheels: tuple[Signal, ...] = ()
     height: Signal | None = None
+    wheel_commands: tuple[Signal, ...] = ()
 
     @property
     def signals(self) -> list[Signal]:
@@ -58,7 +61,7 @@ class Motion:
     def evidence(self) -> list[Signal]:
         """All of them."""
         others = filter(None, (self.height, self.commanded, self.speed, self.mode, self.heading))
-        return [*(self.position or ()), *others, *self.wheels]
+        return [*(self.position or ()), *others, *self.wheels, *self.wheel_commands]
 
 
 def find_motion(
@@ -83,7 +86,10 @@ def find_motion(
     mode = _named(known, options.mode) or _first("mode", signals)
     commanded = _named(known, options.commanded) or _first("commanded_speed", signals)
     speed = None if commanded else _first("speed", signals)
-    wheels = (own[name] for name, role in roles.items() if role == "wheel")
+    wheels, told = (
+        tuple(own[name] for name, role in roles.items() if role == wanted)
+        for wanted in ("wheel", "commanded_wheel")
+    )
     place = "" if named else pair_in(signals)
     return Motion(
         # It may be missing in the rows that were seen.
@@ -94,6 +100,7 @@ def find_motion(
         heading=_first("yaw", signals),
         wheels=tuple(wheel for wheel in wheels if wheel != commanded),
         height=signals.get(f"z{place}"),
+        wheel_commands=tuple(wheel for wheel in told if wheel != commanded),
     )
 
 
@@ -151,6 +158,19 @@ def tracks_in(
     from webots_mcp.store.analysis.track import tracks_of
 
     return tracks_of(*places_of(columns, position), noise_m)
+
+
+def tracks_of_frame(
+    frame: Frame, position: tuple[Signal, Signal]
+) -> tuple[list[Track], list[Indexes]]:
+    """The way of the robot in each stretch without a gap, and the rows of the frame in it."""
+    from webots_mcp.store.analysis.track import tracks_of
+
+    x, y = (in_metres(each, frame.numbers(each.name)) for each in position)
+    rows = np.flatnonzero(np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M)
+    tracks = tracks_of(frame.times[rows], x[rows], y[rows])
+    ends = np.cumsum([len(track.times) for track in tracks])
+    return tracks, np.split(rows, ends[:-1])
 
 
 def path_length(

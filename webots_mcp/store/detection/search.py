@@ -13,6 +13,7 @@ from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.analysis.summary import LARGEST
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import EventKind, NotSearchableError
+from webots_mcp.store.detection.mode_use import ModeUses, frames_of_runs
 from webots_mcp.store.detection.motion import Motion, find_motion
 from webots_mcp.store.detection.verdict import Ledger
 from webots_mcp.store.reading.coverage import less_time, purged_until_s
@@ -27,10 +28,9 @@ from webots_mcp.store.signals.flatten import parse
 from webots_mcp.store.signals.registry import Signal
 
 if TYPE_CHECKING:
-    from webots_mcp.store.detection.habits import MovedIn
-    from webots_mcp.store.detection.standing import Standings
+    from webots_mcp.store.detection.standstill import Findings
 
-    Habits = dict[tuple[int, Motion], MovedIn]
+    Habits = dict[tuple[int, Motion], ModeUses]
 
 MOST_NAMED: Final = 5
 
@@ -217,7 +217,7 @@ class Search:
         """The values of all signals that the kinds look at; read at the first use."""
         wanted = any(kind.of_numbers and not kind.of_frame for kind in self.kinds)
         numbers = self.numbers if wanted else []
-        needed = {each.name: each for each in (*numbers, *self.motion.evidence)}
+        needed = {each.name: each for each in (*numbers, *(self.motion.position or ()))}
         through = [each for kind in self.kinds for each in kind.reads_through(self)]
         return view_of(self.connection, self.segment, list(needed.values()), self.deadline, through)
 
@@ -226,21 +226,15 @@ class Search:
         assert self.view
 
     @cached_property
-    def standings(self) -> Standings:
-        """The standstills, found once for all kinds that tell them; numpy is imported here."""
-        from webots_mcp.store.detection.standing import find_standings
-
-        return find_standings(self)
-
-    @property
-    def moved_in(self) -> MovedIn:
-        """In which modes the robot moves; numpy is imported here."""
-        from webots_mcp.store.detection.habits import MovedIn
+    def standstills(self) -> Findings:
+        """Found once for both kinds that tell of them; how the other kinds look is not imported."""
+        from webots_mcp.store.detection.standstill import judge_standstills
 
         asked = (self.segment.run_id, self.motion)
         if asked not in self.habits:
-            self.habits[asked] = MovedIn(self.connection, *asked, self.deadline)
-        return self.habits[asked]
+            frames = frames_of_runs(self.connection, self.segment.run_id, self.deadline)
+            self.habits[asked] = ModeUses(*asked, frames, self.options)
+        return judge_standstills(self.frame, self.motion, self.options, self.habits[asked])
 
     def event(
         self, kind: str, start_s: float, end_s: float, name: str | None, **details: Any

@@ -15,7 +15,6 @@ from typing import Final, Protocol
 
 from webots_mcp.store.analysis.summary import Summary, summarise_numbers
 from webots_mcp.store.analysis.swings import SLOW_HALF_SWINGS, Swing
-from webots_mcp.store.reading.coverage import less_time
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.gaps import rows_by_bucket
 from webots_mcp.store.reading.intervals import (
@@ -25,7 +24,7 @@ from webots_mcp.store.reading.intervals import (
     spans_in_pieces,
     spans_in_rows,
 )
-from webots_mcp.store.reading.ranges import Segment, just_after
+from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.reading.rollups import Pieces, read_pieces, rows_after
 from webots_mcp.store.reading.rows import (
     Columns,
@@ -35,7 +34,7 @@ from webots_mcp.store.reading.rows import (
     read_columns,
     read_numbers,
 )
-from webots_mcp.store.reading.sampling import MOST_SAMPLES, newest_part, read_sampled
+from webots_mcp.store.reading.sampling import newest_part
 from webots_mcp.store.rollup.buckets import BUCKET_S, FINE, bucket_of, totals
 from webots_mcp.store.rollup.swings import (
     ACROSS_S,
@@ -47,7 +46,6 @@ from webots_mcp.store.rollup.tables import watermark
 from webots_mcp.store.signals.registry import Signal
 
 READING_SHARE: Final = 0.5  # of the time: what is read has to be searched as well
-SAMPLES_PER_STAY: Final = 5
 SAMPLE_ROWS: Final = 3000  # newest rows that tell the usual interval and the usual steps
 MOST_KEPT: Final = 10_000_000  # numbers of 8 bytes, of stretches that are asked for again
 LATE_S: Final = 60.0  # the rollups are usually a few seconds behind
@@ -78,7 +76,6 @@ class View(Protocol):
 
     notes: list[str]  # what could not be looked at, of what was asked since they were taken
     shortest_rest_s: float  # a shorter one may be missed
-    sampled_s: float  # between the rows of `places`; 0 where these are all
     longest_period_s: float  # of swings that show in it
     is_long: bool  # not all of its rows are read
     inside: range  # buckets of 10 s of which what was found is stored; none where all rows are read
@@ -87,18 +84,8 @@ class View(Protocol):
         """What could not be looked at since the notes were last taken; and what never can."""
         ...
 
-    def places(
-        self, signals: Sequence[Signal], stay_s: float, outside: range = _NOTHING
-    ) -> Columns:
-        """Rows close enough to see a stay of that length, of the time outside of some buckets."""
-        ...
-
     def sample(self, signals: Sequence[Signal]) -> Columns:
         """Enough rows one after the other to tell the noise of signals."""
-        ...
-
-    def rows_between(self, start_s: float, end_s: float, signals: Sequence[Signal]) -> Columns:
-        """All rows of the segment in [start_s, end_s)."""
         ...
 
     def summary(self, signal: Signal) -> Summary:
@@ -160,7 +147,6 @@ class RowView:
     """All rows of a segment."""
 
     shortest_rest_s = 0.0
-    sampled_s = 0.0
     is_long = False
     inside = _NOTHING
 
@@ -179,18 +165,8 @@ class RowView:
         """Of rows only that not all were read."""
         return self._lasting
 
-    def places(
-        self, signals: Sequence[Signal], stay_s: float, outside: range = _NOTHING
-    ) -> Columns:
-        """All rows."""
-        return self._columns
-
     def sample(self, signals: Sequence[Signal]) -> Columns:
         """All rows."""
-        return self._columns
-
-    def rows_between(self, start_s: float, end_s: float, signals: Sequence[Signal]) -> Columns:
-        """All rows, also those outside."""
         return self._columns
 
     def summary(self, signal: Signal) -> Summary:
@@ -244,7 +220,6 @@ class LongView:
         self._connection = connection
         self._segment = segment
         self._deadline = deadline
-        self.sampled_s = 0.0
         self._signals = [signal for signal in signals if signal.is_number]
         start, end = -(-segment.start_s // BUCKET_S), segment.end_s // BUCKET_S
         self.inside = range(int(start), int(end))
@@ -257,33 +232,6 @@ class LongView:
         taken, self.notes = list(dict.fromkeys(self.notes)), []
         return taken
 
-    def places(
-        self, signals: Sequence[Signal], stay_s: float, outside: range = _NOTHING
-    ) -> Columns:
-        """A row every fifth of the stay; fewer where that would be too many."""
-        parts = _around(self._segment, outside)[::-1]
-        if parts[0].start_s < outside.start * BUCKET_S or not outside:
-            self._note_purged()
-        span_s = sum(part.end_s - part.start_s for part in parts)
-        every_s = max(stay_s / SAMPLES_PER_STAY, span_s / MOST_SAMPLES)
-        self.sampled_s = every_s
-        if every_s > stay_s / 2:
-            advice = less_time(self._connection, self._segment)
-            self.notes.append(f"not those under {2 * every_s:.3g} s: {advice}")
-        plain = [signal for signal in signals if signal.is_plain]
-        found = Columns(self._segment.run_id, values={signal.name: [] for signal in plain})
-        for part in parts:
-            sampled = read_sampled(self._connection, part, plain, every_s, self._deadline)
-            found.add(sampled)
-            if sampled.cut:
-                reached_s = sampled.times[-1] if sampled.times else part.start_s
-                self.notes.append(
-                    f"not after {reached_s:.3f} s: time limit reached, ask start_s={reached_s:.3f}"
-                )
-                return found
-        self._add_newest(found, plain, every_s)
-        return found
-
     def sample(self, signals: Sequence[Signal]) -> Columns:
         """The newest rows, read once of all numbers that were asked for."""
         own = {signal.name for signal in self._signals}
@@ -293,12 +241,6 @@ class LongView:
             part = newest_part(self._connection, self._segment, SAMPLE_ROWS)
             self._samples[names] = read_columns(self._connection, part, wanted, self._deadline)
         return self._samples[names]
-
-    def rows_between(self, start_s: float, end_s: float, signals: Sequence[Signal]) -> Columns:
-        """Read from the segment."""
-        start_s, end_s = max(start_s, self._segment.start_s), min(end_s, self._segment.end_s)
-        part = replace(self._segment, start_s=start_s, end_s=end_s)
-        return read_columns(self._connection, part, signals, self._deadline)
 
     def summary(self, signal: Signal) -> Summary:
         """Counts from the rollups."""
@@ -477,14 +419,6 @@ class LongView:
         """Those that have the same value throughout a bucket."""
         resting = {signal_id for (signal_id,) in self._connection.execute(_RESTING, self._span)}
         return [signal for signal in self._signals if signal.id in resting]
-
-    def _add_newest(self, found: Columns, signals: Sequence[Signal], every_s: float) -> None:
-        """The rows after the last sample: who is stuck may be so up to the newest one."""
-        after_s = found.times[-1] if found.times else math.inf
-        part = replace(
-            self._segment, start_s=just_after(max(after_s, self._segment.end_s - 2 * every_s))
-        )
-        found.add(read_columns(self._connection, part, signals, self._deadline))
 
     def _note_late(self) -> None:
         if self._segment.end_s - self._rolled_until_s > LATE_S:

@@ -221,6 +221,11 @@ class Standings:
     def _smoothed(self) -> list[Array]:
         return [np.concatenate([getattr(p, axis) for p in self.places]) for axis in ("x", "y")]
 
+    def codes(self, rows: slice) -> list[int]:
+        """The modes in some of the rows."""
+        counts: Indexes = np.bincount(self.modes[rows])
+        return np.flatnonzero(counts).tolist()
+
     def reach_m(self, at: int) -> float:
         """How far apart the places are to and fro between which it went."""
         return math.hypot(np.ptp(self.places[at].x), np.ptp(self.places[at].y))
@@ -266,8 +271,7 @@ class Weighing:
         self._motion = standings.motion
         self._options = standings.options
         self._by_mode = {
-            code: self._moves_in(standings.labels[code])
-            for code in np.flatnonzero(np.bincount(standings.modes)).tolist()
+            code: self._moves_in(standings.labels[code]) for code in standings.codes(slice(None))
         }
         moves = np.zeros(len(standings.labels), np.bool_)
         for code in [code for code, (why, _) in self._by_mode.items() if why]:
@@ -330,7 +334,7 @@ class Weighing:
     def _shown(self, rows: slice) -> tuple[list[str], str | None]:
         """What shows that it should have moved in these rows; or why that is in doubt."""
         found, said = self._found, list[str]()
-        codes = np.unique(found.modes[rows]).tolist()
+        codes = found.codes(rows)
         said += [why for code in codes for why in self._by_mode[code][:1] if why]
         told, wheels = found.told[rows], found.wheel_drives[rows] != 0
         speeds: Array | None = None
@@ -373,7 +377,7 @@ class Weighing:
             said.append(f"{motion.commanded.name} {stopped:.3g}")
         if mostly(found.resting):
             said.append("wheels at rest")
-        codes = np.flatnonzero(np.bincount(found.modes[rows])).tolist()
+        codes = found.codes(rows)
         said += [why for code in codes for why in self._by_mode[code][1:] if why]
         if mostly(found.turns):
             said.append(

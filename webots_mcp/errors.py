@@ -11,7 +11,7 @@ of its own.
     │   ├── MalformedRowError       a row holds a value that no bridge has written
     │   ├── SessionGoneError        the session that is being recorded was deleted
     │   ├── SchemaTooNewError       a newer webots-mcp wrote it
-    │   └── SchemaTooOldError       an older webots-mcp wrote it: import it
+    │   └── SchemaTooOldError       an older webots-mcp wrote it
     ├── PoolError                   the store of many recordings is the problem
     │   ├── PoolUnavailableError    it is away, restarts or is full: worth trying again
     │   └── PoolBusyError           another ships the same recording

@@ -28,10 +28,10 @@ from webots_mcp.transactions import transaction
 
 SCHEMA_FILE: Final = Path(__file__).with_name("schema.sql")
 
-IMPORTED_SCHEMA: Final = 9  # that of an older recording which `webots-mcp import` takes over
+OLDER_SCHEMA: Final = 9  # of the recordings before the values lay in chunks
 _FROM_OLDER: Final = (
-    "{file} has schema {version}, of an older webots-mcp: take it over with 'webots-mcp import "
-    '"{file}" --database "{file}"\', which keeps the old one next to it'
+    "{file} has schema {version}, of an older webots-mcp, and this one knows {known}: move it "
+    "aside, so that a new one is begun, and read it with the webots-mcp that made it"
 )
 _MADE: Final = re.compile(r'CREATE (?:UNIQUE )?(?:TABLE|VIEW|INDEX|TRIGGER) "?(\w+)', re.IGNORECASE)
 _TOKENS: Final = re.compile(
@@ -95,10 +95,9 @@ def require_current(connection: sqlite3.Connection) -> None:
         )
     if version < SCHEMA_VERSION:
         raise SchemaTooOldError(
-            _FROM_OLDER.format(file=_file(connection, "main"), version=version)
-            if version == IMPORTED_SCHEMA
-            else f"the database has schema {version}, which this webots-mcp neither reads nor "
-            f"imports: only recordings of schema {IMPORTED_SCHEMA} can be taken over"
+            _FROM_OLDER.format(
+                file=_file(connection, "main"), version=version, known=SCHEMA_VERSION
+            )
         )
 
 

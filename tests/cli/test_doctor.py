@@ -30,7 +30,7 @@ def test_what_is_wrong_ends_with_1_and_what_mends_it_with_its_page(
     make_older(tmp_path / "webots.db")
     assert main(["doctor", "--no-server", "--data-dir", str(tmp_path)]) == 1
     out = capsys.readouterr().out
-    assert "take it over with 'webots-mcp import" in out
+    assert "move it aside" in out
     assert "(docs/troubleshooting.md#schema)" in out
     assert "Server" not in out
 

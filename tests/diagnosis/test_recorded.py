@@ -17,7 +17,7 @@ from tests.older_recording import make_older
 from tests.recordings.rows import Recorded, RecordedRobot
 from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.queue import CommandQueue
-from webots_mcp.schema import IMPORTED_SCHEMA
+from webots_mcp.schema import OLDER_SCHEMA
 from webots_mcp.waiting_file import waiting_path
 
 KILLED = """
@@ -58,12 +58,12 @@ def test_where_nothing_was_recorded_the_lines_that_record_are_shown(look: Look) 
     assert look("Rows").verdict == look("Schema").verdict == "not checked"
 
 
-def test_an_older_schema_names_the_command_that_takes_it_over(look: Look, file: Path) -> None:
+def test_an_older_schema_says_what_to_do_with_the_recording(look: Look, file: Path) -> None:
     make_older(file)
     schema = look("Schema")
     assert schema.verdict == "wrong"
-    assert schema.seen == f"{IMPORTED_SCHEMA}, this webots-mcp needs {SCHEMA_VERSION}"
-    assert f'webots-mcp import "{file}"' in (schema.fix or "")
+    assert schema.seen == f"{OLDER_SCHEMA}, this webots-mcp needs {SCHEMA_VERSION}"
+    assert "move it aside" in (schema.fix or "")
     assert look("Database").verdict == "ok"
 
 

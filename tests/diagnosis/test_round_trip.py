@@ -27,7 +27,7 @@ def test_a_server_that_answers_that_it_cannot_read_the_recording_is_not_to_blame
     make_older(file)
     found = look("Server")
     assert found.verdict == "warning"
-    assert "webots-mcp import" in found.seen
+    assert "move it aside" in found.seen
     assert "Schema" in (found.fix or "")
 
 

@@ -90,4 +90,4 @@ async def test_a_database_of_an_older_version_is_a_clear_error(
 ) -> None:
     make_older(file)
     async with connect() as client:
-        assert "webots-mcp import" in await fail(client, "webots_list_robots")
+        assert "move it aside" in await fail(client, "webots_list_robots")

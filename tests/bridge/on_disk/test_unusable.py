@@ -26,7 +26,7 @@ from webots_mcp.bridge import backlog, recorder
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, SCHEMA_VERSION
 from webots_mcp.errors import DatabaseError
-from webots_mcp.schema import IMPORTED_SCHEMA, create_schema
+from webots_mcp.schema import OLDER_SCHEMA, create_schema
 from webots_mcp.standin import InProcessSupervisor
 
 NOT_ROOT = pytest.mark.skipif(
@@ -182,8 +182,8 @@ def test_a_database_of_another_application_is_left_alone(
     ("version", "next_step"),
     [
         (SCHEMA_VERSION + 1, "pip install --upgrade"),
-        (IMPORTED_SCHEMA, "webots-mcp import"),
-        (IMPORTED_SCHEMA - 1, "only recordings of schema 9"),
+        (OLDER_SCHEMA, "move it aside"),
+        (OLDER_SCHEMA - 1, "move it aside"),
     ],
 )
 def test_another_schema_is_said_and_the_robot_drives_on(

@@ -105,7 +105,7 @@ def test_a_range_that_begins_before_the_first_row_left_says_so(
 ) -> None:
     keep_rows(rover, tmp_path, 1500)
     (note,) = find_range(rover, Scope(run_id=1)).notes
-    assert "rows of run 1 before 55 s were purged" in note and "10 s summaries" in note
+    assert "rows of run 1 before 55 s were purged" in note and "read from chunks" in note
     assert find_range(rover, Scope(run_id=1, start_s=60.0)).notes == ()
     assert "were purged" in find_range(rover, Scope(run_id=1, start_s=10.0, end_s=20.0)).notes[0]
 

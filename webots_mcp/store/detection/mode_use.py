@@ -29,6 +29,7 @@ _STANDS_SHARE: Final = 0.8  # of a visit
 _MOVES_SHARE: Final = 0.1  # of the samples of a visit, or of so many
 _ENOUGH: Final = 200
 _SAMPLE_S: Final = 0.5
+_FAST: Final = 0.9  # of the speeds while it moves are below what is called fast
 _PACE_S: Final = 1.0  # over so long a speed is measured; longer, by so much for each metre of noise
 _PACE_S_PER_M: Final = 100.0
 
@@ -159,6 +160,8 @@ def _uses_of(
     for code in np.unique(codes).tolist():
         of_code = codes[firsts] == code
         some = speeds[np.repeat(of_code & moved, lengths)]
-        speed_m_s = median(some[some >= some.max() / 2]) if len(some) else 0.0
+        # Not beside the greatest one: where it was put elsewhere it seems to be very fast.
+        fast = float(np.quantile(some, _FAST)) if len(some) else 0.0
+        speed_m_s = median(some[some >= fast / 2]) if len(some) else 0.0
         counts = int((of_code & moved).sum()), int((of_code & stood).sum())
         yield code, ModeUse(*counts, speed_m_s, run_id)

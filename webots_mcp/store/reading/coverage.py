@@ -99,7 +99,7 @@ def purge_notes(connection: sqlite3.Connection, run_id: int, start_s: float) -> 
     if until_s is None:
         return
     when = "" if until_s == math.inf else f" before {until_s:g} s"
-    left = "only 10 s summaries of that time are left (no single rows, jumps or export)"
+    left = "numbers, flags and texts of that time are read from chunks, but not exported"
     yield f"the rows of run {run_id}{when} were purged: {left}"
 
 

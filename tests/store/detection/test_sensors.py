@@ -207,6 +207,13 @@ def test_a_sensor_that_is_frozen_for_most_of_the_run_is_flat(
     assert told(ask(empty, "flat")) == [("front", 30.0, 119.9)]
 
 
+def test_what_goes_from_one_value_to_the_next_is_not_flat_at_each_of_them(
+    empty: sqlite3.Connection,
+) -> None:
+    record(empty, lambda t: {"index": t // 25, "x": t}, until_s=400.0)
+    assert told(ask(empty, "flat")) == []
+
+
 @pytest.mark.parametrize("count", [2, 10, 40])
 @pytest.mark.parametrize("quiet", [True, False])
 def test_dropouts_are_told_however_many_there_are(

@@ -99,7 +99,7 @@ class EventOptions:
         silent_s: Without a value for so long, though it mostly has one.
         flat_s: Exactly the same number for so long, though it mostly changes; for a signal that
             is noisy otherwise 0.15 of that are enough.
-        jump_score: How many times larger than the usual step (modified z-score) a jump is.
+        jump_min_score: How many times larger than the usual step (modified z-score) a jump is.
         jump_m: A position jumps by at least so much between two rows.
         min_half_periods: Half periods in a row; with a period of more than 5 s at least 12.
         oscillation_period_s: The longest period that counts; None for as long a one as fits in
@@ -120,7 +120,7 @@ class EventOptions:
     where: str | None = None
     silent_s: float = 1.0
     flat_s: float = 20.0
-    jump_score: float = 12.0
+    jump_min_score: float = 12.0
     jump_m: float = 0.3
     min_half_periods: int = LEAST_HALF_SWINGS
     oscillation_period_s: float | None = None
@@ -131,7 +131,7 @@ class EventOptions:
             raise InvalidInputError(
                 f"unknown log level {self.log_level!r}; there is {', '.join(LEVELS)}"
             )
-        for name in ("stuck_m", "stuck_s", "silent_s", "flat_s", "jump_score", "jump_m"):
+        for name in ("stuck_m", "stuck_s", "silent_s", "flat_s", "jump_min_score", "jump_m"):
             value = getattr(self, name)
             if not 0 < value < math.inf:
                 raise InvalidInputError(f"{name}={value} must be a number above 0")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 from webots_mcp.store.analysis.arrays import Array, np
@@ -42,10 +43,14 @@ class Rests:
     whole_s: float
 
     def changes_but_for(self, rests: Sequence[Rest]) -> bool:
-        """Whether it changed in most of the rows outside of those rests, and in ten at least."""
+        """Whether it changed in most of the rows outside of those rests, and in ten at least.
+
+        What goes from one of them right to the next, as a counter does, has not changed otherwise.
+        """
         flat_s = sum(rest.duration_s for rest in rests)
         outside = max(0.0, 1 - flat_s / self.whole_s) if self.whole_s > 0 else 0.0
-        return self.changes >= max(LEAST_CHANGES, MOSTLY * self.present * outside)
+        changes = self.changes - sum(a.stop == b.start for a, b in pairwise(rests))
+        return changes >= max(LEAST_CHANGES, MOSTLY * self.present * outside)
 
 
 def flat_events(search: Search) -> Iterator[Event]:

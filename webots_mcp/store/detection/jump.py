@@ -34,7 +34,7 @@ def jump_events(search: Search) -> Iterator[Event]:
     for index, signal in enumerate(signals):
         if search.is_over("jump", signals[index:]):
             break
-        jumps = find_jumps(search.frame, signal.name, search.options.jump_score)
+        jumps = find_jumps(search.frame, signal.name, search.options.jump_min_score)
         if jumps and are_usual(jumps, int(search.frame.zones(signal.name).value_count.sum())):
             many = f"not in {signal.name}: large steps are normal for it ({len(jumps)} found)"
             search.not_searched("jump", many)

@@ -13,19 +13,11 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Final, Protocol
 
-from webots_mcp.store.analysis.summary import Summary, summarise_numbers
 from webots_mcp.store.analysis.swings import SLOW_HALF_SWINGS, Swing
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.gaps import rows_by_bucket
-from webots_mcp.store.reading.intervals import (
-    Condition,
-    Span,
-    joined,
-    spans_in_pieces,
-    spans_in_rows,
-)
 from webots_mcp.store.reading.ranges import Segment
-from webots_mcp.store.reading.rollups import Pieces, read_pieces, rows_after
+from webots_mcp.store.reading.rollups import rows_after
 from webots_mcp.store.reading.rows import (
     Columns,
     Numbers,
@@ -35,7 +27,7 @@ from webots_mcp.store.reading.rows import (
     read_numbers,
 )
 from webots_mcp.store.reading.sampling import newest_part
-from webots_mcp.store.rollup.buckets import BUCKET_S, FINE, bucket_of, totals
+from webots_mcp.store.rollup.buckets import BUCKET_S, FINE, bucket_of
 from webots_mcp.store.rollup.swings import (
     ACROSS_S,
     LONGEST_PERIOD_S,
@@ -48,13 +40,11 @@ from webots_mcp.store.signals.registry import Signal
 READING_SHARE: Final = 0.5  # of the time: what is read has to be searched as well
 SAMPLE_ROWS: Final = 3000  # newest rows that tell the usual interval and the usual steps
 MOST_KEPT: Final = 10_000_000  # numbers of 8 bytes, of stretches that are asked for again
-LATE_S: Final = 60.0  # the rollups are usually a few seconds behind
 _NOTHING: Final = range(0)
 
 _OF_SIGNAL: Final = (
     "FROM all_rollup WHERE run_id = ? AND signal_id = ? AND bucket >= ? AND bucket < ?"
 )
-_COUNTS: Final = {"rows": "sum", "present": "sum", "changes": "sum"}
 _STEPS: Final = (
     f"SELECT bucket, present, largest_step, first, last {_OF_SIGNAL} AND first IS NOT NULL "
     "ORDER BY bucket"
@@ -64,18 +54,12 @@ _ROWS_IN: Final = (
 )
 _LAST_BEFORE: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s < ?"
 _FIRST_ROW: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ?"
-_RESTING: Final = (
-    "SELECT s.id FROM run r CROSS JOIN signal s ON s.robot_id = r.robot_id WHERE r.id = ? "
-    "AND EXISTS (SELECT 1 FROM all_rollup WHERE run_id = r.id AND signal_id = s.id "
-    "AND bucket >= ? AND bucket < ? AND min = max AND present = rows)"
-)
 
 
 class View(Protocol):
     """What a detector may ask."""
 
     notes: list[str]  # what could not be looked at, of what was asked since they were taken
-    shortest_rest_s: float  # a shorter one may be missed
     longest_period_s: float  # of swings that show in it
     is_long: bool  # not all of its rows are read
     inside: range  # buckets of 10 s of which what was found is stored; none where all rows are read
@@ -86,14 +70,6 @@ class View(Protocol):
 
     def sample(self, signals: Sequence[Signal]) -> Columns:
         """Enough rows one after the other to tell the noise of signals."""
-        ...
-
-    def summary(self, signal: Signal) -> Summary:
-        """Of the whole segment."""
-        ...
-
-    def spans(self, signal: Signal, condition: Condition) -> list[Span]:
-        """Where the condition holds in every row; across a recording gap it is taken to go on."""
         ...
 
     def stored_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
@@ -146,7 +122,6 @@ def view_of(
 class RowView:
     """All rows of a segment."""
 
-    shortest_rest_s = 0.0
     is_long = False
     inside = _NOTHING
 
@@ -159,7 +134,6 @@ class RowView:
         self._columns = columns
         length_s = columns.times[-1] - columns.times[0] if columns.times else 0.0
         self.longest_period_s = max(LONGEST_PERIOD_S, 2 * length_s / SLOW_HALF_SWINGS)
-        self._summaries: dict[str, Summary] = {}
 
     def taken_notes(self) -> list[str]:
         """Of rows only that not all were read."""
@@ -168,19 +142,6 @@ class RowView:
     def sample(self, signals: Sequence[Signal]) -> Columns:
         """All rows."""
         return self._columns
-
-    def summary(self, signal: Signal) -> Summary:
-        """Of all rows."""
-        if signal.name not in self._summaries:
-            rows = len(self._columns.times)
-            numbers = self._columns.numbers(signal.name)
-            self._summaries[signal.name] = summarise_numbers(*numbers, rows=rows)
-        return self._summaries[signal.name]
-
-    def spans(self, signal: Signal, condition: Condition) -> list[Span]:
-        """From all rows."""
-        values = self._columns.values[signal.name]
-        return list(spans_in_rows(self._columns.times, values, condition))
 
     def stored_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
         """None: all rows are there to look in."""
@@ -200,7 +161,6 @@ class RowView:
 class LongView:
     """The rollups of a long segment, and what has to be read besides."""
 
-    shortest_rest_s = 2 * BUCKET_S  # a shorter one need not fill a bucket
     longest_period_s = LONGEST_PERIOD_S
     is_long = True
 
@@ -215,7 +175,6 @@ class LongView:
         self.notes: list[str] = []
         self._through = through
         self._kept: dict[Segment, Numbers] = {}
-        self._read: dict[Segment, Columns] = {}
         self._samples: dict[tuple[str, ...], Columns] = {}
         self._connection = connection
         self._segment = segment
@@ -241,56 +200,6 @@ class LongView:
             part = newest_part(self._connection, self._segment, SAMPLE_ROWS)
             self._samples[names] = read_columns(self._connection, part, wanted, self._deadline)
         return self._samples[names]
-
-    def summary(self, signal: Signal) -> Summary:
-        """Counts from the rollups."""
-        self._note_late()
-        return self._totals.get(signal.id or 0, Summary(self._rows))
-
-    def spans(self, signal: Signal, condition: Condition) -> list[Span]:
-        """From rollups, and rows where they leave it open."""
-        self._note_late()
-        if self._purged_until_s is not None:
-            self.notes.append(
-                f"not those under {self.shortest_rest_s:g} s before "
-                f"{self._purged_until_s:.3f} s, whose rows were purged"
-            )
-        if condition.lasting and signal not in self._resting:
-            return []
-        if self._deadline.passed:
-            self._cut()
-            return []
-        shared = condition.lasting and signal in self._changing
-        pieces = self._pieces if shared else self._pieces_of([signal])
-        read = functools.partial(self._rows_of, signal)
-        spans = joined(spans_in_pieces(self._segment, signal, pieces, condition, read))
-        if self._deadline.passed or pieces.cut_at_s is not None:
-            self._cut()
-        return spans
-
-    def _pieces_of(self, signals: Sequence[Signal]) -> Pieces:
-        return read_pieces(self._connection, self._segment, signals, self._deadline)
-
-    @functools.cached_property
-    def _pieces(self) -> Pieces:
-        """Of all signals that rest at times, which are read together."""
-        return self._pieces_of(self._changing)
-
-    @functools.cached_property
-    def _changing(self) -> list[Signal]:
-        """Those that rest at times only."""
-        changing = {signal_id for signal_id, total in self._totals.items() if total.changes}
-        return [signal for signal in self._resting if signal.id in changing]
-
-    def _rows_of(self, signal: Signal, part: Segment) -> Columns:
-        """Read with the other signals that rest at times, which are likely to ask for the same."""
-        kept = self._read.get(part)
-        if kept is None or signal.name not in kept.values:
-            wanted = {each.name: each for each in (*self._resting, signal)}
-            kept = read_columns(self._connection, part, list(wanted.values()), self._deadline)
-            if not kept.cut:
-                self._read[part] = kept
-        return kept
 
     def stored_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
         """Those of the coarse rollups that lie inside."""
@@ -400,29 +309,6 @@ class LongView:
         if reached_s is None and held < MOST_KEPT:
             self._kept[part] = numbers
         return numbers
-
-    @functools.cached_property
-    def _totals(self) -> dict[int, Summary]:
-        """Rows count also where they lack the signal: as many as of the one that is in most."""
-        run_id, first, end = self._span
-        found = totals(self._connection, run_id, range(first, end), _COUNTS)
-        rows = max((counted for counted, *_ in found.values()), default=0)
-        return {signal_id: Summary(rows, *counts) for signal_id, (_, *counts) in found.items()}
-
-    @functools.cached_property
-    def _rows(self) -> int:
-        """Of the whole segment."""
-        return max((each.rows for each in self._totals.values()), default=0)
-
-    @functools.cached_property
-    def _resting(self) -> list[Signal]:
-        """Those that have the same value throughout a bucket."""
-        resting = {signal_id for (signal_id,) in self._connection.execute(_RESTING, self._span)}
-        return [signal for signal in self._signals if signal.id in resting]
-
-    def _note_late(self) -> None:
-        if self._segment.end_s - self._rolled_until_s > LATE_S:
-            self.notes.append(f"not after {self._rolled_until_s:.3f} s, which is not rolled up yet")
 
     @functools.cached_property
     def _purged_until_s(self) -> float | None:

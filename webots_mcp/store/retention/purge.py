@@ -208,6 +208,7 @@ class _Purge:
         self._writes = ShortWrites(connection)
         self._vacuuming = _Pace()
         self._paces = {table: _Pace() for table in _STEPS}
+        self._in_chunks: dict[int, int] = {}  # run: the id up to which all that can be is
         self.purged = Purged()
 
     def in_turn(self, tables: Sequence[Iterator[Purged]]) -> Iterator[Purged]:
@@ -235,7 +236,9 @@ class _Purge:
                 if table == "state" and keys[-1]["id"] > watermark(self._connection):
                     roll(self._connection, ROLLED_ROWS)
                 elif table == "state" and (run_id := self._not_in_chunks(keys)):
-                    chunk_whole_run(self._connection, run_id)
+                    if chunk_whole_run(self._connection, run_id):
+                        # What is in no chunk now holds what no bridge writes, and may go.
+                        self._in_chunks[run_id] = keys[-1]["id"]
                 else:
                     keys = keys[self._delete_some(table, keys) :]
                 yield self.purged
@@ -257,7 +260,8 @@ class _Purge:
             (
                 run
                 for run, last in newest.items()
-                if reached(self._connection, run).max_in_groups < last
+                if max(reached(self._connection, run).max_in_groups, self._in_chunks.get(run, 0))
+                < last
             ),
             None,
         )

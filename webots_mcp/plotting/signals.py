@@ -182,15 +182,15 @@ def _notes(parts: Sequence[Part], curves: Sequence[Curve]) -> list[str]:
         if silent and part.unread is None:
             notes.append(f"without a value in {part.name}: {listed(silent)}")
         notes += [
-            f"{columns.name} in {part.name} was {_counted(columns.odd)}: not drawn"
+            f"{columns.name} in {part.name} was {_counted(columns.replaced)}: not drawn"
             for columns in part.run.numbers
-            if columns.odd
+            if columns.replaced
         ]
     return list(dict.fromkeys(notes))
 
 
-def _counted(odd: dict[str, int]) -> str:
-    return ", ".join(f"{value} {count} times" for value, count in odd.items())
+def _counted(replaced: dict[str, int]) -> str:
+    return ", ".join(f"{value} {count} times" for value, count in replaced.items())
 
 
 def _left_out(names: Sequence[str], room: Room) -> str:

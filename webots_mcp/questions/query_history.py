@@ -154,7 +154,7 @@ def _run_series(run: RunHistory) -> RunSeries:
         or None,
         states={str(short_name(columns.name)): _change_series(columns) for columns in run.changes}
         or None,
-        rows=run.rows,
+        row_count=run.rows,
         recording_gaps=[
             [seconds(gap.start_s), seconds(gap.end_s)] for gap in run.gaps[:_SHOWN_GAPS]
         ]
@@ -173,7 +173,7 @@ def _usual_counts(numbers: Sequence[NumberColumns]) -> list[int] | None:
 def _number_series(
     columns: NumberColumns, counts: list[int] | None, run: RunHistory
 ) -> NumberSeries:
-    whole, replaced = columns.whole, columns.odd or None
+    whole, replaced = columns.whole, columns.replaced or None
     if not whole.present:
         return NumberSeries(silent=run.cut_at_s is None or None, replaced=replaced)
     if whole.min is None:
@@ -270,5 +270,5 @@ def _row_columns(page: Page, rows: int, view: View) -> RowColumns:
             ]
             for name, values in page.values.items()
         },
-        replaced=page.odd or None,
+        replaced=page.replaced or None,
     )

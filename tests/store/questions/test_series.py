@@ -85,7 +85,7 @@ def test_modes_come_as_change_points(rover: sqlite3.Connection, tier: str) -> No
 
 def test_odd_values_are_named(rover: sqlite3.Connection) -> None:
     front = column(ask(rover, "sensors.front", start_s=99.0, end_s=106.0), "sensors.front")
-    assert front.odd == {"nan": 40}
+    assert front.replaced == {"nan": 40}
     assert sum(front.count) == 30
 
 
@@ -93,14 +93,14 @@ def test_a_value_that_is_no_number_is_named_within_its_array(empty: sqlite3.Conn
     recorder = start_run(empty)
     for step in range(30):
         state = {"short": [None, step, None if step < 9 else 1], "long": [1.0] * 30 + [None]}
-        odd = {"short.*": "nan", "long.*": "inf"}
-        recorder.publish(float(step), state, odd if step < 20 else {"short.0": "inf"})
+        replaced = {"short.*": "nan", "long.*": "inf"}
+        recorder.publish(float(step), state, replaced if step < 20 else {"short.0": "inf"})
     roll(empty)
     run = ask(empty, "short", "long.mean")
-    assert column(run, "short.0").odd == {"nan": 20, "inf": 10}
-    assert column(run, "short.1").odd == {}
-    assert column(run, "short.2").odd == {"nan": 9}
-    assert column(run, "long.mean").odd == {"inf": 20}
+    assert column(run, "short.0").replaced == {"nan": 20, "inf": 10}
+    assert column(run, "short.1").replaced == {}
+    assert column(run, "short.2").replaced == {"nan": 9}
+    assert column(run, "long.mean").replaced == {"inf": 20}
     counted = dict(
         empty.execute("SELECT name, replaced_row_count FROM signal WHERE name LIKE 'short%'")
     )

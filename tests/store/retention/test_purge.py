@@ -53,7 +53,7 @@ def test_rows_are_rolled_up_before_they_go(filed: tuple[Path, Recorded]) -> None
     assert watermark(recorded.connection) == 0
     recorded.prune(states(rows=1000, spared_rows=0))
     assert watermark(recorded.connection) >= 4000
-    assert recorded.connection.execute("SELECT max(rows) FROM signal").fetchone()[0] >= 4000
+    assert recorded.connection.execute("SELECT max(row_count) FROM signal").fetchone()[0] >= 4000
 
 
 def test_progress_ends_with_everything_that_was_planned(filed: tuple[Path, Recorded]) -> None:
@@ -183,7 +183,7 @@ def test_no_write_of_a_purge_does_more_than_its_time_allows(filed: tuple[Path, R
 def test_a_robot_that_records_meanwhile_loses_no_row(filed: tuple[Path, Recorded]) -> None:
     file, recorded = filed
     recorded.end_run("finished")
-    recorded.connection.execute("UPDATE run SET rows = 5000 WHERE id = 2")
+    recorded.connection.execute("UPDATE run SET row_count = 5000 WHERE id = 2")
     robot, steps = InProcessSupervisor("other"), 0
     line = [sys.executable, "-m", "webots_mcp", "prune", "--keep-states", "0rows"]
     with MCPBridge(robot, throttle_interval=1, database=file) as bridge:
@@ -197,7 +197,8 @@ def test_a_robot_that_records_meanwhile_loses_no_row(filed: tuple[Path, Recorded
         assert bridge.stats().rows_dropped == 0
     assert said.splitlines()[1].split()[0] == "state"
     rows = recorded.connection.execute(
-        "SELECT rows, purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) FROM run"
+        "SELECT row_count, purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) "
+        "FROM run"
     ).fetchall()
     assert rows == [(5000, 5000), (steps, steps)]
     assert recorded.connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)

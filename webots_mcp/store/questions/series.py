@@ -37,7 +37,7 @@ class NumberColumns:
         turn: A whole turn in its unit, of an angle; else None.
         mean: Of an angle the circular mean.
         whole: The same for the whole range, with the times of its extremes.
-        odd: How often a value stood there that JSON cannot hold ("nan", "inf"); None if the
+        replaced: How often a value stood there that JSON cannot hold ("nan", "inf"); None if the
             range is too long for the rows to be looked at.
     """
 
@@ -53,7 +53,7 @@ class NumberColumns:
     last: list[float | None]
     count: list[int]
     whole: Summary
-    odd: dict[str, int] | None
+    replaced: dict[str, int] | None
 
 
 @dataclass(frozen=True)
@@ -219,7 +219,7 @@ def _columns(signal: Signal, table: Table) -> NumberColumns:
         last=[cell.last for cell in cells],
         count=[cell.present for cell in cells],
         whole=merge(cells) if cells else Summary(),
-        odd=None if table.odd is None else dict(table.odd.get(signal.name, {})),
+        replaced=None if table.replaced is None else dict(table.replaced.get(signal.name, {})),
     )
 
 

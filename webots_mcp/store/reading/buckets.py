@@ -36,7 +36,7 @@ class Table:
         starts: Begin of each bucket.
         cells: Per signal one summary per bucket.
         rows: Rows of the segment that were read, be it as rollups.
-        odd: Per signal, how often each value that JSON cannot hold; None if long.
+        replaced: Per signal, how often each value that JSON cannot hold; None if long.
         cut_at_s: Where the deadline stopped the reading: nothing behind it is in the table. None
             if it did not.
     """
@@ -47,7 +47,7 @@ class Table:
     cells: dict[str, list[Summary]]
     rows: int
     rhythm: Rhythm
-    odd: dict[str, Counter[str]] | None
+    replaced: dict[str, Counter[str]] | None
     cut_at_s: float | None
 
 
@@ -128,7 +128,9 @@ def _from_rows(
     }
     tier = "rows" if step_s is None else "raw"
     rhythm = rhythm_of(times)
-    return Table(tier, step_s, starts, cells, len(times), rhythm, columns.odd, columns.cut_at_s)
+    return Table(
+        tier, step_s, starts, cells, len(times), rhythm, columns.replaced, columns.cut_at_s
+    )
 
 
 def _edges(times: Sequence[float], step_s: float) -> tuple[list[float], list[int]]:

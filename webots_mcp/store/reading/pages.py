@@ -28,7 +28,7 @@ class Page:
 
     Attributes:
         values: Per signal one value per row; None where the row has none.
-        odd: Per signal, how often each value that JSON cannot hold.
+        replaced: Per signal, how often each value that JSON cannot hold.
         cursor: Give it as `after_id` for the next page; None after the last row, or where the time
             was over before any was read.
         cut: The time was over: there may be more rows even where none is here.
@@ -40,7 +40,7 @@ class Page:
     sim_time_s: list[float]
     wall_time_s: list[float]
     values: dict[str, list[Value]]
-    odd: dict[str, dict[str, int]]
+    replaced: dict[str, dict[str, int]]
     cursor: int | None
     notes: tuple[str, ...]
     cut: bool = False
@@ -108,10 +108,10 @@ def _page(
     time_range: TimeRange, signals: Sequence[Signal], parts: list[Columns], limit: int, *, cut: bool
 ) -> Page:
     ids = [row_id for part in parts for row_id in part.ids]
-    odd: dict[str, Counter[str]] = {}
+    replaced: dict[str, Counter[str]] = {}
     for part in parts:
-        for name, counts in part.odd.items():
-            odd.setdefault(name, Counter()).update(counts)
+        for name, counts in part.replaced.items():
+            replaced.setdefault(name, Counter()).update(counts)
     more = (cut or len(ids) > limit) and bool(ids)
     return Page(
         time_range.robot,
@@ -120,7 +120,7 @@ def _page(
         [time_s for part in parts for time_s in part.times][:limit],
         [time_s for part in parts for time_s in part.walls][:limit],
         {s.name: [v for part in parts for v in part.values[s.name]][:limit] for s in signals},
-        {name: dict(counts) for name, counts in odd.items()},
+        {name: dict(counts) for name, counts in replaced.items()},
         ids[:limit][-1] if more else None,
         time_range.notes,
         cut,

@@ -17,7 +17,7 @@ TABLES: Final = ("state", "kept_state", "log", "event", "image")
 _OWN: Final = {"image": f"AND kind <> '{KEPT_FRAME}'"}
 
 _RUNS: Final = (
-    f"SELECT id, robot_id, rows, started_wall_time_s, last_wall_time_s, {KEPT}, "
+    f"SELECT id, robot_id, row_count, started_wall_time_s, last_wall_time_s, {KEPT}, "
     "ended_wall_time_s IS NULL OR id = (SELECT max(id) FROM run n WHERE n.robot_id = run.robot_id)"
     " AS is_current FROM run WHERE typeof(started_wall_time_s) IN ('real', 'integer') "
     "AND typeof(last_wall_time_s) IN ('real', 'integer') ORDER BY started_wall_time_s, id"
@@ -53,7 +53,7 @@ _ID_RANGE: Final = "SELECT coalesce(min(id), 0), coalesce(max(id), -1) FROM {tab
 _WINDOW: Final = (
     "SELECT run_id, {payload} FROM {table} NOT INDEXED WHERE id >= ? ORDER BY id LIMIT ?"
 )
-_FILE_BYTES: Final = "iif(bytes BETWEEN 0 AND 1e12, bytes, 0)"
+_FILE_BYTES: Final = "iif(size_bytes BETWEEN 0 AND 1e12, size_bytes, 0)"
 _PICTURES: Final = (
     f"SELECT run_id, avg({_FILE_BYTES}) FROM image WHERE kind <> '{KEPT_FRAME}' GROUP BY run_id"
 )

@@ -32,7 +32,7 @@ _USED: Final = " OR ".join(
     for table in ("rollup", "recent_rollup", "change")
 )
 _DESCRIBED: Final = (
-    "name, kind, unit, path, reduce, role, first_seen_wall_time_s, last_seen_wall_time_s"
+    "name, kind, unit, path, reduction, role, first_seen_wall_time_s, last_seen_wall_time_s"
 )
 _ENTER: Final = (
     f"INSERT INTO main.signal (robot_id, {_DESCRIBED}) SELECT :here, {_DESCRIBED} "
@@ -159,7 +159,7 @@ def _renamed(text: str, names: dict[int, int]) -> str | None:
 
 
 def _counts(connection: sqlite3.Connection, here: int) -> list[Count]:
-    """What the run adds to the register; how many of its values were odd summaries do not tell."""
+    """What the run adds to the register; how many values were replaced summaries do not tell."""
     counts: list[Count] = []
     for signal_id, name, kind, kind_there, seen_s, rows, present, least, most in connection.execute(
         _COUNTS, {"run": here}

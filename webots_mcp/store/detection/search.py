@@ -16,6 +16,7 @@ from webots_mcp.store.detection.motion import Motion, find_motion
 from webots_mcp.store.detection.verdict import Ledger
 from webots_mcp.store.reading.coverage import less_time, purged_until_s
 from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import Segment, just_after, recorded_bounds
 from webots_mcp.store.reading.views import View, view_of
 from webots_mcp.store.reading.wall_time import UP_TO, RunClock
@@ -172,6 +173,11 @@ class Search:
         figures = {"min": "min", "max": "max"}
         found = totals(self.connection, self.segment.run_id, EVER, figures)
         return {signal_id: (least, greatest) for signal_id, (least, greatest) in found.items()}
+
+    @cached_property
+    def frame(self) -> Frame:
+        """The rows of the segment."""
+        return read_frame(self.connection, self.segment, self.deadline)
 
     @cached_property
     def view(self) -> View:

@@ -17,7 +17,6 @@ from webots_mcp.store.analysis.arrays import Array, Flags, np
 from webots_mcp.store.analysis.jumps import least_jump
 from webots_mcp.store.analysis.rhythm import usual_interval_s
 from webots_mcp.store.analysis.summary import Summary, summarise_numbers
-from webots_mcp.store.analysis.swings import SLOW_HALF_SWINGS, Swing
 from webots_mcp.store.reading.coverage import less_time
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.gaps import rows_by_bucket
@@ -38,15 +37,15 @@ from webots_mcp.store.reading.rows import (
     read_columns,
     read_numbers,
 )
-from webots_mcp.store.reading.sampling import MOST_SAMPLES, newest_part, read_sampled
+from webots_mcp.store.reading.sampling import (
+    ACROSS_S,
+    MOST_SAMPLES,
+    STRETCH_ROWS,
+    newest_part,
+    read_sampled,
+)
 from webots_mcp.store.reading.steps import BucketSteps, read_steps
 from webots_mcp.store.rollup.buckets import BUCKET_S, FINE, bucket_of, totals
-from webots_mcp.store.rollup.swings import (
-    ACROSS_S,
-    LONGEST_PERIOD_S,
-    STRETCH_ROWS,
-    stored_swings,
-)
 from webots_mcp.store.rollup.tables import watermark
 from webots_mcp.store.signals.registry import Signal
 
@@ -98,7 +97,6 @@ class View(Protocol):
     notes: list[str]  # what could not be looked at, of what was asked since they were taken
     shortest_rest_s: float  # a shorter one may be missed
     sampled_s: float  # between the rows of `places`; 0 where these are all
-    longest_period_s: float  # of swings that show in it
     is_long: bool  # not all of its rows are read
     inside: range  # buckets of 10 s of which what was found is stored; none where all rows are read
 
@@ -132,10 +130,6 @@ class View(Protocol):
         self, signals: Sequence[Signal], score: float
     ) -> Iterator[tuple[Signal, Iterator[Course]]]:
         """Where a jump of each signal may be."""
-        ...
-
-    def stored_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
-        """Swings that were found before; and of which buckets, where all of a signal's are."""
         ...
 
     def stretches(
@@ -196,8 +190,6 @@ class RowView:
             after = f"after {columns.cut_at_s:.3f} s" if columns.times else "at all"
             self._lasting.append(f"time limit reached: not read {after}; ask for less time")
         self._columns = columns
-        length_s = columns.times[-1] - columns.times[0] if columns.times else 0.0
-        self.longest_period_s = max(LONGEST_PERIOD_S, 2 * length_s / SLOW_HALF_SWINGS)
         self._summaries: dict[str, Summary] = {}
 
     def taken_notes(self) -> list[str]:
@@ -238,10 +230,6 @@ class RowView:
         for signal in signals:
             yield signal, iter([Course(*self._columns.numbers(signal.name))])
 
-    def stored_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
-        """None: all rows are there to look in."""
-        return _NOTHING, {}
-
     def stretches(
         self,
         signals: Sequence[Signal],
@@ -257,7 +245,6 @@ class LongView:
     """The rollups of a long segment, and what has to be read besides."""
 
     shortest_rest_s = 2 * BUCKET_S  # a shorter one need not fill a bucket
-    longest_period_s = LONGEST_PERIOD_S
     is_long = True
 
     def __init__(
@@ -444,10 +431,6 @@ class LongView:
                 times, numbers = self._numbers(buckets, alike[buckets]).of(signal.name)
                 livelier = least_jump(numbers, score) > limit
                 yield Course(times, numbers, None if livelier else usual)
-
-    def stored_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
-        """Those of the coarse rollups that lie inside."""
-        return stored_swings(self._connection, self._segment, self.inside, signals)
 
     def stretches(
         self,

@@ -1,6 +1,6 @@
 """What is found where 500 s of a run are over, and stored with their rollups.
 
-Swings and standstills show in all rows only, for which a question about hours has no time.
+Standstills show in all rows only, for which a question about hours has no time.
 """
 
 from __future__ import annotations
@@ -15,13 +15,12 @@ from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.reading.rows import Columns, read_columns
-from webots_mcp.store.reading.sampling import newest_part
+from webots_mcp.store.reading.sampling import ACROSS_S, STRETCH_ROWS, newest_part
 from webots_mcp.store.rollup.buckets import COARSE_S
 from webots_mcp.store.rollup.standstills import StandstillsToStore
-from webots_mcp.store.rollup.swings import ACROSS_S, STRETCH_ROWS, SwingsToStore
 from webots_mcp.store.signals.registry import Signal, registered
 
-FINDINGS: Final = ("swings", "standstills")  # columns of the table
+FINDINGS: Final = ("standstills",)  # columns of the table
 MOST_ROWS: Final = 100_000  # in 500 s: of more a maintainer had to read too much at once
 _LONGEST_S: Final = 60.0  # that it reads
 
@@ -42,18 +41,16 @@ def findings_to_store(
     """
     known = registered(connection, robot_id)
     here = {name: signal for name, signal in known.items() if signal.id in rows}
-    swings = SwingsToStore(here.values())
     standstills = StandstillsToStore(find_motion(here, EventOptions()))
-    signals = {each.name: each for each in (*swings.signals, *standstills.signals)}
+    signals = {each.name: each for each in standstills.signals}
     segment = Segment(run_id, bucket * COARSE_S, (bucket + 1) * COARSE_S)
-    most, found = max(rows.values(), default=0), (swings, standstills)
+    most = max(rows.values(), default=0)
     left = 0
     if signals and most <= MOST_ROWS:
         for columns, own_rows in _stretches(connection, segment, list(signals.values())):
             left += own_rows
-            for each in found:
-                each.add(columns)
-    return [each.stored() if 0 < most <= left else {} for each in found]
+            standstills.add(columns)
+    return [standstills.stored() if 0 < most <= left else {}]
 
 
 def _stretches(

@@ -37,7 +37,7 @@ VERY_REGULAR: Final = 0.8  # ... and so many over four periods, where nothing is
 WINDOW: Final = 2.2  # periods
 CLIPPED: Final = 1.5  # times the median magnitude: a sine has a height of 1.4 times its own
 LIKELY: Final = 0.6  # of a clipped window is explained by a sine ...
-MOST_LIKELY: Final = 0.75  # ... and so much somewhere in the stretch
+MOST_LIKELY: Final = 0.7  # ... and so much somewhere in the stretch
 SEMITONES: Final = range(-5, 6)  # about the period of a level, which reaches from -3 to 3
 HIDDEN: Final = 1.0  # of a period, for which bends may hide a swing that goes on
 
@@ -358,29 +358,29 @@ def _regular_blocks(bends: Array, half: int) -> Flags:
     turned = np.bitwise_count((above[half : half + whole] != above[:whole]).view(np.uint32))
     turns = sums_of(turned, window)
     sizes = np.abs(bends[:whole:BLOCK])
-    sizes += np.abs(bends[2:whole:BLOCK])
-    loud = sums_of(sizes, window)
-    regular = (turns >= REGULAR * BLOCK * window) & (loud > LOUD * _usual(loud))
+    sizes += np.abs(bends[2:whole:BLOCK])  # a quarter of a period later: of a sine never small
+    loud = sums_of((sizes > LOUD * _usual(sizes)).view(np.uint8), window)
+    regular = (turns >= REGULAR * BLOCK * window) & (loud >= window - 1)
     if len(turns) > window:
         long = turns[:-window] + turns[window:] >= VERY_REGULAR * BLOCK * 2 * window
         regular[:-window] |= long
         regular[window:] |= long
     else:
         regular |= turns >= VERY_REGULAR * BLOCK * window
-    return regular & (loud > 0)
+    return regular
 
 
-def _usual(loud: Array) -> Array | float:
-    """The lower quartile about each window, the least of three such stretches."""
-    some = loud[::4]
+def _usual(sizes: Array) -> Array | float:
+    """The lower quartile about each size, the least of three such stretches."""
+    some = sizes[::4]
     count, quarter = len(some) // SURROUNDING, SURROUNDING // 4
     if count < 2:
         return float(np.partition(some, len(some) // 4)[len(some) // 4])
     parts: Array = np.reshape(some[: count * SURROUNDING], (count, SURROUNDING))
     padded: Array = np.pad(np.partition(parts, quarter, axis=1)[:, quarter], 1, mode="edge")
     least = np.minimum(np.minimum(padded[:-2], padded[1:-1]), padded[2:])
-    usual = np.repeat(least, 4 * SURROUNDING)[: len(loud)]
-    return np.pad(usual, (0, len(loud) - len(usual)), mode="edge")
+    usual = np.repeat(least, 4 * SURROUNDING)[: len(sizes)]
+    return np.pad(usual, (0, len(sizes) - len(usual)), mode="edge")
 
 
 @lru_cache(64)  # the same for all signals

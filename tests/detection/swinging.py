@@ -147,12 +147,10 @@ def draw_roaming(rng: np.random.Generator) -> LabelledRun:
     speed = float(rng.uniform(0.1, 0.4)) * interval_s
     noise = rng.normal(0, float(rng.choice([0, 0.001, 0.005, 0.01])), (2, len(heading)))
     x, y = np.cumsum(speed * np.cos(heading)), np.cumsum(speed * np.sin(heading))
+    places: Array = np.stack((x, y)) + noise
     columns: dict[str, Sequence[Any]] = {
         "heading": np.angle(np.exp(1j * heading)).tolist(),
-        "position": [
-            {"x": at_x, "y": at_y}
-            for at_x, at_y in (zip(*(np.stack((x, y)) + noise), strict=False))
-        ],
+        "position": [{"x": each[0], "y": each[1]} for each in places.T.tolist()],
     }
     return LabelledRun(interval_s * np.arange(len(x)), columns, interval_s)
 

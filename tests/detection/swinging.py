@@ -102,7 +102,7 @@ def draw_steady(rng: np.random.Generator) -> LabelledRun:
 def _calm(rng: np.random.Generator, **columns: Array) -> LabelledRun:
     """Values at times that are their indexes, which no swing is in."""
     interval_s = float(rng.choice(_INTERVALS_S[1:5]))
-    times = interval_s * np.arange(len(next(iter(columns.values()))))
+    times: Array = interval_s * np.arange(len(next(iter(columns.values()))), dtype=np.float64)
     return LabelledRun(times, {name: each.tolist() for name, each in columns.items()}, interval_s)
 
 
@@ -152,7 +152,8 @@ def draw_roaming(rng: np.random.Generator) -> LabelledRun:
         "heading": np.angle(np.exp(1j * heading)).tolist(),
         "position": [{"x": each[0], "y": each[1]} for each in places.T.tolist()],
     }
-    return LabelledRun(interval_s * np.arange(len(x)), columns, interval_s)
+    times: Array = interval_s * np.arange(len(x), dtype=np.float64)
+    return LabelledRun(times, columns, interval_s)
 
 
 def draw_with_gap(rng: np.random.Generator) -> LabelledRun:

@@ -264,7 +264,7 @@ def evidence(loudness: float, robustly: float, explained: float, count: float) -
     return (
         OF_LOUDNESS * math.log(max(loudness, LEAST_LOUDNESS))
         + OF_ROBUST_FIT * math.log(1.01 - max(0.0, robustly))
-        + OF_FIT * math.log(1.05 - explained)
+        + OF_FIT * math.log(1.05 - min(explained, 1.0))
         + OF_COUNT * math.log(count)
     )
 
@@ -359,7 +359,7 @@ def _regular_blocks(bends: Array, half: int) -> Flags:
     turns = sums_of(turned, window)
     sizes = np.abs(bends[:whole:BLOCK])
     sizes += np.abs(bends[2:whole:BLOCK])  # a quarter of a period later: of a sine never small
-    loud = sums_of((sizes > LOUD * _usual(sizes)).view(np.uint8), window)
+    loud = sums_of((sizes > LOUD * _usual(sizes)).astype(np.uint8), window)
     regular = (turns >= REGULAR * BLOCK * window) & (loud >= window - 1)
     if len(turns) > window:
         long = turns[:-window] + turns[window:] >= VERY_REGULAR * BLOCK * 2 * window

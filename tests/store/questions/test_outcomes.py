@@ -72,7 +72,12 @@ def test_what_no_run_has_is_told_as_not_known(empty: sqlite3.Connection) -> None
     found = compare_runs(empty, [1, 2])
     assert "distance_m" not in {each.name for each in found.measures}
     (names,) = (names for names, why in found.unknown.items() if "no position is known" in why)
-    assert names.split(", ") == ["distance_m", "mean_speed_m_s", "standstill per min", "stuck per min"]
+    assert names.split(", ") == [
+        "distance_m",
+        "mean_speed_m_s",
+        "standstill per min",
+        "stuck per min",
+    ]
 
 
 def test_runs_that_are_too_short_for_a_kind_share_one_reason(empty: sqlite3.Connection) -> None:

@@ -16,7 +16,6 @@ from typing import Final, Protocol
 from webots_mcp.store.analysis.summary import Summary, summarise_numbers
 from webots_mcp.store.analysis.swings import SLOW_HALF_SWINGS, Swing
 from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.gaps import rows_by_bucket
 from webots_mcp.store.reading.intervals import (
     Condition,
     Span,
@@ -25,7 +24,7 @@ from webots_mcp.store.reading.intervals import (
     spans_in_rows,
 )
 from webots_mcp.store.reading.ranges import Segment
-from webots_mcp.store.reading.rollups import Pieces, read_pieces, rows_after
+from webots_mcp.store.reading.rollups import Pieces, read_pieces, rows_after, rows_by_bucket
 from webots_mcp.store.reading.rows import (
     Columns,
     Numbers,

@@ -12,6 +12,8 @@ from typing import Final, NamedTuple, get_args
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.signal_kinds import Kind, unit_of, widen
 from webots_mcp.signal_register import MAX_SIGNALS
+from webots_mcp.store.chunks.merging_chunks import take_in_chunks
+from webots_mcp.store.chunks.stored import STATE_IDS
 from webots_mcp.store.rollup.tables import ADD_COUNTS, IS_ID, fill, run_mark
 from webots_mcp.store.signals.registry import Count, enter_signals
 
@@ -19,7 +21,11 @@ from webots_mcp.store.signals.registry import Count, enter_signals
 _MOST_IDS: Final = 2**40
 _IDS: Final = (
     "SELECT min(id), max(id) FROM (SELECT id FROM source.state WHERE run_id = :run UNION ALL "
-    f"SELECT state_id FROM source.change WHERE run_id = :run AND {IS_ID.format('state_id')})"
+    f"SELECT state_id FROM source.change WHERE run_id = :run AND {IS_ID.format('state_id')} "
+    "UNION ALL SELECT last_state_id FROM source.row_group WHERE run_id = :run "
+    "UNION ALL SELECT max_state_id FROM source.row_group WHERE run_id = :run "
+    "UNION ALL SELECT CAST(min AS INTEGER) FROM source.chunk WHERE run_id = :run "
+    f"AND signal_id = {STATE_IDS} AND min IS NOT NULL)"
 )
 _LAST_HERE: Final = "SELECT coalesce(max(seq), 0) FROM main.sqlite_sequence WHERE name = 'state'"
 _RESERVE: Final = (
@@ -28,7 +34,7 @@ _RESERVE: Final = (
 )
 _USED: Final = " OR ".join(
     f"EXISTS (SELECT 1 FROM source.{table} WHERE run_id = :run AND signal_id = s.id)"
-    for table in ("rollup", "recent_rollup", "change")
+    for table in ("rollup", "recent_rollup", "change", "chunk")
 )
 _DESCRIBED: Final = (
     "name, kind, unit, path, reduce, role, first_seen_wall_time_s, last_seen_wall_time_s"
@@ -49,10 +55,9 @@ _FILL_MAP: Final = (
 )
 _TABLES: Final = ("rollup", "recent_rollup", "coarse_rollup", "change")
 _COUNTS: Final = (
-    "SELECT n.id, n.name, n.kind, s.kind, s.last_seen_wall_time_s, sum(u.rows), sum(u.present), "
-    "min(u.min), max(u.max) FROM (SELECT signal_id, rows, present, min, max FROM main.rollup "
-    "WHERE run_id = :run UNION ALL SELECT signal_id, rows, present, min, max "
-    "FROM main.recent_rollup WHERE run_id = :run) u "
+    "SELECT n.id, n.name, n.kind, s.kind, s.last_seen_wall_time_s, sum(u.row_count), "
+    "sum(u.value_count), min(u.min), max(u.max) FROM (SELECT signal_id, row_count, value_count, "
+    "min, max FROM main.chunk WHERE run_id = :run) u "
     "JOIN temp.signal_here m ON m.here = u.signal_id "
     "JOIN source.signal s ON s.id = m.there JOIN main.signal n ON n.id = m.here GROUP BY n.id"
 )
@@ -93,6 +98,7 @@ def take_in_summaries(connection: sqlite3.Connection, there: int, here: int, rob
     connection.execute(_FILL_MAP, asked)
     for table in _TABLES:
         _copy(connection, table, there, here, ids.shift)
+    take_in_chunks(connection, there, here, ids.shift)
     fill(connection, "new_count", _counts(connection, here))
     connection.execute(ADD_COUNTS)
     enter_signals(connection, robot_id, ())

@@ -28,6 +28,7 @@ MOST_ROWS: Final = 2_000_000  # of a run: its first ones
 _STANDS_SHARE: Final = 0.8  # of a visit
 _MOVES_SHARE: Final = 0.1  # of the samples of a visit, or of so many
 _ENOUGH: Final = 200
+_FAST: Final = 0.9  # of the samples are slower
 _SAMPLE_S: Final = 0.5
 _PACE_S: Final = 1.0  # over so long a speed is measured; longer, by so much for each metre of noise
 _PACE_S_PER_M: Final = 100.0
@@ -159,6 +160,7 @@ def _uses_of(
     for code in np.unique(codes).tolist():
         of_code = codes[firsts] == code
         some = speeds[np.repeat(of_code & moved, lengths)]
-        speed_m_s = median(some[some >= some.max() / 2]) if len(some) else 0.0
+        # Not of where it braked or turned; a leap is no speed.
+        usual = some[some >= np.quantile(some, _FAST) / 2] if len(some) else np.zeros(1)
         counts = int((of_code & moved).sum()), int((of_code & stood).sum())
-        yield code, ModeUse(*counts, speed_m_s, run_id)
+        yield code, ModeUse(*counts, median(usual), run_id)

@@ -27,6 +27,9 @@ ALLOWED = {
     "pauses": set[str](),
     "stored_breakpoints": {"conditions", "contract", "errors", "transactions"},
     "naming": set[str](),
+    "signal_kinds": {"naming"},
+    "signal_roles": {"naming", "signal_kinds"},
+    "signal_register": {"signal_kinds", "signal_roles"},
     "conditions": {"conditions", "errors", "naming"},
     "parameter": {"errors", "naming"},
     "entries": {"queue"},
@@ -44,6 +47,9 @@ ENTRIES = {
     "pauses",
     "liveness",
     "queue",
+    "signal_kinds",
+    "signal_register",
+    "signal_roles",
     "stored_breakpoints",
 }
 STDLIB = {

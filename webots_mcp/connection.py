@@ -130,7 +130,7 @@ def connect(
 
 
 def _prepare(connection: sqlite3.Connection, role: Role) -> None:
-    """Set what the role needs, and look whether all is ours; another version's is only migrated."""
+    """Set what the role needs, and look whether all is ours; another version's is not used."""
     for pragma in _PRAGMAS[role]:
         connection.execute(f"PRAGMA {pragma}")
     if _can_distrust():

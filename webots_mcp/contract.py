@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import tempfile
 
 APPLICATION_ID: Final = 0x57424D43  # "WBMC", shown by the `file` command
-SCHEMA_VERSION: Final = 9  # PRAGMA user_version of a database that this version reads and writes
+SCHEMA_VERSION: Final = 10  # PRAGMA user_version of a database that this version reads and writes
 
 DATABASE_NAME: Final = "webots.db"
 WORLD_ENDING: Final = ".wbt"
@@ -108,7 +108,12 @@ ENDING: Final = ("load_world", "quit")  # actions that are done when the control
 Pace = Literal["fast", "real_time"]  # of a `run` command
 Then = Literal["pause", "go_on", "as_before"]  # what it does at its end
 RunEnd = Literal[
-    "condition held", "time over", "pruned", "run ended", "interrupted", "condition failed"
+    "condition held",
+    "simulation time reached",
+    "pruned",
+    "run ended",
+    "interrupted",
+    "condition failed",
 ]
 SEE_STEPS: Final = (
     "call bridge.publish({...}) and bridge.get_command() in every round of the loop, or "

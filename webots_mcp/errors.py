@@ -11,7 +11,7 @@ of its own.
     │   ├── MalformedRowError       a row holds a value that no bridge has written
     │   ├── SessionGoneError        the session that is being recorded was deleted
     │   ├── SchemaTooNewError       a newer webots-mcp wrote it
-    │   └── SchemaTooOldError       an older webots-mcp wrote it: migrate first
+    │   └── SchemaTooOldError       an older webots-mcp wrote it
     ├── PoolError                   the store of many recordings is the problem
     │   ├── PoolUnavailableError    it is away, restarts or is full: worth trying again
     │   └── PoolBusyError           another ships the same recording
@@ -84,7 +84,7 @@ class SchemaTooNewError(DatabaseError):
 
 
 class SchemaTooOldError(DatabaseError):
-    """The database has an older schema and was not migrated."""
+    """The database was written by an older version of this package."""
 
 
 class PoolError(WebotsMCPError):

@@ -33,8 +33,8 @@ _ALIVE: Final = (
 )
 _BEAT_SESSION: Final = (
     "UPDATE session SET last_seen_wall_time_s = ?, last_seen_monotonic_s = ?, "
-    "last_poll_wall_time_s = ?, moved_wall_time_s = ?, sim_time_s = ?, hold = ?, hold_mode = ?, "
-    "rows_waiting = ?, rows_dropped = ?, last_error = ?, "
+    "last_poll_wall_time_s = ?, moved_wall_time_s = ?, sim_time_s = ?, hold = ?, "
+    "mode_before_pause = ?, rows_waiting = ?, rows_dropped = ?, last_error = ?, "
     f"ended_wall_time_s = {_ALIVE.format('session', 'id', 'ended_wall_time_s')}, "
     f"end_reason = {_ALIVE.format('session', 'id', 'end_reason')} WHERE id = ?"
 )

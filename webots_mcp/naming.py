@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Collection, Iterable, Sequence
 from functools import lru_cache
+from itertools import takewhile
 from typing import Any, Final, Literal, TypeAlias
 
 Value: TypeAlias = "int | float | str | None"  # a bool is an int
@@ -147,29 +148,33 @@ def find_position(numeric: Collection[str]) -> tuple[str, str] | None:
     """The names of a robot's x and y, among those of its numbers; None without any.
 
     In metres, unless the names have another unit: see `units.metres_in`.
+    """
+    return next(iter(positions_in(numeric)), None)
+
+
+def positions_in(numeric: Collection[str]) -> list[tuple[str, str]]:
+    """The names that may be a robot's x and y, the best ones first.
 
     It is what is called `pose`, `position`, `pos`, `gps`, `odometry`, `odom` or `location` (in
     this order), or `x` and `y` at the top, or else the first branch by name that has an x and y:
     one with such a word in its name before others (`currentPosition.x`, `posX`, `robotPose.0`), and
-    none of what is elsewhere (`goal`, `ball`) or no place (`velocity`). The views robot_now and
-    robot_trajectory have the same rule, row by row. Where an observer sees several robots, none
-    of their positions is taken.
+    none of what is elsewhere (`goal`, `ball`) or no place (`velocity`). Where an observer sees
+    several robots, none of their positions is taken, nor one that comes after them.
     """
-    for x, y in USUAL_POSITIONS:
-        if x in numeric and y in numeric:
-            return x, y
+    usual = [(x, y) for x, y in USUAL_POSITIONS if x in numeric and y in numeric]
     places = {place: name for name in numeric if (place := _place_of(name)) is not None}
     pairs = [
         (branch, (name, places[branch, key, "y"]))
         for (branch, key, axis), name in places.items()
         if axis == "x" and (branch, key, "y") in places
     ]
-    branch, found = min(pairs, key=_place_first, default=("", None))
-    if branch.startswith(_SEEN) and sum(each.startswith(_SEEN) for each, _ in pairs) > 1:
-        return None
-    return found
+    pairs.sort(key=_place_first)
+    if sum(branch.startswith(_SEEN) for branch, _ in pairs) > 1:
+        pairs = takewhile(lambda pair: not pair[0].startswith(_SEEN), pairs)
+    return list(dict.fromkeys([*usual, *(names for _, names in pairs)]))
 
 
+@lru_cache(maxsize=_KEPT)
 def _place_of(name: str) -> tuple[str, str, str] | None:
     """The branch of an x or y, the rest of its name and which of them it is; None of all else."""
     branch, _, last = name.rpartition(".")
@@ -229,34 +234,38 @@ def find_mode(texts: Collection[str], choices: Collection[str] = ()) -> str | No
     """The name of what a robot is doing, among those of its texts; None without any.
 
     Without such a text it is one of `choices`: whole numbers with few different values.
+    """
+    return next(iter(modes_in(texts, choices)), None)
+
+
+def modes_in(texts: Collection[str], choices: Collection[str] = ()) -> list[str]:
+    """The names that may be of what a robot is doing, the best ones first; texts before `choices`.
 
     It is `mode`, `behaviour`, `behavior`, `action`, `task` or `phase` (in this order), or else the
     shortest name that ends in one of these words, as `nav.mode`, `driveMode` and `mode_name` do;
     then the same of `state` and `status`. What was or shall be (`lastAction`, `next_state`) is
-    none. The views robot_now and robot_trajectory have the same rule, row by row.
+    none.
     """
-    return _mode_among(texts) or _mode_among(choices)
+    return [*_modes_among(texts), *_modes_among(choices)]
 
 
-def _mode_among(texts: Collection[str]) -> str | None:
-    last_words = {name: _without_spelling(words_of(name.rpartition(".")[2])) for name in texts}
-    for words in (MODES, STATES):
-        ending = [
-            name
-            for name, (*before, last) in last_words.items()
-            if last in words and PAST_OR_FUTURE.isdisjoint(before)
-        ]
-        if ending:
-            return next((word for word in words if word in texts), min(ending, key=_shortest))
-    return None
+def _modes_among(names: Iterable[str]) -> list[str]:
+    ranks = {name: rank for name in names if (rank := _mode_rank(name)) is not None}
+    return sorted(ranks, key=lambda name: (ranks[name], name))
+
+
+@lru_cache(maxsize=_KEPT)
+def _mode_rank(name: str) -> tuple[bool, int, int] | None:
+    """Lower is better: is it of anything, the word's own rank, the length; None of no mode."""
+    *before, last = _without_spelling(words_of(name.rpartition(".")[2]))
+    if last not in (*MODES, *STATES) or not PAST_OR_FUTURE.isdisjoint(before):
+        return None
+    words = MODES if last in MODES else STATES
+    return last in STATES, words.index(name) if name in words else len(words), len(name)
 
 
 def _without_spelling(words: Sequence[str]) -> Sequence[str]:
     return words[:-1] if words[1:] and words[-1] in SPELLINGS else words
-
-
-def _shortest(name: str) -> tuple[int, str]:
-    return len(name), name
 
 
 def _place_first(pair: tuple[str, tuple[str, str]]) -> tuple[bool, tuple[str, str]]:

@@ -1,8 +1,8 @@
 """Whether a database is ours, whole and of our version, and making an empty one ready.
 
-The schema is defined by `store/models.py` and the migrations; `schema.sql` is generated from them
-(a test compares the two), so that a controller can make a database in milliseconds and without
-importing anything but the standard library.
+The schema is defined by `store/models.py` and the views in `migrations`; `schema.sql` is generated
+from them (a test compares the two), so that a controller can make a database in milliseconds and
+without importing anything but the standard library.
 
 A file of foreign origin may hold anything: a view under the name of a table of ours, or a trigger
 on one, would run its author's SQL in every process that opens the file, and a recursion in it need
@@ -28,6 +28,11 @@ from webots_mcp.transactions import transaction
 
 SCHEMA_FILE: Final = Path(__file__).with_name("schema.sql")
 
+OLDER_SCHEMA: Final = 9  # of the recordings before the values lay in chunks
+_FROM_OLDER: Final = (
+    "{file} has schema {version}, of an older webots-mcp, and this one knows {known}: move it "
+    "aside, so that a new one is begun, and read it with the webots-mcp that made it"
+)
 _MADE: Final = re.compile(r'CREATE (?:UNIQUE )?(?:TABLE|VIEW|INDEX|TRIGGER) "?(\w+)', re.IGNORECASE)
 _TOKENS: Final = re.compile(
     r"('(?:[^']|'')*'|\"[^\"]*\"|`[^`]*`|\[[^\]]*\]|\w+|/\*.*?\*/|--[^\n]*|[^\s\w])", re.DOTALL
@@ -62,7 +67,7 @@ def schema_version(connection: sqlite3.Connection) -> int:
     _, _, file = connection.execute("PRAGMA database_list").fetchone()
     if application_id == APPLICATION_ID:
         version = int(connection.execute("PRAGMA user_version").fetchone()[0])
-        if version < 0 or (version == 0 and tables):  # migrating would run what is there unseen
+        if version < 0 or (version == 0 and tables):
             raise ForeignDatabaseError(
                 f"{file or 'the database'} has tables of schema {version}, which no version of "
                 "webots-mcp makes; choose another file"
@@ -90,8 +95,9 @@ def require_current(connection: sqlite3.Connection) -> None:
         )
     if version < SCHEMA_VERSION:
         raise SchemaTooOldError(
-            f"the database has schema {version}, this webots-mcp needs {SCHEMA_VERSION}: "
-            "run 'webots-mcp migrate'"
+            _FROM_OLDER.format(
+                file=_file(connection, "main"), version=version, known=SCHEMA_VERSION
+            )
         )
 
 

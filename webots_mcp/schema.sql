@@ -1,14 +1,13 @@
 PRAGMA application_id = 1463962947;
-PRAGMA user_version = 9;
+PRAGMA user_version = 10;
 CREATE TABLE alembic_version (
 	version_num VARCHAR(32) NOT NULL, 
 	CONSTRAINT alembic_version_pkc PRIMARY KEY (version_num)
 );
-CREATE TABLE lease (
-	name TEXT NOT NULL, 
-	holder TEXT NOT NULL, 
-	until_wall_time_s FLOAT NOT NULL, 
-	PRIMARY KEY (name)
+CREATE TABLE recording (
+	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
+	created_wall_time_s FLOAT NOT NULL, 
+	PRIMARY KEY (uuid)
 );
 CREATE TABLE robot (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
@@ -41,10 +40,238 @@ CREATE TABLE session (
 	rows_dropped INTEGER DEFAULT 0 NOT NULL /* rows that could never be written */, 
 	last_error TEXT /* newest thing that could not be recorded, and why */, 
 	ended_wall_time_s FLOAT, 
-	end_reason TEXT /* finished, reload, crashed, replaced */, uuid TEXT /* random (version 4); names the row among those of all machines */ NULL, process TEXT /* which process of that pid; null where the system does not tell */ NULL, last_seen_monotonic_s FLOAT /* the host's monotonic clock at last_seen_wall_time_s */ NULL, extern INTEGER /* 1 where nobody starts the controller again */ NULL, hold_mode TEXT /* simulation mode to go back to when the hold ends */ NULL, adopted_rows INTEGER DEFAULT 0 /* number of the last entry taken in from its file beside */ NOT NULL, throttle_interval INTEGER /* of so many publish() calls one is recorded */ NULL, 
+	end_reason TEXT /* finished, reload, crashed, replaced */, 
+	uuid TEXT /* random (version 4); names the row among those of all machines */, 
+	process TEXT /* which process of that pid; null where the system does not tell */, 
+	last_seen_monotonic_s FLOAT /* the host's monotonic clock at last_seen_wall_time_s */, 
+	extern INTEGER /* 1 where nobody starts the controller again */, 
+	mode_before_pause TEXT /* simulation mode to go back to when the hold ends */, 
+	last_adopted_entry INTEGER DEFAULT 0 NOT NULL /* number of the last entry taken in from its file beside */, 
+	throttle_interval INTEGER /* of so many publish() calls one is recorded */, 
 	CONSTRAINT fk_session_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE
 );
 CREATE INDEX ix_session_robot_id_id ON session (robot_id, id);
+CREATE UNIQUE INDEX ix_session_uuid ON session (uuid);
+CREATE TABLE run (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	session_id INTEGER NOT NULL, 
+	robot_id INTEGER NOT NULL, 
+	world TEXT /* path of the world file */, 
+	basic_time_step_ms FLOAT, 
+	start_reason TEXT NOT NULL /* start, reset or reload */, 
+	started_wall_time_s FLOAT NOT NULL, 
+	started_sim_time_s FLOAT NOT NULL, 
+	last_wall_time_s FLOAT NOT NULL /* last sign of life */, 
+	last_sim_time_s FLOAT NOT NULL, 
+	ended_wall_time_s FLOAT, 
+	end_reason TEXT /* finished, reset, reload, crashed, replaced */, 
+	rows INTEGER DEFAULT 0 NOT NULL /* state rows, as of last_wall_time_s */, 
+	label TEXT, 
+	note TEXT, 
+	keep INTEGER DEFAULT 0 NOT NULL /* 1: retention deletes nothing of this run */, 
+	purged_rows INTEGER DEFAULT 0 NOT NULL /* of the rows, those that retention has deleted */, 
+	is_chunked INTEGER DEFAULT 0 NOT NULL /* 1 once it has ended and none of its rows wait for a chunk */, 
+	uuid TEXT /* random (version 4); names the row among those of all machines */, 
+	rolled_state_id INTEGER DEFAULT 0 NOT NULL /* last state.id in the rollups, where beyond the watermark */, 
+	coarse_end INTEGER /* buckets of coarse_rollup below it are complete; null before the first */, 
+	CONSTRAINT fk_run_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE CASCADE, 
+	CONSTRAINT fk_run_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE
+);
+CREATE INDEX ix_run_robot_id_id ON run (robot_id, id);
+CREATE INDEX ix_run_session_id ON run (session_id);
+CREATE UNIQUE INDEX ix_run_uuid ON run (uuid);
+CREATE TABLE state (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	run_id INTEGER NOT NULL, 
+	sim_time_s FLOAT NOT NULL, 
+	wall_time_s FLOAT NOT NULL, 
+	data TEXT NOT NULL /* JSON object */, 
+	odd TEXT /* JSON object: path of a replaced value to what it was (nan, inf, ...) */, 
+	CONSTRAINT fk_state_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+);
+CREATE INDEX ix_state_run_id_sim_time_s ON state (run_id, sim_time_s);
+CREATE TABLE signal (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	robot_id INTEGER NOT NULL, 
+	name TEXT NOT NULL /* dotted: pose.0, sensors.front, lidar.min */, 
+	kind TEXT NOT NULL /* num, bool, text, angle (radians), null (no value yet) */, 
+	unit TEXT /* where the name tells it */, 
+	path TEXT NOT NULL /* for json_extract(state.data, path) */, 
+	reduce TEXT /* count, min, max, mean or argmin of the long array at path */, 
+	role TEXT /* x, y, z, yaw, mode, speed, commanded_speed, wheel or commanded_wheel; x2 without an x */, 
+	first_seen_wall_time_s FLOAT NOT NULL, 
+	last_seen_wall_time_s FLOAT NOT NULL, 
+	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held it, up to the watermark */, 
+	null_row_count INTEGER DEFAULT 0 NOT NULL /* of them without a value */, 
+	replaced_row_count INTEGER DEFAULT 0 NOT NULL /* of them with a value that JSON cannot hold (nan, inf, ...) */, 
+	min FLOAT, 
+	max FLOAT, 
+	CONSTRAINT uq_signal_robot_id UNIQUE (robot_id, name), 
+	CONSTRAINT fk_signal_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE
+);
+CREATE INDEX ix_signal_robot_id_role ON signal (robot_id, role) WHERE role IS NOT NULL;
+CREATE TABLE rollup (
+	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held the signal */, 
+	present INTEGER DEFAULT 0 NOT NULL /* of them with a value */, 
+	changes INTEGER DEFAULT 0 NOT NULL /* of the values, those unlike the one before in the bucket */, 
+	first FLOAT /* of numbers and flags (0, 1); null for text, as all that follows */, 
+	first_sim_time_s FLOAT, 
+	last FLOAT, 
+	last_sim_time_s FLOAT, 
+	min FLOAT, 
+	min_sim_time_s FLOAT /* of the first such extreme */, 
+	max FLOAT, 
+	max_sim_time_s FLOAT /* of the first such extreme */, 
+	sum FLOAT, 
+	squares FLOAT /* sum of squared deviations from sum / count */, 
+	sines FLOAT /* angles only: sum of sines */, 
+	cosines FLOAT /* angles only: sum of cosines */, 
+	largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */, 
+	first_until_sim_time_s FLOAT /* up to then it had its first number; null in older versions */, 
+	last_since_sim_time_s FLOAT /* from then on it had its last number; null in older versions */, 
+	run_id INTEGER NOT NULL, 
+	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
+	bucket INTEGER NOT NULL /* floor(sim_time_s / 10) */, 
+	PRIMARY KEY (run_id, signal_id, bucket), 
+	CONSTRAINT fk_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+)
+ WITHOUT ROWID;
+CREATE TABLE recent_rollup (
+	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held the signal */, 
+	present INTEGER DEFAULT 0 NOT NULL /* of them with a value */, 
+	changes INTEGER DEFAULT 0 NOT NULL /* of the values, those unlike the one before in the bucket */, 
+	first FLOAT /* of numbers and flags (0, 1); null for text, as all that follows */, 
+	first_sim_time_s FLOAT, 
+	last FLOAT, 
+	last_sim_time_s FLOAT, 
+	min FLOAT, 
+	min_sim_time_s FLOAT /* of the first such extreme */, 
+	max FLOAT, 
+	max_sim_time_s FLOAT /* of the first such extreme */, 
+	sum FLOAT, 
+	squares FLOAT /* sum of squared deviations from sum / count */, 
+	sines FLOAT /* angles only: sum of sines */, 
+	cosines FLOAT /* angles only: sum of cosines */, 
+	largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */, 
+	first_until_sim_time_s FLOAT /* up to then it had its first number; null in older versions */, 
+	last_since_sim_time_s FLOAT /* from then on it had its last number; null in older versions */, 
+	run_id INTEGER NOT NULL, 
+	bucket INTEGER NOT NULL /* floor(sim_time_s / 10) */, 
+	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
+	PRIMARY KEY (run_id, bucket, signal_id), 
+	CONSTRAINT fk_recent_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+)
+ WITHOUT ROWID;
+CREATE TABLE coarse_rollup (
+	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held the signal */, 
+	present INTEGER DEFAULT 0 NOT NULL /* of them with a value */, 
+	changes INTEGER DEFAULT 0 NOT NULL /* of the values, those unlike the one before in the bucket */, 
+	first FLOAT /* of numbers and flags (0, 1); null for text, as all that follows */, 
+	first_sim_time_s FLOAT, 
+	last FLOAT, 
+	last_sim_time_s FLOAT, 
+	min FLOAT, 
+	min_sim_time_s FLOAT /* of the first such extreme */, 
+	max FLOAT, 
+	max_sim_time_s FLOAT /* of the first such extreme */, 
+	sum FLOAT, 
+	squares FLOAT /* sum of squared deviations from sum / count */, 
+	sines FLOAT /* angles only: sum of sines */, 
+	cosines FLOAT /* angles only: sum of cosines */, 
+	largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */, 
+	first_until_sim_time_s FLOAT /* up to then it had its first number; null in older versions */, 
+	last_since_sim_time_s FLOAT /* from then on it had its last number; null in older versions */, 
+	run_id INTEGER NOT NULL, 
+	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
+	bucket INTEGER NOT NULL /* floor(sim_time_s / 500) */, 
+	swings TEXT /* JSON: the swings of what a robot swings with, each as [begin, end, half swings, period in s, amplitude, explained share]; null where they were not looked for */, 
+	PRIMARY KEY (run_id, signal_id, bucket), 
+	CONSTRAINT fk_coarse_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+)
+ WITHOUT ROWID;
+CREATE TABLE row_group (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	run_id INTEGER NOT NULL, 
+	start_sim_time_s FLOAT NOT NULL /* of the first row */, 
+	end_sim_time_s FLOAT NOT NULL /* of the last row */, 
+	last_state_id INTEGER NOT NULL /* state.id of the last row */, 
+	max_state_id INTEGER NOT NULL /* the greatest state.id among them */, 
+	row_count INTEGER NOT NULL, 
+	is_complete INTEGER NOT NULL /* 1 once all of its chunks are there */, 
+	CONSTRAINT fk_row_group_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+);
+CREATE INDEX ix_row_group_run_id_start_sim_time_s ON row_group (run_id, start_sim_time_s);
+CREATE TABLE chunk (
+	id INTEGER NOT NULL, 
+	group_id INTEGER NOT NULL, 
+	run_id INTEGER NOT NULL, 
+	signal_id INTEGER NOT NULL /* signal.id; 0: simulation times, -1: wall times, -2: ids of the state rows */, 
+	row_count INTEGER NOT NULL /* rows whose state has the signal */, 
+	value_count INTEGER NOT NULL /* of them with a value */, 
+	change_count INTEGER NOT NULL /* values unlike the one before */, 
+	first FLOAT /* of numbers and flags (0, 1), as all that follows */, 
+	last FLOAT, 
+	min FLOAT, 
+	max FLOAT, 
+	sum FLOAT, 
+	squared_deviations FLOAT /* sum of squared deviations from the mean */, 
+	largest_step FLOAT /* largest difference of values that follow each other */, 
+	codec TEXT NOT NULL /* how numbers are compressed */, 
+	numbers BLOB /* CRC-32, then the numbers compressed */, 
+	codes BLOB /* zlib: for each row 0 a number, 1 no such key, else 2 + the place of its label */, 
+	labels TEXT /* JSON array; an item that is an array says what was replaced */, 
+	PRIMARY KEY (id), 
+	CONSTRAINT fk_chunk_group_id FOREIGN KEY(group_id) REFERENCES row_group (id) ON DELETE CASCADE
+);
+CREATE INDEX ix_chunk_group_id ON chunk (group_id);
+CREATE INDEX ix_chunk_statistics ON chunk (run_id, signal_id, group_id, row_count, value_count, change_count, first, last, min, max, sum, squared_deviations, largest_step);
+CREATE TABLE change (
+	run_id INTEGER NOT NULL, 
+	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
+	state_id INTEGER NOT NULL /* state.id of the row, which may have been deleted since */, 
+	sim_time_s FLOAT NOT NULL, 
+	value TEXT /* text (its first 200 characters), true, false or null */, 
+	PRIMARY KEY (run_id, signal_id, state_id), 
+	CONSTRAINT fk_change_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+)
+ WITHOUT ROWID;
+CREATE TABLE watermark (
+	name TEXT NOT NULL /* rollup */, 
+	state_id INTEGER NOT NULL, 
+	PRIMARY KEY (name)
+);
+CREATE TABLE log (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	run_id INTEGER NOT NULL, 
+	sim_time_s FLOAT NOT NULL, 
+	wall_time_s FLOAT NOT NULL, 
+	level TEXT NOT NULL /* debug, info, ... critical */, 
+	source TEXT NOT NULL /* controller, bridge, console or webots */, 
+	message TEXT NOT NULL, 
+	logger TEXT /* name of the Python logger, where one logged it */, 
+	CONSTRAINT fk_log_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+);
+CREATE INDEX ix_log_run_id_sim_time_s ON log (run_id, sim_time_s);
+CREATE TABLE console_line (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	instance TEXT NOT NULL /* session.instance of who said it */, 
+	wall_time_s FLOAT NOT NULL, 
+	level TEXT NOT NULL, 
+	source TEXT NOT NULL /* webots, or console: a controller, not told which; as in log later on */, 
+	message TEXT NOT NULL, 
+	logger TEXT /* stdout or stderr */
+);
+CREATE TABLE event (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	run_id INTEGER NOT NULL, 
+	sim_time_s FLOAT NOT NULL, 
+	wall_time_s FLOAT NOT NULL, 
+	kind TEXT NOT NULL /* change, start, reset, reload, pause, resume, dropped, storage, ... */, 
+	name TEXT /* the signal that changed, where one did */, 
+	data TEXT /* JSON object */, 
+	CONSTRAINT fk_event_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+);
+CREATE INDEX ix_event_run_id_sim_time_s ON event (run_id, sim_time_s);
 CREATE TABLE command (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
 	robot_id INTEGER NOT NULL, 
@@ -64,43 +291,53 @@ CREATE TABLE command (
 	result TEXT /* JSON value */, 
 	error TEXT, 
 	CONSTRAINT fk_command_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
-	CONSTRAINT fk_command_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE SET NULL, 
-	CONSTRAINT uq_command_idempotency_key UNIQUE (idempotency_key)
+	CONSTRAINT uq_command_idempotency_key UNIQUE (idempotency_key), 
+	CONSTRAINT fk_command_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE SET NULL
 );
 CREATE INDEX ix_command_claimed ON command (robot_id, id) WHERE status = 'claimed';
 CREATE INDEX ix_command_pending ON command (robot_id, id) WHERE status = 'pending';
-CREATE TABLE run (
+CREATE INDEX ix_command_session_id ON command (session_id);
+CREATE TABLE breakpoint (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	session_id INTEGER NOT NULL, 
 	robot_id INTEGER NOT NULL, 
-	world TEXT /* path of the world file */, 
-	basic_time_step_ms FLOAT, 
-	start_reason TEXT NOT NULL /* start, reset or reload */, 
-	started_wall_time_s FLOAT NOT NULL, 
-	started_sim_time_s FLOAT NOT NULL, 
-	last_wall_time_s FLOAT NOT NULL /* last sign of life */, 
-	last_sim_time_s FLOAT NOT NULL, 
-	ended_wall_time_s FLOAT, 
-	end_reason TEXT /* finished, reset, reload, crashed, replaced */, 
-	rows INTEGER DEFAULT 0 NOT NULL /* state rows, as of last_wall_time_s */, 
-	label TEXT, 
-	note TEXT, keep INTEGER /* 1: retention deletes nothing of this run */ DEFAULT 0 NOT NULL, purged_rows INTEGER /* of the rows, those that retention has deleted */ DEFAULT 0 NOT NULL, uuid TEXT /* random (version 4); names the row among those of all machines */ NULL, rolled_state_id INTEGER DEFAULT 0 /* last state.id in the rollups, where beyond the watermark */ NOT NULL, coarse_end INTEGER /* buckets of coarse_rollup below it are complete; null before the first */ NULL, 
-	CONSTRAINT fk_run_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
-	CONSTRAINT fk_run_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE CASCADE
+	session_id INTEGER, 
+	condition TEXT NOT NULL /* see docs/conditions.md */, 
+	action TEXT NOT NULL /* pause, log or keep */, 
+	after_hits INTEGER DEFAULT 1 NOT NULL /* the action is taken from this hit of a run on */, 
+	enabled INTEGER DEFAULT 1 NOT NULL /* 0 once the condition failed */, 
+	hits INTEGER DEFAULT 0 NOT NULL /* how often it began to hold, in all runs */, 
+	created_wall_time_s FLOAT NOT NULL, 
+	created_by TEXT /* mcp, cli or controller: its code, for session_id only */, 
+	error TEXT /* why the condition failed */, 
+	CONSTRAINT fk_breakpoint_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
+	CONSTRAINT fk_breakpoint_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE SET NULL
 );
-CREATE INDEX ix_run_robot_id_id ON run (robot_id, id);
-CREATE INDEX ix_run_session_id ON run (session_id);
-CREATE TABLE event (
+CREATE INDEX ix_breakpoint_robot_id ON breakpoint (robot_id);
+CREATE INDEX ix_breakpoint_session_id ON breakpoint (session_id);
+CREATE TABLE kept_stretch (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
 	run_id INTEGER NOT NULL, 
+	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
+	start_sim_time_s FLOAT NOT NULL, 
+	end_sim_time_s FLOAT NOT NULL /* ahead of the newest row while it goes on */, 
+	wall_time_s FLOAT NOT NULL /* when it was asked for */, 
+	reason TEXT NOT NULL /* why it is kept */, 
+	CONSTRAINT fk_kept_stretch_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+);
+CREATE INDEX ix_kept_stretch_run_id_start_sim_time_s ON kept_stretch (run_id, start_sim_time_s);
+CREATE UNIQUE INDEX ix_kept_stretch_uuid ON kept_stretch (uuid);
+CREATE TABLE kept_state (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	run_id INTEGER NOT NULL, 
+	call INTEGER /* its number in the session; null where retention moved it here from state */, 
 	sim_time_s FLOAT NOT NULL, 
 	wall_time_s FLOAT NOT NULL, 
-	kind TEXT NOT NULL /* change, start, reset, reload, pause, resume, dropped, storage, ... */, 
-	name TEXT /* the signal that changed, where one did */, 
-	data TEXT /* JSON object */, 
-	CONSTRAINT fk_event_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+	data TEXT NOT NULL /* JSON object */, 
+	odd TEXT /* as in state */, 
+	CONSTRAINT uq_kept_state_run_id UNIQUE (run_id, call), 
+	CONSTRAINT fk_kept_state_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 );
-CREATE INDEX ix_event_run_id_sim_time_s ON event (run_id, sim_time_s);
+CREATE INDEX ix_kept_state_run_id_sim_time_s ON kept_state (run_id, sim_time_s);
 CREATE TABLE image (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
 	run_id INTEGER NOT NULL, 
@@ -115,82 +352,91 @@ CREATE TABLE image (
 	CONSTRAINT fk_image_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 );
 CREATE INDEX ix_image_run_id_sim_time_s ON image (run_id, sim_time_s);
-CREATE TABLE log (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	run_id INTEGER NOT NULL, 
-	sim_time_s FLOAT NOT NULL, 
-	wall_time_s FLOAT NOT NULL, 
-	level TEXT NOT NULL /* debug, info, ... critical */, 
-	source TEXT NOT NULL /* controller or bridge */, 
-	message TEXT NOT NULL, logger TEXT /* name of the Python logger, where one logged it */ NULL, 
-	CONSTRAINT fk_log_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
-);
-CREATE INDEX ix_log_run_id_sim_time_s ON log (run_id, sim_time_s);
-CREATE TABLE state (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	run_id INTEGER NOT NULL, 
-	sim_time_s FLOAT NOT NULL, 
-	wall_time_s FLOAT NOT NULL, 
-	data TEXT NOT NULL /* JSON object */, 
-	odd TEXT /* JSON object: path of a replaced value to what it was (nan, inf, ...) */, 
-	CONSTRAINT fk_state_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
-);
-CREATE INDEX ix_state_run_id_sim_time_s ON state (run_id, sim_time_s);
-CREATE TABLE signal (
+CREATE TABLE parameter (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
 	robot_id INTEGER NOT NULL, 
-	name TEXT NOT NULL /* dotted: pose.0, sensors.front, lidar.min */, 
-	kind TEXT NOT NULL /* num, bool, text, angle (radians), null (no value yet) */, 
-	unit TEXT /* where the name tells it */, 
-	path TEXT NOT NULL /* for json_extract(state.data, path) */, 
-	reduce TEXT /* count, min, max, mean or argmin of the long array at path */, 
-	first_seen_wall_time_s FLOAT NOT NULL, 
-	last_seen_wall_time_s FLOAT NOT NULL, 
-	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held it, up to the watermark */, 
-	null_rows INTEGER DEFAULT 0 NOT NULL /* of them without a value */, 
-	odd_rows INTEGER DEFAULT 0 NOT NULL /* of them with a value that JSON cannot hold (nan, inf, ...) */, 
-	min FLOAT, 
-	max FLOAT, 
-	CONSTRAINT fk_signal_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
-	CONSTRAINT uq_signal_robot_id UNIQUE (robot_id, name)
+	session_id INTEGER NOT NULL /* session.id of the controller that did */, 
+	name TEXT NOT NULL, 
+	kind TEXT NOT NULL /* float, int, bool or str */, 
+	default_value TEXT NOT NULL /* JSON value */, 
+	low FLOAT /* least value */, 
+	high FLOAT /* greatest value */, 
+	choices TEXT /* JSON array: the only values that it may have */, 
+	doc TEXT NOT NULL, 
+	unit TEXT, 
+	next_value TEXT /* JSON value that it takes with the next reset of the world */, 
+	declared_wall_time_s FLOAT NOT NULL, 
+	CONSTRAINT uq_parameter_robot_id UNIQUE (robot_id, name), 
+	CONSTRAINT fk_parameter_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE
 );
-CREATE TABLE rollup (
+CREATE TABLE parameter_value (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
 	run_id INTEGER NOT NULL, 
-	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
-	bucket INTEGER NOT NULL /* floor(sim_time_s / 10) */, 
-	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held the signal */, 
-	present INTEGER DEFAULT 0 NOT NULL /* of them with a value */, 
-	changes INTEGER DEFAULT 0 NOT NULL /* of the values, those unlike the one before in the bucket */, 
-	first FLOAT /* of numbers and flags (0, 1); null for text, as all that follows */, 
-	first_sim_time_s FLOAT, 
-	last FLOAT, 
-	last_sim_time_s FLOAT, 
-	min FLOAT, 
-	min_sim_time_s FLOAT /* of the first such extreme */, 
-	max FLOAT, 
-	max_sim_time_s FLOAT /* of the first such extreme */, 
-	sum FLOAT, 
-	squares FLOAT /* sum of squared deviations from sum / count */, 
-	sines FLOAT /* angles only: sum of sines */, 
-	cosines FLOAT /* angles only: sum of cosines */, largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */ NULL, first_until_sim_time_s FLOAT /* up to then it had its first number; null in older versions */ NULL, last_since_sim_time_s FLOAT /* from then on it had its last number; null in older versions */ NULL, 
-	PRIMARY KEY (run_id, signal_id, bucket), 
-	CONSTRAINT fk_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
-)
- WITHOUT ROWID;
-CREATE TABLE change (
-	run_id INTEGER NOT NULL, 
-	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
-	state_id INTEGER NOT NULL /* state.id of the row, which may have been deleted since */, 
+	name TEXT NOT NULL, 
 	sim_time_s FLOAT NOT NULL, 
-	value TEXT /* text (its first 200 characters), true, false or null */, 
-	PRIMARY KEY (run_id, signal_id, state_id), 
-	CONSTRAINT fk_change_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
-)
- WITHOUT ROWID;
-CREATE TABLE watermark (
-	name TEXT NOT NULL /* rollup */, 
-	state_id INTEGER NOT NULL, 
+	wall_time_s FLOAT NOT NULL, 
+	value TEXT NOT NULL /* JSON value */, 
+	is_default INTEGER NOT NULL /* 1 where the code declared it */, 
+	set_by TEXT NOT NULL /* code, environment, command or trial */, 
+	command_id INTEGER /* command.id that set it, which may have been deleted since */, 
+	CONSTRAINT fk_parameter_value_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+);
+CREATE INDEX ix_parameter_value_run_id_name_id ON parameter_value (run_id, name, id);
+CREATE TABLE trial_set (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
+	"plan" TEXT NOT NULL /* JSON object */, 
+	created_wall_time_s FLOAT NOT NULL, 
+	host TEXT /* of the process at work */, 
+	pid INTEGER, 
+	process TEXT /* which process of that pid; null where the system does not tell */, 
+	robot_id INTEGER /* in whose simulation the trials run; null: each in one of its own */, 
+	session_id INTEGER /* of the controller that was tried */, 
+	former_values TEXT /* JSON object: its parameters before, until they are set back */, 
+	stop_reason TEXT /* why it does not go on although trials wait */, 
+	CONSTRAINT fk_trial_set_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE SET NULL, 
+	CONSTRAINT fk_trial_set_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE SET NULL
+);
+CREATE INDEX ix_trial_set_robot_id ON trial_set (robot_id);
+CREATE INDEX ix_trial_set_session_id ON trial_set (session_id);
+CREATE UNIQUE INDEX ix_trial_set_uuid ON trial_set (uuid);
+CREATE TABLE trial (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	trial_set_id INTEGER NOT NULL, 
+	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
+	number INTEGER NOT NULL /* its place in the set, from 1 */, 
+	parameters TEXT NOT NULL /* JSON object */, 
+	status TEXT NOT NULL /* waiting, running, then done, failed or pruned */, 
+	run_id INTEGER, 
+	score FLOAT /* if it is done */, 
+	ended_by TEXT /* for_s, until or prune */, 
+	ended_sim_time_s FLOAT /* the end */, 
+	error TEXT /* why it failed */, 
+	started_wall_time_s FLOAT, 
+	finished_wall_time_s FLOAT, 
+	pid INTEGER /* of its simulator, while it runs */, 
+	process TEXT /* which process of that pid; null where the system does not tell */, 
+	CONSTRAINT uq_trial_trial_set_id UNIQUE (trial_set_id, number), 
+	CONSTRAINT fk_trial_trial_set_id FOREIGN KEY(trial_set_id) REFERENCES trial_set (id) ON DELETE CASCADE, 
+	CONSTRAINT fk_trial_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE SET NULL
+);
+CREATE INDEX ix_trial_run_id ON trial (run_id);
+CREATE UNIQUE INDEX ix_trial_uuid ON trial (uuid);
+CREATE TABLE lease (
+	name TEXT NOT NULL, 
+	holder TEXT NOT NULL, 
+	until_wall_time_s FLOAT NOT NULL, 
 	PRIMARY KEY (name)
+);
+CREATE TABLE retention_limit (
+	kind TEXT NOT NULL /* state, rollup, log, event, image or run */, 
+	size_bytes BIGINT /* on the disk; of pictures their files */, 
+	rows BIGINT, 
+	age_s FLOAT /* since it was recorded, in wall time */, 
+	times FLOAT /* run only: what is left of one stays so many times longer than its states; 0 for ever */, 
+	set_by TEXT NOT NULL /* serve, prune or retain */, 
+	set_wall_time_s FLOAT NOT NULL, 
+	PRIMARY KEY (kind)
 );
 CREATE VIEW robot_run AS
 /* Runs: how long in simulation and in wall time, how fast, what is left of the rows. */
@@ -224,47 +470,6 @@ SELECT (
   strftime('%Y-%m-%d %H:%M:%f', e.wall_time_s, 'unixepoch') AS utc, e.kind, e.name,
   json_extract(j, '$.from') AS from_value, json_extract(j, '$.to') AS to_value, e.data
 FROM (SELECT *, CASE WHEN json_valid(data) THEN data END AS j FROM event) e;
-CREATE TABLE recording (
-	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
-	created_wall_time_s FLOAT NOT NULL, 
-	PRIMARY KEY (uuid)
-);
-CREATE TABLE retention_limit (
-	kind TEXT NOT NULL /* state, rollup, log, event, image or run */, 
-	size_bytes BIGINT /* on the disk; of pictures their files */, 
-	rows BIGINT, 
-	age_s FLOAT /* since it was recorded, in wall time */, 
-	times FLOAT /* run only: what is left of one stays so many times longer than its states; 0 for ever */, 
-	set_by TEXT NOT NULL /* serve, prune or retain */, 
-	set_wall_time_s FLOAT NOT NULL, 
-	PRIMARY KEY (kind)
-);
-CREATE UNIQUE INDEX ix_session_uuid ON session (uuid);
-CREATE UNIQUE INDEX ix_run_uuid ON run (uuid);
-CREATE INDEX ix_command_session_id ON command (session_id);
-CREATE TABLE recent_rollup (
-	run_id INTEGER NOT NULL, 
-	bucket INTEGER NOT NULL /* floor(sim_time_s / 10) */, 
-	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
-	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held the signal */, 
-	present INTEGER DEFAULT 0 NOT NULL /* of them with a value */, 
-	changes INTEGER DEFAULT 0 NOT NULL /* of the values, those unlike the one before in the bucket */, 
-	first FLOAT /* of numbers and flags (0, 1); null for text, as all that follows */, 
-	first_sim_time_s FLOAT, 
-	last FLOAT, 
-	last_sim_time_s FLOAT, 
-	min FLOAT, 
-	min_sim_time_s FLOAT /* of the first such extreme */, 
-	max FLOAT, 
-	max_sim_time_s FLOAT /* of the first such extreme */, 
-	sum FLOAT, 
-	squares FLOAT /* sum of squared deviations from sum / count */, 
-	sines FLOAT /* angles only: sum of sines */, 
-	cosines FLOAT /* angles only: sum of cosines */, largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */ NULL, first_until_sim_time_s FLOAT /* up to then it had its first number; null in older versions */ NULL, last_since_sim_time_s FLOAT /* from then on it had its last number; null in older versions */ NULL, 
-	PRIMARY KEY (run_id, bucket, signal_id), 
-	CONSTRAINT fk_recent_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
-)
- WITHOUT ROWID;
 CREATE VIEW robot_period AS
 /* How long a text or flag of the state kept a value. Signals that never changed have none. */
 SELECT (
@@ -293,108 +498,6 @@ SELECT (
   l.run_id, l.id AS log_id, l.sim_time_s,
   strftime('%Y-%m-%d %H:%M:%f', l.wall_time_s, 'unixepoch') AS utc, l.level, l.source, l.logger, l.message
 FROM log l;
-CREATE TABLE coarse_rollup (
-	run_id INTEGER NOT NULL, 
-	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
-	bucket INTEGER NOT NULL /* floor(sim_time_s / 500) */, 
-	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held the signal */, 
-	present INTEGER DEFAULT 0 NOT NULL /* of them with a value */, 
-	changes INTEGER DEFAULT 0 NOT NULL /* of the values, those unlike the one before in the bucket */, 
-	first FLOAT /* of numbers and flags (0, 1); null for text, as all that follows */, 
-	first_sim_time_s FLOAT, 
-	last FLOAT, 
-	last_sim_time_s FLOAT, 
-	min FLOAT, 
-	min_sim_time_s FLOAT /* of the first such extreme */, 
-	max FLOAT, 
-	max_sim_time_s FLOAT /* of the first such extreme */, 
-	sum FLOAT, 
-	squares FLOAT /* sum of squared deviations from sum / count */, 
-	sines FLOAT /* angles only: sum of sines */, 
-	cosines FLOAT /* angles only: sum of cosines */, largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */ NULL, first_until_sim_time_s FLOAT /* up to then it had its first number; null in older versions */ NULL, last_since_sim_time_s FLOAT /* from then on it had its last number; null in older versions */ NULL, swings TEXT /* JSON: the swings of what a robot swings with, each as [begin, end, half swings, period in s, amplitude, explained share]; null where they were not looked for */ NULL, standstills TEXT /* JSON, at the signal of x: where the robot stood still, and what shows whether it should have moved; null where that was not looked for */ NULL, 
-	PRIMARY KEY (run_id, signal_id, bucket), 
-	CONSTRAINT fk_coarse_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
-)
- WITHOUT ROWID;
-CREATE TABLE breakpoint (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	robot_id INTEGER NOT NULL, 
-	session_id INTEGER, 
-	condition TEXT NOT NULL /* see docs/conditions.md */, 
-	action TEXT NOT NULL /* pause, log or keep */, 
-	after_hits INTEGER DEFAULT 1 NOT NULL /* the action is taken from this hit of a run on */, 
-	enabled INTEGER DEFAULT 1 NOT NULL /* 0 once the condition failed */, 
-	hits INTEGER DEFAULT 0 NOT NULL /* how often it began to hold, in all runs */, 
-	created_wall_time_s FLOAT NOT NULL, 
-	created_by TEXT /* mcp, cli or controller: its code, for session_id only */, 
-	error TEXT /* why the condition failed */, 
-	CONSTRAINT fk_breakpoint_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
-	CONSTRAINT fk_breakpoint_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE SET NULL
-);
-CREATE INDEX ix_breakpoint_robot_id ON breakpoint (robot_id);
-CREATE INDEX ix_breakpoint_session_id ON breakpoint (session_id);
-CREATE TABLE parameter (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	robot_id INTEGER NOT NULL, 
-	session_id INTEGER NOT NULL /* session.id of the controller that did */, 
-	name TEXT NOT NULL, 
-	kind TEXT NOT NULL /* float, int, bool or str */, 
-	default_value TEXT NOT NULL /* JSON value */, 
-	low FLOAT /* least value */, 
-	high FLOAT /* greatest value */, 
-	choices TEXT /* JSON array: the only values that it may have */, 
-	doc TEXT NOT NULL, 
-	unit TEXT, 
-	next_value TEXT /* JSON value that it takes with the next reset of the world */, 
-	declared_wall_time_s FLOAT NOT NULL, 
-	CONSTRAINT fk_parameter_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
-	CONSTRAINT uq_parameter_robot_id UNIQUE (robot_id, name)
-);
-CREATE TABLE parameter_value (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	run_id INTEGER NOT NULL, 
-	name TEXT NOT NULL, 
-	sim_time_s FLOAT NOT NULL, 
-	wall_time_s FLOAT NOT NULL, 
-	value TEXT NOT NULL /* JSON value */, 
-	is_default INTEGER NOT NULL /* 1 where the code declared it */, 
-	set_by TEXT NOT NULL /* code, environment, command or trial */, 
-	command_id INTEGER /* command.id that set it, which may have been deleted since */, 
-	CONSTRAINT fk_parameter_value_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
-);
-CREATE INDEX ix_parameter_value_run_id_name_id ON parameter_value (run_id, name, id);
-CREATE TABLE trial_set (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
-	"plan" TEXT NOT NULL /* JSON object */, 
-	created_wall_time_s FLOAT NOT NULL, 
-	host TEXT /* of the process at work */, 
-	pid INTEGER, 
-	process TEXT /* which process of that pid; null where the system does not tell */
-, robot_id INTEGER /* in whose simulation the trials run; null: each in one of its own */ CONSTRAINT fk_trial_set_robot_id REFERENCES robot (id) ON DELETE SET NULL, session_id INTEGER /* of the controller that was tried */ CONSTRAINT fk_trial_set_session_id REFERENCES session (id) ON DELETE SET NULL, former_values TEXT /* JSON object: its parameters before, until they are set back */ NULL, stop_reason TEXT /* why it does not go on although trials wait */ NULL);
-CREATE UNIQUE INDEX ix_trial_set_uuid ON trial_set (uuid);
-CREATE TABLE trial (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	trial_set_id INTEGER NOT NULL, 
-	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
-	number INTEGER NOT NULL /* its place in the set, from 1 */, 
-	parameters TEXT NOT NULL /* JSON object */, 
-	status TEXT NOT NULL /* waiting, running, then done, failed or pruned */, 
-	run_id INTEGER, 
-	score FLOAT /* if it is done */, 
-	ended_by TEXT /* for_s, until or prune */, 
-	ended_sim_time_s FLOAT /* the end */, 
-	error TEXT /* why it failed */, 
-	started_wall_time_s FLOAT, 
-	finished_wall_time_s FLOAT, 
-	pid INTEGER /* of its simulator, while it runs */, 
-	process TEXT /* which process of that pid; null where the system does not tell */, 
-	CONSTRAINT fk_trial_trial_set_id FOREIGN KEY(trial_set_id) REFERENCES trial_set (id) ON DELETE CASCADE, 
-	CONSTRAINT fk_trial_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE SET NULL, 
-	CONSTRAINT uq_trial_trial_set_id UNIQUE (trial_set_id, number)
-);
-CREATE INDEX ix_trial_run_id ON trial (run_id);
-CREATE UNIQUE INDEX ix_trial_uuid ON trial (uuid);
 CREATE VIEW robot_parameter AS
 /* The values that parameters had in each run, each from a time on; true and false as text. */
 SELECT r.name AS robot, v.run_id, v.name,
@@ -404,33 +507,7 @@ SELECT r.name AS robot, v.run_id, v.name,
 FROM (SELECT *, CASE WHEN json_valid(value) THEN value END AS j FROM parameter_value) v
 JOIN run u ON u.id = v.run_id JOIN robot r ON r.id = u.robot_id
 LEFT JOIN parameter p ON p.robot_id = u.robot_id AND p.name = v.name;
-CREATE INDEX ix_trial_set_robot_id ON trial_set (robot_id);
-CREATE INDEX ix_trial_set_session_id ON trial_set (session_id);
-CREATE TABLE kept_stretch (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	run_id INTEGER NOT NULL, 
-	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
-	start_sim_time_s FLOAT NOT NULL, 
-	end_sim_time_s FLOAT NOT NULL /* ahead of the newest row while it goes on */, 
-	wall_time_s FLOAT NOT NULL /* when it was asked for */, 
-	reason TEXT NOT NULL /* why it is kept */, 
-	CONSTRAINT fk_kept_stretch_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
-);
-CREATE INDEX ix_kept_stretch_run_id_start_sim_time_s ON kept_stretch (run_id, start_sim_time_s);
-CREATE UNIQUE INDEX ix_kept_stretch_uuid ON kept_stretch (uuid);
-CREATE TABLE kept_state (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	run_id INTEGER NOT NULL, 
-	call INTEGER /* its number in the session; null where retention moved it here from state */, 
-	sim_time_s FLOAT NOT NULL, 
-	wall_time_s FLOAT NOT NULL, 
-	data TEXT NOT NULL /* JSON object */, 
-	odd TEXT /* as in state */, 
-	CONSTRAINT fk_kept_state_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE, 
-	CONSTRAINT uq_kept_state_run_id UNIQUE (run_id, call)
-);
-CREATE INDEX ix_kept_state_run_id_sim_time_s ON kept_state (run_id, sim_time_s);
-CREATE VIEW every_state AS
+CREATE VIEW all_state AS
 /* All states of a run, those that only kept stretches have included: they have no state_id. */
 SELECT id AS state_id, run_id, sim_time_s, wall_time_s, data, odd FROM state
 UNION ALL
@@ -439,7 +516,7 @@ CREATE VIEW robot_kept AS
 /* Stretches that are kept at full rate: from when to when, why, how many states each has. */
 SELECT r.name AS robot, k.run_id, k.id AS stretch_id, k.start_sim_time_s AS start_s,
   min(k.end_sim_time_s, max(u.last_sim_time_s, k.start_sim_time_s)) AS end_s,
-  (SELECT count(*) FROM every_state s WHERE s.run_id = k.run_id
+  (SELECT count(*) FROM all_state s WHERE s.run_id = k.run_id
     AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s) AS states,
   strftime('%Y-%m-%d %H:%M:%f', k.wall_time_s, 'unixepoch') AS utc, k.reason
 FROM kept_stretch k JOIN run u ON u.id = k.run_id JOIN robot r ON r.id = u.robot_id;
@@ -447,188 +524,77 @@ CREATE VIEW all_rollup AS
 /* Rollups, those of buckets that are over and the newest. */
 SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step, first_until_sim_time_s, last_since_sim_time_s FROM rollup
 UNION ALL SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step, first_until_sim_time_s, last_since_sim_time_s FROM recent_rollup;
-CREATE TABLE console_line (
-	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	instance TEXT NOT NULL /* session.instance of who said it */, 
-	wall_time_s FLOAT NOT NULL, 
-	level TEXT NOT NULL, 
-	source TEXT NOT NULL /* webots, or console: a controller, not told which; as in log later on */, 
-	message TEXT NOT NULL, 
-	logger TEXT /* stdout or stderr */
-);
 CREATE VIEW robot_now AS
-/* The newest state of each robot and how old it is. Lengths and angles as published. */
+/* The newest state of each robot, how old it is and how the robot moves. Speeds as published. */
 SELECT robot, run_id, end_reason, sim_time_s, round((julianday('now') - 2440587.5) * 86400.0 - wall_time_s, 1) AS age_s,
-  coalesce(
-    (SELECT json_extract(j, '$.' || p.key) * CASE WHEN replace(replace(replace(p.key, '"', ''), '[', '.'), ']', '') || '.' GLOB '*_mm.*' THEN 0.001 WHEN replace(replace(replace(p.key, '"', ''), '[', '.'), ']', '') || '.' GLOB '*_cm.*' THEN 0.01 ELSE 1 END
-      FROM json_each('{"pose[0]": "pose[1]", "pose.x": "pose.y", "pose.x_m": "pose.y_m", "pose.x_cm": "pose.y_cm", "pose.x_mm": "pose.y_mm", "position[0]": "position[1]", "position.x": "position.y", "position.x_m": "position.y_m", "position.x_cm": "position.y_cm", "position.x_mm": "position.y_mm", "pos[0]": "pos[1]", "pos.x": "pos.y", "pos.x_m": "pos.y_m", "pos.x_cm": "pos.y_cm", "pos.x_mm": "pos.y_mm", "gps[0]": "gps[1]", "gps.x": "gps.y", "gps.x_m": "gps.y_m", "gps.x_cm": "gps.y_cm", "gps.x_mm": "gps.y_mm", "odometry[0]": "odometry[1]", "odometry.x": "odometry.y", "odometry.x_m": "odometry.y_m", "odometry.x_cm": "odometry.y_cm", "odometry.x_mm": "odometry.y_mm", "odom[0]": "odom[1]", "odom.x": "odom.y", "odom.x_m": "odom.y_m", "odom.x_cm": "odom.y_cm", "odom.x_mm": "odom.y_mm", "location[0]": "location[1]", "location.x": "location.y", "location.x_m": "location.y_m", "location.x_cm": "location.y_cm", "location.x_mm": "location.y_mm", "pose_m[0]": "pose_m[1]", "pose_cm[0]": "pose_cm[1]", "pose_mm[0]": "pose_mm[1]", "position_m[0]": "position_m[1]", "position_cm[0]": "position_cm[1]", "position_mm[0]": "position_mm[1]", "pos_m[0]": "pos_m[1]", "pos_cm[0]": "pos_cm[1]", "pos_mm[0]": "pos_mm[1]", "gps_m[0]": "gps_m[1]", "gps_cm[0]": "gps_cm[1]", "gps_mm[0]": "gps_mm[1]", "odometry_m[0]": "odometry_m[1]", "odometry_cm[0]": "odometry_cm[1]", "odometry_mm[0]": "odometry_mm[1]", "odom_m[0]": "odom_m[1]", "odom_cm[0]": "odom_cm[1]", "odom_mm[0]": "odom_mm[1]", "location_m[0]": "location_m[1]", "location_cm[0]": "location_cm[1]", "location_mm[0]": "location_mm[1]", "x": "y", "x_m": "y_m", "x_cm": "y_cm", "x_mm": "y_mm"}') p
-      WHERE json_type(j, '$.' || p.key) IN ('integer', 'real') AND json_type(j, '$.' || p.value) IN ('integer', 'real')
-      LIMIT 1),
-    (WITH s0 AS MATERIALIZED (SELECT x.value AS x, y.value AS y, replace(replace(replace(x.fullkey, '"', ''), '[', '.'), ']', '') AS name,
-          CASE WHEN x.key = upper(x.key) THEN lower(x.key) ELSE x.key END AS x_key,
-          CASE WHEN y.key = upper(y.key) THEN lower(y.key) ELSE y.key END AS y_key, replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') AS way
-        FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
-        WHERE x.type IN ('integer', 'real') AND y.type IN ('integer', 'real')
-          AND (x.key = 0 AND y.key = 1 OR x.key GLOB '*[xX]*' AND y.key GLOB '*[yY]*')),
-        s1 AS MATERIALIZED (SELECT x, y, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(x_key, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS x_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(y_key, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS y_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(way, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS way FROM s0),
-        s2 AS MATERIALIZED (SELECT x, y, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(x_key, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS x_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(y_key, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS y_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(way, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS way FROM s1),
-        s3 AS MATERIALIZED (SELECT x, y, name, '.' || replace(ltrim(x_key, '_'), '_', '..') || '.' AS x_key, '.' || replace(ltrim(y_key, '_'), '_', '..') || '.' AS y_key,
-        '.' || replace(way, '_', '.') || '.' AS way, '.' || replace(substr(way, length(rtrim(way, replace(way, '.', ''))) + 1), '_', '.') || '.' AS branch FROM s2),
-        s4 AS MATERIALIZED (SELECT *, way || x_key AS named, x_key AS rest FROM s3),
-        s5 AS MATERIALIZED (SELECT x, y, name, x_key, y_key, way, branch, named, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(rest, '.pose.', ''), '.position.', ''), '.pos.', ''), '.gps.', ''), '.odometry.', ''), '.odom.', ''), '.location.', ''), '.m.', ''), '.cm.', ''), '.mm.', ''), '.km.', ''), '.robot.', ''), '.rover.', ''), '.current.', '') AS rest FROM s4),
-        s6 AS MATERIALIZED (SELECT x, y, name, x_key, y_key, way, branch, named, replace(replace(replace(rest, '.actual.', ''), '.own.', ''), '.self.', '') AS rest FROM s5)
-      SELECT x * CASE WHEN instr(named, '.mm.') THEN 0.001 WHEN instr(named, '.cm.') THEN 0.01 WHEN instr(named, '.km.') THEN 1000 ELSE 1 END FROM s6
-      WHERE NOT EXISTS (SELECT 1 FROM json_each('["accel", "acceleration", "accelerometer", "angular", "axis", "cmd", "command", "compass", "error", "force", "gravity", "gyro", "imu", "linear", "magnetometer", "offset", "speed", "torque", "twist", "vel", "velocity", "wind", "ball", "blob", "box", "desired", "destination", "goal", "image", "item", "marker", "object", "obstacle", "pixel", "reference", "setpoint", "target", "waypoint"]') w WHERE instr(way, '.' || w.value || '.'))
-        AND (x_key = '.0.' AND y_key = '.1.' AND EXISTS (SELECT 1 FROM json_each('["pose", "position", "pos", "gps", "odometry", "odom", "location"]') w WHERE instr(branch, '.' || w.value || '.'))
-          OR rest = '.x.' AND y_key = replace(x_key, '.x.', '.y.'))
-      ORDER BY NOT EXISTS (SELECT 1 FROM json_each('["pose", "position", "pos", "gps", "odometry", "odom", "location"]') w WHERE instr(branch || x_key, '.' || w.value || '.')), name LIMIT 1)) AS x_m,
-  coalesce(
-    (SELECT json_extract(j, '$.' || p.value) * CASE WHEN replace(replace(replace(p.key, '"', ''), '[', '.'), ']', '') || '.' GLOB '*_mm.*' THEN 0.001 WHEN replace(replace(replace(p.key, '"', ''), '[', '.'), ']', '') || '.' GLOB '*_cm.*' THEN 0.01 ELSE 1 END
-      FROM json_each('{"pose[0]": "pose[1]", "pose.x": "pose.y", "pose.x_m": "pose.y_m", "pose.x_cm": "pose.y_cm", "pose.x_mm": "pose.y_mm", "position[0]": "position[1]", "position.x": "position.y", "position.x_m": "position.y_m", "position.x_cm": "position.y_cm", "position.x_mm": "position.y_mm", "pos[0]": "pos[1]", "pos.x": "pos.y", "pos.x_m": "pos.y_m", "pos.x_cm": "pos.y_cm", "pos.x_mm": "pos.y_mm", "gps[0]": "gps[1]", "gps.x": "gps.y", "gps.x_m": "gps.y_m", "gps.x_cm": "gps.y_cm", "gps.x_mm": "gps.y_mm", "odometry[0]": "odometry[1]", "odometry.x": "odometry.y", "odometry.x_m": "odometry.y_m", "odometry.x_cm": "odometry.y_cm", "odometry.x_mm": "odometry.y_mm", "odom[0]": "odom[1]", "odom.x": "odom.y", "odom.x_m": "odom.y_m", "odom.x_cm": "odom.y_cm", "odom.x_mm": "odom.y_mm", "location[0]": "location[1]", "location.x": "location.y", "location.x_m": "location.y_m", "location.x_cm": "location.y_cm", "location.x_mm": "location.y_mm", "pose_m[0]": "pose_m[1]", "pose_cm[0]": "pose_cm[1]", "pose_mm[0]": "pose_mm[1]", "position_m[0]": "position_m[1]", "position_cm[0]": "position_cm[1]", "position_mm[0]": "position_mm[1]", "pos_m[0]": "pos_m[1]", "pos_cm[0]": "pos_cm[1]", "pos_mm[0]": "pos_mm[1]", "gps_m[0]": "gps_m[1]", "gps_cm[0]": "gps_cm[1]", "gps_mm[0]": "gps_mm[1]", "odometry_m[0]": "odometry_m[1]", "odometry_cm[0]": "odometry_cm[1]", "odometry_mm[0]": "odometry_mm[1]", "odom_m[0]": "odom_m[1]", "odom_cm[0]": "odom_cm[1]", "odom_mm[0]": "odom_mm[1]", "location_m[0]": "location_m[1]", "location_cm[0]": "location_cm[1]", "location_mm[0]": "location_mm[1]", "x": "y", "x_m": "y_m", "x_cm": "y_cm", "x_mm": "y_mm"}') p
-      WHERE json_type(j, '$.' || p.key) IN ('integer', 'real') AND json_type(j, '$.' || p.value) IN ('integer', 'real')
-      LIMIT 1),
-    (WITH s0 AS MATERIALIZED (SELECT x.value AS x, y.value AS y, replace(replace(replace(x.fullkey, '"', ''), '[', '.'), ']', '') AS name,
-          CASE WHEN x.key = upper(x.key) THEN lower(x.key) ELSE x.key END AS x_key,
-          CASE WHEN y.key = upper(y.key) THEN lower(y.key) ELSE y.key END AS y_key, replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') AS way
-        FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
-        WHERE x.type IN ('integer', 'real') AND y.type IN ('integer', 'real')
-          AND (x.key = 0 AND y.key = 1 OR x.key GLOB '*[xX]*' AND y.key GLOB '*[yY]*')),
-        s1 AS MATERIALIZED (SELECT x, y, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(x_key, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS x_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(y_key, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS y_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(way, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS way FROM s0),
-        s2 AS MATERIALIZED (SELECT x, y, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(x_key, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS x_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(y_key, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS y_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(way, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS way FROM s1),
-        s3 AS MATERIALIZED (SELECT x, y, name, '.' || replace(ltrim(x_key, '_'), '_', '..') || '.' AS x_key, '.' || replace(ltrim(y_key, '_'), '_', '..') || '.' AS y_key,
-        '.' || replace(way, '_', '.') || '.' AS way, '.' || replace(substr(way, length(rtrim(way, replace(way, '.', ''))) + 1), '_', '.') || '.' AS branch FROM s2),
-        s4 AS MATERIALIZED (SELECT *, way || x_key AS named, x_key AS rest FROM s3),
-        s5 AS MATERIALIZED (SELECT x, y, name, x_key, y_key, way, branch, named, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(rest, '.pose.', ''), '.position.', ''), '.pos.', ''), '.gps.', ''), '.odometry.', ''), '.odom.', ''), '.location.', ''), '.m.', ''), '.cm.', ''), '.mm.', ''), '.km.', ''), '.robot.', ''), '.rover.', ''), '.current.', '') AS rest FROM s4),
-        s6 AS MATERIALIZED (SELECT x, y, name, x_key, y_key, way, branch, named, replace(replace(replace(rest, '.actual.', ''), '.own.', ''), '.self.', '') AS rest FROM s5)
-      SELECT y * CASE WHEN instr(named, '.mm.') THEN 0.001 WHEN instr(named, '.cm.') THEN 0.01 WHEN instr(named, '.km.') THEN 1000 ELSE 1 END FROM s6
-      WHERE NOT EXISTS (SELECT 1 FROM json_each('["accel", "acceleration", "accelerometer", "angular", "axis", "cmd", "command", "compass", "error", "force", "gravity", "gyro", "imu", "linear", "magnetometer", "offset", "speed", "torque", "twist", "vel", "velocity", "wind", "ball", "blob", "box", "desired", "destination", "goal", "image", "item", "marker", "object", "obstacle", "pixel", "reference", "setpoint", "target", "waypoint"]') w WHERE instr(way, '.' || w.value || '.'))
-        AND (x_key = '.0.' AND y_key = '.1.' AND EXISTS (SELECT 1 FROM json_each('["pose", "position", "pos", "gps", "odometry", "odom", "location"]') w WHERE instr(branch, '.' || w.value || '.'))
-          OR rest = '.x.' AND y_key = replace(x_key, '.x.', '.y.'))
-      ORDER BY NOT EXISTS (SELECT 1 FROM json_each('["pose", "position", "pos", "gps", "odometry", "odom", "location"]') w WHERE instr(branch || x_key, '.' || w.value || '.')), name LIMIT 1)) AS y_m,
-  CASE json_array_length(j, '$.pose')
-    WHEN 3 THEN json_extract(j, '$.pose[2]')
-    WHEN 4 THEN json_extract(j, '$.pose[3]')
-    WHEN 6 THEN json_extract(j, '$.pose[5]')
-    ELSE coalesce(
-    json_extract(j, '$.pose.yaw'),
-    json_extract(j, '$.pose.theta'),
-    json_extract(j, '$.pose.heading'),
-    json_extract(j, '$.yaw'),
-    json_extract(j, '$.theta'),
-    json_extract(j, '$.heading'))
-  END AS yaw_rad,
-  coalesce(
-    CASE WHEN json_type(j, '$.mode') = 'text' THEN json_extract(j, '$.mode') END,
-    CASE WHEN json_type(j, '$.behaviour') = 'text' THEN json_extract(j, '$.behaviour') END,
-    CASE WHEN json_type(j, '$.behavior') = 'text' THEN json_extract(j, '$.behavior') END,
-    CASE WHEN json_type(j, '$.action') = 'text' THEN json_extract(j, '$.action') END,
-    CASE WHEN json_type(j, '$.task') = 'text' THEN json_extract(j, '$.task') END,
-    CASE WHEN json_type(j, '$.phase') = 'text' THEN json_extract(j, '$.phase') END,
-    (WITH s0 AS MATERIALIZED (SELECT value, type, replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') AS name FROM json_tree(j)
-        WHERE type IN ('text', 'integer') AND (key LIKE '%mode' OR key LIKE '%behaviour' OR key LIKE '%behavior' OR key LIKE '%action' OR key LIKE '%task' OR key LIKE '%phase' OR key LIKE '%state' OR key LIKE '%status' OR key LIKE '%name' OR key LIKE '%label' OR key LIKE '%str')),
-        s1 AS MATERIALIZED (SELECT *, substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) AS last FROM s0),
-        s2 AS MATERIALIZED (SELECT value, type, name, CASE WHEN last = upper(last) THEN lower(last) ELSE last END AS last FROM s1),
-        s3 AS MATERIALIZED (SELECT value, type, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS last FROM s2),
-        s4 AS MATERIALIZED (SELECT value, type, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS last FROM s3),
-        s5 AS MATERIALIZED (SELECT *, CASE WHEN '.' || replace(last, '_', '.') IN ('.name', '.label', '.str') THEN '.' || replace(last, '_', '.') ELSE rtrim(replace(replace(replace('.' || replace(last, '_', '.') || '|', '.name|', '|'), '.label|', '|'), '.str|', '|'), '|') END AS words FROM s4),
-        s6 AS MATERIALIZED (SELECT *, instr('.mode.behaviour.behavior.action.task.phase.state.status.', substr(words, length(rtrim(words, replace(words, '.', '')))) || '.') AS rank FROM s5)
-      SELECT value FROM s6
-      WHERE rank > 0 AND NOT EXISTS (SELECT 1 FROM json_each('["last", "previous", "prev", "old", "next", "desired", "target"]') w WHERE instr(words || '.', '.' || w.value || '.'))
-      ORDER BY type = 'integer', rank >= 43,
-        CASE WHEN name = '$' || words THEN rank ELSE 56 END, length(name), name
-      LIMIT 1)) AS mode,
+  (SELECT json_extract(j, p.path) * CASE p.unit WHEN 'mm' THEN 0.001 WHEN 'cm' THEN 0.01 WHEN 'km' THEN 1000 ELSE 1 END
+    FROM signal p JOIN signal o
+      ON o.robot_id = p.robot_id AND o.role = 'y' || substr(p.role, 2)
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'x' AND 'x9'
+      AND json_type(j, p.path) IN ('integer', 'real') AND json_type(j, o.path) IN ('integer', 'real')
+    ORDER BY p.role LIMIT 1) AS x_m,
+  (SELECT json_extract(j, p.path) * CASE p.unit WHEN 'mm' THEN 0.001 WHEN 'cm' THEN 0.01 WHEN 'km' THEN 1000 ELSE 1 END
+    FROM signal p JOIN signal o
+      ON o.robot_id = p.robot_id AND o.role = 'x' || substr(p.role, 2)
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'y' AND 'y9'
+      AND json_type(j, p.path) IN ('integer', 'real') AND json_type(j, o.path) IN ('integer', 'real')
+    ORDER BY p.role LIMIT 1) AS y_m,
+  (SELECT json_extract(j, p.path) * CASE p.unit WHEN 'deg' THEN 0.017453292519943295 ELSE 1 END FROM signal p
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'yaw' AND 'yaw9'
+      AND json_type(j, p.path) IN ('integer', 'real') ORDER BY p.role LIMIT 1) AS yaw_rad,
+  (SELECT json_extract(j, p.path) FROM signal p
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'mode' AND 'mode9'
+      AND json_type(j, p.path) IN ('text', 'integer') ORDER BY p.role LIMIT 1) AS mode,
+  (SELECT json_extract(j, p.path) FROM signal p
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'speed' AND 'speed9'
+      AND json_type(j, p.path) IN ('integer', 'real') ORDER BY p.role LIMIT 1) AS speed,
+  (SELECT json_extract(j, p.path) FROM signal p
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'commanded_speed' AND 'commanded_speed9'
+      AND json_type(j, p.path) IN ('integer', 'real') ORDER BY p.role LIMIT 1) AS commanded_speed,
   data, odd
 FROM (
-  SELECT r.name AS robot, u.id AS run_id, s.sim_time_s, s.wall_time_s, s.data, s.odd,
-    u.end_reason, CASE WHEN json_valid(s.data) THEN s.data END AS j
+  SELECT r.id AS robot_id, r.name AS robot, u.id AS run_id, u.end_reason, s.sim_time_s,
+    s.wall_time_s, s.data, s.odd, CASE WHEN json_valid(s.data) THEN s.data END AS j
   FROM robot r
   LEFT JOIN run u ON u.id = (SELECT max(id) FROM run WHERE robot_id = r.id)
   LEFT JOIN state s ON s.id = (
     SELECT id FROM state WHERE run_id = u.id ORDER BY sim_time_s DESC, id DESC LIMIT 1)
-);
+) s;
 CREATE VIEW robot_trajectory AS
-/* Where each robot was and in which mode, row by row: ask with run_id = ... and a time. */
-SELECT (
-  SELECT r.name FROM run u JOIN robot r ON r.id = u.robot_id WHERE u.id = s.run_id) AS robot,
+/* How each robot moved, row by row: ask with run_id = ... and a time. Speeds as published. */
+SELECT (SELECT r.name FROM robot r WHERE r.id = s.robot_id) AS robot,
   s.run_id, s.id AS state_id, s.sim_time_s,
   strftime('%Y-%m-%d %H:%M:%f', s.wall_time_s, 'unixepoch') AS utc,
-  coalesce(
-    (SELECT json_extract(j, '$.' || p.key) * CASE WHEN replace(replace(replace(p.key, '"', ''), '[', '.'), ']', '') || '.' GLOB '*_mm.*' THEN 0.001 WHEN replace(replace(replace(p.key, '"', ''), '[', '.'), ']', '') || '.' GLOB '*_cm.*' THEN 0.01 ELSE 1 END
-      FROM json_each('{"pose[0]": "pose[1]", "pose.x": "pose.y", "pose.x_m": "pose.y_m", "pose.x_cm": "pose.y_cm", "pose.x_mm": "pose.y_mm", "position[0]": "position[1]", "position.x": "position.y", "position.x_m": "position.y_m", "position.x_cm": "position.y_cm", "position.x_mm": "position.y_mm", "pos[0]": "pos[1]", "pos.x": "pos.y", "pos.x_m": "pos.y_m", "pos.x_cm": "pos.y_cm", "pos.x_mm": "pos.y_mm", "gps[0]": "gps[1]", "gps.x": "gps.y", "gps.x_m": "gps.y_m", "gps.x_cm": "gps.y_cm", "gps.x_mm": "gps.y_mm", "odometry[0]": "odometry[1]", "odometry.x": "odometry.y", "odometry.x_m": "odometry.y_m", "odometry.x_cm": "odometry.y_cm", "odometry.x_mm": "odometry.y_mm", "odom[0]": "odom[1]", "odom.x": "odom.y", "odom.x_m": "odom.y_m", "odom.x_cm": "odom.y_cm", "odom.x_mm": "odom.y_mm", "location[0]": "location[1]", "location.x": "location.y", "location.x_m": "location.y_m", "location.x_cm": "location.y_cm", "location.x_mm": "location.y_mm", "pose_m[0]": "pose_m[1]", "pose_cm[0]": "pose_cm[1]", "pose_mm[0]": "pose_mm[1]", "position_m[0]": "position_m[1]", "position_cm[0]": "position_cm[1]", "position_mm[0]": "position_mm[1]", "pos_m[0]": "pos_m[1]", "pos_cm[0]": "pos_cm[1]", "pos_mm[0]": "pos_mm[1]", "gps_m[0]": "gps_m[1]", "gps_cm[0]": "gps_cm[1]", "gps_mm[0]": "gps_mm[1]", "odometry_m[0]": "odometry_m[1]", "odometry_cm[0]": "odometry_cm[1]", "odometry_mm[0]": "odometry_mm[1]", "odom_m[0]": "odom_m[1]", "odom_cm[0]": "odom_cm[1]", "odom_mm[0]": "odom_mm[1]", "location_m[0]": "location_m[1]", "location_cm[0]": "location_cm[1]", "location_mm[0]": "location_mm[1]", "x": "y", "x_m": "y_m", "x_cm": "y_cm", "x_mm": "y_mm"}') p
-      WHERE json_type(j, '$.' || p.key) IN ('integer', 'real') AND json_type(j, '$.' || p.value) IN ('integer', 'real')
-      LIMIT 1),
-    (WITH s0 AS MATERIALIZED (SELECT x.value AS x, y.value AS y, replace(replace(replace(x.fullkey, '"', ''), '[', '.'), ']', '') AS name,
-          CASE WHEN x.key = upper(x.key) THEN lower(x.key) ELSE x.key END AS x_key,
-          CASE WHEN y.key = upper(y.key) THEN lower(y.key) ELSE y.key END AS y_key, replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') AS way
-        FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
-        WHERE x.type IN ('integer', 'real') AND y.type IN ('integer', 'real')
-          AND (x.key = 0 AND y.key = 1 OR x.key GLOB '*[xX]*' AND y.key GLOB '*[yY]*')),
-        s1 AS MATERIALIZED (SELECT x, y, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(x_key, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS x_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(y_key, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS y_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(way, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS way FROM s0),
-        s2 AS MATERIALIZED (SELECT x, y, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(x_key, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS x_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(y_key, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS y_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(way, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS way FROM s1),
-        s3 AS MATERIALIZED (SELECT x, y, name, '.' || replace(ltrim(x_key, '_'), '_', '..') || '.' AS x_key, '.' || replace(ltrim(y_key, '_'), '_', '..') || '.' AS y_key,
-        '.' || replace(way, '_', '.') || '.' AS way, '.' || replace(substr(way, length(rtrim(way, replace(way, '.', ''))) + 1), '_', '.') || '.' AS branch FROM s2),
-        s4 AS MATERIALIZED (SELECT *, way || x_key AS named, x_key AS rest FROM s3),
-        s5 AS MATERIALIZED (SELECT x, y, name, x_key, y_key, way, branch, named, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(rest, '.pose.', ''), '.position.', ''), '.pos.', ''), '.gps.', ''), '.odometry.', ''), '.odom.', ''), '.location.', ''), '.m.', ''), '.cm.', ''), '.mm.', ''), '.km.', ''), '.robot.', ''), '.rover.', ''), '.current.', '') AS rest FROM s4),
-        s6 AS MATERIALIZED (SELECT x, y, name, x_key, y_key, way, branch, named, replace(replace(replace(rest, '.actual.', ''), '.own.', ''), '.self.', '') AS rest FROM s5)
-      SELECT x * CASE WHEN instr(named, '.mm.') THEN 0.001 WHEN instr(named, '.cm.') THEN 0.01 WHEN instr(named, '.km.') THEN 1000 ELSE 1 END FROM s6
-      WHERE NOT EXISTS (SELECT 1 FROM json_each('["accel", "acceleration", "accelerometer", "angular", "axis", "cmd", "command", "compass", "error", "force", "gravity", "gyro", "imu", "linear", "magnetometer", "offset", "speed", "torque", "twist", "vel", "velocity", "wind", "ball", "blob", "box", "desired", "destination", "goal", "image", "item", "marker", "object", "obstacle", "pixel", "reference", "setpoint", "target", "waypoint"]') w WHERE instr(way, '.' || w.value || '.'))
-        AND (x_key = '.0.' AND y_key = '.1.' AND EXISTS (SELECT 1 FROM json_each('["pose", "position", "pos", "gps", "odometry", "odom", "location"]') w WHERE instr(branch, '.' || w.value || '.'))
-          OR rest = '.x.' AND y_key = replace(x_key, '.x.', '.y.'))
-      ORDER BY NOT EXISTS (SELECT 1 FROM json_each('["pose", "position", "pos", "gps", "odometry", "odom", "location"]') w WHERE instr(branch || x_key, '.' || w.value || '.')), name LIMIT 1)) AS x_m,
-  coalesce(
-    (SELECT json_extract(j, '$.' || p.value) * CASE WHEN replace(replace(replace(p.key, '"', ''), '[', '.'), ']', '') || '.' GLOB '*_mm.*' THEN 0.001 WHEN replace(replace(replace(p.key, '"', ''), '[', '.'), ']', '') || '.' GLOB '*_cm.*' THEN 0.01 ELSE 1 END
-      FROM json_each('{"pose[0]": "pose[1]", "pose.x": "pose.y", "pose.x_m": "pose.y_m", "pose.x_cm": "pose.y_cm", "pose.x_mm": "pose.y_mm", "position[0]": "position[1]", "position.x": "position.y", "position.x_m": "position.y_m", "position.x_cm": "position.y_cm", "position.x_mm": "position.y_mm", "pos[0]": "pos[1]", "pos.x": "pos.y", "pos.x_m": "pos.y_m", "pos.x_cm": "pos.y_cm", "pos.x_mm": "pos.y_mm", "gps[0]": "gps[1]", "gps.x": "gps.y", "gps.x_m": "gps.y_m", "gps.x_cm": "gps.y_cm", "gps.x_mm": "gps.y_mm", "odometry[0]": "odometry[1]", "odometry.x": "odometry.y", "odometry.x_m": "odometry.y_m", "odometry.x_cm": "odometry.y_cm", "odometry.x_mm": "odometry.y_mm", "odom[0]": "odom[1]", "odom.x": "odom.y", "odom.x_m": "odom.y_m", "odom.x_cm": "odom.y_cm", "odom.x_mm": "odom.y_mm", "location[0]": "location[1]", "location.x": "location.y", "location.x_m": "location.y_m", "location.x_cm": "location.y_cm", "location.x_mm": "location.y_mm", "pose_m[0]": "pose_m[1]", "pose_cm[0]": "pose_cm[1]", "pose_mm[0]": "pose_mm[1]", "position_m[0]": "position_m[1]", "position_cm[0]": "position_cm[1]", "position_mm[0]": "position_mm[1]", "pos_m[0]": "pos_m[1]", "pos_cm[0]": "pos_cm[1]", "pos_mm[0]": "pos_mm[1]", "gps_m[0]": "gps_m[1]", "gps_cm[0]": "gps_cm[1]", "gps_mm[0]": "gps_mm[1]", "odometry_m[0]": "odometry_m[1]", "odometry_cm[0]": "odometry_cm[1]", "odometry_mm[0]": "odometry_mm[1]", "odom_m[0]": "odom_m[1]", "odom_cm[0]": "odom_cm[1]", "odom_mm[0]": "odom_mm[1]", "location_m[0]": "location_m[1]", "location_cm[0]": "location_cm[1]", "location_mm[0]": "location_mm[1]", "x": "y", "x_m": "y_m", "x_cm": "y_cm", "x_mm": "y_mm"}') p
-      WHERE json_type(j, '$.' || p.key) IN ('integer', 'real') AND json_type(j, '$.' || p.value) IN ('integer', 'real')
-      LIMIT 1),
-    (WITH s0 AS MATERIALIZED (SELECT x.value AS x, y.value AS y, replace(replace(replace(x.fullkey, '"', ''), '[', '.'), ']', '') AS name,
-          CASE WHEN x.key = upper(x.key) THEN lower(x.key) ELSE x.key END AS x_key,
-          CASE WHEN y.key = upper(y.key) THEN lower(y.key) ELSE y.key END AS y_key, replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') AS way
-        FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
-        WHERE x.type IN ('integer', 'real') AND y.type IN ('integer', 'real')
-          AND (x.key = 0 AND y.key = 1 OR x.key GLOB '*[xX]*' AND y.key GLOB '*[yY]*')),
-        s1 AS MATERIALIZED (SELECT x, y, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(x_key, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS x_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(y_key, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS y_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(way, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS way FROM s0),
-        s2 AS MATERIALIZED (SELECT x, y, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(x_key, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS x_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(y_key, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS y_key, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(way, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS way FROM s1),
-        s3 AS MATERIALIZED (SELECT x, y, name, '.' || replace(ltrim(x_key, '_'), '_', '..') || '.' AS x_key, '.' || replace(ltrim(y_key, '_'), '_', '..') || '.' AS y_key,
-        '.' || replace(way, '_', '.') || '.' AS way, '.' || replace(substr(way, length(rtrim(way, replace(way, '.', ''))) + 1), '_', '.') || '.' AS branch FROM s2),
-        s4 AS MATERIALIZED (SELECT *, way || x_key AS named, x_key AS rest FROM s3),
-        s5 AS MATERIALIZED (SELECT x, y, name, x_key, y_key, way, branch, named, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(rest, '.pose.', ''), '.position.', ''), '.pos.', ''), '.gps.', ''), '.odometry.', ''), '.odom.', ''), '.location.', ''), '.m.', ''), '.cm.', ''), '.mm.', ''), '.km.', ''), '.robot.', ''), '.rover.', ''), '.current.', '') AS rest FROM s4),
-        s6 AS MATERIALIZED (SELECT x, y, name, x_key, y_key, way, branch, named, replace(replace(replace(rest, '.actual.', ''), '.own.', ''), '.self.', '') AS rest FROM s5)
-      SELECT y * CASE WHEN instr(named, '.mm.') THEN 0.001 WHEN instr(named, '.cm.') THEN 0.01 WHEN instr(named, '.km.') THEN 1000 ELSE 1 END FROM s6
-      WHERE NOT EXISTS (SELECT 1 FROM json_each('["accel", "acceleration", "accelerometer", "angular", "axis", "cmd", "command", "compass", "error", "force", "gravity", "gyro", "imu", "linear", "magnetometer", "offset", "speed", "torque", "twist", "vel", "velocity", "wind", "ball", "blob", "box", "desired", "destination", "goal", "image", "item", "marker", "object", "obstacle", "pixel", "reference", "setpoint", "target", "waypoint"]') w WHERE instr(way, '.' || w.value || '.'))
-        AND (x_key = '.0.' AND y_key = '.1.' AND EXISTS (SELECT 1 FROM json_each('["pose", "position", "pos", "gps", "odometry", "odom", "location"]') w WHERE instr(branch, '.' || w.value || '.'))
-          OR rest = '.x.' AND y_key = replace(x_key, '.x.', '.y.'))
-      ORDER BY NOT EXISTS (SELECT 1 FROM json_each('["pose", "position", "pos", "gps", "odometry", "odom", "location"]') w WHERE instr(branch || x_key, '.' || w.value || '.')), name LIMIT 1)) AS y_m,
-  CASE json_array_length(j, '$.pose')
-    WHEN 3 THEN json_extract(j, '$.pose[2]')
-    WHEN 4 THEN json_extract(j, '$.pose[3]')
-    WHEN 6 THEN json_extract(j, '$.pose[5]')
-    ELSE coalesce(
-    json_extract(j, '$.pose.yaw'),
-    json_extract(j, '$.pose.theta'),
-    json_extract(j, '$.pose.heading'),
-    json_extract(j, '$.yaw'),
-    json_extract(j, '$.theta'),
-    json_extract(j, '$.heading'))
-  END AS yaw_rad,
-  coalesce(
-    CASE WHEN json_type(j, '$.mode') = 'text' THEN json_extract(j, '$.mode') END,
-    CASE WHEN json_type(j, '$.behaviour') = 'text' THEN json_extract(j, '$.behaviour') END,
-    CASE WHEN json_type(j, '$.behavior') = 'text' THEN json_extract(j, '$.behavior') END,
-    CASE WHEN json_type(j, '$.action') = 'text' THEN json_extract(j, '$.action') END,
-    CASE WHEN json_type(j, '$.task') = 'text' THEN json_extract(j, '$.task') END,
-    CASE WHEN json_type(j, '$.phase') = 'text' THEN json_extract(j, '$.phase') END,
-    (WITH s0 AS MATERIALIZED (SELECT value, type, replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') AS name FROM json_tree(j)
-        WHERE type IN ('text', 'integer') AND (key LIKE '%mode' OR key LIKE '%behaviour' OR key LIKE '%behavior' OR key LIKE '%action' OR key LIKE '%task' OR key LIKE '%phase' OR key LIKE '%state' OR key LIKE '%status' OR key LIKE '%name' OR key LIKE '%label' OR key LIKE '%str')),
-        s1 AS MATERIALIZED (SELECT *, substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) AS last FROM s0),
-        s2 AS MATERIALIZED (SELECT value, type, name, CASE WHEN last = upper(last) THEN lower(last) ELSE last END AS last FROM s1),
-        s3 AS MATERIALIZED (SELECT value, type, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS last FROM s2),
-        s4 AS MATERIALIZED (SELECT value, type, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS last FROM s3),
-        s5 AS MATERIALIZED (SELECT *, CASE WHEN '.' || replace(last, '_', '.') IN ('.name', '.label', '.str') THEN '.' || replace(last, '_', '.') ELSE rtrim(replace(replace(replace('.' || replace(last, '_', '.') || '|', '.name|', '|'), '.label|', '|'), '.str|', '|'), '|') END AS words FROM s4),
-        s6 AS MATERIALIZED (SELECT *, instr('.mode.behaviour.behavior.action.task.phase.state.status.', substr(words, length(rtrim(words, replace(words, '.', '')))) || '.') AS rank FROM s5)
-      SELECT value FROM s6
-      WHERE rank > 0 AND NOT EXISTS (SELECT 1 FROM json_each('["last", "previous", "prev", "old", "next", "desired", "target"]') w WHERE instr(words || '.', '.' || w.value || '.'))
-      ORDER BY type = 'integer', rank >= 43,
-        CASE WHEN name = '$' || words THEN rank ELSE 56 END, length(name), name
-      LIMIT 1)) AS mode, s.odd
-FROM (SELECT *, CASE WHEN json_valid(data) THEN data END AS j FROM state) s;
-INSERT INTO alembic_version (version_num) VALUES ('0009');
+  (SELECT json_extract(j, p.path) * CASE p.unit WHEN 'mm' THEN 0.001 WHEN 'cm' THEN 0.01 WHEN 'km' THEN 1000 ELSE 1 END
+    FROM signal p JOIN signal o
+      ON o.robot_id = p.robot_id AND o.role = 'y' || substr(p.role, 2)
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'x' AND 'x9'
+      AND json_type(j, p.path) IN ('integer', 'real') AND json_type(j, o.path) IN ('integer', 'real')
+    ORDER BY p.role LIMIT 1) AS x_m,
+  (SELECT json_extract(j, p.path) * CASE p.unit WHEN 'mm' THEN 0.001 WHEN 'cm' THEN 0.01 WHEN 'km' THEN 1000 ELSE 1 END
+    FROM signal p JOIN signal o
+      ON o.robot_id = p.robot_id AND o.role = 'x' || substr(p.role, 2)
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'y' AND 'y9'
+      AND json_type(j, p.path) IN ('integer', 'real') AND json_type(j, o.path) IN ('integer', 'real')
+    ORDER BY p.role LIMIT 1) AS y_m,
+  (SELECT json_extract(j, p.path) * CASE p.unit WHEN 'deg' THEN 0.017453292519943295 ELSE 1 END FROM signal p
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'yaw' AND 'yaw9'
+      AND json_type(j, p.path) IN ('integer', 'real') ORDER BY p.role LIMIT 1) AS yaw_rad,
+  (SELECT json_extract(j, p.path) FROM signal p
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'mode' AND 'mode9'
+      AND json_type(j, p.path) IN ('text', 'integer') ORDER BY p.role LIMIT 1) AS mode,
+  (SELECT json_extract(j, p.path) FROM signal p
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'speed' AND 'speed9'
+      AND json_type(j, p.path) IN ('integer', 'real') ORDER BY p.role LIMIT 1) AS speed,
+  (SELECT json_extract(j, p.path) FROM signal p
+    WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'commanded_speed' AND 'commanded_speed9'
+      AND json_type(j, p.path) IN ('integer', 'real') ORDER BY p.role LIMIT 1) AS commanded_speed, s.odd
+FROM (SELECT *, CASE WHEN json_valid(data) THEN data END AS j, (SELECT robot_id FROM run WHERE id = run_id) AS robot_id FROM state) s;
+CREATE VIEW robot_statistics AS
+/* What the numbers of a signal come to in each group of about 1,024 rows, also of purged rows. */
+SELECT r.name AS robot, g.run_id, s.name AS signal, g.start_sim_time_s AS start_s,
+  g.end_sim_time_s AS end_s, c.row_count, c.value_count, c.min, c.max,
+  c.sum / nullif(c.value_count, 0) AS mean, c.first, c.last, c.largest_step, c.change_count
+FROM chunk c JOIN row_group g ON g.id = c.group_id AND g.is_complete
+JOIN signal s ON s.id = c.signal_id JOIN robot r ON r.id = s.robot_id;
+INSERT INTO alembic_version (version_num) VALUES ('0010');

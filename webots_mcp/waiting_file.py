@@ -3,10 +3,10 @@
 A row that meets a lock for longer than a control loop may wait is appended, as one line with one
 `write()`, to a file of its session next to the database (`webots.db-waiting-<session uuid>.jsonl`).
 It survives a killed process; the next process that opens the database adopts it: exactly once, in
-order, in short transactions. The progress is in `session.adopted_rows`, the number of the last
-entry, which is written in the same transaction as the rows. So it does not matter what happens to
-the file afterwards: a process that finds it again, after a kill or an interrupt at any place, skips
-the entries that are already in the database.
+order, in short transactions. The progress is in `session.last_adopted_entry`, which is written in
+the same transaction as the rows. So it does not matter what happens to the file afterwards: a
+process that finds it again, after a kill or an interrupt at any place, skips the entries that are
+already in the database.
 
 The first line says who records. Each further one is an `Entry` as a JSON array: its number, its
 kind, the UUID of its run and its values. A line that was cut off by a kill in the middle of its
@@ -41,9 +41,9 @@ _NO_NUMBER: Final = 1 << 63  # SQLite's integers end there
 _LOCKED_BYTE: Final = 1 << 40  # far beyond the end: Windows refuses to read what is locked
 _PIECE_S: Final = 0.001  # how long a transaction may keep other writers out
 
-_SESSION_OF: Final = "SELECT id, adopted_rows FROM session WHERE uuid = ?"
-_ADOPTED: Final = "SELECT adopted_rows FROM session WHERE id = ?"
-_SET_ADOPTED: Final = "UPDATE session SET adopted_rows = ? WHERE id = ?"
+_SESSION_OF: Final = "SELECT id, last_adopted_entry FROM session WHERE uuid = ?"
+_ADOPTED: Final = "SELECT last_adopted_entry FROM session WHERE id = ?"
+_SET_ADOPTED: Final = "UPDATE session SET last_adopted_entry = ? WHERE id = ?"
 _RUN_OF: Final = "SELECT id FROM run WHERE uuid = ?"
 _RECOUNT: Final = (
     "SELECT purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id), id FROM run "

@@ -10,6 +10,7 @@ from typing import Final
 from tests.recordings.long import CYCLE_S, INTERVAL_S, build
 from tests.recordings.rover import WALL_START_S
 from webots_mcp.connection import connect
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.rollup.rolling import roll
 
 LINE_INTERVAL_S: Final = 1.0
@@ -43,6 +44,8 @@ def record(file: Path, rows: int) -> None:
         connection.executemany(_LOG, map(_log_line, lines))
         connection.execute("COMMIT")
         while not roll(connection, _ROLLED_ROWS).done:
+            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+        while not make_chunks(connection, _ROLLED_ROWS).done:
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
 

@@ -384,7 +384,7 @@ def test_frames_that_cannot_be_written_are_counted_and_the_rows_are_there(
     assert bridge.stats().frames_missed >= 8
     assert "keep_camera failed" in str(bridge.stats().last_error)
     assert recording.rows(FRAMES) == []
-    assert recording.rows("SELECT count(*) FROM every_state") == [120]
+    assert recording.rows("SELECT count(*) FROM all_state") == [120]
 
 
 @pytest.mark.parametrize("size", [(640, 480), (1921, 7), (3, 500), (160, 160), (161, 1)])

@@ -49,7 +49,7 @@ def test_a_successor_is_held_in_its_first_step_until_a_resume(
     leave_held(simulation, database)
     assert simulation.mode is Mode.PAUSE
     with succeed(simulation, database) as bridge:
-        assert recording.rows("SELECT hold, hold_mode FROM session WHERE id = 2") == [
+        assert recording.rows("SELECT hold, mode_before_pause FROM session WHERE id = 2") == [
             ("paused", "fast")
         ]
         resume = recording.send("resume")

@@ -5,22 +5,19 @@ from __future__ import annotations
 import json
 import os
 import signal
-import sqlite3
 import subprocess
 import sys
 import time
 from collections.abc import Generator, Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from tests.recordings.rows import Recorded, RecordedRobot
 from webots_mcp.cli import main, names
-from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.queue import CommandQueue
 from webots_mcp.store.logs import Follower
-from webots_mcp.store.migrate import upgrade
 
 
 @pytest.fixture
@@ -129,7 +126,7 @@ def test_status_as_json_holds_the_same(
     assert (robot["status"], robot["rows_dropped"]) == ("running", 1)
 
 
-@pytest.mark.parametrize("arguments", [["status"], ["tail"], ["migrate"]])
+@pytest.mark.parametrize("arguments", [["status"], ["tail"]])
 def test_without_a_database_one_line_says_so_and_the_exit_code_is_2(
     arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -250,33 +247,9 @@ def test_a_data_folder_that_is_none_is_said_to_be_none(
     assert why in capsys.readouterr().err
 
 
-def test_an_old_database_is_migrated_with_its_data(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = tmp_path / "webots.db"
-    upgrade(file, "0001")
-    assert main(["status", "--database", str(file)]) == 2
-    assert "webots-mcp migrate" in capsys.readouterr().err
-    assert main(["migrate", "--database", str(file)]) == 0
-    assert f"schema 1, now {SCHEMA_VERSION}" in capsys.readouterr().out
-    assert main(["migrate", "--json", "--database", str(file)]) == 0
-    now = {"database": str(file), "before": SCHEMA_VERSION, "after": SCHEMA_VERSION}
-    assert json.loads(capsys.readouterr().out) == now
-    with closing(sqlite3.connect(file)) as connection:
-        assert connection.execute("PRAGMA user_version").fetchone() == (SCHEMA_VERSION,)
-
-
 def test_an_argument_too_many_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["migrate", "head", "now"]) == 2
-    assert "migrate takes no further argument: 'head' 'now'" in capsys.readouterr().err
-
-
-def test_an_unknown_revision_is_bad_input(
-    rover: RecordedRobot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["migrate", "--revision", "7777", "--data-dir", str(tmp_path)]) == 2
-    assert "7777" in capsys.readouterr().err
-    assert rover.run_id
+    assert main(["status", "head", "now"]) == 2
+    assert "status takes no further argument: 'head' 'now'" in capsys.readouterr().err
 
 
 def test_the_server_keeps_stdout_for_the_protocol(tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.older_recording import make_older
 from webots_mcp.cli import main
-from webots_mcp.store.migrate import upgrade
 
 
 def test_what_is_well_ends_with_0_and_a_line_for_each_check(
@@ -27,16 +27,16 @@ def test_what_is_well_ends_with_0_and_a_line_for_each_check(
 def test_what_is_wrong_ends_with_1_and_what_mends_it_with_its_page(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    upgrade(tmp_path / "webots.db", "0001")
+    make_older(tmp_path / "webots.db")
     assert main(["doctor", "--no-server", "--data-dir", str(tmp_path)]) == 1
     out = capsys.readouterr().out
-    assert "-> run 'webots-mcp migrate'" in out
+    assert "move it aside" in out
     assert "(docs/troubleshooting.md#schema)" in out
     assert "Server" not in out
 
 
 def test_as_json_it_is_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    upgrade(tmp_path / "webots.db", "0001")
+    make_older(tmp_path / "webots.db")
     assert main(["doctor", "--no-server", "--json", "--data-dir", str(tmp_path)]) == 1
     checks = {each["check"]: each for each in json.loads(capsys.readouterr().out)["checks"]}
     assert checks["Schema"]["verdict"] == "wrong"

@@ -60,7 +60,7 @@ def run(site: Path, commands: list[list[str]]) -> subprocess.CompletedProcess[st
 
 
 @pytest.mark.parametrize(
-    "command", ["status", "serve", "migrate", "plot", "demo", "history", "export", "launch"]
+    "command", ["status", "serve", "plot", "demo", "history", "export", "launch"]
 )
 def test_a_command_names_what_is_missing_and_the_line_that_installs_it(
     site: Path, database: Path, command: str

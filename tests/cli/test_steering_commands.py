@@ -55,7 +55,7 @@ def test_a_run_says_why_it_stopped_and_what_happened(
     where = ("--database", str(file))
     assert main(["run", *where, "--for", "0.48", "--reset", "--until", "steps < 0"]) == 0
     said = capsys.readouterr().out
-    assert "stopped time over" in said
+    assert "stopped simulation time reached" in said
     assert "ran: run_id 2, from_s 0, to_s 0.48, advanced_s 0.48" in said
     assert "mode pause" in said
     assert "\nrows:\n  sim_time_s  steps\n" in said
@@ -129,7 +129,7 @@ def test_a_run_that_takes_longer_is_waited_for_or_ended_with_the_lines_that_it_n
     assert main([*line, "--timeout", "0.1"]) == 2
     assert "'webots-mcp" not in capsys.readouterr().out
     assert main(line) == 0
-    assert "time over" in capsys.readouterr().out
+    assert "simulation time reached" in capsys.readouterr().out
     assert main([*line[:1], "999", *line[2:]]) == 2
     assert "no command 999" in capsys.readouterr().err
     capsys.readouterr()

@@ -15,7 +15,6 @@ from tests import unprivileged
 from tests.recordings.rows import Recorded
 from tests.server.conftest import ask, fail
 from webots_mcp.contract import new_uuid
-from webots_mcp.store.migrate import upgrade
 from webots_mcp.waiting_file import waiting_path
 
 pytestmark = [
@@ -165,26 +164,7 @@ def test_where_the_log_can_be_read_in_place_nothing_is_missing(recorded: Recorde
     assert "storage" not in facts
 
 
-def test_an_older_schema_asks_for_a_copy(tmp_path: Path) -> None:
-    file = tmp_path / "artifact" / "webots.db"
-    file.parent.mkdir()
-    upgrade(file, "0003")
-    with unprivileged.unwritable(file.parent):
-        ended = run("-m", "webots_mcp", "status", "--database", str(file))
-    assert ended.returncode == 2
-    assert "copy" in ended.stderr
-    assert "migrate" in ended.stderr
-    assert "Traceback" not in ended.stderr
-
-
-def test_it_is_not_migrated_and_the_reason_is_said(artifact: Path) -> None:
-    ended = run("-m", "webots_mcp", "migrate", "--database", str(artifact))
-    assert ended.returncode == 2
-    assert "cannot be written from here" in ended.stderr
-    assert "Traceback" not in ended.stderr
-
-
-@pytest.mark.parametrize("command", ["status", "migrate"])
+@pytest.mark.parametrize("command", ["status", "tail"])
 def test_a_folder_that_cannot_be_looked_into_is_said_to_be_one(
     recorded: Recorded, command: str
 ) -> None:

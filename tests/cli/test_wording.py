@@ -46,7 +46,6 @@ def data_dir(tmp_path: Path) -> Iterator[Path]:
         ("parameters --from-reset", "--from-reset needs what is set then: NAME=VALUE"),
         (f"tail -n {10**20} --no-follow", f"{10**20} is too large"),
         ("label --note --json", 'Invalid value "--json" for --note'),
-        ("migrate --revision=", "--revision is empty"),
         ("field ROVER.translation --stop", "--stop goes with a VALUE"),
         ("export -o x.zz --robot rover", "or say it with --format"),
         ("runs -n 5000", "-n must be less than or equal to 500"),

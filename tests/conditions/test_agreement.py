@@ -13,9 +13,12 @@ from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.conditions import parse_condition
 from webots_mcp.connection import connect
 from webots_mcp.standin import InProcessSupervisor
+from webots_mcp.store.detection.condition import values_at, where_held
 from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.held import where_held
+from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import whole_run
+
+Held = list[tuple[float, dict[str, Any]]]
 
 STEP_MS = 16  # stands for the tenth of a second that the rows are apart
 SHORT = {1.0: 0.16, 0.5: 0.08, 0.3: 0.048, 0.2: 0.032, 0.1: 0.016}
@@ -39,7 +42,9 @@ def test_hits_and_stretches_begin_at_the_same_steps(
         connection = connect(database, "reader")
         for (run_id,) in connection.execute("SELECT DISTINCT run_id FROM state").fetchall():
             for text in texts:
-                assert _found(connection, run_id, text) == _hit(connection, run_id, text)
+                assert _told(_found(connection, run_id, text), text) == _told(
+                    _hit(connection, run_id, text), text
+                )
         connection.close()
     finally:
         database.close()
@@ -65,17 +70,28 @@ def _drive(robot: InProcessSupervisor, bridge: MCPBridge, history: Rows) -> None
         at_s = time_s
 
 
-def _found(connection: Any, run_id: int, text: str) -> list[tuple[float, dict[str, Any]]]:
+def _found(connection: Any, run_id: int, text: str) -> Held:
     segment = whole_run(connection, run_id)
     assert segment is not None
-    held = where_held(connection, segment, parse_condition(text), Deadline())
-    return [(stretch.start_s, stretch.values) for stretch in held.stretches]
+    condition, frame = parse_condition(text), read_frame(connection, segment, Deadline())
+    runs = where_held(condition, frame, ("x", "y"))
+    values = values_at(condition, frame, None, runs)
+    return [(run.start_s, held) for run, held in zip(runs.each(), values, strict=True)]
 
 
-def _hit(connection: Any, run_id: int, text: str) -> list[tuple[float, dict[str, Any]]]:
+def _hit(connection: Any, run_id: int, text: str) -> Held:
     sql = (
         "SELECT sim_time_s, json_extract(data, '$.values') FROM event "
         "WHERE run_id = ? AND kind = 'breakpoint' AND name = ? ORDER BY id"
     )
     found = connection.execute(sql, (run_id, text)).fetchall()
     return [(time_s, json.loads(values)) for time_s, values in found]
+
+
+def _told(held: Held, text: str) -> Held:
+    """Without a place, which has no y either where it has no x."""
+    places = ("x", "y") if "displacement" in text else ()
+    return [
+        (time_s, {name: value for name, value in values.items() if name not in places})
+        for time_s, values in held
+    ]

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import pytest
 
+from tests.conditions.writing import Rows
+from tests.frames import frame_of_states
 from webots_mcp.conditions.scoring import Facts, Scored, parse_score
-from webots_mcp.errors import InvalidConditionError, UnknownSignalError
+from webots_mcp.errors import ConditionFailedError, InvalidConditionError, UnknownSignalError
+from webots_mcp.store.conditions_on_arrays import aggregated
 
-STATES = [
+STATES: Rows = [
     (0.0, {"x": -1.0, "error": -2.0, "mode": "drive", "bumper": False, "gone": None}),
     (1.0, {"x": 3.0, "error": 4.0, "mode": "drive", "bumper": True, "gone": None}),
     (3.0, {"x": 2.0, "error": 0.0, "mode": "stop", "bumper": True, "gone": None}),
@@ -15,8 +18,13 @@ STATES = [
 ]
 
 
-def score(text: str, **counts: int | str) -> Scored:
-    return parse_score(text).of(STATES, Facts(4.0, counts))
+def score(text: str, states: Rows = STATES, **counts: int | str) -> Scored:
+    asked, frame = parse_score(text), frame_of_states(states)
+    try:
+        found = [aggregated(each, frame) for each in asked.aggregates]
+    except ConditionFailedError as error:
+        return Scored(None, str(error))
+    return asked.of(Facts(4.0, counts, found))
 
 
 @pytest.mark.parametrize(
@@ -66,22 +74,22 @@ def test_a_run_that_does_not_give_a_score_has_none_and_not_0(text: str, why: str
 def test_a_mean_is_that_over_time_however_many_states_tell_of_a_stretch() -> None:
     seldom = [0.05 * n for n in range(201)]
     often = [9 + 0.001 * n for n in range(500)]  # the greatest values, as at a breakpoint
-    states = [(t, {"x": t * t, "n": 1}) for t in sorted({*seldom, *often})]
+    states: Rows = [(t, {"x": t * t, "n": 1}) for t in sorted({*seldom, *often})]
 
-    mean = parse_score("mean(x)").of(states, Facts(10.0, {})).value
+    mean = score("mean(x)", states).value
 
     assert mean == pytest.approx(100 / 3, rel=0.01)  # of t * t from 0 to 10
-    assert parse_score("mean(n)").of(states, Facts(10.0, {})).value == 1
+    assert score("mean(n)", states).value == 1
 
 
 def test_a_mean_of_states_of_one_moment_is_that_of_the_states() -> None:
-    states = [(2.0, {"x": 1.0}), (2.0, {"x": 4.0})]
-    assert parse_score("mean(x)").of(states, Facts(0.0, {})).value == 2.5
+    states: Rows = [(2.0, {"x": 1.0}), (2.0, {"x": 4.0})]
+    assert score("mean(x)", states).value == 2.5
 
 
 def test_a_run_without_a_state_has_no_mean_and_no_time_of_anything() -> None:
     for text in ("mean(x)", "time(x > 0)"):
-        scored = parse_score(text).of([], Facts(0.0, {}))
+        scored = score(text, [])
         assert scored.value is None
         assert "no recorded state" in str(scored.why)
 

@@ -21,7 +21,7 @@ _ALL: Final = 1_000_000
 
 # The kinds of events that tell each measure.
 _KINDS: Final[dict[Measure, tuple[str, ...]]] = {
-    "standstill": ("still", "stuck"),
+    "standstill": ("standstill", "stuck"),
     "stuck": ("stuck",),
     "silent": ("silent",),
     "flat": ("flat",),
@@ -171,7 +171,7 @@ def told_distances(
     comparison = compare_runs(connection, run_ids, deadline_s=UNHURRIED_S)
     way = next((each for each in comparison.measures if each.name == "distance_m"), None)
     spread = way.spread if way else [None] * len(run_ids)
-    doubts = comparison.not_known.get("distance_m, mean_speed_m_s", "")
+    doubts = comparison.unknown.get("distance_m, mean_speed_m_s", "")
     return [
         each and ToldDistance(each.median, _longer_m(doubts, run_id, each.median))
         for run_id, each in zip(run_ids, spread, strict=True)

@@ -75,7 +75,7 @@ def test_where_memory_cannot_be_shared_it_is_wrong_and_says_why(
         ("/home/ada", [LOCAL], "ok"),
         ("/media/host", [LOCAL, Mount("/media/host", "vboxsf")], "warning"),
         ("/host", [LOCAL, Mount("/host", "9p")], "warning"),
-        ("/p", [], "not looked at"),
+        ("/p", [], "not checked"),
     ],
 )
 def test_other_places_are_not_called_wrong(folder: str, mounts: list[Mount], verdict: str) -> None:

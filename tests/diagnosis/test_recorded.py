@@ -13,10 +13,11 @@ from pathlib import Path
 import pytest
 
 from tests.diagnosis.conftest import Look
+from tests.older_recording import make_older
 from tests.recordings.rows import Recorded, RecordedRobot
 from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.queue import CommandQueue
-from webots_mcp.store.migrate import upgrade
+from webots_mcp.schema import OLDER_SCHEMA
 from webots_mcp.waiting_file import waiting_path
 
 KILLED = """
@@ -54,18 +55,16 @@ def test_where_nothing_was_recorded_the_lines_that_record_are_shown(look: Look) 
     database = look("Database")
     assert (database.verdict, "nothing was recorded" in database.seen) == ("warning", True)
     assert "MCPBridge.attach(robot)" in (database.fix or "")
-    assert look("Rows").verdict == look("Schema").verdict == "not looked at"
+    assert look("Rows").verdict == look("Schema").verdict == "not checked"
 
 
-def test_an_old_schema_names_the_command_that_brings_it_forward(look: Look, file: Path) -> None:
-    upgrade(file, "0001")
+def test_an_older_schema_says_what_to_do_with_the_recording(look: Look, file: Path) -> None:
+    make_older(file)
     schema = look("Schema")
     assert schema.verdict == "wrong"
-    assert schema.seen == f"1, this webots-mcp needs {SCHEMA_VERSION}"
-    assert "webots-mcp migrate" in (schema.fix or "")
+    assert schema.seen == f"{OLDER_SCHEMA}, this webots-mcp needs {SCHEMA_VERSION}"
+    assert "move it aside" in (schema.fix or "")
     assert look("Database").verdict == "ok"
-    with closing(sqlite3.connect(file)) as connection:
-        assert connection.execute("PRAGMA user_version").fetchone() == (1,)
 
 
 def test_a_newer_schema_asks_for_a_newer_version(

@@ -45,7 +45,7 @@ def test_a_recording_in_memory_is_looked_at_as_well() -> None:
         memory.close()
     by_name = {check.name: finding for check, finding in checked}
     assert "nothing was recorded" in by_name["Database"].seen
-    assert by_name["Rows"].verdict == "not looked at"
+    assert by_name["Rows"].verdict == "not checked"
 
 
 def test_a_check_that_fails_says_so_and_the_others_go_on(tmp_path: Path) -> None:
@@ -57,7 +57,7 @@ def test_a_check_that_fails_says_so_and_the_others_go_on(tmp_path: Path) -> None
 
     subject = subject_of(Recording(tmp_path / "webots.db", tmp_path), "the test")
     first, second = diagnose(subject, (Check("One", fails), Check("Two", well)))
-    assert first.finding.verdict == "not looked at"
+    assert first.finding.verdict == "not checked"
     assert "nobody may look there" in first.finding.seen
     assert second.is_well
 

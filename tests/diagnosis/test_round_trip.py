@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from tests.diagnosis.conftest import Look
+from tests.older_recording import make_older
 from tests.recordings.rows import Recorded
-from webots_mcp.store.migrate import upgrade
 
 BREAKS = "raise RuntimeError('the gear is gone')"
 
@@ -24,10 +24,10 @@ def test_a_server_that_starts_and_answers_is_well(look: Look, recorded: Recorded
 def test_a_server_that_answers_that_it_cannot_read_the_recording_is_not_to_blame(
     look: Look, file: Path
 ) -> None:
-    upgrade(file, "0001")
+    make_older(file)
     found = look("Server")
     assert found.verdict == "warning"
-    assert "webots-mcp migrate" in found.seen
+    assert "move it aside" in found.seen
     assert "Schema" in (found.fix or "")
 
 

@@ -67,7 +67,16 @@ TOOLS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     "events one by one": ("webots_find_events", {"group": False, "limit": 30}),
     **{
         f"events: {kind}": ("webots_find_events", {"kinds": [kind]})
-        for kind in ("stuck", "still", "gap", "jump", "flat", "silent", "oscillation", "change")
+        for kind in (
+            "stuck",
+            "standstill",
+            "gap",
+            "jump",
+            "flat",
+            "silent",
+            "oscillation",
+            "change",
+        )
     },
     "events where a condition held": ("webots_find_events", {"where": "X > 0.2 for 0.5"}),
     "events where it never held": ("webots_find_events", {"where": "X > 1e6"}),

@@ -15,9 +15,9 @@ from tests.recordings.rover import record_rover
 from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plugins.page.growing import grow_signals, grow_way
+from webots_mcp.plugins.page.tab_data import NewRows
 from webots_mcp.plugins.report.charts import draw_signals, draw_way
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
-from webots_mcp.store.reading.rows import Columns
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def test_a_curve_goes_on_and_the_mode_changes_where_it_did(rover: sqlite3.Connec
         "pose.0": [8.0, 7.9, None],
         "mode": ["cruise", "back_up", "back_up"],
     }
-    grow_signals(chart, Columns(1, times=[50.0, 50.1, 50.2], values=rows))
+    grow_signals(chart, NewRows(times=[50.0, 50.1, 50.2], values=rows))
     assert list(chart.sources["curve", "pose.0", 1].data["mean"][-3:-1]) == [8.0, 7.9]
     assert math.isnan(chart.sources["curve", "pose.0", 1].data["mean"][-1])
     modes = chart.sources["ground", "mode", 0].data
@@ -49,7 +49,7 @@ def test_a_curve_goes_on_and_the_mode_changes_where_it_did(rover: sqlite3.Connec
 
 def test_an_angle_that_goes_round_is_no_line_across_the_figure(rover: sqlite3.Connection) -> None:
     chart: Any = draw_signals(compose_signals(rover, beginning(rover, 50), ["heading"])[0])
-    later = Columns(1, times=[50.0, 50.1, 50.2], values={"heading": [3.1, -3.1, -3.0]})
+    later = NewRows(times=[50.0, 50.1, 50.2], values={"heading": [3.1, -3.1, -3.0]})
     grow_signals(chart, later, {"heading"})
     means = list(chart.sources["curve", "heading", 1].data["mean"][-4:])
     assert means[0] == 3.1
@@ -64,7 +64,7 @@ def test_a_way_goes_on_to_where_the_robot_is(rover: sqlite3.Connection) -> None:
         "pose.1": [0.1, 0.1, 0.2],
         "mode": ["turn"] * 3,
     }
-    grow_way(chart, ("pose.0", "pose.1"), Columns(1, times=[30.0, 30.1, 30.2], values=values))
+    grow_way(chart, ("pose.0", "pose.1"), NewRows(times=[30.0, 30.1, 30.2], values=values))
     way, end = chart.sources["way", 0].data, chart.sources["end", 0].data
     assert (way["x0"][-1], way["x1"][-1], way["value"][-1]) == (6.0, 6.2, "turn")
     assert (end["x"], end["y"]) == ([6.2], [0.2])

@@ -263,7 +263,7 @@ def test_what_was_not_read_in_time_is_hatched_and_is_no_end(
         path = way.tracks[0].path
         last_s = path.places[-1].time_s
         assert path.is_whole == (last_s == pytest.approx(199.9))
-        assert (f"the way of run 1 is not read after {last_s:g} s" in notes) != path.is_whole
+        assert (f"the path of run 1 is not read after {last_s:g} s" in notes) != path.is_whole
 
 
 @pytest.mark.parametrize("compose", [compose_signals, compose_trajectory])

@@ -224,7 +224,7 @@ def test_kept_stretches_come_whole_though_only_summaries_were_shipped(
     with closing(connect(database, "reader")) as there, lab.opened() as here:
         before, after = everything(there, database.parent, 1), everything(here, lab.here, run)
         kept = valued(here.execute(KEPT.format("kept_state"), (run,)))
-        in_both = "(SELECT * FROM every_state a WHERE EXISTS (SELECT 1 FROM kept_stretch k WHERE "
+        in_both = "(SELECT * FROM all_state a WHERE EXISTS (SELECT 1 FROM kept_stretch k WHERE "
         in_both += "a.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s))"
         assert kept == valued(there.execute(KEPT.format(in_both), (1,))) != []
     assert after["state"] == [] != before["state"]

@@ -28,9 +28,8 @@ from webots_mcp.plugins.pool.report import Report
 from webots_mcp.plugins.pool.row_batch import BATCH_BYTES
 from webots_mcp.plugins.pool.shipped_tables import table
 from webots_mcp.plugins.pool.target import is_whole
-from webots_mcp.schema import create_schema
+from webots_mcp.schema import OLDER_SCHEMA, create_schema
 from webots_mcp.store.merging import merge
-from webots_mcp.store.migrate import downgrade
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.retention.shipped import read_shipped
 from webots_mcp.store.rollup.rolling import forget
@@ -226,9 +225,9 @@ def test_a_recording_without_uuid_is_refused(shipped: Shipped) -> None:
     assert not shipped.pool.exists()
 
 
-def test_an_older_schema_is_not_migrated_by_a_shipper(shipped: Shipped) -> None:
-    downgrade(shipped.folder / "webots.db", "0008")
-    with pytest.raises(SchemaTooOldError, match="webots-mcp migrate"):
+def test_a_recording_of_an_older_schema_is_not_shipped(shipped: Shipped) -> None:
+    shipped.connection.execute(f"PRAGMA user_version = {OLDER_SCHEMA}")
+    with pytest.raises(SchemaTooOldError, match="move it aside"):
         shipped.ship()
     assert not shipped.pool.exists()
 

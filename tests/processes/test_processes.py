@@ -90,7 +90,7 @@ for n in range(1007):
     assert why.startswith(f"the controller ended by {reason}")
     assert why.count(reason) == 1  # it is logged as well
     steps = filed.rows(
-        "SELECT json_extract(data, '$.n') FROM every_state "
+        "SELECT json_extract(data, '$.n') FROM all_state "
         "WHERE sim_time_s BETWEEN ? AND ? ORDER BY sim_time_s",
         start_s,
         end_s,

@@ -81,7 +81,10 @@ def test_twenty_seconds_are_twenty_seconds(start: Start, filed: Recording) -> No
     simulation = drive(start, 7, ASKED_FIRST)
     simulation.wait_for(lambda: has_states(filed), timeout_s=30)
     result = wait(simulation, filed, filed.send("run", for_s=20, reset=True, pace="fast"))
-    assert (result["ended"], result["sim_time_s"]) == ("time over", pytest.approx(20.0))
+    assert (result["ended"], result["sim_time_s"]) == (
+        "simulation time reached",
+        pytest.approx(20.0),
+    )
     assert simulation.time_s == pytest.approx(20.0)
     further = wait(simulation, filed, filed.send("run", for_s=0.5, pace="fast"))
     assert further["advanced_s"] == pytest.approx(0.512)  # the step of 16 ms that reaches 0.5 s

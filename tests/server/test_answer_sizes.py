@@ -95,8 +95,8 @@ async def test_robots_that_do_the_same_again_and_again_are_told_in_1500_tokens(
             ("webots_query_history", {"signals": ["*"], "raw": True}),
             ("webots_get_trends", {}),
             ("webots_find_events", {}),
-            ("webots_find_events", {"kinds": ["still", "change", "command"]}),
-            ("webots_find_events", {"kinds": ["still"], "group": False}),
+            ("webots_find_events", {"kinds": ["standstill", "change", "command"]}),
+            ("webots_find_events", {"kinds": ["standstill"], "group": False}),
             ("webots_get_timeline", {}),
             ("webots_monitor", {"lookback_wall_s": 900}),
         ):

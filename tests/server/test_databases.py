@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.older_recording import make_older
 from tests.recordings.rows import Recorded
 from tests.server.conftest import DATA_TOOLS, Connect, ask, fail, text_of
 from webots_mcp.contract import SCHEMA_VERSION
-from webots_mcp.store.migrate import upgrade
 
 pytestmark = pytest.mark.anyio
 
@@ -85,18 +85,9 @@ async def test_a_database_of_a_newer_version_is_a_clear_error(
         assert "pip install --upgrade" in await fail(client, "webots_list_robots")
 
 
-async def test_an_older_database_is_migrated_once_by_the_server(
+async def test_a_database_of_an_older_version_is_a_clear_error(
     connect: Connect, file: Path
 ) -> None:
-    upgrade(file, "0001")
+    make_older(file)
     async with connect() as client:
-        assert (await ask(client, "webots_list_robots"))["status"] == "never seen"
-    connection = sqlite3.connect(file)
-    assert connection.execute("PRAGMA user_version").fetchone() == (SCHEMA_VERSION,)
-    connection.close()
-
-
-async def test_a_read_only_server_does_not_migrate(connect: Connect, file: Path) -> None:
-    upgrade(file, "0001")
-    async with connect(read_only=True) as client:
-        assert "webots-mcp migrate" in await fail(client, "webots_list_robots")
+        assert "move it aside" in await fail(client, "webots_list_robots")

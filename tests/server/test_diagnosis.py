@@ -17,8 +17,8 @@ pytestmark = pytest.mark.anyio
 async def test_of_what_is_well_only_the_names_are_told(connect: Connect, driver: Driver) -> None:
     async with connect() as client:
         answer = await ask(client, "webots_diagnose")
-    assert {"Recording now", "Rows", "Commands", "Simulation"} <= set(answer["well"].split(", "))
-    assert "wrong" not in [each["verdict"] for each in answer.get("not_well", [])]
+    assert {"Recording now", "Rows", "Commands", "Simulation"} <= set(answer["passed"].split(", "))
+    assert "wrong" not in [each["verdict"] for each in answer.get("failed", [])]
 
 
 async def test_what_is_wrong_comes_first_with_what_mends_it(
@@ -28,9 +28,9 @@ async def test_what_is_wrong_comes_first_with_what_mends_it(
     async with connect(read_only=True) as client:
         answer = await ask(client, "webots_diagnose")
     assert answer["verdict"] == "wrong"
-    verdicts = [each["verdict"] for each in answer["not_well"]]
+    verdicts = [each["verdict"] for each in answer["failed"]]
     assert verdicts == sorted(verdicts, reverse=True)
-    told = {each["check"]: each for each in answer["not_well"]}
+    told = {each["check"]: each for each in answer["failed"]}
     assert told["Rows"]["seen"] == "3 rows of rover were dropped"
     assert told["Simulation"]["fix"]
 
@@ -38,8 +38,8 @@ async def test_what_is_wrong_comes_first_with_what_mends_it(
 async def test_each_check_is_told_once_also_where_nothing_was_recorded(connect: Connect) -> None:
     async with connect() as client:
         answer = await ask(client, "webots_diagnose")
-    names = [each["check"] for each in answer["not_well"]]
-    for listed in (answer["well"], *answer["not_looked_at"].values()):
+    names = [each["check"] for each in answer["failed"]]
+    for listed in (answer["passed"], *answer["not_checked"].values()):
         names += listed.split(", ")
     assert sorted(names) == sorted(check.name for check in all_checks())
 

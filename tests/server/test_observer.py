@@ -98,7 +98,7 @@ async def test_a_controller_that_knows_nothing_of_us_is_seen_and_asked_about(beg
         position = ["world.ROVER.x_m", "world.ROVER.y_m"]
         trends = await ask(client, "webots_get_trends", signals=[*position])
         assert trends["robot"] == "mcp_observer"
-        both = {"kinds": ["stuck", "still"], "position": position}
+        both = {"kinds": ["stuck", "standstill"], "position": position}
         events = await ask(client, "webots_find_events", **both)
         assert "found" not in events["verdicts"]  # it drives in circles
         assert len(json.dumps(world)) < 6000
@@ -139,7 +139,7 @@ async def test_a_controller_that_hangs_is_told_from_a_pause_and_ended_by_a_reloa
 
         stopped = await until(client, "webots_get_world_info", is_silent)
         assert "not paused, as robot 'mcp_observer' sees" in stopped["why"]
-        found = (await ask(client, "webots_diagnose"))["not_well"]
+        found = (await ask(client, "webots_diagnose"))["failed"]
         (simulation,) = [each for each in found if each["check"] == "Simulation"]
         assert "paused by hand" not in simulation["seen"]
         # Of the robot whose loop hangs, or of the observer, whichever was seen last.
@@ -160,7 +160,7 @@ async def test_a_pause_by_hand_is_taken_back_by_the_observer(begin: Any) -> None
             client, "webots_get_robot_state", lambda at: at["status"].startswith("stopped")
         )
         assert "paused in Webots, as robot 'mcp_observer' sees" in stopped["why"]
-        found = (await ask(client, "webots_diagnose"))["not_well"]
+        found = (await ask(client, "webots_diagnose"))["failed"]
         (simulation,) = [each for each in found if each["check"] == "Simulation"]
         assert simulation["fix"].startswith("webots_simulation_control('resume')")
         answer = await ask(client, "webots_simulation_control", command="resume")

@@ -52,7 +52,7 @@ async def test_it_says_why_and_where_it_stopped_and_what_happened(
 async def test_a_time_after_a_reset_is_exact(connect: Connect, driver: Driver) -> None:
     async with connect() as client:
         answer = await ask(client, "webots_run", for_s=0.8, reset=True, then="pause")
-        assert answer["stopped"] == "time over"
+        assert answer["stopped"] == "simulation time reached"
         assert answer["ran"]["to_s"] == answer["ran"]["advanced_s"] == pytest.approx(0.8)
         assert answer["ran"]["run_id"] == answer["run_id"]
         assert (await ask(client, "webots_get_robot_state"))["status"] == "paused"
@@ -63,14 +63,14 @@ async def test_out_of_wall_time_it_goes_on_and_a_second_call_gives_the_same_answ
 ) -> None:
     async with connect() as client:
         first = await ask(client, "webots_run", for_s=1.2, pace="as_it_is", timeout_wall_s=0.3)
-        assert (first["outcome"], first["stopped"]) == ("claimed", "out of wall time")
+        assert (first["outcome"], first["stopped"]) == ("claimed", "wall time limit reached")
         number = first["command_id"]
         (sent,) = rows_of((await ask(client, "webots_list_commands"))["commands"])
         assert "pace" not in sent["params"], "no mode is set where it goes on as it runs"
         assert f"command_id={number}" in first["hint"]
         assert 0 <= first["ran"]["advanced_s"] < 1.2
         then = await ask(client, "webots_wait_for_command", command_id=number, timeout_wall_s=30)
-        assert then["stopped"] == "time over"
+        assert then["stopped"] == "simulation time reached"
         assert then["ran"]["advanced_s"] == pytest.approx(1.2)
         assert then["state"]
         assert then["trends"]
@@ -258,7 +258,12 @@ async def test_a_run_that_ended_before_its_row_was_written_is_told_of_all_the_sa
 ) -> None:
     robot = recorded.robot()
     robot.state(1.0, {"x": 1})
-    result = {"ended": "time over", "from_s": 0.0, "sim_time_s": 1.0, "advanced_s": 1.0}
+    result = {
+        "ended": "simulation time reached",
+        "from_s": 0.0,
+        "sim_time_s": 1.0,
+        "advanced_s": 1.0,
+    }
     times = ("created", "expires", "claimed", "finished")
     number = insert(
         recorded.connection,
@@ -283,7 +288,7 @@ async def test_two_at_once_are_refused(connect: Connect, driver: Driver) -> None
         await paused(client)
         ended = await ask(client, "webots_wait_for_command", command_id=first["command_id"])
         assert ended["stopped"] == "interrupted"
-        assert "(pause)" in ended["why_stopped"]
+        assert "(pause)" in ended["stop_reason"]
 
 
 async def test_a_robot_that_has_ended_or_is_no_supervisor_is_refused(

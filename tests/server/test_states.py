@@ -219,7 +219,7 @@ async def test_the_world_is_described_with_its_companions(
     assert answer["basic_time_step_ms"] == 16.0
     assert answer["real_time_factor"] == 2.0
     assert answer["run"]["rows"] == 5
-    assert answer["companions"]["rows"] == [["referee", "Supervisor", ""]]
+    assert answer["other_robots"]["rows"] == [["referee", "Supervisor", ""]]
     assert answer["controller"]["file"].endswith("rover.py")
 
 

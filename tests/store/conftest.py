@@ -12,6 +12,9 @@ from tests.memory import memory_connection
 from tests.recordings.rover import record_rover
 from tests.recordings.rows import Recorded
 from webots_mcp.contract import Database, MemoryDatabase
+from webots_mcp.store.chunks import making
+from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.reading import frame, frame_summary
 from webots_mcp.store.reading import rows as columns
 from webots_mcp.store.rollup.rolling import roll
 
@@ -46,7 +49,27 @@ def _recorded() -> Iterator[dict[str, sqlite3.Connection]]:
         for connection in (raw, rolled):
             record_rover(connection)
         assert roll(rolled, 100_000).done
+        with pytest.MonkeyPatch.context() as patched:
+            _shorten_chunks(patched)
+            assert make_chunks(rolled, 100_000).done
         yield {"raw": raw, "rolled": rolled}
+
+
+CHUNK_ROWS = 100
+
+
+def _shorten_chunks(patched: pytest.MonkeyPatch) -> None:
+    for module in (making, frame):
+        patched.setattr(module, "GROUP_ROWS", CHUNK_ROWS)
+
+
+@pytest.fixture(params=["values", "chunks"])
+def looked_at(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Answers from every value; and from chunks of 100 rows, as of a long range."""
+    if request.param == "chunks":
+        _shorten_chunks(monkeypatch)
+        monkeypatch.setattr(frame_summary, "FULL_ROWS", 0)
+    return request.param
 
 
 @pytest.fixture

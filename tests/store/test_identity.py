@@ -21,30 +21,6 @@ from webots_mcp.liveness import process_identity
 from webots_mcp.schema import create_schema
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.json_folder.folder_import import import_folder
-from webots_mcp.store.migrate import downgrade, upgrade
-
-OLD_ROWS = (
-    "INSERT INTO robot (name, kind, first_seen_wall_time_s, last_seen_wall_time_s) "
-    "VALUES ('rover', 'Robot', 1.0, 2.0)",
-    *(
-        "INSERT INTO session (robot_id, pid, host, instance, supervisor, started_wall_time_s, "
-        f"last_seen_wall_time_s) VALUES (1, 7, 'here', 'i', 0, {started_s}, 2.0)"
-        for started_s in (1.5, 1.25, 1.75)
-    ),
-    *(
-        "INSERT INTO run (session_id, robot_id, start_reason, started_wall_time_s, "
-        f"started_sim_time_s, last_wall_time_s, last_sim_time_s, note) "
-        f"VALUES ({session_id}, 1, 'start', 1, 0, 2, 1, 'n{session_id}')"
-        for session_id in (1, 2, 3)
-    ),
-    *(
-        "INSERT INTO state (run_id, sim_time_s, wall_time_s, data) "
-        f"VALUES ({run_id}, 0.5, 1.5, '{{}}')"
-        for run_id in (1, 2, 3)
-    ),
-    "INSERT INTO log (run_id, sim_time_s, wall_time_s, level, source, message) "
-    "VALUES (2, 0.5, 1.5, 'info', 'bridge', 'm')",
-)
 
 
 def is_random_uuid(text: str) -> bool:
@@ -61,59 +37,6 @@ def test_new_uuids_are_random_ones_of_version_4() -> None:
     made = [new_uuid() for _ in range(1000)]
     assert all(map(is_random_uuid, made))
     assert len(set(made)) == len(made)
-
-
-@pytest.fixture
-def old(tmp_path: Path) -> Path:
-    """A database of schema 3 with three sessions and what belongs to them."""
-    file = tmp_path / "webots.db"
-    upgrade(file, "0003")
-    with closing(connect(file, "writer")) as connection:
-        for statement in OLD_ROWS:
-            connection.execute(statement)
-    return file
-
-
-def everything(connection: sqlite3.Connection) -> list[object]:
-    tables = ("robot", "session", "run", "state", "log")
-    return [connection.execute(f"SELECT * FROM {table}").fetchall() for table in tables]
-
-
-def test_rows_of_an_older_database_are_named_once_and_for_all(old: Path) -> None:
-    upgrade(old)
-    with closing(connect(old, "reader")) as connection:
-        before = [uuids(connection, table) for table in ("recording", "session", "run")]
-    upgrade(old)
-    with closing(connect(old, "reader")) as connection:
-        assert before == [uuids(connection, table) for table in ("recording", "session", "run")]
-        created_s = connection.execute("SELECT created_wall_time_s FROM recording").fetchall()
-    assert [len(set(named)) for named in before] == [1, 3, 3]
-    assert created_s == [(1.25,)]  # when its first session started
-
-
-def test_no_row_is_lost_on_the_way_forward_and_back(old: Path) -> None:
-    with closing(connect(old, "reader")) as connection:
-        before = everything(connection)
-    upgrade(old)
-    with closing(connect(old, "reader")) as connection:
-        assert connection.execute("SELECT note FROM robot_run ORDER BY run_id").fetchall() == [
-            ("n1",),
-            ("n2",),
-            ("n3",),
-        ]
-    downgrade(old, "0003")
-    with closing(connect(old, "reader")) as connection:
-        assert everything(connection) == before
-
-
-@pytest.mark.parametrize("table", ["session", "run"])
-def test_two_rows_cannot_have_the_same_uuid(old: Path, table: str) -> None:
-    upgrade(old)
-    with (
-        closing(connect(old, "writer")) as connection,
-        pytest.raises(sqlite3.IntegrityError, match=f"{table}.uuid"),
-    ):
-        connection.execute(f"UPDATE {table} SET uuid = (SELECT uuid FROM {table} WHERE id = 1)")
 
 
 def test_starters_at_once_make_one_recording(tmp_path: Path) -> None:

@@ -26,8 +26,9 @@ from webots_mcp.store.retention.purge import prune
 from webots_mcp.store.rollup.rolling import roll
 
 SIGNALS = (
-    "SELECT name, kind, unit, path, reduce, rows, null_rows, min, max FROM signal WHERE robot_id = "
-    "(SELECT id FROM robot WHERE name = 'rover') AND name NOT GLOB 'pose*' AND name <> 'mode'"
+    "SELECT name, kind, unit, path, reduce, rows, null_row_count, min, max FROM signal "
+    "WHERE robot_id = (SELECT id FROM robot WHERE name = 'rover') "
+    "AND name NOT GLOB 'pose*' AND name <> 'mode'"
 )
 
 

@@ -13,12 +13,10 @@ from tests.recordings.rows import Recorded
 from webots_mcp import MCPBridge, connection
 from webots_mcp.cli import main
 from webots_mcp.connection import Role, connect, keep_deadline
-from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.errors import DatabaseError, ForeignDatabaseError
 from webots_mcp.schema import shipped_objects
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.merging import merge
-from webots_mcp.store.migrate import downgrade, upgrade
 from webots_mcp.store.questions.schema_text import describe_schema
 from webots_mcp.store.recording import Recording
 
@@ -108,7 +106,7 @@ def test_what_was_removed_is_named_before_a_question_fails_over_it(file: Path, r
     "asked",
     [
         ("status",), ("runs",), ("events",), ("trends",), ("history", "x"), ("logs",), ("signals",),
-        ("export",), ("sql", "SELECT 1"), ("prune",), ("pause",), ("migrate",),
+        ("export",), ("sql", "SELECT 1"), ("prune",), ("pause",),
     ],
     ids=" ".join,
 )  # fmt: skip
@@ -154,35 +152,11 @@ def test_what_a_person_has_added_is_left_alone(
     assert "1" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("version", range(1, SCHEMA_VERSION + 1))
-def test_a_database_of_each_version_comes_forward_and_is_ours(tmp_path: Path, version: int) -> None:
-    file = tmp_path / "webots.db"
-    upgrade(file, f"{version:04}")
-    for later in range(version, SCHEMA_VERSION + 1):
-        upgrade(file, f"{later:04}")
-    connect(file, "reader").close()
-    downgrade(file, f"{version:04}")
-    upgrade(file)
-    connect(file, "reader").close()
-
-
-def test_nothing_of_an_older_version_is_run_to_bring_it_forward(tmp_path: Path) -> None:
-    file = tmp_path / "webots.db"
-    upgrade(file, "0003")
-    change(file, *HOSTILE["view 'robot'"])
-    with pytest.raises(ForeignDatabaseError, match="the view 'robot' in"):
-        Recording(file, tmp_path).migrate()
-    with closing(sqlite3.connect(file)) as other:
-        assert other.execute("PRAGMA user_version").fetchone() == (3,)
-
-
 @pytest.mark.parametrize("version", [-5, 0])
-def test_nothing_is_run_to_migrate_a_version_that_was_never_made(file: Path, version: int) -> None:
-    change(file, *HOSTILE["view 'robot'"], "UPDATE alembic_version SET version_num = '0003'")
-    change(file, f"PRAGMA user_version = {version}")
-    for ask in (lambda: upgrade(file), lambda: connect(file, "loop", create=True)):
-        with pytest.raises(ForeignDatabaseError, match=f"tables of schema {version}, which no"):
-            ask()
+def test_a_version_that_was_never_made_is_refused(file: Path, version: int) -> None:
+    change(file, *HOSTILE["view 'robot'"], f"PRAGMA user_version = {version}")
+    with pytest.raises(ForeignDatabaseError, match=f"tables of schema {version}, which no"):
+        connect(file, "loop", create=True)
 
 
 def spaced(sql: str) -> str:

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import json
+import math
+import random
 import sqlite3
-from collections.abc import Iterator
-from contextlib import closing
-from pathlib import Path
+from collections.abc import Iterator, Sequence
 from typing import Any
 
-import numpy as np
 import pytest
 
 from tests.memory import memory_connection
 from tests.recordings.rover import Recorder, start_run
-from webots_mcp.connection import connect
-from webots_mcp.contract import SCHEMA_VERSION
-from webots_mcp.naming import USUAL_POSITIONS, flatten
+from webots_mcp.naming import USUAL_POSITIONS, find_position, flatten, metres_in
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.detection.motion import find_motion, in_metres
-from webots_mcp.store.migrate import downgrade, upgrade
+from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.reading.subject import Subject
+from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.signals.catalogue import catalogue
+from webots_mcp.store.signals.registry import Signal
 
 POSES: list[tuple[dict[str, Any], tuple[Any, ...]]] = [
     ({"pose": [1, 2, 0.5], "mode": "cruise"}, (1, 2, 0.5, "cruise")),
@@ -39,7 +37,7 @@ POSES: list[tuple[dict[str, Any], tuple[Any, ...]]] = [
 ]
 VIEWS = {
     "robot_now", "robot_trajectory", "robot_run", "robot_command", "robot_event", "robot_log",
-    "robot_period", "all_rollup", "robot_parameter", "every_state", "robot_kept",
+    "robot_period", "robot_statistics", "all_rollup", "robot_parameter", "all_state", "robot_kept",
 }  # fmt: skip
 
 
@@ -60,6 +58,7 @@ def test_the_usual_ways_to_publish_a_pose_are_understood(
     recorder: Recorder, state: dict[str, Any], flat: tuple[Any, ...]
 ) -> None:
     recorder.publish(1.0, state)
+    roll(recorder.connection)
     for view in ("robot_trajectory", "robot_now"):
         assert rows(recorder.connection, f"SELECT x_m, y_m, yaw_rad, mode FROM {view}") == [flat]
 
@@ -125,23 +124,125 @@ CHOICES = [
 ]
 
 
+SPEEDS = [
+    {"speed": 1.5, "arm": {"speed": 7}},
+    {"cmd_vel": {"linear": {"x": 1.5}}, "arm": {"command": 7}},
+    {"speed": 1, "commanded": 2, "wheels": {"left": 3, "right": 4}, "motor_left": {"cmd": 5}},
+    {"pose": {"x": 1, "y": 2, "theta_deg": 90}, "heading": 0.5, "speed": "fast"},
+    {"world": {"one": {"x_m": 1, "y_m": 2, "speed_mps": 3}}, "velocity": 0.5},
+    {"odometry": [1, 2, 3, 0.5], "pose_mm": [7, 8, 9]},
+]
+WORDS = (
+    "pose", "position", "gps", "odom", "x", "y", "X", "mm", "cm", "km", "m", "robot", "current",
+    "goal", "target", "vel", "ball", "mode", "state", "status", "name", "str", "last", "next",
+    "action", "arm", "GPS", "IMU", "nav", "task", "own", "0", "1", "speed", "solid", "world",
+    "heading", "yaw", "deg", "theta", "cmd", "wheel", "motor", "left", "command", "z", "alt",
+)  # fmt: skip
+
+
+def some_key(numbers: random.Random) -> str:
+    words = numbers.choices(WORDS, k=numbers.randint(1, 3))
+    camel = words[0] + "".join(word.capitalize() for word in words[1:])
+    return numbers.choice(("_".join(words), camel, camel[:1].upper() + camel[1:], camel.upper()))
+
+
+def some_value(numbers: random.Random, depth: int = 0) -> Any:
+    kind = numbers.random() + depth / 10
+    if kind > 0.4:
+        return numbers.choice((1, 2, 3.5, -7, 0.25, 100, "go", "wait", "", None, True))
+    if kind > 0.25:
+        return [some_value(numbers, depth + 1) for _ in range(numbers.randint(1, 6))]
+    return {some_key(numbers): some_value(numbers, depth + 1) for _ in range(numbers.randint(1, 3))}
+
+
+def some_state(numbers: random.Random) -> dict[str, Any]:
+    """A state with a pair of coordinates in a branch, as a rule, and with anything else."""
+    state = {some_key(numbers): some_value(numbers) for _ in range(numbers.randint(1, 4))}
+    before, after = numbers.choice(("", "pos_", "robot_")), numbers.choice(("", "_mm", "_cm", "_m"))
+    pair = {f"{before}x{after}": 1.5, f"{before}y{after}": 2}
+    return state | ({some_key(numbers): pair} if numbers.random() < 0.7 else {})
+
+
+def some_states(count: int) -> list[dict[str, Any]]:
+    numbers = random.Random(11)
+    return [some_state(numbers) for _ in range(count)]
+
+
+def record_robots(connection: sqlite3.Connection, states: Sequence[dict[str, Any]]) -> None:
+    """Each state by a robot of its own."""
+    recorder = Recorder(connection)
+    for number, state in enumerate(states):
+        robot_id = recorder.robot(f"robot {number}")
+        recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+        text = json.dumps(state, ensure_ascii=False).replace("Infinity", "1e400")
+        recorder.insert("state", **recorder.at(1.0), data=text)
+
+
+def seen_by_tools(connection: sqlite3.Connection, robot_id: int, state: Any) -> tuple[Any, ...]:
+    """x, y, yaw, mode, speed and commanded speed of the only row of a robot."""
+    subject = Subject(robot_id=robot_id, robot="", run_id=robot_id)
+    motion = find_motion(catalogue(connection, subject), EventOptions())
+    values = flatten(state)
+
+    def number(signal: Signal | None, factor: float = 1.0) -> Any:
+        value = values[signal.name] if signal else None
+        return value if value is None or isinstance(value, str) else value * factor
+
+    place = [number(each, metres_in(each.name)) for each in motion.position or ()]
+    x, y = (None, None) if None in place else place or (None, None)
+    yaw = number(motion.heading, math.tau / ((motion.heading and motion.heading.turn) or math.tau))
+    speeds = (None if motion.commanded else number(motion.speed), number(motion.commanded))
+    return x, y, yaw, number(motion.mode), *speeds
+
+
+def test_the_views_and_the_tools_take_the_same_signals_for_the_same_roles() -> None:
+    states = [*PLACES, *MODES, *CHOICES, *SPEEDS, *(state for state, _ in POSES)]
+    states += some_states(400)
+    with memory_connection() as connection:
+        record_robots(connection, states)
+        early = [seen_by_tools(connection, n + 1, state) for n, state in enumerate(states)]
+        assert roll(connection, 10_000).done
+        for number, state in enumerate(states, start=1):
+            wanted = seen_by_tools(connection, number, state)
+            assert wanted == early[number - 1], state
+            for view in ("robot_trajectory", "robot_now"):
+                found = rows(
+                    connection,
+                    "SELECT x_m, y_m, yaw_rad, mode, iif(commanded_speed IS NULL, speed, NULL), "
+                    f"commanded_speed FROM {view} WHERE run_id = {number}",
+                )
+                assert found == [pytest.approx(wanted)], state
+
+
 @pytest.mark.parametrize("state", [*PLACES, *MODES, *CHOICES], ids=json.dumps)
-def test_the_views_and_the_tools_find_position_and_mode_under_the_same_names(
+def test_position_and_mode_are_found_however_they_are_called(
     recorder: Recorder, state: dict[str, Any]
 ) -> None:
     recorder.publish(1.0, state)
-    connection = recorder.connection
-    known = catalogue(connection, Subject(robot_id=1, robot="rover", run_id=1))
-    motion = find_motion(known, EventOptions())
-    told = [*(motion.position or (None, None)), motion.mode]
-    values = flatten(state)
-    found = tuple(values[signal.name] if signal else None for signal in told)
-    assert found in ((1, 2, None), (None, None, "go"), (None, None, 7))
-    if motion.position:
-        x, y = (in_metres(each, np.array([values[each.name]])) for each in motion.position)
-        found = (x[0], y[0], None)
-    for view in ("robot_trajectory", "robot_now"):
-        assert rows(connection, f"SELECT x_m, y_m, mode FROM {view}") == [found]
+    x, y, _, mode, *_ = seen_by_tools(recorder.connection, 1, state)
+    assert mode in (None, "go", 7)
+    if mode is None:
+        values = flatten(state)
+        found = find_position([name for name, each in values.items() if type(each) is int])
+        assert found is not None
+        assert (values[found[0]], values[found[1]]) in ((1, 2), (150, -20.5))
+        assert (x, y) == pytest.approx((metres_in(found[0]), 2 * metres_in(found[1])))
+
+
+def test_what_takes_a_role_in_one_run_leaves_the_others_theirs(recorder: Recorder) -> None:
+    for start_s, state in enumerate((
+        {"pos": {"x": 1, "y": 2}, "state": "old"},
+        {"pose": {"x": 3, "y": 4, "yaw": 0.5}, "mode": "new"},
+        {"pose": {"x": None, "y": None}, "pos": {"x": 5, "y": 6}, "mode": None, "state": "both"},
+    )):  # fmt: skip
+        recorder.publish(float(start_s), state)
+    roll(recorder.connection)
+    sql = "SELECT x_m, y_m, yaw_rad, mode FROM robot_trajectory"
+    assert rows(recorder.connection, sql) == [
+        (1, 2, None, "old"),
+        (3, 4, 0.5, "new"),
+        (5, 6, None, "both"),
+    ]
 
 
 @pytest.mark.parametrize("data", ["", "no JSON", '{"pose": NaN}', "[1, 2]", "3", "null", '{"a":'])
@@ -150,6 +251,7 @@ def test_a_row_whose_data_is_no_json_object_is_shown_without_values(
 ) -> None:
     recorder.publish(0.0, {"pose": [1, 2, 3]})
     recorder.insert("state", **recorder.at(1.0), data=data)
+    roll(recorder.connection)
     recorder.insert("event", **recorder.at(1.0), kind="change", name="mode", data=data)
     connection = recorder.connection
     flat = "SELECT sim_time_s, x_m, mode FROM"
@@ -260,25 +362,3 @@ def test_the_shell_shows_what_each_view_is_for(reader: sqlite3.Connection) -> No
     views = dict(rows(reader, "SELECT name, sql FROM sqlite_master WHERE type = 'view'"))
     assert set(views) == VIEWS
     assert all("\n/* " in sql for sql in views.values())
-
-
-def test_the_views_come_and_go_with_their_revision_and_the_data_stays(tmp_path: Path) -> None:
-    file = tmp_path / "webots.db"
-    upgrade(file, "0002")
-    with closing(connect(file, "writer")) as connection:
-        recorder = start_run(connection)
-        recorder.publish(0.0, {"pose": [1, 2, 3]})
-
-        assert upgrade(file, "0003") == (2, 3)
-        assert rows(connection, "SELECT x_m FROM robot_now") == [(1,)]
-        assert rows(connection, "SELECT keep, purged_rows FROM run") == [(0, 0)]
-
-        assert upgrade(file) == (3, SCHEMA_VERSION)
-        assert rows(connection, "SELECT x_m FROM robot_now") == [(1,)]
-        assert downgrade(file, "0003") == (SCHEMA_VERSION, 3)
-        assert rows(connection, "SELECT x_m FROM robot_now") == [(1,)]
-
-        assert downgrade(file, "0002") == (3, 2)
-        assert rows(connection, "SELECT name FROM sqlite_master WHERE type = 'view'") == []
-        assert rows(connection, "SELECT count(*) FROM state") == [(1,)]
-        assert rows(connection, "SELECT count(*) FROM pragma_table_info('run')") == [(15,)]

@@ -299,7 +299,7 @@ class Watch:
         run_s = self._clock.sim_time_s - since_s
         if for_s is None or run_s <= 0 or run_s < for_s - self._tolerance_s:
             return None
-        return self._reached("time over")
+        return self._reached("simulation time reached")
 
     def _judge_run(self, watched: _Watched) -> Reached | None:
         if watched.run is None or self._clock.run is watched.run:

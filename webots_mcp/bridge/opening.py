@@ -1,16 +1,15 @@
-"""Opening the database of a controller: creating or migrating it, and entering a session."""
+"""Opening the database of a controller: creating it, and entering a session."""
 
 from __future__ import annotations
 
 import sqlite3
-import sys
 import time
 from pathlib import Path
 
 from webots_mcp.bridge.identity import Identity
 from webots_mcp.bridge.registration import Registration, register
 from webots_mcp.connection import connect, journal_mode
-from webots_mcp.contract import DATABASE_NAME, SCHEMA_VERSION, Database, MemoryDatabase
+from webots_mcp.contract import DATABASE_NAME, Database, MemoryDatabase
 from webots_mcp.schema import create_schema, require_current, schema_version
 from webots_mcp.transactions import never_wait
 from webots_mcp.waiting_file import adopt
@@ -26,7 +25,7 @@ def open_session(
         identity: The robot and the process.
         session_uuid: The session's UUID; a session that the database knows is continued.
         actions: The registered custom actions as JSON text.
-        patient: Wait for locks and migrate an older schema: at the start, not in the loop.
+        patient: Wait for locks: at the start, not in the loop.
 
     Returns:
         A connection that never waits for a lock, and the ids to record under.
@@ -36,10 +35,10 @@ def open_session(
     """
     connection = connect(database, "loop", create=True, patient=patient)
     try:
-        _prepare(connection, database, patient)
-        if patient and isinstance(
-            database, Path
-        ):  # in the loop it takes too long: the maintainer's
+        if schema_version(connection) == 0:
+            create_schema(connection)
+        require_current(connection)
+        if patient and isinstance(database, Path):  # in the loop it takes too long
             adopt(connection, database)
         registration = register(connection, identity, session_uuid, actions)
         never_wait(connection)
@@ -47,25 +46,6 @@ def open_session(
         connection.close()
         raise
     return connection, registration
-
-
-def _prepare(connection: sqlite3.Connection, database: Database, patient: bool) -> None:
-    version = schema_version(connection)
-    if version == 0:
-        create_schema(connection)
-    elif version < SCHEMA_VERSION and patient:
-        _migrate(database)
-    require_current(connection)
-
-
-def _migrate(database: Database) -> None:
-    """Migrate an older schema in a process of its own: Alembic takes a second to import."""
-    if isinstance(database, MemoryDatabase):
-        return
-    import subprocess  # only here: it would be a tenth of the bridge's import time
-
-    line = [sys.executable, "-m", "webots_mcp", "migrate", "--database", str(database)]
-    subprocess.run(line, check=False, capture_output=True, timeout=60, stdin=subprocess.DEVNULL)
 
 
 def why_readers_block(connection: sqlite3.Connection) -> str | None:

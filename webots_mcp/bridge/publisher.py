@@ -12,6 +12,7 @@ from webots_mcp.bridge.context import Context
 from webots_mcp.bridge.device_reader import DeviceReader
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.run_starts import Runs
+from webots_mcp.bridge.signal_names import SignalNames
 from webots_mcp.bridge.stats import PublishCost
 
 
@@ -33,6 +34,7 @@ class Publisher:
         self._keeper = context.keeper
         self._runs = runs
         self._changes = Changes()
+        self._names = SignalNames(context.recorder)
         self.devices = DeviceReader(context.simulation, context.journal, context.recorder.errors)
         self._run = context.clock.run
         self.cost = PublishCost()
@@ -111,6 +113,7 @@ class Publisher:
         self._context.journal.state(encoded)
         if isinstance(state, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
             self._record_changes(state)
+        self._names.look(state, encoded.text)
         self._heartbeat.beat_if_due()
         self.cost.add(time.perf_counter() - started_s)
 

@@ -17,7 +17,7 @@ recognised by their number, and the connection lock is free when the call that t
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -34,6 +34,7 @@ from webots_mcp.bridge.session_connection import SessionConnection, patiently
 from webots_mcp.contract import Database
 from webots_mcp.entries import Kind, Values
 from webots_mcp.liveness import LoopStatus, RecordingStatus, write_heartbeat
+from webots_mcp.signal_register import Seen
 from webots_mcp.transactions import in_transaction
 from webots_mcp.waiting_file import WaitingFile, waiting_path
 
@@ -121,6 +122,12 @@ class Recorder:
         if self.session.connection is None:
             return None
         return self._locked(lambda: self._writer.fetch(statement, values))
+
+    def enter_signals(self, seen: Mapping[str, Seen]) -> bool:
+        """Enter names into the register of signals; False where that has to wait."""
+        if self._backlog.waits or self.session.connection is None:
+            return False
+        return self._locked(lambda: self._writer.enter_signals(seen)) is True
 
     def flush(self) -> bool:
         """Write waiting rows, for as long as one call may; True if none are left."""

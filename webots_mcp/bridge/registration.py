@@ -39,8 +39,8 @@ _RELOADED_RUN: Final = (
     "AND id = (SELECT max(id) FROM run WHERE robot_id = ?)"
 )
 _PAUSED_MODE: Final = (
-    "SELECT coalesce(hold_mode, 'real_time') FROM session WHERE id = (SELECT max(id) FROM session "
-    "WHERE robot_id = ?) AND instance = ? AND hold = ?"
+    "SELECT coalesce(mode_before_pause, 'real_time') FROM session "
+    "WHERE id = (SELECT max(id) FROM session WHERE robot_id = ?) AND instance = ? AND hold = ?"
 )
 _LONGEST_RELOAD_S: Final = 10.0  # from the end of the old controller to the start of the new one
 

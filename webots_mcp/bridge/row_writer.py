@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, Final
 
 from webots_mcp.bridge.backlog import Backlog, Row
@@ -13,7 +14,8 @@ from webots_mcp.bridge.row_counts import RowCounts
 from webots_mcp.bridge.run import Run
 from webots_mcp.bridge.session_connection import SessionConnection, patiently
 from webots_mcp.entries import STATEMENTS, Kind, Values, bind
-from webots_mcp.transactions import in_transaction, roll_back
+from webots_mcp.signal_register import Seen, find_changes, write_changes
+from webots_mcp.transactions import FAILURES, in_transaction, is_busy, roll_back
 from webots_mcp.waiting_file import Taken, is_unfit, take_in
 
 _CATCH_UP_S: Final = 0.002  # per call: writing waiting rows must not stall the loop
@@ -73,6 +75,24 @@ class RowWriter:
                 self.write(kind, run, values)
             return
         self._counts.written += len(rows)
+
+    def enter_signals(self, seen: Mapping[str, Seen]) -> bool:
+        """Enter names into the register of signals; False where another writer has the lock.
+
+        What fails for another reason is left to the maintainer.
+        """
+        if not self.is_ready(None):
+            return False
+        connection, registration = self._session.opened
+        robot_id = registration.robot_id
+        try:
+            changes = find_changes(connection, robot_id, seen)
+            if changes.new or changes.changed:
+                write = partial(write_changes, connection, robot_id, changes)
+                patiently(lambda: in_transaction(connection, write))
+        except FAILURES as error:
+            return not is_busy(error)
+        return True
 
     def fetch(self, statement: str, values: Values) -> Sequence[Any] | None:
         """The rows that a statement reads or returns; None while waiting rows come first."""

@@ -61,7 +61,6 @@ _OF_THE_CORE: Final = {
     "completion": Command(SETUP, "webots_mcp.cli.setting_up", "completion"),
     "doctor": Command(SETUP, "webots_mcp.cli.setting_up", "doctor"),
     "init": Command(SETUP, "webots_mcp.cli.setting_up", "init"),
-    "migrate": Command(SETUP, "webots_mcp.cli.serving", "migrate"),
     "observe": Command(SETUP, "webots_mcp.cli.serving", "observe"),
     "serve": Command(SETUP, "webots_mcp.cli.serving", "serve"),
     "run": Command(STEER, f"{_Q}.run_simulation", "webots_run"),

@@ -54,7 +54,7 @@ class Where:
     ] = None
 
     def recording(self, *, read_only: bool = True) -> Recording:
-        """The recording; read-only it is never migrated."""
+        """The recording."""
         from webots_mcp.contract import resolve_database
         from webots_mcp.store.recording import Recording
 
@@ -78,7 +78,7 @@ class Where:
 
     @contextmanager
     def writer(self, *, create: bool = False) -> Generator[tuple[Recording, sqlite3.Connection]]:
-        """The recording, migrated where it has to be, and a connection that may write to it."""
+        """The recording, and a connection that may write to it."""
         recording = self.recording(read_only=False)
         if create:
             recording.create()

@@ -1,4 +1,4 @@
-"""Commands that run beside Webots: the server, the observer; and the one that migrates."""
+"""Commands that run beside Webots: the server and the observer."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from webots_mcp.cli.recordings import HERE, DataDir, Json, Where
 from webots_mcp.cli.rendering import print_json
 from webots_mcp.cli.values import Parameter, whole_number
 from webots_mcp.contract import OBSERVER_NAME
-from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
+from webots_mcp.errors import CommandRefusedError, WebotsMCPError
 
 if TYPE_CHECKING:
     from webots_mcp.contract import Database
@@ -139,35 +139,6 @@ def _ask_for(limits: Asked, database: Database, data_dir: Path) -> None:
         notes = [f"the limits were not set: {error}"]
     for note in notes:
         print(f"webots-mcp: {note}", file=sys.stderr)
-
-
-def migrate(
-    *,
-    revision: Annotated[
-        str, Parameter("--revision", help="An Alembic revision; else the newest.")
-    ] = "head",
-    as_json: Json = False,
-    recorded: Where = HERE,
-) -> None:
-    """Bring a database to the schema of this version; its data is kept."""
-    from alembic.util import CommandError
-
-    from webots_mcp.connection import is_there
-    from webots_mcp.contract import MemoryDatabase
-
-    if not revision:
-        raise InvalidInputError("--revision is empty: leave it out for the newest")
-    recording = recorded.recording(read_only=False)
-    database = recording.database
-    if isinstance(database, MemoryDatabase) or not is_there(database):
-        raise InvalidInputError(f"no database at {database}: give --data-dir or --database")
-    try:
-        before, after = recording.migrate(revision)
-    except CommandError as error:
-        raise InvalidInputError(f"--revision {revision}: {error}") from error
-    if as_json:
-        return print_json({"database": str(database), "before": before, "after": after})
-    print(f"{database}: schema {before}, now {after}" if before != after else f"schema {after}")
 
 
 def observe(

@@ -33,14 +33,13 @@ POSITION: Final = "the position"  # what a displacement reads, whatever its sign
 _MOST_OFFERED: Final = 3
 MAX_DURATION_S: Final = 3600.0
 _MOST_TIMES_AS_OLD: Final = 2.0  # a displacement takes a place that is so many times as old
-MAX_NAME_CHARACTERS: Final = 200
 
 Number: TypeAlias = "int | float"
 Holds: TypeAlias = Callable[[State], bool]
 Compare: TypeAlias = Callable[[Value, Value], bool]
 ReadNumber: TypeAlias = Callable[[State], "Number | None"]
 
-_COMPARISONS: Final[dict[type[ast.cmpop], tuple[str, Callable[[Any, Any], bool]]]] = {
+COMPARISONS: Final[dict[type[ast.cmpop], tuple[str, Callable[[Any, Any], bool]]]] = {
     ast.Lt: ("<", operator.lt),
     ast.LtE: ("<=", operator.le),
     ast.Gt: (">", operator.gt),
@@ -55,9 +54,9 @@ ARITHMETIC: Final[dict[type[ast.operator], Callable[[Any, Any], Any]]] = {
     ast.Div: lambda a, b: a / b,
 }
 OF_NUMBERS: Final[dict[str, Callable[..., Any]]] = {"abs": abs, "min": min, "max": max}
-_GIVING_FLAGS: Final = ("changed", "missing")
+GIVING_FLAGS: Final = ("changed", "missing")
 _ALWAYS_OR_NEVER: Final = "it would always be true or always be false"
-FUNCTIONS: Final = (*OF_NUMBERS, *_GIVING_FLAGS, "rate", "displacement", "signal")
+FUNCTIONS: Final = (*OF_NUMBERS, *GIVING_FLAGS, "rate", "displacement", "signal")
 
 
 def _as_it_is(value: Any) -> Any:
@@ -73,14 +72,16 @@ class Condition:
         signals: The names of those that it reads, in order, without the position's.
         asks_position: Whether it asks where the robot is.
         remembers_s: How far back in time what it says of a state may reach.
+        scanned: Its text as it was parsed.
+        tree: All nodes of it are of the language.
     """
 
     text: str
     signals: tuple[str, ...]
     asks_position: bool
     remembers_s: float
-    _scanned: Scanned = field(repr=False, compare=False)
-    _tree: ast.expr = field(repr=False, compare=False)
+    scanned: Scanned = field(repr=False, compare=False)
+    tree: ast.expr = field(repr=False, compare=False)
 
     def evaluator(self, plain: Plain = _as_it_is) -> Evaluator:
         """Something that follows one robot from state to state.
@@ -89,7 +90,7 @@ class Condition:
             plain: The counterpart that a row holds, in JSON's terms, of a value that is not plain
                 JSON; recorded rows hold no others.
         """
-        return Evaluator(Compiler(self._scanned, self._tree, plain), plain)
+        return Evaluator(Compiler(self.scanned, self.tree, plain), plain)
 
     def describe_unknown(self, known: Collection[str]) -> list[str]:
         """A sentence for each of its signals, and the position, not among the known ones."""
@@ -238,7 +239,7 @@ class Compiler(Nodes):
             return self._comparison(node)
         if isinstance(node, ast.Tuple):
             return self._lasting(node)
-        if function_of(node) in _GIVING_FLAGS:
+        if function_of(node) in GIVING_FLAGS:
             return self._flag_of(cast("ast.Call", node))
         if is_signal(node):
             return self._flag(node)
@@ -249,7 +250,7 @@ class Compiler(Nodes):
     def _comparison(self, node: ast.Compare) -> Holds:
         sides = [node.left, *node.comparators]
         for op in node.ops:
-            if type(op) not in _COMPARISONS:
+            if type(op) not in COMPARISONS:
                 self._refuse(node, "compare with < <= > >= == !=; there is no `in` and no `is`")
         reads = [self._value(side) for side in sides]
         steps = [
@@ -262,7 +263,7 @@ class Compiler(Nodes):
         return lambda state: compare(left(state), right(state))
 
     def _compare(self, op: ast.cmpop, left: ast.expr) -> Compare:
-        sign, compare = _COMPARISONS[type(op)]
+        sign, compare = COMPARISONS[type(op)]
         column = self._column(left)
 
         def holds(a: Value, b: Value) -> bool:
@@ -367,7 +368,7 @@ class Compiler(Nodes):
 
     def _call(self, node: ast.Call) -> ReadNumber:
         name = function_of(node)
-        if name in _GIVING_FLAGS:
+        if name in GIVING_FLAGS:
             self._refuse(node, f"{name}(...) is a condition, not a number")
         if name == "rate":
             return self._keep(Rate(self._number(self._only(node)))).read
@@ -406,35 +407,11 @@ class Compiler(Nodes):
     # -- signals and constants -----------------------------------------------------------------
 
     def _signal(self, node: ast.expr) -> Read:
-        name = self._name(node)
-        if len(name) > MAX_NAME_CHARACTERS:
-            self._refuse(node, f"a name has at most {MAX_NAME_CHARACTERS} characters")
+        name = self._signal_name(node)
         if name not in self.readers:
             self.readers[name] = reader(name, self._plain)
             self.columns[name] = self._column(node)
         return self.readers[name]
-
-    def _name(self, node: ast.expr) -> str:
-        if isinstance(node, ast.Name):
-            return node.id
-        if isinstance(node, ast.Attribute):
-            return f"{self._name(node.value)}.{node.attr}"
-        if isinstance(node, ast.Subscript):
-            return f"{self._name(node.value)}.{self._item(node.slice)}"
-        if isinstance(node, ast.Call) and function_of(node) == "signal":
-            return self._quoted_name(self._only(node))
-        self._refuse(node, "a signal is needed here")
-
-    def _quoted_name(self, node: ast.expr) -> str:
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value:
-            return node.value
-        self._refuse(node, "signal() takes a name in quotes, as in signal('front left.x')")
-
-    def _item(self, node: ast.expr) -> str:
-        value = node.value if isinstance(node, ast.Constant) else None
-        if (type(value) is int or type(value) is str) and len(str(value)) < MAX_NAME_CHARACTERS:
-            return str(value)
-        self._refuse(node, "an item is a number from 0, or a key in quotes, as in front[2]")
 
     def _seconds(self, node: ast.expr, of: str) -> float:
         value = node.value if isinstance(node, ast.Constant) else None

@@ -1,45 +1,58 @@
 """A score of a finished run: `max(pose.x) - 2 * count(stuck)`; see docs/trials.md.
 
-What the values of a whole run come to (mean(x), max(x), time(condition)) follows state by state.
+It is arithmetic over facts about the run, such as what the values of a signal come to: mean(x),
+max(x), time(condition).
 """
 
 from __future__ import annotations
 
 import ast
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final, NamedTuple, Protocol, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 from webots_mcp.conditions.compiler import ARITHMETIC, OF_NUMBERS, Compiler, Number
-from webots_mcp.conditions.signal_values import State
 from webots_mcp.conditions.syntax import Nodes, Scanned, function_of, is_signal, parse, scan
-from webots_mcp.errors import ConditionFailedError, UnknownSignalError
+from webots_mcp.errors import UnknownSignalError
 from webots_mcp.naming import nearest_first
 
-REDUCTIONS: Final[dict[str, Callable[[Sequence[Number]], Number]]] = {
-    "min": min,
-    "max": max,
-    "first": lambda numbers: numbers[0],
-    "last": lambda numbers: numbers[-1],
-}
+_REDUCTIONS: Final = ("min", "max", "first", "last", "mean")
 _DURATION: Final = "duration"
-FUNCTIONS: Final = (*REDUCTIONS, "mean", "abs", "time", "count")
+_FUNCTIONS: Final = (*_REDUCTIONS, "abs", "time", "count")
 _MOST_OFFERED: Final = 3
 _MISPLACED_FOR: Final = "`for` belongs to a condition, as in time(x < 1 for 2)"
 
 
+class Aggregate(NamedTuple):
+    """What the values of a whole run come to.
+
+    Attributes:
+        text: As it is written: `mean(x)`.
+        function: `mean`, `min`, `max`, `first` or `last` of a number, or `time` of a condition.
+        scanned: What the tree was parsed from.
+        tree: Of that number or condition.
+    """
+
+    text: str
+    function: str
+    scanned: Scanned
+    tree: ast.expr
+
+
 class Facts(NamedTuple):
-    """Facts about a run in addition to its states.
+    """Facts about a run.
 
     Attributes:
         duration_s: Simulated seconds.
         counts: Of each kind of event that the score counts, how many there are; a text says why
             that is not known.
+        aggregates: Of each that the score has; None where no row has a value.
     """
 
     duration_s: float
     counts: Mapping[str, int | str]
+    aggregates: Sequence[float | None]
 
 
 class Scored(NamedTuple):
@@ -49,7 +62,7 @@ class Scored(NamedTuple):
     why: str | None = None
 
 
-Term: TypeAlias = Callable[[Facts], Number]
+_Term: TypeAlias = Callable[[Facts], Number]
 
 
 class _NoValueError(Exception):
@@ -64,28 +77,21 @@ class Score:
         text: Without the spaces around it.
         signals: The columns of those that it reads, by their names, counted from 0.
         kinds: The columns of the kinds of events that it counts, by their names.
+        aggregates: What it asks of the values of a run.
     """
 
     text: str
     signals: dict[str, int]
     kinds: dict[str, int]
+    aggregates: tuple[Aggregate, ...]
     _scanned: Scanned = field(repr=False, compare=False)
-    _tree: ast.expr = field(repr=False, compare=False)
+    _root: _Term = field(repr=False, compare=False)
 
-    def of(self, states: Iterable[tuple[float, State]], facts: Facts) -> Scored:
-        """The score of a run.
-
-        Args:
-            states: Each with its simulation time, in order.
-            facts: What else is known of the run.
-        """
-        compiled = _Compiler(self._scanned, self._tree)
+    def of(self, facts: Facts) -> Scored:
+        """The score of a run."""
         try:
-            for sim_time_s, state in states:
-                for aggregate in compiled.aggregates:
-                    aggregate.update(state, sim_time_s)
-            value = float(compiled.root(facts))
-        except (_NoValueError, ConditionFailedError) as error:
+            value = float(self._root(facts))
+        except _NoValueError as error:
             return Scored(None, str(error))
         except (ZeroDivisionError, OverflowError) as error:
             return Scored(None, f"score {self.text!r}: {error}")
@@ -100,9 +106,8 @@ class Score:
         for name, column in self.signals.items():
             if name not in signals:
                 offer = ", ".join(nearest_first(name, signals)[:_MOST_OFFERED]) or "nothing yet"
-                place = self._scanned.place(column)
                 raise UnknownSignalError(
-                    f"{place}: no signal {name!r} is recorded; there is {offer}"
+                    f"{self.place(column)}: no signal {name!r} is recorded; there is {offer}"
                 )
 
     def place(self, column: int) -> str:
@@ -118,106 +123,13 @@ def parse_score(text: str) -> Score:
             be possible there.
     """
     scanned = scan(text, "score")
-    tree = parse(scanned)
-    compiled = _Compiler(scanned, tree)
-    return Score(scanned.original, compiled.signals, compiled.kinds, scanned, tree)
-
-
-class Aggregate(Protocol):
-    """One of them, in one run."""
-
-    def update(self, state: State, sim_time_s: float) -> None:
-        """Take in the next state."""
-        ...
-
-    def value(self) -> Number | None:
-        """What it has come to; None where nothing had a value."""
-        ...
-
-
-class Reduced:
-    """An extreme, or the first or last of a number's values."""
-
-    def __init__(self, compiled: Compiler, reduce: Callable[[Sequence[Number]], Number]) -> None:
-        self._compiled = compiled
-        self._reduce = reduce
-        self._numbers: list[Number] = []
-
-    def update(self, state: State, sim_time_s: float) -> None:
-        """States in which the number has no value do not count."""
-        number = _root(self._compiled, state, sim_time_s)
-        if number is not None:
-            self._numbers.append(number)
-
-    def value(self) -> Number | None:
-        """Flags count as 1 and 0."""
-        return self._reduce(self._numbers) if self._numbers else None
-
-
-class Mean:
-    """The mean over time: each value counts for as long as it holds, up to the next state.
-
-    So a stretch with more states than others does not count more.
-    """
-
-    def __init__(self, compiled: Compiler) -> None:
-        self._compiled = compiled
-        self._newest: tuple[float, Number] | None = None
-        self._area = self._time_s = self._sum = 0.0
-        self._count = 0
-
-    def update(self, state: State, sim_time_s: float) -> None:
-        """While the number has no value, the time does not count."""
-        if self._newest is not None:
-            since_s, held = self._newest
-            self._area += held * (sim_time_s - since_s)
-            self._time_s += sim_time_s - since_s
-        number = _root(self._compiled, state, sim_time_s)
-        self._newest = None if number is None else (sim_time_s, number)
-        if number is not None:
-            self._sum += number
-            self._count += 1
-
-    def value(self) -> float | None:
-        """Where no time has passed, the states count alike."""
-        if self._time_s > 0:
-            return self._area / self._time_s
-        return self._sum / self._count if self._count else None
-
-
-class TimeHeld:
-    """For how many seconds a condition held: from each state in which it does up to the next."""
-
-    def __init__(self, compiled: Compiler) -> None:
-        self._compiled = compiled
-        self._since_s: float | None = None
-        self._held_s: float | None = None
-
-    def update(self, state: State, sim_time_s: float) -> None:
-        """Take in the next state."""
-        if self._since_s is not None:
-            self._held_s = (self._held_s or 0.0) + sim_time_s - self._since_s
-        holds = _root(self._compiled, state, sim_time_s)
-        self._since_s = sim_time_s if holds else None
-        self._held_s = self._held_s or 0.0
-
-    def value(self) -> float | None:
-        """None without any state."""
-        return self._held_s
-
-
-def _root(compiled: Compiler, state: State, sim_time_s: float) -> Number | None:
-    for memory in compiled.memories:
-        memory.update(state, sim_time_s)
-    return compiled.root(state)
+    read = _Compiler(scanned, parse(scanned))
+    aggregates = tuple(read.aggregates)
+    return Score(scanned.original, read.signals, read.kinds, aggregates, scanned, read.root)
 
 
 class _Compiler(Nodes):
-    """Makes a closure of the nodes of a score; what is inside an aggregate is a number of states.
-
-    Attributes:
-        aggregates: Each has to take in every state.
-    """
+    """Makes a closure of the nodes of a score; what is inside an aggregate is left as it is."""
 
     def __init__(self, scanned: Scanned, tree: ast.expr) -> None:
         super().__init__(scanned)
@@ -229,7 +141,7 @@ class _Compiler(Nodes):
         for place in self._durations:
             self._refuse_at(place, _MISPLACED_FOR)
 
-    def _term(self, node: ast.expr) -> Term:
+    def _term(self, node: ast.expr) -> _Term:
         if isinstance(node, ast.Constant):
             value = self._constant(node)
             if isinstance(value, str):
@@ -249,9 +161,9 @@ class _Compiler(Nodes):
             return self._call(node)
         if self._durations and isinstance(node, ast.Tuple):
             self._refuse_at(min(self._durations), _MISPLACED_FOR)
-        self._refuse(node, "a score is a number: there are + - * /, " + ", ".join(FUNCTIONS))
+        self._refuse(node, "a score is a number: there are + - * /, " + ", ".join(_FUNCTIONS))
 
-    def _arithmetic(self, node: ast.BinOp) -> Term:
+    def _arithmetic(self, node: ast.BinOp) -> _Term:
         left, right, apply = (
             self._term(node.left),
             self._term(node.right),
@@ -259,30 +171,26 @@ class _Compiler(Nodes):
         )
         return lambda facts: apply(left(facts), right(facts))
 
-    def _call(self, node: ast.Call) -> Term:
+    def _call(self, node: ast.Call) -> _Term:
         self._require_plain_call(node)
         name = function_of(node)
         if name == "count":
             return self._count(node)
         if name == "time":
-            return self._aggregate(node, TimeHeld(self._part(self._condition_in(node))))
-        if name == "mean":
-            return self._aggregate(node, Mean(self._part(self._only(node), number=True)))
-        if name in REDUCTIONS and (len(node.args) == 1 or name not in OF_NUMBERS):
-            return self._aggregate(
-                node, Reduced(self._part(self._only(node), number=True), REDUCTIONS[name])
-            )
+            return self._aggregate(node, name, self._condition_in(node))
+        if name in _REDUCTIONS and (len(node.args) == 1 or name not in OF_NUMBERS):
+            return self._aggregate(node, name, self._only(node))
         if name in OF_NUMBERS:
             return self._of_numbers(node, name)
         self._refuse(node, self._unknown(name))
 
-    def _of_numbers(self, node: ast.Call, name: str) -> Term:
+    def _of_numbers(self, node: ast.Call, name: str) -> _Term:
         terms = [self._term(each) for each in ([self._only(node)] if name == "abs" else node.args)]
         if not terms:
             self._refuse(node, f"{name} takes one value or more")
         return lambda facts: OF_NUMBERS[name](*(term(facts) for term in terms))
 
-    def _count(self, node: ast.Call) -> Term:
+    def _count(self, node: ast.Call) -> _Term:
         kind = self._only(node)
         if isinstance(kind, ast.Name):
             name = kind.id
@@ -300,31 +208,27 @@ class _Compiler(Nodes):
 
         return count
 
-    def _aggregate(self, node: ast.Call, aggregate: Aggregate) -> Term:
-        self.aggregates.append(aggregate)
-        start, end = self._column(node), self._end_column(node)
+    def _aggregate(self, node: ast.Call, function: str, inside: ast.expr) -> _Term:
+        start, end = self._column(inside), self._end_column(inside)
+        durations = frozenset(place for place in self._durations if start <= place < end)
+        self._durations -= durations
+        scanned = replace(self._scanned, durations=durations)
+        is_number = function != "time"
+        compiled = Compiler(scanned, inside, lambda value: value, number=is_number)
+        for name, column in compiled.columns.items():
+            self.signals.setdefault(name, column)
         columns = self._scanned.columns
-        text = self._scanned.original[columns[start] : columns[end]]
+        text = self._scanned.original[columns[self._column(node)] : columns[self._end_column(node)]]
+        place = len(self.aggregates)
+        self.aggregates.append(Aggregate(text, function, scanned, inside))
 
         def value(facts: Facts) -> Number:
-            found = aggregate.value()
+            found = facts.aggregates[place]
             if found is None:
                 raise _NoValueError(f"{text} has no value: no recorded state of the run has one")
             return found
 
         return value
-
-    def _part(self, node: ast.expr, *, number: bool = False) -> Compiler:
-        """What is asked of each state."""
-        start, end = self._column(node), self._end_column(node)
-        inside = frozenset(place for place in self._durations if start <= place < end)
-        self._durations -= inside
-        compiled = Compiler(
-            replace(self._scanned, durations=inside), node, lambda value: value, number=number
-        )
-        for name, column in compiled.columns.items():
-            self.signals.setdefault(name, column)
-        return compiled
 
     def _condition_in(self, node: ast.Call) -> ast.expr:
         """The condition in `time(...)`: `c for 2` has become two arguments."""
@@ -338,6 +242,6 @@ class _Compiler(Nodes):
 
     def _unknown(self, name: str | None) -> str:
         if name is None:
-            return "only functions can be called: " + ", ".join(FUNCTIONS)
-        offer = ", ".join(f"{each}()" for each in nearest_first(name, FUNCTIONS))
+            return "only functions can be called: " + ", ".join(_FUNCTIONS)
+        offer = ", ".join(f"{each}()" for each in nearest_first(name, _FUNCTIONS))
         return f"there is no {name}() of a run; there are {offer}"

@@ -44,7 +44,7 @@ _NUMERIC: Final = frozenset("-0123456789")
 _LONGEST_NUMBER: Final = 30  # characters
 _CONSTANT_KEYS: Final[dict[str, object]] = {"null": None, "true": True, "false": False}
 SAME_TIME_S: Final = 1e-6  # a clock that adds up steps is off by less
-_PLACES_KEPT: Final = 200  # of one displacement
+PLACES_KEPT: Final = 200  # of one displacement
 
 Answer = TypeVar("Answer")
 
@@ -333,7 +333,7 @@ class Displacement:
     ) -> None:
         self._place = place
         self._seconds = seconds
-        self._apart_s = seconds / _PLACES_KEPT
+        self._apart_s = seconds / PLACES_KEPT
         self.forget()
 
     def forget(self) -> None:

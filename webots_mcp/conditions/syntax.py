@@ -56,6 +56,7 @@ _NAME: Final = re.compile(r"""'[^']*'|"[^"]*"|(?P<name>[^\W\d]\w*(?:\.\w+|\[\d+\
 _SIGNS: Final = ("and", "or", "not", "in", "is", "for", "if", "else", "True", "False", "None")
 MAX_DEPTH: Final = 50
 MAX_NUMBER: Final = 1e300
+MAX_NAME_CHARACTERS: Final = 200
 FLAGS: Final = {"true": True, "false": False, "True": True, "False": False}
 
 
@@ -211,6 +212,34 @@ class Nodes:
         if abs(number) > MAX_NUMBER:
             self._refuse(node, f"numbers are up to {MAX_NUMBER:g}")
         return number
+
+    def _signal_name(self, node: ast.expr) -> str:
+        name = self._name(node)
+        if len(name) > MAX_NAME_CHARACTERS:
+            self._refuse(node, f"a name has at most {MAX_NAME_CHARACTERS} characters")
+        return name
+
+    def _name(self, node: ast.expr) -> str:
+        if isinstance(node, ast.Name):
+            return node.id
+        if isinstance(node, ast.Attribute):
+            return f"{self._name(node.value)}.{node.attr}"
+        if isinstance(node, ast.Subscript):
+            return f"{self._name(node.value)}.{self._item(node.slice)}"
+        if isinstance(node, ast.Call) and function_of(node) == "signal":
+            return self._quoted_name(self._only(node))
+        self._refuse(node, "a signal is needed here")
+
+    def _quoted_name(self, node: ast.expr) -> str:
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value:
+            return node.value
+        self._refuse(node, "signal() takes a name in quotes, as in signal('front left.x')")
+
+    def _item(self, node: ast.expr) -> str:
+        value = node.value if isinstance(node, ast.Constant) else None
+        if (type(value) is int or type(value) is str) and len(str(value)) < MAX_NAME_CHARACTERS:
+            return str(value)
+        self._refuse(node, "an item is a number from 0, or a key in quotes, as in front[2]")
 
     def _durations_between(self, node: ast.Tuple) -> list[int]:
         start, end = self._column(node), self._end_column(node)

@@ -93,7 +93,7 @@ _FIX: Final = (
 def server(subject: Examined) -> Finding:
     """Whether a server starts, names its tools and answers."""
     if subject.file is None:
-        return Finding("not looked at", "a recording in memory belongs to one process")
+        return Finding("not checked", "a recording in memory belongs to one process")
     import anyio
 
     line = [*subject.server, "--database", str(subject.file)]

@@ -27,9 +27,9 @@ from webots_mcp.transactions import is_damage, text_of
 if TYPE_CHECKING:
     from webots_mcp.webots.instances import Instance
 
-Verdict = Literal["ok", "warning", "wrong", "not looked at"]
+Verdict = Literal["ok", "warning", "wrong", "not checked"]
 
-_WORST_FIRST: Final[tuple[Verdict, ...]] = ("wrong", "warning", "not looked at", "ok")
+_WORST_FIRST: Final[tuple[Verdict, ...]] = ("wrong", "warning", "not checked", "ok")
 PAGE: Final = "docs/troubleshooting.md"
 _RECOVER: Final = (
     "stop what records there, save rows with 'sqlite3 FILE .recover', and move the file away"
@@ -188,15 +188,15 @@ def diagnose(subject: Examined, checks: Sequence[Check] | None = None) -> list[C
 def _look(check: Check, subject: Examined) -> Finding:
     """Run one check; one that fails reports that, and the others still run."""
     if check.needs_recording and subject.connection is None:
-        return Finding("not looked at", "there is no recording that can be read")
+        return Finding("not checked", "there is no recording that can be read")
     try:
         return check.look(subject)
     except ModuleNotFoundError as error:
-        return Finding("not looked at", f"the Python package {error.name!r} is missing")
+        return Finding("not checked", f"the Python package {error.name!r} is missing")
     except Exception as error:  # noqa: BLE001  (it is reported)
         if is_damage(error):
             return Finding("wrong", f"the database is damaged: {text_of(error)}", _RECOVER)
-        return Finding("not looked at", f"{type(error).__name__}: {error}")
+        return Finding("not checked", f"{type(error).__name__}: {error}")
 
 
 def subject_of(recording: Recording, chosen_by: str) -> Examined:

@@ -158,7 +158,7 @@ def judge_file_system(folder: str, mounts: Iterable[Mount], *, is_wsl: bool) -> 
         return _on_the_network(folder, "a network drive")
     mount = _mount_of(path, mounts)
     if mount is None:
-        return Finding("not looked at", f"the system does not show on which drive {folder} is")
+        return Finding("not checked", f"the system does not show on which drive {folder} is")
     kind = mount.kind.lower()
     if is_wsl and kind in _WINDOWS_FROM_WSL:
         return _across_the_border(folder, f"a drive of Windows, seen from WSL ({kind})")

@@ -10,7 +10,7 @@ from webots_mcp.connection import connect, is_there, journal_mode
 from webots_mcp.contract import HEARTBEAT_LATE_S, SCHEMA_VERSION
 from webots_mcp.diagnosis.doctor import Examined, Finding, ago, check, last_seen_s, worst
 from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
-from webots_mcp.schema import schema_version
+from webots_mcp.schema import require_current, schema_version
 from webots_mcp.store.recording import GETTING_STARTED, View, name_of
 from webots_mcp.store.sessions import Session, fetch_session
 from webots_mcp.store.status import handler_at_work, rows_waiting
@@ -53,17 +53,16 @@ def database(subject: Examined) -> Finding:
 def schema(subject: Examined) -> Finding:
     """Whether the database has the tables of this version."""
     if subject.unread is not None and not _is_about_schema(subject):
-        return Finding("not looked at", "there is no recording that can be read")
+        return Finding("not checked", "there is no recording that can be read")
     if subject.file is None or not is_there(subject.file):
         return Finding("ok", f"{SCHEMA_VERSION}")
     with closing(connect(subject.file, "reader")) as connection:
         version = schema_version(connection)
-    seen = f"{version}, this webots-mcp needs {SCHEMA_VERSION}"
-    if version < SCHEMA_VERSION:
-        fix = "run 'webots-mcp migrate'; a server that may write, or a controller, does it as well"
-        return Finding("wrong", seen, fix)
-    if version > SCHEMA_VERSION:
-        return Finding("wrong", seen, "upgrade webots-mcp: a newer one has written this file")
+        try:
+            require_current(connection)
+        except (SchemaTooOldError, SchemaTooNewError) as error:
+            seen = f"{version}, this webots-mcp needs {SCHEMA_VERSION}"
+            return Finding("wrong", seen, str(error))
     return Finding("ok", f"{version}")
 
 

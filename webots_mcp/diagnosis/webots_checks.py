@@ -245,7 +245,7 @@ def installed(_: Examined) -> Finding:
     except CommandRefusedError as error:
         seen, fix = str(error).rsplit(": ", 1)
         return Finding("warning", seen, fix)
-    return Finding("not looked at", "it was installed while this looked")
+    return Finding("not checked", "it was installed while this looked")
 
 
 def _complete(webots: Installation) -> Finding:

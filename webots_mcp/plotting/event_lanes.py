@@ -32,9 +32,7 @@ def event_lanes(
     most = min(rows, MOST_LANES)
     drawn = tuple(kind.name for kind in drawn_kinds())
     options = EventOptions(kinds=drawn, signals=tuple(names))
-    found = find_events(
-        connection, part.range, options, limit=MOST_EVENTS, around=(), group=False, exact=False
-    )
+    found = find_events(connection, part.range, options, limit=MOST_EVENTS, around=(), group=False)
     kinds = [kind for kind in drawn if any(event.kind == kind for event in found.events)]
     lanes = [_lane(kind, found, part) for kind in kinds[:most]]
     notes = [note for note in found.notes if note not in part.notes]
@@ -85,7 +83,7 @@ def stuck_mark(
     """When the robot was stuck, and where that was not looked for."""
     options = EventOptions(kinds=("stuck",), signals=position, position=position)
     found = find_events(
-        connection, part.range, options, limit=MOST_EVENTS, around=(), group=False, exact=False,
+        connection, part.range, options, limit=MOST_EVENTS, around=(), group=False,
         deadline_s=deadline_s,
     )  # fmt: skip
     intervals = [_within(Interval("stuck", e.start_s, e.end_s), part) for e in found.events]

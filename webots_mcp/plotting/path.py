@@ -6,18 +6,19 @@ import math
 import sqlite3
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import accumulate, pairwise
-from typing import Final, NamedTuple, TypeGuard
+from typing import Final, NamedTuple
 
-from webots_mcp.naming import Value
 from webots_mcp.plotting.parts import Part
+from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.analysis.rhythm import rhythm_of
 from webots_mcp.store.analysis.summary import LARGEST
 from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.rows import exceeds, read_columns
+from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.signals.registry import Signal
 
+MOST_PLACES: Final = 20_000  # of a way; a picture has a thousandth as many pixels
 _LEAP: Final = 10.0  # times the speed that 95 % of the steps keep to
 _FINENESS: Final = 1 / 2000  # of the larger side: what lies nearer is the same pixel
 
@@ -69,34 +70,22 @@ class Path:
 def read_path(
     connection: sqlite3.Connection, part: Part, x: Signal, y: Signal, deadline_s: float
 ) -> Path:
-    """The places of one run: of every row, or of the part's buckets if the rows are many."""
+    """The places of one run: of every row, or of every so many if the rows are many."""
     (segment,) = part.range.segments
-    cut_s = part.run.cut_at_s
-    if exceeds(connection, segment):
-        run = part.run
-        by_name = {columns.name: columns.last for columns in run.numbers}
-        path = _path(run.sim_time_s, by_name[x.name], by_name[y.name], run.step_s)
-    else:
-        columns = read_columns(connection, segment, [x, y], Deadline(deadline_s))
-        path = _path(columns.times, columns.values[x.name], columns.values[y.name], None)
-        cut_s = columns.cut_at_s
-    return replace(path, is_whole=cut_s is None)
-
-
-def _path(
-    times: Sequence[float], xs: Sequence[Value], ys: Sequence[Value], step_s: float | None
-) -> Path:
+    frame = read_frame(connection, segment, Deadline(deadline_s))
+    xs, ys = frame.numbers(x.name), frame.numbers(y.name)
+    rows = np.flatnonzero(np.maximum(np.abs(xs), np.abs(ys)) <= LARGEST)
+    every = max(1, math.ceil(len(rows) / MOST_PLACES))
+    shown = np.union1d(rows[::every], rows[-1:])
+    times = frame.times
     places = [
-        Place(time, x, y)
-        for time, x, y in zip(times, xs, ys, strict=True)
-        if _is_usable(x) and _is_usable(y)
+        Place(*place)
+        for place in zip(times[shown].tolist(), xs[shown].tolist(), ys[shown].tolist(), strict=True)
     ]
-    return Path(places, step_s, frozenset(_breaks(places)))
-
-
-def _is_usable(value: Value) -> TypeGuard[float]:
-    """Whether a distance to it can be told."""
-    return isinstance(value, (int, float)) and abs(value) <= LARGEST
+    step_s = None
+    if every > 1:
+        step_s = float(f"{float(np.median(np.diff(times[shown]))):.3g}")
+    return Path(places, step_s, frozenset(_breaks(places)), is_whole=frame.cut_at_s is None)
 
 
 def _breaks(places: Sequence[Place]) -> Iterator[int]:

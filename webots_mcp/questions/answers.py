@@ -127,7 +127,7 @@ class WorldAnswer(Answer):
     runs_recorded: int | None = None
     controller: dict[str, Any] | None = None
     devices: dict[str, str] | None = None
-    companions: Table | None = Field(
+    other_robots: Table | None = Field(
         default=None, description="Other robots in the same simulation."
     )
     database: str | None = None
@@ -151,9 +151,9 @@ class DiagnosisAnswer(Answer):
     """What is not well between the controllers and their asker."""
 
     verdict: str | None = Field(default=None, description="ok, warning or wrong: the worst.")
-    not_well: list[dict[str, str]] | None = None
-    not_looked_at: dict[str, str] | None = Field(default=None, description="Why, and which.")
-    well: str | None = Field(default=None, description="Checks that passed.")
+    failed: list[dict[str, str]] | None = None
+    not_checked: dict[str, str] | None = Field(default=None, description="Why, and which.")
+    passed: str | None = Field(default=None, description="Checks that found nothing.")
 
 
 class LogsAnswer(Answer):

@@ -41,7 +41,7 @@ from webots_mcp.questions.budget import (
 from webots_mcp.questions.declaring import READS, SETS, is_for_a_person, question
 from webots_mcp.questions.history_answers import ComparisonAnswer, RunsAnswer
 from webots_mcp.questions.shortening import DETAIL_BUDGET_TOKENS, WHOLE, shorten
-from webots_mcp.store.analysis.spread import MATTERS_SD, Spread
+from webots_mcp.store.analysis.spread import MIN_EFFECT_SD, Spread
 from webots_mcp.store.detection.event import EventOptions, both_of
 from webots_mcp.store.questions.compare import (
     Comparison,
@@ -136,7 +136,7 @@ def webots_list_runs(
     READS,
     command="compare",
     positional=("run_ids",),
-    options={"run_ids": "RUN", "matters_sd": "--matters"},
+    options={"run_ids": "RUN", "min_effect_sd": "--min-effect"},
     core=True,
     example="3 4 --signal 'pose*'",
 )
@@ -148,9 +148,9 @@ def webots_compare_runs(
     trial_set: TrialSetId = None,
     position: Position = None,
     mode: Mode = None,
-    matters_sd: Annotated[
+    min_effect_sd: Annotated[
         float, Field(gt=0, le=100, description="What matters, in deviations of like runs.")
-    ] = MATTERS_SD,
+    ] = MIN_EFFECT_SD,
     robot: RobotName = None,
 ) -> ComparisonAnswer:
     """Did my edit help? Runs beside each other; or how fast, how far and in which modes one ran.
@@ -168,7 +168,7 @@ def webots_compare_runs(
         return answer_about(
             view,
             ComparisonAnswer,
-            lambda: _compared(view, run_ids, trial_set, signals, limit, options, matters_sd),
+            lambda: _compared(view, run_ids, trial_set, signals, limit, options, min_effect_sd),
         )
 
 
@@ -272,9 +272,13 @@ def _compared(
     names: Sequence[str] | None,
     limit: int | None,
     options: EventOptions,
-    matters_sd: float,
+    min_effect_sd: float,
 ) -> dict[str, Any]:
-    asked: dict[str, Any] = {"names": names or ("*",), "options": options, "matters_sd": matters_sd}
+    asked: dict[str, Any] = {
+        "names": names or ("*",),
+        "options": options,
+        "min_effect_sd": min_effect_sd,
+    }
     asked["limit"] = limit or DEFAULT_DIFFERENCES
     if run_ids:
         found = compare_runs(view.connection, run_ids, **asked)
@@ -285,7 +289,7 @@ def _compared(
     differing = [each for each in found.differences if _differs(each)]
     groups, notes, only_in = _groups(found), notes_of(found.notes), list(found.only_in.items())
     most = len(only_in) if is_for_a_person() else _MOST_ONLY_IN
-    beside: list[Any] = [groups and groups.rows, found.not_known, notes]
+    beside: list[Any] = [groups and groups.rows, found.unknown, notes]
     of_measures = int(_OF_MEASURES * room_tokens(limit, beside))
     measures = fitting(list(map(_measure_row, found.measures)), of_measures)
     beside.append(measures)
@@ -295,7 +299,7 @@ def _compared(
         "groups": groups,
         "compared_s": seconds(found.compared_s),
         "measures": without_empty(MEASURE_COLUMNS, measures),
-        "not_known": found.not_known or None,
+        "unknown": found.unknown or None,
         "differences": without_empty(DIFFERENCE_COLUMNS, rows),
         "total": found.total,
         "only_in": {name: list(groups) for name, groups in only_in[:most]} or None,

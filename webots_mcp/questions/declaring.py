@@ -249,7 +249,8 @@ def _with_left_out(reply: Reply, left_out: Sequence[str]) -> Reply:
         return reply
     if reply.data is None:
         return Reply(None, [*reply.shown, compact_json({"left_out": list(left_out)})])
-    return _in_text(reply.data | {"left_out": list(left_out)}, reply.shown[1:])
+    whole = [*(reply.data.get("left_out") or ()), *left_out]
+    return _in_text(reply.data | {"left_out": whole}, reply.shown[1:])
 
 
 _client: Final[ContextVar[Client]] = ContextVar("client", default="mcp")

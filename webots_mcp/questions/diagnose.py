@@ -25,13 +25,13 @@ def webots_diagnose(recording: Recording) -> DiagnosisAnswer:
     checked = diagnose(subject_of(recording, "how this server was started"))
     return DiagnosisAnswer(
         verdict=worst([each.finding for each in checked]).verdict,
-        not_well=_not_well(checked) or None,
-        not_looked_at=_by_reason(checked) or None,
-        well=", ".join(each.check.name for each in checked if each.is_well),
+        failed=_failed(checked) or None,
+        not_checked=_by_reason(checked) or None,
+        passed=", ".join(each.check.name for each in checked if each.is_well),
     )
 
 
-def _not_well(checked: Sequence[Checked]) -> list[dict[str, str]]:
+def _failed(checked: Sequence[Checked]) -> list[dict[str, str]]:
     """What is wrong before what might be."""
     told: list[dict[str, str]] = []
     left = _BUDGET_TOKENS
@@ -49,6 +49,6 @@ def _not_well(checked: Sequence[Checked]) -> list[dict[str, str]]:
 def _by_reason(checked: Sequence[Checked]) -> dict[str, str]:
     names: dict[str, list[str]] = {}
     for check, finding in checked:
-        if finding.verdict == "not looked at":
+        if finding.verdict == "not checked":
             names.setdefault(cut_text(finding.seen, _LONGEST_TEXT), []).append(check.name)
     return {reason: ", ".join(those) for reason, those in names.items()}

@@ -95,7 +95,7 @@ def trend_tables(run: RunTrends, limit: int, budget_tokens: int) -> RunTrendTabl
         start_s=seconds(run.start_s),
         end_s=seconds(run.end_s if run.cut_at_s is None else run.cut_at_s),
         rows=run.rows,
-        from_means_of_s=run.resolution_s,
+        resolution_s=run.resolution_s,
         numbers=table(TREND_COLUMNS, rows),
         states=table(STATE_COLUMNS, states),
         constant=constant or None,

@@ -76,10 +76,12 @@ class RunSeries(Part):
     numbers: dict[str, NumberSeries] | None = None
     states: dict[str, ChangeSeries] | None = None
     rows: int | None = None
-    gaps: list[list[float | None]] | None = Field(
+    recording_gaps: list[list[float | None]] | None = Field(
         default=None, description="[from, to] where no row was recorded."
     )
-    gap_count: int | None = Field(default=None, description="How many, if not all are shown.")
+    recording_gap_count: int | None = Field(
+        default=None, description="How many, if not all are shown."
+    )
     rows_missing_from_s: float | None = Field(
         default=None, description="Reading took too long: from here on rows are missing."
     )
@@ -111,7 +113,7 @@ class RunTrendTables(Part):
     start_s: float | None
     end_s: float | None
     rows: int
-    from_means_of_s: float | None = Field(
+    resolution_s: float | None = Field(
         default=None, description="Shapes and slopes come from means over this many seconds."
     )
     numbers: Table | None = Field(default=None, description="What changed most is first.")
@@ -208,7 +210,7 @@ class TrialsAnswer(NotedAnswer):
     noise: float | None = Field(
         default=None, description="Standard deviation of the scores of like trials."
     )
-    best_is_better: bool | None = Field(
+    is_best_confirmed: bool | None = Field(
         default=None, description="By more than the spread of repeats; null: unknown."
     )
     verdict: str | None = None
@@ -219,9 +221,10 @@ class RunAnswer(CommandAnswer):
 
     stopped: str | None = Field(
         default=None,
-        description="condition held, time over, run ended, interrupted, or out of wall time.",
+        description="condition held, simulation time reached, run ended, interrupted, or "
+        "wall time limit reached.",
     )
-    why_stopped: str | None = None
+    stop_reason: str | None = None
     ran: dict[str, Any] | None = Field(default=None, description="How far simulation time came.")
     values: dict[str, Any] | None = Field(default=None, description="Of the condition's signals.")
     mode: str | None = None
@@ -268,7 +271,7 @@ class ComparisonAnswer(NotedAnswer):
         "this many runs of each would tell, if they went on like these. interval: of the "
         "difference of the means, 90 %.",
     )
-    not_known: dict[str, str] | None = Field(
+    unknown: dict[str, str] | None = Field(
         default=None, description="Figures that are null, or not of everything: why; what to do."
     )
     differences: Table | None = Field(

@@ -155,8 +155,11 @@ def _run_series(run: RunHistory) -> RunSeries:
         states={str(short_name(columns.name)): _change_series(columns) for columns in run.changes}
         or None,
         rows=run.rows,
-        gaps=[[seconds(gap.start_s), seconds(gap.end_s)] for gap in run.gaps[:_SHOWN_GAPS]] or None,
-        gap_count=len(run.gaps) if len(run.gaps) > _SHOWN_GAPS else None,
+        recording_gaps=[
+            [seconds(gap.start_s), seconds(gap.end_s)] for gap in run.gaps[:_SHOWN_GAPS]
+        ]
+        or None,
+        recording_gap_count=len(run.gaps) if len(run.gaps) > _SHOWN_GAPS else None,
         rows_missing_from_s=seconds(run.cut_at_s),
     )
 

@@ -87,7 +87,7 @@ def webots_get_world_info(
             runs_recorded=count_runs(view.connection, view.robot.id),
             controller=_controller(session),
             devices=_devices(view.robot.devices),
-            companions=Table(columns=["robot", "kind", "hold"], rows=shown) if shown else None,
+            other_robots=Table(columns=["robot", "kind", "hold"], rows=shown) if shown else None,
             database=name_of(recording.database),
             retention=_retention(recording, view.connection),
             data_dir=str(recording.data_dir),

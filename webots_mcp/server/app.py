@@ -24,6 +24,7 @@ from webots_mcp.server.resources import add_resources
 from webots_mcp.server.tools import ToolServer, tool_of
 from webots_mcp.steering.launcher import Companions, Launcher
 from webots_mcp.steering.trial_worker import TrialWorkers
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.retention.limits import Asked, ask_where_unset
 from webots_mcp.store.retention.upkeep import Upkeep
@@ -103,6 +104,7 @@ def _lifespan(
             unasked.clear()
         reap_if_dead(connection)
         roll(connection, pause_s=_PAUSE_S)
+        make_chunks(connection, pause_s=_PAUSE_S)
         retain(connection)
 
     @asynccontextmanager

@@ -239,8 +239,8 @@ def _params_of(command: Command) -> Mapping[str, Any]:
 def run_facts(view: View, command: Command) -> dict[str, Any]:
     """The facts of an answer about a `run` command: why it stopped, its progress, its events."""
     progress, result = _progress_in(view.connection, command), _result_of(command)
-    stopped, why = _why_stopped(command, result)
-    facts: dict[str, Any] = {"stopped": stopped, "why_stopped": why}
+    stopped, why = _stop_reason(command, result)
+    facts: dict[str, Any] = {"stopped": stopped, "stop_reason": why}
     if progress.run_id is None or stopped is None:
         return facts
     facts |= {
@@ -257,9 +257,9 @@ def run_facts(view: View, command: Command) -> dict[str, Any]:
     return facts | _what_happened(view, command, progress) if command.is_final else facts
 
 
-def _why_stopped(command: Command, result: Mapping[str, Any]) -> tuple[str | None, str | None]:
+def _stop_reason(command: Command, result: Mapping[str, Any]) -> tuple[str | None, str | None]:
     if command.status == "claimed":
-        return "out of wall time", "it continues, and ends as requested"
+        return "wall time limit reached", "it continues, and ends as requested"
     if command.status == "lost":
         return "run ended", command.error
     return result.get("ended"), result.get("why")

@@ -248,7 +248,7 @@ def _facts(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
         "score": f"{cut_text(str(plan.get('score')), 500)} ({best} is best)",
         "ranked": condensed((*_names(ranking), *_FIGURES), rows),
         "noise": figure(ranking.noise.deviation) if ranking.noise.freedom else None,
-        "best_is_better": ranking.better,
+        "is_best_confirmed": ranking.better,
         "verdict": ranking.verdict if over else None,
         "notes": notes_of(
             [

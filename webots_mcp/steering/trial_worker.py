@@ -50,7 +50,7 @@ _PATIENCE_S: Final = 5.0  # with a command that takes a round of the loop
 _END_PATIENCE_S: Final = 2.0  # the same where the server ends
 _ASKER: Final = "trials"
 _SET_PARAMETERS: Final = "set_parameters"
-_ENDS: Final = {"condition held": "until", "time over": "for_s", "pruned": "prune"}
+_ENDS: Final = {"condition held": "until", "simulation time reached": "for_s", "pruned": "prune"}
 _RUN_OF: Final = (
     "SELECT min(id) FROM run WHERE session_id = ? AND started_wall_time_s >= "
     "(SELECT claimed_wall_time_s FROM command WHERE id = ?)"

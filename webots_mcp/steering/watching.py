@@ -14,7 +14,6 @@ from webots_mcp.store.detection.motion import (
     doubt_of_length,
     doubt_of_unit,
     find_motion,
-    places_of,
 )
 from webots_mcp.store.questions.ways import Way, read_way
 from webots_mcp.store.reading.coverage import row_before
@@ -80,11 +79,12 @@ def movement(
     speeds_m_s: list[float] = []
     for segment in found.segments:
         way = read_way(view.connection, segment, position, deadline)
-        times, is_cut = way.columns.times, way.columns.cut
-        missing = {"rows_missing_from_s": seconds((times or [segment.start_s])[-1])}
-        if facts := (_distances(way) or {}) | (missing if is_cut else {}):
+        missing = {}
+        if way.cut_at_s is not None:
+            missing = {"rows_missing_from_s": seconds(max(way.cut_at_s, segment.start_s))}
+        if facts := (_distances(way) or {}) | missing:
             ways[segment.run_id] = facts
-            took_s = times[-1] - times[0] if times else 0.0
+            took_s = float(way.times[-1] - way.times[0]) if len(way.times) else 0.0
             travelled_m: float = facts.get("distance_m") or 0.0
             speeds_m_s.append(travelled_m / took_s if took_s else 0.0)
     if doubt := doubt_of_unit(position, max(speeds_m_s, default=0.0)):
@@ -96,17 +96,15 @@ def movement(
 
 def _distances(way: Way) -> dict[str, Any] | None:
     """Start, end, distance and displacement in one run, without invalid positions."""
-    times, x, y = places_of(way.columns, way.position)
-    if len(times) < 2:
+    if len(way.times) < 2:
         return None
     length = way.length
-    sampled = f"from one position every {way.sampled_s:.2g} s" if way.sampled_s else None
-    notes = "; ".join(filter(None, (sampled, doubt_of_length(length))))
-    first, last = ((float(x[row]), float(y[row])) for row in (0, -1))
+    note = doubt_of_length(length)
+    first, last = ((float(way.x_m[row]), float(way.y_m[row])) for row in (0, -1))
     return {
         "from_m": [figure(value) for value in first],
         "to_m": [figure(value) for value in last],
         "distance_m": figure(length.length_m),
-        **({"distance_note": notes} if notes else {}),
+        **({"distance_note": note} if note else {}),
         "displacement_m": figure(math.dist(first, last)),
     }

@@ -1,1 +1,1 @@
-"""The server's side of the database: models, migrations, queries and the command queue."""
+"""The server's side of the database: models, queries and the command queue."""

@@ -46,7 +46,8 @@ _REFERENCES: Final = {
 _TABLES: Final = ("robot", "session", "run", "state", "log", "event", "image", "command",
                   "signal", "rollup", "recent_rollup", "coarse_rollup", "change", "watermark",
                   "retention_limit", "parameter", "parameter_value", "breakpoint", "trial_set",
-                  "trial", "kept_stretch", "kept_state", "console_line")  # fmt: skip
+                  "trial", "kept_stretch", "kept_state", "console_line",
+                  "row_group", "chunk")  # fmt: skip
 # What a row of foreign origin may hold: values of any type, numbers, text and nesting that cannot
 # be stored, a run that is not there.
 _UNSTORABLE: Final = (
@@ -179,6 +180,8 @@ def _check(table: str, name: str, kind: str) -> tuple[str, str]:
         return f"CASE typeof({name}) WHEN 'text' THEN {checked} ELSE 0 END", "JSON"
     if kind == "TEXT":
         return f"typeof({name}) = 'text'", "text"
+    if kind == "BLOB":
+        return f"typeof({name}) = 'blob'", "bytes"
     if "INT" in kind:
         return f"typeof({name}) = 'integer' AND abs({name} / 2) <= {_MAX_INTEGER // 2}", "integer"
     limit = _MAX_FLOAT

@@ -159,7 +159,9 @@ def _require_fit(connection: sqlite3.Connection, source: Path, run_id: int | Non
         for name in ("main", "source")
     ]
     if versions[0] != versions[1]:
-        raise InvalidInputError(f"{source} has another schema: run 'webots-mcp migrate' on it")
+        raise InvalidInputError(
+            f"{source} has schema {versions[1]}, this webots-mcp needs {versions[0]}"
+        )
     require_shipped(connection, schema="source")
     recording, nameless = connection.execute(_UNFIT, {"run": run_id}).fetchone()
     subject = f"{source}" if run_id is None else f"run {run_id}"

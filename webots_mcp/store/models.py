@@ -16,6 +16,7 @@ from sqlalchemy import (
     ForeignKey,
     Index,
     Integer,
+    LargeBinary,
     Text,
     UniqueConstraint,
     text,
@@ -27,6 +28,10 @@ SQLModel.metadata.naming_convention = {
     "fk": "fk_%(table_name)s_%(column_0_name)s",
     "uq": "uq_%(table_name)s_%(column_0_name)s",
 }
+STATISTICS = (
+    "row_count", "value_count", "change_count", "first", "last", "min", "max", "sum",
+    "squared_deviations", "largest_step",
+)  # fmt: skip
 _KEEP_IDS = {"sqlite_autoincrement": True}
 _UUID = "random (version 4); names the row among those of all machines"
 
@@ -125,8 +130,8 @@ class Session(SQLModel, table=True):
         "the host's monotonic clock at last_seen_wall_time_s"
     )
     extern: bool | None = _column(Integer, "1 where nobody starts the controller again")
-    hold_mode: str | None = _text("simulation mode to go back to when the hold ends")
-    adopted_rows: int = _count("number of the last entry taken in from its file beside")
+    mode_before_pause: str | None = _text("simulation mode to go back to when the hold ends")
+    last_adopted_entry: int = _count("number of the last entry taken in from its file beside")
     throttle_interval: int | None = _column(Integer, "of so many publish() calls one is recorded")
 
 
@@ -156,6 +161,7 @@ class Run(SQLModel, table=True):
     note: str | None = _text()
     keep: bool = _count("1: retention deletes nothing of this run")
     purged_rows: int = _count("of the rows, those that retention has deleted")
+    is_chunked: bool = _count("1 once it has ended and none of its rows wait for a chunk")
     uuid: str | None = _text(_UUID)
     rolled_state_id: int = _count("last state.id in the rollups, where beyond the watermark")
     coarse_end: int | None = _column(
@@ -175,10 +181,17 @@ class State(SQLModel, table=True):
     odd: str | None = _text("JSON object: path of a replaced value to what it was (nan, inf, ...)")
 
 
+_HAS_ROLE = text("role IS NOT NULL")
+
+
 class Signal(SQLModel, table=True):
     """A number, flag or text that a robot's states hold, by its dotted name."""
 
-    __table_args__ = (UniqueConstraint("robot_id", "name"), _KEEP_IDS)
+    __table_args__ = (
+        UniqueConstraint("robot_id", "name"),
+        Index(None, "robot_id", "role", sqlite_where=_HAS_ROLE, postgresql_where=_HAS_ROLE),
+        _KEEP_IDS,
+    )
     id: int | None = _id()
     robot_id: int = _to("robot")
     name: str = _text("dotted: pose.0, sensors.front, lidar.min", nullable=False)
@@ -186,11 +199,14 @@ class Signal(SQLModel, table=True):
     unit: str | None = _text("where the name tells it")
     path: str = _text("for json_extract(state.data, path)", nullable=False)
     reduce: str | None = _text("count, min, max, mean or argmin of the long array at path")
+    role: str | None = _text(
+        "x, y, z, yaw, mode, speed, commanded_speed, wheel or commanded_wheel; x2 without an x"
+    )
     first_seen_wall_time_s: float = _number(nullable=False)
     last_seen_wall_time_s: float = _number(nullable=False)
     rows: int = _count("state rows that held it, up to the watermark")
-    null_rows: int = _count("of them without a value")
-    odd_rows: int = _count("of them with a value that JSON cannot hold (nan, inf, ...)")
+    null_row_count: int = _count("of them without a value")
+    replaced_row_count: int = _count("of them with a value that JSON cannot hold (nan, inf, ...)")
     min: float | None = _number()
     max: float | None = _number()
 
@@ -272,10 +288,58 @@ class CoarseRollup(_Summary, table=True):
         "JSON: the swings of what a robot swings with, each as [begin, end, half swings, period "
         "in s, amplitude, explained share]; null where they were not looked for",
     )
-    standstills: str | None = _text(
-        "JSON, at the signal of x: where the robot stood still, and what shows whether it should "
-        "have moved; null where that was not looked for",
+
+
+class RowGroup(SQLModel, table=True):
+    """About 1,024 state rows of a run that follow each other, whose values stand in chunks.
+
+    The rows themselves may have been deleted since.
+    """
+
+    __tablename__: ClassVar[Any] = "row_group"
+    __table_args__ = (Index(None, "run_id", "start_sim_time_s"), _KEEP_IDS)
+    id: int | None = _id()
+    run_id: int = _to("run")
+    start_sim_time_s: float = _number("of the first row", nullable=False)
+    end_sim_time_s: float = _number("of the last row", nullable=False)
+    last_state_id: int = _column(Integer, "state.id of the last row", nullable=False)
+    max_state_id: int = _column(Integer, "the greatest state.id among them", nullable=False)
+    row_count: int = _column(Integer, nullable=False)
+    is_complete: bool = _column(Integer, "1 once all of its chunks are there", nullable=False)
+
+
+class Chunk(SQLModel, table=True):
+    """The values of one signal in a group of rows, compressed, and what they come to."""
+
+    __table_args__ = (
+        Index("ix_chunk_statistics", "run_id", "signal_id", "group_id", *STATISTICS),
+        Index(None, "group_id"),
     )
+    id: int | None = _id()
+    group_id: int = _to("row_group")
+    run_id: int = _column(Integer, nullable=False)
+    signal_id: int = _column(
+        Integer,
+        "signal.id; 0: simulation times, -1: wall times, -2: ids of the state rows",
+        nullable=False,
+    )
+    row_count: int = _column(Integer, "rows whose state has the signal", nullable=False)
+    value_count: int = _column(Integer, "of them with a value", nullable=False)
+    change_count: int = _column(Integer, "values unlike the one before", nullable=False)
+    first: float | None = _number("of numbers and flags (0, 1), as all that follows")
+    last: float | None = _number()
+    min: float | None = _number()
+    max: float | None = _number()
+    sum: float | None = _number()
+    squared_deviations: float | None = _number("sum of squared deviations from the mean")
+    largest_step: float | None = _number("largest difference of values that follow each other")
+    codec: str = _text("how numbers are compressed", nullable=False)
+    numbers: bytes | None = _column(LargeBinary, "CRC-32, then the numbers compressed")
+    codes: bytes | None = _column(
+        LargeBinary,
+        "zlib: for each row 0 a number, 1 no such key, else 2 + the place of its label",
+    )
+    labels: str | None = _text("JSON array; an item that is an array says what was replaced")
 
 
 class Change(SQLModel, table=True):

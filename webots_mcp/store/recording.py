@@ -1,9 +1,8 @@
-"""A recording as questions are asked of it: opened anew for each, migrated where needed."""
+"""A recording as questions are asked of it: opened anew for each."""
 
 from __future__ import annotations
 
 import sqlite3
-import threading
 import time
 from collections.abc import Generator
 from contextlib import closing, contextmanager
@@ -19,7 +18,6 @@ from webots_mcp.errors import (
     MalformedRowError,
     NoDatabaseError,
     NothingRecordedError,
-    SchemaTooOldError,
 )
 from webots_mcp.queue import any_unfinished
 from webots_mcp.schema import create_schema, require_current, schema_version
@@ -130,7 +128,6 @@ class Recording:
     read_only: bool = False
     limits: Asked = field(default_factory=dict[str, Any])
     asker: str = "mcp"
-    _migrating: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     @contextmanager
     def reader(self) -> Generator[sqlite3.Connection]:
@@ -178,28 +175,6 @@ class Recording:
         ):
             create_schema(connection)
 
-    def migrate(self, revision: str = "head") -> tuple[int, int]:
-        """Bring the database forward to a revision of Alembic's.
-
-        Returns:
-            The schema version before and after.
-
-        Raises:
-            DatabaseError: It cannot be written, or is not ours.
-        """
-        from sqlalchemy.exc import SQLAlchemyError
-
-        from webots_mcp.store.migrate import upgrade
-
-        with self._migrating, self._explained():
-            try:
-                return upgrade(self.database, revision)
-            except SQLAlchemyError as error:
-                raise DatabaseError(
-                    f"the database at {name_of(self.database)} could not be migrated: {error}; "
-                    "stop what uses it and run 'webots-mcp migrate'"
-                ) from error
-
     @contextmanager
     def _opened(self, role: Role) -> Generator[sqlite3.Connection]:
         with self._explained(), closing(self._open(role)) as connection:
@@ -220,14 +195,6 @@ class Recording:
             raise NoDatabaseError(f"{error}. {GETTING_STARTED}") from error
         try:
             self._require_ours(connection)
-        except SchemaTooOldError as error:
-            connection.close()
-            if isinstance(connection, FrozenConnection):
-                raise SchemaTooOldError(
-                    f"{error}, of a copy in a folder that can be written; {_FROZEN}"
-                ) from error
-            self._migrate()
-            return connect(self.database, role)
         except BaseException:
             connection.close()
             raise
@@ -240,15 +207,6 @@ class Recording:
                 f"there yet. {GETTING_STARTED}"
             )
         require_current(connection)
-
-    def _migrate(self) -> None:
-        """Bring an older schema forward, once; importing Alembic costs a second."""
-        if self.read_only:
-            raise SchemaTooOldError(
-                f"the database at {name_of(self.database)} has an older schema, which a reader "
-                "does not migrate: run 'webots-mcp migrate'"
-            )
-        self.migrate()
 
 
 def look(connection: sqlite3.Connection, robot: str | None, run_id: int | None = None) -> View:

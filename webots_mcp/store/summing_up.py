@@ -17,6 +17,7 @@ from webots_mcp.connection import FrozenConnection
 from webots_mcp.errors import DatabaseError
 from webots_mcp.leases import holder_of
 from webots_mcp.maintenance import Maintainer
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.robots import list_robots
 from webots_mcp.store.rollup.rolling import BATCH_ROWS, roll, watermark
@@ -66,7 +67,9 @@ def sum_up(
         with recording.writer() as connection, _checkpoints(recording):
             live = any(robot.live for robot in list_robots(connection, time.time()))
             while not why and mark <= last:
-                done = roll(connection, BATCH_ROWS, _PAUSE_S if live else 0.0).done
+                pause_s = _PAUSE_S if live else 0.0
+                done = roll(connection, BATCH_ROWS, pause_s).done
+                make_chunks(connection, BATCH_ROWS, pause_s)
                 mark = watermark(connection)
                 if progress is not None:
                     progress(min(mark, last) - first, last - first)

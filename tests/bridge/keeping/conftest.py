@@ -43,7 +43,7 @@ def bridge(make: Make) -> MCPBridge:
 def kept_numbers(recording: Recording) -> list[list[int]]:
     """The `n` of all that each kept stretch has, in order of time."""
     sql = (
-        "SELECT json_extract(data, '$.n') FROM every_state "
+        "SELECT json_extract(data, '$.n') FROM all_state "
         "WHERE run_id = ? AND sim_time_s BETWEEN ? AND ? ORDER BY sim_time_s"
     )
     return [recording.rows(sql, *where) for *where, _ in recording.rows(STRETCHES)]

@@ -40,7 +40,10 @@ def test_a_time_shorter_than_a_step_runs_one(
     rounds.drive(5)
     _, result, error = recording.fate(sent)
     assert error is None
-    assert (result["ended"], result["advanced_s"]) == ("time over", pytest.approx(STEP_S))
+    assert (result["ended"], result["advanced_s"]) == (
+        "simulation time reached",
+        pytest.approx(STEP_S),
+    )
     assert len(paused) == 1
 
 
@@ -69,7 +72,7 @@ def test_it_pauses_at_the_step_that_reaches_the_time(
     (at_s,) = paused
     began = 4  # it is claimed in the fourth round
     assert at_s == pytest.approx((began + 100) * STEP_S)
-    assert result["ended"] == "time over"
+    assert result["ended"] == "simulation time reached"
     assert result["advanced_s"] == pytest.approx(100 * STEP_S)
     assert began + 100 in [state["n"] for state in recording.states()]
 

@@ -332,23 +332,14 @@ def test_a_folder_that_holds_other_things_is_refused_and_not_touched(tmp_path: P
         write_all(str(tmp_path / "thesis.tex"), STEPS)
 
 
-def test_a_pool_that_a_newer_version_made_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("schema", "next_step"), [(99, "update webots-mcp"), (9, "ship the recordings anew")]
+)
+def test_a_pool_of_another_version_is_refused(tmp_path: Path, schema: int, next_step: str) -> None:
     write_all(str(tmp_path), STEPS)
-    (tmp_path / "_pool").write_text('{"format": 1, "schema": 99}')
-    with pytest.raises(PoolError, match=r"schema 99.*update webots-mcp"):
+    (tmp_path / "_pool").write_text(f'{{"format": 1, "schema": {schema}}}')
+    with pytest.raises(PoolError, match=f"schema {schema}.*{next_step}"):
         write_all(str(tmp_path), STEPS)
-
-
-def test_a_pool_of_an_older_version_gets_the_columns_that_it_lacks(tmp_path: Path) -> None:
-    write_all(str(tmp_path), STEPS[:1])
-    (tmp_path / "_pool").write_text('{"format": 1, "schema": 8}')
-    for file in tmp_path.rglob("*/part-*.parquet"):
-        held: Any = parquet.ParquetFile(file).read()
-        lacking = [name for name in held.column_names if name not in ("logger", "coarse_end")]
-        parquet.write_table(held.select(lacking), file)
-    write_all(str(tmp_path), STEPS)
-    assert ids(pooled(str(tmp_path), UUID, "log")) == [1, 2, 3, 4, 5, 6]
-    assert json.loads((tmp_path / "_pool").read_text())["schema"] > 8
 
 
 @pytest.mark.parametrize("name", ["_progress", "part"])

@@ -72,23 +72,14 @@ def test_two_that_prepare_at_once_make_one_pool(postgres: Server, database: str)
     with ThreadPoolExecutor() as both:
         made = [both.submit(prepare, postgres.url(database), "here") for _ in range(3)]
         assert [each.result() for each in made] == [None] * 3
-    assert postgres.execute(database, "SELECT version_num FROM pool_version") == [("0009",)]
+    assert postgres.execute(database, "SELECT version_num FROM pool_version") == [
+        (f"{SCHEMA_VERSION:04}",)
+    ]
 
 
-def test_an_older_pool_is_brought_forward_with_its_rows(postgres: Server, database: str) -> None:
-    url = postgres.url(database)
-    prepare(url, "here", "0005")
-    former = "11111111-2222-4333-8444-555555555555"
-    postgres.execute(
-        database,
-        "INSERT INTO robot (recording_uuid, id, name, kind, devices, first_seen_wall_time_s, "
-        f"last_seen_wall_time_s) VALUES ('{former}', 1, 'rover', 'Robot', '{{}}', 0, 0)",
-    )
-    prepare(url, "here")
-    version = f"{SCHEMA_VERSION:04}"
-    assert postgres.execute(database, "SELECT version_num FROM pool_version") == [(version,)]
-    assert postgres.execute(database, "SELECT robot, x_m FROM robot_now") == [("rover", None)]
-    assert "kept_state" in relations(postgres, database)
+def test_an_older_pool_is_left_alone(postgres: Server, pool: str) -> None:
+    postgres.execute(pool, "UPDATE pool_version SET version_num = '0009'")
+    assert "schema 9, of an older webots-mcp: ship the recordings anew" in refusal(postgres, pool)
 
 
 def test_a_newer_pool_is_left_alone(postgres: Server, pool: str) -> None:

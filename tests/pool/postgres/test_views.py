@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import random
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
@@ -17,9 +16,16 @@ from tests.memory import memory_connection
 from tests.pool.postgres.shipped import ship, uuid_of
 from tests.postgres import Server
 from tests.recordings.rover import Recorder, record_rover, start_run
-from tests.store.test_views import CHOICES, MODES, PLACES, POSES
+from tests.store.test_views import (
+    CHOICES,
+    MODES,
+    PLACES,
+    POSES,
+    SPEEDS,
+    record_robots,
+    some_states,
+)
 from webots_mcp.connection import connect
-from webots_mcp.naming import find_mode, find_position, flatten, metres_in
 from webots_mcp.plugins.pool.postgres.postgres_views import VIEWS
 from webots_mcp.store.rollup.rolling import roll
 
@@ -59,8 +65,9 @@ def shipped(postgres: Server, pool_template: str, recordings: dict[str, sqlite3.
 
 
 def record_odd(connection: sqlite3.Connection) -> None:
+    states = [*(state for state, _ in POSES), *PLACES, *MODES, *CHOICES, *SPEEDS, *STATES]
+    record_robots(connection, [*states, *some_states(200)])
     recorder = start_run(connection)
-    states = [*(state for state, _ in POSES), *PLACES, *MODES, *CHOICES, *STATES]
     for number, state in enumerate(states):
         text = json.dumps(state, ensure_ascii=False).replace("Infinity", "1e400")
         recorder.insert("state", **recorder.at(float(number)), data=text)
@@ -78,6 +85,7 @@ def record_odd(connection: sqlite3.Connection) -> None:
     recorder.insert("kept_state", **recorder.at(2.5), call=3, data='{"x": 1}')
     recorder.end_run("finished")
     recorder.robot("idle")
+    assert roll(connection, 100_000).done
 
 
 def record_parameters(recorder: Recorder) -> None:
@@ -137,58 +145,3 @@ def test_how_old_the_newest_state_is(
     (here,) = recordings["rover"].execute(sql).fetchone()
     ((there,),) = postgres.execute(shipped, sql)
     assert there == pytest.approx(here, abs=60)
-
-
-WORDS = (
-    "pose", "position", "gps", "odom", "x", "y", "X", "mm", "cm", "km", "m", "robot", "current",
-    "goal", "target", "vel", "ball", "mode", "state", "status", "name", "str", "last", "next",
-    "action", "arm", "GPS", "IMU", "nav", "task", "own", "0", "1", "speed", "solid",
-)  # fmt: skip
-
-
-def some_key(numbers: random.Random) -> str:
-    words = numbers.choices(WORDS, k=numbers.randint(1, 3))
-    camel = words[0] + "".join(word.capitalize() for word in words[1:])
-    return numbers.choice(("_".join(words), camel, camel[:1].upper() + camel[1:], camel.upper()))
-
-
-def some_value(numbers: random.Random, depth: int = 0) -> Any:
-    kind = numbers.random() + depth / 10
-    if kind > 0.4:
-        return numbers.choice((1, 2, 3.5, -7, 0.25, 100, "go", "wait", "", None, True))
-    if kind > 0.25:
-        return [some_value(numbers, depth + 1) for _ in range(numbers.randint(1, 6))]
-    return {some_key(numbers): some_value(numbers, depth + 1) for _ in range(numbers.randint(1, 3))}
-
-
-def some_state(numbers: random.Random) -> dict[str, Any]:
-    """A state with a pair of coordinates in a branch, as a rule, and with anything else."""
-    state = {some_key(numbers): some_value(numbers) for _ in range(numbers.randint(1, 4))}
-    before, after = numbers.choice(("", "pos_", "robot_")), numbers.choice(("", "_mm", "_cm", "_m"))
-    pair = {f"{before}x{after}": 1.5, f"{before}y{after}": 2}
-    return state | ({some_key(numbers): pair} if numbers.random() < 0.7 else {})
-
-
-def named(state: dict[str, Any]) -> tuple[float | None, float | None, str | None]:
-    """The position in metres and the mode, by the rule of the tools."""
-    values = flatten(state)
-    names = {kind: [n for n, v in values.items() if type(v) is kind] for kind in (int, float, str)}
-    place = find_position([*names[int], *names[float]])
-    x, y = (float(values[n] or 0) * metres_in(n) for n in place) if place else (None, None)
-    mode = find_mode(names[str], names[int])
-    return x, y, None if mode is None else str(values[mode])
-
-
-def test_position_and_mode_are_found_as_the_tools_find_them(postgres: Server, pool: str) -> None:
-    numbers = random.Random(11)
-    states = [some_state(numbers) for _ in range(400)]
-    found = postgres.execute(
-        pool,
-        "SELECT (position_of(j))[1], (position_of(j))[2], mode_of(j) "
-        "FROM unnest(%s::jsonb[]) WITH ORDINALITY s (j, number) ORDER BY number",
-        [json.dumps(state) for state in states],
-    )
-    wanted = [named(state) for state in states]
-    assert sum(x is not None for x, _, _ in wanted) > 50 < sum(bool(mode) for _, _, mode in wanted)
-    for state, there, here in zip(states, found, wanted, strict=True):
-        assert there == pytest.approx(here), json.dumps(state)

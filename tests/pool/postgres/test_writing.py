@@ -159,8 +159,13 @@ def test_what_jsonb_lacks_is_held_as_text(
     texts = ["", "{", '{"a": NaN}', '{"a": "\\u0000"}', "[" * 100_000, "1e999999"]
     good = batch("state", data='{"pose": [1, 2]}')
     odd = [batch("state", id=2 + number, data=text) for number, text in enumerate(texts)]
+    signals = [
+        batch("signal", id=3 + number, name=f"pose.{number}", path=f"$.pose[{number}]", role=role)
+        for number, role in enumerate("xy")
+    ]
     with target.shipment(OTHER) as shipment:
         shipment.write([Batch(good.table, [*good.rows, *each.rows]) for each in odd], {})
+        shipment.write([batch("run", id=0), *signals], {})
     sql = "SELECT data #>> '{}' FROM state WHERE jsonb_typeof(data) = 'string' ORDER BY id"
     assert postgres.execute(pool, sql) == [(text,) for text in texts]
     assert first(postgres, pool, "SELECT x_m FROM robot_trajectory WHERE state_id = 1") == 1

@@ -154,8 +154,10 @@ async def test_of_each_kind_it_is_told_whether_it_was_found_is_absent_or_was_not
         assert len(lacking) == len(set(lacking))
         asked = {*(kinds or (kind.name for kind in asked_kinds(EventOptions())))}
         assert {*told.get("found", ()), *lacking} == asked
-    (answer,) = [await tell(story, "webots_find_events", kinds=["still"], signals=["mode"])]
-    assert "still" in answer["verdicts"]["came_near"] or answer["verdicts"]["found"]["still"]
+    (answer,) = [await tell(story, "webots_find_events", kinds=["standstill"], signals=["mode"])]
+    assert (
+        "standstill" in answer["verdicts"]["came_near"] or answer["verdicts"]["found"]["standstill"]
+    )
     blind = await tell(story, "webots_find_events", kinds=["silent"], signals=["mode"])
     assert blind["verdicts"] == {
         "not_searched": {"silent": "no number was published, or none with these names"}

@@ -59,7 +59,7 @@ async def test_an_extreme_is_never_lost_in_a_bucket(story: Path) -> None:
     assert max(run["numbers"]["ir"]["max"]) == 5.0
     whole = run["numbers"]["ir"]["whole"]
     assert (whole["max"], whole["max_at_s"]) == (5.0, 70.0)
-    assert run["gaps"] == [[89.9, 95.0]]
+    assert run["recording_gaps"] == [[89.9, 95.0]]
     assert sum(run["count"]) == run["rows"] == 1150
 
 

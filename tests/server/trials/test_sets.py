@@ -37,7 +37,7 @@ async def test_a_grid_is_tried_and_ranked_and_the_parameters_are_set_back(
         assert (other["kp"], other["score"]) == (1.0, pytest.approx(0.16))
         assert best["range"] == [best["score"]] * 2
         assert answer["ranked"]["in_every_row"]["gait"] == "trot"
-        assert answer["best_is_better"] is True
+        assert answer["is_best_confirmed"] is True
         assert "is ahead of the second best" in answer["verdict"]
         assert await ask(client, "webots_get_trials") == answer | {
             name: pytest.approx(answer[name], abs=5) for name in ("age_s",)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from webots_mcp.store.analysis.spread import (
-    MATTERS_SD,
+    MIN_EFFECT_SD,
     Spread,
     Verdict,
     chance_of,
@@ -46,9 +46,9 @@ def test_the_chance_is_a_share_and_the_same_both_ways(one: list[float], other: l
 
 
 def told(
-    groups: list[list[float]], tests: int = 1, matters_sd: float = MATTERS_SD
+    groups: list[list[float]], tests: int = 1, min_effect_sd: float = MIN_EFFECT_SD
 ) -> list[bool | None]:
-    return [each.different for each in verdicts_on(groups, tests, matters_sd=matters_sd)]
+    return [each.different for each in verdicts_on(groups, tests, min_effect_sd=min_effect_sd)]
 
 
 def test_of_one_run_each_nothing_can_be_told() -> None:
@@ -127,7 +127,7 @@ def test_no_is_said_only_where_a_difference_that_matters_is_excluded() -> None:
 def test_how_much_matters_is_the_askers_to_say() -> None:
     first, other = [1.0, 2.0, 3.0, 4.0], [2.0, 3.0, 4.0, 5.0]
     assert told([first, other]) == [False, None]
-    assert told([first, other], matters_sd=3.0) == [False, False]
+    assert told([first, other], min_effect_sd=3.0) == [False, False]
 
 
 @pytest.mark.parametrize(

@@ -118,3 +118,17 @@ def test_a_creep_that_bends_is_no_standstill(noise_m: float) -> None:
     phases = [(10, 0.2, 0.0), (90, 0.002, 0.03), (10, 0.2, 0.0)]
     track, _ = noisy_track(phases, 0.1, noise_m)
     assert find_standstills(track, RADIUS_M, LEAST_S) == []
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.001])
+@pytest.mark.parametrize("twitches_m", [[0.005, 0.025], [0.012] * 3, [0.004] * 8])
+def test_who_twitches_in_a_place_stands_once(twitches_m: list[float], noise_m: float) -> None:
+    pause_s = 44.0 / (len(twitches_m) + 1)
+    phases = [(50.0, 0.2, 0.0), (pause_s, 0.0, 0.0)]
+    for twitch_m in twitches_m:
+        phases += [(0.1, 10 * twitch_m, 0.0), (pause_s, 0.0, 0.0)]
+    track, _ = noisy_track([*phases, (30.0, 0.2, 0.0)], 0.1, noise_m)
+    ends_s = 50.0, 94.0 + 0.1 * len(twitches_m)
+    (found,) = find_standstills(track, RADIUS_M, LEAST_S)
+    told_s = track.times[found.start], track.times[found.last]
+    assert told_s == pytest.approx(ends_s, abs=0.25)

@@ -13,6 +13,7 @@ import pytest
 
 from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading.ranges import Scope, find_range
@@ -115,25 +116,20 @@ def test_a_signal_that_few_rows_of_the_run_hold_is_not_silent_in_the_others(
     assert find_events(empty, asked, EventOptions(kinds=("silent",))).events == ()
 
 
-@pytest.mark.parametrize("rolled", [True, False])
-def test_what_a_short_stretch_costs_does_not_grow_with_the_run(
-    empty: sqlite3.Connection, rolled: bool
-) -> None:
+def test_what_a_short_stretch_costs_does_not_grow_with_the_run(empty: sqlite3.Connection) -> None:
     recorder = start_run(empty)
-    costs = [after_so_many_rows(recorder, empty, rows, rolled) for rows in (2000, 10_000)]
+    costs = [after_so_many_rows(recorder, empty, rows) for rows in (2048, 10_240)]
     assert costs[1] < 1.5 * costs[0]
 
 
-def after_so_many_rows(
-    recorder: Recorder, connection: sqlite3.Connection, rows: int, rolled: bool
-) -> int:
+def after_so_many_rows(recorder: Recorder, connection: sqlite3.Connection, rows: int) -> int:
     """What the last second of the run costs; its mode rests, and one value is never there."""
     (first,) = connection.execute("SELECT count(*) FROM state").fetchone()
     for step in range(first, rows):
         state = {"pose": [step * 0.02, 0.0], "mode": "drive", "text": f"row {step}", "none": None}
         recorder.publish(step * 0.1, state)
-    if rolled:
-        roll(connection, 100_000)
+    roll(connection, 100_000)
+    make_chunks(connection, 100_000)
     return calls(connection)
 
 

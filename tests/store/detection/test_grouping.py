@@ -49,22 +49,22 @@ def of_kind(events: Events, kind: str) -> list[Event]:
 
 
 def test_standstills_of_one_mode_are_one_event_with_what_they_share(docking: Recorder) -> None:
-    told = found(docking, "still")
+    told = found(docking, "standstill")
     group, last = told.events
     assert (group.count, group.details["mode"]) == (CYCLES - 1, "dock")
     assert group.start_s == pytest.approx(14.0, abs=0.2)
     assert group.details["says"].startswith("9 standstills, the first at 1")
     assert "each 6" in group.details["says"] or "median 6" in group.details["says"]
     assert group.details["x_m"] == "2.8 to 25.2"
-    assert "commanded_m_s 0" in group.details["not_stuck"]
+    assert "commanded_m_s 0" in group.details["why_not_stuck"]
     assert last.ongoing and last.count == 1
-    assert told.verdicts.found == {"still": CYCLES}
+    assert told.verdicts.found == {"standstill": CYCLES}
 
 
 def test_alike_events_are_told_one_by_one_where_that_is_asked_for(docking: Recorder) -> None:
-    told = found(docking, "still", group=False)
+    told = found(docking, "standstill", group=False)
     assert [each.count for each in told.events] == [1] * CYCLES
-    assert told.verdicts.found == {"still": CYCLES}
+    assert told.verdicts.found == {"standstill": CYCLES}
 
 
 def test_a_flag_that_flickers_is_one_event_with_its_values(docking: Recorder) -> None:
@@ -76,10 +76,12 @@ def test_a_flag_that_flickers_is_one_event_with_its_values(docking: Recorder) ->
     assert told.verdicts.found["change"] == sum(each.count for each in told.events)
 
 
-def test_a_group_says_how_exactly_those_of_its_begins_are_known_that_samples_tell() -> None:
-    rough = {"mode": "dock", "within_s": 0.6}
+def test_a_group_says_how_exactly_its_begins_are_known() -> None:
+    rough = {"within_s": 0.6}
     events = [
-        Event("still", 1, at_s, at_s + 9.0, 0.0, details=rough if at_s else {"mode": "dock"})
+        Event(
+            "silent", 1, at_s, at_s + 9.0, 0.0, "front", details=rough if at_s else {"mode": "dock"}
+        )
         for at_s in (0.0, 20.0, 40.0, 60.0)
     ]
     (group,) = grouped(events, {})
@@ -112,7 +114,7 @@ def test_lines_that_differ_in_their_numbers_only_are_one_event(empty: sqlite3.Co
 
 def test_what_matters_is_told_beside_thousands_of_changes(docking: Recorder) -> None:
     told = found(docking, limit=8)
-    assert of_kind(told, "still") and of_kind(told, "run")
+    assert of_kind(told, "standstill") and of_kind(told, "run")
     assert told.left_out == {} or set(told.left_out) == {"change"}
 
 

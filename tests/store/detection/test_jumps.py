@@ -14,7 +14,6 @@ import pytest
 from tests.recordings.rover import start_run
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.questions.events import find_events
-from webots_mcp.store.reading import rows, views
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.rollup.rolling import roll
 
@@ -95,16 +94,6 @@ def test_dropouts_everywhere_in_a_long_range_are_found(
     record(empty, lambda t: {"front": 0.0 if round(10 * t) % 70 == 33 else 2 + 0.1 * math.sin(t)})
     (dropouts,) = jumps(empty)
     assert dropouts.count == sum(step % 70 == 33 for step in range(2000))
-
-
-def test_what_of_a_long_range_is_too_much_to_be_read_for_jumps_is_told(
-    empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(rows, "RAW_ROWS", 100)
-    monkeypatch.setattr(views, "JUMP_ROWS", 500)
-    record(empty, lambda t: {"front": 0.0 if round(10 * t) % 70 == 33 else 2 + 0.1 * math.sin(t)})
-    answer = find_events(empty, find_range(empty, Scope()), EventOptions(kinds=("jump",)))
-    assert "only in 5 of 20 stretches of 10 s" in answer.verdicts.not_searched["jump"]
 
 
 def test_a_swing_whose_rows_meet_the_same_values_again_does_not_drop_out(

@@ -8,10 +8,7 @@ from itertools import count
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from tests.memory import memory_connection
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.extent import Detection
@@ -58,73 +55,6 @@ def test_swings_and_leaps_are_searched_in_the_whole_of_a_long_run(long: sqlite3.
     assert "not before" not in str(found.verdicts.not_searched)
 
 
-def test_stretches_that_are_read_for_leaps_are_not_read_again_for_swings(
-    long: sqlite3.Connection,
-) -> None:
-    long.execute("UPDATE rollup SET largest_step = NULL")  # else only parts of them are read
-    assert 0 < reads(long, "jump", "oscillation") < reads(long, "jump") + reads(long, "oscillation")
-
-
-def test_leaps_are_looked_for_only_where_the_rollups_do_not_rule_them_out(
-    long: sqlite3.Connection,
-) -> None:
-    found, few = leaps(long), reads(long, "jump")
-    long.execute("UPDATE rollup SET largest_step = NULL")  # as older versions left them
-    assert leaps(long) == found
-    assert reads(long, "jump") > few
-
-
-def leaps(connection: sqlite3.Connection) -> list[tuple[float, Any]]:
-    asked = EventOptions(kinds=("jump",), signals=("pose.*",))
-    found = find_events(connection, find_range(connection, Scope()), asked, limit=1000, group=False)
-    return [(each.start_s, each.details["distance_m"]) for each in found.events]
-
-
-course = st.lists(
-    st.tuples(
-        st.sampled_from([0.0, 0.1, 0.1, 0.1, 25.0]),
-        st.sampled_from([0.0, 0.02, 0.02, 0.2, 0.25, 5.0]) | st.none(),
-        st.sampled_from([0.0, 0.0, 0.22, -5.0]) | st.none(),
-    ),
-    min_size=30,
-    max_size=120,
-)
-
-
-@settings(max_examples=30, deadline=None)
-@given(course, st.integers(10, 60))
-def test_ruling_leaps_out_changes_none_that_are_found(
-    steps: list[tuple[float, float | None, float | None]], budget: int
-) -> None:
-    with memory_connection() as connection, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rows, "RAW_ROWS", 20)
-        patch.setattr(views, "STRETCH_ROWS", 15)
-        recorder = start_run(connection)
-        time_s, place = 0.0, [0.0, 0.0]
-        for index, (later_s, *moves) in enumerate(steps):
-            time_s += later_s
-            place = [at + (move or 0.0) for at, move in zip(place, moves, strict=True)]
-            told = [None if move is None else at for at, move in zip(place, moves, strict=True)]
-            recorder.publish(time_s, {"pose": told if index else place})
-        while not roll(connection, budget).done:
-            pass
-        found = leaps(connection)
-        connection.execute("UPDATE rollup SET largest_step = NULL")
-        connection.execute("UPDATE recent_rollup SET largest_step = NULL")
-        assert leaps(connection) == found
-
-
-def reads(connection: sqlite3.Connection, *kinds: str) -> int:
-    """How many statements read values of rows."""
-    statements: list[str] = []
-    connection.set_trace_callback(statements.append)
-    find_events(connection, find_range(connection, Scope()), EventOptions(kinds=kinds))
-    connection.set_trace_callback(None)
-    return sum(
-        "json_extract(data" in each and "ORDER BY sim_time_s, row_id" in each for each in statements
-    )
-
-
 def test_what_there_was_no_time_for_is_told_by_time(long: sqlite3.Connection) -> None:
     ticks = count()
     asked = find_range(long, Scope())
@@ -139,25 +69,10 @@ def test_what_there_was_no_time_for_is_told_by_time(long: sqlite3.Connection) ->
     assert find_events(long, rest, options).events[0].start_s == pytest.approx(100, abs=0.5)
 
 
-def test_standstills_take_no_time_from_kinds_that_cost_less(long: sqlite3.Connection) -> None:
-    """Once samples are read for them, the time is over."""
-    late: list[str] = []
-    options = EventOptions(kinds=("still", "stuck", "silent", "flat", "jump", "oscillation"))
-    kinds, deadline = asked_kinds(options), Deadline(6.0, lambda: 100.0 * len(late))
-    asked, ledger = find_range(long, Scope()), Ledger()
-    detection = Detection(long, known_signals(long, asked), kinds, options, deadline, ledger)
-    long.set_trace_callback(lambda each: late.append(each) if "RECURSIVE tick" in each else None)
-    found = detection.events_touching(asked.segments[0])
-    long.set_trace_callback(None)
-    told = ledger.verdicts(kinds, found).not_searched
-    assert {kind for kind, why in told.items() if "time limit reached" in why} == {"still", "stuck"}
-    assert {each.kind for each in found} == {"flat", "jump", "oscillation"}
-
-
 def test_where_the_robot_stood_it_is_told_as_stuck_too_though_the_time_is_over_by_then(
     empty: sqlite3.Connection,
 ) -> None:
-    """Both are found at once: as many statements as are enough for `still` are for both."""
+    """Both are found at once: as many statements as are enough for `standstill` are for both."""
     recorder = start_run(empty)
     for step in range(600):
         there_m = 0.03 * (min(step, 200) + max(step - 400, 0))
@@ -176,11 +91,11 @@ def test_where_the_robot_stood_it_is_told_as_stuck_too_though_the_time_is_over_b
         detection = Detection(empty, known, asked_kinds(options), options, deadline, Ledger())
         return [each.kind for each in detection.events_touching(asked.segments[0])]
 
-    assert found_kinds(("still",), math.inf) == ["still"]
+    assert found_kinds(("standstill",), math.inf) == ["standstill"]
     times = range(1, len(statements) + 1)
-    enough = [each for each in times if found_kinds(("still",), each) == ["still"]]
+    enough = [each for each in times if found_kinds(("standstill",), each) == ["standstill"]]
     assert enough
-    assert all(found_kinds(("still", "stuck"), each) == ["stuck"] for each in enough)
+    assert all(found_kinds(("standstill", "stuck"), each) == ["stuck"] for each in enough)
     empty.set_trace_callback(None)
 
 
@@ -206,7 +121,7 @@ def test_the_position_of_a_run_is_the_one_that_it_published(empty: sqlite3.Conne
     roll(empty, 100_000)
     for run_id in (1, 2):
         found = find_events(
-            empty, find_range(empty, Scope(run_id=run_id)), EventOptions(kinds=("still",))
+            empty, find_range(empty, Scope(run_id=run_id)), EventOptions(kinds=("standstill",))
         )
         assert [round(each.start_s) for each in found.events] == [20], run_id
 
@@ -230,28 +145,9 @@ def stopping(empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch) -> sqli
 def test_standstills_of_a_long_run_that_are_told_begin_and_end_to_the_row(
     stopping: sqlite3.Connection,
 ) -> None:
-    asked, options = find_range(stopping, Scope()), EventOptions(kinds=("still",))
+    asked, options = find_range(stopping, Scope()), EventOptions(kinds=("standstill",))
     found = find_events(stopping, asked, options, limit=3, group=False)
-    assert found.totals == {"still": 10}
+    assert found.totals == {"standstill": 10}
     ends = [(each.start_s, each.end_s) for each in found.events]
     expected = [(60.0 * at + 29.9, 60.0 * at + 59.9) for at in (7, 8, 9)]
     assert ends == [pytest.approx(each, abs=0.11) for each in expected]
-    assert all("within_s" not in each.details for each in found.events)
-    rough = find_events(stopping, asked, options, group=False, exact=False)
-    assert [each.details["within_s"] for each in rough.events] == [0.6] * 10
-
-
-def test_no_rows_are_read_for_the_ends_of_rests_that_the_rollups_tell(
-    stopping: sqlite3.Connection,
-) -> None:
-    def flat() -> list[tuple[float, float]]:
-        asked = EventOptions(kinds=("flat",), signals=("ticks",))
-        found = find_events(stopping, find_range(stopping, Scope()), asked, group=False)
-        return [(each.start_s, each.end_s) for each in found.events]
-
-    told, few = flat(), reads(stopping, "flat")
-    assert few < len(told)  # what shows at other times is read once for all
-    stopping.execute("UPDATE rollup SET last_since_sim_time_s = NULL")  # as older versions left it
-    assert flat() == told
-    assert len(told) == 10
-    assert reads(stopping, "flat") > few

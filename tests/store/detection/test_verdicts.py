@@ -25,9 +25,9 @@ def ask(connection: sqlite3.Connection, rows: int, *kinds: str) -> Verdicts:
 
 
 def test_what_no_run_so_short_can_hold_was_not_searched(empty: sqlite3.Connection) -> None:
-    told = ask(empty, 21, "stuck", "still", "flat", "silent")
+    told = ask(empty, 21, "stuck", "standstill", "flat", "silent")
     run = "run 1 lasted only 2 s; this kind needs at least"
-    assert told.gaps == {"still, stuck": f"{run} 3 s", "flat": f"{run} 20 s"}
+    assert told.gaps == {"standstill, stuck": f"{run} 3 s", "flat": f"{run} 20 s"}
     assert told.far == ["silent"]
 
 

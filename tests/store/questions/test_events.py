@@ -13,13 +13,14 @@ import pytest
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from tests.store.questions.asking import ask, spans
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
-from webots_mcp.store.analysis.jumps import find_jumps
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold
 from webots_mcp.store.detection.extent import Detection
+from webots_mcp.store.detection.jump_search import find_jumps
 from webots_mcp.store.detection.registry import asked_kinds
 from webots_mcp.store.detection.verdict import Ledger
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.signals.catalogue import known_signals
@@ -44,7 +45,9 @@ def test_a_robot_that_should_move_and_does_not_is_stuck(
 
 
 def test_standing_in_a_mode_that_rests_is_not_stuck(rover: sqlite3.Connection) -> None:
-    moving = ask(rover, "stuck", commanded="target", moving_modes=("back_up",), min_commanded=9.0)
+    moving = ask(
+        rover, "stuck", commanded="target", moving_modes=("back_up",), min_commanded_m_s=9.0
+    )
     assert moving.events == ()
 
 
@@ -276,7 +279,7 @@ def test_options_without_sense_are_refused(rover: sqlite3.Connection) -> None:
 @pytest.mark.parametrize("seed", range(10))
 def test_noise_neither_jumps_nor_swings(seed: int) -> None:
     noise = np.random.default_rng(seed).normal(size=2000)
-    assert find_jumps(np.arange(2000.0), noise, 12.0) == []
+    assert find_jumps(Frame.of(np.arange(2000.0), {"x": noise}), "x", 12.0) == []
 
 
 def test_a_wall_range_over_several_runs_knows_the_signals_of_each(

@@ -62,7 +62,7 @@ def test_what_was_not_looked_for_in_a_run_is_not_known_of_it(empty: sqlite3.Conn
     found = compare_runs(empty, [1, 2])
     stuck = measure(found, "stuck per min")
     assert medians(stuck) == [pytest.approx(3.0, abs=0.02), None]
-    (why,) = (why for names, why in found.not_known.items() if "stuck per min" in names)
+    (why,) = (why for names, why in found.unknown.items() if "stuck per min" in names)
     assert why.startswith("run 2: no position is known")
 
 
@@ -71,15 +71,20 @@ def test_what_no_run_has_is_told_as_not_known(empty: sqlite3.Connection) -> None
     record(empty, "b", without_position)
     found = compare_runs(empty, [1, 2])
     assert "distance_m" not in {each.name for each in found.measures}
-    (names,) = (names for names, why in found.not_known.items() if "no position is known" in why)
-    assert names.split(", ") == ["distance_m", "mean_speed_m_s", "still per min", "stuck per min"]
+    (names,) = (names for names, why in found.unknown.items() if "no position is known" in why)
+    assert names.split(", ") == [
+        "distance_m",
+        "mean_speed_m_s",
+        "standstill per min",
+        "stuck per min",
+    ]
 
 
 def test_runs_that_are_too_short_for_a_kind_share_one_reason(empty: sqlite3.Connection) -> None:
     record(empty, "a", driving)
     for seconds in (0.5, 0.9, 2.0):
         record(empty, "b", driving, end_s=seconds)
-    found = compare_runs(empty, [1, 2, 3, 4]).not_known
+    found = compare_runs(empty, [1, 2, 3, 4]).unknown
     (why,) = (why for names, why in found.items() if "stuck per min" in names)
     assert why.startswith("run 2 lasted only") and why.endswith("; likewise run 3, 4")
     assert "run 2: run 2" not in str(found)
@@ -98,7 +103,7 @@ def test_who_asks_names_the_position_and_a_mode_that_is_a_number(
     empty: sqlite3.Connection,
 ) -> None:
     record(empty, "a", with_names_of_its_own)
-    (why,) = (why for names, why in compare_runs(empty, [1]).not_known.items() if "stuck" in names)
+    (why,) = (why for names, why in compare_runs(empty, [1]).unknown.items() if "stuck" in names)
     assert "position=[x, y]" in why
     options = EventOptions(position=("rail.alongMm", "rail.acrossMm"), mode="betriebsart")
     found = compare_runs(empty, [1], options=options)
@@ -111,7 +116,7 @@ def test_who_asks_names_the_position_and_a_mode_that_is_a_number(
 def test_metres_that_no_robot_drives_are_doubted(empty: sqlite3.Connection) -> None:
     record(empty, "a", lambda time_s: {"pose": [300.0 * time_s, 0.0]})
     record(empty, "a", driving)
-    why = compare_runs(empty, [1, 2]).not_known["distance_m, mean_speed_m_s"]
+    why = compare_runs(empty, [1, 2]).unknown["distance_m, mean_speed_m_s"]
     assert why.startswith("run 1: pose.0 is taken as metres")
     assert "pose_mm" in why
 
@@ -133,7 +138,7 @@ def test_bends_that_noise_hides_are_told_as_a_doubt_of_the_distance(
     for seed, noise_m in enumerate((0.0, 0.08, 0.03)):
         record(empty, "a", circling_slowly(seed, noise_m), end_s=60)
     found = compare_runs(empty, [1, 2, 3])
-    why = found.not_known["distance_m, mean_speed_m_s"]
+    why = found.unknown["distance_m, mean_speed_m_s"]
     assert "run 1" not in why
     for run in ("run 2: the path may be up to ", "run 3: the path may be up to "):
         assert run in why
@@ -146,7 +151,7 @@ def test_a_run_without_a_mode_was_in_no_mode_for_no_known_time(empty: sqlite3.Co
     record(empty, "a", lambda time_s: driving(time_s) | {"mode": "turn"})
     found = compare_runs(empty, [1, 2, 3])
     assert medians(measure(found, "share of drive")) == [1.0, None, 0.0]
-    assert found.not_known["share of each mode"].startswith("run 2: no mode is known")
+    assert found.unknown["share of each mode"].startswith("run 2: no mode is known")
 
 
 @pytest.mark.parametrize("runs", [2, 5])
@@ -230,10 +235,10 @@ def test_of_what_was_not_read_in_time_no_figure_is_told(empty: sqlite3.Connectio
     assert {verdict for each in found.differences for verdict in each.different} == {None}
     assert all(mean is None for each in found.differences for mean in each.mean)
     assert found.only_in == {}
-    told = {name for names in found.not_known for name in names.split(", ")}
+    told = {name for names in found.unknown for name in names.split(", ")}
     unread = {"distance_m", "mean_speed_m_s", "share of each mode", "events per min"}
     assert told == unread | {"means of signals"}
-    assert all(why.startswith("time limit reached") for why in found.not_known.values())
+    assert all(why.startswith("time limit reached") for why in found.unknown.values())
 
 
 def test_how_much_runs_differ_is_told_as_an_interval(empty: sqlite3.Connection) -> None:
@@ -244,7 +249,7 @@ def test_how_much_runs_differ_is_told_as_an_interval(empty: sqlite3.Connection) 
     (_, interval) = speed.interval
     assert interval == pytest.approx((-0.0174, 0.0174), rel=0.02)  # 2.132 * 0.01 * (2 / 3)**0.5
     assert speed.different == [False, None]
-    speed = measure(compare_code(empty, matters_sd=3.0), "mean_speed_m_s")
+    speed = measure(compare_code(empty, min_effect_sd=3.0), "mean_speed_m_s")
     assert speed.different == [False, False]
 
 

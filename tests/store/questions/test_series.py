@@ -101,7 +101,9 @@ def test_a_value_that_is_no_number_is_named_within_its_array(empty: sqlite3.Conn
     assert column(run, "short.1").odd == {}
     assert column(run, "short.2").odd == {"nan": 9}
     assert column(run, "long.mean").odd == {"inf": 20}
-    counted = dict(empty.execute("SELECT name, odd_rows FROM signal WHERE name LIKE 'short%'"))
+    counted = dict(
+        empty.execute("SELECT name, replaced_row_count FROM signal WHERE name LIKE 'short%'")
+    )
     assert counted == {"short.0": 30, "short.1": 0, "short.2": 9}
 
 

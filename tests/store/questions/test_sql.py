@@ -156,6 +156,6 @@ def test_the_schema_describes_itself(empty: sqlite3.Connection) -> None:
     assert "table state: id, run_id, sim_time_s" in text
     assert "data [JSON object]" in text
     assert "logger [name of the Python logger" in text  # a column that was added later
-    assert "table rollup, table recent_rollup, table coarse_rollup, view all_rollup: " in text
+    assert "view robot_statistics: " in text
     assert "alembic" not in text
     assert len(text) < 8000

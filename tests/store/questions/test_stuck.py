@@ -12,11 +12,12 @@ import pytest
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from tests.store.questions.asking import ask, spans
 from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.evidence import Counts, Observed, Part, weigh
-from webots_mcp.store.detection.habits import MovedIn
+from webots_mcp.store.detection.mode_use import ModeUses, frames_of_runs
 from webots_mcp.store.detection.motion import find_motion
+from webots_mcp.store.detection.standstill import judge_standstills
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.signals.catalogue import known_signals
 
@@ -43,7 +44,7 @@ def test_a_robot_told_to_stand_is_not_stuck(empty: sqlite3.Connection) -> None:
 def test_no_verdict_hangs_on_what_a_mode_is_called(empty: sqlite3.Connection, mode: str) -> None:
     (stuck,) = publish_stuck(empty, mode=(mode, mode))
     assert stuck.start_s == pytest.approx(10.0, abs=0.2)
-    assert stuck.details["evidence"] == f"in mode {mode}, in which it moved at 0.2 m/s"
+    assert stuck.details["evidence_for"] == f"in mode {mode}, in which it moved at 0.2 m/s"
 
 
 def test_what_is_ready_or_idle_beside_switches_nothing_off(empty: sqlite3.Connection) -> None:
@@ -56,7 +57,7 @@ def test_what_is_ready_or_idle_beside_switches_nothing_off(empty: sqlite3.Connec
 def test_wheels_that_turn_show_that_it_is_stuck(empty: sqlite3.Connection) -> None:
     wheels = {"left": 4.0, "right": 4.0}
     (stuck,) = publish_stuck(empty, wheels=(wheels, wheels))
-    assert "wheels at 4" in stuck.details["evidence"]
+    assert "wheels at 4" in stuck.details["evidence_for"]
 
 
 def test_a_mode_of_an_earlier_run_in_which_it_moved_is_evidence(empty: sqlite3.Connection) -> None:
@@ -66,25 +67,25 @@ def test_a_mode_of_an_earlier_run_in_which_it_moved_is_evidence(empty: sqlite3.C
     for step in range(100):
         recorder.publish(step * 0.1, {"mode": "S3", "gps": {"x": 1, "y": 0}})
     (stuck,) = ask(empty, "stuck", bounds={"run_id": 2}).events
-    assert stuck.details["evidence"] == "in mode S3, in which it moved at 0.2 m/s in run 1"
+    assert stuck.details["evidence_for"] == "in mode S3, in which it moved at 0.2 m/s in run 1"
 
 
 def test_what_stood_is_told_also_where_nothing_shows_that_it_was_stuck(
     empty: sqlite3.Connection,
 ) -> None:
     assert not publish_stuck(empty, mode=("go", "S0"))
-    (still,) = ask(empty, "still").events
+    (still,) = ask(empty, "standstill").events
     assert (still.start_s, still.ongoing) == (pytest.approx(10.0, abs=0.2), True)
     assert still.details["mode"] == "S0"
-    assert still.details["not_stuck"] == "not seen moving in mode S0"
+    assert still.details["why_not_stuck"] == "not seen moving in mode S0"
 
 
 def test_without_any_evidence_a_standstill_says_that_there_is_none(
     empty: sqlite3.Connection,
 ) -> None:
     assert not publish_stuck(empty, volts=(12.0, 12.1))
-    (still,) = ask(empty, "still").events
-    assert "no published signal shows" in still.details["not_stuck"]
+    (still,) = ask(empty, "standstill").events
+    assert "no published signal shows" in still.details["why_not_stuck"]
 
 
 def test_who_turns_on_the_spot_is_not_stuck(empty: sqlite3.Connection) -> None:
@@ -94,9 +95,9 @@ def test_who_turns_on_the_spot_is_not_stuck(empty: sqlite3.Connection) -> None:
         place = [driven, 0.0, math.remainder(turned, 2 * math.pi)]
         recorder.publish(step * 0.1, {"pose": place, "mode": "go"})
     assert ask(empty, "stuck").events == ()
-    (still,) = ask(empty, "still").events
+    (still,) = ask(empty, "standstill").events
     assert still.details["turned_rad"] == pytest.approx(7.45, abs=0.3)
-    assert "it turned in place" in still.details["not_stuck"]
+    assert "it turned in place" in still.details["why_not_stuck"]
 
 
 def test_wheels_against_each_other_are_no_turn_that_was_seen(empty: sqlite3.Connection) -> None:
@@ -105,9 +106,9 @@ def test_wheels_against_each_other_are_no_turn_that_was_seen(empty: sqlite3.Conn
         wheels = {"left": 5.0, "right": 5.0 if step < 150 else -5.0}
         state = {"x": min(step, 150) * 0.02, "y": 0.0, "wheels": wheels, "mode": "go"}
         recorder.publish(step * 0.1, state)
-    (still,) = ask(empty, "still").events
-    assert "its wheels turned in opposite directions" in still.details["not_stuck"]
-    assert "it turned in place" not in still.details["not_stuck"]
+    (still,) = ask(empty, "standstill").events
+    assert "its wheels turned in opposite directions" in still.details["why_not_stuck"]
+    assert "it turned in place" not in still.details["why_not_stuck"]
 
 
 @pytest.mark.parametrize("period_s", [0.6, 1.5, 2.0])
@@ -134,7 +135,7 @@ def test_a_recording_gap_ends_a_standstill(empty: sqlite3.Connection) -> None:
     recorder = start_run(empty)
     for step in (*range(100), *range(200, 300)):
         recorder.publish(step * 0.1, {"gps": {"x": 1.0, "y": 0.0}})
-    assert spans(ask(empty, "still")) == [(0.0, 9.9), (20.0, 29.9)]
+    assert spans(ask(empty, "standstill")) == [(0.0, 9.9), (20.0, 29.9)]
 
 
 def test_without_a_position_stuck_cannot_be_searched_and_the_answer_says_so(
@@ -156,7 +157,7 @@ def test_a_short_command_within_a_long_standstill_is_told_as_evidence(
         recorder.publish(step * 0.1, state)
     (stuck,) = ask(empty, "stuck").events
     assert (stuck.start_s, stuck.end_s) == pytest.approx((100.0, 109.9))
-    assert stuck.details["evidence"] == "commanded_m_s 0.2"
+    assert stuck.details["evidence_for"] == "commanded_m_s 0.2"
 
 
 def test_a_mode_that_was_not_looked_at_in_time_is_not_said_to_be_one_in_which_it_stands(
@@ -164,18 +165,12 @@ def test_a_mode_that_was_not_looked_at_in_time_is_not_said_to_be_one_in_which_it
 ) -> None:
     publish_stuck(empty, mode=("go", "go"))
     asked = find_range(empty, Scope(run_id=1))
-    segment = asked.segments[0]
     motion = find_motion(known_signals(empty, asked), EventOptions())
-    moved_in = MovedIn(empty, segment.run_id, motion, Deadline(0.0))
-    part = Part(10.0, 20.0, 100, "go", False, False, (None, 100), None)
-    observed = Observed([part], Counts(rows=100))
-    evidence = weigh(observed, motion, EventOptions(), moved_in)
-    assert evidence.against == ["not checked whether it moves in mode go: time limit reached"]
-    statements: list[str] = []
-    empty.set_trace_callback(statements.append)
-    assert weigh(observed, motion, EventOptions(), moved_in) == evidence
-    empty.set_trace_callback(None)
-    assert not statements  # what there is no time for is not tried again at each standstill
+    frame = read_frame(empty, asked.segments[0], Deadline(math.inf))
+    uses = ModeUses(1, motion, frames_of_runs(empty, 1, Deadline(0.0)), EventOptions())
+    (standstill,) = judge_standstills(frame, motion, EventOptions(), uses).events
+    why = standstill.details["why_not_stuck"]
+    assert why == "not checked whether it moves in mode go: time limit reached"
 
 
 def test_noise_is_no_motion_in_a_mode_of_which_there_are_few_rows(
@@ -189,6 +184,6 @@ def test_noise_is_no_motion_in_a_mode_of_which_there_are_few_rows(
         place = [x_m + noise.gauss(0, 0.01), noise.gauss(0, 0.01)]
         recorder.publish(step * 0.5, {"pose": place, "mode": "charging" if charging else "drive"})
     found = find_events(
-        empty, find_range(empty, Scope(run_id=1)), EventOptions(kinds=("still", "stuck"))
+        empty, find_range(empty, Scope(run_id=1)), EventOptions(kinds=("standstill", "stuck"))
     )
-    assert found.totals == {"still": 7}
+    assert found.totals == {"standstill": 7}

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import start_run
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.questions.trend import Trend
 from webots_mcp.store.questions.trends import RunTrends, trends
 from webots_mcp.store.reading.ranges import Scope, find_range
@@ -30,7 +31,7 @@ def one(connection: sqlite3.Connection, name: str, **bounds: Any) -> Trend:
     return ask(connection, name, **bounds).numbers[0]
 
 
-def test_a_falling_battery_falls(rover: sqlite3.Connection, tier: str) -> None:
+def test_a_falling_battery_falls(rover: sqlite3.Connection, looked_at: str) -> None:
     battery = one(rover, "battery_v")
     assert (battery.shape, battery.monotonic) == ("falling", "falling")
     assert battery.slope_per_s == pytest.approx(-0.001, rel=0.05)
@@ -38,7 +39,9 @@ def test_a_falling_battery_falls(rover: sqlite3.Connection, tier: str) -> None:
     assert battery.says == "falls from 12.6 to 12.48 V (-0.001 V/s)"
 
 
-def test_mean_and_deviation_are_exact_in_both_tiers(rover: sqlite3.Connection, tier: str) -> None:
+def test_mean_and_deviation_are_exact_from_values_and_from_chunks(
+    rover: sqlite3.Connection, looked_at: str
+) -> None:
     battery = one(rover, "battery_v", start_s=2.05, end_s=80.0)
     values = [12.6 - 0.0001 * step for step in range(21, 800)]
     assert battery.mean == pytest.approx(statistics.fmean(values))
@@ -71,7 +74,7 @@ def test_a_spike_is_told(rover: sqlite3.Connection) -> None:
 def record(
     connection: sqlite3.Connection, *, rows: int, interval_s: float, **courses: Course
 ) -> None:
-    """One run, rolled up: each signal by name with its course."""
+    """One run: each signal by name with its course."""
     recorder = start_run(connection)
     connection.execute("BEGIN")
     for index in range(rows):
@@ -81,34 +84,33 @@ def record(
         recorder.publish(time_s, present)
     connection.execute("COMMIT")
     roll(connection, 100_000)
+    make_chunks(connection, 100_000)
 
 
-def test_a_swing_faster_than_the_rollups_gets_no_period_of_an_alias(
-    empty: sqlite3.Connection, long_ranges: None
+@pytest.mark.parametrize("looked_at", ["chunks"], indirect=True)
+def test_a_swing_faster_than_the_chunks_gets_no_period_of_an_alias(
+    empty: sqlite3.Connection, looked_at: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def yaw(time_s: float) -> float:
-        return math.remainder(math.pi + 0.5 * math.sin(3 * time_s), 2 * math.pi)
-
-    record(empty, rows=4000, interval_s=0.1, sine=math.sin, yaw=yaw)
+    record(empty, rows=4000, interval_s=0.1, sine=math.sin)
     (note,) = trends(empty, find_range(empty, Scope(run_id=1))).notes
     assert "oscillations with a period under 80 s were not searched for" in note
-    for name in ("sine", "yaw"):
-        trend = one(empty, name)
-        assert (trend.shape, trend.swings, trend.flat_since_s) == ("varying", (), None)
-        assert "varies within 10 s: ask for a shorter range" in trend.says
-        assert "varies within" not in one(empty, name, start_s=100.0, end_s=109.0).says
+    trend = one(empty, "sine")
+    assert (trend.shape, trend.swings, trend.flat_since_s) == ("varying", (), None)
+    assert "varies within 10 s: ask for a shorter range" in trend.says
+    monkeypatch.undo()
+    assert "varies within" not in one(empty, "sine", start_s=100.0, end_s=109.0).says
 
 
-def test_a_swing_slower_than_the_rollups_is_told_in_both_tiers(
-    empty: sqlite3.Connection, tier: str
+def test_a_swing_slower_than_the_chunks_is_told_from_values_and_from_chunks(
+    empty: sqlite3.Connection, looked_at: str
 ) -> None:
-    record(empty, rows=4000, interval_s=0.2, sine=lambda t: math.sin(2 * math.pi * t / 80))
+    record(empty, rows=8000, interval_s=0.1, sine=lambda t: math.sin(2 * math.pi * t / 80))
     sine = one(empty, "sine")
     (swing,) = sine.swings
     assert sine.shape == "oscillating"
     assert swing.period_s == pytest.approx(80, rel=0.03)
     assert swing.amplitude == pytest.approx(1, rel=0.02)
-    assert ("seen in means of 10 s" in sine.says) == (tier != "rows")
+    assert ("seen in means of 10 s" in sine.says) == (looked_at == "chunks")
 
 
 def test_what_swung_and_rests_is_said_to_have_swung(empty: sqlite3.Connection) -> None:
@@ -166,7 +168,7 @@ def test_noise_does_not_hide_a_swing(empty: sqlite3.Connection) -> None:
 
 @pytest.mark.parametrize("rate_rad_s", [0.2, -0.21])
 def test_an_angle_turns_by_as_much_as_it_turned(
-    empty: sqlite3.Connection, tier: str, rate_rad_s: float
+    empty: sqlite3.Connection, looked_at: str, rate_rad_s: float
 ) -> None:
     record(
         empty, rows=2001, interval_s=0.05,
@@ -177,31 +179,31 @@ def test_an_angle_turns_by_as_much_as_it_turned(
 
 
 def test_rows_without_the_signal_are_rows_without_a_value(
-    empty: sqlite3.Connection, tier: str
+    empty: sqlite3.Connection, looked_at: str
 ) -> None:
     record(empty, rows=2000, interval_s=0.1, x=float, lidar=lambda t: 1.0 + t if t < 100 else None)
     lidar = one(empty, "lidar")
     assert 2 * lidar.missing == lidar.summary.rows
-    assert f"no {'usable ' * (tier != 'rows')}value in 1000 of 2000 rows" in lidar.says
+    assert f"no {'usable ' * (looked_at == 'chunks')}value in 1000 of 2000 rows" in lidar.says
 
 
-def test_missing_values_are_told(rover: sqlite3.Connection, tier: str) -> None:
+def test_missing_values_are_told(rover: sqlite3.Connection, looked_at: str) -> None:
     front = one(rover, "sensors.front", start_s=90.0)
     assert front.missing == 40
-    assert f"no {'usable ' * (tier != 'rows')}value in 40 of 250 rows" in front.says
+    assert f"no {'usable ' * (looked_at == 'chunks')}value in 40 of 250 rows" in front.says
 
 
-def test_what_changed_most_comes_first(rover: sqlite3.Connection, tier: str) -> None:
+def test_what_changed_most_comes_first(rover: sqlite3.Connection, looked_at: str) -> None:
     run = ask(rover)
     names = [trend.name for trend in run.numbers]
     assert names.index("pose.0") < names.index("battery_v") < names.index("target")
     assert run.total == len(names)
     target = run.numbers[names.index("target")]
     assert (target.shape, target.change, target.says) == ("constant", 0.0, "constant at 3")
-    assert run.resolution_s == (None if tier == "rows" else 10.0)
+    assert run.resolution_s == (None if looked_at == "values" else 10.0)
 
 
-def test_a_clock_is_never_what_changed_most(empty: sqlite3.Connection, tier: str) -> None:
+def test_a_clock_is_never_what_changed_most(empty: sqlite3.Connection, looked_at: str) -> None:
     record(
         empty, rows=2000, interval_s=0.1, time_s=lambda t: t, robotTime=lambda t: t + 1e6,
         loop_steps=lambda t: round(t * 10), lap_time=lambda t: t % 7,
@@ -213,7 +215,7 @@ def test_a_clock_is_never_what_changed_most(empty: sqlite3.Connection, tier: str
     assert set(names[3:]) == {"time_s", "robotTime", "loop_steps"}
 
 
-def test_modes_are_counted_with_their_times(rover: sqlite3.Connection, tier: str) -> None:
+def test_modes_are_counted_with_their_times(rover: sqlite3.Connection, looked_at: str) -> None:
     mode, bumper = ask(rover, "mode", "sensors.bumper").states
     assert (mode.changes, mode.last, mode.since_s) == (3, "cruise", 95.0)
     assert mode.time_by_value_s == pytest.approx({"cruise": 76.9, "avoid": 35.0, "back_up": 8.0})
@@ -221,7 +223,7 @@ def test_modes_are_counted_with_their_times(rover: sqlite3.Connection, tier: str
 
 
 def test_a_mode_alone_is_told_with_the_rows_that_it_is_of(
-    rover: sqlite3.Connection, tier: str
+    rover: sqlite3.Connection, looked_at: str
 ) -> None:
     """Of a long run it was "no row in that range"."""
     (whole,) = trends(rover, find_range(rover, Scope(run_id=1))).runs
@@ -241,7 +243,7 @@ def test_an_empty_range_has_empty_trends(rover: sqlite3.Connection) -> None:
 
 
 def test_a_step_is_told_with_its_time_and_without_a_slope(
-    empty: sqlite3.Connection, tier: str
+    empty: sqlite3.Connection, looked_at: str
 ) -> None:
     record(empty, rows=1000, interval_s=0.1, gear=lambda time_s: 1 if time_s < 80 else 2)
     assert one(empty, "gear").says == "steps from 1 to 2 at 80 s"
@@ -272,7 +274,7 @@ def test_the_ends_of_what_rises_are_told_apart(empty: sqlite3.Connection) -> Non
 
 @pytest.mark.parametrize("step", [0.15, 5.0])
 def test_what_stepped_from_one_rest_to_another_is_flat_since_the_step(
-    empty: sqlite3.Connection, tier: str, step: float
+    empty: sqlite3.Connection, looked_at: str, step: float
 ) -> None:
     recorder = start_run(empty)
     for row in range(1200):
@@ -318,7 +320,7 @@ def test_a_constant_that_lost_its_value_is_told_with_the_last(empty: sqlite3.Con
 
 
 def test_numbers_too_large_to_reckon_with_are_not_called_missing(
-    empty: sqlite3.Connection, tier: str
+    empty: sqlite3.Connection, looked_at: str
 ) -> None:
     record(empty, rows=300, interval_s=0.1, big=lambda _: 1e308, x=lambda time_s: time_s)
     roll(empty)
@@ -326,7 +328,7 @@ def test_numbers_too_large_to_reckon_with_are_not_called_missing(
 
 
 def test_whole_numbers_that_name_a_mode_have_times_and_no_slope(
-    empty: sqlite3.Connection, tier: str
+    empty: sqlite3.Connection, looked_at: str
 ) -> None:
     recorder = start_run(empty)
     for step in range(1200):
@@ -344,14 +346,14 @@ def test_whole_numbers_that_name_a_mode_have_times_and_no_slope(
 
 
 def test_numbers_that_are_too_large_are_not_told_as_missing(
-    empty: sqlite3.Connection, tier: str
+    empty: sqlite3.Connection, looked_at: str
 ) -> None:
     record(
         empty, rows=700, interval_s=0.1,
         range_m=lambda time_s: 1e200 if round(10 * time_s) % 7 == 0 else None if time_s < 5 else 2,
     )  # fmt: skip
     says = one(empty, "range_m").says
-    if tier == "rows":
+    if looked_at == "values":
         assert "beyond 1e+100 in 100 of 700 rows; no value in 42 of 700 rows" in says
     else:
         assert "no usable value in" in says
@@ -359,7 +361,7 @@ def test_numbers_that_are_too_large_are_not_told_as_missing(
 
 @pytest.mark.parametrize("centre", [0.0, 2.6])
 def test_the_extremes_of_an_angle_are_its_own_and_not_those_of_means(
-    empty: sqlite3.Connection, tier: str, centre: float
+    empty: sqlite3.Connection, looked_at: str, centre: float
 ) -> None:
     def yaw(time_s: float) -> float:
         swings = 100 <= time_s < 120

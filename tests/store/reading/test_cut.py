@@ -151,7 +151,7 @@ def test_who_had_no_time_at_all_says_so_of_text_as_of_numbers(
         assert (history.cut_at_s, trend.cut_at_s) == (100.0, 100.0)
         assert (history.rows, trend.rows) == (0, 0)
         assert trend.silent == (), "nobody has looked"
-        assert not any(each.points or each.time_by_value_s for each in history.changes)
+        assert not any(each.time_by_value_s for each in history.changes)
 
 
 def test_no_mode_is_told_behind_the_end_of_the_numbers_beside_it(

@@ -12,7 +12,7 @@ from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S, start_run
 from webots_mcp.store.analysis.spread import Spread
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.questions.compare import Comparison, compare_code, compare_runs
+from webots_mcp.store.questions.compare import Comparison, compare_runs
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.questions.series import RunHistory, query_history
 from webots_mcp.store.questions.trends import trends
@@ -105,7 +105,7 @@ def test_a_range_that_begins_before_the_first_row_left_says_so(
 ) -> None:
     keep_rows(rover, tmp_path, 1500)
     (note,) = find_range(rover, Scope(run_id=1)).notes
-    assert "rows of run 1 before 55 s were purged" in note and "10 s summaries" in note
+    assert "rows of run 1 before 55 s were purged" in note and "read from chunks" in note
     assert find_range(rover, Scope(run_id=1, start_s=60.0)).notes == ()
     assert "were purged" in find_range(rover, Scope(run_id=1, start_s=10.0, end_s=20.0)).notes[0]
 
@@ -143,9 +143,9 @@ def test_where_rows_were_purged_events_do_not_claim_to_have_looked_at_them(
 ) -> None:
     keep_rows(rover, tmp_path, 1500)
     told = find_events(rover, find_range(rover, Scope(run_id=1))).verdicts.not_searched
-    for kind in ("still", "stuck", "jump", "oscillation"):
-        assert "not before 55.000 s, whose rows were purged" in told[kind], kind
-    assert "not those under 20 s before 55.000 s" in told["silent"]
+    assert "not before 55.000 s, whose rows were purged" in told["oscillation"]
+    kinds = {"standstill", "stuck", "jump", "silent", "flat", "threshold"}
+    assert not kinds & told.keys()
 
 
 def distance(comparison: Comparison) -> list[Spread | None]:
@@ -153,15 +153,14 @@ def distance(comparison: Comparison) -> list[Spread | None]:
 
 
 @pytest.mark.parametrize("rows", [900, 1500])
-def test_the_distance_of_a_run_that_lost_rows_is_not_known(
+def test_the_distance_of_a_run_that_lost_rows_is_the_same(
     rover: sqlite3.Connection, tmp_path: Path, rows: int
 ) -> None:
+    before = distance(compare_runs(rover, [1, 3]))
     keep_rows(rover, tmp_path, rows)
     comparison = compare_runs(rover, [1, 3])
-    first, third = distance(comparison)
-    assert first is None and third is not None
-    assert any("run 1 were purged" in note and "distance" in note for note in comparison.notes)
-    assert distance(compare_code(rover))[0] is None  # of one of its runs it is not known
+    assert distance(comparison) == before
+    assert any("run 1 were purged" in note for note in comparison.notes)
 
 
 @pytest.fixture
@@ -186,23 +185,30 @@ def events_of(connection: sqlite3.Connection, kind: str, **bounds: float) -> Eve
     return find_events(connection, found, options)
 
 
-def test_a_mode_that_is_a_number_changed_when_its_summary_says(
+def test_a_mode_that_is_a_number_changed_when_its_rows_said_before_they_were_purged(
     patrol: sqlite3.Connection,
 ) -> None:
     told = events_of(patrol, "change", end_s=300.0)
     assert [(each.name, each.start_s) for each in told.events] == [("task", 83.5)]
-    assert "of task at most one in 10 s" in told.verdicts.not_searched["change"]
+    assert "change" not in told.verdicts.not_searched
 
 
-def test_where_only_a_bucket_tells_when_a_silence_began_the_answer_says_so(
+def test_a_silence_of_which_no_row_is_left_has_its_begin_and_end(
     patrol: sqlite3.Connection,
 ) -> None:
     (silent,) = events_of(patrol, "silent", end_s=300.0).events
-    assert (silent.start_s, silent.end_s) == pytest.approx((130.0, 200.0), abs=0.2)
-    assert silent.details["within_s"] == 10.0
+    assert (silent.start_s, silent.end_s) == pytest.approx((123.5, 199.9))
 
 
-@pytest.mark.parametrize("kind", ["still", "jump", "oscillation", "condition"])
+def test_a_condition_of_which_no_row_is_left_is_asked_of_every_value(
+    patrol: sqlite3.Connection,
+) -> None:
+    told = events_of(patrol, "condition", start_s=234.0, end_s=300.0)
+    assert any(each.start_s <= 234.0 and each.end_s >= 289.9 for each in told.events)
+    assert "condition" not in told.verdicts.not_searched
+
+
+@pytest.mark.parametrize("kind", ["oscillation"])
 def test_of_what_was_purged_no_call_is_advised_that_brings_nothing(
     patrol: sqlite3.Connection, kind: str
 ) -> None:
@@ -210,8 +216,8 @@ def test_of_what_was_purged_no_call_is_advised_that_brings_nothing(
     assert verdicts.unlooked(kind) == "the rows of that time were purged for good"
 
 
-def test_trends_of_what_was_purged_advise_no_shorter_range(patrol: sqlite3.Connection) -> None:
+def test_trends_of_what_was_purged_are_those_of_its_values(patrol: sqlite3.Connection) -> None:
     purged = trends(patrol, find_range(patrol, Scope(run_id=1, start_s=20.0, end_s=120.0)))
     (front,) = (each for each in purged.runs[0].numbers if each.name == "front_m")
-    assert "varies within 10 s, and its rows were purged" in front.says
-    assert not any("ask for" in note for note in purged.notes)
+    assert (front.summary.present, front.resolution_s) == (1000, None)
+    assert front.mean == pytest.approx(4.0, abs=0.01)

@@ -40,7 +40,7 @@ def connection(request: pytest.FixtureRequest) -> Iterator[sqlite3.Connection]:
 
 def kept(connection: sqlite3.Connection) -> list[list[int]]:
     sql = (
-        "SELECT json_extract(data, '$.n') FROM every_state WHERE run_id = ? "
+        "SELECT json_extract(data, '$.n') FROM all_state WHERE run_id = ? "
         "AND sim_time_s BETWEEN ? AND ? ORDER BY sim_time_s"
     )
     stretches = connection.execute(

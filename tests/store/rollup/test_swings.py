@@ -72,7 +72,7 @@ def swings_of(connection: sqlite3.Connection, **asked: Any) -> list[tuple[float,
     options = EventOptions(kinds=("oscillation",), **asked)
     found = find_events(connection, find_range(connection, Scope()), options, deadline_s=60.0)
     assert "not before" not in found.verdicts.not_searched.get("oscillation", "")
-    figures = ("period_s", "amplitude", "turns")
+    figures = ("period_s", "amplitude", "half_periods")
     return [
         (each.start_s, each.end_s, *(each.details[name] for name in figures))
         for each in found.events
@@ -106,8 +106,8 @@ def test_swings_of_other_lengths_or_of_other_signals_are_looked_for_in_the_rows(
     long: sqlite3.Connection,
 ) -> None:
     assert len(swings_of(long, signals=("lidar",))) == len(SWINGS_S)
-    assert len(swings_of(long, oscillation_turns=26)) == 1
-    assert rows_read(long, oscillation_turns=26) > rows_read(long)
+    assert len(swings_of(long, min_half_periods=26)) == 1
+    assert rows_read(long, min_half_periods=26) > rows_read(long)
 
 
 def test_stored_swings_outlast_the_rows(long: sqlite3.Connection, tmp_path: Path) -> None:

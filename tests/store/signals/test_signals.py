@@ -9,13 +9,13 @@ import pytest
 from tests.recordings.rover import start_run
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.naming import flatten
+from webots_mcp.signal_kinds import Place, places
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.pages import query_rows
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.reading.subject import find_subject
 from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.signals.catalogue import catalogue, list_signals, resolve_signals
-from webots_mcp.store.signals.flatten import Place, places
 
 
 def test_every_leaf_has_a_dotted_name() -> None:

@@ -12,16 +12,16 @@ import numpy as np
 
 from webots_mcp.naming import Value, spelled_out
 from webots_mcp.plotting.palette import FAINT, area_styles
+from webots_mcp.plugins.page.tab_data import NewRows
 from webots_mcp.plugins.report.charts import SignalsChart, WayChart
 from webots_mcp.store.reading.changes import spelled
-from webots_mcp.store.reading.rows import Columns
 
 MOST_POINTS: Final = 20_000  # of a curve in the browser; the oldest go first
 _PALE: Final = "#EEEEEE"
 _STRETCH: Final = ("start_s", "end_s", "value", "colour", "hatch")
 
 
-def grow_signals(chart: SignalsChart, columns: Columns, angles: Collection[str] = ()) -> None:
+def grow_signals(chart: SignalsChart, columns: NewRows, angles: Collection[str] = ()) -> None:
     """Add rows to the curves, and let the modes and rows of states go on.
 
     Args:
@@ -87,7 +87,7 @@ def _colour(value: str, known: dict[str, str]) -> str:
     return area_styles([*known, value])[value].colour if value != "null" else _PALE
 
 
-def grow_way(chart: WayChart, position: tuple[str, str], columns: Columns) -> None:
+def grow_way(chart: WayChart, position: tuple[str, str], columns: NewRows) -> None:
     """Add steps to the way, up to where the robot is now."""
     source: Any = chart.sources["way", 0]
     end: Any = chart.sources["end", 0]

@@ -16,7 +16,7 @@ from webots_mcp.errors import (
     UnknownRobotError,
     UnknownSignalError,
 )
-from webots_mcp.naming import spelled_out
+from webots_mcp.naming import Value, spelled_out
 from webots_mcp.plotting.question import changed_most
 from webots_mcp.plotting.signal_axes import SignalAxes
 from webots_mcp.plotting.signals import compose_signals
@@ -32,8 +32,8 @@ from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines
 from webots_mcp.store.parameters import described
 from webots_mcp.store.questions.runs import RunInfo, list_runs
 from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range
-from webots_mcp.store.reading.rows import Columns, read_columns
 from webots_mcp.store.recording import Recording, View, view_of
 from webots_mcp.store.robots import list_robots, without_observers
 from webots_mcp.store.run_rows import Run, current_run, fetch_run
@@ -54,6 +54,13 @@ class RunKey(NamedTuple):
 
     run_id: int
     started_wall_time_s: float
+
+
+class NewRows(NamedTuple):
+    """Rows that have come since a moment: their simulation times, and the values of each signal."""
+
+    times: list[float]
+    values: dict[str, list[Value]]
 
 
 @dataclass(frozen=True)
@@ -231,11 +238,13 @@ def _ranges(connection: sqlite3.Connection, shown: Look, choice: Choice) -> list
 
 def rows_after(
     recording: Recording, run_id: int, signals: Sequence[Signal], after_s: float
-) -> Columns:
+) -> NewRows:
     """The rows of a run that have come since a simulation time."""
     segment = Segment(run_id, math.nextafter(after_s, math.inf), math.inf)
     with recording.reader() as connection:
-        return read_columns(connection, segment, signals, Deadline(_LOOK_S), limit=MOST_ROWS)
+        frame = read_frame(connection, segment, Deadline(_LOOK_S)).rows(0, MOST_ROWS)
+        values = {signal.name: frame.values(signal.name) for signal in signals}
+        return NewRows(frame.times.tolist(), values)
 
 
 def run_title(run: RunInfo) -> str:

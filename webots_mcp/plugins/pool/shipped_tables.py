@@ -12,7 +12,8 @@ _APPENDED: Final = ("state", "kept_state", "log", "event", "image", "parameter_v
 # Of one machine or one moment: who maintains it, what is kept there, and console lines that wait
 # to become log lines. Recent rollups are shipped as rollups: the difference is how they are
 # written here.
-_LOCAL: Final = ("lease", "watermark", "retention_limit", "console_line", "recent_rollup")
+_LOCAL: Final = ("lease", "watermark", "retention_limit", "console_line", "recent_rollup",
+                 "row_group", "chunk")  # fmt: skip
 _OF_TRIALS: Final = ("trial_set", "trial")
 _TYPES: Final[dict[str, type[int | float | str]]] = {
     "INTEGER": int, "BIGINT": int, "FLOAT": float, "TEXT": str, "VARCHAR": str,

@@ -341,7 +341,7 @@ def _timeline(connection: sqlite3.Connection, stored: Found) -> Grid:
     if len(stored.events) > MOST_ENTRIES:
         stored = stored.only([e for e in stored.events if e.kind != "log" or _mark(e)])
         notes = ["Of the log only warnings and errors stand here."]
-    answer = stored.told(connection, MOST_ENTRIES, exact=False)
+    answer = stored.told(connection, MOST_ENTRIES)
     rows = [
         Row([time_at(each.start_s), _lasted(each), each.kind, told(each)], _mark(each))
         for each in answer.events
@@ -440,7 +440,7 @@ def _travelled(connection: sqlite3.Connection, run_id: int) -> tuple[list[str], 
     distance, speed = known.get("distance_m"), known.get("mean_speed_m_s")
     why_not = [
         f"not known: {figures}: {why}"
-        for figures, why in found.not_known.items()
+        for figures, why in found.unknown.items()
         if "distance_m" in figures
     ]
     if distance is None or speed is None:

@@ -52,7 +52,7 @@ def beside(connection: sqlite3.Connection, run_ids: Sequence[int], room_bytes: f
         return Beside(why_not=str(error))
     names = [group.name for group in found.groups]
     differences = _differences(found, names).within(_SHARE_OF_TEXTS * room_bytes)
-    notes = [f"not known: {figures}: {why}" for figures, why in found.not_known.items()]
+    notes = [f"not known: {figures}: {why}" for figures, why in found.unknown.items()]
     notes += [f"only in {' and '.join(groups)}: {listed(only)}" for groups, only in _only_in(found)]
     return Beside(
         _says(found),

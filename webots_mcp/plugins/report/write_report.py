@@ -25,7 +25,7 @@ class ReportAnswer(NotedAnswer):
     file: str | None = None
     size_bytes: int | None = None
     holds: dict[str, int] | None = Field(default=None, description="How many of each.")
-    not_in_it: list[str] | None = Field(default=None, description="What had no room, and why.")
+    left_out: list[str] | None = Field(default=None, description="What had no room, and why.")
 
 
 @question("Write a report", DESTROYS)
@@ -52,7 +52,7 @@ def webots_report(
             file=str(path),
             size_bytes=len(made.html),
             holds=made.holds,
-            not_in_it=notes_of(made.left_out),
+            left_out=notes_of(made.left_out),
             hint=None if made.holds.get("figures") else "nothing in it could be drawn",
         )
 

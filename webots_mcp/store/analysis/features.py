@@ -90,17 +90,26 @@ def _apart_around(values: Array, rows: Indexes) -> Array:
     return np.asarray(np.abs(np.diff(near, axis=0)).max(axis=0), np.float64)
 
 
-def flat_since(times: Array, values: Array) -> float | None:
+def flat_since(
+    times: Array, values: Array, *, span: float | None = None, start_s: float | None = None
+) -> float | None:
     """Since when the value has stayed within 0.5 % of its range; None if not for 10 % of the time.
 
     A step within that band from one rest to another is no rest: it is flat since the step. A
     signal that never changed is flat since its first value.
+
+    Args:
+        times: In s.
+        values: The last ones at least: all from before the last that is outside of the band.
+        span: The range of all values; None where these are all.
+        start_s: When the first of all values was; None where these are all.
     """
-    span = float(np.ptp(values))
+    span = float(np.ptp(values)) if span is None else span
+    start_s = float(times[0]) if start_s is None else start_s
     away = np.flatnonzero(np.abs(values - values[-1]) > FLAT_BAND * span)
     row = int(away[-1]) + 1 if len(away) else 0
     since_s = float(times[row + _last_step(values[row:])])
-    return since_s if span == 0 or times[-1] - since_s >= 0.1 * (times[-1] - times[0]) else None
+    return since_s if span == 0 or times[-1] - since_s >= 0.1 * (times[-1] - start_s) else None
 
 
 def find_step(times: Array, values: Array) -> Step | None:

@@ -9,7 +9,7 @@ from functools import lru_cache
 from typing import Final, NamedTuple, TypeAlias
 
 MOST_CHANCE: Final = 0.002  # that any of the figures compared at once differs among like runs
-MATTERS_SD: Final = 1.0  # a difference that matters, in standard deviations between like runs
+MIN_EFFECT_SD: Final = 1.0  # a difference that matters, in standard deviations between like runs
 MOST_REPEATED: Final = 10  # runs of each group: who asks for more of them has no answer
 _OUTSIDE: Final = 0.1  # how often an interval does not hold the difference
 _LEAST_RUNS: Final = 4  # of each group, that tell how much they differ, and no two clusters
@@ -167,7 +167,7 @@ def verdicts_on(
     tests: int,
     chance: Chance = chance_of,
     tests_of_more: int = 0,
-    matters_sd: float = MATTERS_SD,
+    min_effect_sd: float = MIN_EFFECT_SD,
 ) -> list[Verdict]:
     """Of each group whether it differs from the first by more than like runs do.
 
@@ -177,7 +177,7 @@ def verdicts_on(
     matters is excluded: two one-sided tests at 5 %, which is the same as an interval of 90 % within
     the margin (D. J. Schuirmann, A comparison of the two one-sided tests procedure, J.
     Pharmacokinetics and Biopharmaceutics 15, 1987). Of a figure whose unit is unknown, the one
-    scale there is is how much like runs differ: the margin is `matters_sd` of their standard
+    scale there is is how much like runs differ: the margin is `min_effect_sd` of their standard
     deviations, as far as these runs tell it. Where like runs agree to the last digit and the groups
     do as well, False takes as many runs as True would. The first is False; None where that cannot
     be decided, or a figure of any run is missing.
@@ -187,13 +187,13 @@ def verdicts_on(
         tests: How many such questions are asked at once: the more, the surer True has to be.
         chance: How often like runs lie as far apart.
         tests_of_more: How many are asked once there are more runs, if not as many.
-        matters_sd: The least difference that matters.
+        min_effect_sd: The least difference that matters.
     """
     known = [[each for each in group if each is not None] for group in groups]
     if any(len(a) < len(b) for a, b in zip(known, groups, strict=True)):
         return [Verdict(None)] * len(groups)
     limits = [MOST_CHANCE / max(each, 1) for each in (tests, tests_of_more or tests)]
-    others = (_verdict(known[0], other, limits, chance, matters_sd) for other in known[1:])
+    others = (_verdict(known[0], other, limits, chance, min_effect_sd) for other in known[1:])
     return [Verdict(False), *others]
 
 
@@ -202,20 +202,20 @@ def _verdict(
     other: Sequence[float],
     limits: Sequence[float],
     chance: Chance,
-    matters_sd: float,
+    min_effect_sd: float,
 ) -> Verdict:
     apart = _apart(first, other)
     if apart is None:
         return Verdict(None)
     within = apart.error * _student_quantile(apart.freedom)
     interval = (apart.by - within, apart.by + within) if apart.deviation else None
-    different = _differs(first, other, limits[0], chance, matters_sd)
+    different = _differs(first, other, limits[0], chance, min_effect_sd)
     if different is not None:
         return Verdict(different, None, interval)
     fewest = min(len(first), len(other)) + 1
     for runs in range(fewest, MOST_REPEATED + 1):
         more = _so_many(first, runs), _so_many(other, runs)
-        if _differs(*more, limits[1], chance, matters_sd) is not None:
+        if _differs(*more, limits[1], chance, min_effect_sd) is not None:
             return Verdict(None, runs, interval)
     return Verdict(None, None, interval)
 
@@ -225,7 +225,7 @@ def _differs(
     other: Sequence[float],
     limit: float,
     chance: Chance,
-    matters_sd: float,
+    min_effect_sd: float,
 ) -> bool | None:
     apart, found = _apart(first, other), chance(first, other)
     if apart is None or found is None:
@@ -237,7 +237,7 @@ def _differs(
     if not apart.deviation:
         return False if is_repeated and not apart.by else None
     farthest = abs(apart.by) + apart.error * _student_quantile(apart.freedom)
-    return False if farthest < matters_sd * apart.deviation else None
+    return False if farthest < min_effect_sd * apart.deviation else None
 
 
 def _so_many(figures: Sequence[float], runs: int) -> list[float]:

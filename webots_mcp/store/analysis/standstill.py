@@ -1,24 +1,31 @@
-"""Where a robot stood still, and from when to when."""
+"""Where a robot stood still, and from when to when: all standstills of a track at once."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from webots_mcp.store.analysis.arrays import Array, mean, median, np
-from webots_mcp.store.analysis.creep import is_creep, rest_within
+from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, median, np
+from webots_mcp.store.analysis.creep import Rows, is_creep, rest_within
 from webots_mcp.store.analysis.track import Track
 
 WIDENED_BY: Final = 5.0  # a place is at least so many deviations of the smoothed position wide
 SETTLED_SHARE: Final = 0.2  # of the radius: within it of the place is where a standstill begins
-_NEARLY: Final = 0.95  # of the shortest duration: ends are known to a row or two
+NEARLY: Final = 0.95  # of the shortest duration: ends are known to a row or two
 UNSEEN_SLOPE: Final = 3.0  # deviations: a speed that is less may be noise alone
+_SAMPLES: Final = 12  # of the shortest standstill: so finely places are compared at first
+_NEAR_SHARE: Final = 0.9  # of the shortest standstill that it has to stay within the radius
 _LEAST_RAMP_ROWS: Final = 4
 _MOST_RAMP_ROWS: Final = 2**14
-_AGREEING: Final = 2.5  # standard deviations: ends of one ramp in more and more rows
+_AGREEING: Final = 3.0  # standard deviations: ends of one ramp in more and more rows
 _RAMP_SHARE: Final = 0.75  # of the smoothed rows: so far a ramp is looked for at first
+_REST_SHARE: Final = 4  # times as many rows as the ramp's tell the place of the rest after it
 _CERTAIN_RAMP: Final = 50.0  # variances of the noise: a ramp that explains more is none of it
+_EXACT_ROWS: Final = 0.25  # an end whose deviation is less is exact enough
+_ROUNDING_M: Final = 1e-6
+_MOST_AT_ONCE: Final = 2**20  # positions
 
 
 @dataclass(frozen=True)
@@ -27,7 +34,7 @@ class Standstill:
 
     Attributes:
         start: Index of the first row in which it stood; `last` of the last one.
-        x_m: Where: the median of its positions.
+        x_m: Where: the mean of its positions.
         y_m: As well.
     """
 
@@ -42,19 +49,23 @@ def find_standstills(track: Track, radius_m: float, least_s: float) -> list[Stan
 
     The radius is widened to five times what is left of the noise. A steady motion that is so slow
     that it stays within the radius for long is none (see `creep`); of a stretch in which there is
-    one the part counts in which the robot rested. The ends are where a ramp that ends in rest fits
-    the rows best (least squares).
+    one the part counts in which the robot rested. Who twitches within the radius rests in between.
+    The ends are where a ramp that ends in rest fits the rows best (least squares).
     """
+    if len(track.times) < 2:
+        return []
     radius_m = max(radius_m, WIDENED_BY * track.left_m)
-    found: list[Standstill] = []
-    stays = list(_stays(track, radius_m, least_s))
-    for index, stay in enumerate(stays):
-        each = _standstill(track, stay, radius_m, least_s, _touching(stays, index))
-        if each and found and _is_same(track, found[-1], each, radius_m):
-            found[-1] = replace(found[-1], last=max(each.last, found[-1].last))
-        elif each:
-            found.append(each)
-    return found
+    grid = _grid_of(track, least_s)
+    stays = _pairs(list(_stays(grid, radius_m)))
+    if not len(stays):
+        return []
+    rows = Rows(track)
+    firsts, lasts = _resting(track, rows, grid, stays, radius_m)
+    starts = _begins_of_rest(track, firsts, lasts, grid.rows)
+    newest = len(track.times) - 1
+    ends = newest - _begins_of_rest(track.reversed, newest - lasts, newest - firsts, grid.rows)
+    long_enough = track.times[ends] - track.times[starts] >= NEARLY * least_s
+    return _joined(track, rows, starts[long_enough], ends[long_enough], grid.rows, radius_m)
 
 
 def shortest_seen_s(noise_m: float, interval_s: float, radius_m: float, least_s: float) -> float:
@@ -67,87 +78,138 @@ def shortest_seen_s(noise_m: float, interval_s: float, radius_m: float, least_s:
     return max(least_s, (noise * least_s / radius_m) ** (2 / 3))
 
 
-def _touching(stays: Sequence[tuple[int, int]], index: int) -> tuple[int, int]:
+class _Grid(NamedTuple):
+    """Smoothed positions at even times.
+
+    Attributes:
+        window: How many of them a standstill lasts at least.
+        rows: How many rows lie between two of them, one at least.
+    """
+
+    times: Array
+    x: Array
+    y: Array
+    window: int
+    rows: int
+
+
+def _grid_of(track: Track, least_s: float) -> _Grid:
+    interval_s = median(np.diff(track.times))
+    step_s = max(least_s / _SAMPLES, interval_s)
+    lasts_s = float(track.times[-1] - track.times[0])
+    times = track.times[0] + step_s * np.arange(int(lasts_s / step_s * (1 + 1e-9)) + 1)
+    places: list[Array] = [np.interp(times, track.times, each) for each in (track.x, track.y)]
+    window = max(2, math.ceil(_NEAR_SHARE * least_s / step_s))
+    rows = math.ceil(step_s / interval_s) if interval_s else 1
+    return _Grid(times, places[0], places[1], window, rows)
+
+
+def _stays(grid: _Grid, radius_m: float) -> Iterator[tuple[int, int]]:
+    """Index ranges in which every position is within the radius of their mean, one by one."""
+    if len(grid.times) < grid.window:
+        return
+    away_m2 = np.zeros((len(grid.times) - grid.window + 1, grid.window))
+    for each in (grid.x, grid.y):
+        windows = np.lib.stride_tricks.sliding_window_view(each, grid.window)
+        away_m2 += (windows - windows.mean(axis=1, keepdims=True)) ** 2
+    starts = np.flatnonzero(away_m2.max(axis=1) <= radius_m**2)
+    sums = [np.concatenate(([0.0], np.cumsum(each))) for each in (grid.x, grid.y)]
+    at = 0
+    while at < len(starts):
+        start = int(starts[at])
+        end = start + grid.window
+        while end < len(grid.times):  # as far as they stay near, in steps that double
+            x_m, y_m = ((each[end] - each[start]) / (end - start) for each in sums)
+            more = slice(end, 2 * end - start + 8)
+            away = np.hypot(grid.x[more] - x_m, grid.y[more] - y_m) > radius_m
+            if away.any():
+                end += int(away.argmax())
+                break
+            end = min(len(grid.times), more.stop)
+        yield start, end
+        at = int(np.searchsorted(starts, end))
+
+
+def _resting(
+    track: Track, rows: Rows, grid: _Grid, stays: Indexes, radius_m: float
+) -> tuple[Indexes, Indexes]:
+    """About the first and the last row of the rest in each stay in which it does not only creep.
+
+    It begins near the place of the first seconds and ends near that of the last: a robot that
+    twitched in between stands elsewhere.
+    """
+    limit_m = max(SETTLED_SHARE * radius_m, 3 * track.left_m)
+    first = stays[:, 0] + _settled(grid, stays[:, :1] + np.arange(grid.window), limit_m)
+    last = stays[:, 1] - 1 - _settled(grid, stays[:, 1:] - 1 - np.arange(grid.window), limit_m)
+    edges = np.searchsorted(track.times, grid.times[stays % len(grid.times)])
+    edges[stays == len(grid.times)] = newest = len(track.times)
+    firsts = np.searchsorted(track.times, grid.times[first])
+    lasts = np.searchsorted(track.times, grid.times[last], "right") - 1
+    # At the ends of the track smoothing leaves more of the noise.
+    slack = track.smoothed_rows // 2 + grid.rows
+    firsts[(edges[:, 0] == 0) & (firsts <= slack)] = 0
+    lasts[(edges[:, 1] == newest) & (lasts >= newest - 1 - slack)] = newest - 1
+    rests = [
+        rest_within(rows, *_touching(edges, at)) or rest_within(rows, *edges[at].tolist())
+        if creeps
+        else (int(firsts[at]), int(lasts[at]) + 1)
+        for at, creeps in enumerate(is_creep(rows, firsts, lasts + 1, radius_m))
+    ]
+    known = _pairs([rest for rest in rests if rest])
+    return known[:, 0], known[:, 1] - 1
+
+
+def _pairs(ranges: Sequence[tuple[int, int]]) -> Indexes:
+    return np.asarray(np.reshape(np.array(ranges, np.intp), (-1, 2)))
+
+
+def _settled(grid: _Grid, window: Indexes, limit_m: float) -> Indexes:
+    """In each window the first position that is near their median."""
+    away_m2 = np.zeros(window.shape)
+    for each in (grid.x, grid.y):
+        away_m2 += (each[window] - np.median(each[window], axis=1, keepdims=True)) ** 2
+    return np.argmax(away_m2 <= limit_m**2, axis=1)
+
+
+def _touching(edges: Indexes, at: int) -> tuple[int, int]:
     """A stay with those right before and after it: between them it can only have crept."""
-    start, end = stays[index]
-    if index and stays[index - 1][1] == start:
-        start = stays[index - 1][0]
-    if stays[index + 1 :] and stays[index + 1][0] == end:
-        end = stays[index + 1][1]
+    start, end = edges[at].tolist()
+    if at and edges[at - 1, 1] == start:
+        start = int(edges[at - 1, 0])
+    if at + 1 < len(edges) and edges[at + 1, 0] == end:
+        end = int(edges[at + 1, 1])
     return start, end
 
 
-def _is_same(track: Track, before: Standstill, after: Standstill, radius_m: float) -> bool:
-    """Whether it stood on where a stay ended: who creeps up to a place leaves a stay there."""
-    way_m = float(np.hypot(after.x_m - before.x_m, after.y_m - before.y_m))
-    return (
-        after.start - before.last <= track.smoothed_rows + 1
-        and way_m <= SETTLED_SHARE * radius_m + 3 * track.left_m
-    )
+def _joined(
+    track: Track, rows: Rows, starts: Indexes, ends: Indexes, slack: int, radius_m: float
+) -> list[Standstill]:
+    """Each standstill once: who creeps up to a place leaves a stay there, and stands on."""
+    found: list[Standstill] = []
+    _, _, x, y = (each[:, 0] for each in rows.means(starts, ends + 1, 1))
+    near_m = SETTLED_SHARE * radius_m + 3 * track.left_m
+    for at in np.lexsort((ends, starts)).tolist():
+        start, end, x_m, y_m = (
+            int(starts[at]),
+            int(ends[at]),
+            round(float(x[at]), 6),
+            round(float(y[at]), 6),
+        )
+        new = Standstill(start, end, x_m, y_m)
+        before = found[-1] if found else None
+        if (
+            before
+            and start - before.last <= track.smoothed_rows + slack
+            and (start <= before.last or math.hypot(before.x_m - x_m, before.y_m - y_m) <= near_m)
+        ):
+            found[-1] = Standstill(before.start, max(end, before.last), before.x_m, before.y_m)
+        else:
+            found.append(new)
+    return found
 
 
-def _stays(track: Track, radius_m: float, least_s: float) -> Iterator[tuple[int, int]]:
-    """Index ranges in which every position is within the radius of their mean, one by one."""
-    later = np.searchsorted(track.times, track.times + 0.9 * least_s)
-    place = np.minimum(later, len(track.times) - 1)
-    near = np.hypot(track.x[place] - track.x, track.y[place] - track.y) <= radius_m
-    starts = np.flatnonzero(near & (later < len(track.times)))
-    reached = 0
-    for start in starts.tolist():
-        if start < reached:
-            continue
-        end = int(later[start])
-        if _farthest_m(track, start, end) <= radius_m:
-            reached = _extended(track, start, end, radius_m)
-            yield start, reached
-
-
-def _farthest_m(track: Track, start: int, end: int) -> float:
-    x, y = track.x[start:end], track.y[start:end]
-    return float(np.hypot(x - mean(x), y - mean(y)).max())
-
-
-def _extended(track: Track, start: int, end: int, radius_m: float) -> int:
-    """How far the positions stay within the radius of their mean, in steps that double."""
-    while end < len(track.times):
-        x_m, y_m = mean(track.x[start:end]), mean(track.y[start:end])
-        more = slice(end, 2 * end - start + 8)
-        away = np.hypot(track.x[more] - x_m, track.y[more] - y_m) > radius_m
-        if away.any():
-            return end + int(away.argmax())
-        end = min(len(track.times), more.stop)
-    return end
-
-
-def _standstill(
-    track: Track,
-    stay: tuple[int, int],
-    radius_m: float,
-    least_s: float,
-    around: tuple[int, int] | None = None,
-) -> Standstill | None:
-    """That of a stay; of one in which it creeps, that of the rest in it or around it, if any."""
-    x_m, y_m = median(track.x[slice(*stay)]), median(track.y[slice(*stay)])
-    away_m = np.hypot(track.x[slice(*stay)] - x_m, track.y[slice(*stay)] - y_m)
-    settled = np.flatnonzero(away_m <= max(SETTLED_SHARE * radius_m, 3 * track.left_m))
-    if len(settled) < 2:
-        return None
-    first, last = stay[0] + int(settled[0]), stay[0] + int(settled[-1])
-    newest = len(track.times) - 1
-    # At the ends of the track smoothing leaves more of the noise.
-    first = 0 if stay[0] == 0 and first <= track.smoothed_rows // 2 else first
-    last = newest if stay[1] > newest and last >= newest - track.smoothed_rows // 2 else last
-    if around and is_creep(track, first, last + 1, radius_m):
-        rest = rest_within(track, *around) or rest_within(track, *stay)
-        return rest and _standstill(track, rest, radius_m, least_s)
-    start = _begin_of_rest(track, first, last)
-    end = newest - _begin_of_rest(track.reversed, newest - last, newest - first)
-    long_enough = track.times[end] - track.times[start] >= _NEARLY * least_s
-    return Standstill(start, end, x_m, y_m) if long_enough else None
-
-
-def _begin_of_rest(track: Track, first: int, last: int) -> int:
-    """The row from which on it stands: of a ramp that ends in rest, the best fitting end.
+def _begins_of_rest(track: Track, firsts: Indexes, lasts: Indexes, coarse_rows: int) -> Indexes:
+    """The rows from which on it stands: of a ramp that ends in rest, the best fitting end.
 
     A slow robot is near its place long before it rests: its ramp is looked for in ever more rows,
     until it stands out from the noise. From then on more rows make its end more exact, as long as
@@ -155,35 +217,47 @@ def _begin_of_rest(track: Track, first: int, last: int) -> int:
 
     Args:
         track: The positions as recorded count: smoothing blurs the bend.
-        first: About where rest begins; until `last` it lasts.
-        last: Index of a row in rest.
+        firsts: About where rest begins; until `lasts` it lasts.
+        lasts: Indexes of rows in rest.
+        coarse_rows: How exactly these are known.
     """
-    reach = max(_LEAST_RAMP_ROWS, int(_RAMP_SHARE * track.smoothed_rows))
-    latest, rested = (first + last) // 2, last + 1 - (last - first) // 4
-    found: _Ramp | None = None
-    while first > 0:
-        rows = slice(max(0, first - reach), min(latest, first + reach))
-        if rows.stop <= rows.start:
-            break
-        ramp = _end_of_ramp(track, rows, rested)
-        widest = rows.start == 0 or reach >= _MOST_RAMP_ROWS
-        certain = ramp.explained_m2 > _CERTAIN_RAMP * track.noise_m**2
-        if found is None and not certain and not widest:
-            reach *= 2
-        elif found is None and ramp.end == rows.stop - 1 and rows.stop < latest:
-            first = ramp.end
-        elif found is not None and not _is_same_ramp(track, found, ramp):
-            break
-        else:
-            found = ramp
-            if widest:
-                break
-            reach *= 2
-    return first if found is None else found.end
+    least = max(_LEAST_RAMP_ROWS, int(_RAMP_SHARE * track.smoothed_rows), coarse_rows)
+    interval_s = median(np.diff(track.times))
+    begins: Indexes = np.array(firsts)
+    centre, reach = np.array(begins), np.full(len(firsts), least)
+    latest, rested = (firsts + lasts) // 2, lasts + 1 - (lasts - firsts) // 4
+    known = np.zeros(len(firsts), np.bool_)
+    rows, left = np.zeros(len(firsts), np.intp), np.arange(len(firsts))
+    while True:
+        start, stop = np.maximum(0, centre - reach), np.minimum(latest, centre + reach)
+        left = left[(centre[left] > 0) & (stop[left] > start[left])]
+        if not len(left):
+            return begins
+        some = left[: max(1, _MOST_AT_ONCE // int(2 * reach[left].max()))]
+        start, stop = start[some], stop[some]
+        rest_until = np.maximum(stop, np.minimum(rested[some], stop + _REST_SHARE * reach[some]))
+        ramp = _ends_of_ramps(track, start, stop, rest_until)
+        widest = (start == 0) | (reach[some] >= _MOST_RAMP_ROWS)
+        certain = ramp.explained_m2 > _CERTAIN_RAMP * max(track.noise_m, _ROUNDING_M) ** 2
+        new = ~known[some]
+        unseen = new & ~certain & ~widest
+        moves_on = new & ~unseen & (ramp.end == stop - 1) & (stop < latest[some])
+        same = new | _is_same_ramp(track, begins[some], rows[some], ramp)
+        taken = same & ~unseen & ~moves_on
+        here = some[taken]
+        begins[here], rows[here], known[here] = ramp.end[taken], ramp.rows[taken], True
+        centre[some[moves_on]] = begins[some[moves_on]] = ramp.end[moves_on]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            error_s = 2 * track.noise_m / (ramp.speed_m_s * np.sqrt(ramp.rows))
+        exact = error_s <= _EXACT_ROWS * interval_s
+        goes_on = taken & ~widest & ~exact
+        reach[some[unseen | goes_on]] *= 2
+        done = some[~(unseen | moves_on | goes_on)]
+        left = left[~np.isin(left, done)]
 
 
-class _Ramp(NamedTuple):
-    """A steady motion that ends in rest.
+class _Ramps(NamedTuple):
+    """Steady motions that end in rest.
 
     Attributes:
         end: The row in which it rests.
@@ -191,31 +265,36 @@ class _Ramp(NamedTuple):
         explained_m2: How many squares it explains.
     """
 
-    end: int
-    rows: int
-    speed_m_s: float
-    explained_m2: float
+    end: Indexes
+    rows: Indexes
+    speed_m_s: Array
+    explained_m2: Array
 
 
-def _end_of_ramp(track: Track, rows: slice, rested: int) -> _Ramp:
-    """Of ramps that end in rest, each in another row, the best, with the place of that rest.
-
-    Args:
-        track: Recorded positions.
-        rows: Where one may end.
-        rested: Until that row it certainly stands.
-    """
-    whole = slice(rows.start, max(rows.stop, rested))
-    off = np.stack([each[rows] - mean(each[whole]) for each in (track.raw_x, track.raw_y)])
-    times = track.times[rows] - track.times[rows.start]
-    ones = np.ones_like(times)
-    sums, of_times, along = (_along_ramps(times, each) for each in (ones, times, off))
-    squares = times * sums - of_times - sums**2 / (whole.stop - whole.start)
-    explained: Array = (along**2).sum(axis=0)
+def _ends_of_ramps(track: Track, start: Indexes, stop: Indexes, rest_until: Indexes) -> _Ramps:
+    """Of ramps that end in rest, each in another row [start, stop), the best, with that rest."""
+    at = start[:, None] + np.arange(int((stop - start).max()))
+    inside = at < stop[:, None]
+    at = np.minimum(at, len(track.times) - 1)
+    times = track.times[at] - track.times[start][:, None]
+    ones = inside.astype(np.float64)
+    count = (rest_until - start)[:, None]
+    explained = np.zeros(at.shape)
+    for each in (track.raw_x, track.raw_y):
+        off = each[at] - each[start][:, None]
+        ends = np.stack((start, rest_until), axis=1).ravel()
+        # The sum of each stretch [start, rest_until): those in between are left out.
+        sums = np.add.reduceat(np.append(each, 0.0), ends)[::2]
+        off -= (sums / count[:, 0] - each[start])[:, None]
+        explained += _along_ramps(times, off * ones) ** 2
+    sums, of_times = _along_ramps(times, ones), _along_ramps(times, times * ones)
+    squares = np.where(inside, times * sums - of_times - sums**2 / count, 0.0)
     gain = np.divide(explained, squares, out=np.zeros_like(squares), where=squares > 0)
-    best = int(np.argmax(gain))
-    speed_m_s = float(np.sqrt(explained[best])) / squares[best] if squares[best] else 0.0
-    return _Ramp(rows.start + best, best, speed_m_s, float(gain[best]))
+    best = np.argmax(gain, axis=1)
+    picked = np.arange(len(start)), best
+    with np.errstate(divide="ignore", invalid="ignore"):
+        speed_m_s = np.nan_to_num(np.sqrt(explained[picked]) / squares[picked])
+    return _Ramps(start + best, best, speed_m_s, gain[picked])
 
 
 def _along_ramps(times: Array, values: Array) -> Array:
@@ -224,7 +303,7 @@ def _along_ramps(times: Array, values: Array) -> Array:
     return times * sums - moments
 
 
-def _is_same_ramp(track: Track, found: _Ramp, wider: _Ramp) -> bool:
+def _is_same_ramp(track: Track, end: Indexes, rows: Indexes, wider: _Ramps) -> Flags:
     """Whether a ramp in more rows ends where it does if all of them are of one motion.
 
     The end of n rows at a speed is known to twice the noise over the speed and the root of n: the
@@ -232,8 +311,7 @@ def _is_same_ramp(track: Track, found: _Ramp, wider: _Ramp) -> bool:
     the variance of their difference is the difference of their variances (J. A. Hausman,
     Specification tests in econometrics, Econometrica 46, 1978).
     """
-    if not wider.rows or not wider.speed_m_s:
-        return False
-    more = 1 / max(found.rows, 1) - 1 / wider.rows
-    apart_m = float(track.times[wider.end] - track.times[found.end]) * wider.speed_m_s
-    return apart_m**2 <= more * (_AGREEING * 2 * track.noise_m) ** 2
+    more = 1 / np.maximum(rows, 1) - 1 / np.maximum(wider.rows, 1)
+    apart_m = (track.times[wider.end] - track.times[end]) * wider.speed_m_s
+    moves = (wider.rows > 0) & (wider.speed_m_s > 0)
+    return moves & (apart_m**2 <= more * (_AGREEING * 2 * track.noise_m) ** 2)

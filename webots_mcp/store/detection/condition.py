@@ -3,19 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, Final
+from dataclasses import replace
+from typing import Final
 
 from webots_mcp.conditions import Condition, parse_condition
-from webots_mcp.conditions.compiler import POSITION
-from webots_mcp.errors import UnknownSignalError
+from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.naming import NO_POSITION, Value
+from webots_mcp.store.analysis.arrays import np
+from webots_mcp.store.analysis.runs import Runs, runs_of
+from webots_mcp.store.conditions_on_arrays import OnArrays, first_failure, position_in
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import Alike, EventKind, NotSearchableError
 from webots_mcp.store.detection.search import Search
-from webots_mcp.store.reading.held import Held, recorded_share, where_held
+from webots_mcp.store.reading.coverage import recorded_share
+from webots_mcp.store.reading.frame import Frame, read_frame
+from webots_mcp.store.reading.kept import kept_parts
+from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.signals.catalogue import say_unknown
 
 _MOST_VALUES: Final = 8
+_EARLIER_S: Final = 10.0  # before a range, where its earlier rows were purged
+_SOME_BEFORE: Final = (  # what was there last, for `changed` and `rate`
+    "SELECT min(sim_time_s) FROM (SELECT sim_time_s FROM state WHERE run_id = ? "
+    "AND sim_time_s < ? ORDER BY sim_time_s DESC LIMIT 20)"
+)
 
 
 def condition_events(search: Search) -> Iterator[Event]:
@@ -26,22 +37,61 @@ def condition_events(search: Search) -> Iterator[Event]:
     _require_known(condition, search)
     if search.recorded is None:
         raise NotSearchableError("nothing was recorded in that range")
-    search.require_rows()
-    held = where_held(search.connection, search.recorded, condition, search.deadline)
-    if held.cut and held.reached_s is not None:
-        then = f"ask again with start_s={held.reached_s:.3f}"
-        search.not_searched("condition", f"time limit reached at {held.reached_s:.3f} s: {then}")
+    frame = _read(search, search.recorded, condition)
+    position = position_in(frame, search.known) if condition.asks_position else None
+    first = int(np.searchsorted(frame.times, search.recorded.start_s))
+    runs = where_held(condition, frame, position, first)
+    if frame.cut_at_s is not None:
+        then = f"ask again with start_s={frame.cut_at_s:.3f}"
+        search.not_searched("condition", f"time limit reached at {frame.cut_at_s:.3f} s: {then}")
     if search.only is None:
         share = recorded_share(search.connection, search.segment.run_id)
         search.ledger.note_of_run(search.segment.run_id, share)
-        _require_values(condition, held)
-        search.ledger.rows += held.rows
+        if not len(runs):
+            _require_values(condition, frame, position)
+        search.ledger.rows += len(frame) - first
         search.ledger.came_near(
             "condition", search.ledger.rows, f"true in none of {search.ledger.rows} rows"
         )
-    for stretch in held.stretches:
-        times = (stretch.start_s, stretch.end_s)
-        yield search.event("condition", *times, condition.text, **_details(stretch.values))
+    for run, values in zip(runs.each(), values_at(condition, frame, position, runs), strict=True):
+        details = dict(list(values.items())[:_MOST_VALUES])
+        yield search.event("condition", run.start_s, run.end_s, condition.text, **details)
+
+
+def _read(search: Search, segment: Segment, condition: Condition) -> Frame:
+    """The rows of a segment, and those before it as far as the condition remembers."""
+    run_id, start_s = segment.run_id, segment.start_s
+    (before_s,) = search.connection.execute(_SOME_BEFORE, (run_id, start_s)).fetchone()
+    known_from_s = start_s - _EARLIER_S if before_s is None else before_s
+    longer = replace(segment, start_s=min(known_from_s, start_s - condition.remembers_s))
+    every_call = bool(kept_parts(search.connection, run_id, longer.start_s, segment.end_s))
+    frame = read_frame(search.connection, longer, search.deadline, every_call=every_call)
+    search.require_read(frame)
+    return frame
+
+
+def where_held(
+    condition: Condition, frame: Frame, position: tuple[str, str] | None, first: int = 0
+) -> Runs:
+    """Where a condition held in the rows from the first that was asked for on.
+
+    Raises:
+        InvalidInputError: The values are not of the kinds that it can be asked of.
+    """
+    holds, failures = OnArrays(condition.scanned, frame, position).condition(condition.tree)
+    if failed := first_failure(failures):
+        place = f"in run {frame.run_id}, at {frame.times[failed.row]:.3f} s"
+        raise InvalidInputError(f"{failed.why} ({place})")
+    return runs_of(holds & (np.arange(len(frame)) >= first), frame.times)
+
+
+def values_at(
+    condition: Condition, frame: Frame, position: tuple[str, str] | None, runs: Runs
+) -> Iterator[dict[str, Value]]:
+    """The signals of a condition in the first row of each run."""
+    names = dict.fromkeys([*condition.signals, *(position or ())])
+    columns = {name: frame.values_at(name, runs.starts) for name in names}
+    return ({name: column[place] for name, column in columns.items()} for place in range(len(runs)))
 
 
 def _require_known(condition: Condition, search: Search) -> None:
@@ -51,17 +101,15 @@ def _require_known(condition: Condition, search: Search) -> None:
         raise UnknownSignalError("; ".join(said))
 
 
-def _require_values(condition: Condition, held: Held) -> None:
+def _require_values(condition: Condition, frame: Frame, position: tuple[str, str] | None) -> None:
     """Of what is never there a condition can ask only whether it is missing."""
-    if held.stretches or not held.never_there or "missing(" in condition.text:
+    lost = condition.asks_position and position is None
+    missing = [name for name in condition.signals if not frame.zones(name).value_count.any()]
+    if "missing(" in condition.text or not (lost or missing):
         return
-    names = ", ".join(sorted(held.never_there))
-    why = f": {NO_POSITION}" if POSITION in held.never_there else ""
+    names = ", ".join(sorted([*missing, *["the position"] * lost]))
+    why = f": {NO_POSITION}" if lost else ""
     raise NotSearchableError(f"{names} had no value in any row, so it could not be true{why}")
-
-
-def _details(values: dict[str, Value]) -> dict[str, Any]:
-    return dict(list(values.items())[:_MOST_VALUES])
 
 
 def _is_given(options: EventOptions) -> bool:
@@ -77,4 +125,5 @@ CONDITION: Final = EventKind(
     counted=False,
     alike=Alike(lambda events, unit: "stretches"),
     effort=4,
+    of_frame=True,
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -28,8 +28,6 @@ class Event:
         details: What there is to say about it, by kind.
         around: Values of a few signals when it began.
         count: How many alike events it stands for; it begins with the first, ends with the last.
-        exactly: What all rows about it tell, where it was found in samples of a long run: mostly
-            one event, which begins and ends to the row.
     """
 
     kind: str
@@ -42,7 +40,6 @@ class Event:
     ongoing: bool = False
     around: dict[str, Value] = field(default_factory=dict[str, Value])
     count: int = 1
-    exactly: Callable[[], Sequence[Event]] | None = field(default=None, repr=False, compare=False)
 
     @property
     def duration_s(self) -> float:
@@ -62,10 +59,6 @@ class Threshold:
     def __post_init__(self) -> None:
         if (self.above is None) == (self.below is None):
             raise InvalidInputError(f"threshold on {self.signal!r}: give either above or below")
-
-    def holds(self, value: float) -> bool:
-        """Whether the value is beyond the threshold."""
-        return value > self.above if self.above is not None else value < (self.below or 0.0)
 
 
 def both_of(names: Sequence[str] | None) -> tuple[str, str] | None:
@@ -97,18 +90,18 @@ class EventOptions:
             seen moving, in this run or an earlier one.
         commanded: The signal of the commanded speed; None finds it by name (`commanded`, `cmd`,
             `target_speed`). Of `speed` and `velocity` it is open whether they are commanded.
-        min_commanded: A commanded speed of at least this should move the robot.
-        stuck_m: Still is who stays within this distance (more where the noise of the position is
-            more), stuck who should move besides, ...
+        min_commanded_m_s: A commanded speed of at least this should move the robot.
+        stuck_m: Who stays within this distance (more where the noise of the position is more) is at
+            a standstill, and stuck who should move besides, ...
         stuck_s: ... for so long.
         thresholds: For the kind "threshold".
         where: For the kind "condition"; see docs/conditions.md.
         silent_s: Without a value for so long, though it mostly has one.
         flat_s: Exactly the same number for so long, though it mostly changes; for a signal that
             is noisy otherwise 0.15 of that are enough.
-        jump_score: How many times larger than the usual step (modified z-score) a jump is.
+        jump_min_score: How many times larger than the usual step (modified z-score) a jump is.
         jump_m: A position jumps by at least so much between two rows.
-        oscillation_turns: Turning points in a row; with a period of more than 5 s at least 12.
+        min_half_periods: Half periods in a row; with a period of more than 5 s at least 12.
         oscillation_period_s: The longest period that counts; None for as long a one as fits in
             the stretch, and for 5 s where that is too long to be read row by row.
         log_level: Log lines of this level and above.
@@ -120,16 +113,16 @@ class EventOptions:
     mode: str | None = None
     moving_modes: tuple[str, ...] | None = None
     commanded: str | None = None
-    min_commanded: float = 0.01
+    min_commanded_m_s: float = 0.01
     stuck_m: float = 0.05
     stuck_s: float = 3.0
     thresholds: tuple[Threshold, ...] = ()
     where: str | None = None
     silent_s: float = 1.0
     flat_s: float = 20.0
-    jump_score: float = 12.0
+    jump_min_score: float = 12.0
     jump_m: float = 0.3
-    oscillation_turns: int = LEAST_HALF_SWINGS
+    min_half_periods: int = LEAST_HALF_SWINGS
     oscillation_period_s: float | None = None
     log_level: str = "warning"
 
@@ -138,7 +131,7 @@ class EventOptions:
             raise InvalidInputError(
                 f"unknown log level {self.log_level!r}; there is {', '.join(LEVELS)}"
             )
-        for name in ("stuck_m", "stuck_s", "silent_s", "flat_s", "jump_score", "jump_m"):
+        for name in ("stuck_m", "stuck_s", "silent_s", "flat_s", "jump_min_score", "jump_m"):
             value = getattr(self, name)
             if not 0 < value < math.inf:
                 raise InvalidInputError(f"{name}={value} must be a number above 0")

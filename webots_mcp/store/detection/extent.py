@@ -62,16 +62,18 @@ class Detection:
         reaches_s = ((each.least_s, each.around_s) for each in search.kinds)
         reach_s = max((of(self.options) for both in reaches_s for of in both), default=0.0)
         looked_at = _around(search, segment, reach_s)
-        found = self._found(replace(search, segment=looked_at, asked=segment))
+        looked = replace(search, segment=looked_at, asked=segment)
+        found = self._found(looked)
         events = [each for each in found if _reaches_into(each, segment)]
         lost: list[Event] = []
-        while cut := [e for e in events if e not in lost and self._is_cut(e, looked_at, search)]:
+        while cut := [e for e in events if e not in lost and self._is_cut(e, looked)]:
             if self.deadline.passed:
                 self._note_longer(cut, "time limit reached")
                 break
             reach_s = FARTHER * max(reach_s, 1.0)
             looked_at = _around(search, segment, reach_s)
-            whole = self._whole(cut, looked_at)
+            looked = self._search_of(cut, looked_at)
+            whole = self._found(looked)
             longer = {id(each): _longer(each, whole) for each in cut}
             lost += [each for each in cut if longer[id(each)] is each]
             events = [longer.get(id(each), each) for each in events]
@@ -89,12 +91,11 @@ class Detection:
             habits=self.habits,
         )  # fmt: skip
 
-    def _whole(self, cut: Sequence[Event], segment: Segment) -> list[Event]:
-        """Events of the same kinds and signals in a longer segment; what it lacks is known."""
+    def _search_of(self, cut: Sequence[Event], segment: Segment) -> Search:
+        """For events of the same kinds and signals in a longer segment; what it lacks is known."""
         kinds = [kind_named(name) for name in dict.fromkeys(each.kind for each in cut)]
         names = frozenset(each.name for each in cut if each.name is not None)
-        search = replace(self._search(segment, kinds), ledger=Ledger(), only=names or None)
-        return self._found(search)
+        return replace(self._search(segment, kinds), ledger=Ledger(), only=names or None)
 
     def _found(self, search: Search) -> list[Event]:
         """The events in the segment of a search, cut off at its ends.
@@ -103,7 +104,7 @@ class Detection:
         before it have left.
         """
         efforts = sorted({kind.effort for kind in search.kinds})
-        if len(efforts) > 1:
+        if len(efforts) > 1 and not all(kind.of_frame for kind in search.kinds):
             search.open_view()
         found: dict[str, list[Event]] = {}
         for index, effort in enumerate(efforts):
@@ -130,22 +131,29 @@ class Detection:
             search.not_searched(kind.name, _too_short(kind, search))
             return []
         search.ledger.searched.add(kind.name)
-        if not kind.stored:
+        if kind.of_frame:
+            search.not_searched(kind.name, *search.unread())
+        elif not kind.stored:
             search.not_searched(kind.name, *search.view.taken_notes())
         return found
 
-    def _is_cut(self, event: Event, looked_at: Segment, search: Search) -> bool:
+    def _is_cut(self, event: Event, looked: Search) -> bool:
         """Whether it reaches the first or last row that was looked at, and others follow there."""
-        kind = kind_named(event.kind)
-        before_it, after_it = looked_at.start_s > search.began_s, looked_at.end_s <= search.ended_s
+        kind, looked_at = kind_named(event.kind), looked.segment
+        before_it, after_it = looked_at.start_s > looked.began_s, looked_at.end_s <= looked.ended_s
         if not kind.lasts or not (before_it or after_it):
             return False
         within_s = kind.ends_within_s(event)
-        before = (event.run_id, looked_at.start_s, event.start_s - within_s)
-        after = (event.run_id, event.end_s + within_s, looked_at.end_s)
-        has_begin, has_end = self.connection.execute(
-            _ROWS_BEFORE_AND_AFTER, (*before, *after)
-        ).fetchone()
+        start_s, end_s = event.start_s - within_s, event.end_s + within_s
+        if kind.of_frame:
+            times = looked.frame.times
+            has_begin, has_end = bool(times[0] < start_s), bool(times[-1] > end_s)
+        else:
+            before = (event.run_id, looked_at.start_s, start_s)
+            after = (event.run_id, end_s, looked_at.end_s)
+            has_begin, has_end = self.connection.execute(
+                _ROWS_BEFORE_AND_AFTER, (*before, *after)
+            ).fetchone()
         return (before_it and not has_begin) or (after_it and not has_end)
 
 
@@ -179,7 +187,6 @@ def _longer(event: Event, others: Sequence[Event]) -> Event:
         if alike and other.start_s <= event.end_s and event.start_s <= other.end_s:
             first = min(event, other, key=attrgetter("start_s"))
             last = max(other, event, key=attrgetter("end_s"))
-            details, exactly = other.details, other.exactly
             ends = {"end_s": last.end_s, "ongoing": last.ongoing}
-            return replace(first, **ends, details=details, exactly=exactly)
+            return replace(first, **ends, details=other.details)
     return event

@@ -77,7 +77,6 @@ def _as_one(alike: Sequence[Event], how: Alike, known: dict[str, Signal]) -> Eve
         ongoing=last.ongoing,
         details=details,
         count=len(alike),
-        exactly=None,
     )
 
 

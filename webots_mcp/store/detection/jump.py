@@ -6,29 +6,23 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 from webots_mcp.naming import metres_in
-from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.analysis.jumps import (
-    POSITION_STEPS,
+from webots_mcp.store.detection.event import Event
+from webots_mcp.store.detection.jump_search import (
     Jump,
     are_usual,
     find_jumps,
     find_leaps,
 )
-from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import Alike, EventKind
-from webots_mcp.store.detection.motion import in_metres
 from webots_mcp.store.detection.search import Search
-from webots_mcp.store.reading.rows import Numbers
 from webots_mcp.store.signals.registry import Signal
 
 REACH_S: Final = 2.0  # before and after a range: whether a value comes back shows there
-_LEAST_SHARE: Final = 0.7  # of a distance, less than the root of a half
 _ALIKE_SHARE: Final = 0.05  # of a dropout's size: so near each other they go to the same value
 
 
 def jump_events(search: Search) -> Iterator[Event]:
     """Dropouts and spikes that come back, steps that stay, and leaps of the position."""
-    search.require_rows()
     position = search.motion.position or ()
     numbers = search.numbers if position else search.required_quantities()
     search.note_too_large("jump")
@@ -37,17 +31,11 @@ def jump_events(search: Search) -> Iterator[Event]:
         for signal in numbers
         if signal.kind != "angle" and not signal.is_index and signal not in position
     ]
-    score = search.options.jump_score
-    for index, (signal, courses) in enumerate(search.view.courses(signals, score)):
+    for index, signal in enumerate(signals):
         if search.is_over("jump", signals[index:]):
             break
-        found = {  # two courses may show the same
-            jump.sim_time_s: jump
-            for course in courses
-            for jump in find_jumps(course.times, course.numbers, score, course.usual)
-        }
-        jumps = [found[time_s] for time_s in sorted(found)]
-        if are_usual(jumps, search.view.summary(signal).present):
+        jumps = find_jumps(search.frame, signal.name, search.options.jump_min_score)
+        if jumps and are_usual(jumps, int(search.frame.zones(signal.name).value_count.sum())):
             many = f"not in {signal.name}: large steps are normal for it ({len(jumps)} found)"
             search.not_searched("jump", many)
             continue
@@ -66,22 +54,10 @@ def _leaps(search: Search) -> Iterator[Event]:
     """The position changed by more than driving explains."""
     if (position := search.motion.position) is None:
         return
-    # In one of the two directions it is farther than that.
-    least_steps = [_LEAST_SHARE * search.options.jump_m / metres_in(each.name) for each in position]
-    leaps: dict[float, float] = {}
-    for numbers in search.view.stretches(position, least_steps, apart=POSITION_STEPS):
-        leaps |= _leaps_in(numbers, position, search.options.jump_m)
-    for time_s in sorted(leaps):
-        yield search.event("jump", time_s, time_s, "position", distance_m=leaps[time_s])
-
-
-def _leaps_in(
-    numbers: Numbers, position: tuple[Signal, Signal], at_least_m: float
-) -> dict[float, float]:
-    x, y = (in_metres(signal, numbers.values[signal.name]) for signal in position)
-    known = np.isfinite(x) & np.isfinite(y)
-    places = numbers.times[known], x[known], y[known]
-    return dict(find_leaps(*places, at_least_m, numbers.stretch_rows))
+    x, y = (each.name for each in position)
+    metres = metres_in(x), metres_in(y)
+    for time_s, length_m in find_leaps(search.frame, x, y, metres, search.options.jump_m):
+        yield search.event("jump", time_s, time_s, "position", distance_m=length_m)
 
 
 def _is_back(event: Event) -> bool:
@@ -111,7 +87,7 @@ JUMP: Final = EventKind(
     least_s=lambda options: REACH_S,
     of_numbers=True,
     drawn=1,
-    reads_through=lambda search: search.motion.position or (),
     alike=Alike(_alike, sort=_is_back),
     effort=2,
+    of_frame=True,
 )

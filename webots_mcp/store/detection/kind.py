@@ -97,8 +97,10 @@ class EventKind:
         drawn: Its place among the rows below a plot, the least first; None if it has none there.
         alike: How similar ones are reported as one; None where each is reported by itself.
         reads_through: Signals of which it reads all rows, also of a long segment.
+        of_frame: It reads nothing but the frame of a search.
         effort: Its rank by what it costs to look for: the least is searched first. Kinds of one
             rank find things together, and share their part of the time.
+        of_frame: It reads the frame of a search alone.
     """
 
     name: str
@@ -116,4 +118,6 @@ class EventKind:
     drawn: int | None = None
     alike: Alike | None = None
     reads_through: Callable[[Search], Sequence[Signal]] = _nothing
+    of_frame: bool = False
     effort: int = 0
+    of_frame: bool = False

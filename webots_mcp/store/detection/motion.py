@@ -6,53 +6,25 @@ numpy is imported at the first use: the start of a server does not wait for it.
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from webots_mcp.naming import (
-    FARTHEST_M,
-    METRES,
-    find_mode,
-    find_position,
-    in_snake_case,
-    is_seen_speed,
-    metres_in,
-    unit_in,
-    words_of,
-)
-from webots_mcp.store.analysis.arrays import Array, np
+from webots_mcp.naming import FARTHEST_M, metres_in, unit_in
+from webots_mcp.signal_roles import first_in, pair_in
+from webots_mcp.store.analysis.arrays import Array, Indexes, np
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.signals.catalogue import one_signal
-from webots_mcp.store.signals.flatten import may_be_yaw
-from webots_mcp.store.signals.registry import Signal
+from webots_mcp.store.signals.registry import Signal, roles_of, stored_roles
 
 if TYPE_CHECKING:
     from webots_mcp.store.analysis.track import PathLength, Track
+    from webots_mcp.store.reading.frame import Frame
 
 TRUE_WITHIN: Final = 0.05  # a distance that may be short by less, or by less than so many metres,
 TRUE_WITHIN_M: Final = 0.1  # is reported without a doubt
 IMPLAUSIBLE_M_S: Final = 50.0  # a mean speed beyond is hardly that of a robot
-
-_TAIL: Final = r"([._](x|vx|linear|speed|velocity|m_s|mps))*$"
-_COMMANDED: Final = re.compile(
-    rf"(^|[._])(commanded|command|cmd|cmd_vel|target_speed){_TAIL}", re.IGNORECASE
-)
-_SPEED: Final = re.compile(rf"(^|[._])(speed|velocity|linear){_TAIL}", re.IGNORECASE)
-_WHEEL: Final = re.compile(
-    r"(^|[._])(wheels?|(left|right)_motors?|motors?[._]?(left|right|\d)?)([._]|$)", re.IGNORECASE
-)
-_NO_SPEED: Final = re.compile(  # of a wheel or a motor; and motors that move no robot
-    r"(^|[._])(position|pos|angle|encoders?|ticks?|odo\w*|distance|torque|force|current|power"
-    r"|temp\w*|radius|base|track|width|slip|contact|max|min|limit|gain|count|volt\w*"
-    r"|arm|gripper|hand|head|neck|joint|finger|lidar|camera|mast|lift)([._]|$)",
-    re.IGNORECASE,
-)
-_PLACES: Final = ("rad", "deg", *METRES)  # units of where a wheel is, not of how fast it turns
-_THIRD_AXES: Final = {"0": "2", "x": "z", "x_m": "z_m", "x_cm": "z_cm", "x_mm": "z_mm"}
-_HEADING: Final = re.compile(r"(^|\.)(deg\w*_)?(heading|yaw|theta|bearing)[^.]*", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -65,7 +37,8 @@ class Motion:
             it is commanded or measured.
         mode: What it is doing.
         heading: Where it looks; an angle.
-        wheels: Speeds of its wheels or driving motors, commanded or measured.
+        wheels: Speeds of its wheels or driving motors, commanded or measured; `wheel_commands`
+            are speeds that these should have.
         height: z: a robot that climbs does not stand still.
     """
 
@@ -76,6 +49,7 @@ class Motion:
     heading: Signal | None = None
     wheels: tuple[Signal, ...] = ()
     height: Signal | None = None
+    wheel_commands: tuple[Signal, ...] = ()
 
     @property
     def signals(self) -> list[Signal]:
@@ -87,13 +61,13 @@ class Motion:
     def evidence(self) -> list[Signal]:
         """All of them."""
         others = filter(None, (self.height, self.commanded, self.speed, self.mode, self.heading))
-        return [*(self.position or ()), *others, *self.wheels]
+        return [*(self.position or ()), *others, *self.wheels, *self.wheel_commands]
 
 
 def find_motion(
     known: dict[str, Signal], options: EventOptions, here: Collection[str] | None = None
 ) -> Motion:
-    """Find the signals of motion: those that the options name, else by their names.
+    """Find the signals of motion: those that the options name, else those of the roles.
 
     Args:
         known: All signals of the robot.
@@ -106,85 +80,52 @@ def find_motion(
         InvalidInputError: A name in them means several.
     """
     own = known if here is None else {name: known[name] for name in known if name in here}
-    mode = _named(known, options.mode) or _mode(own)
-    moved = {name: signal for name, signal in own.items() if not is_seen_speed(name)}
-    commanded = _named(known, options.commanded) or _first(moved, _COMMANDED)
-    speed = None if commanded else _first(moved, _SPEED, _is_no_wheel)
-    wheels = tuple(
-        signal
-        for name, signal in moved.items()
-        if signal.kind == "num" and not _is_no_wheel(name)
-        if not _NO_SPEED.search(in_snake_case(name))
-        if signal.unit not in _PLACES and signal not in (commanded, speed)
+    named = _named_position(known, options.position)
+    roles = roles_of(own, (named[0].name, named[1].name)) if named else stored_roles(own)
+    signals = {role: own[name] for name, role in roles.items() if name in own}
+    mode = _named(known, options.mode) or _first("mode", signals)
+    commanded = _named(known, options.commanded) or _first("commanded_speed", signals)
+    speed = None if commanded else _first("speed", signals)
+    wheels, told = (
+        tuple(own[name] for name, role in roles.items() if role == wanted)
+        for wanted in ("wheel", "commanded_wheel")
     )
-    position = _position(known, options.position) if options.position else _position(own, None)
-    position = position or _position(known, None)  # it may be missing in the rows that were seen
-    heading, height = _heading(own, position), _height(own, position)
-    return Motion(position, commanded, speed, mode, heading, wheels, height)
+    place = "" if named else pair_in(signals)
+    return Motion(
+        # It may be missing in the rows that were seen.
+        named or _pair(signals, place) or _position_ever(known),
+        commanded,
+        speed,
+        mode,
+        heading=_first("yaw", signals),
+        wheels=tuple(wheel for wheel in wheels if wheel != commanded),
+        height=signals.get(f"z{place}"),
+        wheel_commands=tuple(wheel for wheel in told if wheel != commanded),
+    )
 
 
-def _is_no_wheel(name: str) -> bool:
-    return not _WHEEL.search(in_snake_case(name))
+def _position_ever(known: dict[str, Signal]) -> tuple[Signal, Signal] | None:
+    signals = {role: known[name] for name, role in stored_roles(known).items()}
+    return _pair(signals, pair_in(signals))
 
 
-def _height(known: dict[str, Signal], position: tuple[Signal, Signal] | None) -> Signal | None:
-    """The third of the position's numbers, or an altitude next to it or at the top.
-
-    The third of a pose or odometry of three is where it looks.
-    """
-    branch, _, axis = position[0].name.rpartition(".") if position else ("", "", "")
-    name = f"{branch}.{_THIRD_AXES.get(axis, '')}".removeprefix(".")
-    if may_be_yaw(name) and f"{branch}.3" not in known:
-        name = ""
-    altitudes = [each for each in known if position and _is_altitude(each, branch)]
-    signals = (known.get(each) for each in (name, *altitudes))
-    return next((each for each in signals if each and each.kind == "num"), None)
+def _pair(signals: dict[str, Signal], place: str | None) -> tuple[Signal, Signal] | None:
+    return None if place is None else (signals[f"x{place}"], signals[f"y{place}"])
 
 
-def _is_altitude(name: str, branch: str) -> bool:
-    nearby, _, last = name.rpartition(".")
-    return nearby in (branch, "") and words_of(last)[0] in ("altitude", "alt")
-
-
-def _heading(known: dict[str, Signal], position: tuple[Signal, Signal] | None) -> Signal | None:
-    """An angle next to the position, or else the one with the shortest name that says so."""
-    angles = [name for name, signal in known.items() if signal.turn is not None]
-    branch = position[0].name.rpartition(".")[0] if position else ""
-    nearby = [name for name in angles if name.rpartition(".")[0] == branch and branch]
-    named = [name for name in angles if _HEADING.search(in_snake_case(name))]
-    found = nearby or named
-    return known[min(found, key=len)] if found else None
+def _first(role: str, signals: dict[str, Signal]) -> Signal | None:
+    found = first_in(role, signals)
+    return signals[found] if found else None
 
 
 def _named(known: dict[str, Signal], name: str | None) -> Signal | None:
     return None if name is None else one_signal(known, name)
 
 
-def _position(
-    known: dict[str, Signal], named: tuple[str, str] | None
+def _named_position(
+    known: dict[str, Signal], names: tuple[str, str] | None
 ) -> tuple[Signal, Signal] | None:
-    if named is not None:
-        x, y = (_named(known, name) for name in named)
-        return (x, y) if x and y else None
-    numeric = [name for name, signal in known.items() if signal.is_number]
-    held = [name for name in numeric if known[name].kind != "null"]
-    names = find_position(held) or find_position(numeric)
-    return (known[names[0]], known[names[1]]) if names else None
-
-
-def _mode(known: dict[str, Signal]) -> Signal | None:
-    texts = {name for name, signal in known.items() if signal.kind == "text"}
-    name = find_mode(texts, {name for name, signal in known.items() if signal.is_choice})
-    return known[name] if name else None
-
-
-def _first(
-    known: dict[str, Signal], name: re.Pattern[str], wanted: Callable[[str], bool] = bool
-) -> Signal | None:
-    """The number with the shortest name that fits: `speed` before `arm.speed`."""
-    numbers = [each for each, signal in known.items() if signal.kind == "num"]
-    fitting = [each for each in numbers if name.search(in_snake_case(each)) and wanted(each)]
-    return known[min(fitting, key=len)] if fitting else None
+    return (one_signal(known, names[0]), one_signal(known, names[1])) if names else None
 
 
 def in_metres(signal: Signal, lengths: Array) -> Array:
@@ -217,6 +158,19 @@ def tracks_in(
     from webots_mcp.store.analysis.track import tracks_of
 
     return tracks_of(*places_of(columns, position), noise_m)
+
+
+def tracks_of_frame(
+    frame: Frame, position: tuple[Signal, Signal]
+) -> tuple[list[Track], list[Indexes]]:
+    """The way of the robot in each stretch without a gap, and the rows of the frame in it."""
+    from webots_mcp.store.analysis.track import tracks_of
+
+    x, y = (in_metres(each, frame.numbers(each.name)) for each in position)
+    rows = np.flatnonzero(np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M)
+    tracks = tracks_of(frame.times[rows], x[rows], y[rows])
+    ends = np.cumsum([len(track.times) for track in tracks])
+    return tracks, np.split(rows, ends[:-1])
 
 
 def path_length(

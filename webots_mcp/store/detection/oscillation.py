@@ -34,22 +34,25 @@ def oscillation_events(search: Search) -> Iterator[Event]:
     search.note_too_large("oscillation")
     for name, swings in _found(search, signals).items():
         for swing in joined_swings(swings):
-            details = {"period_s": swing.period_s, "amplitude": swing.amplitude}
-            ends = (swing.start_s, swing.end_s)
-            event = search.event("oscillation", *ends, name, turns=swing.half_swings, **details)
+            details = {
+                "half_periods": swing.half_swings,
+                "period_s": swing.period_s,
+                "amplitude": swing.amplitude,
+            }
+            event = search.event("oscillation", swing.start_s, swing.end_s, name, **details)
             goes_on = search.ended_s - swing.end_s < _ends_within_s(event)
             yield replace(event, ongoing=goes_on)
 
 
 def _note_periods(search: Search) -> None:
     """Which periods are too long for the run to hold enough of them, or to be looked for at all."""
-    turns, longest_s = search.options.oscillation_turns, _longest_period_s(search)
-    fitting_s = 2 * search.length_s / turns
+    half_periods, longest_s = search.options.min_half_periods, _longest_period_s(search)
+    fitting_s = 2 * search.length_s / half_periods
     if fitting_s < longest_s:
         search.not_searched(
             "oscillation",
             f"run {search.segment.run_id} lasted only {search.length_s:.3g} s, too short for "
-            f"{turns} half periods where a period is over {fitting_s:.2g} s",
+            f"{half_periods} half periods where a period is over {fitting_s:.2g} s",
         )
     elif search.view.is_long and search.options.oscillation_period_s is None:
         search.not_searched(
@@ -66,8 +69,8 @@ def _longest_period_s(search: Search) -> float:
 def _found(search: Search, signals: Sequence[Signal]) -> dict[str, list[Swing]]:
     """Those that are stored, and in the rows of which none are."""
     options = search.options
-    asked = options.oscillation_turns, _longest_period_s(search)
-    usual = asked == (EventOptions.oscillation_turns, LONGEST_PERIOD_S)
+    asked = options.min_half_periods, _longest_period_s(search)
+    usual = asked == (EventOptions.min_half_periods, LONGEST_PERIOD_S)
     stored, found = search.view.stored_swings(signals if usual else ())
     for some, outside in (
         ([each for each in signals if each.name in found], stored),
@@ -88,7 +91,7 @@ def _swinging(search: Search) -> list[Signal]:
 
 
 def _around_s(options: EventOptions) -> float:
-    return options.oscillation_turns * (options.oscillation_period_s or LONGEST_PERIOD_S) / 2
+    return options.min_half_periods * (options.oscillation_period_s or LONGEST_PERIOD_S) / 2
 
 
 def _ends_within_s(event: Event) -> float:

@@ -9,13 +9,16 @@ from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.naming import flatten, listed
+from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.analysis.summary import LARGEST
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import EventKind, NotSearchableError
+from webots_mcp.store.detection.mode_use import ModeUses, frames_of_runs
 from webots_mcp.store.detection.motion import Motion, find_motion
 from webots_mcp.store.detection.verdict import Ledger
 from webots_mcp.store.reading.coverage import less_time, purged_until_s
 from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import Segment, just_after, recorded_bounds
 from webots_mcp.store.reading.views import View, view_of
 from webots_mcp.store.reading.wall_time import UP_TO, RunClock
@@ -25,10 +28,9 @@ from webots_mcp.store.signals.flatten import parse
 from webots_mcp.store.signals.registry import Signal
 
 if TYPE_CHECKING:
-    from webots_mcp.store.detection.habits import MovedIn
-    from webots_mcp.store.detection.standing import Standings
+    from webots_mcp.store.detection.standstill import Findings
 
-    Habits = dict[tuple[int, Motion], MovedIn]
+    Habits = dict[tuple[int, Motion], ModeUses]
 
 MOST_NAMED: Final = 5
 
@@ -174,14 +176,48 @@ class Search:
         return {signal_id: (least, greatest) for signal_id, (least, greatest) in found.items()}
 
     @cached_property
+    def frame(self) -> Frame:
+        """The rows of the segment.
+
+        Raises:
+            NotSearchableError: They were purged.
+        """
+        frame = read_frame(self.connection, self.segment, self.deadline)
+        self.require_read(frame)
+        return frame
+
+    def require_read(self, frame: Frame) -> None:
+        """See that something is left of what was recorded.
+
+        Raises:
+            NotSearchableError: It was purged.
+        """
+        if not len(frame):
+            self.require_rows()
+
+    def unread(self) -> list[str]:
+        """What of the segment is not in its frame."""
+        run_id, start_s = self.segment.run_id, self.segment.start_s
+        notes = [str(each) for each in self.frame.unread]
+        until_s = purged_until_s(self.connection, run_id, start_s)
+        if until_s is not None and len(self.frame) and self.frame.times[0] >= until_s:
+            notes.append(f"not before {until_s:.3f} s, whose rows were purged")
+        return notes
+
+    @cached_property
+    def whole(self) -> Frame:
+        """The rows of the whole run."""
+        part = Segment(self.segment.run_id, self.began_s, just_after(self.ended_s))
+        if replace(self.segment, open_start=False, open_end=False) == part:
+            return self.frame
+        return read_frame(self.connection, part, self.deadline)
+
+    @cached_property
     def view(self) -> View:
         """The values of all signals that the kinds look at; read at the first use."""
-        limits = [
-            signal
-            for threshold in self.options.thresholds
-            for signal in resolve_signals(self.known, [threshold.signal])
-        ]
-        needed = {each.name: each for each in (*self.numbers, *self.motion.evidence, *limits)}
+        wanted = any(kind.of_numbers and not kind.of_frame for kind in self.kinds)
+        numbers = self.numbers if wanted else []
+        needed = {each.name: each for each in (*numbers, *(self.motion.position or ()))}
         through = [each for kind in self.kinds for each in kind.reads_through(self)]
         return view_of(self.connection, self.segment, list(needed.values()), self.deadline, through)
 
@@ -190,21 +226,15 @@ class Search:
         assert self.view
 
     @cached_property
-    def standings(self) -> Standings:
-        """The standstills, found once for all kinds that tell them; numpy is imported here."""
-        from webots_mcp.store.detection.standing import find_standings
-
-        return find_standings(self)
-
-    @property
-    def moved_in(self) -> MovedIn:
-        """In which modes the robot moves; numpy is imported here."""
-        from webots_mcp.store.detection.habits import MovedIn
+    def standstills(self) -> Findings:
+        """Found once for both kinds that tell of them; how the other kinds look is not imported."""
+        from webots_mcp.store.detection.standstill import judge_standstills
 
         asked = (self.segment.run_id, self.motion)
         if asked not in self.habits:
-            self.habits[asked] = MovedIn(self.connection, *asked, self.deadline)
-        return self.habits[asked]
+            frames = frames_of_runs(self.connection, self.segment.run_id, self.deadline)
+            self.habits[asked] = ModeUses(*asked, frames, self.options)
+        return judge_standstills(self.frame, self.motion, self.options, self.habits[asked])
 
     def event(
         self, kind: str, start_s: float, end_s: float, name: str | None, **details: Any
@@ -231,9 +261,14 @@ class Search:
 
     @cached_property
     def _too_large(self) -> list[str]:
-        """Those with such numbers in their newest rows."""
-        values = {each.name: self.view.sample([each]).aligned(each.name) for each in self.numbers}
-        return [name for name, found in values.items() if (abs(found) > LARGEST).any()]
+        """Those with such numbers."""
+        return [each.name for each in self.numbers if self._is_too_large(each.name)]
+
+    def _is_too_large(self, name: str) -> bool:
+        zones = self.frame.zones(name)
+        spans = zones.spans(zones.value_count < zones.held_count)
+        parts = (self.frame.rows(*span).numbers(name) for span in spans)
+        return any((np.abs(part) > LARGEST).any() for part in parts)
 
     def came_near(self, kind: str, share: float, what: str) -> None:
         """Note what came near to an event, as a share of what would be one."""

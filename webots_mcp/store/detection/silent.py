@@ -7,118 +7,106 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from webots_mcp.naming import LONGEST_SPREAD_ARRAY, listed
-from webots_mcp.store.analysis.summary import Summary
+from webots_mcp.naming import listed
+from webots_mcp.store.analysis.arrays import Flags, np
+from webots_mcp.store.analysis.runs import MOSTLY, Runs, runs_of
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import Alike, EventKind
-from webots_mcp.store.detection.resting import replaced_value
 from webots_mcp.store.detection.search import MOST_NAMED, Search
-from webots_mcp.store.reading.intervals import MOSTLY, Silent, Span, common
-from webots_mcp.store.rollup.tables import watermark
+from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.signals.catalogue import other_form
 from webots_mcp.store.signals.registry import Signal
 
 MANY_SILENCES: Final = 10  # of a signal that mostly has no value: it comes so by nature
 _INDEX: Final = re.compile(r"\.\d+$")  # items that fall silent at once are reported as the array
 
-# Whether it had a value before, in the rollups or in rows that are not rolled up yet.
-_HAD_VALUE: Final = (
-    "SELECT EXISTS (SELECT 1 FROM all_rollup WHERE run_id = :run AND signal_id = :signal "
-    "AND first_sim_time_s < :before) OR EXISTS (SELECT 1 FROM state WHERE id > :mark "
-    "AND +run_id = :run AND sim_time_s < :before AND json_extract(data, :path) IS NOT NULL)"
-)
-_TYPES_AT: Final = (  # of the array, and of the item in it
-    "SELECT json_type(data, ?), json_type(data, ?) FROM state WHERE run_id = ? "
-    "AND sim_time_s >= ? ORDER BY sim_time_s, id LIMIT 1"
-)
-
 
 def silent_events(search: Search) -> Iterator[Event]:
     """It has begun, and lasts to the signal's next value, if any."""
     shorter: Counter[str] = Counter()
-    asked = search.asked or search.segment
     for index, signal in enumerate(search.required_numbers()):
-        here = search.view.summary(signal)
-        if here.present == here.rows:
-            continue
         if search.is_over("silent", search.numbers[index:]):
             break
-        spans = [
-            span
-            for span in _without_value(search, signal)
-            if _has_begun(search, signal, span) and not _is_shorter(search, signal, span)
-        ]
-        least_s = _least_silence_s(search, signal, here, spans)
-        short = 0
-        for span in spans:
-            lasts_s = span.end_s - span.start_s
-            if lasts_s >= least_s:
-                instead = replaced_value(search, signal, span.start_s)
-                details = {**span.how_exact, **({"value": instead} if instead else {})}
-                yield search.event("silent", span.start_s, span.end_s, signal.name, **details)
-            elif lasts_s > 0:
-                what = f"{signal.name} had no value for {lasts_s:.3g} s from {span.start_s:.6g} s"
-                search.came_near("silent", lasts_s / least_s, what)
-                short += span.start_s < asked.end_s and span.end_s >= asked.start_s
-        if short and least_s == search.options.silent_s:
-            array = _INDEX.sub(".*", signal.name)
-            shorter[array] = max(short, shorter[array])
-    if shorter:
+        runs = _silences(search, signal)
+        if not len(runs):
+            continue
+        least_s = _least_silence_s(search, signal, runs)
+        for run in runs.only(runs.durations_s >= least_s).each():
+            replaced = search.frame.rows(run.start, run.start + 1).replaced(signal.name)
+            details = {"value": next(iter(replaced))} if replaced else {}
+            yield search.event("silent", run.start_s, run.end_s, signal.name, **details)
+        short = runs.only((runs.durations_s > 0) & (runs.durations_s < least_s))
+        if len(short):
+            _note_longest(search, signal, short, least_s)
+            if least_s == search.options.silent_s:
+                array = _INDEX.sub(".*", signal.name)
+                shorter[array] = max(_count_asked(search, short), shorter[array])
+    if +shorter:
         counts = [
-            f"{name} {count} time{'s' * (count > 1)}" for name, count in shorter.most_common()
+            f"{name} {count} time{'s' * (count > 1)}" for name, count in (+shorter).most_common()
         ]
         limit = f"for less than silent_s={search.options.silent_s:g} s"
         note = f"without a value {limit}, so not counted as silent: {listed(counts, MOST_NAMED)}"
         search.ledger.note_of_run(search.segment.run_id, note)
 
 
-def _without_value(search: Search, signal: Signal) -> list[Span]:
+def _silences(search: Search, signal: Signal) -> Runs:
     """Where neither the signal has a value nor its array in its other form, long or short."""
-    spans = search.view.spans(signal, Silent())
-    other = other_form(search.known, signal)
-    if other is None or not spans:
-        return spans
-    return list(common(spans, search.view.spans(other, Silent())))
+    frame, other = search.frame, other_form(search.known, signal)
+    signals = [each for each in (signal, other) if each]
+    lacks: Flags | None = None
+    for each in signals:
+        missing = rows_without_value(frame, each.name)
+        lacks = missing if lacks is None or missing is None else lacks & missing
+        if lacks is None:
+            return runs_of(np.zeros(0, np.bool_), frame.times)
+    assert lacks is not None
+    runs = runs_of(lacks, frame.times)
+    return runs.only(_have_begun(search, signals, runs) & ~_are_shorter(search, signal, runs))
 
 
-def _has_begun(search: Search, signal: Signal, span: Span) -> bool:
+def rows_without_value(frame: Frame, name: str) -> Flags | None:
+    """The rows that have no value of a signal; None where all have one, by the statistics."""
+    zones = frame.zones(name)
+    is_lacking = zones.value_count < zones.row_count
+    if not is_lacking.any():
+        return None
+    lacks = np.repeat(zones.held_count == 0, zones.row_count)
+    for start, stop in zones.spans(is_lacking & (zones.held_count > 0)):
+        part = frame.rows(start, stop)
+        lacks[start:stop] = np.isnan(part.numbers(name)) & (part.texts(name).codes == 0)
+    return lacks
+
+
+def _have_begun(search: Search, signals: Sequence[Signal], runs: Runs) -> Flags:
     """What had no value before its first one was not there yet; that is no silence."""
-    if span.start_s <= search.began_s or signal.kind == "null":
-        return False
-    if not span.from_first:
-        return True
-    other = other_form(search.known, signal)
-    return any(_had_value(search, each, span.start_s) for each in (signal, other) if each)
+    begun = (runs.starts_s > search.began_s) & (signals[0].kind != "null")
+    if len(runs) and begun[0] and runs.starts[0] == 0:
+        before = search.whole.between(search.began_s, float(runs.starts_s[0]))
+        begun[0] = any(before.zones(each.name).value_count.any() for each in signals)
+    return begun
 
 
-def _had_value(search: Search, signal: Signal, at_s: float) -> bool:
-    run_id = search.segment.run_id
-    asked = {"run": run_id, "signal": signal.id, "before": at_s, "path": signal.path}
-    asked["mark"] = watermark(search.connection, run_id)
-    return bool(search.connection.execute(_HAD_VALUE, asked).fetchone()[0])
-
-
-def _is_shorter(search: Search, signal: Signal, span: Span) -> bool:
+def _are_shorter(search: Search, signal: Signal, runs: Runs) -> Flags:
     """Whether the array was there when it began, but so short or long that it has no such item.
 
     A long one is reduced; whose items are all replaced (a lidar that sees nothing) has no number.
     """
-    array = signal.path if signal.reduce else signal.path.rpartition("[")[0]
-    if not array:
-        return False
-    item = f"{array}[{LONGEST_SPREAD_ARRAY}]" if signal.reduce else signal.path
-    asked = (array, item, search.segment.run_id, span.start_s)
-    types = search.connection.execute(_TYPES_AT, asked).fetchone()
-    return types is not None and types[0] == "array" and types[1] != "null"
+    if not len(runs) or not (signal.reduce or signal.path.endswith("]")):
+        return np.zeros(len(runs), np.bool_)
+    frame, array = search.frame, signal.name.rpartition(".")[0]
+    others = frame.held(f"{array}.0") | frame.held(f"{array}.count")
+    return others[runs.starts] & ~frame.held(signal.name)[runs.starts]
 
 
-def _least_silence_s(search: Search, signal: Signal, here: Summary, spans: Sequence[Span]) -> float:
+def _least_silence_s(search: Search, signal: Signal, runs: Runs) -> float:
     """Longer for an intermittent signal: three times its usual interval between values."""
     least_s = search.options.silent_s
-    lengths = sorted(span.end_s - span.start_s for span in spans)
-    if here.present >= MOSTLY * here.rows or len(lengths) < MANY_SILENCES:
+    zones = search.frame.zones(signal.name)
+    is_usual = zones.value_count.sum() >= MOSTLY * zones.row_count.sum()
+    if is_usual or len(runs) < MANY_SILENCES:
         return least_s
-    usual_s = lengths[len(lengths) // 2]
+    usual_s = float(np.sort(runs.durations_s)[len(runs) // 2])
     if 3 * usual_s <= least_s:
         return least_s
     search.ledger.notes.append(
@@ -126,6 +114,20 @@ def _least_silence_s(search: Search, signal: Signal, here: Summary, spans: Seque
         f"after {3 * usual_s:.3g} s"
     )
     return 3 * usual_s
+
+
+def _note_longest(search: Search, signal: Signal, short: Runs, least_s: float) -> None:
+    longest = int(short.durations_s.argmax())
+    lasts_s, start_s = float(short.durations_s[longest]), float(short.starts_s[longest])
+    what = f"{signal.name} had no value for {lasts_s:.3g} s from {start_s:.6g} s"
+    search.came_near("silent", lasts_s / least_s, what)
+
+
+def _count_asked(search: Search, short: Runs) -> int:
+    """How many of them touch what was asked for."""
+    asked = search.asked or search.segment
+    inside = (short.starts_s < asked.end_s) & (short.ends_s >= asked.start_s)
+    return int(np.count_nonzero(inside))
 
 
 SILENT: Final = EventKind(
@@ -137,4 +139,5 @@ SILENT: Final = EventKind(
     of_numbers=True,
     drawn=2,
     alike=Alike(lambda events, unit: "stretches without a value", of_arrays=True),
+    of_frame=True,
 )

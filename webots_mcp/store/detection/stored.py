@@ -40,7 +40,7 @@ _IN_SEGMENT: Final = (
 )
 _NEWEST: Final = "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
 _LOGS: Final = f"SELECT sim_time_s, wall_time_s, level, source, message FROM log {_IN_SEGMENT}"
-_NOTICED: Final = (  # changes are in the change table, of all signals and without a limit
+_NOTICED: Final = (  # changes of signals are read from states, of all signals, without a limit
     f"SELECT sim_time_s, wall_time_s, kind, name, data FROM event {_IN_SEGMENT} "
     "AND kind NOT IN ('change', 'start', 'reset', 'reload') "
 )
@@ -128,10 +128,11 @@ def change_events(search: Search) -> Iterator[Event]:
             "no text, flag or mode was published, or none with these names; for another number "
             "ask with where='changed(NAME)'"
         )
-    _note_purged(search, [each.name for each in states if each.is_number])
     around = Segment(segment.run_id, segment.start_s - AROUND_S, segment.end_s + AROUND_S)
     found = change_points(search.connection, around, states, search.deadline, since=False)
     _note_unread(search, "change", found.unread_from_s)
+    for each in found.unread:
+        search.not_searched("change", str(each))
     for signal in states:
         name, points = signal.name, found.points[signal.name]
         points_left = _without_measurements(points)
@@ -159,16 +160,6 @@ def _note_unread(search: Search, kind: str, from_s: float | None) -> None:
         from_s = max(from_s, search.segment.start_s)
         why = f"not after {from_s:.3f} s: time limit reached, ask start_s={from_s:.3f}"
         search.not_searched(kind, why)
-
-
-def _note_purged(search: Search, numbers: Sequence[str]) -> None:
-    """Of numbers no change is stored: what came and went within a bucket is gone with its rows."""
-    until_s = purged_until_s(search.connection, search.segment.run_id, search.segment.start_s)
-    if numbers and until_s is not None:
-        before = "" if until_s == math.inf else f" before {until_s:.3f} s"
-        names = listed(numbers, MOST_NAMED)
-        why = f"of {names} at most one in 10 s{before}, as rows were purged"
-        search.not_searched("change", why)
 
 
 class _Change(NamedTuple):

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import ast
 from collections.abc import Hashable, Iterator, Sequence
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.store.analysis.arrays import np
+from webots_mcp.store.analysis.runs import extremes_in, runs_of
+from webots_mcp.store.conditions_on_arrays import compared
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold
 from webots_mcp.store.detection.kind import Alike, EventKind, NotSearchableError
 from webots_mcp.store.detection.search import Search
-from webots_mcp.store.reading.intervals import Beyond
+from webots_mcp.store.reading.frame import Zones
 from webots_mcp.store.signals.catalogue import resolve_signals
 from webots_mcp.store.signals.registry import Signal
 
@@ -49,23 +53,29 @@ def threshold_events(search: Search) -> Iterator[Event]:
 def _beyond(search: Search, signal: Signal, threshold: Threshold) -> Iterator[Event]:
     limit = {"above": threshold.above, "below": threshold.below}
     given = {name: value for name, value in limit.items() if value is not None}
-    longest_s = None
-    for span in search.view.spans(signal, Beyond(threshold.holds)):
-        if span.end_s - span.start_s >= threshold.for_s:
-            details = {**given, "min": span.low, "max": span.high, **span.how_exact}
-            yield search.event("threshold", span.start_s, span.end_s, signal.name, **details)
-        else:
-            longest_s = max(longest_s or 0.0, span.end_s - span.start_s)
-    if longest_s is not None:
+    frame = search.frame
+    (limit_at,) = given.values()
+    op = ast.Gt if threshold.above is not None else ast.Lt
+    runs = runs_of(compared(frame, signal.name, op, limit_at), frame.times)
+    long = runs.only(runs.durations_s >= threshold.for_s)
+    numbers = frame.numbers(signal.name) if len(long) else np.zeros(0)
+    for run, low, high in zip(long.each(), *extremes_in(long, numbers), strict=True):
+        details = {**given, "min": float(low), "max": float(high)}
+        yield search.event("threshold", run.start_s, run.end_s, signal.name, **details)
+    if len(runs) > len(long):
+        longest_s = float(runs.durations_s[runs.durations_s < threshold.for_s].max())
         what = f"{signal.name} was beyond the limit for at most {longest_s:.3g} s"
         search.came_near("threshold", longest_s / threshold.for_s, what)
-    elif (extreme := _extreme(search, signal, threshold)) is not None:
+    elif not len(runs) and (extreme := _extreme(frame.zones(signal.name), op)) is not None:
         search.came_near("threshold", 0.0, f"{signal.name} reached {extreme:.4g}")
 
 
-def _extreme(search: Search, signal: Signal, threshold: Threshold) -> float | None:
-    summary = search.view.summary(signal)
-    return summary.max if threshold.above is not None else summary.min
+def _extreme(zones: Zones, op: type[ast.cmpop]) -> float | None:
+    there = zones.value_count > 0
+    values = (zones.max if op is ast.Gt else zones.min)[there & ~np.isnan(zones.min)]
+    if not len(values):
+        return None
+    return float(values.max() if op is ast.Gt else values.min())
 
 
 def _limit(event: Event) -> Hashable:
@@ -85,4 +95,5 @@ THRESHOLD: Final = EventKind(
     least_s=_for_s,
     counted=False,
     alike=Alike(lambda events, unit: "stretches", sort=_limit),
+    of_frame=True,
 )

@@ -33,6 +33,8 @@ from webots_mcp.store.json_folder.folder_reading import (
     is_there,
     read_folder,
 )
+from webots_mcp.store.rollup.batch import Batch
+from webots_mcp.store.signals.registry import enter_signals
 from webots_mcp.transactions import transaction
 
 Progress = Callable[[int, int], object]
@@ -189,7 +191,13 @@ class _Writer:
         self._insert("event", **self._at(self._first_s), kind="import", data=text)
         if state := self._found.state:
             at = self._at(state.wall_time_s)
-            self._insert("state", **at, data=state.data, odd=state.odd)
+            state_id = self._insert("state", **at, data=state.data, odd=state.odd)
+            batch = Batch()
+            batch.add(
+                state_id, self._robot_id, self.run_id, at["sim_time_s"], state.wall_time_s,
+                state.data, state.odd,
+            )  # fmt: skip
+            enter_signals(self._connection, self._robot_id, batch.columns())
         for picture, path in zip(self._found.pictures, paths, strict=True):
             self._insert_picture(picture, path)
         self._insert_commands(session_id)

@@ -12,7 +12,7 @@ from typing import Final
 from webots_mcp.conditions.signal_values import SAME_TIME_S
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.parameter import Value
-from webots_mcp.store.analysis.spread import MATTERS_SD
+from webots_mcp.store.analysis.spread import MIN_EFFECT_SD
 from webots_mcp.store.analysis.summary import Summary
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import find_motion
@@ -23,16 +23,15 @@ from webots_mcp.store.questions.outcomes import (
     Measure,
     RunPart,
     outcomes_of,
-    sampling_notes,
 )
 from webots_mcp.store.questions.runs import RunInfo, run_infos
 from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.frame import read_frame
+from webots_mcp.store.reading.frame_summary import summary_of
 from webots_mcp.store.reading.ranges import whole_run
-from webots_mcp.store.reading.rollups import read_pieces
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.reading.subject import Subject
 from webots_mcp.store.robots import resolve_robot
-from webots_mcp.store.rollup.buckets import COARSE_S
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.signals.catalogue import catalogue, resolve_signals
 from webots_mcp.store.signals.registry import Signal
@@ -73,7 +72,7 @@ class Comparison:
         compared_s: All figures are about the first so many simulated seconds of each run, as many
             as the shortest has.
         measures: What the runs came to as a whole.
-        not_known: Figures that are not known, or not wholly: of which runs, why, and what would
+        unknown: Figures that are not known, or not wholly: of which runs, why, and what would
             make them known.
         differences: What differs most comes first; at most `limit` of `total`.
         only_in: Signals that not every group has, with the groups that have them.
@@ -83,7 +82,7 @@ class Comparison:
     groups: tuple[Group, ...]
     compared_s: float
     measures: tuple[Measure, ...]
-    not_known: dict[str, str]
+    unknown: dict[str, str]
     differences: tuple[Difference, ...]
     total: int
     only_in: dict[str, tuple[str, ...]]
@@ -98,7 +97,7 @@ def compare_runs(
     names: Sequence[str] = ("*",),
     limit: int = 30,
     options: EventOptions | None = None,
-    matters_sd: float = MATTERS_SD,
+    min_effect_sd: float = MIN_EFFECT_SD,
     deadline_s: float = COMPARE_DEADLINE_S,
 ) -> Comparison:
     """Compare runs, aligned at their start; that of the first one is the reference.
@@ -112,7 +111,7 @@ def compare_runs(
         names: Signals, with `*`.
         limit: The most differences to return.
         options: What counts as an event, and what the position and the mode are.
-        matters_sd: The least difference that matters, in standard deviations between like runs.
+        min_effect_sd: The least difference that matters, in standard deviations between like runs.
         deadline_s: After it, figures for which not all rows were read are None.
 
     Raises:
@@ -122,7 +121,7 @@ def compare_runs(
     """
     if not 1 <= len(run_ids) <= MOST_COMPARED or len(set(run_ids)) < len(run_ids):
         raise InvalidInputError(f"give 1 to {MOST_COMPARED} different runs, not {list(run_ids)}")
-    asked = _Asked(names, limit, options or EventOptions(), matters_sd, deadline_s)
+    asked = _Asked(names, limit, options or EventOptions(), min_effect_sd, deadline_s)
     return _compare(connection, _repeats(connection, run_ids), asked)
 
 
@@ -146,7 +145,7 @@ def compare_code(
     names: Sequence[str] = ("*",),
     limit: int = 30,
     options: EventOptions | None = None,
-    matters_sd: float = MATTERS_SD,
+    min_effect_sd: float = MIN_EFFECT_SD,
     deadline_s: float = COMPARE_DEADLINE_S,
 ) -> Comparison:
     """Compare the runs before and after the last edit of the robot's controller.
@@ -174,7 +173,7 @@ def compare_code(
         )
     (_, after), (_, before) = blocks
     groups = {"before": before[:MOST_COMPARED][::-1], "after": after[:MOST_COMPARED][::-1]}
-    asked = _Asked(names, limit, options or EventOptions(), matters_sd, deadline_s)
+    asked = _Asked(names, limit, options or EventOptions(), min_effect_sd, deadline_s)
     return _compare(connection, groups, asked)
 
 
@@ -186,7 +185,7 @@ def compare_trials(
     names: Sequence[str] = ("*",),
     limit: int = 30,
     options: EventOptions | None = None,
-    matters_sd: float = MATTERS_SD,
+    min_effect_sd: float = MIN_EFFECT_SD,
     deadline_s: float = COMPARE_DEADLINE_S,
 ) -> Comparison:
     """Compare the runs of a trial set by their parameters; the best is the reference.
@@ -200,7 +199,7 @@ def compare_trials(
     """
     found = scored_runs(connection, set_id)
     groups = {name: found[name][:MOST_COMPARED] for name in list(found)[:MOST_SETS]}
-    asked = _Asked(names, limit, options or EventOptions(), matters_sd, deadline_s)
+    asked = _Asked(names, limit, options or EventOptions(), min_effect_sd, deadline_s)
     compared = _compare(connection, groups, asked)
     if len(found) == len(groups):
         return compared
@@ -213,12 +212,12 @@ class _Asked:
     names: Sequence[str]
     limit: int
     options: EventOptions
-    matters_sd: float
+    min_effect_sd: float
     deadline_s: float
 
     def __post_init__(self) -> None:
-        if not 0 < self.matters_sd < math.inf:
-            raise InvalidInputError(f"matters_sd={self.matters_sd} must be a number above 0")
+        if not 0 < self.min_effect_sd < math.inf:
+            raise InvalidInputError(f"min_effect_sd={self.min_effect_sd} must be a number above 0")
 
 
 def _compare(
@@ -235,15 +234,14 @@ def _compare(
     shared = [each for each in differences if 0 not in each.count]
     shared.sort(key=size_of, reverse=True)
     compared = _groups(connection, groups)
-    outcomes = outcomes_of(connection, cut, options, deadline, asked.matters_sd)
+    outcomes = outcomes_of(connection, cut, options, deadline, asked.min_effect_sd)
     unread = any(None in each.count for each in differences)
     notes = _notes(compared) + _cut_notes(durations_s, compared_s)
-    notes += sampling_notes(connection, [part for found in cut for part in found])
     return Comparison(
         groups=compared,
         compared_s=compared_s,
         measures=outcomes.measures,
-        not_known=outcomes.not_known | ({"means of signals": OUT_OF_TIME} if unread else {}),
+        unknown=outcomes.unknown | ({"means of signals": OUT_OF_TIME} if unread else {}),
         differences=tuple(shared[: asked.limit]),
         total=len(shared),
         only_in=only_in(differences, list(groups)),
@@ -266,7 +264,7 @@ def _differences(
         [_summarise(connection, part, numbers, deadline) for part in group] for group in groups
     ]
     tests = 2 * len(numbers)
-    return [difference_of(signal, summaries, tests, asked.matters_sd) for signal in numbers]
+    return [difference_of(signal, summaries, tests, asked.min_effect_sd) for signal in numbers]
 
 
 def _notes(groups: Sequence[Group]) -> list[str]:
@@ -279,10 +277,7 @@ def _notes(groups: Sequence[Group]) -> list[str]:
         notes.append(f"these are runs of different robots: {', '.join(robots)}")
     purged = [str(run.run_id) for run in runs if run.purged_rows]
     if purged:
-        notes.append(
-            f"rows of run {', '.join(purged)} were purged: their events are missing, and the "
-            "distance is unknown (null)"
-        )
+        notes.append(f"rows of run {', '.join(purged)} were purged: their events are missing")
     return notes
 
 
@@ -317,11 +312,13 @@ def _summarise(
     connection: sqlite3.Connection, part: RunPart, signals: Sequence[Signal], deadline: Deadline
 ) -> dict[str, Summary] | None:
     """Each signal that the run has over its compared stretch; None where not all was read."""
-    own = [part.known[signal.name] for signal in signals if signal.name in part.known]
-    pieces = read_pieces(connection, part.segment, own, deadline, COARSE_S)
-    if pieces.cut_at_s is not None:
-        return None
-    return {signal.name: pieces.summaries(signal.name).whole() for signal in own}
+    frame = read_frame(connection, part.segment, deadline)
+    found: dict[str, Summary] = {}
+    for signal in (part.known[each.name] for each in signals if each.name in part.known):
+        if deadline.passed:
+            return None
+        found[signal.name] = summary_of(frame, signal)
+    return None if frame.cut_at_s is not None else found
 
 
 def _groups(connection: sqlite3.Connection, groups: dict[str, list[int]]) -> tuple[Group, ...]:

@@ -51,7 +51,7 @@ def difference_of(
     signal: Signal,
     groups: Sequence[Sequence[dict[str, Summary] | None]],
     tests: int,
-    matters_sd: float,
+    min_effect_sd: float,
 ) -> Difference:
     """A signal in each run of each group.
 
@@ -59,7 +59,7 @@ def difference_of(
         signal: Which.
         groups: Of each run its summaries; None of one of which not all was read.
         tests: So many are made at once.
-        matters_sd: See `analysis.spread`.
+        min_effect_sd: See `analysis.spread`.
     """
     whole = [[run for run in group if run is not None] for group in groups]
     is_whole = [len(a) == len(b) for a, b in zip(whole, groups, strict=True)]
@@ -72,8 +72,8 @@ def difference_of(
         for figures in (_means(turn, runs), _deviations(turn, runs))
     )
     mean, deviation = [spread_of(each) for each in means], [spread_of(each) for each in deviations]
-    of_means = verdicts_on(means, tests, matters_sd=matters_sd)
-    of_deviations = verdicts_on(deviations, tests, matters_sd=matters_sd)
+    of_means = verdicts_on(means, tests, min_effect_sd=min_effect_sd)
+    of_deviations = verdicts_on(deviations, tests, min_effect_sd=min_effect_sd)
     verdicts = zip(of_means, of_deviations, strict=True)
     return Difference(
         name=signal.name,

@@ -116,25 +116,20 @@ class Found:
         counts = count_by_kind(events)
         return replace(self, entries=entries, verdicts=replace(self.verdicts, found=dict(counts)))
 
-    def told(self, connection: sqlite3.Connection, limit: int, *, exact: bool = True) -> Events:
+    def told(self, connection: sqlite3.Connection, limit: int) -> Events:
         """An answer of at most `limit` events: see `choose`.
 
         Args:
             connection: Any.
-            limit: How many, give or take what all rows make of those that samples show.
-            exact: Those that samples of a long run show begin and end to the row.
+            limit: How many.
         """
         chosen = {id(event) for event in choose(self.events, limit)}
         on_page = [entry for entry in self.entries if id(entry[1]) in chosen]
         rest = [entry for entry in self.entries if id(entry[1]) not in chosen]
-        events = [each for _, event in on_page for each in (_exactly(event) if exact else (event,))]
-        found = Counter(self.verdicts.found)
-        found.update(count_by_kind(events))
-        found.subtract(count_by_kind([event for _, event in on_page]))
         return Events(
             self.robot,
-            tuple(_with_values(connection, event, self.context) for event in events),
-            replace(self.verdicts, found={kind: found[kind] for kind in found if found[kind]}),
+            tuple(_with_values(connection, event, self.context) for _, event in on_page),
+            self.verdicts,
             _left_out([event for _, event in rest]),
             _cursor(on_page, rest, self.borders),
             self.notes,
@@ -151,7 +146,6 @@ def find_events(
     group: bool = True,
     after: str | None = None,
     deadline_s: float = QUESTION_DEADLINE_S,
-    exact: bool = True,
 ) -> Events:
     """What happened in a range: with its true begin and end, also where it reaches out of it.
 
@@ -171,8 +165,6 @@ def find_events(
         after: The `cursor` of an answer, for the events that it left out.
         deadline_s: After it, what was found so far is the answer, and the verdicts say what was
             not looked at.
-        exact: Events that samples of a long run show begin and end to the row, for which the rows
-            about those that are reported are read.
 
     Raises:
         UnknownSignalError: A name in the options or in `around` meets nothing.
@@ -182,7 +174,7 @@ def find_events(
         connection, time_range, options, around=around, group=group, after=after,
         deadline_s=deadline_s,
     )  # fmt: skip
-    return found.told(connection, limit, exact=exact)
+    return found.told(connection, limit)
 
 
 @in_one_snapshot
@@ -211,13 +203,6 @@ def search_events(
         tuple(context),
         borders or {},
     )
-
-
-def _exactly(event: Event) -> Sequence[Event]:
-    """What all rows tell of it; that nothing goes on any more is known already."""
-    if event.exactly is None:
-        return (event,)
-    return [replace(each, ongoing=each.ongoing and event.ongoing) for each in event.exactly()]
 
 
 def _is_left(place: Place, borders: dict[str, Place | None] | None) -> bool:

@@ -28,7 +28,7 @@ from webots_mcp.store.detection.motion import (
 from webots_mcp.store.detection.registry import asked_kinds
 from webots_mcp.store.questions.events import Collected, collect
 from webots_mcp.store.questions.runs import run_info
-from webots_mcp.store.questions.ways import read_way, sampling_interval_s
+from webots_mcp.store.questions.ways import read_way
 from webots_mcp.store.reading.changes import change_points
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment, TimeRange
@@ -91,12 +91,12 @@ class Outcomes:
     """What the runs came to.
 
     Attributes:
-        not_known: Figures that are not known, or not wholly: of which runs, why, and what would
+        unknown: Figures that are not known, or not wholly: of which runs, why, and what would
             make them known.
     """
 
     measures: tuple[Measure, ...]
-    not_known: dict[str, str]
+    unknown: dict[str, str]
 
 
 def outcomes_of(
@@ -104,7 +104,7 @@ def outcomes_of(
     groups: Sequence[Sequence[RunPart]],
     options: EventOptions,
     deadline: Deadline,
-    matters_sd: float,
+    min_effect_sd: float,
 ) -> Outcomes:
     """What the runs came to: the way, the modes and the events of the compared stretch."""
     found = [[_outcome(connection, part, options, deadline) for part in group] for group in groups]
@@ -113,11 +113,11 @@ def outcomes_of(
     kinds: list[str] = list(dict.fromkeys(kind for run in runs for kind in run.events))
     tests, of_more = _facts(found, list(names), kinds)
     measures = [
-        _measure(name, figures, verdicts_on(figures, tests, chance_of, of_more, matters_sd))
+        _measure(name, figures, verdicts_on(figures, tests, chance_of, of_more, min_effect_sd))
         for name in names
         for figures in [[[run.figure(name) for run in group] for group in found]]
     ]
-    measures += [_counted(kind, found, tests, of_more, matters_sd) for kind in kinds]
+    measures += [_counted(kind, found, tests, of_more, min_effect_sd) for kind in kinds]
     return Outcomes(tuple(measures), _not_known(runs))
 
 
@@ -159,13 +159,13 @@ def _counted(
     groups: Sequence[Sequence[_Outcome]],
     tests: int,
     of_more: int,
-    matters_sd: float,
+    min_effect_sd: float,
 ) -> Measure:
     """Events per minute; whether they differ is asked of their counts, in stretches of a length."""
     counts = [[run.events_of(kind) for run in group] for group in groups]
     rate = 60 / groups[0][0].duration_s
     per_min = [[None if each is None else each * rate for each in group] for group in counts]
-    verdicts = verdicts_on(counts, tests, chance_of_counts, of_more, matters_sd)
+    verdicts = verdicts_on(counts, tests, chance_of_counts, of_more, min_effect_sd)
     scaled = [
         each._replace(interval=each.interval and (each.interval[0] * rate, each.interval[1] * rate))
         for each in verdicts
@@ -177,7 +177,7 @@ def _not_known(runs: Sequence[_Outcome]) -> dict[str, str]:
     """Why figures are not known: those that share a reason under one key, reasons in one text."""
     alike: dict[tuple[str, str], dict[int, str]] = {}
     for run in runs:
-        for name, reasons in run.not_known.items():
+        for name, reasons in run.unknown.items():
             for why in reasons:
                 key = (name, _OF_THIS_RUN.sub("", why))
                 alike.setdefault(key, {})[run.run_id] = why
@@ -206,7 +206,7 @@ class _Outcome(NamedTuple):
     Attributes:
         has_mode: Its mode is known: one in which it never was took no time.
         events: How many of each kind.
-        not_known: What is not known of it, or not wholly, with why.
+        unknown: What is not known of it, or not wholly, with why.
         unlooked: Kinds that were not looked for at all.
         complete: All rows are there and were looked at.
     """
@@ -216,7 +216,7 @@ class _Outcome(NamedTuple):
     figures: dict[str, float | None]
     has_mode: bool
     events: Counter[str]
-    not_known: dict[str, tuple[str, ...]]
+    unknown: dict[str, tuple[str, ...]]
     unlooked: frozenset[str]
     complete: bool
 
@@ -236,51 +236,41 @@ def _outcome(
     run_id, duration_s = part.segment.run_id, part.segment.end_s - part.segment.start_s
     purged = run_info(connection, run_id).purged_rows > 0
     figures: dict[str, float | None] = {}
-    not_known: dict[str, tuple[str, ...]] = {}
+    unknown: dict[str, tuple[str, ...]] = {}
     position = part.motion.position
     if position is None:
-        not_known["distance_m, mean_speed_m_s"] = (NAME_POSITION,)
+        unknown["distance_m, mean_speed_m_s"] = (NAME_POSITION,)
     else:
-        read = None if purged else read_way(connection, part.segment, position, deadline)
-        way = None if read is None or deadline.passed else read.length
+        read = read_way(connection, part.segment, position, deadline)
+        way = None if deadline.passed or read.cut_at_s is not None else read.length
         speed = None if way is None else way.length_m / duration_s
         figures |= {"distance_m": way and way.length_m, _SPEED: speed}
         doubt = doubt_of_unit(position, speed or 0.0)
         doubt = OUT_OF_TIME if deadline.passed else doubt
         if doubt := doubt or (way and doubt_of_length(way)):
-            not_known["distance_m, mean_speed_m_s"] = (doubt,)
+            unknown["distance_m, mean_speed_m_s"] = (doubt,)
     modes = _mode_times(connection, part, deadline)
     if deadline.passed:
         modes = {}
     figures |= {f"{_SHARE}{mode}": seconds / duration_s for mode, seconds in modes.items()}
     if not modes:
-        not_known["share of each mode"] = (OUT_OF_TIME if deadline.passed else NO_MODE,)
+        unknown["share of each mode"] = (OUT_OF_TIME if deadline.passed else NO_MODE,)
     found = _events(connection, part, options, deadline)
     verdicts = found.ledger.verdicts(found.kinds, found.events)
     if deadline.passed:
-        not_known[f"events{_RATE}"] = (OUT_OF_TIME,)
+        unknown[f"events{_RATE}"] = (OUT_OF_TIME,)
     else:
-        not_known |= {f"{kind}{_RATE}": reasons for kind, reasons in verdicts.reasons.items()}
+        unknown |= {f"{kind}{_RATE}": reasons for kind, reasons in verdicts.reasons.items()}
     return _Outcome(
         run_id,
         duration_s,
         figures,
         bool(modes),
         Counter(event.kind for event in found.events),
-        not_known,
+        unknown,
         frozenset(kind for kind in verdicts.not_searched if verdicts.unlooked(kind)),
         not purged and not deadline.passed,
     )
-
-
-def sampling_notes(connection: sqlite3.Connection, parts: Sequence[RunPart]) -> list[str]:
-    """Says of which runs the distance comes from samples."""
-    return [
-        f"the distance of run {part.segment.run_id} is from one position every {every_s:.2g} s"
-        for part in parts
-        if (position := part.motion.position)
-        if (every_s := sampling_interval_s(connection, part.segment, position))
-    ]
 
 
 def _mode_times(

@@ -18,16 +18,23 @@ _BOOKKEEPING: Final = (
     "lease",
     "watermark",
     "recording",
+    "rollup",
+    "all_rollup",
+    "recent_rollup",
     "retention_limit",
     "kept_state",
+    "row_group",
+    "coarse_rollup",
+    "chunk",
 )
 _BOOKKEEPING_COLUMNS: Final = (
     "uuid",
     "process",
-    "adopted_rows",
+    "last_adopted_entry",
     "last_seen_monotonic_s",
-    "hold_mode",
+    "mode_before_pause",
     "rolled_state_id",
+    "is_chunked",
     "coarse_end",
     "first_until_sim_time_s",
     "last_since_sim_time_s",
@@ -40,8 +47,8 @@ _COMMENT: Final = re.compile(r'(?:^|,)\s*"?(\w+)"?\s[^\n,]*?/\* (.*?) \*/', re.M
 _RULES: Final = (
     "Times are seconds: sim_time_s of the simulation, wall_time_s Unix. state.data is JSON: "
     "json_extract(data, '$.pose[0]'); signal.path has the path of each name. A range of a run is "
-    "fast by run_id and sim_time_s; for a long one use all_rollup (10 s buckets) "
-    "or coarse_rollup (500 s; bucket = floor(sim_time_s / 500))."
+    "fast by run_id and sim_time_s; for a long one use robot_statistics (min, max, mean of about "
+    "1,024 rows each, also of purged ones)."
 )
 
 

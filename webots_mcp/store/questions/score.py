@@ -4,32 +4,30 @@ from __future__ import annotations
 
 import math
 import sqlite3
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 from webots_mcp.conditions.scoring import Facts, Score, Scored, parse_score
-from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.errors import ConditionFailedError, InvalidInputError, NothingRecordedError
 from webots_mcp.naming import listed, nearest_first
+from webots_mcp.store.conditions_on_arrays import aggregated, position_in
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.registry import kind_names
 from webots_mcp.store.questions.events import collect
 from webots_mcp.store.questions.runs import run_info
+from webots_mcp.store.reading.coverage import unrecorded
 from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.held import unrecorded
+from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.kept import kept_parts
-from webots_mcp.store.reading.ranges import Segment, TimeRange, whole_run
+from webots_mcp.store.reading.ranges import TimeRange, whole_run
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.reading.subject import Subject
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.signals.catalogue import catalogue
-from webots_mcp.store.signals.flatten import parse
+from webots_mcp.store.signals.registry import Signal
 
 SCORE_DEADLINE_S: Final = 60.0
-_ROWS: Final = (
-    "SELECT sim_time_s, data FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ? "
-    "ORDER BY sim_time_s, id"
-)
 _STORED: Final = (
     "SELECT count(*) FROM event WHERE run_id = ? AND kind = ? AND sim_time_s >= ? "
     "AND sim_time_s < ?"
@@ -89,14 +87,16 @@ def score_run(
     if segment is None:
         why = f"run {run_id} has no state row: its controller published nothing"
         return RunScore(run_id, score.text, None, why, run.duration_s, 0)
-    score.require_known(catalogue(connection, subject))
+    known = catalogue(connection, subject)
+    score.require_known(known)
     noticed_s = fetch_run(connection, run_id).started_sim_time_s
     began_s = 0.0 if run.start_reason == "reset" else noticed_s  # a reset shows a step later
     duration_s = run.duration_s + noticed_s - began_s
     if end_s is not None and end_s < segment.end_s:
         duration_s = end_s - began_s
         segment = segment.through(end_s)
-    return _scored(connection, score, subject, segment, duration_s, Deadline(deadline_s))
+    time_range = TimeRange(subject.robot_id, subject.robot, (segment,), "simulation")
+    return _scored(connection, score, known, time_range, duration_s, Deadline(deadline_s))
 
 
 def unseen(connection: sqlite3.Connection, run_ids: Iterable[int | None]) -> list[str]:
@@ -121,38 +121,36 @@ def unseen(connection: sqlite3.Connection, run_ids: Iterable[int | None]) -> lis
 def _scored(
     connection: sqlite3.Connection,
     score: Score,
-    subject: Subject,
-    segment: Segment,
+    known: Mapping[str, Signal],
+    time_range: TimeRange,
     duration_s: float,
     deadline: Deadline,
 ) -> RunScore:
-    rows = _Rows(connection, segment, deadline)
-    time_range = TimeRange(subject.robot_id, subject.robot, (segment,), "simulation")
+    (segment,) = time_range.segments
     counts = {kind: _count(connection, kind, time_range, deadline) for kind in score.kinds}
-    found = score.of(rows, Facts(duration_s, counts))
-    if rows.cut:
-        found = Scored(None, f"time limit reached after {rows.read} rows")
-    return RunScore(segment.run_id, score.text, *found, duration_s, rows.read)
+    frame = read_frame(connection, segment, deadline, full_rate=False)
+    if frame.cut_at_s is not None:
+        found = Scored(None, f"time limit reached after {len(frame)} rows")
+    else:
+        found = _found(score, frame, known, duration_s, counts)
+    return RunScore(segment.run_id, score.text, *found, duration_s, len(frame))
 
 
-class _Rows:
-    """The states of a segment, in order."""
-
-    def __init__(
-        self, connection: sqlite3.Connection, segment: Segment, deadline: Deadline
-    ) -> None:
-        self._rows = connection.execute(_ROWS, (segment.run_id, segment.start_s, segment.end_s))
-        self._deadline = deadline
-        self.read = 0
-        self.cut = False
-
-    def __iter__(self) -> Iterator[tuple[float, Any]]:
-        for sim_time_s, data in self._rows:
-            self.cut = self.read % 500 == 499 and self._deadline.passed
-            if self.cut:
-                return
-            self.read += 1
-            yield sim_time_s, parse(data)
+def _found(
+    score: Score,
+    frame: Frame,
+    known: Mapping[str, Signal],
+    duration_s: float,
+    counts: Mapping[str, int | str],
+) -> Scored:
+    position = position_in(frame, known)
+    try:
+        aggregates = [aggregated(each, frame, position) for each in score.aggregates]
+    except ConditionFailedError as error:
+        return Scored(None, str(error))
+    if frame.unread:
+        return Scored(None, "; ".join(map(str, frame.unread)))
+    return score.of(Facts(duration_s, counts, aggregates))
 
 
 def require_kinds(connection: sqlite3.Connection, score: Score, run_id: int) -> None:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from webots_mcp.naming import words_of
-from webots_mcp.store.analysis.arrays import Array, np
+from webots_mcp.store.analysis.arrays import Array, Indexes, np
 from webots_mcp.store.analysis.features import (
+    FLAT_BAND,
     Line,
     Spike,
     Step,
@@ -20,9 +21,9 @@ from webots_mcp.store.analysis.features import (
     leaps_in,
     time_effect,
 )
-from webots_mcp.store.analysis.summaries import Summaries
 from webots_mcp.store.analysis.summary import LARGEST, Summary, summarise_numbers
 from webots_mcp.store.analysis.swings import LEAST_HALF_SWINGS, Swing, find_swings
+from webots_mcp.store.reading.frame import Frame, Zones
 from webots_mcp.store.reading.moments import shown_time
 from webots_mcp.store.signals.registry import Signal
 
@@ -39,7 +40,6 @@ _CLOCKS: Final = frozenset((
 ))  # fmt: skip
 _CLOCK_R2: Final = 0.99
 _DUST: Final = 1e-12  # of a value: what adding leaves of it
-_HALF_TURN_VARIANCE: Final = -2 * math.log(2 / math.pi)  # of angles spread over half a turn
 
 Shape = Literal["constant", "rising", "falling", "oscillating", "resting", "varying"]
 Monotonic = Literal["rising", "falling"]
@@ -51,8 +51,7 @@ class Trend:
 
     Attributes:
         summary: Count, first, last, extremes with their times, mean, deviation. Where the turns of
-            an angle are counted, its extremes are those of the unwrapped angle too (from rollups
-            in which it passed the border of a turn those of their means).
+            an angle are counted, its extremes are those of the unwrapped angle too.
         mean: Of an angle the circular mean. What is less than a few millionths of the range is
             rounded away: it comes from adding.
         deviation: Standard deviation; of an angle that of the unwrapped angle, or the circular one
@@ -61,14 +60,14 @@ class Trend:
         leaps: An angle that changed by more than a quarter turn from row to row, as the bearing to
             the nearest of several things does: its turns cannot be counted.
         monotonic: "rising", "falling" (never the other way, and not constant), or None.
-        fast: It varies so fast that the means of buckets do not show its course.
+        fast: It varies so fast that the means of chunks do not show its course.
         swings: Where it moved to and fro, as `find_events` reports it, but of any period.
         resolution_s: Length of the means in which swings were seen; None where rows were.
         flat_since_s: Since when it rests; None if it does not.
         spikes: Values that stand out from both neighbours; None where rows were not looked at.
         step: The one change that makes most of its range; None where rows were not looked at, and
             of an angle.
-        missing: Of the rows, those without a value; from rollups also those with one beyond 1e100.
+        missing: Of the rows, those without a value; of many rows also those with one beyond 1e100.
         too_large: Of the rows, those with a number beyond 1e100; None where rows were not read.
         change: How much it changed with time, 0 to 2: the share of its variance that is slow
             (`time_effect`) times its range in units of its largest magnitude. Free of units.
@@ -113,57 +112,147 @@ class Trend:
         return is_straight and not _CLOCKS.isdisjoint(words_of(self.name.rpartition(".")[2]))
 
 
+@dataclass(frozen=True)
+class Course:
+    """How a signal went.
+
+    Attributes:
+        times: In s.
+        numbers: The values, of an angle with turns counted; or the means of many of them.
+        inner: What these come to.
+        counted: What the values of an angle come to whose turns are counted; else None.
+        leaps: An angle whose turns cannot be counted.
+        monotonic: Whether the values go one way; of chunks as far as their ends and extremes tell.
+        rest_s: Since when the values rest; None if they do not.
+        inner_variance: That of the values within what the means are of. Where more of it lies there
+            than between them, the course of the means is not that of the values.
+        resolution_s: The usual length of what the means are of; None where the numbers are values.
+    """
+
+    times: Array
+    numbers: Array
+    inner: Summary
+    counted: Summary | None = None
+    leaps: bool = False
+    monotonic: Monotonic | None = None
+    rest_s: float | None = None
+    inner_variance: float = 0.0
+    resolution_s: float | None = None
+
+
+def course_of_values(times: Array, recorded: Array, turn: float | None, summary: Summary) -> Course:
+    """The course of a signal of which every value is looked at.
+
+    Args:
+        times: In s, one at least.
+        recorded: The usable values.
+        turn: A whole turn of an angle, in its unit; None of what is none.
+        summary: What the values come to.
+    """
+    leaps = turn is not None and leaps_in(recorded, turn)
+    counts = turn is not None and not leaps
+    numbers = _unwrapped(recorded, summary, turn) if turn is not None and counts else recorded
+    counted = summarise_numbers(times, numbers) if counts else None
+    monotonic, rest_s = _monotonic(numbers), flat_since(times, numbers)
+    return Course(times, numbers, counted or summary, counted, leaps, monotonic, rest_s)
+
+
+def in_means(course: Course, rows: int) -> Course:
+    """A course in the means of so many values each, for what takes long to find in all of them."""
+    starts = np.arange(0, len(course.times), rows)
+    counts = np.diff(starts, append=len(course.times))
+    means = np.add.reduceat(course.numbers, starts) / counts
+    off = course.numbers - np.repeat(means, counts)
+    times = np.add.reduceat(course.times, starts) / counts
+    return replace(
+        course,
+        times=times,
+        numbers=means,
+        inner=summarise_numbers(times, means),
+        inner_variance=float(np.mean(off * off)),
+        resolution_s=_digits(np.median(np.diff(times))) if len(times) > 1 else None,
+    )
+
+
+def course_of_means(frame: Frame, name: str, zones: Zones) -> Course:
+    """The course of a signal with numbers, of many rows, from what its chunks come to."""
+    held = np.flatnonzero(~np.isnan(zones.sum))
+    counts, means = zones.value_count[held], zones.sum[held] / zones.value_count[held]
+    variances = np.where(
+        zones.min[held] < zones.max[held],
+        zones.squared_deviations[held] / np.maximum(1, counts - 1),
+        0.0,
+    )
+    starts = zones.start_s[held]
+    lengths = np.diff(starts) if len(held) > 1 else zones.end_s[held] - starts
+    times = (starts + zones.end_s[held]) / 2
+    return Course(
+        times,
+        means,
+        summarise_numbers(times, means),
+        monotonic=_monotonic_chunks(zones, held),
+        rest_s=_rest_of_chunks(frame, name, zones, held),
+        inner_variance=math.fsum(variances.tolist()) / len(held),
+        resolution_s=_digits(np.median(lengths)),
+    )
+
+
+def _digits(length_s: Any) -> float:
+    return float(f"{float(length_s):.3g}")
+
+
+def _rest_of_chunks(frame: Frame, name: str, zones: Zones, held: Indexes) -> float | None:
+    """Since when all values stay within 0.5 % of their range, as `flat_since` says it."""
+    low, high = float(zones.min[held].min()), float(zones.max[held].max())
+    last = float(zones.last[held[-1]])
+    farthest = np.maximum(zones.max[held] - last, last - zones.min[held])
+    away = np.flatnonzero(farthest > FLAT_BAND * (high - low))
+    first = int(zones.first_row[held[away[-1] if len(away) else 0]])
+    times, values = frame.rows(first, len(frame)).usable(name)
+    return flat_since(times, values, span=high - low, start_s=float(zones.start_s[held[0]]))
+
+
+def _monotonic_chunks(zones: Zones, held: Indexes) -> Monotonic | None:
+    first, last, low, high = (
+        each[held] for each in (zones.first, zones.last, zones.min, zones.max)
+    )
+    if first[0] == last[-1]:
+        return None
+    if (first == low).all() and (last == high).all() and (first[1:] >= last[:-1]).all():
+        return "rising"
+    if (first == high).all() and (last == low).all() and (first[1:] <= last[:-1]).all():
+        return "falling"
+    return None
+
+
 def judge(
     signal: Signal,
     summary: Summary,
-    times: Array,
-    numbers: Array,
-    spikes: list[Spike] | None,
-    inner_variance: float = 0.0,
-    resolution_s: float | None = None,
-    pieces: Summaries | None = None,
+    course: Course,
+    spikes: list[Spike] | None = None,
     too_large: int | None = None,
-    *,
-    rows_left: bool = True,
 ) -> Trend:
     """Combine the summary with the course of the numbers.
 
     Args:
         signal: Whose trend.
         summary: Of the whole range.
-        times: Of the numbers.
-        numbers: The values, or the means of buckets; at least one.
-        spikes: None where only buckets were looked at.
-        inner_variance: That of the values within the buckets. Where more of it lies there than
-            between them, a course of their means is not that of the values (it may be an alias).
-        resolution_s: The length of the buckets; None where the numbers are the values.
-        pieces: The buckets, of which ends and extremes are known in addition to the means.
+        course: How it went.
+        spikes: None where not every value was looked at.
         too_large: How many of the values are beyond 1e100; None where that is not known.
-        rows_left: Whether less time would be seen in rows.
     """
-    of_rows = spikes is not None
-    turn = signal.turn if of_rows else summary.turn_of(signal.turn)
-    leaps = turn is not None and of_rows and leaps_in(numbers, turn)
-    course = _unwrapped(numbers, summary, turn) if turn and not leaps else numbers
-    inner = summary if of_rows and course is numbers else summarise_numbers(times, course)
-    slow = _slow_share(inner, inner_variance, turn)
-    fast = slow < SLOW_SHARE or leaps
-    line = None if leaps else _of_all(fit_line(times, course, inner.mean or 0.0), slow)
-    monotonic = None if fast else _monotonic(course)
-    swings = () if fast or monotonic else _swings(times, course, resolution_s)
-    rest_s = None
-    if not fast:
-        known = (times, course) if pieces is None or turn else pieces.known_values()
-        rest_s = flat_since(*known)
-    mean = _mean(signal, summary, inner, numbers)
-    counted = course is not numbers and not fast
-    deviation = summary.deviation_in(signal.turn)
-    if counted:
-        deviation = _deviation(inner, inner_variance)
-    if counted and pieces is not None and turn is not None:
-        summary = _with_extremes_in(pieces, course - numbers, course, turn, summary)
-    elif counted:
-        summary = _with_extremes_of(inner, summary)
+    times, numbers, inner = course.times, course.numbers, course.inner
+    turn = signal.turn if summary.sines is not None else None
+    slow = _slow_share(inner, course.inner_variance)
+    fast = slow < SLOW_SHARE or course.leaps
+    line = None if course.leaps else _of_all(fit_line(times, numbers, inner.mean or 0.0), slow)
+    monotonic, rest_s = (None, None) if fast else (course.monotonic, course.rest_s)
+    swings = () if fast or monotonic else _swings(times, numbers, course.resolution_s)
+    mean = summary.mean if turn is None else summary.centre(turn)
+    counted = None if fast else course.counted
+    deviation = summary.deviation_in(turn) if counted is None else counted.deviation
+    if counted is not None:
+        summary = _with_extremes_of(counted, summary)
     shape = _shape(summary, line, monotonic, swings, rest_s, float(times[-1] - times[0]))
     trend = Trend(
         name=signal.name,
@@ -172,33 +261,32 @@ def judge(
         summary=summary,
         mean=_rounded(mean, inner),
         deviation=deviation,
-        turned=_turned(summary, numbers, turn) if turn and not fast else None,
-        leaps=leaps,
+        turned=None if counted is None else (counted.last or 0.0) - (counted.first or 0.0),
+        leaps=course.leaps,
         slope_per_s=line.slope_per_s if line else None,
         r2=line.r2 if line else None,
         shape=shape,
         monotonic=monotonic,
         fast=fast,
         swings=swings,
-        resolution_s=resolution_s,
+        resolution_s=course.resolution_s,
         flat_since_s=rest_s,
         spikes=None if spikes is None else tuple(spikes),
-        step=None if spikes is None or turn else find_step(times, numbers),
+        step=None if spikes is None or turn is not None else find_step(times, numbers),
         missing=summary.rows - summary.present - (too_large or 0),
         too_large=too_large,
-        change=time_effect(times, course, inner.mean or 0.0, inner.squares or 0.0)
+        change=time_effect(times, numbers, inner.mean or 0.0, inner.squares or 0.0)
         * slow
         * _relative_range(summary),
         says="",
     )
-    return replace(trend, says="; ".join(_remarks(trend, rows_left=rows_left)))
+    return replace(trend, says="; ".join(_remarks(trend)))
 
 
-def _slow_share(means: Summary, inner_variance: float, turn: float | None) -> float:
-    """The share of the variance between the means; 0 where an angle's turns cannot be counted."""
-    countable = math.inf if turn is None else _HALF_TURN_VARIANCE * (turn / math.tau) ** 2
-    if inner_variance == 0 or inner_variance > countable:
-        return float(inner_variance == 0)
+def _slow_share(means: Summary, inner_variance: float) -> float:
+    """The share of the variance that lies between the means."""
+    if inner_variance == 0:
+        return 1.0
     between = (means.squares or 0.0) / means.present
     return between / (between + inner_variance)
 
@@ -236,50 +324,6 @@ def _with_extremes_of(course: Summary, summary: Summary) -> Summary:
         max=course.max,
         max_sim_time_s=course.max_sim_time_s,
     )
-
-
-def _with_extremes_in(
-    pieces: Summaries, turned: Array, course: Array, turn: float, summary: Summary
-) -> Summary:
-    """With those of the buckets, turned on as far as their means are.
-
-    Of one that reaches over half a turn, because it passed the border of a turn, only the mean is
-    known to be in the course.
-    """
-    narrow = pieces["max"] - pieces["min"] < turn / 2
-    lows = np.where(narrow, pieces["min"] + turned, course)
-    highs = np.where(narrow, pieces["max"] + turned, course)
-    least, most = int(lows.argmin()), int(highs.argmax())
-    return summary._replace(
-        min=float(lows[least]),
-        min_sim_time_s=float(pieces["min_sim_time_s"][least]),
-        max=float(highs[most]),
-        max_sim_time_s=float(pieces["max_sim_time_s"][most]),
-    )
-
-
-def _mean(signal: Signal, summary: Summary, course: Summary, numbers: Array) -> float | None:
-    """Of an angle the circular one, or where its sines are not known that of the unwrapped one."""
-    if summary.turn_of(signal.turn) is not None:
-        return summary.centre(signal.turn)
-    if signal.turn is None or course is summary or course.mean is None:
-        return summary.mean
-    return (
-        course.mean % signal.turn
-        if numbers.min() >= 0
-        else math.remainder(course.mean, signal.turn)
-    )
-
-
-def _deviation(means: Summary, inner_variance: float) -> float | None:
-    """Of the means of buckets and of the values within them; of values the usual one."""
-    between = means.deviation
-    return None if between is None else math.hypot(between, math.sqrt(inner_variance))
-
-
-def _turned(summary: Summary, numbers: Array, turn: float) -> float:
-    turned = np.unwrap([summary.first or 0.0, *numbers, summary.last or 0.0], period=turn)
-    return float(turned[-1] - turned[0])
 
 
 def _rounded(mean: float | None, inner: Summary) -> float | None:
@@ -333,14 +377,13 @@ def _relative_range(summary: Summary) -> float:
     return (summary.max - summary.min) / largest if largest else 0.0
 
 
-def _remarks(trend: Trend, *, rows_left: bool) -> Iterator[str]:
+def _remarks(trend: Trend) -> Iterator[str]:
     summary, unit = trend.summary, f" {trend.unit}" if trend.unit else ""
     yield _course(trend, unit)
     if trend.leaps:
         yield "changes by more than a quarter turn between rows: turns are not counted"
     elif trend.fast:
-        advice = ": ask for a shorter range" if rows_left else ", and its rows were purged"
-        yield f"varies within {trend.resolution_s:g} s{advice}"
+        yield f"varies within {trend.resolution_s:g} s: ask for a shorter range"
     yield from _beyond_ends(trend)
     if trend.swings and not any(_is_wide(each, summary) for each in trend.swings):
         yield f"also {_swinging(trend, unit)}"
@@ -355,7 +398,7 @@ def _remarks(trend: Trend, *, rows_left: bool) -> Iterator[str]:
     if trend.too_large:
         yield f"beyond {LARGEST:g} in {trend.too_large} of {summary.rows} rows"
     if trend.is_lacking:
-        usable = "usable " if trend.too_large is None else ""  # rollups do not tell the two apart
+        usable = "usable " if trend.too_large is None else ""  # chunks do not tell the two apart
         yield (
             f"no {usable}value in {trend.missing} of {summary.rows} rows, the last value at "
             f"{summary.last_sim_time_s:.6g} s"

@@ -2,31 +2,37 @@
 
 from __future__ import annotations
 
-import math
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import Array, np
+from webots_mcp.naming import listed
+from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.analysis.features import find_spikes
-from webots_mcp.store.analysis.summaries import Summaries
-from webots_mcp.store.analysis.summary import LARGEST, Summary, summarise_numbers, with_extremes
+from webots_mcp.store.analysis.summary import LARGEST, Summary, with_extremes
 from webots_mcp.store.analysis.swings import SHORTEST_PERIOD_ROWS
+from webots_mcp.store.chunks import making
 from webots_mcp.store.questions.series import STATES_SHARE
-from webots_mcp.store.questions.trend import Trend, judge
+from webots_mcp.store.questions.trend import (
+    Trend,
+    course_of_means,
+    course_of_values,
+    in_means,
+    judge,
+)
+from webots_mcp.store.reading import frame_summary
 from webots_mcp.store.reading.changes import Changes, change_points
-from webots_mcp.store.reading.coverage import purged_until_s
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
+from webots_mcp.store.reading.frame import Frame, read_frame, read_kept
+from webots_mcp.store.reading.frame_summary import reads_values, summary_of, summary_of_zones
 from webots_mcp.store.reading.ranges import Segment, TimeRange, recorded_bounds
-from webots_mcp.store.reading.rollups import piece_length_s, read_pieces
-from webots_mcp.store.reading.rows import Columns, Numbers, exceeds, kept_columns, read_numbers
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.signals.catalogue import signals_of
 from webots_mcp.store.signals.registry import Signal
 
 TOO_LARGE: Final = "its numbers are beyond 1e100"
-LEAST_PIECES: Final = 100  # of a long range, whose means tell its course
+MOST_NAMED: Final = 5
 
 
 @dataclass(frozen=True)
@@ -52,13 +58,13 @@ class RunTrends:
     """The part of an answer that is about one run.
 
     Attributes:
-        resolution_s: None if every row was looked at; else the length of the rollups from which
-            shape, slope and swings come (counts, extremes, mean and deviation stay exact).
+        resolution_s: None if every row was looked at; else the length of the chunks from whose
+            means shape, slope and swings come (counts, extremes, mean and deviation stay exact).
         numbers: What changed most comes first, clocks come last; at most `limit` of `total`.
         silent: Names that have no value in the range, or none that can be reckoned with.
-        rows: Rows that were read, be it as rollups.
+        rows: Rows of the range, as far as it was read.
         cut_at_s: The deadline passed; from there on something is missing in the answer.
-        rows_left: Whether less time would be seen in rows: they were not purged, or not all.
+        unread: What else was not read, and why.
     """
 
     run_id: int
@@ -71,7 +77,7 @@ class RunTrends:
     silent: tuple[str, ...]
     total: int
     cut_at_s: float | None
-    rows_left: bool = True
+    unread: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -111,15 +117,15 @@ def trends(
         for segment in time_range.segments
     ]
     notes = [_unseen_swings(run) for run in runs if run.resolution_s is not None]
+    notes += [f"run {run.run_id}: {each}" for run in runs for each in run.unread]
     return Trends(time_range.robot, tuple(runs), (*time_range.notes, *notes))
 
 
 def _unseen_swings(run: RunTrends) -> str:
     shortest_s = SHORTEST_PERIOD_ROWS * (run.resolution_s or 0.0)
-    advice = "; ask for less time to see them" if run.rows_left else ""
     return (
         f"run {run.run_id} is seen in means of {run.resolution_s:g} s: oscillations with a period "
-        f"under {shortest_s:g} s were not searched for{advice}"
+        f"under {shortest_s:g} s were not searched for; ask for less time to see them"
     )
 
 
@@ -133,94 +139,86 @@ def _run_trends(
     """The trends of signals in one run."""
     numbers = [signal for signal in signals if signal.is_number and not signal.is_choice]
     states = [signal for signal in signals if signal not in numbers]
-    found: list[Trend | None]
     for_states = deadline.part(STATES_SHARE) if numbers else deadline
     changes = change_points(connection, segment, states, for_states)
-    purged_s = purged_until_s(connection, segment.run_id, segment.start_s)
-    rows_left = purged_s is None or purged_s < segment.end_s
-    if exceeds(connection, segment):
-        piece_s = piece_length_s(connection, segment, LEAST_PIECES)
-        pieces = read_pieces(connection, segment, numbers, deadline, piece_s)
-        kept = kept_columns(connection, segment, numbers, deadline)
-        parts = [pieces.summaries(signal.name) for signal in numbers]
-        found = [
-            _trend_of_pieces(signal, of_signal, piece_s, kept, rows_left=rows_left)
-            for signal, of_signal in zip(numbers, parts, strict=True)
-        ]
-        has_values = [bool(of_signal["present"].any()) for of_signal in parts]
-        rows, numbers_cut_s = pieces.rows, pieces.cut_at_s
-        resolution_s = piece_s if numbers else None
-    else:
-        read = read_numbers(connection, segment, numbers, deadline)
-        kept = None if segment.full_rate else kept_columns(connection, segment, numbers, deadline)
-        found = [_trend_of_rows(signal, read, kept) for signal in numbers]
-        has_values = [not np.isnan(read.values[signal.name]).all() for signal in numbers]
-        rows, resolution_s, numbers_cut_s = len(read.times), None, read.cut_at_s
+    frame = read_frame(connection, segment, deadline)
+    kept = read_kept(connection, segment, deadline) if numbers else None
+    found: dict[str, Trend | None] = {}
+    for signal in numbers:
+        if deadline.passed and found:
+            break
+        found[signal.name] = _trend(frame, signal, kept)
     # Sums differ in their last digits from one processor to the next, and the order must not.
     held = sorted(
-        (trend for trend in found if trend),
+        (trend for trend in found.values() if trend),
         key=lambda trend: (trend.is_clock, -round(trend.change, 9)),
     )
-    silent = [
-        f"{signal.name} ({TOO_LARGE})" if has_value else signal.name
-        for signal, trend, has_value in zip(numbers, found, has_values, strict=True)
-        if trend is None and (has_value or numbers_cut_s is None)
-    ]
+    changes = changes.cut(frame.cut_at_s)
     kept_cut_s = None if kept is None else kept.cut_at_s
-    changes = changes.cut(numbers_cut_s)
-    cuts_s = [e for e in (numbers_cut_s, kept_cut_s, changes.unread_from_s) if e is not None]
+    cuts_s = [e for e in (frame.cut_at_s, kept_cut_s, changes.unread_from_s) if e is not None]
     return RunTrends(
         run_id=segment.run_id,
         start_s=segment.start_s,
         end_s=segment.end_s,
-        resolution_s=resolution_s,
-        rows=rows,
+        resolution_s=max(
+            (t.resolution_s for t in held if t.resolution_s is not None), default=None
+        ),
+        rows=len(frame),
         numbers=tuple(held[:limit]),
         states=_state_trends(connection, changes, states),
-        silent=tuple(silent),
+        silent=tuple(_without_value(frame, found)),
         total=len(held),
         cut_at_s=min(cuts_s, default=None),
-        rows_left=rows_left,
+        unread=(*map(str, frame.unread), *_left([each.name for each in numbers], found)),
     )
 
 
-def _with_kept(signal: Signal, summary: Summary, kept: Columns | None) -> Summary:
-    """With the extremes of what only kept stretches have."""
-    if kept is None:
-        return summary
-    return with_extremes(summary, signal.summarise(kept.times, kept.values[signal.name]))
+def _left(names: Sequence[str], found: Mapping[str, object]) -> Iterator[str]:
+    """The signals that there was no time for."""
+    if left := [name for name in names if name not in found]:
+        yield f"time limit reached, {len(left)} signals left: ask for {listed(left, MOST_NAMED)}"
 
 
-def _trend_of_rows(signal: Signal, read: Numbers, kept: Columns | None) -> Trend | None:
-    times, numbers = read.of(signal.name)
+def _without_value(frame: Frame, found: Mapping[str, Trend | None]) -> Iterator[str]:
+    """Those without a usable number, as far as the range was read."""
+    for name in (name for name, trend in found.items() if trend is None):
+        if (np.abs(frame.numbers(name)) > LARGEST).any():
+            yield f"{name} ({TOO_LARGE})"
+        elif frame.cut_at_s is None:
+            yield name
+
+
+def _trend(frame: Frame, signal: Signal, kept: Frame | None) -> Trend | None:
+    """That of every value; of many rows that of means."""
+    if not reads_values(frame, signal):
+        return _trend_of_chunks(frame, signal, kept)
+    times, numbers = frame.usable(signal.name)
     if not len(numbers):
         return None
-    summary = summarise_numbers(times, numbers, rows=len(read.times), turn=signal.turn)
-    summary = _with_kept(signal, summary, kept)
-    spikes = find_spikes(times, numbers, signal.turn)
-    too_large = int(np.count_nonzero(np.abs(read.values[signal.name]) > LARGEST))
-    return judge(signal, summary, times, numbers, spikes, too_large=too_large)
+    summary = summary_of(frame, signal)
+    course = course_of_values(times, numbers, signal.turn, summary)
+    is_long = len(frame) > frame_summary.FULL_ROWS
+    spikes = None if is_long else find_spikes(times, numbers, signal.turn)
+    if is_long:
+        course = in_means(course, making.GROUP_ROWS)
+    too_large = int(np.count_nonzero(np.abs(frame.numbers(signal.name)) > LARGEST))
+    return judge(signal, _with_kept(signal, summary, kept), course, spikes, too_large)
 
 
-def _trend_of_pieces(
-    signal: Signal,
-    pieces: Summaries,
-    piece_s: float,
-    kept: Columns | None,
-    *,
-    rows_left: bool,
-) -> Trend | None:
-    summary = pieces.whole()
+def _trend_of_chunks(frame: Frame, signal: Signal, kept: Frame | None) -> Trend | None:
+    zones = frame.zones(signal.name)
+    summary = summary_of_zones(frame, signal.name, zones)
     if summary.sum is None:
         return None
-    summary = _with_kept(signal, summary, kept)
-    turn = summary.turn_of(signal.turn)
-    centres = pieces.centres(turn)
-    middles: Array = (pieces["first_sim_time_s"] + pieces["last_sim_time_s"]) / 2
-    held = ~np.isnan(centres) & ~np.isnan(middles)
-    variance = math.fsum(pieces.variances(turn)[held].tolist()) / int(held.sum())
-    course, pieces = (middles[held], centres[held]), Summaries(pieces.table[held])
-    return judge(signal, summary, *course, None, variance, piece_s, pieces, rows_left=rows_left)
+    course = course_of_means(frame, signal.name, zones)
+    return judge(signal, _with_kept(signal, summary, kept), course)
+
+
+def _with_kept(signal: Signal, summary: Summary, kept: Frame | None) -> Summary:
+    """With the extremes of what only kept stretches have."""
+    if kept is None or signal.name not in kept:
+        return summary
+    return with_extremes(summary, summary_of(kept, signal))
 
 
 def _state_trends(

@@ -36,6 +36,10 @@ _IS_THROTTLED: Final = (
     "SELECT 1 FROM run r JOIN session s ON s.id = r.session_id "
     "WHERE r.id = ? AND s.throttle_interval > 1"
 )
+_RECORDED: Final = (
+    "SELECT s.throttle_interval, EXISTS (SELECT 1 FROM event WHERE run_id = r.id "
+    "AND kind = 'dropped') FROM run r JOIN session s ON s.id = r.session_id WHERE r.id = ?"
+)
 _MOST_HITS: Final = 1000
 _LEAST_ROWS_PER_HIT: Final = 200  # fewer than 0.5 % of the rows hardly move a mean
 
@@ -95,7 +99,7 @@ def purge_notes(connection: sqlite3.Connection, run_id: int, start_s: float) -> 
     if until_s is None:
         return
     when = "" if until_s == math.inf else f" before {until_s:g} s"
-    left = "only 10 s summaries of that time are left (no single rows, jumps or export)"
+    left = "numbers, flags and texts of that time are read from chunks, but not exported"
     yield f"the rows of run {run_id}{when} were purged: {left}"
 
 
@@ -126,3 +130,20 @@ def hit_notes(
             f"up to {hits} of {rows} rows of run {run_id} were recorded because a breakpoint was "
             "hit: means and counts are biased towards them"
         )
+
+
+def recorded_share(connection: sqlite3.Connection, run_id: int) -> str:
+    """How many of the published states a run's rows are, in a sentence."""
+    return unrecorded(connection, run_id) or "every publish() call is a row, so nothing was missed"
+
+
+def unrecorded(connection: sqlite3.Connection, run_id: int) -> str | None:
+    """What of the published states is not in a run's rows; None where all of them are."""
+    row = connection.execute(_RECORDED, (run_id,)).fetchone()
+    interval, dropped = row or (None, False)  # of a robot that cannot be read nothing is known
+    if interval == 1:
+        return "rows were dropped, so their values are missing" if dropped else None
+    fewer = "rows may be fewer than publish() calls"
+    share = f"one publish() call in {interval} is a row" if interval else fewer
+    share += " and some were dropped" if dropped else ""
+    return f"{share}: what happened in between is not seen"

@@ -3,7 +3,7 @@
 Rows go in transactions of about a millisecond, as many at once as that allows; between two of them
 the caller rests for longer than the lock was held. The tables take turns, and space that became
 free goes back to the disk in between. Where another writer holds the lock, it is tried again later.
-State rows go only after they were rolled up.
+State rows go only after they were rolled up and put into chunks.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from typing import Any, Final
 
 from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.errors import DatabaseError, InvalidInputError, NothingRecordedError
+from webots_mcp.store.chunks.making import chunk_whole_run
+from webots_mcp.store.chunks.stored import reached
 from webots_mcp.store.images import inside
 from webots_mcp.store.retention.planning import OLD_COMMANDS, ROLLED, Plan, plan
 from webots_mcp.store.retention.planning import Step as Going
@@ -206,6 +208,7 @@ class _Purge:
         self._writes = ShortWrites(connection)
         self._vacuuming = _Pace()
         self._paces = {table: _Pace() for table in _STEPS}
+        self._in_chunks: dict[int, int] = {}  # run: the id up to which all that can be is
         self.purged = Purged()
 
     def in_turn(self, tables: Sequence[Iterator[Purged]]) -> Iterator[Purged]:
@@ -232,6 +235,10 @@ class _Purge:
             while keys:
                 if table == "state" and keys[-1]["id"] > watermark(self._connection):
                     roll(self._connection, ROLLED_ROWS)
+                elif table == "state" and (run_id := self._not_in_chunks(keys)):
+                    if chunk_whole_run(self._connection, run_id):
+                        # What is in no chunk now holds what no bridge writes, and may go.
+                        self._in_chunks[run_id] = keys[-1]["id"]
                 else:
                     keys = keys[self._delete_some(table, keys) :]
                 yield self.purged
@@ -245,6 +252,19 @@ class _Purge:
             while keys:
                 keys = keys[self._delete_some("image", keys) :]
                 yield self.purged
+
+    def _not_in_chunks(self, keys: Sequence[dict[str, Any]]) -> int | None:
+        """A run of which rows are in no chunk yet; None if there is none."""
+        newest = {key["run_id"]: key["id"] for key in keys}
+        return next(
+            (
+                run
+                for run, last in newest.items()
+                if max(reached(self._connection, run).max_in_groups, self._in_chunks.get(run, 0))
+                < last
+            ),
+            None,
+        )
 
     def _in_time(self, table: str, steps: Sequence[Going]) -> Iterator[list[dict[str, Any]]]:
         """Keys in the order in which the rows were recorded, so that whole pages become free."""

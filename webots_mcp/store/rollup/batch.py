@@ -27,7 +27,7 @@ class BatchColumn:
     name: str
     sample: str
     points: list[Point] = field(default_factory=list[Point])
-    odd_rows: int = 0
+    replaced_row_count: int = 0
     first_wall_time_s: float = 0.0
     last_wall_time_s: float = 0.0
 
@@ -62,7 +62,7 @@ class Batch:
         reasons = odd_names(odd)
         for name in reasons.keys() & columns.keys():
             state, _, value = columns[name].points[-1]
-            columns[name].odd_rows += state == state_id and is_odd(reasons, name, value)
+            columns[name].replaced_row_count += state == state_id and is_odd(reasons, name, value)
 
     def columns(self) -> Iterator[BatchColumn]:
         """Every signal of every run."""

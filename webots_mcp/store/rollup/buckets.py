@@ -101,7 +101,7 @@ def stored_texts(
         run_id: Of which run.
         span: What is asked for.
         signal_id: Which signal.
-        name: The column: swings or standstills.
+        name: The column: swings.
 
     Returns:
         Which coarse buckets are there, and the texts of those with a value of the signal; None

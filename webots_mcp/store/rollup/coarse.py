@@ -1,6 +1,6 @@
 """Coarse rollups, merged from those of 10 s once these are over, in steps of about a millisecond.
 
-Swings and standstills are looked for then as well, and stored with them.
+Swings are looked for then as well, and stored with them.
 
 The column `coarse_end` of a run shows up to where they are complete. It moves on here, and back
 where a row comes late into what was merged already; then that is merged again.

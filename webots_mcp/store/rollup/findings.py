@@ -1,6 +1,6 @@
 """What is found where 500 s of a run are over, and stored with their rollups.
 
-Swings and standstills show in all rows only, for which a question about hours has no time.
+Swings show in all rows only, for which a question about hours has no time.
 """
 
 from __future__ import annotations
@@ -10,18 +10,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
-from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.reading.rows import Columns, read_columns
 from webots_mcp.store.reading.sampling import newest_part
 from webots_mcp.store.rollup.buckets import COARSE_S
-from webots_mcp.store.rollup.standstills import StandstillsToStore
 from webots_mcp.store.rollup.swings import ACROSS_S, STRETCH_ROWS, SwingsToStore
 from webots_mcp.store.signals.registry import Signal, registered
 
-FINDINGS: Final = ("swings", "standstills")  # columns of the table
+FINDINGS: Final = ("swings",)  # columns of the table
 MOST_ROWS: Final = 100_000  # in 500 s: of more a maintainer had to read too much at once
 _LONGEST_S: Final = 60.0  # that it reads
 
@@ -43,17 +40,15 @@ def findings_to_store(
     known = registered(connection, robot_id)
     here = {name: signal for name, signal in known.items() if signal.id in rows}
     swings = SwingsToStore(here.values())
-    standstills = StandstillsToStore(find_motion(here, EventOptions()))
-    signals = {each.name: each for each in (*swings.signals, *standstills.signals)}
+    signals = list(swings.signals)
     segment = Segment(run_id, bucket * COARSE_S, (bucket + 1) * COARSE_S)
-    most, found = max(rows.values(), default=0), (swings, standstills)
+    most = max(rows.values(), default=0)
     left = 0
     if signals and most <= MOST_ROWS:
-        for columns, own_rows in _stretches(connection, segment, list(signals.values())):
+        for columns, own_rows in _stretches(connection, segment, signals):
             left += own_rows
-            for each in found:
-                each.add(columns)
-    return [each.stored() if 0 < most <= left else {} for each in found]
+            swings.add(columns)
+    return [swings.stored() if 0 < most <= left else {}]
 
 
 def _stretches(

@@ -33,7 +33,7 @@ from webots_mcp.store.rollup.tables import (
     watermark,
 )
 from webots_mcp.store.signals.flatten import shown
-from webots_mcp.store.signals.registry import Signal, count, enter_signals, seen_now
+from webots_mcp.store.signals.registry import Signal, count, enter_signals
 
 __all__ = ["Rolled", "forget", "roll", "watermark"]
 
@@ -180,8 +180,8 @@ def _sum_up(
     known = enter_signals(connection, robot_id, columns)
     addition = Addition([], [], [])
     for column in columns:
-        signal = seen_now(known.get(column.name), column)
-        if signal is None or signal.id is None:
+        signal = known.get(column.name)
+        if signal is None:
             continue  # beyond the number of signals that a robot may have
         addition.counts.append(count(signal, column))
         addition.rollups.extend(_rollups(connection, before, signal, column))

@@ -46,7 +46,8 @@ _TEMPORARY: Final = {
 }
 ADD_COUNTS: Final = (
     "UPDATE signal SET kind = n.kind, unit = n.unit, rows = signal.rows + n.rows, "
-    "null_rows = signal.null_rows + n.null_rows, odd_rows = signal.odd_rows + n.odd_rows, "
+    "null_row_count = signal.null_row_count + n.null_row_count, "
+    "replaced_row_count = signal.replaced_row_count + n.replaced_row_count, "
     "last_seen_wall_time_s = max(signal.last_seen_wall_time_s, n.seen_wall_time_s), "
     "min = min(coalesce(signal.min, n.min), coalesce(n.min, signal.min)), "
     "max = max(coalesce(signal.max, n.max), coalesce(n.max, signal.max)) "
@@ -92,7 +93,8 @@ _FORGET: Final = (
     "DELETE FROM rollup",
     "DELETE FROM recent_rollup",
     "DELETE FROM change",
-    "UPDATE signal SET rows = 0, null_rows = 0, odd_rows = 0, min = NULL, max = NULL",
+    "UPDATE signal SET rows = 0, null_row_count = 0, replaced_row_count = 0, "
+    "min = NULL, max = NULL",
 )
 
 

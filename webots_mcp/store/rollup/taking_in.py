@@ -6,14 +6,14 @@ references to them are translated to the ids here.
 
 from __future__ import annotations
 
-import json
 import sqlite3
-from typing import Any, Final, NamedTuple, get_args
+from typing import Final, NamedTuple, get_args
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.signal_kinds import Kind, unit_of, widen
+from webots_mcp.signal_register import MAX_SIGNALS
 from webots_mcp.store.rollup.tables import ADD_COUNTS, IS_ID, fill, run_mark
-from webots_mcp.store.signals.flatten import Kind, unit_of, widen
-from webots_mcp.store.signals.registry import MAX_SIGNALS, Count
+from webots_mcp.store.signals.registry import Count, enter_signals
 
 # Ids between the first and the last row of a run; other robots could not have recorded more.
 _MOST_IDS: Final = 2**40
@@ -30,7 +30,9 @@ _USED: Final = " OR ".join(
     f"EXISTS (SELECT 1 FROM source.{table} WHERE run_id = :run AND signal_id = s.id)"
     for table in ("rollup", "recent_rollup", "change")
 )
-_DESCRIBED: Final = "name, kind, unit, path, reduce, first_seen_wall_time_s, last_seen_wall_time_s"
+_DESCRIBED: Final = (
+    "name, kind, unit, path, reduce, role, first_seen_wall_time_s, last_seen_wall_time_s"
+)
 _ENTER: Final = (
     f"INSERT INTO main.signal (robot_id, {_DESCRIBED}) SELECT :here, {_DESCRIBED} "
     "FROM source.signal s WHERE robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
@@ -46,14 +48,6 @@ _FILL_MAP: Final = (
     "WHERE s.robot_id = (SELECT robot_id FROM source.run WHERE id = :run)"
 )
 _TABLES: Final = ("rollup", "recent_rollup", "coarse_rollup", "change")
-_STANDSTILLS: Final = (
-    "SELECT signal_id, bucket, standstills FROM main.coarse_rollup "
-    "WHERE run_id = ? AND standstills IS NOT NULL"
-)
-_RENAME: Final = (
-    "UPDATE main.coarse_rollup SET standstills = ? WHERE run_id = ? AND signal_id = ? "
-    "AND bucket = ?"
-)
 _COUNTS: Final = (
     "SELECT n.id, n.name, n.kind, s.kind, s.last_seen_wall_time_s, sum(u.rows), sum(u.present), "
     "min(u.min), max(u.max) FROM (SELECT signal_id, rows, present, min, max FROM main.rollup "
@@ -99,9 +93,9 @@ def take_in_summaries(connection: sqlite3.Connection, there: int, here: int, rob
     connection.execute(_FILL_MAP, asked)
     for table in _TABLES:
         _copy(connection, table, there, here, ids.shift)
-    _rename_signals(connection, here)
     fill(connection, "new_count", _counts(connection, here))
     connection.execute(ADD_COUNTS)
+    enter_signals(connection, robot_id, ())
     mark = min(run_mark(connection, there, "source.") or 0, ids.last) + ids.shift
     (coarse_end,) = connection.execute(_COARSE_END, (there,)).fetchone()
     connection.execute(_MARK, (max(0, mark), coarse_end, here))
@@ -136,22 +130,6 @@ def _copy(connection: sqlite3.Connection, table: str, there: int, here: int, shi
         f"WHERE t.run_id = ? {sound}",
         (here, there),
     )
-
-
-def _rename_signals(connection: sqlite3.Connection, here: int) -> None:
-    """In what is stored of standstills; what needs signals that are not here was not looked for."""
-    names = dict(connection.execute("SELECT there, here FROM temp.signal_here").fetchall())
-    for signal_id, bucket, text in connection.execute(_STANDSTILLS, (here,)).fetchall():
-        connection.execute(_RENAME, (_renamed(text, names), here, signal_id, bucket))
-
-
-def _renamed(text: str, names: dict[int, int]) -> str | None:
-    try:
-        stored: dict[str, Any] = json.loads(text)
-        stored["signals"] = [names[each] for each in stored["signals"]]
-    except (ValueError, TypeError, LookupError, RecursionError):
-        return None
-    return json.dumps(stored, separators=(",", ":"))
 
 
 def _counts(connection: sqlite3.Connection, here: int) -> list[Count]:

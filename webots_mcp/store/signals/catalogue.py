@@ -10,6 +10,8 @@ from typing import Final
 
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.naming import REDUCTIONS, Value, flatten, nearest_first
+from webots_mcp.signal_kinds import Kind
+from webots_mcp.signal_register import MAX_SIGNALS
 from webots_mcp.store.analysis.summary import Summary, summarise
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import TimeRange
@@ -19,8 +21,8 @@ from webots_mcp.store.reading.subject import Subject, find_subject
 from webots_mcp.store.rollup.batch import Batch, BatchColumn
 from webots_mcp.store.rollup.buckets import EVER, totals
 from webots_mcp.store.rollup.tables import watermark
-from webots_mcp.store.signals.flatten import Kind, parse
-from webots_mcp.store.signals.registry import MAX_SIGNALS, Signal, by_name, registered, seen_now
+from webots_mcp.store.signals.flatten import parse
+from webots_mcp.store.signals.registry import Signal, registered, seen_with
 
 SAMPLED_ROWS: Final = 200  # rows not yet rolled up that are searched for new names and kinds
 _MOST_OFFERED: Final = 5
@@ -98,15 +100,12 @@ def known_signals(connection: sqlite3.Connection, time_range: TimeRange) -> dict
 def _signals_in(
     connection: sqlite3.Connection, robot_id: int, run_ids: Sequence[int]
 ) -> dict[str, Signal]:
-    known = registered(connection, robot_id)
-    found = dict(known)
-    for run_id in run_ids:
-        for column in _unrolled_sample(connection, robot_id, run_id).columns():
-            signal = seen_now(found.get(column.name), column)
-            if signal is not None:
-                found[column.name] = signal
-    named = _without_placeholders(found)
-    return named if len(found) == len(known) else by_name(list(named.values()))
+    columns = [
+        column
+        for run_id in run_ids
+        for column in _unrolled_sample(connection, robot_id, run_id).columns()
+    ]
+    return _without_placeholders(seen_with(registered(connection, robot_id), columns))
 
 
 def _without_placeholders(known: dict[str, Signal]) -> dict[str, Signal]:
@@ -238,9 +237,7 @@ def list_signals(
     stored = _stored(connection, subject.run_id)
     batch, notes = _late(connection, subject, deadline_s)
     late = {column.name: column for column in batch.columns()}
-    known = registered(connection, subject.robot_id)
-    now = (seen_now(known.get(name), column) for name, column in late.items())
-    known |= {signal.name: signal for signal in now if signal}
+    known = seen_with(registered(connection, subject.robot_id), late.values())
     known = _without_placeholders(known)
     there = {name: signal for name, signal in known.items() if signal.id in stored or name in late}
     matching = resolve_signals(there, [pattern]) if pattern != "*" else list(there.values())

@@ -4,44 +4,41 @@ from __future__ import annotations
 
 import math
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.naming import Value, find_mode
-from webots_mcp.store.analysis.summary import Summary, summarise, usable_numbers
-from webots_mcp.store.rollup.batch import BatchColumn
-from webots_mcp.store.signals.flatten import (
+from webots_mcp.signal_kinds import (
     Kind,
     Place,
+    ends_pose,
     is_reachable,
     kind_of,
-    may_be_yaw,
-    parse,
     places,
     turn_of,
     unit_of,
     widen,
 )
-
-MAX_SIGNALS: Final = 2000  # of one robot: keys made of ids or times would grow without end
-
-MOST_CHOICES: Final = 20  # that a number which names a mode has
+from webots_mcp.signal_register import MOST_CHOICES, Seen, find_changes, write_changes
+from webots_mcp.signal_roles import decide_roles
+from webots_mcp.store.analysis.summary import Summary, summarise, usable_numbers
+from webots_mcp.store.chunks.codec import Absent, Replaced
+from webots_mcp.store.rollup.batch import BatchColumn
+from webots_mcp.store.signals.flatten import parse
 
 _OF_ROBOT: Final = (
-    "SELECT id, robot_id, name, kind, unit, path, reduce, max - min FROM signal WHERE robot_id = ? "
-    "AND typeof(name) = 'text' AND typeof(path) = 'text' ORDER BY id"
+    "SELECT id, robot_id, name, kind, unit, path, reduce, role FROM signal "
+    "WHERE robot_id = ? AND typeof(name) = 'text' AND typeof(path) = 'text' ORDER BY id"
 )
-_TYPE_IN_NEWEST: Final = (
-    "SELECT json_type(data, ?) FROM state WHERE json_valid(data) AND run_id = "
-    "(SELECT max(id) FROM run WHERE robot_id = ?) ORDER BY sim_time_s DESC, id DESC LIMIT 1"
-)
-_ADD: Final = (
-    "INSERT OR IGNORE INTO signal (robot_id, name, kind, unit, path, reduce, "
-    "first_seen_wall_time_s, last_seen_wall_time_s) VALUES "
-)
-_ADDED_AT_ONCE: Final = 50  # in one statement, which holds the write lock for half a millisecond
+
+_NO_VALUES: Final = frozenset((type(None), Absent, Replaced))
+_TYPES: Final[dict[Kind, frozenset[type]]] = {  # of values that leave a kind as it is
+    "null": _NO_VALUES,
+    "bool": _NO_VALUES | {bool},
+    "num": _NO_VALUES | {int, float, bool},
+}
 
 
 @dataclass(frozen=True)
@@ -52,6 +49,7 @@ class Signal:
         id: In the register; None for one that was seen only in rows after the watermark.
         path: For `json_extract(state.data, path)`.
         reduce: None, or how the long array at `path` becomes one number.
+        role: What it tells of the robot's motion, as `signal_roles` decides; None of most.
         decoded: Rows must be decoded to read it: its array was at times long enough to be
             reduced, or its name holds what the paths of SQLite before 3.45 do not reach.
         is_choice: Its whole numbers, of which there are few, name what a robot does.
@@ -64,6 +62,7 @@ class Signal:
     unit: str | None
     path: str
     reduce: str | None
+    role: str | None = None
     decoded: bool = False
     is_choice: bool = False
 
@@ -101,26 +100,42 @@ class Signal:
 def registered(connection: sqlite3.Connection, robot_id: int) -> dict[str, Signal]:
     """The signals of a robot in the register, by name."""
     rows = connection.execute(_OF_ROBOT, (robot_id,)).fetchall()
-    return by_name([_as_registered(connection, Signal(*row), span) for *row, span in rows])
+    return by_name([_registered(Signal(*row)) for row in rows])
 
 
-def _as_registered(connection: sqlite3.Connection, signal: Signal, span: float | None) -> Signal:
-    if span is None or span > MOST_CHOICES or not _may_be_choice(signal.name, signal.kind):
-        return signal
-    asked = (signal.path, signal.robot_id)
-    newest = connection.execute(_TYPE_IN_NEWEST, asked).fetchone()
-    return replace(signal, is_choice=newest is not None and newest[0] == "integer")
+def _registered(signal: Signal) -> Signal:
+    is_choice = signal.kind == "num" and (signal.role or "").startswith("mode")
+    return replace(signal, is_choice=True) if is_choice else signal
 
 
-def _may_be_choice(name: str, kind: Kind) -> bool:
-    return kind == "num" and find_mode([name]) is not None
+def stored_roles(known: dict[str, Signal]) -> dict[str, str]:
+    """The roles of signals that have one, by their names."""
+    return {name: signal.role for name, signal in known.items() if signal.role is not None}
+
+
+def roles_of(known: dict[str, Signal], position: tuple[str, str] | None = None) -> dict[str, str]:
+    """The roles that these signals have among each other; see `decide_roles`."""
+    kinds: dict[str, Kind] = {name: signal.kind for name, signal in known.items()}
+    choices = {name for name, signal in known.items() if signal.is_choice}
+    return decide_roles(kinds, choices, position)
+
+
+def with_roles(known: dict[str, Signal]) -> dict[str, Signal]:
+    """These signals with the roles that they have among each other."""
+    roles = roles_of(known)
+    return {
+        name: signal if signal.role == roles.get(name) else replace(signal, role=roles.get(name))
+        for name, signal in known.items()
+    }
 
 
 def _are_choices(column: BatchColumn) -> bool:
-    """Whether the values are few whole numbers."""
-    values = {point[2] for point in column.points}
-    numbers = [value for value in values if type(value) is int]
-    return len(numbers) == len(values) and max(numbers) - min(numbers) <= MOST_CHOICES
+    """Whether the values of what may be a mode are few whole numbers, as far as they are known."""
+    if not find_mode([column.name]):
+        return False
+    values = {point[2] for point in column.points} - {None}
+    numbers = [value for value in values if type(value) is int] or [0]
+    return len(values.difference(numbers)) == 0 and max(numbers) - min(numbers) <= MOST_CHOICES
 
 
 def by_name(signals: Sequence[Signal]) -> dict[str, Signal]:
@@ -134,12 +149,13 @@ def by_name(signals: Sequence[Signal]) -> dict[str, Signal]:
     }
 
 
-def _seen_in(column: BatchColumn, known: Kind = "null") -> Kind:
-    """The kind of a signal, after the values of this column."""
-    planar = may_be_yaw(column.name) and f"{column.name[:-1]}3" not in _places_of(column.sample)
+def _seen_in(column: BatchColumn) -> Kind:
+    """The kind of the values of a column."""
+    is_end = ends_pose(column.name, _places_of(column.sample))
+    found: Kind = "null"
     for value in _telling(column):
-        known = widen(known, kind_of(column.name, value, planar=planar))
-    return known
+        found = widen(found, kind_of(column.name, value, ends_pose=is_end))
+    return found
 
 
 def _telling(column: BatchColumn) -> list[Any]:
@@ -151,53 +167,55 @@ def _telling(column: BatchColumn) -> list[Any]:
 
 
 def enter_signals(
-    connection: sqlite3.Connection, robot_id: int, columns: Sequence[BatchColumn]
+    connection: sqlite3.Connection, robot_id: int, columns: Iterable[BatchColumn]
 ) -> dict[str, Signal]:
-    """Enter the names of a robot that are new; return all that are registered, by name.
+    """Enter what values of a robot's signals tell; return all that are registered, by name.
 
     Names beyond `MAX_SIGNALS` of a robot stay out.
     """
-    known = registered(connection, robot_id)
-    fresh = [column for column in columns if column.name not in known]
-    if not fresh or len(known) >= MAX_SIGNALS:
-        return known
-    described = [row for column in fresh if (row := _description(column))]
-    rows = described[: MAX_SIGNALS - len(known)]
-    for start in range(0, len(rows), _ADDED_AT_ONCE):
-        some = rows[start : start + _ADDED_AT_ONCE]
-        marks = ", ".join(["(?, ?, ?, ?, ?, ?, ?, ?)"] * len(some))
-        connection.execute(_ADD + marks, [value for row in some for value in row])
+    seen = {column.name: each for column in columns if (each := _seen(column))}
+    write_changes(connection, robot_id, find_changes(connection, robot_id, seen))
     return registered(connection, robot_id)
 
 
-def _description(column: BatchColumn) -> tuple[object, ...] | None:
-    signal = _unregistered(column)
-    if signal is None:
-        return None
-    described = (signal.name, signal.kind, signal.unit, signal.path, signal.reduce)
-    return (signal.robot_id, *described, column.first_wall_time_s, column.last_wall_time_s)
+def tell_more(signal: Signal | None, values: Iterable[object]) -> bool:
+    """Whether values may widen what is known of their signal; of most a look at types shows it."""
+    if signal is None or signal.kind == "angle" or signal.is_choice:
+        return True
+    return signal.kind != "text" and not _TYPES[signal.kind].issuperset(map(type, values))
 
 
-def _unregistered(column: BatchColumn) -> Signal | None:
-    """A signal that is known from a column only; None where its value stands nowhere."""
+def _seen(column: BatchColumn) -> Seen | None:
+    """What a column tells of its signal; None where its value stands nowhere."""
     place = _places_of(column.sample).get(column.name)
     if place is None:
         return None
-    kind = _seen_in(column)
-    unit = unit_of(column.name, kind)
-    is_choice = _may_be_choice(column.name, kind) and _are_choices(column)
-    found = Signal(None, column.robot_id, column.name, kind, unit, place.path, place.reduce)
-    return replace(found, is_choice=is_choice)
+    times = (column.first_wall_time_s, column.last_wall_time_s)
+    return Seen(*place, _seen_in(column), _are_choices(column), *times)
 
 
-def seen_now(signal: Signal | None, column: BatchColumn) -> Signal | None:
-    """A signal as it is known after a column of it; None where it cannot be registered."""
-    if signal is None:
-        return _unregistered(column)
-    kind = _seen_in(column, signal.kind)
-    if kind == signal.kind:
+def seen_with(known: dict[str, Signal], columns: Iterable[BatchColumn]) -> dict[str, Signal]:
+    """Signals as they are known after these columns, also those that are not registered."""
+    found = dict(known)
+    for column in columns:
+        signal = _seen_now(found.get(column.name), column)
+        if signal is not None:
+            found[column.name] = signal
+    changed = any(signal is not known.get(name) for name, signal in found.items())
+    return with_roles(by_name([*found.values()])) if changed else found
+
+
+def _seen_now(signal: Signal | None, column: BatchColumn) -> Signal | None:
+    """A signal as it is known after a column of it; None where its value stands nowhere."""
+    seen = _seen(column)
+    if seen is None:
         return signal
-    return replace(signal, kind=kind, unit=unit_of(signal.name, kind))
+    before = signal or Signal(None, column.robot_id, column.name, "null", None, *seen[:2])
+    kind = widen(before.kind, seen.kind)
+    is_choice = seen.is_choice and kind == "num" and (before.is_choice or before.kind == "null")
+    if (kind, is_choice) == (before.kind, before.is_choice):
+        return before
+    return replace(before, kind=kind, unit=unit_of(before.name, kind), is_choice=is_choice)
 
 
 @lru_cache(maxsize=8)  # a row that brings one new name mostly brings several
@@ -212,8 +230,8 @@ class Count(NamedTuple):
     kind: Kind
     unit: str | None
     rows: int
-    null_rows: int
-    odd_rows: int
+    null_row_count: int
+    replaced_row_count: int
     seen_wall_time_s: float
     min: float | None
     max: float | None
@@ -229,7 +247,7 @@ def count(signal: Signal, column: BatchColumn) -> Count:
         signal.unit,
         len(values),
         values.count(None),
-        column.odd_rows,
+        column.replaced_row_count,
         column.last_wall_time_s,
         min(numbers, default=None),
         max(numbers, default=None),

@@ -130,7 +130,7 @@ def encoded(table: Table, arrow_table: Any) -> bytes:
 
 
 def decoded(table: Table, content: bytes, path: str, count: int | None = None) -> Any:
-    """The first rows of a file, or all; columns that an older version had not are null.
+    """The first rows of a file, or all; columns that it lacks are null.
 
     Raises:
         PoolError: The file is none, is damaged, or holds more than a shipper writes into one.

@@ -82,11 +82,11 @@ def place_progress(storage: Storage, recording_uuid: str, progress: Progress) ->
     storage.place(f"{folder_of(recording_uuid)}/{PROGRESS}", content)
 
 
-def require_pool(storage: Storage) -> int:
-    """The version of the schema that the pool has.
+def require_pool(storage: Storage) -> None:
+    """Raise unless a pool of exactly this version is there.
 
     Raises:
-        PoolError: There is no pool, or a newer version made it.
+        PoolError: There is none, or an older or a newer one.
     """
     content = storage.read(POOL)
     if content is None:
@@ -101,21 +101,24 @@ def require_pool(storage: Storage) -> int:
             f"the pool in {storage.address} has format {its_format} and schema {schema}, this "
             f"webots-mcp knows {FORMAT} and {SCHEMA_VERSION}: update webots-mcp"
         )
-    return schema
+    if schema < SCHEMA_VERSION:
+        raise PoolError(
+            f"the pool in {storage.address} has schema {schema}, of an older webots-mcp: ship the "
+            "recordings anew, into another folder"
+        )
 
 
 def make_pool(storage: Storage) -> None:
-    """Make a pool where there is nothing, or bring one to this version.
+    """Make a pool where there is nothing.
 
     Raises:
-        PoolError: Other things are there, or a newer version made it.
+        PoolError: Other things are there, or another version made it.
     """
     if storage.read(POOL) is None:
         if not storage.is_empty():
             raise PoolError(
                 f"{storage.address} holds other things and is no pool: name a new or empty folder"
             )
-    elif require_pool(storage) == SCHEMA_VERSION:
-        return
-    about = {"format": FORMAT, "schema": SCHEMA_VERSION}
-    storage.place(POOL, json.dumps(about).encode())
+        about = {"format": FORMAT, "schema": SCHEMA_VERSION}
+        return storage.place(POOL, json.dumps(about).encode())
+    require_pool(storage)

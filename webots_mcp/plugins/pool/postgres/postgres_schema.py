@@ -25,11 +25,12 @@ from sqlalchemy.dialects import postgresql
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.pool import StaticPool
 
-from webots_mcp.contract import SCHEMA_VERSION, bundled
+from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.errors import PoolError
 from webots_mcp.plugins.pool.postgres.connecting import Connection, clear_errors, connect
 from webots_mcp.plugins.pool.postgres.postgres_views import VIEWS, make_views
 from webots_mcp.plugins.pool.shipped_tables import Table, table, tables
+from webots_mcp.store.migrate import migration_config
 
 OWNER: Final = "recording_uuid"
 VERSION: Final = "pool_version"  # Alembic's, under a name that says whose tables these are
@@ -116,35 +117,27 @@ _TO_GRANT: Final = (
 )
 
 
-def prepare(url: str, address: str, revision: str = "head") -> None:
-    """Make the tables of a pool, or bring them to this version; of several at once, one does it.
+def prepare(url: str, address: str) -> None:
+    """Make the tables of a pool where there are none; of several at once, one does it.
 
     Raises:
         PoolUnavailableError: Nobody answers there.
-        PoolError: The tables are newer or none of ours, or the role lacks a right.
+        PoolError: The tables are older, newer or none of ours, or the role lacks a right.
     """
     with connect(url, address) as connection, clear_errors(address):
         _require_usable(connection, address)
-        is_pool = _is_pool(connection)
-        if is_pool:
+        if _is_pool(connection):
             _require_writable(connection, address)
-        if is_pool and _version(connection) == SCHEMA_VERSION:
-            return
+            return require_current(connection, address)
         _require_create(connection, address)
     with clear_errors(address), _transaction(url, address) as (engine, connection):
         connection.execute("SELECT pg_advisory_xact_lock(%s)", (_LOCK,))
-        before = _version(connection)  # another may have been faster
-        if before == SCHEMA_VERSION:
+        if _is_pool(connection):  # another was faster
             return
-        if before is None:
-            _require_nothing_foreign(connection, address)
-        _drop_views(connection)
-        command.upgrade(_config(engine), revision)
-        if before is None:
-            connection.execute(_OWN.encode())
-        _widen(connection)
-        if revision == "head":
-            make_views(connection)
+        _require_nothing_foreign(connection, address)
+        command.upgrade(_config(engine), "head")
+        connection.execute(_OWN.encode())
+        make_views(connection)
 
 
 def require_current(connection: Connection, address: str) -> None:
@@ -158,8 +151,8 @@ def require_current(connection: Connection, address: str) -> None:
         raise PoolError(f"{address} holds no pool: nothing was shipped there yet")
     if version < SCHEMA_VERSION:
         raise PoolError(
-            f"{address} has schema {version}, this webots-mcp needs {SCHEMA_VERSION}: "
-            f"'webots-mcp ship' brings it forward"
+            f"{address} has schema {version}, of an older webots-mcp: ship the recordings anew, "
+            "into a database or a schema of its own ('?options=-csearch_path%3DNAME' in the URL)"
         )
 
 
@@ -256,22 +249,6 @@ def _require_nothing_foreign(connection: Connection, address: str) -> None:
         )
 
 
-def _widen(connection: Connection) -> None:
-    """Give columns that migrations added as SQL, past Alembic, 64 bits as well."""
-    narrow = connection.execute(
-        "SELECT table_name, column_name FROM information_schema.columns "
-        "WHERE table_schema = current_schema() AND data_type = 'integer' AND table_name = ANY(%s)",
-        ([each.name for each in tables()],),
-    ).fetchall()
-    for name, column in narrow:
-        connection.execute(f'ALTER TABLE "{name}" ALTER "{column}" TYPE bigint'.encode())
-
-
-def _drop_views(connection: Connection) -> None:
-    for view in reversed(VIEWS):
-        connection.execute(f"DROP VIEW IF EXISTS {view}".encode())
-
-
 def _first(connection: Connection, sql: str, *arguments: Any) -> Any:
     row = connection.execute(sql.encode(), arguments or None).fetchone()
     return row[0] if row else None
@@ -295,8 +272,7 @@ def _transaction(url: str, address: str) -> Generator[tuple[sa.Connection, Conne
 
 
 def _config(connection: sa.Connection) -> Config:
-    config = Config()
-    config.set_main_option("script_location", str(bundled("migrations")).replace("%", "%%"))
+    config = migration_config()
     config.attributes["connection"] = connection
     config.attributes["options"] = {"version_table": VERSION}
     config.attributes["adapt"] = _adapt
@@ -318,32 +294,10 @@ class PoolImpl(PostgresqlImpl):
             super().create_table(_pooled(table, found), **kw)
             for outer in _OUTER_PARTITIONS if found.time_column else ():
                 super().execute(outer.format(table.name))
+            for index in sorted(table.indexes, key=str):
+                super().create_index(_index(index))
         elif table.name == VERSION:
             super().create_table(table, **kw)
-
-    def add_column(self, table_name: str, column: sa.Column[Any], **kw: Any) -> None:
-        """In the type that it has in a pool."""
-        if found := _shipped(table_name):
-            super().add_column(table_name, _column(column, found), **kw)
-
-    def create_column_comment(self, column: sa.Column[Any]) -> None:
-        """Only of those that are shipped."""
-        if _shipped(column.table.name):
-            super().create_column_comment(column)
-
-    def create_index(self, index: sa.Index, **kw: Any) -> None:
-        """With the recording first; without texts, of which PostgreSQL indexes no long ones."""
-        assert index.table is not None
-        if _shipped(index.table.name):
-            super().create_index(_index(index), **kw)
-
-    def add_constraint(self, const: Any, **kw: Any) -> None:
-        """None: see the top of this module."""
-
-    def execute(self, sql: Any, execution_options: dict[str, Any] | None = None) -> None:
-        """All but views, which are made when the tables are whole."""
-        if not str(sql).lstrip().startswith(("CREATE VIEW", "DROP VIEW")):
-            super().execute(sql, execution_options)
 
 
 def _shipped(name: str) -> Table | None:

@@ -1,43 +1,13 @@
-"""The views of a pool in PostgreSQL: those of a recording, by the same names, with the recording.
-
-The rule by which robot_now and robot_trajectory find a position and a mode in a state is the one of
-`webots_mcp/naming.py`, and made of its words.
-"""
+"""The views of a pool in PostgreSQL: those of a recording, by the same names, with its UUID."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
 from typing import Final
 
-from webots_mcp import naming
-from webots_mcp.naming import METRES, metres_in
+from webots_mcp.naming import METRES
 from webots_mcp.plugins.pool.postgres.connecting import Connection
 from webots_mcp.schema import shipped_objects
-
-_HUMP: Final = "(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])"  # where a word begins inside one
-
-
-def _array(words: Iterable[str]) -> str:
-    """Words as an array of texts."""
-    return f"'{{{', '.join(words)}}}'::text[]"
-
-
-def _path(name: str) -> str:
-    """A dotted name as the path of a value in JSON."""
-    return _array(name.split("."))
-
-
-_USUAL_POSITIONS: Final = ",\n      ".join(
-    f"({_path(x)}, {_path(y)}, {metres_in(x)})" for x, y in naming.USUAL_POSITIONS
-)
-_UNITS: Final = ", ".join(f"('{unit}', {metres})" for unit, metres in METRES.items())
-_YAWS: Final = ", ".join(
-    f"nullif(state #> {_path(name)}, 'null')"
-    for name in ("pose.yaw", "pose.theta", "pose.heading", "yaw", "theta", "heading")
-)
-_SPELLINGS: Final = _array(sorted(naming.SPELLINGS))
-_RANKED: Final = (*naming.MODES, *naming.STATES)
 
 # From the first Julian day to 1970: SQLite adds it before it rounds, and so loses some digits.
 _JULIAN_MS: Final = "210866760000000.0::double precision"
@@ -69,127 +39,15 @@ LANGUAGE sql IMMUTABLE PARALLEL SAFE AS $$
     WHEN abs(value::numeric) < 1e-307 THEN 0
     ELSE value::double precision END $$;
 
-CREATE OR REPLACE FUNCTION words_of(part text) RETURNS text[]
+CREATE OR REPLACE FUNCTION value_at(state jsonb, path text) RETURNS jsonb
 LANGUAGE sql IMMUTABLE PARALLEL SAFE AS $$
-  SELECT string_to_array(lower(regexp_replace(part, '{_HUMP}', '_', 'g')), '_') $$;
-
--- What one of the unit in a name is in metres: the last counts, and a lone m only at an end.
-CREATE OR REPLACE FUNCTION metres_of(parts text[]) RETURNS double precision
-LANGUAGE plpgsql IMMUTABLE PARALLEL SAFE SET search_path FROM CURRENT AS $$
-BEGIN
-  RETURN coalesce((
-    SELECT u.metres FROM unnest(parts) WITH ORDINALITY p (part, place),
-      unnest(words_of(part)) WITH ORDINALITY w (word, at)
-    JOIN (VALUES {_UNITS}) u (unit, metres) ON u.unit = word
-    WHERE word <> 'm' OR lower(part) LIKE '%\_m'
-    ORDER BY place DESC, at DESC LIMIT 1), 1);
-END $$;
-
--- Numbers and texts of a state with their paths; of arrays only what can be a coordinate.
-CREATE OR REPLACE FUNCTION leaves_of(state jsonb) RETURNS TABLE (path text[], value jsonb)
-LANGUAGE sql IMMUTABLE PARALLEL SAFE AS $$
-  WITH RECURSIVE node (path, value) AS (
-    SELECT ARRAY[]::text[], state
-    UNION ALL
-    SELECT n.path || e.key, e.value FROM node n CROSS JOIN LATERAL (
-      SELECT o.key, o.value
-      FROM jsonb_each(CASE jsonb_typeof(n.value) WHEN 'object' THEN n.value ELSE '{{}}' END) o
-      UNION ALL
-      SELECT (a.ordinality - 1)::text, a.value FROM jsonb_array_elements(
-        CASE jsonb_typeof(n.value) WHEN 'array' THEN n.value ELSE '[]' END
-      ) WITH ORDINALITY a
-      WHERE a.ordinality <= 2 OR jsonb_typeof(a.value) IN ('object', 'array')
-    ) e)
-  SELECT path, value FROM node WHERE jsonb_typeof(value) IN ('number', 'string') $$;
-
--- x and y of a state in metres: the first usual pair, else the first branch that has one.
-CREATE OR REPLACE FUNCTION position_of(state jsonb) RETURNS double precision[]
-LANGUAGE plpgsql IMMUTABLE PARALLEL SAFE SET search_path FROM CURRENT AS $$
-DECLARE
-  found double precision[];
-BEGIN
-  IF jsonb_typeof(state) IS DISTINCT FROM 'object' THEN
-    RETURN NULL;
-  END IF;
-  SELECT ARRAY[number_of(state #> p.x) * p.metres, number_of(state #> p.y) * p.metres] INTO found
-  FROM (VALUES
-      {_USUAL_POSITIONS}
-    ) p (x, y, metres)
-  WHERE jsonb_typeof(state #> p.x) = 'number' AND jsonb_typeof(state #> p.y) = 'number' LIMIT 1;
-  IF found IS NOT NULL THEN
-    RETURN found;
-  END IF;
-  WITH leaf AS (
-    SELECT path[:cardinality(path) - 1] AS branch, path[cardinality(path)] AS last, value,
-      array_to_string(path, '.') AS name
-    FROM leaves_of(state)
-    WHERE jsonb_typeof(value) = 'number' AND (path[cardinality(path)] ~ '[xXyY]'
-      OR path[cardinality(path)] IN ('0', '1')
-        AND path[cardinality(path) - 1] ~* '{"|".join(naming.BRANCHES)}')
-  ), worded AS (
-    SELECT *, words_of(last) AS words, words_of(branch[cardinality(branch)]) AS beside,
-      ARRAY(SELECT w FROM unnest(branch) part, unnest(words_of(part)) w) AS way
-    FROM leaf
-  ), place AS (
-    SELECT *,
-      CASE last WHEN '0' THEN 'x' WHEN '1' THEN 'y'
-        ELSE (SELECT min(w) FROM unnest(words) w WHERE w IN ('x', 'y')) END AS axis,
-      CASE WHEN last IN ('0', '1') THEN ARRAY[]::text[]
-        ELSE ARRAY(SELECT w FROM unnest(words) w WHERE w NOT IN ('x', 'y')) END AS rest
-    FROM worded WHERE NOT way && {_array(sorted(naming.ELSEWHERE))}
-  ), own AS (
-    SELECT * FROM place WHERE CASE WHEN last IN ('0', '1') THEN beside && {_array(naming.BRANCHES)}
-      ELSE cardinality(rest) = cardinality(words) - 1 AND rest <@ {_array(sorted(naming.OWN))}
-        AND cardinality(branch || rest) > 0 END
-  )
-  SELECT ARRAY[number_of(x.value) * x.metres, number_of(y.value) * x.metres] INTO found
-  FROM (SELECT *, metres_of(branch || last) AS metres FROM own WHERE axis = 'x') x
-  JOIN own y ON y.axis = 'y' AND y.branch = x.branch AND y.rest = x.rest
-  ORDER BY NOT (coalesce(x.beside, '{{}}') || x.words) && {_array(naming.BRANCHES)},
-    x.name COLLATE "C", y.name COLLATE "C" LIMIT 1;
-  RETURN found;
-END $$;
-
-CREATE OR REPLACE FUNCTION yaw_of(state jsonb) RETURNS double precision
-LANGUAGE sql IMMUTABLE PARALLEL SAFE SET search_path FROM CURRENT AS $$
-  SELECT number_of(CASE
-      CASE jsonb_typeof(state -> 'pose') WHEN 'array' THEN jsonb_array_length(state -> 'pose') END
-    WHEN 3 THEN state #> '{{pose,2}}' WHEN 4 THEN state #> '{{pose,3}}'
-    WHEN 6 THEN state #> '{{pose,5}}'
-    ELSE coalesce({_YAWS}) END) $$;
-
--- What a robot is doing: the first text, or else whole number, at the name of a mode.
-CREATE OR REPLACE FUNCTION mode_of(state jsonb) RETURNS text
-LANGUAGE plpgsql IMMUTABLE PARALLEL SAFE SET search_path FROM CURRENT AS $$
-DECLARE
-  found text;
-BEGIN
-  IF jsonb_typeof(state) IS DISTINCT FROM 'object' THEN
-    RETURN NULL;
-  END IF;
-  SELECT state ->> word INTO found FROM unnest({_array(naming.MODES)}) word
-  WHERE jsonb_typeof(state -> word) = 'string' LIMIT 1;
-  IF found IS NOT NULL THEN
-    RETURN found;
-  END IF;
-  SELECT text_of(named.value) INTO found FROM (
-    SELECT value, array_to_string(path, '.') AS name, jsonb_typeof(value) = 'number' AS is_number,
-      CASE WHEN cardinality(words) > 1 AND words[cardinality(words)] = ANY({_SPELLINGS})
-        THEN words[:cardinality(words) - 1] ELSE words END AS words
-    FROM leaves_of(state),
-      words_of(regexp_replace(path[cardinality(path)], '^.*[.]', '')) words
-    WHERE jsonb_typeof(value) = 'string' OR scale(value::numeric) = 0
-  ) named, array_position({_array(_RANKED)}, words[cardinality(words)]) rank
-  WHERE rank IS NOT NULL AND NOT words && {_array(sorted(naming.PAST_OR_FUTURE))}
-  ORDER BY is_number, rank > {len(naming.MODES)},
-    CASE WHEN name = array_to_string(words, '_') AND cardinality(words) = 1 THEN rank
-      ELSE {len(_RANKED) + 1} END, length(name), name COLLATE "C"
-  LIMIT 1;
-  RETURN found;
-END $$;
+  SELECT jsonb_path_query_first(state, ('strict ' || path)::jsonpath, '{{}}', true) $$;
 """
 
 _KEY: Final = "recording_uuid"
+_VALUE: Final = "value_at(s.data, p.path)"
+_NUMBER: Final = f"number_of({_VALUE})"
+_IS_NUMBER: Final = f"jsonb_typeof({_VALUE}) = 'number'"
 _NOW_S: Final = "extract(epoch FROM clock_timestamp())::double precision"
 
 
@@ -198,30 +56,62 @@ def _robot_of(alias: str) -> str:
     WHERE u.{_KEY} = {alias}.{_KEY} AND u.id = {alias}.run_id AND r.id = u.robot_id) AS robot"""
 
 
-_POSE: Final = """
-  p.xy[1] AS x_m, p.xy[2] AS y_m, yaw_of(s.data) AS yaw_rad, mode_of(s.data) AS mode"""
-# With an OFFSET it is found once for both coordinates, and not at all where none is asked for.
-_POSITION: Final = "CROSS JOIN LATERAL (SELECT position_of(s.data) AS xy OFFSET 0) p"
+def _motion(robot_id: str) -> str:
+    """What the signals with a role have in a row `s`."""
+    metres = " ".join(f"WHEN '{unit}' THEN {metres}" for unit, metres in METRES.items())
+    integer = f"jsonb_typeof({_VALUE}) = 'number' AND scale(({_VALUE})::numeric) = 0"
+    shown = {
+        "x_m": _first(robot_id, "x", f"{_NUMBER} * CASE p.unit {metres} ELSE 1 END", beside="y"),
+        "y_m": _first(robot_id, "y", f"{_NUMBER} * CASE p.unit {metres} ELSE 1 END", beside="x"),
+        "yaw_rad": _first(
+            robot_id, "yaw", f"{_NUMBER} * CASE p.unit WHEN 'deg' THEN pi() / 180 ELSE 1 END"
+        ),
+        "mode": _first(
+            robot_id,
+            "mode",
+            f"text_of({_VALUE})",
+            f"jsonb_typeof({_VALUE}) = 'string' OR {integer}",
+        ),
+        "speed": _first(robot_id, "speed"),
+        "commanded_speed": _first(robot_id, "commanded_speed"),
+    }
+    return ",".join(f"\n  {query} AS {name}" for name, query in shown.items())
+
+
+def _first(
+    robot_id: str, role: str, shown: str = _NUMBER, wanted: str = _IS_NUMBER, beside: str = ""
+) -> str:
+    """The first of these roles that has such a value in the row, beside one of another role."""
+    other = (
+        f"JOIN signal o ON o.{_KEY} = p.{_KEY} AND o.robot_id = p.robot_id "
+        f"AND o.role = '{beside}' || substr(p.role, 2) AND {_IS_NUMBER.replace('p.', 'o.')}"
+    )
+    # With an OFFSET they are chosen first: a path without a role may be none for PostgreSQL.
+    return f"""(SELECT {shown} FROM (SELECT * FROM signal WHERE {_KEY} = s.{_KEY}
+      AND robot_id = {robot_id} AND role COLLATE "C" BETWEEN '{role}' AND '{role}9' OFFSET 0) p
+    {other if beside else ""}
+    WHERE {wanted} ORDER BY p.role COLLATE "C" LIMIT 1)"""
+
 
 # In the order in which they are made: what a view asks comes before it.
 _QUERIES: Final = {
-    "every_state": f"""SELECT {_KEY}, id AS state_id, run_id, sim_time_s, wall_time_s, data, odd
+    "all_state": f"""SELECT {_KEY}, id AS state_id, run_id, sim_time_s, wall_time_s, data, odd
 FROM state
 UNION ALL
 SELECT {_KEY}, NULL, run_id, sim_time_s, wall_time_s, data, odd FROM kept_state""",
     "all_rollup": "SELECT * FROM rollup",
     "robot_now": f"""SELECT r.{_KEY}, r.name AS robot, u.id AS run_id, u.end_reason, s.sim_time_s,
-  rounded({_NOW_S} - s.wall_time_s, 1) AS age_s,{_POSE},
+  rounded({_NOW_S} - s.wall_time_s, 1) AS age_s,{_motion("r.id")},
   s.data, s.odd
 FROM robot r
 LEFT JOIN LATERAL (SELECT id, end_reason FROM run
   WHERE {_KEY} = r.{_KEY} AND robot_id = r.id ORDER BY id DESC LIMIT 1) u ON true
-LEFT JOIN LATERAL (SELECT sim_time_s, wall_time_s, data, odd FROM state
-  WHERE {_KEY} = r.{_KEY} AND run_id = u.id ORDER BY sim_time_s DESC, id DESC LIMIT 1) s ON true
-{_POSITION}""",
+LEFT JOIN LATERAL (SELECT * FROM state
+  WHERE {_KEY} = r.{_KEY} AND run_id = u.id ORDER BY sim_time_s DESC, id DESC LIMIT 1) s ON true""",
     "robot_trajectory": f"""SELECT s.{_KEY}, {_robot_of("s")},
-  s.run_id, s.id AS state_id, s.sim_time_s, utc_text(s.wall_time_s) AS utc,{_POSE}, s.odd
-FROM state s {_POSITION}""",
+  s.run_id, s.id AS state_id, s.sim_time_s, utc_text(s.wall_time_s) AS utc,{_motion("v.robot_id")},
+  s.odd
+FROM state s LEFT JOIN run v ON v.{_KEY} = s.{_KEY} AND v.id = s.run_id""",
     "robot_run": f"""SELECT u.{_KEY}, r.name AS robot, u.id AS run_id, u.label,
   utc_text(u.started_wall_time_s) AS started_utc,
   rounded(u.last_sim_time_s - u.started_sim_time_s, 3) AS duration_s,
@@ -283,7 +173,7 @@ LEFT JOIN LATERAL (SELECT unit FROM parameter WHERE {_KEY} = u.{_KEY} AND robot_
     "robot_kept": f"""SELECT k.{_KEY}, r.name AS robot, k.run_id, k.id AS stretch_id,
   k.start_sim_time_s AS start_s,
   least(k.end_sim_time_s, greatest(u.last_sim_time_s, k.start_sim_time_s)) AS end_s,
-  (SELECT count(*) FROM every_state s WHERE s.{_KEY} = k.{_KEY} AND s.run_id = k.run_id
+  (SELECT count(*) FROM all_state s WHERE s.{_KEY} = k.{_KEY} AND s.run_id = k.run_id
     AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s) AS states,
   utc_text(k.wall_time_s) AS utc, k.reason
 FROM kept_stretch k JOIN run u ON u.{_KEY} = k.{_KEY} AND u.id = k.run_id

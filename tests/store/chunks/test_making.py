@@ -1,0 +1,225 @@
+"""Rows become chunks once, whoever makes them and whenever he is stopped."""
+
+from __future__ import annotations
+
+import random
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.recordings.rover import Recorder, start_run
+from webots_mcp.connection import connect
+from webots_mcp.store.chunks import making
+from webots_mcp.store.chunks.making import GROUP_ROWS, chunk_whole_run, make_chunks
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.frame import Frame, read_frame
+from webots_mcp.store.reading.ranges import whole_run
+
+ROWS = 2500
+
+
+def state_at(step: int) -> dict[str, Any]:
+    state: dict[str, Any] = {"x": step * 0.25, "mode": "go" if step % 900 < 700 else "turn"}
+    if step % 3:
+        state["lamp"] = step % 7 == 1
+    if step > 1500:
+        state["late_comer"] = None if step % 5 == 0 else step
+    return state
+
+
+def record(
+    connection: sqlite3.Connection, steps: range, recorder: Recorder | None = None
+) -> Recorder:
+    recorder = recorder or start_run(connection)
+    connection.execute("BEGIN")
+    for step in steps:
+        recorder.publish(step * 0.1, state_at(step), {"x": "nan"} if step == 77 else None)
+    connection.execute("COMMIT")
+    return recorder
+
+
+def framed(connection: sqlite3.Connection, run_id: int = 1) -> Frame:
+    segment = whole_run(connection, run_id)
+    assert segment is not None
+    return read_frame(connection, segment, Deadline(60))
+
+
+def contents(connection: sqlite3.Connection) -> dict[str, list[Any]]:
+    frame = framed(connection)
+    names = ("x", "mode", "lamp", "late_comer", "nowhere")
+    return {
+        "times": frame.times.tolist(),
+        "walls": frame.wall_times.tolist(),
+        "ids": frame.ids.tolist(),
+        **{name: frame.values(name) for name in names},
+    }
+
+
+def groups(connection: sqlite3.Connection) -> list[int]:
+    rows = connection.execute("SELECT row_count FROM row_group WHERE is_complete ORDER BY id")
+    return [count for (count,) in rows]
+
+
+def test_full_groups_are_chunked_and_the_newest_rows_wait(empty: sqlite3.Connection) -> None:
+    record(empty, range(ROWS))
+    before = contents(empty)
+    assert make_chunks(empty, 100_000).done
+    assert groups(empty) == [GROUP_ROWS, GROUP_ROWS]
+    assert contents(empty) == before
+    assert make_chunks(empty, 100_000) == (0, True)
+
+
+def test_what_is_left_of_a_run_is_chunked_when_it_has_ended(empty: sqlite3.Connection) -> None:
+    recorder = record(empty, range(ROWS))
+    before = contents(empty)
+    make_chunks(empty, 100_000)
+    recorder.end_run("finished")
+    assert make_chunks(empty, 100_000).done
+    assert groups(empty) == [GROUP_ROWS, GROUP_ROWS, ROWS - 2 * GROUP_ROWS]
+    assert contents(empty) == before
+
+
+def test_a_short_end_is_chunked_before_its_rows_go_and_answers_stay(
+    empty: sqlite3.Connection,
+) -> None:
+    record(empty, range(GROUP_ROWS + 50))
+    before = contents(empty)
+    assert chunk_whole_run(empty, 1)
+    empty.execute("DELETE FROM state")
+    empty.execute("UPDATE run SET purged_rows = rows, last_sim_time_s = ?", (before["times"][-1],))
+    frame = read_frame(empty, making_segment(before["times"]), Deadline(60))
+    assert frame.values("x") == before["x"]
+    assert frame.values("mode") == before["mode"]
+
+
+def making_segment(times: list[float]) -> Any:
+    from webots_mcp.store.reading.ranges import Segment, just_after
+
+    return Segment(1, times[0], just_after(times[-1]))
+
+
+def test_rows_that_come_late_are_in_their_place(empty: sqlite3.Connection) -> None:
+    order = list(range(ROWS))
+    late = sorted(random.Random(1).sample(range(1, 2000), 40))
+    recorder = start_run(empty)
+    record_steps(empty, recorder, [step for step in order if step not in late])
+    make_chunks(empty, 100_000)
+    record_steps(empty, recorder, late)
+    before = contents(empty)
+    assert before["times"] == sorted(before["times"])
+    assert before["x"] == [step * 0.25 for step in order]
+    make_chunks(empty, 100_000)
+    assert sum(groups(empty)) == 2 * GROUP_ROWS + len(late)
+    assert contents(empty) == before
+
+
+def record_steps(connection: sqlite3.Connection, recorder: Recorder, steps: list[int]) -> None:
+    connection.execute("BEGIN")
+    for step in steps:
+        recorder.publish(step * 0.1, state_at(step))
+    connection.execute("COMMIT")
+
+
+def test_rows_of_one_time_are_each_read_once(empty: sqlite3.Connection) -> None:
+    recorder = start_run(empty)
+    empty.execute("BEGIN")
+    for step in range(ROWS):
+        recorder.publish(100.0 if step > 1000 else step * 0.1, {"n": step})
+    empty.execute("COMMIT")
+    make_chunks(empty, 100_000)
+    assert framed(empty).values("n") == list(range(ROWS))
+
+
+def test_one_who_is_stopped_leaves_nothing_half_done(
+    empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record(empty, range(ROWS))
+    before = contents(empty)
+
+    class StoppedError(Exception):
+        pass
+
+    def stop(*_: object) -> bool:
+        raise StoppedError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(making._COMPLETE, "run", stop)  # type: ignore[attr-defined]
+        with pytest.raises(StoppedError):
+            make_chunks(empty, 100_000)
+    assert groups(empty) == []
+    assert contents(empty) == before
+    assert make_chunks(empty, 100_000).done
+    assert groups(empty) == [GROUP_ROWS, GROUP_ROWS]
+    left = "SELECT count(*) FROM chunk WHERE group_id NOT IN (SELECT id FROM row_group)"
+    assert empty.execute(left).fetchone() == (0,)
+    assert contents(empty) == before
+
+
+def test_of_two_that_make_the_same_chunk_one_stores(tmp_path: Path) -> None:
+    file = tmp_path / "webots.db"
+    with closing(connect(file, "writer", create=True)) as one:
+        from webots_mcp.schema import create_schema
+
+        create_schema(one)
+        record(one, range(ROWS))
+        before = contents(one)
+        with closing(connect(file, "writer")) as other:
+            store = making._RunChunks._store  # type: ignore[attr-defined]
+            seen = False
+
+            def overtaken(self: Any, columns: Any, at: Any) -> bool:
+                nonlocal seen
+                if not seen:
+                    seen = True
+                    make_chunks(other, 100_000)
+                return store(self, columns, at)
+
+            making._RunChunks._store = overtaken  # type: ignore[attr-defined,method-assign]
+            try:
+                make_chunks(one, 100_000)
+            finally:
+                making._RunChunks._store = store  # type: ignore[attr-defined,method-assign]
+        make_chunks(one, 100_000)
+        assert groups(one) == [GROUP_ROWS, GROUP_ROWS]
+        assert contents(one) == before
+
+
+def test_a_row_that_no_bridge_wrote_costs_only_itself(
+    empty: sqlite3.Connection, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recorder = record(empty, range(ROWS))
+    empty.execute("UPDATE state SET sim_time_s = 'noon' WHERE id = 10")
+    empty.execute("UPDATE state SET data = x'ff' WHERE id = 20")
+    recorder.end_run("finished")
+    make_chunks(empty, 100_000)
+    assert sum(groups(empty)) == ROWS - 2
+    assert "state 20: data holds no valid JSON" in capsys.readouterr().err
+
+
+def test_a_signal_is_what_all_rows_tell_though_its_name_was_entered_before(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = start_run(empty)
+    recorder.publish(0.0, {"pose": [None, None], "heading": 0.5, "mode": 3})
+    recorder.end_run("finished")
+    chunk_whole_run(empty, 1)
+    kinds = "SELECT name, kind, role FROM signal ORDER BY name"
+    assert empty.execute(kinds).fetchall() == [
+        ("heading", "angle", "yaw"),
+        ("mode", "num", "mode"),
+        ("pose.0", "null", "x"),
+        ("pose.1", "null", "y"),
+    ]
+    recorder.run(1, 1)
+    recorder.publish(0.0, {"pose": [1.5, 2], "heading": 90, "mode": 3.5})
+    recorder.end_run("finished")
+    chunk_whole_run(empty, 2)
+    assert empty.execute(kinds).fetchall() == [
+        ("heading", "num", None),
+        ("mode", "num", None),
+        ("pose.0", "num", "x"),
+        ("pose.1", "num", "y"),
+    ]

@@ -1,0 +1,177 @@
+"""A frame says of a stretch what its rows say, wherever they are read from."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.memory import memory_connection
+from tests.recordings.rover import start_run
+from webots_mcp.connection import connect
+from webots_mcp.schema import create_schema
+from webots_mcp.store.chunks import making
+from webots_mcp.store.chunks.codec import decoded_of
+from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunks.statistics import statistics_of
+from webots_mcp.store.reading import frame as reading
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.frame import Frame, Zones, read_frame
+from webots_mcp.store.reading.ranges import Segment, whole_run
+
+VALUES = st.one_of(
+    st.floats(-1e6, 1e6), st.integers(-1000, 1000), st.booleans(), st.none(), st.sampled_from("abc")
+)
+STATES = st.lists(
+    st.dictionaries(st.sampled_from(["a", "b", "c"]), VALUES), min_size=1, max_size=40
+)
+
+
+@pytest.fixture
+def short_groups(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Groups of eight rows, so that a short recording has several."""
+    for module in (making, reading):
+        monkeypatch.setattr(module, "GROUP_ROWS", 8)
+    monkeypatch.setattr(making, "LEAST_AT_END", 8)
+
+
+def recorded(connection: sqlite3.Connection, states: list[dict[str, Any]]) -> None:
+    recorder = start_run(connection)
+    connection.execute("BEGIN")
+    for step, state in enumerate(states):
+        recorder.publish(round(0.1 * step, 3), state)
+    connection.execute("COMMIT")
+
+
+def framed(connection: sqlite3.Connection) -> Frame:
+    segment = whole_run(connection, 1)
+    assert segment is not None
+    return read_frame(connection, segment, Deadline(60))
+
+
+def as_lists(zones: Zones) -> dict[str, list[str]]:
+    return {name: [*map(str, getattr(zones, name).tolist())] for name in vars(zones)}
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(STATES, st.integers(0, 40), st.integers(0, 40))
+def test_chunks_and_rows_say_the_same(
+    short_groups: None, states: list[dict[str, Any]], start: int, stop: int
+) -> None:
+    with memory_connection() as connection:
+        recorded(connection, states)
+        before = framed(connection)
+        made = make_chunks(connection, 1000)
+        after = framed(connection)
+        assert made.rows == len(states) // 8 * 8
+        assert after.places([start / 10]) == np.searchsorted(before.times, [start / 10])
+        pairs = [
+            (before, after),
+            (before.rows(start, stop), after.rows(start, stop)),
+            (before.between(start / 10, stop / 10), after.between(start / 10, stop / 10)),
+        ]
+        for old, new in pairs:
+            assert old.times.tolist() == new.times.tolist()
+            assert old.wall_times.tolist() == new.wall_times.tolist()
+            for name in ("a", "b", "c"):
+                assert [*map(str, old.numbers(name))] == [*map(str, new.numbers(name))]
+                assert [*map(repr, old.values(name))] == [*map(repr, new.values(name))]
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(STATES, st.integers(0, 40), st.integers(0, 40))
+def test_zones_are_what_the_values_come_to(
+    short_groups: None, states: list[dict[str, Any]], start: int, stop: int
+) -> None:
+    with memory_connection() as connection:
+        recorded(connection, states)
+        make_chunks(connection, 1000)
+        frame = framed(connection).rows(start, stop)
+        for name in ("a", "b", "c"):
+            zones = frame.zones(name)
+            assert int(zones.row_count.sum()) == len(frame)
+            for number, first in enumerate(zones.first_row.tolist()):
+                end = first + int(zones.row_count[number])
+                assert zones.start_s[number] == frame.times[first]
+                assert zones.end_s[number] == frame.times[end - 1]
+                states_there = [s.get(name) for s in states[start : start + len(frame)]][first:end]
+                expected = statistics_of(decoded_of(states_there))
+                for field in ("first", "last", "min", "max", "sum", "largest_step"):
+                    value = getattr(expected, field)
+                    found = float(getattr(zones, field)[number])
+                    assert np.isnan(found) if value is None else found == pytest.approx(value)
+                assert zones.value_count[number] == expected.value_count
+
+
+def test_a_frame_of_arrays_is_one_of_rows() -> None:
+    frame = Frame.of([0.0, 0.1, 0.2], {"x": np.array([1.0, np.nan, 3.0]), "mode": ["a", None, "b"]})
+    assert frame.numbers("x").tolist()[::2] == [1.0, 3.0]
+    assert frame.values("mode") == ["a", None, "b"]
+    assert frame.usable("x")[0].tolist() == [0.0, 0.2]
+    assert "x" in frame
+    assert "y" not in frame
+    assert np.isnan(frame.numbers("y")).all()
+
+
+def test_a_damaged_chunk_is_read_from_its_rows_where_they_are_there(
+    short_groups: None, empty: sqlite3.Connection
+) -> None:
+    states = [{"a": 0.5 * step} for step in range(20)]
+    recorded(empty, states)
+    make_chunks(empty, 1000)
+    empty.execute("UPDATE chunk SET numbers = x'00' WHERE signal_id > 0")
+    frame = framed(empty)
+    assert frame.numbers("a").tolist() == [0.5 * step for step in range(20)]
+    assert frame.unread == ()
+    segment = whole_run(empty, 1)
+    assert segment is not None
+    empty.execute("DELETE FROM state WHERE id <= 8")
+    frame = read_frame(empty, segment, Deadline(60))
+    assert np.isnan(frame.numbers("a")[:8]).all()
+    assert frame.numbers("a")[8:].tolist() == [0.5 * step for step in range(8, 20)]
+    assert [(part.start_s, part.end_s) for part in frame.unread] == [(0.0, 0.7)]
+    assert "the chunk of a is damaged" in frame.unread[0].why
+
+
+def test_a_range_in_wall_time_holds_only_its_rows(empty: sqlite3.Connection) -> None:
+    recorder = start_run(empty)
+    for step in range(6):  # simulation time stands still
+        recorder.publish(1.0, {"a": step})
+        empty.execute("UPDATE state SET wall_time_s = ? WHERE id = ?", (100.0 + step, step + 1))
+    segment = Segment(1, 0.0, 2.0, wall_start_s=102.0, wall_end_s=104.0)
+    assert read_frame(empty, segment, Deadline(60)).values("a") == [2, 3]
+
+
+def test_what_there_was_no_time_for_is_said(empty: sqlite3.Connection) -> None:
+    recorded(empty, [{"a": step} for step in range(3000)])
+    segment = whole_run(empty, 1)
+    assert segment is not None
+    frame = read_frame(empty, segment, Deadline(0.0))
+    assert (len(frame), frame.cut_at_s) == (0, 0.0)
+    assert frame.unread[0].why == "time limit reached"
+
+
+def test_the_newest_rows_are_read_once_and_the_next_come_after_them(tmp_path: Path) -> None:
+    file = tmp_path / "webots.db"
+    with closing(connect(file, "writer", create=True)) as writer:
+        create_schema(writer)
+        recorder = start_run(writer)
+        for step in range(10):
+            recorder.publish(0.1 * step, {"a": step})
+        assert framed(writer).values("a") == list(range(10))
+        for step in (12, 11, 10):  # two of them late
+            recorder.publish(0.1 * step, {"a": step})
+            assert framed(writer).values("a")[-1] == 12
+        assert framed(writer).values("a") == list(range(13))
+        make_chunks(writer, 1000)
+        recorder.publish(1.3, {"a": 13})
+        assert framed(writer).values("a") == list(range(14))
+        writer.execute("DELETE FROM state")
+        recorder.publish(1.4, {"a": 14})
+        assert framed(writer).rows(0, 99).values("a")[-1] == 14

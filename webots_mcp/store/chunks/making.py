@@ -1,0 +1,329 @@
+"""Making chunks: the maintainer's work, never the control loop's.
+
+1,024 rows of a run become a group with a chunk of each signal when there are as many, what is left
+of a run when it has ended, and all of it before retention deletes its rows. A group is prepared
+outside the write lock, stored in pieces of about half a millisecond, and counts once its last piece
+is in. Ids of state rows are given under the write lock, so that a watermark tells which rows were
+looked at. Rows that come late, into a time that is in chunks, become a group of their own.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Final, NamedTuple, TypeVar
+
+from webots_mcp.errors import warn
+from webots_mcp.store.chunks.codec import decoded_of, encode
+from webots_mcp.store.chunks.columns import STATE_COLUMNS, StateColumns
+from webots_mcp.store.chunks.statistics import Statistics, statistics_of
+from webots_mcp.store.chunks.stored import (
+    SIM_TIMES,
+    STATE_IDS,
+    WALL_TIMES,
+    Reached,
+    reached,
+    watermark,
+)
+from webots_mcp.store.invalid_rows import is_over_a_value, valid_rows
+from webots_mcp.store.rollup.batch import BatchColumn
+from webots_mcp.store.signals.registry import enter_signals, registered, tell_more
+from webots_mcp.transactions import LONGEST_WRITE_S, Step
+
+GROUP_ROWS: Final = 1024
+LEAST_AT_END: Final = 256  # fewer rows, with which a run ended, are read as they are
+_IDS_AT_ONCE: Final = 20_000
+_FIRST_AT_ONCE: Final = 20
+_NO_LIMIT: Final = 2**62
+
+Item = TypeVar("Item")
+
+_COLUMNS: Final = (
+    "run_id",
+    "signal_id",
+    *Statistics._fields,
+    "codec",
+    "numbers",
+    "codes",
+    "labels",
+)
+_LIST: Final = ", ".join(_COLUMNS)
+_SET_WATERMARK: Final = (
+    "INSERT INTO watermark (name, state_id) VALUES ('chunk', ?) "
+    "ON CONFLICT (name) DO UPDATE SET state_id = max(state_id, excluded.state_id)"
+)
+_LAST_ID: Final = "SELECT max(id) FROM (SELECT id FROM state WHERE id > ? ORDER BY id LIMIT ?)"
+_WITH_NEW_ROWS: Final = (
+    "SELECT DISTINCT s.run_id, r.robot_id FROM state s JOIN run r ON r.id = s.run_id "
+    "WHERE s.id > ? AND s.id <= ?"
+)
+_ENDED: Final = (
+    "SELECT id, robot_id FROM run WHERE ended_wall_time_s IS NOT NULL AND is_chunked = 0"
+)
+_NEWEST_ID: Final = "SELECT coalesce(max(id), 0) FROM state"
+_SET_CHUNKED: Final = "UPDATE run SET is_chunked = 1 WHERE id = ?"
+_ROBOT: Final = "SELECT robot_id FROM run WHERE id = ?"
+_TAIL: Final = (
+    f"SELECT {STATE_COLUMNS} FROM {{state}} WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
+    "AND id <= ? ORDER BY sim_time_s, id LIMIT ?"
+)
+_COUNT: Final = (  # answered by the index alone
+    "SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
+    "AND id <= ? LIMIT ?)"
+)
+_LATE: Final = (
+    f"SELECT {STATE_COLUMNS} FROM {{state}} WHERE id > ? AND id <= ? AND +run_id = ? "
+    "AND (sim_time_s, id) <= (?, ?) ORDER BY sim_time_s, id LIMIT ?"
+)
+_TEMPORARY: Final = (
+    f"CREATE TEMP TABLE IF NOT EXISTS new_chunk (number INTEGER PRIMARY KEY, {_LIST})"
+)
+_PREPARE: Final = f"INSERT INTO temp.new_chunk VALUES ({', '.join('?' * (len(_COLUMNS) + 1))})"
+_BEGIN_GROUP: Final = (
+    "INSERT INTO row_group (run_id, start_sim_time_s, end_sim_time_s, last_state_id, "
+    "max_state_id, row_count, is_complete) VALUES (?, ?, ?, ?, ?, ?, 0)"
+)
+_STORE: Final = Step(
+    "store_chunks",
+    ("group_id", "first", "last"),
+    f"INSERT INTO chunk (group_id, {_LIST}) SELECT NEW.group_id, {_LIST} FROM new_chunk "
+    "WHERE number >= NEW.first AND number <= NEW.last",
+)
+_COMPLETE: Final = Step(  # unless another process has stored these rows meanwhile
+    "complete_group",
+    ("group_id", "run_id", "max_state_id", "chunks"),
+    "UPDATE row_group SET is_complete = 1 WHERE id = NEW.group_id",
+    unless="(SELECT count(*) FROM chunk WHERE group_id = NEW.group_id) <> NEW.chunks OR "
+    "(SELECT coalesce(max(max_state_id), 0) FROM row_group WHERE run_id = NEW.run_id "
+    "AND is_complete = 1) <> NEW.max_state_id",
+)
+_LEFT_BEHIND: Final = "SELECT id FROM row_group WHERE is_complete = 0"
+_DELETE_CHUNKS: Final = (
+    "DELETE FROM chunk WHERE id IN (SELECT id FROM chunk WHERE group_id = ? LIMIT 20)"
+)
+_DELETE_GROUP: Final = "DELETE FROM row_group WHERE id = ? AND is_complete = 0"
+
+
+class Made(NamedTuple):
+    """What a call of `make_chunks` did.
+
+    Attributes:
+        rows: State rows that were put into chunks.
+        done: Whether nothing is left that could be put into chunks now.
+    """
+
+    rows: int
+    done: bool
+
+
+def make_chunks(
+    connection: sqlite3.Connection, budget_rows: int = 4096, pause_s: float = 0.0
+) -> Made:
+    """Put rows into chunks that are in none, about `budget_rows` of them at most.
+
+    It may end at any moment: what is stored stays, and the next call goes on from there. Rows that
+    hold what no bridge writes are left out, and said on stderr.
+
+    Args:
+        connection: Of the one maintainer (the role "writer"), in autocommit mode.
+        budget_rows: Bounds the time of the call: about 30 us per row of 40 values.
+        pause_s: Between two writes, for others to write; 0 where no other process does.
+
+    Raises:
+        sqlite3.Error: The database is locked or damaged; what was stored before stays.
+    """
+    _delete_left_behind(connection, pause_s)
+    rows = 0
+    while rows < budget_rows:
+        mark = watermark(connection)
+        last = connection.execute(_LAST_ID, (mark, _IDS_AT_ONCE)).fetchone()[0]
+        runs = connection.execute(_ENDED).fetchall()
+        if last is not None:
+            runs += connection.execute(_WITH_NEW_ROWS, (mark, last)).fetchall()
+        for run_id, robot_id in dict.fromkeys(runs):
+            work = _RunChunks(connection, run_id, robot_id, pause_s)
+            rows += work.make(budget_rows - rows, mark if last is None else last)
+            if not work.done:
+                return Made(rows, False)
+        if last is None:
+            return Made(rows, True)
+        connection.execute(_SET_WATERMARK, (last,))
+    return Made(rows, False)
+
+
+def chunk_whole_run(connection: sqlite3.Connection, run_id: int, pause_s: float = 0.0) -> bool:
+    """Put every row of a run into chunks, however few are left; whether all of them are in one."""
+    (robot_id,) = connection.execute(_ROBOT, (run_id,)).fetchone() or (None,)
+    if robot_id is None:
+        return False
+    work = _RunChunks(connection, run_id, robot_id, pause_s, least_rows=1)
+    work.make(_NO_LIMIT, connection.execute(_NEWEST_ID).fetchone()[0])
+    return work.done
+
+
+class _RunChunks:
+    """The chunks of one run that are still to be made."""
+
+    def __init__(
+        self,
+        connection: sqlite3.Connection,
+        run_id: int,
+        robot_id: int,
+        pause_s: float,
+        least_rows: int | None = None,
+    ) -> None:
+        self._connection = connection
+        self._run_id = run_id
+        self._robot_id = robot_id
+        self._pause_s = pause_s
+        self._least_rows = least_rows or GROUP_ROWS
+        self.done = False
+
+    def make(self, budget_rows: int, last_id: int) -> int:
+        """Make those of rows up to an id; how many rows were put into chunks."""
+        rows, least_rows, has_ended = 0, self._least_rows, self._has_ended()
+        if has_ended:
+            least_rows = min(least_rows, LEAST_AT_END)
+        at = reached(self._connection, self._run_id)
+        # Once a later group is stored, the ids of rows that came late would no longer show them.
+        while rows < budget_rows and len(late := self._late(at, last_id)):
+            if not self._store(late, at):
+                return rows
+            rows += len(late)
+            at = reached(self._connection, self._run_id)
+        while rows < budget_rows:
+            tail = self._tail(at, last_id) if self._has_tail(at, last_id, least_rows) else None
+            if tail is None or not len(tail):
+                self.done = True
+                if has_ended:
+                    self._connection.execute(_SET_CHUNKED, (self._run_id,))
+                return rows
+            if not self._store(tail, at):
+                return rows
+            rows += len(tail)
+            at = reached(self._connection, self._run_id)
+        return rows
+
+    def _late(self, at: Reached, last_id: int) -> StateColumns:
+        """Rows in no chunk that came after others of later times were put into one."""
+        if last_id <= at.max_state_id:
+            return StateColumns()
+        place = (at.end_s, at.last_state_id)
+        return _read(self._connection, _LATE, (at.max_state_id, last_id, self._run_id, *place))
+
+    def _has_tail(self, at: Reached, last_id: int, least_rows: int) -> bool:
+        """Whether there are so many rows after those that are in chunks."""
+        place = (at.end_s, at.last_state_id)
+        asked = (self._run_id, *place, last_id, max(1, least_rows))
+        return bool(self._connection.execute(_COUNT, asked).fetchone()[0] >= max(1, least_rows))
+
+    def _tail(self, at: Reached, last_id: int) -> StateColumns:
+        """The first rows after those that are in chunks."""
+        place = (at.end_s, at.last_state_id)
+        return _read(self._connection, _TAIL, (self._run_id, *place, last_id))
+
+    def _has_ended(self) -> bool:
+        ended = "SELECT ended_wall_time_s IS NOT NULL FROM run WHERE id = ?"
+        return bool(self._connection.execute(ended, (self._run_id,)).fetchone()[0])
+
+    def _store(self, columns: StateColumns, at: Reached) -> bool:
+        """Store a group; False where another process has stored some of its rows meanwhile."""
+        ids = _signal_ids(self._connection, self._robot_id, self._run_id, columns)
+        chunks = list(_chunks_of(self._run_id, columns, ids))
+        self._prepare(chunks)
+        group = (self._run_id, columns.times[0], columns.times[-1], columns.ids[-1])
+        begun = self._connection.execute(_BEGIN_GROUP, (*group, max(columns.ids), len(columns)))
+        group_id = begun.lastrowid
+
+        def store(some: Sequence[int]) -> bool:
+            return _STORE.run(self._connection, group_id, some[0], some[-1])
+
+        in_short_steps(range(len(chunks)), store, self._pause_s)
+        return _COMPLETE.run(
+            self._connection, group_id, self._run_id, at.max_in_groups, len(chunks)
+        )
+
+    def _prepare(self, chunks: Sequence[tuple[Any, ...]]) -> None:
+        """Fill the temporary table, in a transaction that locks nothing but it."""
+        self._connection.execute(_TEMPORARY)
+        self._connection.execute("BEGIN")
+        try:
+            self._connection.execute("DELETE FROM temp.new_chunk")
+            rows = ((number, *chunk) for number, chunk in enumerate(chunks))
+            self._connection.executemany(_PREPARE, rows)
+        finally:
+            self._connection.execute("COMMIT")
+
+
+def _read(connection: sqlite3.Connection, query: str, values: tuple[object, ...]) -> StateColumns:
+    """Rows as columns; where one holds what no bridge writes, without all such rows."""
+    columns = StateColumns()
+    try:
+        columns.add(
+            connection.execute(query.format(state="state"), (*values, GROUP_ROWS)).fetchall()
+        )
+    except Exception as error:
+        if not is_over_a_value(error):
+            raise
+        columns = StateColumns()
+        with valid_rows(connection) as invalid:
+            rows = connection.execute(query.format(state="valid_state"), (*values, GROUP_ROWS))
+            columns.add(rows.fetchall())
+        warn(f"left out of the chunks: {'; '.join(invalid.described())}")
+    return columns
+
+
+def _signal_ids(
+    connection: sqlite3.Connection, robot_id: int, run_id: int, columns: StateColumns
+) -> dict[str, int]:
+    """The ids of the signals of some rows, by name; what the rows tell of them is entered."""
+    known = registered(connection, robot_id)
+    fresh = [
+        BatchColumn(robot_id, run_id, name, columns.sample(name), columns.points(name))
+        for name, values in columns.values.items()
+        if tell_more(known.get(name), values)
+    ]
+    if fresh:
+        for column in fresh:
+            column.first_wall_time_s = columns.wall_times[0]
+            column.last_wall_time_s = columns.wall_times[-1]
+        known = enter_signals(connection, robot_id, fresh)
+    return {name: each.id for name, each in known.items() if each.id is not None}
+
+
+def _chunks_of(
+    run_id: int, columns: StateColumns, ids: dict[str, int]
+) -> Iterator[tuple[Any, ...]]:
+    """Rows of the table `chunk`: of the times, and of each signal that is registered."""
+    places: tuple[tuple[int, Sequence[Any]], ...] = (
+        (SIM_TIMES, columns.times),
+        (WALL_TIMES, columns.wall_times),
+        (STATE_IDS, columns.ids),
+    )
+    values = [(ids[name], values) for name, values in columns.values.items() if name in ids]
+    for signal_id, of_rows in (*places, *values):
+        yield (run_id, signal_id, *statistics_of(decoded_of(of_rows)), *encode(of_rows))
+
+
+def in_short_steps(
+    items: Sequence[Item], store: Callable[[Sequence[Item]], bool], pause_s: float
+) -> None:
+    """Store items in order, as many at a time as half a millisecond takes."""
+    most, done = _FIRST_AT_ONCE, 0
+    while done < len(items):
+        some = items[done : done + most]
+        started_s = time.perf_counter()
+        store(some)
+        took_s = time.perf_counter() - started_s
+        done += len(some)
+        most = max(1, round(len(some) * min(2.0, LONGEST_WRITE_S / 2 / took_s)))
+        time.sleep(pause_s)
+
+
+def _delete_left_behind(connection: sqlite3.Connection, pause_s: float) -> None:
+    """Groups of which a process that ended meanwhile had not stored all chunks."""
+    for (group_id,) in connection.execute(_LEFT_BEHIND).fetchall():
+        while connection.execute(_DELETE_CHUNKS, (group_id,)).rowcount:
+            time.sleep(pause_s)
+        connection.execute(_DELETE_GROUP, (group_id,))

@@ -1,0 +1,127 @@
+"""The chunks of a run as they are stored: which groups of rows there are, and what is in them."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator, Sequence
+from typing import Any, Final, NamedTuple
+
+from webots_mcp.store.chunks.codec import DamagedChunkError, Decoded, Encoded, decode
+from webots_mcp.store.chunks.statistics import Statistics
+
+SIM_TIMES: Final = 0  # in the place of a signal's id
+WALL_TIMES: Final = -1
+STATE_IDS: Final = -2
+
+_GROUPS: Final = (
+    "SELECT id, start_sim_time_s, end_sim_time_s, last_state_id, max_state_id, row_count "
+    "FROM row_group WHERE run_id = ? AND is_complete = 1 AND start_sim_time_s < ? "
+    "AND end_sim_time_s >= ? ORDER BY start_sim_time_s, end_sim_time_s, id"
+)
+_IN_CHUNKS: Final = (
+    "SELECT max(end_sim_time_s), max(max_state_id) FROM row_group WHERE run_id = :run "
+    "AND is_complete = 1"
+)
+_LAST_AT: Final = (
+    "SELECT max(last_state_id) FROM row_group WHERE run_id = ? AND is_complete = 1 "
+    "AND end_sim_time_s = ?"
+)
+_WATERMARK: Final = "SELECT state_id FROM watermark WHERE name = 'chunk'"
+_OF_SIGNAL: Final = "FROM chunk WHERE run_id = ? AND signal_id = ? AND group_id BETWEEN ? AND ?"
+_STATISTICS: Final = f"SELECT group_id, {', '.join(Statistics._fields)} {_OF_SIGNAL}"
+_VALUES: Final = f"SELECT group_id, codec, numbers, codes, labels {_OF_SIGNAL}"
+_SIGNALS_IN: Final = "SELECT DISTINCT signal_id FROM chunk WHERE run_id = ? AND signal_id > 0"
+
+
+class Group(NamedTuple):
+    """Rows that follow each other, of which each signal has a chunk. Columns of `row_group`."""
+
+    id: int
+    start_s: float
+    end_s: float
+    last_state_id: int
+    max_state_id: int
+    row_count: int
+
+
+class Reached(NamedTuple):
+    """Which rows of a run are in chunks: those up to a place, but for rows that came later.
+
+    Attributes:
+        end_s: Simulation time of the last of them; -inf before the first chunk.
+        last_state_id: Its id; rows of one time are in the order of their ids.
+        max_state_id: Rows up to that place with greater ids came late and are in none.
+        max_in_groups: The greatest id of a row that is in a chunk.
+    """
+
+    end_s: float
+    last_state_id: int
+    max_state_id: int
+    max_in_groups: int
+
+
+def groups_in(
+    connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
+) -> list[Group]:
+    """The groups of a run that reach into [start_s, end_s), in order of time."""
+    rows = connection.execute(_GROUPS, (run_id, end_s, start_s)).fetchall()
+    return [Group(*row) for row in rows]
+
+
+def reached(connection: sqlite3.Connection, run_id: int) -> Reached:
+    """Up to where a run is in chunks."""
+    end_s, max_id = connection.execute(_IN_CHUNKS, {"run": run_id}).fetchone()
+    if end_s is None:
+        return Reached(float("-inf"), 0, 0, 0)
+    (last_id,) = connection.execute(_LAST_AT, (run_id, end_s)).fetchone()
+    return Reached(end_s, last_id, max(max_id, watermark(connection)), max_id)
+
+
+def watermark(connection: sqlite3.Connection) -> int:
+    """Rows with ids up to it have been looked at, of all runs: none of them comes late any more."""
+    row = connection.execute(_WATERMARK).fetchone()
+    return int(row[0]) if row and isinstance(row[0], int) else 0
+
+
+def signals_in(connection: sqlite3.Connection, run_id: int) -> set[int]:
+    """The ids of the signals that have chunks in a run."""
+    return {signal_id for (signal_id,) in connection.execute(_SIGNALS_IN, (run_id,))}
+
+
+def statistics_in(
+    connection: sqlite3.Connection, run_id: int, signal_id: int, groups: Sequence[Group]
+) -> dict[int, Statistics]:
+    """What a signal comes to in some groups, by their ids; without those that lack it."""
+    rows = connection.execute(_STATISTICS, _between(run_id, signal_id, groups))
+    return {row[0]: Statistics(*row[1:]) for row in rows}
+
+
+def values_in(
+    connection: sqlite3.Connection, run_id: int, signal_id: int, groups: Sequence[Group]
+) -> Iterator[tuple[int, Decoded | DamagedChunkError]]:
+    """The values of a signal in some groups, by their ids, in no order; none of those that lack it.
+
+    Of a chunk that cannot be read comes the error that says why.
+    """
+    wanted = {group.id: group.row_count for group in groups}
+    for group_id, *row in connection.execute(_VALUES, _between(run_id, signal_id, groups)):
+        rows = wanted.get(group_id)
+        if rows is None:
+            continue
+        try:
+            yield group_id, decode(_encoded(row), rows)
+        except DamagedChunkError as error:
+            yield group_id, error
+
+
+def _encoded(row: Sequence[Any]) -> Encoded:
+    codec, numbers, codes, labels = row
+    kinds = (str, bytes | None, bytes | None, str | None)
+    if not all(isinstance(value, kind) for value, kind in zip(row, kinds, strict=True)):
+        raise DamagedChunkError("damaged: another program wrote there")
+    return Encoded(codec, numbers, codes, labels)
+
+
+def _between(run_id: int, signal_id: int, groups: Sequence[Group]) -> tuple[int, int, int, int]:
+    ids = [group.id for group in groups]
+    return run_id, signal_id, min(ids, default=0), max(ids, default=-1)

@@ -197,6 +197,9 @@ CREATE TABLE row_group (
 	last_state_id INTEGER NOT NULL /* state.id of the last row */, 
 	max_state_id INTEGER NOT NULL /* the greatest state.id among them */, 
 	row_count INTEGER NOT NULL, 
+	stored_row_count INTEGER NOT NULL /* of them, those that retention has left in state */, 
+	stored_row_bytes FLOAT NOT NULL /* that one of those takes on the disk */, 
+	chunk_bytes INTEGER NOT NULL /* that its chunks take on the disk */, 
 	is_complete INTEGER NOT NULL /* 1 once all of its chunks are there */, 
 	CONSTRAINT fk_row_group_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 );
@@ -429,7 +432,7 @@ CREATE TABLE lease (
 	PRIMARY KEY (name)
 );
 CREATE TABLE retention_limit (
-	kind TEXT NOT NULL /* state, rollup, log, event, image or run */, 
+	kind TEXT NOT NULL /* state, chunk, log, event, image or run */, 
 	size_bytes BIGINT /* on the disk; of pictures their files */, 
 	rows BIGINT, 
 	age_s FLOAT /* since it was recorded, in wall time */, 

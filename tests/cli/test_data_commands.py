@@ -443,7 +443,7 @@ def test_the_help_tells_the_limits_that_are_in_force(
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
     text = shown.replace(" LIMIT", "")  # Python 3.10 has no words for values
     options = text[text.rindex("--keep-states ") :]
-    for kind in ("state", "rollup", "log", "event", "image"):
+    for kind in ("state", "chunk", "log", "event", "image"):
         limit, told = getattr(DEFAULT, kind), options.partition(f"--keep-{kind}s ")[2]
         spared = f"; an age spares the newest {limit.spared_rows:,}" if limit.limits else ""
         assert f"({limit_text(limit)}{spared})" in told.partition("--keep")[0]

@@ -81,7 +81,7 @@ class Recorded(Recorder):
     def of_runs(self, run_ids: list[int]) -> list[Any]:
         """Everything that is recorded of these runs."""
         marks = ",".join(map(str, run_ids)) or "NULL"
-        tables = ("state", "rollup", "change", "log", "event", "image", "parameter_value")
+        tables = ("state", "row_group", "chunk", "log", "event", "image", "parameter_value")
         found: list[Any] = [
             self.connection.execute(f"SELECT * FROM {table} WHERE run_id IN ({marks})").fetchall()
             for table in tables

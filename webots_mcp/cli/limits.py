@@ -43,8 +43,9 @@ class Limits:
             "kept_state", "Keep so much of what is kept at full rate, the kept stretches ({})."
         ),
     ] = None
-    rollup: Annotated[
-        str | None, _option("rollup", "Keep so much of rollups and change points ({}).")
+    chunk: Annotated[
+        str | None,
+        _option("chunk", "Keep so much of the values in chunks, which outlive states ({})."),
     ] = None
     log: Annotated[str | None, _option("log", "Keep so much of log lines ({}).")] = None
     event: Annotated[

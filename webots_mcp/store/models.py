@@ -305,6 +305,11 @@ class RowGroup(SQLModel, table=True):
     last_state_id: int = _column(Integer, "state.id of the last row", nullable=False)
     max_state_id: int = _column(Integer, "the greatest state.id among them", nullable=False)
     row_count: int = _column(Integer, nullable=False)
+    stored_row_count: int = _column(
+        Integer, "of them, those that retention has left in state", nullable=False
+    )
+    stored_row_bytes: float = _number("that one of those takes on the disk", nullable=False)
+    chunk_bytes: int = _column(Integer, "that its chunks take on the disk", nullable=False)
     is_complete: bool = _column(Integer, "1 once all of its chunks are there", nullable=False)
 
 
@@ -614,7 +619,7 @@ class RetentionLimit(SQLModel, table=True):
 
     __tablename__: ClassVar[Any] = "retention_limit"
     kind: str = Field(
-        sa_column=Column(Text, primary_key=True, comment="state, rollup, log, event, image or run")
+        sa_column=Column(Text, primary_key=True, comment="state, chunk, log, event, image or run")
     )
     size_bytes: int | None = _column(BigInteger, "on the disk; of pictures their files")
     rows: int | None = _column(BigInteger)

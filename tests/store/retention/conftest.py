@@ -10,7 +10,7 @@ import pytest
 from tests.memory import memory_connection
 from tests.recordings.runs import Recorded
 
-TABLES = ("state", "rollup", "change", "log", "event", "image", "command", "run", "session")
+TABLES = ("state", "chunk", "row_group", "log", "event", "image", "command", "run", "session")
 
 
 @pytest.fixture

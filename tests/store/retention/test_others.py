@@ -1,4 +1,4 @@
-"""Logs, events, pictures, commands and rollups are kept and go by limits of their own."""
+"""Logs, events, pictures and commands are kept and go by limits of their own."""
 
 from __future__ import annotations
 
@@ -6,11 +6,9 @@ from collections import Counter
 
 import pytest
 
-from tests.recordings.runs import Recorded, states
+from tests.recordings.runs import Recorded
 from tests.store.retention.conftest import TABLES
 from webots_mcp.store.retention.policy import Limit, Retention
-from webots_mcp.store.rollup.buckets import buckets
-from webots_mcp.store.rollup.rolling import roll
 
 
 def test_logs_events_and_pictures_have_limits_of_their_own(recorded: Recorded) -> None:
@@ -40,42 +38,17 @@ def test_finished_commands_go_with_the_age_of_events(recorded: Recorded) -> None
 def test_what_is_left_of_a_run_outlives_its_rows_ten_times(recorded: Recorded) -> None:
     for _ in range(13):
         recorded.add_run(10)
-    roll(recorded.connection, 1000)
     limits = Retention(Limit(rows=10, spared_rows=0), Limit(), Limit(), Limit(), Limit())
     recorded.prune(limits)
     assert recorded.rows() == {13: 10}
     for table in ("run", "session", "command"):
         assert recorded.connection.execute(f"SELECT min(id) FROM {table}").fetchone() == (3,)
-    for table in ("rollup", "change", "log", "event", "image", "parameter_value"):
+    chunked = recorded.connection.execute("SELECT DISTINCT run_id FROM row_group").fetchall()
+    assert chunked == [(run_id,) for run_id in range(3, 13)]
+    for table in ("log", "event", "image", "parameter_value"):
         sql = f"SELECT count(DISTINCT run_id), min(run_id) FROM {table}"
         assert recorded.connection.execute(sql).fetchone() == (11, 3)
     assert recorded.connection.execute("PRAGMA foreign_key_check").fetchall() == []
-
-
-def test_rollups_stay_when_their_rows_go(recorded: Recorded) -> None:
-    recorded.add_run(100)
-    recorded.add_run(1)
-    recorded.prune(states(rows=1))
-    assert recorded.rows() == {2: 1}
-    signals = dict(recorded.connection.execute("SELECT name, id FROM signal").fetchall())
-    summaries = [part for _, part in buckets(recorded.connection, 1, signals["x"], range(100))]
-    assert sum(part.rows for part in summaries) == 100
-    assert max(part.max or 0 for part in summaries) == 99
-    roll(recorded.connection)
-    assert recorded.count("rollup") > 0
-
-
-def test_rollups_go_only_after_the_rows_that_they_stand_for(recorded: Recorded) -> None:
-    for _ in range(3):
-        recorded.add_run(10)
-    roll(recorded.connection, 1000)
-    only_rollups = Limit(rows=0)
-    recorded.prune(Retention(Limit(), only_rollups, Limit(), Limit(), Limit(), outlive=0))
-    assert recorded.connection.execute("SELECT count(DISTINCT run_id) FROM rollup").fetchone() == (
-        3,
-    )
-    recorded.prune(Retention(Limit(rows=10), only_rollups, Limit(), Limit(), Limit(), outlive=0))
-    assert recorded.connection.execute("SELECT DISTINCT run_id FROM rollup").fetchall() == [(3,)]
 
 
 def test_a_picture_whose_path_leads_out_of_the_folder_is_forgotten_but_not_deleted(

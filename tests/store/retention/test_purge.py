@@ -16,11 +16,12 @@ from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
 from webots_mcp.schema import create_schema
 from webots_mcp.standin import InProcessSupervisor
+from webots_mcp.store.chunks.making import chunk_whole_run
 from webots_mcp.store.retention.planning import plan
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.purge import prune, purge
 from webots_mcp.store.retention.upkeep import Upkeep
-from webots_mcp.store.rollup.rolling import roll, watermark
+from webots_mcp.store.rollup.rolling import roll
 
 
 @pytest.fixture
@@ -38,6 +39,13 @@ def filed(tmp_path: Path) -> Iterator[tuple[Path, Recorded]]:
         yield file, recorded
 
 
+def summed_up(recorded: Recorded) -> None:
+    """Nothing is left to do for the maker of chunks: what a purge does is to delete."""
+    roll(recorded.connection, 10_000)
+    for run_id in recorded.rows():
+        chunk_whole_run(recorded.connection, run_id)
+
+
 def test_purging_gives_the_space_back_to_the_disk(filed: tuple[Path, Recorded]) -> None:
     file, recorded = filed
     recorded.connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
@@ -48,12 +56,12 @@ def test_purging_gives_the_space_back_to_the_disk(filed: tuple[Path, Recorded]) 
     assert done.freed_bytes == pytest.approx(before - file.stat().st_size, rel=0.2)
 
 
-def test_rows_are_rolled_up_before_they_go(filed: tuple[Path, Recorded]) -> None:
+def test_rows_are_in_chunks_before_they_go(filed: tuple[Path, Recorded]) -> None:
     _, recorded = filed
-    assert watermark(recorded.connection) == 0
+    assert recorded.count("row_group") == 0
     recorded.prune(states(rows=1000, spared_rows=0))
-    assert watermark(recorded.connection) >= 4000
-    assert recorded.connection.execute("SELECT max(rows) FROM signal").fetchone()[0] >= 4000
+    sql = "SELECT sum(row_count), sum(stored_row_count) FROM row_group WHERE is_complete"
+    assert recorded.connection.execute(sql).fetchone() == (4096, 96)
 
 
 def test_progress_ends_with_everything_that_was_planned(filed: tuple[Path, Recorded]) -> None:
@@ -91,7 +99,7 @@ def test_a_lock_that_another_holds_is_waited_for_without_waiting(
     filed: tuple[Path, Recorded],
 ) -> None:
     file, recorded = filed
-    roll(recorded.connection, 10_000)
+    summed_up(recorded)
     recorded.connection.execute("PRAGMA busy_timeout=0")
     wanted = plan(recorded.connection, states(rows=4000, spared_rows=0))
     work = purge(recorded.connection, wanted, recorded.folder)
@@ -105,7 +113,7 @@ def test_a_lock_that_another_holds_is_waited_for_without_waiting(
 
 def test_a_maintainer_purges_a_little_in_each_round(filed: tuple[Path, Recorded]) -> None:
     _, recorded = filed
-    roll(recorded.connection, 10_000)
+    summed_up(recorded)
     upkeep = Upkeep(recorded.folder, lambda _: states(rows=1000, spared_rows=0), budget_s=0.0)
     upkeep(recorded.connection)
     left = [recorded.rows()[2]]
@@ -122,7 +130,7 @@ def test_a_maintainer_does_not_look_for_what_is_beyond_again_at_once(
     filed: tuple[Path, Recorded],
 ) -> None:
     _, recorded = filed
-    roll(recorded.connection, 10_000)
+    summed_up(recorded)
     upkeep = Upkeep(recorded.folder, lambda _: states(rows=1000), interval_s=60, budget_s=60)
     upkeep(recorded.connection)
     assert recorded.rows() == {2: 1000}
@@ -133,7 +141,7 @@ def test_a_maintainer_does_not_look_for_what_is_beyond_again_at_once(
 
 def test_a_maintainer_that_reconnects_begins_with_a_new_plan(filed: tuple[Path, Recorded]) -> None:
     file, recorded = filed
-    roll(recorded.connection, 10_000)
+    summed_up(recorded)
     limits = states(rows=1000, spared_rows=0)
     upkeep = Upkeep(recorded.folder, lambda _: limits, interval_s=0, budget_s=0.0)
     with closing(connect(file, "writer")) as first:
@@ -150,7 +158,7 @@ def test_tables_take_turns_so_that_none_grows_while_another_is_purged(
     filed: tuple[Path, Recorded],
 ) -> None:
     _, recorded = filed
-    roll(recorded.connection, 10_000)
+    summed_up(recorded)
     for _ in range(200):
         recorded.add_picture(recorded.run_id)
     few = Limit(rows=10)
@@ -164,7 +172,7 @@ def test_tables_take_turns_so_that_none_grows_while_another_is_purged(
 
 def test_space_goes_back_to_the_disk_while_rows_still_go(filed: tuple[Path, Recorded]) -> None:
     _, recorded = filed
-    roll(recorded.connection, 10_000)
+    summed_up(recorded)
     wanted = plan(recorded.connection, states(rows=100))
     freed = [done.freed_bytes for done in purge(recorded.connection, wanted, recorded.folder)
              if done.rows["state"] < 4900]  # fmt: skip
@@ -174,7 +182,7 @@ def test_space_goes_back_to_the_disk_while_rows_still_go(filed: tuple[Path, Reco
 def test_no_write_of_a_purge_does_more_than_its_time_allows(filed: tuple[Path, Recorded]) -> None:
     """A thousand rows at once would hold the lock for 10 ms; of each write a row at least."""
     _, recorded = filed
-    roll(recorded.connection, 10_000)
+    summed_up(recorded)
     wanted = plan(recorded.connection, states(rows=1000))
     writes = sum(1 for _ in purge(recorded.connection, wanted, recorded.folder))
     assert writes > 10

@@ -27,6 +27,7 @@ from webots_mcp.store.chunks.stored import (
     watermark,
 )
 from webots_mcp.store.invalid_rows import is_over_a_value, valid_rows
+from webots_mcp.store.retention.pages import INDEX_BYTES, disk_bytes
 from webots_mcp.store.rollup.batch import BatchColumn
 from webots_mcp.store.signals.registry import enter_signals, registered, tell_more
 from webots_mcp.transactions import LONGEST_WRITE_S, Step
@@ -36,6 +37,9 @@ LEAST_AT_END: Final = 256  # fewer rows, with which a run ended, are read as the
 _IDS_AT_ONCE: Final = 20_000
 _FIRST_AT_ONCE: Final = 20
 _NO_LIMIT: Final = 2**62
+_STATE_BYTES: Final = 25  # of a record beside its text: run, two times, lengths
+_STATISTICS_BYTES: Final = 115  # of a chunk beside what is compressed
+_CHUNK_INDEX_BYTES: Final = 110  # in both indexes, measured
 
 Item = TypeVar("Item")
 
@@ -82,7 +86,8 @@ _TEMPORARY: Final = (
 _PREPARE: Final = f"INSERT INTO temp.new_chunk VALUES ({', '.join('?' * (len(_COLUMNS) + 1))})"
 _BEGIN_GROUP: Final = (
     "INSERT INTO row_group (run_id, start_sim_time_s, end_sim_time_s, last_state_id, "
-    "max_state_id, row_count, is_complete) VALUES (?, ?, ?, ?, ?, ?, 0)"
+    "max_state_id, row_count, stored_row_count, stored_row_bytes, chunk_bytes, is_complete) "
+    "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, 0)"
 )
 _STORE: Final = Step(
     "store_chunks",
@@ -232,9 +237,10 @@ class _RunChunks:
         ids = _signal_ids(self._connection, self._robot_id, self._run_id, columns)
         chunks = list(_chunks_of(self._run_id, columns, ids))
         self._prepare(chunks)
+        rows = len(columns)
         group = (self._run_id, columns.times[0], columns.times[-1], columns.ids[-1])
-        begun = self._connection.execute(_BEGIN_GROUP, (*group, max(columns.ids), len(columns)))
-        group_id = begun.lastrowid
+        values = (*group, max(columns.ids), rows, rows, *self._room_of(columns, chunks))
+        group_id = self._connection.execute(_BEGIN_GROUP, values).lastrowid
 
         def store(some: Sequence[int]) -> bool:
             return _STORE.run(self._connection, group_id, some[0], some[-1])
@@ -243,6 +249,19 @@ class _RunChunks:
         return _COMPLETE.run(
             self._connection, group_id, self._run_id, at.max_in_groups, len(chunks)
         )
+
+    def _room_of(
+        self, columns: StateColumns, chunks: Sequence[tuple[Any, ...]]
+    ) -> tuple[float, int]:
+        """Bytes on the disk, with indexes: of a state row on average, and of all chunks."""
+        page_bytes = self._connection.execute("PRAGMA page_size").fetchone()[0]
+        texts = (len(text.encode()) + _STATE_BYTES for text in columns.texts)
+        packed = (
+            sum(len(each) for each in chunk[-3:] if each is not None) + _STATISTICS_BYTES
+            for chunk in chunks
+        )
+        row_bytes = disk_bytes(texts, page_bytes) / len(columns) + INDEX_BYTES
+        return row_bytes, round(disk_bytes(packed, page_bytes) + _CHUNK_INDEX_BYTES * len(chunks))
 
     def _prepare(self, chunks: Sequence[tuple[Any, ...]]) -> None:
         """Fill the temporary table, in a transaction that locks nothing but it."""

@@ -49,6 +49,13 @@ _KEPT: Final = (
     "SELECT -id, sim_time_s, wall_time_s, data, odd FROM kept_state "
     f"WHERE {_IN} ORDER BY sim_time_s, id LIMIT ?"
 )
+# Rows that were deleted, and of which no chunk is left. What is oldest goes first.
+_LOST: Final = (
+    "SELECT started_sim_time_s, (SELECT min(start_sim_time_s) FROM row_group WHERE run_id = r.id "
+    "AND is_complete = 1), (SELECT min(sim_time_s) FROM state WHERE run_id = r.id) FROM run r "
+    "WHERE id = ? AND purged_rows > coalesce((SELECT sum(row_count - stored_row_count) "
+    "FROM row_group WHERE run_id = r.id AND is_complete = 1), 0)"
+)
 _SIGNALS: Final = (
     "SELECT s.name, s.id FROM run r JOIN signal s ON s.robot_id = r.robot_id WHERE r.id = ? "
     "AND typeof(s.name) = 'text'"
@@ -434,6 +441,8 @@ def read_frame(
     parts += _rows_in_parts(columns, parts[-1].start + parts[-1].rows if parts else 0)
     names = dict(connection.execute(_SIGNALS, (run_id,)).fetchall())
     source = FrameSource(connection, run_id, parts, names)
+    if lost := _lost(connection, segment):
+        source.unread[lost] = None
     return _framed(source, segment, _said(source, segment, cut_at_s))
 
 
@@ -444,6 +453,16 @@ def _said(source: FrameSource, segment: Segment, cut_at_s: float | None) -> floa
     reached_s = max(cut_at_s, segment.start_s)
     source.unread[Unread(reached_s, segment.end_s, "time limit reached")] = None
     return reached_s
+
+
+def _lost(connection: sqlite3.Connection, segment: Segment) -> Unread | None:
+    """The part of a segment whose rows and chunks retention has deleted."""
+    row = connection.execute(_LOST, (segment.run_id,)).fetchone()
+    if row is None:
+        return None
+    start_s, *left = (time_s for time_s in row if isinstance(time_s, int | float))
+    start_s, end_s = max(start_s, segment.start_s), min([*left, segment.end_s])
+    return Unread(start_s, end_s, "deleted by retention") if start_s < end_s else None
 
 
 def read_kept(connection: sqlite3.Connection, segment: Segment, deadline: Deadline) -> Frame | None:

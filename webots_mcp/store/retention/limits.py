@@ -23,7 +23,7 @@ Asked = Mapping[str, "Limit | float | None"]
 """Limits by the names that they have in `Retention`; None is back to the default."""
 
 SERVE: Final = "serve"
-KINDS: Final = ("state", "kept_state", "rollup", "log", "event", "image", "unshipped")
+KINDS: Final = ("state", "kept_state", "chunk", "log", "event", "image", "unshipped")
 _KIND_OF: Final = {**{kind: kind for kind in KINDS}, "outlive": "run"}
 _NAME_OF: Final = {kind: name for name, kind in _KIND_OF.items()}
 _SHOWN: Final = {"unshipped": "until_shipped"}  # only where it was set

@@ -7,7 +7,7 @@ File Format, section 1.6: B-tree Pages).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Final
 
 _PAGE_HEAD_BYTES: Final = 8
@@ -16,34 +16,28 @@ _LINK_BYTES: Final = 4  # to the next page of a long row
 INDEX_BYTES: Final = 21  # an entry (run_id, sim_time_s, id) of a time index, measured
 
 
-def disk_shares(payloads: Sequence[int], page_bytes: int) -> list[float]:
-    """Bytes that each of some rows takes on the disk, with its share of what stays free.
+def disk_bytes(payloads: Iterable[int], page_bytes: int) -> float:
+    """Bytes that rows which follow each other in a table take on the disk, without its indexes.
 
     Args:
-        payloads: Bytes of the records of rows that follow each other in the table.
+        payloads: Bytes of the record of each row.
         page_bytes: Of the database.
     """
     room = page_bytes - _PAGE_HEAD_BYTES
-    cells = [_cell(payload, page_bytes) for payload in payloads]
-    shares: list[float] = []
-    page: list[tuple[int, int]] = []
-    used = filled_pages = filled_bytes = 0
-    for cell in cells:
-        if page and used + cell[0] > room:
-            shares += _of_page(page, page_bytes / used)
-            filled_pages, filled_bytes = filled_pages + 1, filled_bytes + used
-            page, used = [], 0
-        page.append(cell)
-        used += cell[0]
-    if not page:
-        return shares
-    # The last page goes on with rows that were not read: it will be as full as the others.
-    expected = filled_pages * page_bytes / filled_bytes if filled_pages else 0.0
-    return shares + _of_page(page, expected or page_bytes / (room - used / len(page) / 2))
-
-
-def _of_page(page: Sequence[tuple[int, int]], disk_per_byte: float) -> list[float]:
-    return [local * disk_per_byte + overflow for local, overflow in page]
+    full_pages = own_bytes = filled = used = rows = 0
+    for payload in payloads:
+        local, own = _cell(payload, page_bytes)
+        own_bytes += own
+        if used + local > room:
+            full_pages, filled, used, rows = full_pages + 1, filled + used, 0, 0
+        used, rows = used + local, rows + 1
+    if not rows:
+        return 0.0
+    # The last page goes on with other rows: it will be as full as the others.
+    per_byte = page_bytes / (room - used / rows / 2)
+    if full_pages:
+        per_byte = full_pages * page_bytes / filled
+    return full_pages * page_bytes + used * per_byte + own_bytes
 
 
 def _cell(payload: int, page_bytes: int) -> tuple[int, int]:

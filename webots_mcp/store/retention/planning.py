@@ -6,31 +6,23 @@ import math
 import sqlite3
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import Final
 
 from webots_mcp.contract import FINAL_STATUSES
 from webots_mcp.store.retention.policy import DEFAULT, KEPT, Limit, Retention
-from webots_mcp.store.retention.shipped import (
-    Shipped,
-    complete_until_s,
-    last_shipped,
-    shipped_of,
-)
+from webots_mcp.store.retention.shipped import Shipped, complete_until_s, last_shipped, shipped_of
 from webots_mcp.store.retention.usage import (
     TABLES,
-    Holding,
-    Oldest,
-    count_rows,
-    holdings,
+    UNBOUNDED,
+    Portion,
     nth_id,
-    nth_newest_id,
-    oldest,
+    portions_of,
     read_runs,
     rows_before,
-    rows_below,
+    rows_up_to,
 )
 
 # Those that were created during a kept run stay with it.
@@ -40,30 +32,31 @@ OLD_COMMANDS: Final = (
     f"WHERE robot_id = c.robot_id AND {KEPT} "
     "AND c.created_wall_time_s BETWEEN started_wall_time_s AND last_wall_time_s)"
 )
-ROLLED: Final = ("rollup", "coarse_rollup", "change")
-_ROLLED_BYTES: Final = 150  # a row of those, about
 _COMMAND_BYTES: Final = 400
-_GUESSES: Final = 12
 
 
 @dataclass(frozen=True)
 class Step:
-    """The oldest rows of one run in one table go.
+    """The oldest rows of a portion go; or a run, or commands of a robot.
 
     Attributes:
-        table: Of those in `ROLLED` and of `run` all rows of the run go.
+        table: From which they go; of chunks a row is a state that they stand for.
         owner_id: The run; of commands the robot.
         rows: So many.
         size_bytes: About so much on the disk; of pictures their files.
-        bound: The last id that goes; of commands the wall time before which they were created.
-            By it two that carry out the same plan at once delete no more than one would.
+        newest_s: About when the newest of them was written, in wall time; commands are older.
+        portion: Where they are; None of runs and commands.
+        bound: The last id that goes: two that carry out the same plan at once delete no more
+            than one would.
     """
 
     table: str
     owner_id: int
     rows: int
-    size_bytes: int = 0
-    bound: float = math.inf
+    size_bytes: int
+    newest_s: float
+    portion: Portion | None = None
+    bound: int = UNBOUNDED
 
     @property
     def row_bytes(self) -> float:
@@ -86,7 +79,7 @@ class Plan:
     """What would go now.
 
     Attributes:
-        steps: What goes.
+        steps: What goes, of each table the oldest first.
         held_bytes: About what each kind takes now, of all runs.
         spared: What would have to go as well, and why it does not.
         kept_run_ids: Runs that a person named, described or marked: nothing of them goes, and
@@ -124,10 +117,10 @@ class Plan:
         return sum(step.size_bytes for step in self.steps if step.table == table)
 
     def runs_of(self, table: str) -> list[int]:
-        """The runs that lose rows of a table; commands have none."""
+        """The runs that lose rows of a table, in order; commands have none."""
         if table == "command":
             return []
-        return [step.owner_id for step in self.steps if step.table == table]
+        return list(dict.fromkeys(step.owner_id for step in self.steps if step.table == table))
 
 
 def plan(
@@ -135,7 +128,7 @@ def plan(
 ) -> Plan:
     """Find what is beyond the limits; nothing is changed.
 
-    Costs a pass over the time indexes, about 0.1 s per million state rows, and one over what goes.
+    Costs a look at each row group, and a pass over logs, events, pictures and kept stretches.
 
     Args:
         connection: Any.
@@ -153,47 +146,44 @@ class _Planner:
         self._retention = retention
         self._now_s = now_s
         self._runs = read_runs(connection)
-        self._free = [run for run in self._runs if not run.is_kept]
-        self._held = {table: holdings(connection, table, self._runs) for table in TABLES}
-        self._spared: list[Spared] = []
-        self._unshipped: list[Spared] = []
+        self._held = portions_of(connection, self._runs)
+        self._spared = dict[tuple[str, str], list[float]]()
+        self._unshipped = dict[tuple[str, str], list[float]]()
         self._forgotten = self._find_forgotten() if retention.outlive else set[int]()
 
     def plan(self) -> Plan:
         steps: list[Step] = []
         for table in TABLES:
-            steps += self._beyond(self._of_free_runs(table), getattr(self._retention, table))
-        steps += self._rolled_up(
-            {step.owner_id: step.rows for step in steps if step.table == "state"}
-        )
-        steps += (Step("run", run.id, 1) for run in self._free if run.id in self._forgotten)
+            gone = {step.portion.group_id for step in steps if _is_whole(step) and step.portion}
+            steps += reversed(list(self._beyond(table, gone)))
+        for run in self._runs:
+            if run.id in self._forgotten:
+                steps.append(Step("run", run.id, 1, 0, run.last_wall_time_s))
         for robot_id in {run.robot_id: None for run in self._runs}:
             steps += self._commands(robot_id)
         if limit_bytes := self._retention.unshipped.size_bytes:
-            steps = [step for step in self._after_shipping(steps, limit_bytes) if step.rows]
-        held_bytes = {table: round(_size_of(held)) for table, held in self._held.items()}
-        free_bytes = sum(_size_of(self._of_free_runs(table)) for table in TABLES)
+            steps = self._after_shipping(steps, limit_bytes)
+        every = [portion for portions in self._held.values() for portion in portions]
         return Plan(
             tuple(steps),
-            held_bytes,
-            tuple(self._spared),
+            {table: round(_size_of(portions)) for table, portions in self._held.items()},
+            _listed(self._spared),
             tuple(run.id for run in self._runs if run.is_kept),
-            max(sum(held_bytes.values()) - round(free_bytes), 0),
-            tuple(self._unshipped),
+            round(_size_of([portion for portion in every if portion.run.is_kept])),
+            _listed(self._unshipped),
         )
-
-    def _of_free_runs(self, table: str) -> list[Holding]:
-        return [holding for holding in self._held[table] if not holding.run.is_kept]
 
     def _find_forgotten(self) -> set[int]:
         """Finished runs after which `outlive` times the limits of state was recorded.
 
         As of states, age alone does not do it where few were recorded since.
         """
-        states, limit = self._of_free_runs("state"), self._retention.state
-        row_bytes = _size_of(states) / max(sum(holding.rows for holding in states), 1)
-        newest_first = sorted(self._free, key=lambda run: (-run.started_wall_time_s, -run.id))
+        states = [portion for portion in self._held["state"] if not portion.run.is_kept]
+        row_bytes = _size_of(states) / max(sum(portion.rows for portion in states), 1)
+        free = [run for run in self._runs if not run.is_kept]
+        newest_first = sorted(free, key=lambda run: (-run.started_wall_time_s, -run.id))
         rows_after = accumulate((run.recorded_rows for run in newest_first), initial=0)
+        limit = self._retention.state
         return {
             run.id
             for run, after in zip(newest_first, rows_after, strict=False)
@@ -206,113 +196,55 @@ class _Planner:
             )
         }
 
-    def _beyond(self, held: Sequence[Holding], limit: Limit) -> Iterator[Step]:
-        """Of each run as many rows as have to go; all of those that are forgotten."""
-        staying = [holding for holding in held if holding.run.id not in self._forgotten]
-        going = {
-            holding.run.id: Oldest(holding.rows, math.inf)
-            for holding in held
-            if holding.run.id in self._forgotten
-        }
-        going |= self._oldest_beyond(staying, limit)
-        for run_id, aged in self._aged(staying, limit).items():
-            if run_id not in going or going[run_id].rows < aged.rows:
-                going[run_id] = aged
-        for holding in held:
-            if (gone := going.get(holding.run.id)) and gone.rows:
-                size = round(gone.rows * holding.row_bytes)
-                yield Step(holding.table, holding.run.id, gone.rows, size, gone.bound)
-
-    def _oldest_beyond(self, held: Sequence[Holding], limit: Limit) -> dict[int, Oldest]:
-        """The oldest rows of all runs, as many as are beyond a size or a number of rows."""
-        rows, size_bytes = sum(holding.rows for holding in held), _size_of(held)
-        least_rows = 0 if limit.rows is None else max(rows - limit.rows, 0)
-        excess_bytes = 0.0 if limit.size_bytes is None else size_bytes - limit.size_bytes
-        going = oldest(self._connection, held, least_rows) if least_rows else {}
-        freed_bytes = _size_of_oldest(held, going)
-        if freed_bytes >= excess_bytes:
-            return going
-        return self._oldest_of_size(held, (least_rows, freed_bytes), (rows, size_bytes))
-
-    def _oldest_of_size(
-        self, held: Sequence[Holding], low: tuple[int, float], high: tuple[int, float]
-    ) -> dict[int, Oldest]:
-        """As many as free what the limit asks for, between two (rows, bytes), within a row."""
-        excess_bytes = high[1] - (self._limit_of(held).size_bytes or 0)
-        largest_bytes = max(holding.row_bytes for holding in held)
-        going = {holding.run.id: Oldest(holding.rows, math.inf) for holding in held}
-        for guess in range(_GUESSES):
-            if high[1] - excess_bytes < largest_bytes or high[0] - low[0] <= 1:
-                break
-            share = (excess_bytes - low[1]) / (high[1] - low[1]) if guess % 2 == 0 else 0.5
-            rows = min(low[0] + max(math.ceil((high[0] - low[0]) * share), 1), high[0] - 1)
-            found = oldest(self._connection, held, rows)
-            freed_bytes = _size_of_oldest(held, found)
-            if freed_bytes >= excess_bytes:
-                going, high = found, (rows, freed_bytes)
-            else:
-                low = (rows, freed_bytes)
-        return going
-
-    def _limit_of(self, held: Sequence[Holding]) -> Limit:
-        return getattr(self._retention, held[0].table)
-
-    def _aged(self, held: Sequence[Holding], limit: Limit) -> dict[int, Oldest]:
-        """Rows that are too old, but for the newest of all runs."""
-        if limit.age_s is None:
-            return {}
-        before_s = self._now_s - limit.age_s
-        older = {
-            holding: rows_before(self._connection, holding, before_s)
-            for holding in held
-            if holding.run.started_wall_time_s < before_s
-        }
-        older = {holding: rows for holding, rows in older.items() if rows}
-        if not older:
-            return {}
-        spared_from = nth_newest_id(self._connection, held, limit.spared_rows)
-        going = {
-            holding: min(rows, rows_below(self._connection, holding, spared_from))
-            for holding, rows in older.items()
-        }
-        self._spare_newest(limit, {each: rows - going[each] for each, rows in older.items()})
-        return {
-            holding.run.id: Oldest(rows, nth_id(self._connection, holding, rows))
-            for holding, rows in going.items()
-            if rows
-        }
-
-    def _spare_newest(self, limit: Limit, spared: dict[Holding, int]) -> None:
-        if rows := sum(spared.values()):
-            (table,) = {holding.table for holding in spared}
-            size_bytes = sum(holding.row_bytes * count for holding, count in spared.items())
+    def _beyond(self, table: str, gone_groups: set[int]) -> Iterator[Step]:
+        """What goes of a table, the newest first; all of runs that are forgotten."""
+        limit: Limit = getattr(self._retention, table)
+        free = [portion for portion in self._held[table] if not portion.run.is_kept]
+        staying = [portion for portion in free if portion.run.id not in self._forgotten]
+        before_s = -math.inf if limit.age_s is None else self._now_s - limit.age_s
+        bound, rows = self._bound(staying, limit), 0
+        for portion in free:
+            if portion.run.id in self._forgotten:
+                yield self._step(portion, portion.rows)
+                continue
+            over = rows_up_to(self._connection, portion, bound)
+            old = rows_before(self._connection, portion, before_s)
+            aged = min(old, max(portion.rows - max(limit.spared_rows - rows, 0), 0))
+            going = max(over, aged)
             why = f"too old, but among the newest {limit.spared_rows}"
-            self._spared.append(Spared(table, rows, round(size_bytes), why))
+            _add(self._spared, portion, old - going, why)
+            rows += portion.rows
+            if table == "chunk":
+                going = portion.rows if over or aged == portion.rows else 0
+                if portion.is_held and portion.group_id not in gone_groups:
+                    _add(self._spared, portion, going, "the states are still there")
+                    going = 0
+            if going:
+                yield self._step(portion, going)
 
-    def _rolled_up(self, going_states: dict[int, int]) -> Iterator[Step]:
-        """Rollups and change points go by whole runs, after the state rows that they stand for."""
-        limit = self._retention.rollup
-        asked = [run for run in self._free if limit.limits or run.id in self._forgotten]
-        counts = {run.id: {table: self._count(table, run.id) for table in ROLLED} for run in asked}
-        rows = sum(sum(count.values()) for count in counts.values())
-        spared_rows = 0
-        for run in asked:
-            age_s = self._now_s - run.last_wall_time_s
-            exceeded = limit.is_exceeded(size_bytes=rows * _ROLLED_BYTES, rows=rows, age_s=age_s)
-            if not exceeded and run.id not in self._forgotten:
-                continue
-            rows_of_run = sum(counts[run.id].values())
-            stays = self._count("state", run.id) > going_states.get(run.id, 0)
-            if run.id not in self._forgotten and (stays or run.is_current):
-                spared_rows += rows_of_run
-                continue
-            rows -= rows_of_run
-            for table, count in counts[run.id].items():
-                if count:
-                    yield Step(table, run.id, count, count * _ROLLED_BYTES)
-        if spared_rows:
-            why = "of runs that go on or have states left"
-            self._spared.append(Spared("rollup", spared_rows, spared_rows * _ROLLED_BYTES, why))
+    def _bound(self, held: Sequence[Portion], limit: Limit) -> int:
+        """The id up to which rows have to go, of all runs, for a size and a number of rows."""
+        low, high = 0, held[0].last_id if held else 0
+        while low < high:
+            middle = (low + high) // 2
+            rows, size_bytes = 0, 0.0
+            for portion in held:
+                if portion.last_id <= middle:
+                    break
+                stays = portion.rows - rows_up_to(self._connection, portion, middle)
+                rows, size_bytes = rows + stays, size_bytes + stays * portion.row_bytes
+            if limit.is_exceeded(size_bytes=size_bytes, rows=rows):
+                low = middle + 1
+            else:
+                high = middle
+        return low
+
+    def _step(self, portion: Portion, rows: int) -> Step:
+        is_part = rows < portion.rows
+        bound = nth_id(self._connection, portion, rows) if is_part else UNBOUNDED
+        size_bytes = round(rows * portion.row_bytes)
+        run_id, newest_s = portion.run.id, portion.newest_s
+        return Step(portion.table, run_id, rows, size_bytes, newest_s, portion, bound)
 
     def _commands(self, robot_id: int) -> Iterator[Step]:
         """Finished commands from before all runs of the robot that stay, or older than events."""
@@ -326,62 +258,58 @@ class _Planner:
         if rows := int(self._connection.execute(query, values).fetchone()[0]):
             yield Step("command", robot_id, rows, rows * _COMMAND_BYTES, before_s)
 
-    def _after_shipping(self, steps: Sequence[Step], limit_bytes: float) -> Iterator[Step]:
+    def _after_shipping(self, steps: Sequence[Step], left_bytes: float) -> list[Step]:
         """Without what waits to be shipped: the newest of it stays, up to that size."""
-        pools, left_bytes = shipped_of(self._connection), limit_bytes
-        times = {run.id: run.last_wall_time_s for run in self._runs}
-        waiting = {step: self._waiting(step, pools, times) for step in steps}
-        kept = dict.fromkeys(steps, 0)
-        newest_first = sorted(steps, key=lambda each: times.get(each.owner_id, 0), reverse=True)
-        for step in newest_first:
-            if step.table != "run":
-                kept[step] = min(waiting[step], int(left_bytes / step.row_bytes))
-                left_bytes -= kept[step] * step.row_bytes
-        owners = {step.owner_id for step in steps if kept[step] and step.table != "command"}
-        for step in steps:
-            if step.table in ROLLED and step.owner_id in owners:
-                kept[step] = step.rows  # they stand for states that may stay
-            elif step.table == "run" and (step.owner_id in owners or left_bytes > 0):
-                kept[step] = 1 if step.owner_id in owners else waiting[step]
-        self._spared += _spared({step: kept[step] for step in steps}, "not shipped yet")
-        lost = {step: max(waiting[step] - kept[step], 0) for step in steps}
-        self._unshipped += _spared(lost, "not shipped: beyond what is kept for shipping")
-        return (
-            replace(
-                step,
-                rows=step.rows - kept[step],
-                size_bytes=round(step.row_bytes * (step.rows - kept[step])),
-            )
-            for step in steps
-        )
+        pools = shipped_of(self._connection)
+        going = list[Step]()
+        runs = set[int]()  # that have to wait for their rows
+        for step in sorted(steps, key=lambda each: (each.table == "run", -each.newest_s)):
+            waiting = self._waiting(step, pools)
+            stays = min(waiting, int(left_bytes / step.row_bytes))
+            if step.table == "run":
+                stays = int(step.owner_id in runs or (waiting > 0 and left_bytes > 0))
+            elif step.table == "chunk" and stays:
+                stays = step.rows
+            left_bytes -= stays * step.row_bytes if step.table != "run" else 0
+            if stays and step.table != "command":
+                runs.add(step.owner_id)
+            _add(self._spared, step, stays, "not shipped yet")
+            lost = max(waiting - stays, 0)
+            _add(self._unshipped, step, lost, "not shipped: beyond what is kept for shipping")
+            if stays < step.rows:
+                less = replace(step, rows=step.rows - stays)
+                going.append(self._step(less.portion, less.rows) if less.portion else less)
+        return [step for table in dict.fromkeys(s.table for s in steps)
+                for step in reversed(going) if step.table == table]  # fmt: skip
 
-    def _waiting(self, step: Step, pools: Sequence[Shipped], times: Mapping[int, float]) -> int:
+    def _waiting(self, step: Step, pools: Sequence[Shipped]) -> int:
         """How many of a step's rows are not in all pools."""
-        if step.table not in TABLES:
-            newest_s = step.bound if step.table == "command" else times[step.owner_id]
-            return step.rows if newest_s > complete_until_s(pools) else 0
+        if step.portion is None:
+            return step.rows if step.newest_s > complete_until_s(pools) else 0
         last = last_shipped(pools, step.table)
-        if math.isinf(last):
-            return 0
-        (holding,) = (each for each in self._held[step.table] if each.run.id == step.owner_id)
-        return max(step.rows - rows_below(self._connection, holding, int(last) + 1), 0)
-
-    def _count(self, table: str, run_id: int) -> int:
-        return count_rows(self._connection, table, run_id)
+        return max(step.rows - rows_up_to(self._connection, step.portion, last), 0)
 
 
-def _spared(rows: Mapping[Step, int], why: str) -> Iterator[Spared]:
-    """The rows of steps as reported, by table."""
-    for table in dict.fromkeys(step.table for step in rows):
-        of_table = {step: count for step, count in rows.items() if step.table == table and count}
-        if of_table:
-            size_bytes = sum(step.row_bytes * count for step, count in of_table.items())
-            yield Spared(table, sum(of_table.values()), round(size_bytes), why)
+def _is_whole(step: Step) -> bool:
+    return step.table == "state" and step.bound == UNBOUNDED
 
 
-def _size_of(held: Sequence[Holding]) -> float:
-    return sum(holding.size_bytes for holding in held)
+def _add(
+    found: dict[tuple[str, str], list[float]], of: Portion | Step, rows: int, why: str
+) -> None:
+    """Note so many rows, by table and reason."""
+    if rows > 0:
+        sums = found.setdefault((of.table, why), [0, 0.0])
+        sums[0] += rows
+        sums[1] += rows * of.row_bytes
 
 
-def _size_of_oldest(held: Sequence[Holding], going: dict[int, Oldest]) -> float:
-    return sum(going[each.run.id].rows * each.row_bytes for each in held if each.run.id in going)
+def _listed(found: dict[tuple[str, str], list[float]]) -> tuple[Spared, ...]:
+    return tuple(
+        Spared(table, int(rows), round(size_bytes), why)
+        for (table, why), (rows, size_bytes) in found.items()
+    )
+
+
+def _size_of(portions: Sequence[Portion]) -> float:
+    return sum(portion.size_bytes for portion in portions)

@@ -26,9 +26,9 @@ class Limit:
     """How much of one kind is kept; None is not a limit. What is oldest goes first.
 
     Attributes:
-        size_bytes: So much on the disk, with the free room on the pages and the time index; within
-            a twentieth, because it is estimated from samples. Of pictures their files.
-        rows: So many rows.
+        size_bytes: So much on the disk, with the free room on the pages and the indexes. Of
+            pictures their files.
+        rows: So many rows; of chunks so many states that they stand for.
         age_s: So long after they were written, in wall time.
         spared_rows: So many of the newest rows, of all runs together, do not go because of their
             age: runs of abandoned work do not all vanish. Size and rows always hold.
@@ -51,7 +51,7 @@ class Limit:
         return (self.size_bytes, self.rows, self.age_s) != (None, None, None)
 
     def is_exceeded(
-        self, *, size_bytes: float, rows: float, age_s: float, times: float = 1
+        self, *, size_bytes: float, rows: float, age_s: float = 0, times: float = 1
     ) -> bool:
         """Whether one of these is more than so many times its limit."""
         found = ((size_bytes, self.size_bytes), (rows, self.rows), (age_s, self.age_s))
@@ -63,12 +63,13 @@ class Retention:
     """The limits of each kind of row.
 
     They hold for the whole database, over all robots: rows go in the order in which they were
-    recorded, whatever their run. Runs with a label (but that of
+    recorded, whatever their run, about a thousand of a run at once. Runs with a label (but that of
     a trial), a note or `keep` lose nothing and do not count.
 
     Attributes:
-        state: The full rows. They go only after they were rolled up.
-        rollup: Rollups and change points; of whole finished runs, after the last of their states.
+        state: The full rows. They go only after their values were put into chunks.
+        chunk: The values of each signal, compressed, of about 1,024 states at once. They go only
+            after those states, and with them what their run still says of that time.
         log: Log lines.
         event: Events; its age also holds for finished commands.
         image: Pictures, with their files.
@@ -83,7 +84,7 @@ class Retention:
     """
 
     state: Limit = Limit(size_bytes=1_000_000_000, spared_rows=50_000)
-    rollup: Limit = Limit()
+    chunk: Limit = Limit(size_bytes=1_000_000_000)
     log: Limit = Limit(size_bytes=100_000_000)
     event: Limit = Limit(size_bytes=100_000_000)
     image: Limit = Limit(size_bytes=1_000_000_000, spared_rows=50)

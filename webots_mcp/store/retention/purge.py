@@ -3,7 +3,7 @@
 Rows go in transactions of about a millisecond, as many at once as that allows; between two of them
 the caller rests for longer than the lock was held. The tables take turns, and space that became
 free goes back to the disk in between. Where another writer holds the lock, it is tried again later.
-State rows go only after they were rolled up and put into chunks.
+State rows go only after their values were put into chunks.
 """
 
 from __future__ import annotations
@@ -18,44 +18,52 @@ from typing import Any, Final
 
 from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.errors import DatabaseError, InvalidInputError, NothingRecordedError
-from webots_mcp.store.chunks.making import chunk_whole_run
-from webots_mcp.store.chunks.stored import reached
+from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
 from webots_mcp.store.images import inside
-from webots_mcp.store.retention.planning import OLD_COMMANDS, ROLLED, Plan, plan
+from webots_mcp.store.retention.planning import OLD_COMMANDS, Plan, plan
 from webots_mcp.store.retention.planning import Step as Going
 from webots_mcp.store.retention.policy import DEFAULT, KEPT, Retention
-from webots_mcp.store.retention.usage import TABLES, first_id, rows_of
+from webots_mcp.store.retention.usage import UNBOUNDED, Portion, rows_of
 from webots_mcp.store.rollup.rolling import roll, watermark
 from webots_mcp.transactions import LONGEST_WRITE_S, ShortWrites, Step, is_busy
 
 BATCH_ROWS: Final = 500
+CHUNKED_ROWS: Final = 4096
 ROLLED_ROWS: Final = 100
 REST_S: Final = 0.005  # at least, between two writes
 HURRIED_REST_S: Final = 0.001  # where no robot records: a checkpoint still gets its turn
 RESTS: Final = 9  # the lock is held for a tenth of the time at most
 
 _FREE_RUN: Final = f"NOT EXISTS (SELECT 1 FROM run WHERE id = :run_id AND {KEPT})"
-_IN_TIME: Final = (
-    "SELECT id, run_id FROM {table} NOT INDEXED WHERE id > :after AND id <= :bound "
-    "AND run_id IN (SELECT value FROM json_each(:runs)) {own} ORDER BY id LIMIT :limit"
-)
-_LAST: Final = "SELECT coalesce(max(id), 0) FROM {table}"
-_IN_RUN: Final = "SELECT run_id, signal_id, {third} FROM {table} WHERE run_id = ? LIMIT ?"
 _OLD_COMMANDS: Final = f"SELECT id {OLD_COMMANDS} ORDER BY id LIMIT :limit"
-_THIRD_KEY: Final = {"rollup": "bucket", "coarse_rollup": "bucket", "change": "state_id"}
 _DELETE: Final = {
-    table: f"DELETE FROM {table} WHERE id = :id AND {_FREE_RUN}" for table in (*TABLES, "run")
-} | {
-    table: f"DELETE FROM {table} WHERE run_id = :run_id AND signal_id = :signal_id "
-    f"AND {_THIRD_KEY[table]} = :third AND {_FREE_RUN}"
-    for table in ROLLED
+    "command": "DELETE FROM command WHERE id = :id",
+    "chunk": "DELETE FROM chunk WHERE id = :id",
+    "image": f"DELETE FROM image WHERE id = :id AND {_FREE_RUN}",
+    "run": f"DELETE FROM run WHERE id = :id AND {_FREE_RUN}",
 }
-_DELETE["command"] = "DELETE FROM command WHERE id = :id"
+# A group that is not complete is none to readers; what is left of it when this process ends, the
+# maker of chunks deletes.
+_HIDE_GROUP: Final = (
+    "UPDATE row_group SET is_complete = 0 WHERE id = :id AND is_complete = 1 "
+    f"AND stored_row_count = 0 AND {_FREE_RUN}"
+)
+_CHUNKS: Final = "SELECT id FROM chunk WHERE group_id = ?"
+_DELETE_GROUP: Final = "DELETE FROM row_group WHERE id = ? AND is_complete = 0"
+_GROUPS_WITH_ROWS: Final = (
+    "SELECT id FROM row_group WHERE run_id = ? AND is_complete = 1 AND stored_row_count > 0 "
+    "ORDER BY max_state_id"
+)
+_NONE_STORED: Final = "UPDATE row_group SET stored_row_count = 0 WHERE id = :group_id"
 # Rows without files go many at once, in one statement: see `Step`. What is left in `going` went.
 _GOING: Final = "CREATE TEMP TABLE IF NOT EXISTS going (id INTEGER PRIMARY KEY, run_id INTEGER)"
 _NOT_GOING: Final = (
     "DELETE FROM going WHERE run_id IN (SELECT id FROM run WHERE {kept}) "
     "OR NOT EXISTS (SELECT 1 FROM {table} WHERE id = going.id)"
+)
+_COUNT_STORED: Final = (
+    "UPDATE row_group SET stored_row_count = max(0, stored_row_count - "
+    "(SELECT count(*) FROM going)) WHERE id = NEW.group_id"
 )
 _COUNT_PURGED: Final = (
     "UPDATE run SET purged_rows = purged_rows + "
@@ -75,12 +83,15 @@ _END_KEEPING: Final = (
     "CROSS JOIN kept_state s ON s.id = g.id WHERE s.run_id = kept_stretch.run_id "
     "AND s.sim_time_s BETWEEN kept_stretch.start_sim_time_s AND kept_stretch.end_sim_time_s)"
 )
-_BEFORE_DELETION: Final = {"state": (_COUNT_PURGED, _MOVE_KEPT), "kept_state": (_END_KEEPING,)}
+_BEFORE_DELETION: Final = {
+    "state": (_COUNT_STORED, _COUNT_PURGED, _MOVE_KEPT),
+    "kept_state": (_END_KEEPING,),
+}
 _DELETE_GOING: Final = "DELETE FROM {table} WHERE id IN (SELECT id FROM going)"
 _STEPS: Final = {
     table: Step(
         f"purge_{table}",
-        ("step",),
+        ("group_id",),
         _NOT_GOING.format(table=table, kept=KEPT),
         *_BEFORE_DELETION.get(table, ()),
         _DELETE_GOING.format(table=table),
@@ -153,6 +164,8 @@ def prune(
         DatabaseError: Another process held the write lock all the time.
         sqlite3.Error: The file cannot be written or is damaged; what was deleted stays deleted.
     """
+    while not make_chunks(connection, CHUNKED_ROWS, 0.002 if rest else 0.0).done:
+        pass
     wanted = plan(connection, retention, now_s)
     purged = Purged()
     for purged in purge(connection, wanted, data_dir):
@@ -178,10 +191,14 @@ def purge(
     """
     work = _Purge(connection, data_dir, spare_pages)
     yield work.purged
-    # Summaries go after the states that they stand for, and a run after all that it holds.
-    for tables in ((*TABLES, "command"), ROLLED, ("run",)):
+    # Chunks go after the states that they stand for, and a run after all that it holds.
+    for tables in (
+        ("state", "kept_state", "log", "event", "image", "command"),
+        ("chunk",),
+        ("run",),
+    ):
         steps = {name: [step for step in wanted.steps if step.table == name] for name in tables}
-        yield from work.in_turn([work.carry_out(name, its) for name, its in steps.items() if its])
+        yield from work.in_turn([work.carry_out(its) for its in steps.values() if its])
         if steps.get("kept_state"):
             yield from work.forget_frames()
     yield from work.give_back()
@@ -208,7 +225,6 @@ class _Purge:
         self._writes = ShortWrites(connection)
         self._vacuuming = _Pace()
         self._paces = {table: _Pace() for table in _STEPS}
-        self._in_chunks: dict[int, int] = {}  # run: the id up to which all that can be is
         self.purged = Purged()
 
     def in_turn(self, tables: Sequence[Iterator[Purged]]) -> Iterator[Purged]:
@@ -228,20 +244,70 @@ class _Purge:
         while self._give_some_back():
             yield self.purged
 
-    def carry_out(self, table: str, steps: Sequence[Going]) -> Iterator[Purged]:
+    def carry_out(self, steps: Sequence[Going]) -> Iterator[Purged]:
         """Delete what has to go of a table."""
-        find = self._in_time if table in TABLES else self._by_owner
-        for keys in find(table, steps):
-            while keys:
-                if table == "state" and keys[-1]["id"] > watermark(self._connection):
-                    roll(self._connection, ROLLED_ROWS)
-                elif table == "state" and (run_id := self._not_in_chunks(keys)):
-                    if chunk_whole_run(self._connection, run_id):
-                        # What is in no chunk now holds what no bridge writes, and may go.
-                        self._in_chunks[run_id] = keys[-1]["id"]
-                else:
-                    keys = keys[self._delete_some(table, keys) :]
+        for step in steps:
+            if step.table == "state":
+                yield from self._states(step)
+            elif step.table == "chunk":
+                yield from self._chunks(step)
+            elif step.portion is not None:
+                yield from self._rows(step.portion, step.bound)
+            else:
+                yield from self._by_key(step)
+
+    def _states(self, step: Going) -> Iterator[Purged]:
+        """Rows of a group; those that are in none become one first."""
+        assert step.portion is not None
+        groups: list[int] = [step.portion.group_id]
+        if not step.portion.group_id:
+            while not self._unless_locked(lambda: self._chunked(step.owner_id)):
                 yield self.purged
+            found = self._connection.execute(_GROUPS_WITH_ROWS, (step.owner_id,)).fetchall()
+            groups = [group_id for (group_id,) in found]
+        for group_id in groups:
+            yield from self._rows(step.portion._replace(group_id=group_id), step.bound)
+
+    def _chunked(self, run_id: int) -> bool:
+        """Put rows into chunks for a moment; whether all rows of a run are in one."""
+        if not make_chunks(self._connection, CHUNKED_ROWS).done:
+            return False
+        return chunk_whole_run(self._connection, run_id)
+
+    def _rows(self, portion: Portion, bound: int) -> Iterator[Purged]:
+        """Rows of a portion up to an id, in the order of their ids."""
+        rows, values = rows_of(portion)
+        query = f"SELECT s.id {rows} AND s.id > :after AND s.id <= :bound ORDER BY s.id LIMIT :most"
+        values |= {"after": 0, "bound": bound, "most": BATCH_ROWS}
+        while found := self._connection.execute(query, values).fetchall():
+            keys = [{"id": row_id, "run_id": portion.run.id} for (row_id,) in found]
+            values["after"] = found[-1][0]
+            while keys:
+                if portion.table == "state" and keys[-1]["id"] > watermark(self._connection):
+                    roll(self._connection, ROLLED_ROWS)  # questions that read rollups need them
+                else:
+                    keys = keys[self._delete_some(portion.table, keys, portion.group_id) :]
+                yield self.purged
+        if portion.table == "state" and bound == UNBOUNDED:  # what others deleted was not counted
+            query = f"{_NONE_STORED} AND stored_row_count > 0 AND NOT EXISTS (SELECT 1 {rows})"
+            self._unless_locked(lambda: self._connection.execute(query, values).rowcount)
+
+    def _chunks(self, step: Going) -> Iterator[Purged]:
+        """The chunks of a group, which no reader sees any more."""
+        assert step.portion is not None
+        group = {"id": step.portion.group_id, "run_id": step.owner_id}
+        if not self._unless_locked(lambda: self._connection.execute(_HIDE_GROUP, group).rowcount):
+            return
+        found = self._connection.execute(_CHUNKS, (group["id"],)).fetchall()
+        keys = [{"id": chunk_id} for (chunk_id,) in found]
+        while keys:
+            keys = keys[self._delete_some("chunk", keys) :]
+            yield self.purged
+        self._unless_locked(
+            lambda: self._connection.execute(_DELETE_GROUP, (group["id"],)).rowcount
+        )
+        self.purged.rows["chunk"] += step.rows
+        yield self.purged
 
     def forget_frames(self) -> Iterator[Purged]:
         """Delete the frames of kept stretches that are gone, with their files."""
@@ -253,95 +319,50 @@ class _Purge:
                 keys = keys[self._delete_some("image", keys) :]
                 yield self.purged
 
-    def _not_in_chunks(self, keys: Sequence[dict[str, Any]]) -> int | None:
-        """A run of which rows are in no chunk yet; None if there is none."""
-        newest = {key["run_id"]: key["id"] for key in keys}
-        return next(
-            (
-                run
-                for run, last in newest.items()
-                if max(reached(self._connection, run).max_in_groups, self._in_chunks.get(run, 0))
-                < last
-            ),
-            None,
-        )
-
-    def _in_time(self, table: str, steps: Sequence[Going]) -> Iterator[list[dict[str, Any]]]:
-        """Keys in the order in which the rows were recorded, so that whole pages become free."""
-        left: dict[int, int] = {step.owner_id: step.rows for step in steps}
-        bounds = {step.owner_id: step.bound for step in steps}
-        after = first_id(self._connection, table, list(left)) - 1
-        last = self._first(_LAST.format(table=table))  # what comes later was not planned
-        while left:
-            values = {
-                "after": after,
-                "bound": min(max(bounds.values()), last),
-                "runs": f"[{','.join(map(str, left))}]",
-                "limit": BATCH_ROWS,
-            }
-            found = self._connection.execute(rows_of(_IN_TIME, table), values).fetchall()
-            if not found:
-                return  # another has deleted them
-            after = found[-1][0]
-            keys: list[dict[str, Any]] = []
-            for row_id, run_id in found:
-                if left.get(run_id) and row_id <= bounds[run_id]:
-                    left[run_id] -= 1
-                    keys.append({"id": row_id, "run_id": run_id})
-            left = {run_id: rows for run_id, rows in left.items() if rows}
-            yield keys
-
-    def _by_owner(self, table: str, steps: Sequence[Going]) -> Iterator[list[dict[str, Any]]]:
-        """Keys of summaries and runs of a run, of commands of a robot."""
-        for step in steps:
-            left = step.rows
-            while left > 0 and (keys := self._keys_of(table, step, min(left, BATCH_ROWS))):
-                yield keys
-                left -= len(keys)
-
-    def _keys_of(self, table: str, step: Going, limit: int) -> list[dict[str, Any]]:
-        if table == "run":
-            return [{"id": step.owner_id, "run_id": step.owner_id}]
-        if table == "command":
-            before = {"robot_id": step.owner_id, "before_s": step.bound, "limit": limit}
+    def _by_key(self, step: Going) -> Iterator[Purged]:
+        """A run, or commands of a robot."""
+        keys = [{"id": step.owner_id, "run_id": step.owner_id}]
+        if step.table == "command":
+            before = {"robot_id": step.owner_id, "before_s": step.newest_s, "limit": step.rows}
             found = self._connection.execute(_OLD_COMMANDS, before).fetchall()
-            return [{"id": row[0]} for row in found]
-        query = _IN_RUN.format(table=table, third=_THIRD_KEY[table])
-        names = ("run_id", "signal_id", "third")
-        found = self._connection.execute(query, (step.owner_id, limit)).fetchall()
-        return [dict(zip(names, row, strict=True)) for row in found]
+            keys = [{"id": row_id, "run_id": 0} for (row_id,) in found]
+        while keys:
+            keys = keys[self._delete_some(step.table, keys) :]
+            yield self.purged
 
-    def _delete_some(self, table: str, keys: Sequence[dict[str, Any]]) -> int:
+    def _delete_some(
+        self, table: str, keys: Sequence[dict[str, int]], group_id: int | None = None
+    ) -> int:
         """One short transaction; returns how many of the keys are done, 0 where it was locked."""
         if table in _STEPS:
-            return self._unless_locked(lambda: self._run_step(table, keys))
+            return self._unless_locked(lambda: self._run_step(table, keys, group_id))
         deleted = 0
 
-        def delete(key: dict[str, Any]) -> None:
+        def delete(key: dict[str, int]) -> None:
             nonlocal deleted
             deleted += self._delete(table, key)
 
         done = self._unless_locked(lambda: self._writes.write(keys, delete))
         if done:
-            self.purged.rows[table] += deleted
+            self.purged.rows[table] += deleted if table != "chunk" else 0
             self._note(self._writes.held_s)
         return done
 
-    def _run_step(self, table: str, keys: Sequence[dict[str, Any]]) -> int:
+    def _run_step(self, table: str, keys: Sequence[dict[str, int]], group_id: int | None) -> int:
         pace = self._paces[table]
         some = keys[: pace.count]
         self._connection.execute(_GOING)
         self._connection.execute("DELETE FROM going")
         self._connection.executemany("INSERT INTO going VALUES (:id, :run_id)", some)
         started_s = time.perf_counter()
-        _STEPS[table].run(self._connection, None)
+        _STEPS[table].run(self._connection, group_id)
         held_s = time.perf_counter() - started_s
         pace.measure(len(some), held_s)
         self.purged.rows[table] += self._first("SELECT count(*) FROM going")
         self._note(held_s)
         return len(some)
 
-    def _delete(self, table: str, key: dict[str, Any]) -> int:
+    def _delete(self, table: str, key: dict[str, int]) -> int:
         """How many rows; none of a run that was marked since the plan."""
         paths = self._pictures_of(table, key)
         session = self._first(_SESSION, key["id"]) if table == "run" else None
@@ -355,7 +376,7 @@ class _Purge:
                 self._delete_file(path)
         return deleted
 
-    def _pictures_of(self, table: str, key: dict[str, Any]) -> list[str]:
+    def _pictures_of(self, table: str, key: dict[str, int]) -> list[str]:
         """The paths of what goes with a row: the picture, or those that a run still has."""
         query = {"image": _PATH, "run": _PATHS}.get(table)
         if query is None:

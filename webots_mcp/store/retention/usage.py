@@ -1,20 +1,24 @@
-"""How much each run holds, and about how much room it takes on the disk."""
+"""What a recording holds, in portions small enough to be deleted one after the other.
+
+State rows and chunks are counted by their row groups, which know what they take on the disk; only
+rows that are in no group yet, and the smaller tables, are counted row by row.
+"""
 
 from __future__ import annotations
 
+import json
 import sqlite3
-from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.contract import KEPT_FRAME
-from webots_mcp.store.retention.pages import INDEX_BYTES, disk_shares
+from webots_mcp.store.retention.pages import INDEX_BYTES, disk_bytes
 from webots_mcp.store.retention.policy import KEPT
 
-TABLES: Final = ("state", "kept_state", "log", "event", "image")
-# The frames of a kept stretch count with its states, and go with them.
-_OWN: Final = {"image": f"AND kind <> '{KEPT_FRAME}'"}
+TABLES: Final = ("state", "chunk", "kept_state", "log", "event", "image")
+UNBOUNDED: Final = 2**62
+_BLOCK_IDS: Final = 512
 
 _RUNS: Final = (
     f"SELECT id, robot_id, rows, started_wall_time_s, last_wall_time_s, {KEPT}, "
@@ -22,48 +26,43 @@ _RUNS: Final = (
     " AS is_current FROM run WHERE typeof(started_wall_time_s) IN ('real', 'integer') "
     "AND typeof(last_wall_time_s) IN ('real', 'integer') ORDER BY started_wall_time_s, id"
 )
-_ROWS_BY_RUN: Final = "SELECT run_id, count(*) FROM {table} WHERE 1 {own} GROUP BY run_id"
-_ROWS: Final = "SELECT count(*) FROM {table} WHERE run_id = ?"
-# Rows of a run in the order of its simulation time are in the order of their ids.
-_NTH_ID: Final = (
-    "SELECT id FROM {table} WHERE run_id = ? {own} ORDER BY sim_time_s, id LIMIT 1 OFFSET ? - 1"
+_GROUPS: Final = (
+    "SELECT g.id, g.run_id, g.max_state_id, g.row_count, g.stored_row_count, g.stored_row_bytes, "
+    "g.chunk_bytes, coalesce(i.min, 0), w.min, w.max FROM row_group g "
+    "LEFT JOIN chunk i ON i.run_id = g.run_id AND i.signal_id = -2 AND i.group_id = g.id "
+    "LEFT JOIN chunk w ON w.run_id = g.run_id AND w.signal_id = -1 AND w.group_id = g.id "
+    "WHERE g.is_complete = 1"
 )
-_FIRST_TIME: Final = "SELECT min(sim_time_s) FROM {table} WHERE run_id = ? {own}"
-# Any text and any blob is greater than any number.
-_LAST_TIME: Final = (
-    "SELECT max(sim_time_s) FROM {table} WHERE run_id = ? AND sim_time_s <= 9e999 {own}"
+_IN_NO_GROUP: Final = (
+    "s.run_id = r.id AND s.sim_time_s >= coalesce((SELECT max(end_sim_time_s) FROM row_group g "
+    "WHERE g.run_id = r.id AND g.is_complete = 1), -9e999) AND s.id > coalesce((SELECT "
+    "max(max_state_id) FROM row_group g WHERE g.run_id = r.id AND g.is_complete = 1), 0)"
 )
-_WALL_AT: Final = (
-    "SELECT wall_time_s FROM {table} WHERE run_id = ? AND sim_time_s <= ? "
-    "AND wall_time_s <= 9e999 {own} ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+_WALLS: Final = "min(CAST(wall_time_s AS REAL)), max(CAST(wall_time_s AS REAL))"
+_TAILS: Final = (
+    f"SELECT r.id, min(s.id), max(s.id), json_group_array({{payload}}), {_WALLS} "
+    f"FROM run r CROSS JOIN state s ON {_IN_NO_GROUP} GROUP BY r.id"
 )
-_ROWS_UP_TO: Final = "SELECT count(*) FROM {table} WHERE run_id = ? AND sim_time_s <= ? {own}"
-_ROWS_BELOW: Final = "SELECT count(*) FROM {table} WHERE run_id = ? AND id < ? {own}"
-_OF_RUNS: Final = "run_id IN (SELECT value FROM json_each(:runs))"
-# In the order of their ids: only what goes is looked at, and what lies in between.
-_OLDEST: Final = (
-    "SELECT run_id, count(*), max(id) FROM (SELECT run_id, id FROM {table} NOT INDEXED "
-    f"WHERE id >= :first AND {_OF_RUNS} {{own}} ORDER BY id LIMIT :rows) GROUP BY run_id"
+_BLOCKS: Final = (
+    f"SELECT run_id, min(id), max(id), json_group_array({{payload}}), {_WALLS} FROM {{table}} "
+    f"WHERE 1 {{own}} GROUP BY id / {_BLOCK_IDS}, run_id"
 )
-_NTH_NEWEST: Final = (
-    f"SELECT id FROM {{table}} NOT INDEXED WHERE {_OF_RUNS} {{own}} "
-    "ORDER BY id DESC LIMIT 1 OFFSET :rows - 1"
-)
-_ID_RANGE: Final = "SELECT coalesce(min(id), 0), coalesce(max(id), -1) FROM {table}"
-_WINDOW: Final = (
-    "SELECT run_id, {payload} FROM {table} NOT INDEXED WHERE id >= ? ORDER BY id LIMIT ?"
-)
+# The frames of a kept stretch count with its states, and go with them.
+_OWN: Final = f"AND kind <> '{KEPT_FRAME}'"
 _FILE_BYTES: Final = "iif(bytes BETWEEN 0 AND 1e12, bytes, 0)"
-_PICTURES: Final = (
-    f"SELECT run_id, avg({_FILE_BYTES}) FROM image WHERE kind <> '{KEPT_FRAME}' GROUP BY run_id"
-)
 _FRAMES: Final = (
-    f"SELECT run_id, sum({_FILE_BYTES}) FROM image WHERE kind = '{KEPT_FRAME}' GROUP BY run_id"
+    f"SELECT run_id, sum({_FILE_BYTES}) * 1.0 / max(1, (SELECT count(*) FROM kept_state k "
+    f"WHERE k.run_id = image.run_id)) FROM image WHERE kind = '{KEPT_FRAME}' GROUP BY run_id"
 )
 _COLUMNS: Final = "SELECT name, type, pk FROM pragma_table_info(?)"
-_WINDOWS: Final = 32
-_WINDOW_ROWS: Final = 40
-_BISECTIONS: Final = 50
+_ROWS: Final = {
+    "group": "FROM state s JOIN row_group g ON g.id = :group_id WHERE s.run_id = g.run_id "
+    "AND s.sim_time_s BETWEEN g.start_sim_time_s AND g.end_sim_time_s "
+    "AND (s.sim_time_s, s.id) <= (g.end_sim_time_s, g.last_state_id) AND s.id <= g.max_state_id",
+    "tail": f"FROM run r CROSS JOIN state s ON {_IN_NO_GROUP} WHERE r.id = :run_id",
+    "block": "FROM {table} s WHERE s.run_id = :run_id AND s.id >= :first_id AND s.id <= :last_id "
+    "{own}",
+}
 
 
 class Run(NamedTuple):
@@ -78,30 +77,33 @@ class Run(NamedTuple):
     is_current: bool
 
 
-class Holding(NamedTuple):
-    """What a run has in one table, and about what a row of it takes."""
+class Portion(NamedTuple):
+    """Rows of one run in one table that follow each other.
 
-    run: Run
+    Attributes:
+        group_id: Of states and chunks their row group; 0 of states that are in none.
+        first_id: No row of it is below; `last_id` none is beyond.
+        rows: So many; of chunks the states that they stand for.
+        row_bytes: What one of them takes on the disk.
+        oldest_s: Wall time of the oldest one; `newest_s` of the newest one.
+        is_held: Of chunks: the states that they stand for are there as well.
+    """
+
     table: str
+    run: Run
+    group_id: int
+    first_id: int
+    last_id: int
     rows: int
     row_bytes: float
+    oldest_s: float
+    newest_s: float
+    is_held: bool = False
 
     @property
     def size_bytes(self) -> float:
-        """About what all of it takes."""
+        """What all of it takes on the disk."""
         return self.rows * self.row_bytes
-
-
-class Oldest(NamedTuple):
-    """Of a run the oldest rows of a table: how many, and the last id of them."""
-
-    rows: int
-    bound: float
-
-
-def rows_of(query: str, table: str) -> str:
-    """A query about the rows of a table that a limit of their own holds for."""
-    return query.format(table=table, own=_OWN.get(table, ""))
 
 
 def read_runs(connection: sqlite3.Connection) -> list[Run]:
@@ -112,23 +114,98 @@ def read_runs(connection: sqlite3.Connection) -> list[Run]:
     return [Run(*row) for row in connection.execute(_RUNS).fetchall()]
 
 
-def holdings(connection: sqlite3.Connection, table: str, runs: Sequence[Run]) -> list[Holding]:
-    """What these runs have in a table; those that have nothing are left out."""
-    rows: dict[int, int] = dict(connection.execute(rows_of(_ROWS_BY_RUN, table)).fetchall())
-    row_bytes, usual = _row_bytes(connection, table)
-    frame_bytes: dict[int, int] = {}
-    if table == "kept_state":
-        frame_bytes = dict(connection.execute(_FRAMES).fetchall())
-    return [
-        Holding(
-            run,
-            table,
-            rows[run.id],
-            row_bytes.get(run.id, usual) + frame_bytes.get(run.id, 0) / rows[run.id],
-        )
-        for run in runs
-        if run.id in rows
-    ]
+def portions_of(connection: sqlite3.Connection, runs: Sequence[Run]) -> dict[str, list[Portion]]:
+    """What these runs hold, by table, the newest first."""
+    by_id = {run.id: run for run in runs}
+    found: dict[str, list[Portion]] = {table: [] for table in TABLES}
+    for portion in (*_grouped(connection, by_id), *_counted(connection, by_id)):
+        found[portion.table].append(portion)
+    for portions in found.values():
+        portions.sort(key=lambda each: -each.last_id)
+    return found
+
+
+def _grouped(connection: sqlite3.Connection, runs: Mapping[int, Run]) -> Iterator[Portion]:
+    for row in connection.execute(_GROUPS).fetchall():
+        group_id, run_id, last_id, rows, stored, row_bytes, chunk_bytes, first_id, *walls = row
+        if (run := runs.get(run_id)) is None:
+            continue
+        oldest_s, newest_s = (run.last_wall_time_s if wall is None else wall for wall in walls)
+        last, times = (group_id, last_id), (oldest_s, newest_s)
+        if stored:
+            yield Portion("state", run, group_id, int(first_id), last_id, stored, row_bytes, *times)
+        yield Portion("chunk", run, *last, last_id, rows, chunk_bytes / rows, *times, stored > 0)
+
+
+def _counted(connection: sqlite3.Connection, runs: Mapping[int, Run]) -> Iterator[Portion]:
+    (page_bytes,) = connection.execute("PRAGMA page_size").fetchone()
+    frame_bytes: dict[int, float] = dict(connection.execute(_FRAMES).fetchall())
+    for table in ("state", "kept_state", "log", "event", "image"):
+        query = _TAILS if table == "state" else _BLOCKS
+        payload = _FILE_BYTES if table == "image" else _payload(connection, table)
+        asked = query.format(table=table, payload=payload, own=_OWN if table == "image" else "")
+        for run_id, first_id, last_id, sizes, *times in connection.execute(asked).fetchall():
+            if run_id not in runs:
+                continue
+            each: list[int] = json.loads(sizes)
+            row_bytes = sum(each) / len(each)
+            if table != "image":
+                row_bytes = disk_bytes(each, page_bytes) / len(each) + INDEX_BYTES
+            if table == "kept_state":
+                row_bytes += frame_bytes.get(run_id, 0.0)
+            yield Portion(table, runs[run_id], 0, first_id, last_id, len(each), row_bytes, *times)
+
+
+def _payload(connection: sqlite3.Connection, table: str) -> str:
+    """SQL for the bytes of a record: each column takes a byte or two in its head, and its value."""
+    parts = ["2"]
+    for name, kind, is_key in connection.execute(_COLUMNS, (table,)).fetchall():
+        if kind == "TEXT":
+            parts.append(f"coalesce(length(CAST({name} AS BLOB)) + 1, 1)")
+        elif not is_key:
+            parts.append("9" if kind == "FLOAT" else "3")
+    return " + ".join(parts)
+
+
+def rows_of(portion: Portion) -> tuple[str, dict[str, Any]]:
+    """The rows of a portion that are there now: SQL from FROM on, of `s`, and its values."""
+    values = {
+        "run_id": portion.run.id, "group_id": portion.group_id,
+        "first_id": portion.first_id, "last_id": portion.last_id,
+    }  # fmt: skip
+    kind = "block" if portion.table != "state" else "group" if portion.group_id else "tail"
+    own = _OWN if portion.table == "image" else ""
+    return _ROWS[kind].format(table=portion.table, own=own), values
+
+
+def nth_id(connection: sqlite3.Connection, portion: Portion, number: int) -> int:
+    """The id of the row of that number, from 1, counted from the oldest."""
+    rows, values = rows_of(portion)
+    query = f"SELECT s.id {rows} ORDER BY s.id LIMIT 1 OFFSET :number - 1"
+    row = connection.execute(query, values | {"number": number}).fetchone()
+    return row[0] if row else UNBOUNDED
+
+
+def rows_before(connection: sqlite3.Connection, portion: Portion, wall_time_s: float) -> int:
+    """How many of the rows are older than that."""
+    if portion.newest_s < wall_time_s:
+        return portion.rows
+    if portion.oldest_s >= wall_time_s or portion.table == "chunk":
+        return 0
+    rows, values = rows_of(portion)
+    query = f"SELECT count(*) {rows} AND s.wall_time_s < :before_s"
+    return int(connection.execute(query, values | {"before_s": wall_time_s}).fetchone()[0])
+
+
+def rows_up_to(connection: sqlite3.Connection, portion: Portion, last_id: float) -> int:
+    """How many of the rows have ids up to that."""
+    if portion.last_id <= last_id:
+        return portion.rows
+    if portion.first_id > last_id or portion.table == "chunk":
+        return 0
+    rows, values = rows_of(portion)
+    query = f"SELECT count(*) {rows} AND s.id <= :until"
+    return int(connection.execute(query, values | {"until": last_id}).fetchone()[0])
 
 
 def file_sizes(connection: sqlite3.Connection) -> dict[str, int]:
@@ -145,125 +222,3 @@ def file_sizes(connection: sqlite3.Connection) -> dict[str, int]:
     (file,) = connection.execute("SELECT file FROM pragma_database_list").fetchone()
     log = Path(f"{file}-wal")
     return sizes | {"log_beside_bytes": log.stat().st_size if file and log.exists() else 0}
-
-
-def count_rows(connection: sqlite3.Connection, table: str, run_id: int) -> int:
-    """How many rows a run has in a table."""
-    return int(connection.execute(_ROWS.format(table=table), (run_id,)).fetchone()[0])
-
-
-def rows_below(connection: sqlite3.Connection, holding: Holding, row_id: float) -> int:
-    """How many of the rows have smaller ids."""
-    query = rows_of(_ROWS_BELOW, holding.table)
-    return int(connection.execute(query, (holding.run.id, row_id)).fetchone()[0])
-
-
-def nth_id(connection: sqlite3.Connection, holding: Holding, number: int) -> int:
-    """The id of the row of that number, from 1, counted from the oldest."""
-    query = rows_of(_NTH_ID, holding.table)
-    return int(connection.execute(query, (holding.run.id, number)).fetchone()[0])
-
-
-def oldest(connection: sqlite3.Connection, held: Sequence[Holding], rows: int) -> dict[int, Oldest]:
-    """The oldest rows of all of these together, by run; `held` is of one table."""
-    table = held[0].table
-    values = {
-        "runs": _as_json(held),
-        "first": first_id(connection, table, [holding.run.id for holding in held]),
-        "rows": rows,
-    }
-    found = connection.execute(rows_of(_OLDEST, table), values).fetchall()
-    return {run_id: Oldest(count, bound) for run_id, count, bound in found}
-
-
-def first_id(connection: sqlite3.Connection, table: str, run_ids: Sequence[int]) -> int:
-    """An id that no row of these runs is below; what kept stretches took over came later."""
-    if table == "kept_state":
-        return 0
-    query = rows_of(_NTH_ID, table)
-    found = (connection.execute(query, (run_id, 1)).fetchone() for run_id in run_ids)
-    return min((row[0] for row in found if row is not None), default=0)
-
-
-def nth_newest_id(connection: sqlite3.Connection, held: Sequence[Holding], number: int) -> float:
-    """The id of the newest row but `number` - 1 of all of these; below all ids with fewer rows."""
-    if number == 0:
-        return float("inf")
-    values = {"runs": _as_json(held), "rows": number}
-    row = connection.execute(rows_of(_NTH_NEWEST, held[0].table), values).fetchone()
-    return row[0] if row else 0
-
-
-def rows_before(connection: sqlite3.Connection, holding: Holding, wall_time_s: float) -> int:
-    """How many of the rows are older than that: wall time rises with simulation time."""
-    table, run_id = holding.table, holding.run.id
-
-    def is_older(time_s: float) -> bool:
-        query = rows_of(_WALL_AT, table)
-        row = connection.execute(query, (run_id, time_s)).fetchone()
-        return row is not None and row[0] < wall_time_s
-
-    older_s, younger_s = _bounds(connection, table, run_id)
-    if older_s is None or younger_s is None:
-        return 0
-    if is_older(younger_s):
-        return holding.rows
-    if not is_older(older_s):
-        return 0
-    for _ in range(_BISECTIONS):
-        middle_s = (older_s + younger_s) / 2
-        older_s, younger_s = (middle_s, younger_s) if is_older(middle_s) else (older_s, middle_s)
-    query = rows_of(_ROWS_UP_TO, table)
-    return int(connection.execute(query, (run_id, older_s)).fetchone()[0])
-
-
-def _as_json(held: Sequence[Holding]) -> str:
-    return f"[{','.join(str(holding.run.id) for holding in held)}]"
-
-
-def _row_bytes(connection: sqlite3.Connection, table: str) -> tuple[dict[int, float], float]:
-    """About what a row of each run takes on the disk, and what it usually is."""
-    if table == "image":
-        means: dict[int, float] = dict(connection.execute(_PICTURES).fetchall())
-        return means, 0.0
-    page_bytes = int(connection.execute("PRAGMA page_size").fetchone()[0])
-    by_run = defaultdict[int, list[float]](list)
-    for rows in _windows(connection, table):
-        shares = disk_shares([payload for _, payload in rows], page_bytes)
-        for (run_id, _), share in zip(rows, shares, strict=True):
-            by_run[run_id].append(share + INDEX_BYTES)
-    every = [share for shares in by_run.values() for share in shares]
-    usual = sum(every) / max(len(every), 1)
-    return {run_id: sum(shares) / len(shares) for run_id, shares in by_run.items()}, usual
-
-
-def _windows(connection: sqlite3.Connection, table: str) -> Iterator[list[Any]]:
-    """(run, bytes of the record) of rows that follow each other, in windows over the table."""
-    query = _WINDOW.format(table=table, payload=_payload(connection, table))
-    first, last = connection.execute(_ID_RANGE.format(table=table)).fetchone()
-    if last - first < _WINDOWS * _WINDOW_ROWS:
-        yield connection.execute(query, (first, -1)).fetchall()
-        return
-    for number in range(_WINDOWS):
-        start = first + (last - first) * number // _WINDOWS
-        yield connection.execute(query, (start, _WINDOW_ROWS)).fetchall()
-
-
-def _payload(connection: sqlite3.Connection, table: str) -> str:
-    """SQL for the bytes of a record: each column takes a byte or two in its head, and its value."""
-    parts = ["2"]
-    for name, kind, is_key in connection.execute(_COLUMNS, (table,)).fetchall():
-        if kind == "TEXT":
-            parts.append(f"coalesce(length(CAST({name} AS BLOB)) + 1, 1)")
-        elif not is_key:
-            parts.append("9" if kind == "FLOAT" else "3")
-    return " + ".join(parts)
-
-
-def _bounds(
-    connection: sqlite3.Connection, table: str, run_id: int
-) -> tuple[float, float] | tuple[None, None]:
-    """Simulation times of the run's first and last row in a table; None where no row has one."""
-    first = connection.execute(rows_of(_FIRST_TIME, table), (run_id,)).fetchone()[0]
-    last = connection.execute(rows_of(_LAST_TIME, table), (run_id,)).fetchone()[0]
-    return (None, None) if last is None else (first, last)

@@ -1,4 +1,4 @@
-"""Of a run that lost rows what is left comes along: its summaries, and all answers from them."""
+"""Of a run that lost rows what is left comes along: its chunks, and all answers from them."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ import pytest
 from tests.recordings.answers import answers
 from tests.recordings.rounds import PART, ROWS, record_rounds
 from tests.recordings.rover import Recorder, rover_state, start_run
+from tests.store.retention.test_chunks import framed
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.schema import create_schema
 from webots_mcp.store.bundle import unpacked, write_bundle
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.merging import merge
 from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.retention.policy import Limit, Retention
@@ -136,6 +138,31 @@ def test_rows_that_were_not_rolled_up_there_are_rolled_up_here(
         "JOIN signal s ON s.id = a.signal_id WHERE s.name = 'battery_v' AND a.run_id = ?"
     )
     assert target.execute(rolled, (run,)).fetchone() == (ROWS + 1, ROWS * 0.2)
+
+
+@NONE_OR_SOME_LEFT
+def test_the_chunks_of_a_purged_run_come_and_name_the_rows_that_are_left(
+    target: sqlite3.Connection, source: Path, tmp_path: Path
+) -> None:
+    run = merge(target, tmp_path / "here", source, run_id=1).popitem()[1]
+    with closing(connect(source, "reader")) as there:
+        before, after = framed(there, 1), framed(target, run)
+        for name in ("battery_v", "mode", "pose.0"):
+            assert after.values(name) == before.values(name)
+    assert len(after) == ROWS and after.unread == ()
+    left = target.execute("SELECT id FROM state WHERE run_id = ? ORDER BY id", (run,)).fetchall()
+    assert [row_id for (row_id,) in left] == after.ids.tolist()[ROWS - len(left) :]
+
+
+def test_a_whole_run_is_put_into_chunks_here(
+    target: sqlite3.Connection, source: Path, tmp_path: Path
+) -> None:
+    with closing(connect(source, "writer")) as there:
+        make_chunks(there, 10**9)
+    merge(target, tmp_path / "here", source)
+    make_chunks(target, 10**9)
+    sql = "SELECT count(*) FROM run WHERE is_chunked = 0 AND ended_wall_time_s IS NOT NULL"
+    assert target.execute(sql).fetchone() == (0,)
 
 
 @NONE_OR_SOME_LEFT

@@ -1,7 +1,7 @@
 """Taking in another recording: its sessions and runs, distinguished from existing ones by UUID.
 
 Whatever is already there is left as it is, so merging may be repeated, and may be killed anywhere:
-what is new of a session comes in one transaction. Rollups are made anew from the rows; those of a
+what is new of a session comes in one transaction. Chunks are made anew from the rows; those of a
 run that has lost rows come as they are. A bundle is made the same way: an empty recording takes in
 one run.
 """
@@ -20,6 +20,7 @@ from webots_mcp.contract import make_folder, whole_file
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.liveness import reap
 from webots_mcp.schema import require_shipped
+from webots_mcp.store.chunks.taking_in import take_in_chunks
 from webots_mcp.store.images import PICTURES, inside
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.rollup.taking_in import take_in_summaries
@@ -57,6 +58,7 @@ _SAME_COMMAND: Final = (
     "AND params = ?"
 )
 _IS_PURGED: Final = "SELECT purged_rows > 0 FROM main.run WHERE id = ?"
+_TO_BE_CHUNKED: Final = "UPDATE main.run SET is_chunked = 0 WHERE id = ?"
 _OF_RUN: Final = ("kept_stretch", "kept_state", "log", "event", "parameter_value")
 _BUSY: Final = (
     "SELECT EXISTS (SELECT 1 FROM main.session s JOIN main.robot b ON b.id = s.robot_id "
@@ -260,9 +262,15 @@ def _copy_commands(
 
 
 def _copy_states(connection: sqlite3.Connection, run_id: int, run: int, robot_id: int) -> None:
-    """The rows; where some are gone, with the summaries of all."""
+    """The rows; where some are gone, with the chunks of all."""
     (is_purged,) = connection.execute(_IS_PURGED, (run,)).fetchone()
-    shift = take_in_summaries(connection, run_id, run, robot_id) if is_purged else None
+    shift = None
+    if is_purged:
+        ids = take_in_chunks(connection, run_id, run, robot_id)
+        take_in_summaries(connection, run_id, run, robot_id, ids)
+        shift = ids.shift
+    else:
+        connection.execute(_TO_BE_CHUNKED, (run,))
     _insert(connection, "state", "run_id = ?", run_id, {"run_id": run}, shift)
 
 

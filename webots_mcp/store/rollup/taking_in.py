@@ -7,46 +7,13 @@ references to them are translated to the ids here.
 from __future__ import annotations
 
 import sqlite3
-from typing import Final, NamedTuple, get_args
+from typing import Final
 
-from webots_mcp.errors import InvalidInputError
-from webots_mcp.signal_kinds import Kind, unit_of, widen
-from webots_mcp.signal_register import MAX_SIGNALS
+from webots_mcp.signal_kinds import unit_of, widen
+from webots_mcp.store.chunks.taking_in import Ids
 from webots_mcp.store.rollup.tables import ADD_COUNTS, IS_ID, fill, run_mark
 from webots_mcp.store.signals.registry import Count, enter_signals
 
-# Ids between the first and the last row of a run; other robots could not have recorded more.
-_MOST_IDS: Final = 2**40
-_IDS: Final = (
-    "SELECT min(id), max(id) FROM (SELECT id FROM source.state WHERE run_id = :run UNION ALL "
-    f"SELECT state_id FROM source.change WHERE run_id = :run AND {IS_ID.format('state_id')})"
-)
-_LAST_HERE: Final = "SELECT coalesce(max(seq), 0) FROM main.sqlite_sequence WHERE name = 'state'"
-_RESERVE: Final = (
-    "DELETE FROM main.sqlite_sequence WHERE name = 'state'",
-    "INSERT INTO main.sqlite_sequence (name, seq) VALUES ('state', ?)",
-)
-_USED: Final = " OR ".join(
-    f"EXISTS (SELECT 1 FROM source.{table} WHERE run_id = :run AND signal_id = s.id)"
-    for table in ("rollup", "recent_rollup", "change")
-)
-_DESCRIBED: Final = (
-    "name, kind, unit, path, reduce, role, first_seen_wall_time_s, last_seen_wall_time_s"
-)
-_ENTER: Final = (
-    f"INSERT INTO main.signal (robot_id, {_DESCRIBED}) SELECT :here, {_DESCRIBED} "
-    "FROM source.signal s WHERE robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
-    f"AND kind IN {get_args(Kind)} AND ({_USED}) "
-    "AND NOT EXISTS (SELECT 1 FROM main.signal WHERE robot_id = :here "
-    "AND name = s.name) ORDER BY id "
-    f"LIMIT max(0, {MAX_SIGNALS} - (SELECT count(*) FROM main.signal WHERE robot_id = :here))"
-)
-_MAP: Final = "CREATE TEMP TABLE IF NOT EXISTS signal_here (there INTEGER PRIMARY KEY, here)"
-_FILL_MAP: Final = (
-    "INSERT INTO temp.signal_here SELECT s.id, n.id FROM source.signal s JOIN main.signal n "
-    "ON n.robot_id = :here AND n.name = s.name "
-    "WHERE s.robot_id = (SELECT robot_id FROM source.run WHERE id = :run)"
-)
 _TABLES: Final = ("rollup", "recent_rollup", "coarse_rollup", "change")
 _COUNTS: Final = (
     "SELECT n.id, n.name, n.kind, s.kind, s.last_seen_wall_time_s, sum(u.rows), sum(u.present), "
@@ -60,37 +27,18 @@ _MARK: Final = "UPDATE main.run SET rolled_state_id = ?, coarse_end = ? WHERE id
 _COARSE_END: Final = "SELECT coarse_end FROM source.run WHERE id = ?"
 
 
-class _Ids(NamedTuple):
-    """The ids of the state rows of a run there, and by how much they rise."""
-
-    last: int
-    shift: int
-
-
-def take_in_summaries(connection: sqlite3.Connection, there: int, here: int, robot_id: int) -> int:
+def take_in_summaries(
+    connection: sqlite3.Connection, there: int, here: int, robot_id: int, ids: Ids
+) -> None:
     """Take in rollups, change points and what the register knows of them.
 
-    Change points name state rows by ids, also those that are gone. So all ids of the run rise alike
-    here, beyond those that were ever given: what came before what remains so.
-
     Args:
-        connection: In a transaction; the other recording is attached.
+        connection: In a transaction; the other recording is attached, its chunks are here.
         there: The run's id in the other recording.
         here: Its id here; none of its state rows is here yet.
         robot_id: Its robot here.
-
-    Returns:
-        By how much the ids of its state rows are to rise.
-
-    Raises:
-        InvalidInputError: Its ids are spread as no bridge gives them.
+        ids: What `take_in_chunks` gave.
     """
-    ids = _reserved_ids(connection, there)
-    asked = {"run": there, "here": robot_id}
-    connection.execute(_ENTER, asked)
-    connection.execute(_MAP)
-    connection.execute("DELETE FROM temp.signal_here")
-    connection.execute(_FILL_MAP, asked)
     for table in _TABLES:
         _copy(connection, table, there, here, ids.shift)
     fill(connection, "new_count", _counts(connection, here))
@@ -99,24 +47,6 @@ def take_in_summaries(connection: sqlite3.Connection, there: int, here: int, rob
     mark = min(run_mark(connection, there, "source.") or 0, ids.last) + ids.shift
     (coarse_end,) = connection.execute(_COARSE_END, (there,)).fetchone()
     connection.execute(_MARK, (max(0, mark), coarse_end, here))
-    return ids.shift
-
-
-def _reserved_ids(connection: sqlite3.Connection, there: int) -> _Ids:
-    (last_here,) = connection.execute(_LAST_HERE).fetchone()
-    first, last = connection.execute(_IDS, {"run": there}).fetchone()
-    if first is None:
-        return _Ids(last_here, 0)
-    if last - first > _MOST_IDS:
-        raise InvalidInputError(
-            f"the ids of run {there}'s state rows reach from {first} to {last}, which no bridge "
-            "gives: the recording is damaged"
-        )
-    shift = last_here + 1 - first
-    delete, insert = _RESERVE
-    connection.execute(delete)
-    connection.execute(insert, (last + shift,))
-    return _Ids(last, shift)
 
 
 def _copy(connection: sqlite3.Connection, table: str, there: int, here: int, shift: int) -> None:

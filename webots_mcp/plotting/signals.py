@@ -176,21 +176,21 @@ def _notes(parts: Sequence[Part], curves: Sequence[Curve]) -> list[str]:
     drawn = {(curve.run_id, curve.name) for curve in curves}
     for part in parts:
         left = [c for c in part.run.numbers if (part.run.run_id, c.name) not in drawn]
-        if too_large := [columns.name for columns in left if columns.whole.present]:
+        if too_large := [columns.name for columns in left if columns.too_large]:
             notes.append(f"beyond 1e100 in {part.name}: {listed(too_large)}")
-        silent = [columns.name for columns in left if not columns.whole.present]
+        silent = [each.name for each in left if not each.whole.present and not each.too_large]
         if silent and part.unread is None:
             notes.append(f"without a value in {part.name}: {listed(silent)}")
         notes += [
-            f"{columns.name} in {part.name} was {_counted(columns.odd)}: not drawn"
+            f"{columns.name} in {part.name} was {_counted(columns.replaced)}: not drawn"
             for columns in part.run.numbers
-            if columns.odd
+            if columns.replaced
         ]
     return list(dict.fromkeys(notes))
 
 
-def _counted(odd: dict[str, int]) -> str:
-    return ", ".join(f"{value} {count} times" for value, count in odd.items())
+def _counted(replaced: dict[str, int]) -> str:
+    return ", ".join(f"{value} {count} times" for value, count in replaced.items())
 
 
 def _left_out(names: Sequence[str], room: Room) -> str:

@@ -173,11 +173,11 @@ def _usual_counts(numbers: Sequence[NumberColumns]) -> list[int] | None:
 def _number_series(
     columns: NumberColumns, counts: list[int] | None, run: RunHistory
 ) -> NumberSeries:
-    whole, replaced = columns.whole, columns.odd or None
+    whole, replaced = columns.whole, columns.replaced or None
+    if columns.too_large:
+        return NumberSeries(replaced={**(replaced or {}), "beyond 1e100": columns.too_large})
     if not whole.present:
         return NumberSeries(silent=run.cut_at_s is None or None, replaced=replaced)
-    if whole.min is None:
-        return NumberSeries(replaced={**(replaced or {}), "beyond 1e100": whole.present})
     if run.step_s is None:
         return NumberSeries(unit=columns.unit, value=figures(columns.last), replaced=replaced)
     if whole.min == whole.max and columns.count == counts:
@@ -270,5 +270,5 @@ def _row_columns(page: Page, rows: int, view: View) -> RowColumns:
             ]
             for name, values in page.values.items()
         },
-        replaced=page.odd or None,
+        replaced=page.replaced or None,
     )

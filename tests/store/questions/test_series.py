@@ -10,6 +10,7 @@ import pytest
 
 from tests.recordings.rover import start_run
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.questions.series import NumberColumns, query_history
 from webots_mcp.store.reading.pages import query_rows
 from webots_mcp.store.reading.ranges import Scope, find_range
@@ -27,7 +28,7 @@ def column(run: Any, name: str) -> NumberColumns:
 
 
 def test_an_extreme_of_a_single_row_survives_any_bucket(
-    rover: sqlite3.Connection, tier: str
+    rover: sqlite3.Connection, looked_at: str
 ) -> None:
     for max_points in (1, 3, 12, 200):
         ir = column(ask(rover, "ir", max_points=max_points), "ir")
@@ -36,46 +37,36 @@ def test_an_extreme_of_a_single_row_survives_any_bucket(
         assert len(ir.max) <= max_points
 
 
-def test_counts_are_exact_at_both_ends(rover: sqlite3.Connection, tier: str) -> None:
+def test_counts_are_exact_at_both_ends(rover: sqlite3.Connection, looked_at: str) -> None:
     run = ask(rover, "pose.0", start_s=3.05, end_s=61.05)
     pose = column(run, "pose.0")
     assert sum(pose.count) == pose.whole.present == 580
     assert (pose.whole.first_sim_time_s, pose.whole.last_sim_time_s) == (3.1, 61.0)
     assert pose.whole.max == pytest.approx(8.0)
-    assert run.tier == ("raw" if tier == "rows" else "rollup")
 
 
-def test_a_long_step_is_a_multiple_of_the_tier(
-    rover: sqlite3.Connection, long_ranges: None
-) -> None:
-    run = ask(rover, "ir", max_points=5)
-    assert (run.tier, run.step_s) == ("rollup", 30.0)
-    assert run.sim_time_s == [0.0, 30.0, 60.0, 90.0]
-
-
-def test_a_recording_gap_is_visible_as_such(rover: sqlite3.Connection, tier: str) -> None:
+def test_a_recording_gap_is_visible_as_such(rover: sqlite3.Connection, looked_at: str) -> None:
     run = ask(rover, "ir", max_points=500)
     (gap,) = run.gaps
     assert (gap.start_s, gap.end_s) == (pytest.approx(89.9), 95.0)
     assert run.interval_s == pytest.approx(0.1)
-    if tier == "rows":
-        empty = [t for t, n in zip(run.sim_time_s, column(run, "ir").count, strict=True) if n == 0]
-        assert empty and all(90 <= t < 95 for t in empty)
+    empty = [t for t, n in zip(run.sim_time_s, column(run, "ir").count, strict=True) if n == 0]
+    assert empty and all(90 <= t < 95 for t in empty)
 
 
 def test_few_rows_come_as_they_are(rover: sqlite3.Connection) -> None:
     run = ask(rover, "pose.0", "ir", start_s=10.0, end_s=11.0)
-    assert (run.tier, run.step_s, run.rows) == ("rows", None, 10)
+    assert (run.step_s, run.rows) == (None, 10)
     assert column(run, "pose.0").last == [pytest.approx(2.0 + 0.02 * i) for i in range(10)]
 
 
-def test_an_angle_has_a_circular_mean(rover: sqlite3.Connection, tier: str) -> None:
+def test_an_angle_has_a_circular_mean(rover: sqlite3.Connection, looked_at: str) -> None:
     heading = column(ask(rover, "heading", start_s=60.0, end_s=90.0, max_points=3), "heading")
     assert all(abs(abs(mean or 0) - math.pi) < 0.01 for mean in heading.mean)
     assert heading.min[0] is not None and heading.min[0] < -2.6
 
 
-def test_modes_come_as_change_points(rover: sqlite3.Connection, tier: str) -> None:
+def test_modes_come_as_change_points(rover: sqlite3.Connection, looked_at: str) -> None:
     run = ask(rover, "mode", "sensors.bumper", start_s=45.0)
     mode, bumper = run.changes
     assert mode.points == [(0.0, "cruise"), (52.0, "back_up"), (60.0, "avoid"), (95.0, "cruise")]
@@ -85,7 +76,7 @@ def test_modes_come_as_change_points(rover: sqlite3.Connection, tier: str) -> No
 
 def test_odd_values_are_named(rover: sqlite3.Connection) -> None:
     front = column(ask(rover, "sensors.front", start_s=99.0, end_s=106.0), "sensors.front")
-    assert front.odd == {"nan": 40}
+    assert front.replaced == {"nan": 40}
     assert sum(front.count) == 30
 
 
@@ -97,24 +88,26 @@ def test_a_value_that_is_no_number_is_named_within_its_array(empty: sqlite3.Conn
         recorder.publish(float(step), state, odd if step < 20 else {"short.0": "inf"})
     roll(empty)
     run = ask(empty, "short", "long.mean")
-    assert column(run, "short.0").odd == {"nan": 20, "inf": 10}
-    assert column(run, "short.1").odd == {}
-    assert column(run, "short.2").odd == {"nan": 9}
-    assert column(run, "long.mean").odd == {"inf": 20}
+    assert column(run, "short.0").replaced == {"nan": 20, "inf": 10}
+    assert column(run, "short.1").replaced == {}
+    assert column(run, "short.2").replaced == {"nan": 9}
+    assert column(run, "long.mean").replaced == {}, "it is the mean of the others"
     counted = dict(
         empty.execute("SELECT name, replaced_row_count FROM signal WHERE name LIKE 'short%'")
     )
     assert counted == {"short.0": 30, "short.1": 0, "short.2": 9}
 
 
-def test_a_reduced_array_is_a_signal_like_any_other(rover: sqlite3.Connection, tier: str) -> None:
+def test_a_reduced_array_is_a_signal_like_any_other(
+    rover: sqlite3.Connection, looked_at: str
+) -> None:
     run = ask(rover, "lidar.min", "lidar.argmin", start_s=50.0, end_s=80.0)
     lidar = column(run, "lidar.min")
     assert lidar.whole.min == pytest.approx(1.55)
     assert column(run, "lidar.argmin").whole.max == 7
 
 
-def test_rows_and_rollups_give_the_same_whole(rover: sqlite3.Connection, tier: str) -> None:
+def test_values_and_chunks_give_the_same_whole(rover: sqlite3.Connection, looked_at: str) -> None:
     battery = column(ask(rover, "battery_v", start_s=3.3, end_s=117.7), "battery_v").whole
     expected = [12.6 - 0.001 * i / 10 for i in range(33, 1177) if not 900 <= i < 950]
     mean = math.fsum(expected) / len(expected)
@@ -164,12 +157,14 @@ def test_absurd_questions_are_refused(rover: sqlite3.Connection) -> None:
         query_rows(rover, found, ["ir"], limit=0)
 
 
-def test_rows_after_the_watermark_are_in_the_answer(empty: sqlite3.Connection, tier: str) -> None:
+def test_rows_that_are_in_no_chunk_are_in_the_answer(
+    empty: sqlite3.Connection, looked_at: str
+) -> None:
     recorder = start_run(empty)
     for step in range(600):
         recorder.publish(step * 0.1, {"x": float(step), "mode": f"m{step // 200}"})
         if step == 450:
-            roll(empty, 10_000)
+            make_chunks(empty, 10_000)
     run = ask(empty, "x", "mode", start_s=0.05)
     assert column(run, "x").whole[:2] == (599, 599)
     assert column(run, "x").whole.last == 599.0
@@ -187,15 +182,15 @@ def test_integers_beyond_64_bits_stay_what_they_are_in_rows(empty: sqlite3.Conne
 @pytest.mark.parametrize(("name", "turn"), [("heading_deg", 360.0), ("yaw", math.tau)])
 @pytest.mark.parametrize("around", [0.0, 0.25, 0.5])
 def test_the_mean_of_an_angle_is_circular_in_degrees_as_in_radians(
-    empty: sqlite3.Connection, tier: str, name: str, turn: float, around: float
+    empty: sqlite3.Connection, looked_at: str, name: str, turn: float, around: float
 ) -> None:
     recorder = start_run(empty)
     for step in range(200):
         share = around + (0.02 if step % 2 else -0.02)
         value = share % 1.0 if name == "heading_deg" else math.remainder(share, 1.0)
         recorder.publish(float(step), {name: value * turn})
-    if tier == "rollups":
-        roll(empty, 1000)
+    if looked_at == "chunks":
+        make_chunks(empty, 1000)
     angle = column(ask(empty, name, max_points=10), name)
     for mean in (*angle.mean, angle.whole.centre(turn)):
         assert mean is not None

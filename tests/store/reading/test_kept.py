@@ -224,7 +224,7 @@ def test_the_extreme_between_two_rows_is_in_its_bucket_and_in_the_trend(
     (signal,) = run.numbers
     (place,) = [i for i, most in enumerate(signal.max) if most == 900.0]
     assert run.step_s is not None
-    spike_s = signal.max_sim_time_s[place]
+    spike_s = signal.whole.max_sim_time_s
     assert spike_s == pytest.approx((SPIKE + 1) * STEP_MS / 1000, abs=0.02)
     assert spike_s is not None
     assert run.sim_time_s[place] <= spike_s < run.sim_time_s[place] + run.step_s

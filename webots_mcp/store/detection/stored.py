@@ -10,8 +10,7 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.naming import Value, listed
-from webots_mcp.store.analysis.rhythm import rhythm_of
+from webots_mcp.naming import Value
 from webots_mcp.store.detection.event import LEVELS, Event
 from webots_mcp.store.detection.kind import (
     Alike,
@@ -23,10 +22,8 @@ from webots_mcp.store.detection.kind import (
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.detection.together import told_together
 from webots_mcp.store.reading.changes import MOST_VALUES, Point, change_points, value_ended_s
-from webots_mcp.store.reading.coverage import purged_until_s
-from webots_mcp.store.reading.gaps import hidden_gaps, rhythm_in, with_rows_around
+from webots_mcp.store.reading.gaps import frame_around, rhythm_in
 from webots_mcp.store.reading.ranges import Segment, just_after
-from webots_mcp.store.reading.rows import exceeds, read_columns
 from webots_mcp.store.signals.registry import Signal
 
 MOST_OF_A_KIND: Final = 2000  # newest rows of a table that are looked at, per run
@@ -92,31 +89,14 @@ def _recorded(search: Search) -> Segment:
 def gap_events(search: Search) -> Iterator[Event]:
     """Where rows are missing: gaps that the segment touches, also all around it."""
     segment = _recorded(search)
-    around = with_rows_around(search.connection, segment)
-    if exceeds(search.connection, around):
-        rhythm = rhythm_in(search.connection, around)
-    else:
-        columns = read_columns(search.connection, around, (), search.deadline)
-        _note_unread(search, "gap", columns.cut_at_s)
-        rhythm = rhythm_of(columns.times)
+    around = frame_around(search.connection, segment, search.deadline)
+    _note_unread(search, "gap", around.cut_at_s)
+    rhythm = rhythm_in(around)
     details = {"usual_interval_s": rhythm.interval_s}
-    _note_hidden_gaps(search, segment, rhythm.interval_s)
     for gap in rhythm.gaps:
         if gap.end_s > segment.start_s and gap.start_s < segment.end_s:
             wall_s = search.wall_time_at(gap.start_s)
             yield Event("gap", segment.run_id, gap.start_s, gap.end_s, wall_s, None, details)
-
-
-def _note_hidden_gaps(search: Search, segment: Segment, interval_s: float | None) -> None:
-    """For purged rows only the count per 10 s shows that some were missing."""
-    until_s = purged_until_s(search.connection, segment.run_id, segment.start_s)
-    if until_s is None or interval_s is None:
-        return
-    hidden = hidden_gaps(search.connection, segment, until_s, interval_s)
-    if hidden:
-        where = listed([f"{first_s:.6g} and {last_s:.6g} s" for first_s, last_s in hidden], 2)
-        why = f"rows are missing between {where}: their exact times were purged with the rows"
-        search.not_searched("gap", why)
 
 
 def change_events(search: Search) -> Iterator[Event]:

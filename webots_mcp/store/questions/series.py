@@ -1,19 +1,25 @@
-"""`query_history`: signals over a range of any length, in as many buckets as can be read."""
+"""`query_history`: signals over a range of any length, in buckets."""
 
 from __future__ import annotations
 
+import math
 import sqlite3
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.naming import listed
+from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.rhythm import Gap
-from webots_mcp.store.analysis.summary import Summary, merge
-from webots_mcp.store.reading.buckets import Table, Tier, tabulate
+from webots_mcp.store.analysis.summary import LARGEST, Summary, summarise_numbers, with_extremes
+from webots_mcp.store.reading.buckets import Buckets, buckets_of, cells_of
 from webots_mcp.store.reading.changes import Changes, Point, change_points
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
+from webots_mcp.store.reading.frame import Frame, read_frame, read_kept
+from webots_mcp.store.reading.frame_summary import summary_of
+from webots_mcp.store.reading.gaps import rhythm_in
 from webots_mcp.store.reading.ranges import Segment, TimeRange, recorded_bounds
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.signals.catalogue import signals_of
@@ -21,6 +27,7 @@ from webots_mcp.store.signals.registry import Signal
 
 DEFAULT_POINTS: Final = 50
 MOST_POINTS: Final = 500
+MOST_NAMED: Final = 5  # signals that there was no time for
 STATES_SHARE: Final = 0.5  # of the time, where numbers are asked for as well
 
 _NEWEST_WALL: Final = (
@@ -37,8 +44,8 @@ class NumberColumns:
         turn: A whole turn in its unit, of an angle; else None.
         mean: Of an angle the circular mean.
         whole: The same for the whole range, with the times of its extremes.
-        odd: How often a value stood there that JSON cannot hold ("nan", "inf"); None if the
-            range is too long for the rows to be looked at.
+        too_large: How many values are beyond 1e100, where there is no other.
+        replaced: How often a value stood there that JSON cannot hold ("nan", "inf").
     """
 
     name: str
@@ -46,14 +53,13 @@ class NumberColumns:
     unit: str | None
     turn: float | None
     min: list[float | None]
-    min_sim_time_s: list[float | None]
     max: list[float | None]
-    max_sim_time_s: list[float | None]
     mean: list[float | None]
     last: list[float | None]
     count: list[int]
     whole: Summary
-    odd: dict[str, int] | None
+    too_large: int
+    replaced: dict[str, int]
 
 
 @dataclass(frozen=True)
@@ -83,21 +89,19 @@ class RunHistory:
     """The part of an answer that is about one run.
 
     Attributes:
-        tier: "rows" (a bucket is a row), "raw" (made from rows), "rollup" (from 10 s rollups, and
-            from rows at both ends).
-        step_s: Length of a bucket; None in the tier "rows".
+        step_s: Length of a bucket; None where each row is one.
         sim_time_s: Begin of each bucket.
         rows: Rows of the range that were read.
         interval_s: Median simulated time between rows.
         gaps: Where rows are missing.
         cut_at_s: The deadline passed; from there on something is missing in the answer.
+        unread: What else was not read, and why.
         age_s: Wall time since the run's newest row.
     """
 
     run_id: int
     start_s: float
     end_s: float
-    tier: Tier
     step_s: float | None
     sim_time_s: list[float]
     numbers: tuple[NumberColumns, ...]
@@ -106,6 +110,7 @@ class RunHistory:
     interval_s: float | None
     gaps: tuple[Gap, ...]
     cut_at_s: float | None
+    unread: tuple[str, ...]
     age_s: float
 
 
@@ -132,8 +137,8 @@ def query_history(
     """Signals over a range, in columns of at most `max_points` buckets.
 
     Buckets begin at multiples of their length. An extreme is never lost: each bucket has its
-    minimum and maximum. Up to 30,000 rows are read as they are; of a longer range the 10 s
-    rollups are used inside, and rows at both ends, so that counts and extremes stay exact.
+    minimum and maximum. Of a long range only the chunks are opened that a border of a bucket cuts:
+    what the others come to is known.
 
     Args:
         connection: Any.
@@ -160,7 +165,8 @@ def query_history(
         )
         for segment in time_range.segments
     ]  # fmt: skip
-    return History(time_range.robot, tuple(runs), time_range.notes)
+    unread = [f"run {run.run_id}: {each}" for run in runs for each in run.unread]
+    return History(time_range.robot, tuple(runs), (*time_range.notes, *unread))
 
 
 def _share(max_points: int, segment: Segment, total_s: float) -> int:
@@ -179,48 +185,76 @@ def _run_history(
     numbers = [signal for signal in signals if signal.is_number]
     states = [signal for signal in signals if not signal.is_number]
     for_states = deadline.part(STATES_SHARE) if numbers else deadline
-    changes = change_points(connection, segment, states, for_states)
-    table = tabulate(connection, segment, numbers, max_points, deadline, least_step_s)
-    changes = changes.cut(table.cut_at_s)
-    cuts_s = [each for each in (table.cut_at_s, changes.unread_from_s) if each is not None]
+    frame = read_frame(connection, segment, deadline)
+    changes = change_points(connection, segment, states, for_states, frame=frame)
+    kept = read_kept(connection, segment, deadline) if numbers else None
+    buckets = buckets_of(frame, max_points, least_step_s)
+    columns: list[NumberColumns] = []
+    for signal in numbers:
+        if columns and deadline.passed:
+            break
+        columns.append(_columns(frame, signal, buckets, kept))
+    left = [signal.name for signal in numbers[len(columns) :]]
+    cuts_s = [frame.cut_at_s, None if kept is None else kept.cut_at_s, changes.unread_from_s]
     bounds = recorded_bounds(connection, segment.run_id) or (segment.start_s, segment.end_s)
+    rhythm = rhythm_in(frame)
     return RunHistory(
         run_id=segment.run_id,
         start_s=segment.start_s,
         end_s=segment.end_s,
-        tier=table.tier,
-        step_s=table.step_s,
-        sim_time_s=list(table.starts),
-        numbers=tuple(_columns(signal, table) for signal in numbers),
+        step_s=buckets.step_s,
+        sim_time_s=buckets.starts_s.tolist(),
+        numbers=tuple(columns),
         changes=tuple(
             _change_columns(signal, changes, bounds[1], max_changes or max_points)
             for signal in states
         ),
-        rows=table.rows,
-        interval_s=table.rhythm.interval_s,
-        gaps=table.rhythm.gaps,
-        cut_at_s=min(cuts_s, default=None),
+        rows=len(frame),
+        interval_s=rhythm.interval_s,
+        gaps=rhythm.gaps,
+        cut_at_s=min((each for each in cuts_s if each is not None), default=None),
+        unread=(*_unread(frame), *signals_left(left)),
         age_s=time.time() - connection.execute(_NEWEST_WALL, (segment.run_id,)).fetchone()[0],
     )
 
 
-def _columns(signal: Signal, table: Table) -> NumberColumns:
-    cells = table.cells.get(signal.name, [])
+def _unread(frame: Frame) -> Iterator[str]:
+    """What the frame could not read, but for what `cut_at_s` says."""
+    return (str(each) for each in frame.unread if each.end_s < (frame.cut_at_s or math.inf))
+
+
+def signals_left(names: Sequence[str]) -> Iterator[str]:
+    """That there was no time for some signals, if so."""
+    if names:
+        yield f"time limit reached, {len(names)} signals left: ask for {listed(names, MOST_NAMED)}"
+
+
+def _columns(frame: Frame, signal: Signal, buckets: Buckets, kept: Frame | None) -> NumberColumns:
+    cells = cells_of(frame, signal, buckets, kept)
+    whole, too_large = summary_of(frame, signal), 0
+    if kept is not None:
+        of_kept = summarise_numbers(*kept.usable(signal.name), turn=signal.turn)
+        whole = with_extremes(whole, of_kept)
+    if not whole.present:
+        too_large = int(np.count_nonzero(np.abs(frame.numbers(signal.name)) > LARGEST))
     return NumberColumns(
         name=signal.name,
         kind=signal.kind,
         unit=signal.unit,
         turn=signal.turn,
-        min=[cell.min for cell in cells],
-        min_sim_time_s=[cell.min_sim_time_s for cell in cells],
-        max=[cell.max for cell in cells],
-        max_sim_time_s=[cell.max_sim_time_s for cell in cells],
-        mean=[cell.centre(signal.turn) for cell in cells],
-        last=[cell.last for cell in cells],
-        count=[cell.present for cell in cells],
-        whole=merge(cells) if cells else Summary(),
-        odd=None if table.odd is None else dict(table.odd.get(signal.name, {})),
+        min=_figures(cells.min),
+        max=_figures(cells.max),
+        mean=_figures(cells.mean),
+        last=_figures(cells.last),
+        count=cells.counts.tolist(),
+        whole=whole,
+        too_large=too_large,
+        replaced=dict(frame.replaced(signal.name)),
     )
+
+
+def _figures(column: Array) -> list[float | None]:
+    return [None if math.isnan(figure) else figure for figure in column.tolist()]
 
 
 def _change_columns(signal: Signal, changes: Changes, newest_s: float, most: int) -> ChangeColumns:

@@ -7,13 +7,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from webots_mcp.naming import listed
 from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.analysis.features import find_spikes
 from webots_mcp.store.analysis.summary import LARGEST, Summary, with_extremes
 from webots_mcp.store.analysis.swings import SHORTEST_PERIOD_ROWS
 from webots_mcp.store.chunks import making
-from webots_mcp.store.questions.series import STATES_SHARE
+from webots_mcp.store.questions.series import STATES_SHARE, signals_left
 from webots_mcp.store.questions.trend import (
     Trend,
     course_of_means,
@@ -32,7 +31,6 @@ from webots_mcp.store.signals.catalogue import signals_of
 from webots_mcp.store.signals.registry import Signal
 
 TOO_LARGE: Final = "its numbers are beyond 1e100"
-MOST_NAMED: Final = 5
 
 
 @dataclass(frozen=True)
@@ -140,8 +138,8 @@ def _run_trends(
     numbers = [signal for signal in signals if signal.is_number and not signal.is_choice]
     states = [signal for signal in signals if signal not in numbers]
     for_states = deadline.part(STATES_SHARE) if numbers else deadline
-    changes = change_points(connection, segment, states, for_states)
     frame = read_frame(connection, segment, deadline)
+    changes = change_points(connection, segment, states, for_states, frame=frame)
     kept = read_kept(connection, segment, deadline) if numbers else None
     found: dict[str, Trend | None] = {}
     for signal in numbers:
@@ -169,14 +167,8 @@ def _run_trends(
         silent=tuple(_without_value(frame, found)),
         total=len(held),
         cut_at_s=min(cuts_s, default=None),
-        unread=(*map(str, frame.unread), *_left([each.name for each in numbers], found)),
+        unread=(*map(str, frame.unread), *signals_left([e.name for e in numbers[len(found) :]])),
     )
-
-
-def _left(names: Sequence[str], found: Mapping[str, object]) -> Iterator[str]:
-    """The signals that there was no time for."""
-    if left := [name for name in names if name not in found]:
-        yield f"time limit reached, {len(left)} signals left: ask for {listed(left, MOST_NAMED)}"
 
 
 def _without_value(frame: Frame, found: Mapping[str, Trend | None]) -> Iterator[str]:

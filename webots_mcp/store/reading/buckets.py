@@ -1,162 +1,85 @@
-"""Numeric signals over a segment as a table of buckets, from rows or from rollups."""
+"""Numeric signals of a frame in buckets of equal length: counts, extremes, means."""
 
 from __future__ import annotations
 
 import math
-import sqlite3
-from bisect import bisect_right
-from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import count, groupby, pairwise
-from typing import Final, Literal
+from dataclasses import dataclass
+from itertools import count
+from typing import Final, NamedTuple
 
-from webots_mcp.store.analysis.rhythm import Rhythm, rhythm_of
-from webots_mcp.store.analysis.summary import Summary, merge, with_extremes
-from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.gaps import rhythm_in
-from webots_mcp.store.reading.ranges import Segment
-from webots_mcp.store.reading.rollups import piece_length_s, read_pieces
-from webots_mcp.store.reading.rows import Columns, exceeds, kept_columns, read_columns
+from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
+from webots_mcp.store.analysis.summary import LARGEST, NO_LENGTH
+from webots_mcp.store.reading.frame import Frame
+from webots_mcp.store.reading.frame_summary import reads_values
 from webots_mcp.store.signals.registry import Signal
 
-Tier = Literal["rows", "raw", "rollup"]
-
 _NICE: Final = (1, 1.5, 2, 3, 4, 5, 6, 8)
+_DUST: Final = 1e-9  # of a bucket's length: what a float's rounding puts before a border is behind
 
 
 @dataclass(frozen=True)
-class Table:
-    """Buckets of equal length that begin at multiples of it; in the tier "rows" one per row.
+class Buckets:
+    """Buckets that begin at multiples of their length, the empty ones as well.
 
     Attributes:
-        tier: "rows" (a bucket is a row), "raw" (made from rows), "rollup" (from rollups, and from
-            rows at both ends).
-        step_s: Length of a bucket; None in the tier "rows".
-        starts: Begin of each bucket.
-        cells: Per signal one summary per bucket.
-        rows: Rows of the segment that were read, be it as rollups.
-        odd: Per signal, how often each value that JSON cannot hold; None if long.
-        cut_at_s: Where the deadline stopped the reading: nothing behind it is in the table. None
-            if it did not.
+        step_s: Length of a bucket; None where each row is one.
+        starts_s: Begin of each.
+        edges: Place of the first row of each in the frame, and after the last one how many rows
+            there are.
     """
 
-    tier: Tier
     step_s: float | None
-    starts: list[float]
-    cells: dict[str, list[Summary]]
-    rows: int
-    rhythm: Rhythm
-    odd: dict[str, Counter[str]] | None
-    cut_at_s: float | None
+    starts_s: Array
+    edges: Indexes
 
 
-def tabulate(
-    connection: sqlite3.Connection,
-    segment: Segment,
-    signals: Sequence[Signal],
-    max_points: int,
-    deadline: Deadline,
-    least_step_s: float = 0.0,
-) -> Table:
-    """Put a segment into at most `max_points` buckets: from rows up to 30,000 of them.
+class Cells(NamedTuple):
+    """What a signal comes to in each bucket; NaN where it has no usable number there.
+
+    Attributes:
+        mean: Of an angle the circular one, in its unit: below 0 only where its values are.
+    """
+
+    counts: Indexes
+    min: Array
+    max: Array
+    mean: Array
+    last: Array
+
+
+def buckets_of(frame: Frame, max_points: int, least_step_s: float = 0.0) -> Buckets:
+    """At most so many buckets for the rows of a frame; a row is one where they are as few.
 
     Args:
-        connection: Any.
-        segment: The part of one run.
-        signals: Numeric ones.
+        frame: Whose rows.
         max_points: The most buckets.
-        deadline: When to stop reading.
         least_step_s: No bucket is shorter; above 0 no row is a bucket of its own.
     """
-    if exceeds(connection, segment):
-        table = _from_rollups(connection, segment, signals, max_points, deadline, least_step_s)
-    else:
-        columns = read_columns(connection, segment, signals, deadline)
-        table = _from_rows(columns, signals, max_points, least_step_s)
-    if table.starts and not segment.full_rate:
-        cut_at_s = _take_in_kept(connection, segment, signals, deadline, table)
-        cuts_s = [each for each in (table.cut_at_s, cut_at_s) if each is not None]
-        table = replace(table, cut_at_s=min(cuts_s, default=None))
-    return table
-
-
-def _take_in_kept(
-    connection: sqlite3.Connection,
-    segment: Segment,
-    signals: Sequence[Signal],
-    deadline: Deadline,
-    table: Table,
-) -> float | None:
-    """Put the extremes of what only kept stretches have into its buckets.
-
-    A row that is a bucket of its own reaches up to the next one. Gives where the deadline stopped
-    the reading, if it did.
-    """
-    columns = kept_columns(connection, segment, signals, deadline)
-    if columns is None:
-        return None
-    places = [max(0, bisect_right(table.starts, time_s + 1e-9) - 1) for time_s in columns.times]
-    start = 0
-    for place, group in groupby(places):
-        end = start + len(list(group))
-        for signal in signals:
-            values = columns.values[signal.name][start:end]
-            of_rows = signal.summarise(columns.times[start:end], values)
-            if cells := table.cells.get(signal.name):
-                cells[place] = with_extremes(cells[place], of_rows)
-        start = end
-    return columns.cut_at_s
-
-
-def _from_rows(
-    columns: Columns, signals: Sequence[Signal], max_points: int, least_step_s: float
-) -> Table:
-    times = columns.times
-    step_s = None
-    if times and (least_step_s > 0 or len(times) > max_points):
-        step_s = _step(times[0], times[-1], max_points, least_s=least_step_s)
-    starts, edges = (times, list(range(len(times) + 1)))
-    if step_s is not None:
-        starts, edges = _edges(times, step_s)
-    spans = list(pairwise(edges))
-    cells = {
-        signal.name: [
-            signal.summarise(times[a:b], columns.values[signal.name][a:b]) for a, b in spans
-        ]
-        for signal in signals
-    }
-    tier = "rows" if step_s is None else "raw"
-    rhythm = rhythm_of(times)
-    return Table(tier, step_s, starts, cells, len(times), rhythm, columns.odd, columns.cut_at_s)
-
-
-def _edges(times: Sequence[float], step_s: float) -> tuple[list[float], list[int]]:
-    """The begin of each bucket, also of empty ones, and the index of the first row of each."""
-    numbers = [_number(time, step_s) for time in times]
-    starts: list[float] = []
-    edges = [0]
-    index = 0
-    for number in range(numbers[0], numbers[-1] + 1):
-        starts.append(round(number * step_s, 9))
-        while index < len(numbers) and numbers[index] <= number:
-            index += 1
-        edges.append(index)
-    return starts, edges
+    rows = len(frame)
+    if not rows or (least_step_s <= 0 and rows <= max_points):
+        return Buckets(None, frame.times, np.arange(rows + 1))
+    first_s, last_s = frame.bounds_s
+    step_s = _step(first_s, last_s, max_points, least_step_s)
+    numbers: Array = np.arange(
+        _number(first_s, step_s), _number(last_s, step_s) + 2, dtype=np.float64
+    )
+    borders_s: Array = (numbers - _DUST) * step_s
+    edges = frame.places(borders_s)
+    edges[0], edges[-1] = 0, rows
+    starts_s: Array = np.round(numbers[:-1] * step_s, 9)
+    return Buckets(step_s, starts_s, edges)
 
 
 def _number(time_s: float, step_s: float) -> int:
-    """Which bucket holds a time; what a float's rounding puts just before a border is behind it."""
-    return math.floor(time_s / step_s + 1e-9)
+    """Which bucket holds a time."""
+    return math.floor(time_s / step_s + _DUST)
 
 
-def _step(
-    first_s: float, last_s: float, max_points: int, *, unit_s: float = 0.0, least_s: float = 0.0
-) -> float:
-    """The shortest round bucket length (a multiple of `unit_s`) that needs no more buckets."""
-    for step_s in _round_steps(max(unit_s, least_s, (last_s - first_s) / max_points / 10, 1e-9)):
-        fits = step_s >= least_s and (unit_s == 0 or step_s % unit_s == 0)
-        if fits and _number(last_s, step_s) - _number(first_s, step_s) < max_points:
+def _step(first_s: float, last_s: float, max_points: int, least_s: float) -> float:
+    """The shortest round bucket length that needs no more buckets."""
+    for step_s in _round_steps(max(least_s, (last_s - first_s) / max_points / 10, 1e-9)):
+        if step_s >= least_s and _number(last_s, step_s) - _number(first_s, step_s) < max_points:
             return step_s
     raise AssertionError("the steps never end")
 
@@ -167,36 +90,110 @@ def _round_steps(at_least_s: float) -> Iterator[float]:
             yield nice * 10**exponent if exponent >= 0 else nice / 10**-exponent
 
 
-def _from_rollups(
-    connection: sqlite3.Connection,
-    segment: Segment,
-    signals: Sequence[Signal],
-    max_points: int,
-    deadline: Deadline,
-    least_step_s: float,
-) -> Table:
-    unit_s = piece_length_s(connection, segment, max_points, least_step_s)
-    pieces = read_pieces(connection, segment, signals, deadline, unit_s)
-    found = {signal.name: pieces.of(signal.name) for signal in signals}
-    numbers = [piece for of_signal in found.values() for piece, _ in of_signal]
-    rhythm = rhythm_in(connection, segment)
-    if not numbers:
-        return Table("rollup", unit_s, [], {}, pieces.rows, rhythm, None, pieces.cut_at_s)
-    first, last = min(numbers), max(numbers)
-    bounds = (first * unit_s, last * unit_s)
-    step_s = _step(*bounds, max_points, unit_s=unit_s, least_s=least_step_s)
-    width = round(step_s / unit_s)
-    indexes = range(first // width, last // width + 1)
-    starts = [index * step_s for index in indexes]
-    cells = {name: _widened(pieces, width, indexes) for name, pieces in found.items()}
-    cut_at_s = pieces.cut_at_s
-    return Table("rollup", step_s, starts, cells, pieces.rows, rhythm, None, cut_at_s)
+def cells_of(frame: Frame, signal: Signal, buckets: Buckets, kept: Frame | None) -> Cells:
+    """What a signal comes to in each bucket.
+
+    Args:
+        frame: The rows.
+        signal: A numeric one.
+        buckets: From `buckets_of` of the same frame.
+        kept: Rows that only kept stretches have: they count for extremes.
+    """
+    cells = _cells(_parts(frame, signal, buckets), signal.turn, buckets.edges)
+    if kept is not None and len(buckets.starts_s):
+        times, numbers = kept.usable(signal.name)
+        places = np.searchsorted(buckets.starts_s, times + 1e-9, "right") - 1
+        np.fmin.at(cells.min, np.maximum(places, 0), numbers)
+        np.fmax.at(cells.max, np.maximum(places, 0), numbers)
+    return cells
 
 
-def _widened(pieces: list[tuple[int, Summary]], width: int, indexes: range) -> list[Summary]:
-    """Pieces merged into buckets of `width` times their length, with the empty ones."""
-    merged = {
-        index: merge([summary for _, summary in group])
-        for index, group in groupby(pieces, lambda piece: piece[0] // width)
-    }
-    return [merged.get(index, Summary()) for index in indexes]
+class _Parts(NamedTuple):
+    """Rows, and chunks that lie within one bucket, in order: what each comes to."""
+
+    first_row: Indexes
+    counts: Indexes
+    min: Array
+    max: Array
+    sum: Array
+    last: Array
+
+
+def _parts(frame: Frame, signal: Signal, buckets: Buckets) -> _Parts:
+    """Chunks that no border of a bucket cuts are not opened, where there are many rows."""
+    name = signal.name
+    if reads_values(frame, signal):
+        return _of_rows(frame, name, 0, len(frame))
+    zones = frame.zones(name)
+    edges = buckets.edges[buckets.edges < len(frame)]
+    borders = np.searchsorted(zones.first_row, edges, "right") - 1
+    cut: Flags = np.zeros(len(zones), np.bool_)
+    cut[borders[zones.first_row[borders] != edges]] = True
+    whole = ~cut & (zones.value_count > 0) & ~np.isnan(zones.sum)
+    chunks = _Parts(
+        zones.first_row[whole],
+        zones.value_count[whole],
+        zones.min[whole],
+        zones.max[whole],
+        zones.sum[whole],
+        zones.last[whole],
+    )
+    opened = [_of_rows(frame, name, start, stop) for start, stop in zones.spans(cut)]
+    return _in_order([chunks, *opened])
+
+
+def _in_order(some: Sequence[_Parts]) -> _Parts:
+    joined = [np.concatenate(column) for column in zip(*some, strict=True)]
+    order = np.argsort(joined[0], kind="stable")
+    return _Parts(*(column[order] for column in joined))
+
+
+def _of_rows(frame: Frame, name: str, start: int, stop: int) -> _Parts:
+    """Each row that has a usable number."""
+    numbers = frame.rows(start, stop).numbers(name)
+    rows = np.flatnonzero(np.abs(numbers) <= LARGEST)
+    held = numbers if len(rows) == len(numbers) else numbers[rows]
+    return _Parts(rows + start, np.ones(len(rows), np.intp), held, held, held, held)
+
+
+def _cells(parts: _Parts, turn: float | None, edges: Indexes) -> Cells:
+    cells = len(edges) - 1
+    places = np.searchsorted(edges, parts.first_row, "right") - 1
+    starts = np.flatnonzero(np.diff(places, prepend=-1))
+    if not len(starts):
+        nothing = (np.full(cells, np.nan) for _ in range(4))
+        return Cells(np.zeros(cells, np.intp), *nothing)
+    filled = places[starts]
+
+    def spread(figures: Array) -> Array:
+        whole = np.full(cells, np.nan)
+        whole[filled] = figures
+        return whole
+
+    counts = np.add.reduceat(parts.counts, starts)
+    low = np.minimum.reduceat(parts.min, starts)
+    high = np.maximum.reduceat(parts.max, starts)
+    if turn is None:
+        mean = np.add.reduceat(parts.sum, starts) / counts
+        mean = np.minimum(np.maximum(mean, low), high)  # sums round
+    else:
+        mean = _circular_means(parts.sum, starts, counts, turn, low)
+    count_of: Indexes = np.zeros(cells, np.intp)
+    count_of[filled] = counts
+    last = parts.last[np.append(starts[1:], len(places)) - 1]
+    return Cells(count_of, spread(low), spread(high), spread(mean), spread(last))
+
+
+def _circular_means(
+    values: Array, starts: Indexes, counts: Indexes, turn: float, low: Array
+) -> Array:
+    """The direction of the resultant vector; NaN where the vectors cancel out.
+
+    K. V. Mardia, P. E. Jupp, Directional Statistics (2000), section 2.2.1.
+    """
+    angles = values * (math.tau / turn)
+    sines = np.add.reduceat(np.sin(angles), starts)
+    cosines = np.add.reduceat(np.cos(angles), starts)
+    means = np.arctan2(sines, cosines) * (turn / math.tau)
+    means[np.hypot(sines, cosines) < NO_LENGTH * counts] = np.nan
+    return np.where((means < 0) & (low >= 0), means + turn, means)

@@ -243,15 +243,22 @@ class Frame:
 
     def replaced(self, name: str) -> Counter[str]:
         """How often each value that JSON cannot hold (nan, inf, ...) stood there."""
+        if self._source.order is not None:
+            return self._replaced(name)
+        zones, found = self.zones(name), Counter[str]()
+        for start, stop in zones.spans(zones.held_count > zones.value_count):
+            found += self.rows(start, stop)._replaced(name)
+        return found
+
+    def _replaced(self, name: str) -> Counter[str]:
         found = Counter[str]()
-        for part, values, inside in self._parts(name):
+        for _, values, inside in self._parts(name):
             if values is None or values.codes is None:
                 continue
             for code, label in enumerate(values.labels, _FIRST_LABEL):
                 if isinstance(label, Replaced):
                     found[label.why] += int(np.count_nonzero(values.codes[inside] == code))
-            assert part
-        return Counter({why: count for why, count in found.items() if count})
+        return +found
 
     def zones(self, name: str) -> Zones:
         """What the chunks of a signal come to; those that the frame cuts come to what is in it."""

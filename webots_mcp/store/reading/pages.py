@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.naming import Value
+from webots_mcp.naming import Value, flatten
+from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
-from webots_mcp.store.reading.ranges import Segment, TimeRange
-from webots_mcp.store.reading.rollups import rows_after
-from webots_mcp.store.reading.rows import Columns, read_columns
+from webots_mcp.store.reading.frame import Frame, read_frame
+from webots_mcp.store.reading.ranges import TimeRange
+from webots_mcp.store.reading.rows import cleaned
 from webots_mcp.store.reading.snapshot import in_one_snapshot
-from webots_mcp.store.run_rows import State, fetch_state
 from webots_mcp.store.signals.catalogue import signals_of
+from webots_mcp.store.signals.flatten import parse
 from webots_mcp.store.signals.registry import Signal
 
 MOST_ROWS: Final = 1000
+_STATES: Final = "SELECT id, data FROM state WHERE id IN (SELECT value FROM json_each(?))"
+_KEPT_STATES: Final = "SELECT id, data FROM kept_state WHERE id IN (SELECT value FROM json_each(?))"
 
 
 @dataclass(frozen=True)
@@ -28,7 +32,7 @@ class Page:
 
     Attributes:
         values: Per signal one value per row; None where the row has none.
-        odd: Per signal, how often each value that JSON cannot hold.
+        replaced: Per signal, how often each value that JSON cannot hold.
         cursor: Give it as `after_id` for the next page; None after the last row, or where the time
             was over before any was read.
         cut: The time was over: there may be more rows even where none is here.
@@ -40,7 +44,7 @@ class Page:
     sim_time_s: list[float]
     wall_time_s: list[float]
     values: dict[str, list[Value]]
-    odd: dict[str, dict[str, int]]
+    replaced: dict[str, dict[str, int]]
     cursor: int | None
     notes: tuple[str, ...]
     cut: bool = False
@@ -73,55 +77,91 @@ def query_rows(
     if not 1 <= limit <= MOST_ROWS:
         raise InvalidInputError(f"limit={limit} must be from 1 to {MOST_ROWS}")
     signals = signals_of(connection, time_range, names)
-    parts: list[Columns] = []
-    room = limit + 1  # one more, to know whether there is a next page
     deadline = Deadline(deadline_s)
+    parts: list[Frame] = []
+    room, cut = limit + 1, False  # one more, to know whether there is a next page
     for segment in time_range.segments:
-        rest, after = _rest(connection, segment, after_id)
-        if rest is not None and room > 0 and not any(part.cut for part in parts):
-            parts.append(
-                read_columns(
-                    connection, rest, signals, deadline, after=after, limit=room, exact=True
-                )
-            )
-            room -= len(parts[-1].ids)
-    return _page(time_range, signals, parts, limit, cut=any(part.cut for part in parts))
+        if room <= 0 or cut:
+            break
+        frame = read_frame(connection, segment, deadline)
+        start = _place_after(frame, after_id)
+        parts.append(frame.rows(start, start + room))
+        room -= len(parts[-1])
+        cut = frame.cut_at_s is not None and room > 0
+    return _page(connection, time_range, signals, parts, limit, cut=cut)
 
 
-def _rest(
-    connection: sqlite3.Connection, segment: Segment, after_id: int
-) -> tuple[Segment | None, int | State]:
-    """The part that may have rows after that one, and after what they come.
-
-    At full rate ids do not rise with time: there the row itself has its place.
-    """
-    if segment.full_rate and after_id == 0:
-        return segment, 0
-    row = fetch_state(connection, after_id) if segment.full_rate else None
-    if row is None or row.run_id != segment.run_id:
-        return rows_after(connection, segment, max(after_id, 0)), max(after_id, 0)
-    start_s = max(segment.start_s, row.sim_time_s)
-    return (replace(segment, start_s=start_s) if start_s < segment.end_s else None), row
+def _place_after(frame: Frame, after_id: int) -> int:
+    """The place of the row after that one; where it is gone, of the first one with a greater id."""
+    if after_id == 0:
+        return 0
+    ids = frame.ids
+    at = np.flatnonzero(ids == after_id)
+    if len(at):
+        return int(at[0]) + 1
+    later = np.flatnonzero(ids > after_id)
+    return int(later[0]) if len(later) else len(frame)
 
 
 def _page(
-    time_range: TimeRange, signals: Sequence[Signal], parts: list[Columns], limit: int, *, cut: bool
+    connection: sqlite3.Connection,
+    time_range: TimeRange,
+    signals: Sequence[Signal],
+    parts: Sequence[Frame],
+    limit: int,
+    *,
+    cut: bool,
 ) -> Page:
-    ids = [row_id for part in parts for row_id in part.ids]
-    odd: dict[str, Counter[str]] = {}
-    for part in parts:
-        for name, counts in part.odd.items():
-            odd.setdefault(name, Counter()).update(counts)
-    more = (cut or len(ids) > limit) and bool(ids)
+    rows = sum(map(len, parts))
+    more = rows > limit or (cut and rows > 0)
+    shown = [*parts[:-1], parts[-1].rows(0, len(parts[-1]) - max(0, rows - limit))] if parts else []
+    ids = [row_id for part in shown for row_id in part.ids.tolist()]
+    replaced: dict[str, Counter[str]] = {}
+    for signal in signals:
+        found = sum((part.replaced(signal.name) for part in shown), Counter[str]())
+        if found:
+            replaced[signal.name] = found
     return Page(
         time_range.robot,
-        [part.run_id for part in parts for _ in part.ids][:limit],
-        ids[:limit],
-        [time_s for part in parts for time_s in part.times][:limit],
-        [time_s for part in parts for time_s in part.walls][:limit],
-        {s.name: [v for part in parts for v in part.values[s.name]][:limit] for s in signals},
-        {name: dict(counts) for name, counts in odd.items()},
-        ids[:limit][-1] if more else None,
-        time_range.notes,
+        [part.run_id for part in shown for _ in range(len(part))],
+        ids,
+        [time_s for part in shown for time_s in part.times.tolist()],
+        [time_s for part in shown for time_s in part.wall_times.tolist()],
+        _values(connection, signals, shown, ids),
+        {name: dict(counts) for name, counts in replaced.items()},
+        ids[-1] if more else None,
+        (*time_range.notes, *(str(each) for part in shown for each in part.unread)),
         cut,
     )
+
+
+def _values(
+    connection: sqlite3.Connection,
+    signals: Sequence[Signal],
+    parts: Sequence[Frame],
+    ids: Sequence[int],
+) -> dict[str, list[Value]]:
+    """The values as they were recorded, where the rows are there; else those of their chunks."""
+    states = _states_by_id(connection, ids)
+    found: dict[str, list[Value]] = {}
+    for signal in signals:
+        name = signal.name
+        values = [value for part in parts for value in part.values(name)]
+        exact = [
+            states[row_id].get(name) if row_id in states else value
+            for row_id, value in zip(ids, values, strict=True)
+        ]
+        found[name] = cleaned(signal, exact)
+    return found
+
+
+def _states_by_id(
+    connection: sqlite3.Connection, ids: Sequence[int]
+) -> dict[int, dict[str, Value]]:
+    listed = json.dumps([abs(row_id) for row_id in ids])
+    found: dict[int, dict[str, Value]] = {}
+    for query, sign in ((_STATES, 1), (_KEPT_STATES, -1)):
+        if any(row_id * sign > 0 for row_id in ids):
+            for row_id, data in connection.execute(query, (listed,)):
+                found[sign * row_id] = flatten(parse(data))
+    return found

@@ -18,7 +18,6 @@ from webots_mcp.store.analysis.arrays import Array, Indexes, np
 from webots_mcp.store.analysis.summaries import Summaries
 from webots_mcp.store.analysis.summary import COUNTS, Summary, merge
 from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.gaps import rows_by_bucket
 from webots_mcp.store.reading.moments import shown_time
 from webots_mcp.store.reading.ranges import Segment, recorded_bounds
 from webots_mcp.store.reading.rows import Columns, read_columns
@@ -52,6 +51,25 @@ _ROW_IN: Final = (
 _BEFORE_ALL: Final = -(2**62)
 _BUCKETS_AT_ONCE: Final = 500  # of all signals, between two looks at what they hold together
 _Part = tuple["Indexes", "Array"]  # the numbers of pieces, and a table of their summaries
+# The signal that is in most rows shows how many a bucket has, and its first and last time.
+_IN_MOST_ROWS: Final = (
+    "FROM {table} WHERE run_id = :run AND bucket >= :first AND bucket < :end AND signal_id = "
+    "(SELECT id FROM signal s WHERE robot_id = (SELECT robot_id FROM run WHERE id = :run) "
+    "AND EXISTS (SELECT 1 FROM all_rollup WHERE run_id = :run AND signal_id = s.id) "
+    "ORDER BY s.rows - s.null_row_count DESC LIMIT 1)"
+)
+_BUCKETS: Final = (
+    f"SELECT bucket, rows, first_sim_time_s, last_sim_time_s {_IN_MOST_ROWS} ORDER BY bucket"
+)
+
+
+def rows_by_bucket(
+    connection: sqlite3.Connection, run_id: int, grain: Grain, span: range
+) -> dict[int, int]:
+    """How many rows each bucket has in the rollups: also of a signal that not all of them hold."""
+    bounds = {"run": run_id, "first": span.start, "end": span.stop}
+    rows = connection.execute(_BUCKETS.format(table=grain.table), bounds)
+    return {bucket: count for bucket, count, *_ in rows}
 
 
 class Pieces:

@@ -15,9 +15,8 @@ from typing import Final, Protocol
 
 from webots_mcp.store.analysis.swings import SLOW_HALF_SWINGS, Swing
 from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.gaps import rows_by_bucket
 from webots_mcp.store.reading.ranges import Segment
-from webots_mcp.store.reading.rollups import rows_after
+from webots_mcp.store.reading.rollups import rows_after, rows_by_bucket
 from webots_mcp.store.reading.rows import (
     Columns,
     Numbers,

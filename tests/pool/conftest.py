@@ -23,8 +23,8 @@ from webots_mcp.plugins.pool.engines import open_pool, open_target
 from webots_mcp.plugins.pool.report import Report
 from webots_mcp.plugins.pool.shipping import Order, ship
 from webots_mcp.schema import create_schema
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.rollup.rolling import roll
 
 
 class Shipped:
@@ -46,10 +46,10 @@ class Shipped:
         return self.connection.execute("SELECT uuid FROM recording").fetchone()[0]
 
     def add_run(self, rows: int = 60, end: str | None = "reset") -> int:
-        """A run with a UUID, rolled up."""
+        """A run with a UUID, in chunks."""
         run_id = self.recorded.add_run(rows, end)
         self.connection.execute("UPDATE run SET uuid = ? WHERE id = ?", (new_uuid(), run_id))
-        self.roll()
+        self.make_chunks()
         return run_id
 
     def keep(self, run_id: int, start_s: float, end_s: float) -> None:
@@ -60,8 +60,8 @@ class Shipped:
             (run_id, new_uuid(), start_s, end_s),
         )
 
-    def roll(self) -> None:
-        while not roll(self.connection).done:
+    def make_chunks(self) -> None:
+        while not make_chunks(self.connection).done:
             pass
 
     def ship(self, **options: Any) -> Report:

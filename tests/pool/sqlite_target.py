@@ -115,9 +115,7 @@ def recorded(connection: sqlite3.Connection) -> dict[str, list[tuple[SQLValue, .
     """The same of a recording, as a pool of full rate should hold it."""
     return {
         table.name: connection.execute(
-            f"SELECT {', '.join(table.columns)} "
-            f"FROM {'all_rollup' if table.name == 'rollup' else table.name} "
-            f"ORDER BY {', '.join(table.key)}"
+            f"SELECT {', '.join(table.columns)} FROM {table.name} ORDER BY {', '.join(table.key)}"
         ).fetchall()
         for table in tables()
     }

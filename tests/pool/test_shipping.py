@@ -24,6 +24,7 @@ from webots_mcp.errors import (
     SchemaTooOldError,
 )
 from webots_mcp.plugins.pool.following import follow
+from webots_mcp.plugins.pool.reading import Source
 from webots_mcp.plugins.pool.report import Report
 from webots_mcp.plugins.pool.row_batch import BATCH_BYTES
 from webots_mcp.plugins.pool.shipped_tables import table
@@ -32,7 +33,6 @@ from webots_mcp.schema import OLDER_SCHEMA, create_schema
 from webots_mcp.store.merging import merge
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.retention.shipped import read_shipped
-from webots_mcp.store.rollup.rolling import forget
 
 
 def test_a_pool_at_full_rate_holds_every_row_as_the_recording_does(shipped: Shipped) -> None:
@@ -41,7 +41,7 @@ def test_a_pool_at_full_rate_holds_every_row_as_the_recording_does(shipped: Ship
     shipped.ship(full=True)
     rows = shipped.rows()
     assert shipped.pooled() == rows
-    assert all(rows[table] for table in ("state", "rollup", "coarse_rollup", "change", "signal"))
+    assert all(rows[table] for table in ("state", "row_group", "chunk", "signal"))
 
 
 def test_a_run_whose_process_was_killed_is_over_in_the_pool(shipped: Shipped) -> None:
@@ -59,11 +59,16 @@ def test_a_run_whose_process_was_killed_is_over_in_the_pool(shipped: Shipped) ->
         assert is_whole(pool.progress(shipped.uuid), run.run_id)
 
 
-def test_states_that_are_neither_shipped_nor_in_rollups_are_said(shipped: Shipped) -> None:
-    shipped.add_run()
+def test_the_last_rows_of_a_run_that_is_over_are_in_chunks_in_the_pool(shipped: Shipped) -> None:
+    shipped.recorded.add_run(1100)
     assert not shipped.ship().notes
-    shipped.recorded.add_run(20)
-    assert shipped.ship().notes[0].startswith("the newest 20 states are in no rollups yet")
+    rows = table("row_group").columns.index("row_count")
+    assert [group[rows] for group in shipped.pooled()["row_group"]] == [1024, 76]
+
+
+def test_states_that_are_neither_shipped_nor_in_chunks_are_said(shipped: Shipped) -> None:
+    shipped.recorded.add_run(1044, end=None)
+    assert shipped.ship().notes[0].startswith("20 states are in no chunk yet")
     assert not shipped.ship(full=True).notes
     assert not shipped.ship().notes  # the pool has them since
 
@@ -78,11 +83,10 @@ def test_only_what_came_since_is_sent(shipped: Shipped) -> None:
     shipped.add_run(2000, end=None)
     shipped.ship(full=True)
     shipped.recorded.publish(1000.0, {"x": 1, "mode": "c"})
-    shipped.roll()
+    shipped.make_chunks()
     sent = shipped.ship(full=True).rows
     assert shipped.pooled() == shipped.rows()
-    assert (sent["state"], sent["event"], sent["change"]) == (1, 0, 1)
-    assert 0 < sent["rollup"] <= 4  # of two signals, the newest bucket and the one before
+    assert (sent["state"], sent["event"], sent["chunk"]) == (1, 0, 0)
 
 
 def test_without_full_rate_no_states_are_sent_but_those_of_kept_stretches(
@@ -319,7 +323,7 @@ def test_rows_of_other_programs_that_hold_no_text_and_no_times_are_shipped_as_wh
         )
     shipped.keep(run_id, 0, 9e999)
     shipped.recorded.publish(100.0, {"x": 1})
-    shipped.roll()
+    shipped.make_chunks()
     shipped.ship()
     shipped.ship(full=True)
     pooled = shipped.pooled()
@@ -332,7 +336,7 @@ def test_a_row_that_is_larger_than_a_batch_is_shipped(shipped: Shipped) -> None:
     shipped.add_run()
     for _ in range(3):
         shipped.recorded.publish(100.0, {"x": "y" * (BATCH_BYTES + 1)})
-    shipped.roll()
+    shipped.make_chunks()
     shipped.ship(full=True)
     assert shipped.pooled() == shipped.rows()
 
@@ -349,36 +353,22 @@ def test_more_changes_than_a_transaction_takes_are_shipped_in_several(shipped: S
     assert shipped.pooled() == shipped.rows()
 
 
-def test_a_shipper_that_starts_again_sends_only_the_rollups_that_went_on(shipped: Shipped) -> None:
+def test_a_row_group_that_is_not_complete_is_shipped_when_it_is(shipped: Shipped) -> None:
     shipped.add_run(2500)
-    shipped.add_run(2500, end=None)
-    shipped.ship()
-    shipped.recorded.publish(1300.0, {"x": 1, "mode": "c"})
-    shipped.roll()
-    sent = shipped.ship().rows
-    assert shipped.pooled()["coarse_rollup"] == shipped.rows()["coarse_rollup"]
-    assert shipped.pooled()["rollup"] == shipped.rows()["rollup"]
-    assert 0 < sent["rollup"] <= 4
-    assert sent["coarse_rollup"] <= 8
+    shipped.connection.execute("UPDATE row_group SET is_complete = 0 WHERE id > 1")
+    reader = Source(shipped.connection)
+    assert [group_id for group_id, _ in reader.groups(0, reader.last_group())] == [1]
 
 
-def test_rollups_that_are_made_anew_are_shipped_anew(shipped: Shipped) -> None:
-    shipped.add_run(2500)
+def test_late_rows_are_shipped_as_a_group_of_their_own(shipped: Shipped) -> None:
+    shipped.add_run(1100, end=None)
     shipped.ship()
-    forget(shipped.connection)
-    shipped.connection.execute("DELETE FROM state WHERE id % 2")
-    shipped.ship()
-    shipped.roll()
-    shipped.ship()
-    assert shipped.pooled()["rollup"] == shipped.rows()["rollup"]
-    assert shipped.pooled()["coarse_rollup"] == shipped.rows()["coarse_rollup"]
-
-
-def test_rollups_of_an_older_version_that_marked_no_runs_are_shipped(shipped: Shipped) -> None:
-    shipped.add_run(100)
-    shipped.connection.execute("UPDATE run SET rolled_state_id = 0")
-    shipped.ship()
-    assert shipped.pooled()["rollup"] == shipped.rows()["rollup"] != []
+    shipped.connection.execute(
+        "INSERT INTO state (run_id, sim_time_s, wall_time_s, data) "
+        "VALUES (1, 3.25, 0, '{\"x\": 7}')"
+    )
+    assert shipped.ship().rows["row_group"] == 1
+    assert shipped.pooled()["chunk"] == shipped.rows()["chunk"]
 
 
 def test_while_a_pool_writes_the_log_of_the_database_can_be_cut_back(shipped: Shipped) -> None:
@@ -402,7 +392,7 @@ def test_states_that_retention_moved_while_no_shipper_ran_are_in_the_pool_once(
     shipped.ship(full=full)
     for i in range(20, 60):
         shipped.recorded.publish(i / 2, {"x": i, "mode": "c"})
-    shipped.roll()
+    shipped.make_chunks()
     shipped.recorded.prune(states(rows=5))
     assert shipped.ship(full=full).lost.keys() <= {"state"}
     pooled = shipped.pooled()
@@ -466,5 +456,3 @@ def test_what_comes_while_a_shipper_follows_is_shipped_with_all_that_it_refers_t
     assert len(runs) == 47
     assert {row[1] for row in pooled["state"]} == runs
     assert {row[1] for row in pooled["run"]} <= {row[0] for row in pooled["session"]}
-    run_id = table("rollup").columns.index("run_id")
-    assert {row[run_id] for row in pooled["rollup"]} == runs

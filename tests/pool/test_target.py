@@ -66,5 +66,5 @@ def test_a_url_without_a_secret_is_shown_as_it_is(url: str) -> None:
 def test_each_table_comes_after_those_that_it_refers_to() -> None:
     names = [table.name for table in tables()]
     assert names.index("robot") < names.index("session") < names.index("run")
-    assert all(names.index("run") < names.index(name) for name in ("state", "rollup", "log"))
+    assert all(names.index("run") < names.index(name) for name in ("state", "chunk", "log"))
     assert not {"lease", "watermark", "retention_limit"} & set(names)

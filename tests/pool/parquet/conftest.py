@@ -16,8 +16,8 @@ from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.plugins.pool.parquet.parquet_writing import ParquetTarget
 from webots_mcp.plugins.pool.report import Report
 from webots_mcp.plugins.pool.shipping import Order, ship
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.rollup.rolling import roll
 
 RECORDINGS: Final = 50
 STARTED_S: Final = 1_700_000_000.0  # 2023-11-14, 22:13 in UTC: later recordings begin the next day
@@ -50,7 +50,7 @@ def record(folder: Path, number: int) -> Path:
         robot.now += 60
         robot.end_run("finished")
         connection.execute("COMMIT")
-        while not roll(connection).done:
+        while not make_chunks(connection).done:
             pass
     return database
 

@@ -27,11 +27,9 @@ def uuid_of(file: Path) -> str:
 
 
 def rows_of(file: Path, each: Table) -> list[Row]:
-    """As SQLite has them, in the order of the key; recent rollups are rollups."""
+    """As SQLite has them, in the order of the key."""
     columns, key = ", ".join(each.columns), ", ".join(each.key)
     select = f"SELECT {columns} FROM {each.name}"
-    if each.name == "rollup":
-        select += f" UNION ALL SELECT {columns} FROM recent_rollup"
     with closing(sqlite3.connect(file)) as connection:
         return connection.execute(f"{select} ORDER BY {key}").fetchall()
 

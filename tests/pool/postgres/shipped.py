@@ -21,9 +21,8 @@ def uuid_of(recording: sqlite3.Connection) -> str:
 def rows_of(recording: sqlite3.Connection, table: Table) -> list[tuple[Any, ...]]:
     """What a recording has of a table, in the order of its key."""
     columns = ", ".join(f'"{each}"' for each in table.columns)
-    sources = ("rollup", "recent_rollup") if table.name == "rollup" else (table.name,)
-    every = " UNION ALL ".join(f"SELECT {columns} FROM {each}" for each in sources)
-    return recording.execute(f"{every} ORDER BY {', '.join(table.key)}").fetchall()
+    query = f"SELECT {columns} FROM {table.name} ORDER BY {', '.join(table.key)}"
+    return recording.execute(query).fetchall()
 
 
 def all_batches(recording: sqlite3.Connection) -> Iterator[Batch]:

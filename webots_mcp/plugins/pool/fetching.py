@@ -38,7 +38,7 @@ _MOST_RUNS: Final = 100  # that are written into one small recording,
 _MOST_ROWS: Final = 200_000  # unless one of them has more rows by itself
 _UNCOUNTED_ROWS: Final = 10_000
 _OF_RUN: Final = (
-    "rollup", "coarse_rollup", "change", "kept_stretch", "kept_state", "log", "event",
+    "row_group", "chunk", "kept_stretch", "kept_state", "log", "event",
     "parameter_value", "image",
 )  # fmt: skip
 _STATES: Final = ("state", "kept_state")
@@ -47,14 +47,8 @@ _COUNTED: Final = (
     "SELECT id, rows, purged_rows, (SELECT count(*) FROM state WHERE run_id = run.id), "
     "(SELECT count(*) FROM state s WHERE run_id = run.id AND EXISTS (SELECT 1 FROM kept_stretch k "
     "WHERE k.run_id = s.run_id AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s)), "
-    "coalesce((SELECT max(held) FROM (SELECT sum(u.rows) AS held FROM rollup u "
-    "WHERE u.run_id = run.id GROUP BY u.signal_id)), 0) FROM run ORDER BY id"
-)
-# An older version told only for all runs up to which row rollups are: those of this one are whole.
-_MARK: Final = (
-    "UPDATE run SET rolled_state_id = coalesce((SELECT max(id) FROM state "
-    "WHERE run_id = run.id), 0) WHERE rolled_state_id = 0 "
-    "AND EXISTS (SELECT 1 FROM rollup WHERE run_id = run.id)"
+    "coalesce((SELECT sum(row_count) FROM row_group WHERE run_id = run.id), 0) "
+    "FROM run ORDER BY id"
 )
 _PURGED: Final = "UPDATE run SET purged_rows = ? WHERE id = ?"
 _MOVE_KEPT: Final = (
@@ -209,15 +203,14 @@ class _Fetcher:
 
     def _settle(self, small: sqlite3.Connection, uuids: Mapping[int, str]) -> None:
         """Say of each run how many of its rows are gone; a run whose rows still come is dropped."""
-        small.execute(_MARK)
-        for run_id, rows, purged, left, kept, rolled in small.execute(_COUNTED).fetchall():
+        for run_id, rows, purged, left, kept, chunked in small.execute(_COUNTED).fetchall():
             gone = max(0, rows - left)
             if gone and left == kept:
                 gone = rows
                 small.execute(_MOVE_KEPT, {"run": run_id})
                 small.execute(_DROP_STATES, {"run": run_id})
                 self.found.summaries.append(uuids[run_id])
-                self.found.unsummed |= {uuids[run_id]: rolled} if rolled < rows else {}
+                self.found.unsummed |= {uuids[run_id]: chunked} if chunked < rows else {}
             elif left < rows - purged:
                 self.found.arriving.append(uuids[run_id])
                 small.execute(_DROP_RUN, {"run": run_id})

@@ -18,35 +18,26 @@ from webots_mcp.plugins.pool.row_batch import (
     BATCH_ROWS,
     Batch,
     Row,
-    batches,
     row_bytes,
 )
-from webots_mcp.plugins.pool.shipped_tables import SQLValue, Table
-from webots_mcp.store.rollup.buckets import COARSE_BUCKETS, bucket_of
-from webots_mcp.store.rollup.rolling import watermark
+from webots_mcp.plugins.pool.shipped_tables import SQLValue, Table, table
+from webots_mcp.store.chunks.stored import reached
 
 CHUNK_ROWS: Final = 32
-NOT_YET: Final = -(2**62)  # before the first bucket
-ROLLED: Final = ("rollup", "coarse_rollup", "change")
+GROUPS_AT_ONCE: Final = 64
 _UUID: Final = "SELECT uuid FROM recording LIMIT 2"
 _RUNS: Final = "SELECT id, uuid FROM run"
 _SESSIONS: Final = "SELECT id, session_id FROM run"
 _ENDED: Final = "SELECT id FROM run WHERE ended_wall_time_s IS NOT NULL"
 _SEQUENCE: Final = "SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = ?"
 _LAST: Final = "SELECT coalesce(max(id), 0) FROM {table}"
-_MARKS: Final = (
-    "SELECT id, robot_id, iif(typeof(rolled_state_id) = 'integer', rolled_state_id, 0), "
-    "iif(typeof(coarse_end) = 'integer', coarse_end, NULL) FROM run ORDER BY id"
+# Up to the first that somebody is still making: its id is not looked at again later.
+_COMPLETE: Final = (
+    "SELECT coalesce((SELECT min(id) - 1 FROM row_group WHERE is_complete = 0), "
+    "(SELECT max(id) FROM row_group), 0)"
 )
-# By the id of the rows, not by the index of a run: only what came since is looked at.
-_EARLIEST: Final = (
-    "SELECT min(sim_time_s) FROM state NOT INDEXED WHERE id > ? AND id <= ? AND +run_id = ?"
-)
-_FIRST_STATE: Final = "SELECT coalesce(min(id), 0) FROM state"
-_SIGNALS: Final = "SELECT id FROM signal WHERE robot_id = ? ORDER BY id"
-_OF_SIGNAL: Final = (
-    "SELECT {columns} FROM {table} WHERE run_id = ? AND signal_id = ? AND {third} > ? "
-    "ORDER BY {third}"
+_IN_NO_CHUNK: Final = (
+    "SELECT count(*) FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) AND id > ?"
 )
 _STRETCHES: Final = (
     "SELECT k.id, k.run_id, k.start_sim_time_s, k.end_sim_time_s, u.ended_wall_time_s IS NOT NULL "
@@ -59,20 +50,6 @@ _IN_STRETCH: Final = (
 _PICTURES: Final = (
     "SELECT id, run_id, path FROM image WHERE id > ? AND id <= ? ORDER BY id LIMIT 100"
 )
-_OF_RUN: Final = (
-    "SELECT {columns} FROM {table} WHERE run_id = ? AND (signal_id, {third}) > (?, ?) "
-    "ORDER BY signal_id, {third}"
-)
-_RECENT: Final = "SELECT {columns} FROM recent_rollup WHERE run_id = ? AND bucket > ?"
-
-
-class Mark(NamedTuple):
-    """How far the rollups of a run have come; as columns of `run`."""
-
-    run_id: int
-    robot_id: int
-    state_id: int
-    coarse_end: int | None
 
 
 class Stretch(NamedTuple):
@@ -181,52 +158,30 @@ class Source:
             return range(1)
         return range(since // CHUNK_ROWS, self.last_id(table) // CHUNK_ROWS + 1)
 
-    def watermark(self) -> int:
-        """The id of the last state row that is in the rollups of all runs."""
-        return watermark(self._connection)
+    def last_group(self) -> int:
+        """The id of the last row group up to which all are complete."""
+        return self._first(_COMPLETE)
 
-    def marks(self) -> list[Mark]:
-        """How far the rollups have come, of the runs that are ours to ship, in their order."""
-        found = map(Mark._make, self._connection.execute(_MARKS).fetchall())
-        return [mark for mark in found if mark.run_id not in self.foreign]
+    def groups(self, after: int, upto: int) -> Iterator[tuple[int, list[Batch]]]:
+        """The next row groups by their ids, each with its chunks; nothing of another's runs."""
+        groups, chunks = table("row_group"), table("chunk")
+        query = f"SELECT {', '.join(groups.columns)} FROM row_group WHERE id > ? AND id <= ?"
+        of_group = f"SELECT {', '.join(chunks.columns)} FROM chunk WHERE group_id = ? ORDER BY id"
+        found = self._connection.execute(
+            f"{query} ORDER BY id LIMIT ?", (after, upto, GROUPS_AT_ONCE)
+        )
+        for group in found.fetchall():
+            rows = self._connection.execute(of_group, group[:1]).fetchall()
+            both = (groups, self.ours(groups, [group])), (chunks, self.ours(chunks, rows))
+            yield int(group[0]), [Batch(*each) for each in both]
 
-    def since_bucket(self, mark: Mark, known: int) -> int | None:
-        """The first bucket that state rows after `known` may have changed; None for all."""
-        if not 0 < known < mark.state_id or self._first(_FIRST_STATE) > known + 1:
-            return None  # rolled up anew, or rows that would tell are deleted
-        asked = (known, mark.state_id, mark.run_id)
-        earliest = self._connection.execute(_EARLIEST, asked).fetchone()[0]
-        return bucket_of(earliest) if is_finite(earliest) else None
-
-    def rolled(self, table: Table, mark: Mark, after: int) -> Iterator[Batch]:
-        """Rollups or change points of a run whose bucket or state row comes after that one."""
-        if table.name == "rollup":
-            query = _RECENT.format(columns=", ".join(table.columns))
-            rows = self._connection.execute(query, (mark.run_id, after)).fetchall()
-            yield from batches(table, rows)
-        yield from batches(table, self._rolled_rows(table, mark, after))
-
-    def _rolled_rows(self, table: Table, mark: Mark, after: int) -> Iterator[Row]:
-        """All of a run in the order of its key, or signal by signal the newest."""
-        columns, (_, _, third) = ", ".join(table.columns), table.key
-        if after == NOT_YET:
-            query = _OF_RUN.format(columns=columns, table=table.name, third=third)
-            yield from self._in_pieces(query, (mark.run_id,), (NOT_YET, NOT_YET), table)
-            return
-        query = _OF_SIGNAL.format(columns=columns, table=table.name, third=third)
-        for (signal_id,) in self._connection.execute(_SIGNALS, (mark.robot_id,)).fetchall():
-            yield from self._in_pieces(query, (mark.run_id, signal_id), (after,), table)
-
-    def _in_pieces(
-        self, query: str, owner: tuple[int, ...], after: tuple[Any, ...], table: Table
-    ) -> Iterator[Row]:
-        """Rows after a key, with no transaction open while they are used."""
-        places = [table.columns.index(name) for name in table.key[-len(after) :]]
-        is_all = False
-        while not is_all:
-            rows, is_all = self._some(query, (*owner, *after))
-            yield from rows
-            after = tuple(rows[-1][place] for place in places) if rows else after
+    def in_no_chunk(self, shipped: int) -> int:
+        """How many states after that one are in no row group, of the runs that are ours to ship."""
+        found = 0
+        for run_id in self.runs().keys() - self.foreign:
+            at = reached(self._connection, run_id)
+            found += self._first(_IN_NO_CHUNK, run_id, at.end_s, at.last_state_id, shipped)
+        return found
 
     def stretches(self) -> list[Stretch]:
         """Kept stretches of the runs that are ours to ship."""
@@ -281,13 +236,6 @@ def _without(table: Table, rows: Sequence[Row], column: str | None, foreign: set
 def is_finite(value: SQLValue) -> TypeGuard[int | float]:
     """Whether it is a number that can be reckoned with, as all that a bridge writes."""
     return isinstance(value, int | float) and math.isfinite(value)
-
-
-def coarse_after(known_end: int | None, since: int | None) -> int:
-    """The last coarse bucket that has not changed since that end and that bucket."""
-    if known_end is None or since is None:
-        return NOT_YET
-    return min(known_end, since // COARSE_BUCKETS) - 1
 
 
 def digest(rows: Sequence[Sequence[SQLValue]]) -> int:

@@ -7,16 +7,19 @@ from functools import cache
 from typing import Any, Final, TypeAlias, cast
 
 SQLValue: TypeAlias = "int | float | str | bytes | None"
+Kind: TypeAlias = type[int] | type[float] | type[str] | type[bytes]
 
-_APPENDED: Final = ("state", "kept_state", "log", "event", "image", "parameter_value")
+_DATED: Final = ("state", "kept_state", "log", "event", "image", "parameter_value")
+CHUNKS: Final = ("row_group", "chunk")
 # Of one machine or one moment: who maintains it, what is kept there, and console lines that wait
-# to become log lines. Recent rollups are shipped as rollups: the difference is how they are
-# written here.
-_LOCAL: Final = ("lease", "watermark", "retention_limit", "console_line", "recent_rollup",
-                 "row_group", "chunk")  # fmt: skip
+# to become log lines; and what chunks hold as well.
+_LOCAL: Final = (
+    "lease", "watermark", "retention_limit", "console_line", "rollup", "recent_rollup",
+    "coarse_rollup", "change",
+)  # fmt: skip
 _OF_TRIALS: Final = ("trial_set", "trial")
-_TYPES: Final[dict[str, type[int | float | str]]] = {
-    "INTEGER": int, "BIGINT": int, "FLOAT": float, "TEXT": str, "VARCHAR": str,
+_TYPES: Final[dict[str, Kind]] = {
+    "INTEGER": int, "BIGINT": int, "FLOAT": float, "TEXT": str, "VARCHAR": str, "BLOB": bytes,
 }  # fmt: skip
 
 
@@ -36,7 +39,8 @@ class Table:
         is_appended: Rows come with rising ids and never change; otherwise a row replaces the one
             of the same key.
         full_rate_only: Shipped only at full rate, but for the rows of kept stretches.
-        time_column: The wall time by which a pool may cut it into parts, of appended tables.
+        time_column: The wall time by which a pool may cut it into parts, of appended tables but
+            row groups and chunks.
         run_column: The column that names the row's run, where it belongs to one.
         session_column: The column that names its session.
         outlasts_runs: It stays where the run or session that it names is not shipped.
@@ -45,7 +49,7 @@ class Table:
     name: str
     key: tuple[str, ...]
     columns: tuple[str, ...]
-    types: tuple[type[int | float | str], ...]
+    types: tuple[Kind, ...]
     json_columns: frozenset[str]
     json_values: frozenset[str]
     nullable: frozenset[str]
@@ -79,7 +83,6 @@ def table(name: str) -> Table:
 def _table(model: Any) -> Table:
     name: str = model.name
     columns = tuple(str(column.name) for column in model.columns)
-    is_appended = name in _APPENDED
     return Table(
         name=name,
         key=tuple(column.name for column in model.primary_key.columns),
@@ -89,9 +92,9 @@ def _table(model: Any) -> Table:
         json_values=frozenset(column.name for column in model.columns if _is_value(column)),
         nullable=frozenset(column.name for column in model.columns if column.nullable),
         lasting=frozenset(column.name for column in model.columns if _is_lasting(column)),
-        is_appended=is_appended,
+        is_appended=name in _DATED + CHUNKS,
         full_rate_only=name == "state",
-        time_column="wall_time_s" if is_appended else None,
+        time_column="wall_time_s" if name in _DATED else None,
         run_column=_column_of("run", name, columns),
         session_column=_column_of("session", name, columns),
         outlasts_runs=name in _OF_TRIALS,

@@ -25,18 +25,13 @@ from webots_mcp.errors import (
 )
 from webots_mcp.liveness import dead_sessions
 from webots_mcp.plugins.pool.kept_states import Kept
-from webots_mcp.plugins.pool.missing_rollups import Summaries
 from webots_mcp.plugins.pool.outbox import WRITE_BYTES, Outbox
-from webots_mcp.plugins.pool.reading import (
-    ROLLED,
-    Mark,
-    Source,
-    digest,
-)
+from webots_mcp.plugins.pool.reading import GROUPS_AT_ONCE, Source, digest
 from webots_mcp.plugins.pool.report import Report
 from webots_mcp.plugins.pool.row_batch import Batch
-from webots_mcp.plugins.pool.shipped_tables import Table, table, tables
-from webots_mcp.plugins.pool.target import Shipment, Target, whole_runs
+from webots_mcp.plugins.pool.shipped_tables import CHUNKS, Table, table, tables
+from webots_mcp.plugins.pool.target import Shipment, Target, is_whole, whole_runs
+from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
 from webots_mcp.store.images import MAX_FILE_BYTES, PICTURES, inside
 from webots_mcp.store.merging import settled
 from webots_mcp.store.recording import Recording
@@ -45,6 +40,7 @@ from webots_mcp.store.retention.shipped import Shipped, read_shipped, write_ship
 MOST_BATCHES: Final = 8  # of a table in a round, before the others get their turn
 _HANDOVER_S: Final = (0.02, 0.1, 0.3, 0.6)
 _UNCHECKED: Final = -1
+_PAUSE_S: Final = 0.002  # between two short writes, for robots to write theirs
 _PICTURE: Final = "picture"  # of the progress: the last one whose file was shipped
 
 
@@ -75,7 +71,7 @@ def ship(order: Order, report: Report) -> None:
     with shipper(order, report) as connected:
         while not connected.round(thorough=True):
             pass
-        connected.note_unsummed()
+        connected.note_states_in_no_chunk()
 
 
 @contextmanager
@@ -126,9 +122,6 @@ class Shipper:
         self._owners = dict[str, str | None]()
         self._is_checked = False
         self._last_ids = dict[str, int]()
-        self._marks: list[Mark] = []
-        self._watermark = 0
-        self._summaries = Summaries(self._progress, self._put)
         self._kept = Kept(self._progress, self._put)
         self._ended = set[int]()
         self.address = target.address
@@ -146,11 +139,13 @@ class Shipper:
         with self._order.recording.reader() as connection:
             source = Source(connection)
             self._require_the_same(source)
+            is_frozen = isinstance(connection, FrozenConnection)
             if thorough:
                 self._end_what_was_killed(connection)
+            if thorough and not is_frozen:
+                self._make_chunks(source)
             self._ship_changing(source, thorough=thorough)
-            self._summaries.ship(source, self._marks, self._watermark)
-            is_complete = self._ship_all_appended(source)
+            is_complete = self._ship_groups(source) and self._ship_all_appended(source)
             if is_complete and not self._order.full:
                 self._kept.ship(source, self._last_ids["state"], thorough=thorough)
             if self._order.pictures:
@@ -159,19 +154,20 @@ class Shipper:
             if is_whole:
                 self._tell_whole(source)
             self._outbox.send()
-            is_frozen = isinstance(connection, FrozenConnection)
         if not is_frozen:
             self._leave_word(started_s, is_complete=is_whole)
         return is_complete
 
-    def note_unsummed(self) -> None:
-        """Say that states are neither shipped nor in rollups, which only a server makes."""
-        shipped = self._progress.get("state", 0)  # at full rate, now or before
-        behind = self._last_ids["state"] - max(self._watermark, shipped)
-        if behind > 0:
+    def note_states_in_no_chunk(self) -> None:
+        """Say how many states are neither shipped nor in chunks."""
+        with self._order.recording.reader() as connection:
+            source = Source(connection)
+            self._knows_owners(source)
+            behind = source.in_no_chunk(self._progress.get("state", 0))  # at full rate
+        if behind:
             self._report.note(
-                f"the newest {behind} states are in no rollups yet, which 'webots-mcp serve' makes "
-                "at the edge, or a question there such as 'webots-mcp trends': ship with --full"
+                f"{behind} states are in no chunk yet, and so not in the pool: ship again when "
+                "their run has ended, or with --full"
             )
 
     def _end_what_was_killed(self, connection: sqlite3.Connection) -> None:
@@ -184,9 +180,24 @@ class Shipper:
         except DatabaseError as error:
             self._report.note(f"runs whose process was killed stay open in the pool: {error}")
 
+    def _make_chunks(self, source: Source) -> None:
+        """Put states into chunks, at the edge; all of those of runs that are over."""
+        database = self._order.recording.database
+        if not isinstance(database, Path):
+            return
+        ended = [each for each in source.ended_runs() if not is_whole(self._progress, each)]
+        try:
+            with Recording(database, database.parent).writer() as connection:
+                while not make_chunks(connection, pause_s=_PAUSE_S).done:
+                    pass
+                for run_id in ended:
+                    chunk_whole_run(connection, run_id, _PAUSE_S)
+        except (DatabaseError, sqlite3.Error) as error:
+            self._report.note(f"not all states are in chunks, which alone are shipped: {error}")
+
     def _appended(self) -> list[Table]:
         """States last: others should not wait for the largest table."""
-        wanted = [each for each in tables() if each.is_appended]
+        wanted = [each for each in tables() if each.is_appended and each.name not in CHUNKS]
         wanted = [each for each in wanted if self._order.full or not each.full_rate_only]
         return sorted(wanted, key=lambda each: each.full_rate_only)
 
@@ -200,7 +211,7 @@ class Shipper:
             raise ReplacedError(f"the recording {uuid} stands now where {self._uuid} was")
         if self._is_checked:
             return
-        for each in (table("run"), *self._appended()):
+        for each in (table("run"), table("row_group"), *self._appended()):
             known = self._progress.get(each.name, 0)
             if source.sequence(each) < known or self._is_other(source, each, known):
                 raise PoolError(
@@ -221,7 +232,7 @@ class Shipper:
         """Ship what differs in tables that change.
 
         What the rows of the others refer to is at the pool then, up to where they were read: to
-        `_last_ids`, `_marks` and `_watermark`.
+        `_last_ids`.
         """
 
         def read() -> bool:
@@ -230,9 +241,9 @@ class Shipper:
             for each in tables():
                 if each.is_appended:
                     self._last_ids[each.name] = source.last_id(each)
-                elif each.name not in ROLLED and not self._compare(source, each, thorough=thorough):
+                elif not self._compare(source, each, thorough=thorough):
                     return False
-            self._marks, self._watermark = source.marks(), source.watermark()
+            self._last_ids["row_group"] = source.last_group()
             self._ended = source.ended_runs()
             return True
 
@@ -267,6 +278,15 @@ class Shipper:
                 self._outbox.add(Batch(each, rows), {name: value, each.name: max([last, *ids])})
                 last = self._progress[each.name]
         return True
+
+    def _ship_groups(self, source: Source) -> bool:
+        """Ship the next row groups, each with its chunks at once; whether these were all."""
+        after, upto, count = self._progress.get("row_group", 0), self._last_ids["row_group"], 0
+        for group_id, (group, chunks) in source.groups(after, upto):
+            self._outbox.add(chunks, {})
+            self._put(group, _told_of(group, group_id))
+            count += 1
+        return count < GROUPS_AT_ONCE
 
     def _ship_all_appended(self, source: Source) -> bool:
         """Ship the next rows of the appended tables; returns whether these were all.
@@ -341,7 +361,8 @@ class Shipper:
         assert isinstance(database, Path)
         before = read_shipped(database, self._uuid).get(self.address)
         complete_s = before.complete_wall_time_s if before else 0.0
-        last_ids = {each.name: self._progress.get(each.name, 0) for each in self._appended()}
+        shipped_tables = (table("row_group"), *self._appended())
+        last_ids = {each.name: self._progress.get(each.name, 0) for each in shipped_tables}
         shipped = Shipped(
             self._uuid, last_ids, started_s if is_complete else complete_s, time.time()
         )

@@ -25,6 +25,7 @@ _FINE: Final[dict[type, frozenset[type]]] = {
     int: frozenset({int, type(None)}),
     float: frozenset({int, float, type(None)}),
     str: frozenset({str, type(None)}),
+    bytes: frozenset({bytes, type(None)}),
 }
 
 
@@ -36,7 +37,7 @@ def schema_of(table: Table) -> Any:
     """
     arrow = package("pyarrow")
 
-    types = {int: arrow.int64(), float: arrow.float64(), str: arrow.string()}
+    types = {int: arrow.int64(), float: arrow.float64(), str: arrow.string(), bytes: arrow.binary()}
     comments = _comments(table.name)
     fields = [
         arrow.field(
@@ -102,6 +103,8 @@ def _nearest(value: SQLValue, kind: type) -> SQLValue:
         return None
     if kind is str:
         return _text(value)
+    if kind is bytes:
+        return value if isinstance(value, bytes) else None
     if not isinstance(value, int | float):
         return None
     if kind is float:
@@ -122,7 +125,7 @@ def encoded(table: Table, arrow_table: Any) -> bytes:
 
     sink = io.BytesIO()
     alike = [name for name in table.columns if name not in table.json_columns]
-    group_rows = _APPENDED_GROUP_ROWS if table.is_appended else _CHANGING_GROUP_ROWS
+    group_rows = _APPENDED_GROUP_ROWS if table.time_column else _CHANGING_GROUP_ROWS
     parquet.write_table(
         arrow_table, sink, compression="zstd", use_dictionary=alike, row_group_size=group_rows
     )

@@ -31,7 +31,7 @@ _NUMBERS: Final = (
     "BOOLEAN", "TINYINT", "SMALLINT", "INTEGER", "BIGINT", "HUGEINT", "UTINYINT", "USMALLINT",
     "UINTEGER", "UBIGINT", "UHUGEINT", "FLOAT", "DOUBLE",
 )  # fmt: skip
-_TYPES: Final = {int: "BIGINT", float: "DOUBLE", str: "VARCHAR"}
+_TYPES: Final = {int: "BIGINT", float: "DOUBLE", str: "VARCHAR", bytes: "BLOB"}
 
 
 def ask(url: str, sql: str, max_rows: int) -> Result:
@@ -103,13 +103,13 @@ def _view(table: Table, paths: list[str]) -> str:
             f'CAST(NULL AS {_TYPES[kind]}) AS "{name}"'
             for name, kind in zip(table.columns, table.types, strict=True)
         )
-        day = ", CAST(NULL AS DATE) AS day" if table.is_appended else ""
+        day = ", CAST(NULL AS DATE) AS day" if table.time_column else ""
         return (
             f'CREATE VIEW "{table.name}" AS SELECT CAST(NULL AS VARCHAR) AS recording_uuid, '
             f"{columns}{day} WHERE false"
         )
     columns = ", ".join(f'"{name}"' for name in table.columns)
-    day = ", day" if table.is_appended else ""
+    day = ", day" if table.time_column else ""
     types = "{'recording': VARCHAR, 'table': VARCHAR" + (", 'day': DATE}" if day else "}")
     files = ", ".join(map(_quoted, paths))
     return (

@@ -13,9 +13,7 @@ ships sees each row once or, for a moment, not yet. Engines pass over names that
 
 Rows that never change are in the part that was open when they came, and stay there: a part is over
 once it is large. The progress says which one is open and how many rows of its files count: rows
-beyond are those of a shipper that was killed. Rows that change are in blocks of ids. The summaries
-of a run, which are many, are cut by simulation time; the first minutes of neighbouring runs are
-together, so that a thousand short trials do not become a thousand files.
+beyond are those of a shipper that was killed. Rows that change are in blocks of ids.
 """
 
 from __future__ import annotations
@@ -39,10 +37,6 @@ NO_DAY: Final = "__HIVE_DEFAULT_PARTITION__"  # read as null by engines
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=timezone.utc)
 _IDS_IN_BLOCK: Final = 4096
-_RUNS_IN_BLOCK: Final = 16
-_FIRST_BUCKETS: Final = 32
-_BUCKETS_IN_BLOCK: Final = 360  # an hour of rollups, two days of coarse ones
-_BUCKET_S: Final = 10.0
 
 
 def folder_of(recording_uuid: str) -> str:
@@ -79,7 +73,7 @@ def appended_file(table: Table, day: str, number: int) -> str:
 
 def files_of(table: Table, recording_uuid: str = "*") -> str:
     """The pattern of all files of a table, of one recording or of all."""
-    day = "/day=*" if table.is_appended else ""
+    day = "/day=*" if table.time_column else ""
     return f"{folder_of(recording_uuid)}/table={table.name}{day}/part-*.parquet"
 
 
@@ -115,20 +109,7 @@ def by_block(table: Table, rows: Iterable[Row]) -> Mapping[str, list[Row]]:
 def _block(table: Table, row: Row) -> str:
     if table.key == ("id",):
         return f"{_whole(row[table.columns.index('id')]) // _IDS_IN_BLOCK:09}"
-    if "run_id" not in table.key:
-        return f"{0:09}"
-    run_id = _whole(row[table.columns.index("run_id")])
-    bucket = _bucket(table, row)
-    if bucket < _FIRST_BUCKETS:
-        return f"{run_id // _RUNS_IN_BLOCK * _RUNS_IN_BLOCK:09}-first"
-    return f"{run_id:09}-{bucket // _BUCKETS_IN_BLOCK:06}"
-
-
-def _bucket(table: Table, row: Row) -> int:
-    if "bucket" in table.key:
-        return _whole(row[table.columns.index("bucket")])
-    time_s = row[table.columns.index("sim_time_s")]
-    return _whole(time_s / _BUCKET_S) if isinstance(time_s, int | float) else 0
+    return f"{0:09}"
 
 
 def _whole(value: SQLValue) -> int:

@@ -95,7 +95,7 @@ class ParquetPool:
     ) -> Iterator[Batch]:
         """Rows whose columns have one of these values, in the order of the key."""
         part = None
-        if table.is_appended:
+        if table.time_column:
             part = read_progress(self._storage, recording_uuid).part(table.name)
         paths = self._storage.find(files_of(table, recording_uuid))
         with ThreadPoolExecutor(_AT_ONCE) as workers:
@@ -138,7 +138,7 @@ class ParquetPool:
         content = self._storage.read(piece.path)  # whole: it may be replaced by a larger one
         if content is None:
             raise PoolUnavailableError(f"{piece.path} is gone from {self.address}: ask again")
-        if table.is_appended:  # those of a kept stretch may stand before older ones
+        if table.time_column:  # those of a kept stretch may stand before older ones
             held = decoded(table, content, piece.path, piece.counted)
             found = iter([held.sort_by("id")])
         else:

@@ -148,7 +148,7 @@ class ParquetShipment:
         for table, rows in _by_table(batches):
             if table.name == "run":
                 self._claim(table, rows)
-            if table.is_appended:
+            if table.time_column:
                 told = told.with_part(table.name, self._append(table, rows))
             else:
                 self._replace(table, rows)
@@ -226,7 +226,7 @@ class ParquetShipment:
     def _settle(self) -> None:
         """Take out what was placed and never counted."""
         for table in tables():
-            if table.is_appended:
+            if table.time_column:
                 part = self._progress.part(table.name)
                 for path in self._storage.find(self._path(appended_file(table, "*", part.number))):
                     self._settle_file(table, path, part.counted(path) or 0)

@@ -31,6 +31,7 @@ from webots_mcp.plugins.pool.postgres.connecting import Connection, clear_errors
 from webots_mcp.plugins.pool.postgres.postgres_views import VIEWS, make_views
 from webots_mcp.plugins.pool.shipped_tables import Table, table, tables
 from webots_mcp.store.migrate import migration_config
+from webots_mcp.store.models import STATISTICS
 
 OWNER: Final = "recording_uuid"
 VERSION: Final = "pool_version"  # Alembic's, under a name that says whose tables these are
@@ -335,6 +336,7 @@ def _index(index: sa.Index) -> sa.Index:
         sa.Column(column.name, column.type)
         for column in index.columns
         if column.name == "uuid" or not isinstance(column.type, sa.Text)
+        if column.name not in STATISTICS
     ]
     table = sa.Table(index.table.name, sa.MetaData(), sa.Column(OWNER, postgresql.UUID()), *columns)
     where = index.dialect_kwargs.get("postgresql_where")

@@ -99,7 +99,6 @@ _QUERIES: Final = {
 FROM state
 UNION ALL
 SELECT {_KEY}, NULL, run_id, sim_time_s, wall_time_s, data, odd FROM kept_state""",
-    "all_rollup": "SELECT * FROM rollup",
     "robot_now": f"""SELECT r.{_KEY}, r.name AS robot, u.id AS run_id, u.end_reason, s.sim_time_s,
   rounded({_NOW_S} - s.wall_time_s, 1) AS age_s,{_motion("r.id")},
   s.data, s.odd
@@ -170,6 +169,12 @@ FROM parameter_value v JOIN run u ON u.{_KEY} = v.{_KEY} AND u.id = v.run_id
 JOIN robot r ON r.{_KEY} = u.{_KEY} AND r.id = u.robot_id
 LEFT JOIN LATERAL (SELECT unit FROM parameter WHERE {_KEY} = u.{_KEY} AND robot_id = u.robot_id
   AND name = v.name ORDER BY id DESC LIMIT 1) p ON true""",
+    "robot_statistics": f"""SELECT g.{_KEY}, r.name AS robot, g.run_id, s.name AS signal,
+  g.start_sim_time_s AS start_s, g.end_sim_time_s AS end_s, c.row_count, c.value_count, c.min,
+  c.max, c.sum / nullif(c.value_count, 0) AS mean, c.first, c.last, c.largest_step, c.change_count
+FROM chunk c JOIN row_group g ON g.{_KEY} = c.{_KEY} AND g.id = c.group_id
+JOIN signal s ON s.{_KEY} = c.{_KEY} AND s.id = c.signal_id
+JOIN robot r ON r.{_KEY} = s.{_KEY} AND r.id = s.robot_id""",
     "robot_kept": f"""SELECT k.{_KEY}, r.name AS robot, k.run_id, k.id AS stretch_id,
   k.start_sim_time_s AS start_s,
   least(k.end_sim_time_s, greatest(u.last_sim_time_s, k.start_sim_time_s)) AS end_s,

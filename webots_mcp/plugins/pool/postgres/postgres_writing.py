@@ -35,7 +35,7 @@ from webots_mcp.plugins.pool.target import redacted
 _T = TypeVar("_T")
 _SHIPPER: Final = 1_463_962_947  # the seed of the lock of who ships a recording
 _MANY: Final = 500  # rows of a table that changes: as a rule, so many at once are new
-_TYPES: Final = {int: "bigint", float: "double precision", str: "text"}
+_TYPES: Final = {int: "bigint", float: "double precision", str: "text", bytes: "bytea"}
 _REPLACEMENT: Final = "\N{REPLACEMENT CHARACTER}"
 # Of values, where a batch has one that PostgreSQL cannot hold; and of rows that are there already.
 _REFUSED: Final = (
@@ -196,16 +196,16 @@ class PostgresShipment:
     def _append(self, batch: Batch) -> None:
         names = ", ".join([OWNER, *map(_quoted, batch.table.columns)])
         uuid = self._uuid
-        self._copy(batch.table.name, names, ((uuid, *row) for row in batch.rows))
+        self._copy(batch.table, batch.table.name, names, ((uuid, *row) for row in batch.rows))
 
     def _merge(self, batch: Batch) -> None:
         """Through a temporary table, where rows may be anything that the types hold."""
         name = self._stage(batch.table)
         columns = ", ".join(map(_quoted, batch.table.columns))
         self._connection.execute(f"TRUNCATE {name}".encode())
-        if not self._tried(lambda: self._copy(name, columns, batch.rows)):
+        if not self._tried(lambda: self._copy(batch.table, name, columns, batch.rows)):
             held = [self._holdable(batch.table, row) for row in batch.rows]
-            self._copy(name, columns, held)
+            self._copy(batch.table, name, columns, held)
         self._connection.execute(_merging(batch.table, name).encode(), (self._uuid,))
 
     def _stage(self, table: Table) -> str:
@@ -230,9 +230,10 @@ class PostgresShipment:
             return False
         return True
 
-    def _copy(self, name: str, columns: str, rows: Iterable[Row]) -> None:
+    def _copy(self, table: Table, name: str, columns: str, rows: Iterable[Row]) -> None:
         with self._connection.cursor() as cursor:
-            cursor.adapters.register_dumper(bytes, _NoBytes)
+            if bytes not in table.types:
+                cursor.adapters.register_dumper(bytes, _NoBytes)
             with cursor.copy(f"COPY {name} ({columns}) FROM STDIN".encode()) as copy:
                 for row in rows:
                     copy.write_row(row)
@@ -316,6 +317,8 @@ def _nearest(value: SQLValue, kind: type, nullable: bool) -> SQLValue:
         return None if nullable else kind()
     if kind is str:
         return _text(value)
+    if kind is bytes:
+        return value if isinstance(value, bytes) else None
     number = _number(value)
     if number is None:
         return None if nullable else kind()

@@ -32,7 +32,7 @@ from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.purge import prune
-from webots_mcp.store.rollup.rolling import roll
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.trials import (
     find_trial_set,
     trials_of,
@@ -123,7 +123,7 @@ def test_a_run_of_full_rate_comes_back_with_the_same_answers_whatever_was_purged
 
     found = lab.fetch(run_uuid=uuid[:13])
 
-    assert (list(found.runs), found.summaries, found.unsummed) == ([uuid], [], {})
+    assert (list(found.runs), found.only_chunks, found.unchunked) == ([uuid], [], {})
     with lab.opened() as here:
         run = found.runs[uuid]
         assert run_info(here, run).purged_rows == 0
@@ -148,7 +148,7 @@ def test_each_value_of_a_state_comes_back(lab: Lab, runs: Recorded) -> None:
     runs.connection.execute(
         "UPDATE run SET uuid = ?, rows = ? WHERE id = ?", (new_uuid(), len(ODD_STATES), run_id)
     )
-    while not roll(runs.connection).done:
+    while not make_chunks(runs.connection).done:
         pass
     lab.ship(runs.folder / DATABASE_NAME, full=True)
     uuid = uuid_of(runs.folder / DATABASE_NAME, run_id)
@@ -163,7 +163,7 @@ def test_each_value_of_a_state_comes_back(lab: Lab, runs: Recorded) -> None:
 
 
 @IN_EACH_POOL
-def test_of_a_run_of_summaries_the_answers_are_those_after_all_its_rows_were_purged(
+def test_of_a_run_of_chunks_the_answers_are_those_after_all_its_rows_were_purged(
     lab: Lab, rounds: Path
 ) -> None:
     lab.ship(rounds)
@@ -171,7 +171,7 @@ def test_of_a_run_of_summaries_the_answers_are_those_after_all_its_rows_were_pur
 
     found = lab.fetch(run_uuid=uuid)
 
-    assert (found.summaries, found.unsummed) == ([uuid], {})
+    assert (found.only_chunks, found.unchunked) == ([uuid], {})
     with closing(connect(rounds, "writer")) as there, lab.opened() as here:
         prune(there, rounds.parent, Retention(state=Limit(rows=0), outlive=0), rest=False)
         run = found.runs[uuid]
@@ -186,20 +186,19 @@ def test_of_a_run_whose_first_rows_were_purged_before_they_were_shipped_the_othe
     with closing(connect(rounds, "writer")) as there:
         there.execute("UPDATE run SET keep = 1 WHERE id = 2")
         prune(there, rounds.parent, Retention(state=Limit(rows=1500), outlive=0), rest=False)
-        there.execute("UPDATE run SET rolled_state_id = 0")  # as older versions left it
     lab.ship(rounds, full=True)
     uuid = uuid_of(rounds, 1)
 
     found = lab.fetch(run_uuid=uuid)
 
-    assert found.summaries == []
+    assert found.only_chunks == []
     with closing(connect(rounds, "reader")) as there, lab.opened() as here:
         assert answers(here, found.runs[uuid], PART) == answers(there, 1, PART)
         assert everything(here, lab.here, found.runs[uuid]) == everything(there, rounds.parent, 1)
 
 
 @IN_EACH_POOL
-def test_kept_stretches_come_whole_though_only_summaries_were_shipped(
+def test_kept_stretches_come_whole_though_only_chunks_were_shipped(
     lab: Lab, tmp_path: Path
 ) -> None:
     database = tmp_path / "there" / DATABASE_NAME
@@ -230,7 +229,7 @@ def test_kept_stretches_come_whole_though_only_summaries_were_shipped(
     assert after["state"] == [] != before["state"]
     for name in ("log", "event", "image", "parameter_value", "parameter", "session", "pictures"):
         assert after[name] == before[name] != []
-    assert found.unsummed == {uuid: 0}
+    assert found.unchunked == {}
 
 
 @IN_EACH_POOL

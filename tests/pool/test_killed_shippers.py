@@ -27,7 +27,7 @@ from webots_mcp.plugins.pool.row_batch import Row
 from webots_mcp.plugins.pool.shipped_tables import Table, tables
 from webots_mcp.plugins.pool.shipping import Order, ship
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.rollup.rolling import roll
+from webots_mcp.store.chunks.making import make_chunks
 
 KILLS = {"postgresql": 20, "parquet": 8}
 
@@ -117,14 +117,14 @@ def test_of_shippers_that_are_killed_while_a_bridge_records_no_row_is_lost_or_tw
             shipper.start()
             writing.recv()
             drive(40)
-            roll(connection)
+            make_chunks(connection)
             if chance.random() < 0.5:
                 writing.recv()  # what was recorded since
             drive(4)
             shipper.kill()
             shipper.join()
         rover.bridge.close()
-        while not roll(connection).done:
+        while not make_chunks(connection).done:
             pass
         last = ship_again(folder, url)
         (uuid,) = connection.execute("SELECT uuid FROM recording").fetchone()

@@ -193,7 +193,7 @@ def _take_in(
     else:
         owner = {"robot_id": connection.execute(_ROBOT_OF, (here,)).fetchone()[0]}
     commands = _copy_commands(connection, wanted, owner | {"session_id": here}, is_new=is_new)
-    own = owner | {"session_id": here, "rolled_state_id": 0, "coarse_end": None}
+    own = owner | {"session_id": here, "is_chunked": 0, "rolled_state_id": 0, "coarse_end": None}
     for run_id, run_uuid in runs:
         run = _insert(connection, "run", "id = ?", run_id, own)
         _copy_states(connection, run_id, run, owner["robot_id"])

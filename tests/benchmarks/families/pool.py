@@ -54,7 +54,7 @@ def _measure(bench: Bench, server: Server) -> Iterable[Line]:
     prepare(url, "the pool")
     server.execute(pool, "SELECT make_partition('state', 2023, 11)")
     rows = bench.count(_ROWS, 50)
-    for name, made in (("state", _states(rows)), ("rollup", _rollups(rows))):
+    for name, made in (("state", _states(rows)), ("chunk", _chunks(rows))):
         bench.say(name)
         with connect(url, "the pool") as connection:
             yield from _lines(name, rows, _compare(connection, list(batches(table(name), made))))
@@ -69,11 +69,14 @@ def _states(rows: int) -> Iterable[tuple[Any, ...]]:
         })  # fmt: skip
 
 
-def _rollups(rows: int) -> Iterable[tuple[Any, ...]]:
-    figures = dict.fromkeys(("first", "last", "min", "max", "sum", "squares"), 1.25)
+def _chunks(rows: int) -> Iterable[tuple[Any, ...]]:
+    figures = dict.fromkeys(("first", "last", "min", "max", "sum", "largest_step"), 1.25)
+    counts = {"row_count": 1024, "value_count": 1024, "change_count": 9}
+    numbers = bytes(range(256)) * 5
     for number in range(rows):
-        key = {"run_id": 1, "signal_id": number % 39, "bucket": number // 39}
-        yield _row(table("rollup"), {"rows": 600, "present": 600, "changes": 9} | key | figures)
+        key = {"id": number + 1, "run_id": 1, "signal_id": number % 39, "group_id": number // 39}
+        held = {"codec": "pcodec/float64", "numbers": numbers}
+        yield _row(table("chunk"), counts | key | figures | held)
 
 
 def _row(of: Table, values: dict[str, Any]) -> tuple[Any, ...]:
@@ -115,6 +118,8 @@ def _as_text(connection: Connection, shipped: list[Batch]) -> list[bytes]:
 
 
 def _field(value: Any) -> str:
+    if isinstance(value, bytes):
+        return rf"\\x{value.hex()}"
     return r"\N" if value is None else str(value).replace("\\", r"\\")
 
 

@@ -216,24 +216,6 @@ def test_a_row_replaces_the_one_of_its_key_but_what_lasts_is_not_lost(tmp_path: 
     assert found == [(1, "done", 4, None), (2, "claimed", 4, None), (3, "done", None, "e")]
 
 
-def rollup(run_id: int, bucket_number: int) -> dict[str, SQLValue]:
-    counts = {"rows": 1, "present": 1, "changes": 1}
-    return {"run_id": run_id, "signal_id": 1, "bucket": bucket_number, **counts}
-
-
-def test_short_runs_share_files_and_long_runs_have_some_of_their_own(tmp_path: Path) -> None:
-    with shipping(tmp_path) as shipment:
-        short = [rollup(run_id, number) for run_id in range(1, 60) for number in range(5)]
-        shipment.write([batch("rollup", *short)], {})
-        shipment.write([batch("rollup", *(rollup(3, number) for number in range(1000)))], {})
-    names = [file.name for file in (tmp_path / f"recording={UUID}/table=rollup").iterdir()]
-    assert len(names) == 4 + 3
-    found = pooled(str(tmp_path), UUID, "rollup", {"run_id": (3,)})
-    at = table("rollup").columns.index("bucket")
-    assert [row[at] for row in found] == list(range(1000))
-    assert len(globbed(tmp_path, "rollup")) == 58 * 5 + 1000
-
-
 def test_what_a_column_cannot_hold_becomes_what_comes_nearest_and_is_counted(
     tmp_path: Path,
 ) -> None:

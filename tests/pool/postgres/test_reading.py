@@ -19,7 +19,7 @@ from webots_mcp.errors import InvalidInputError, PoolError
 from webots_mcp.plugins.pool.postgres import postgres_reading as reading
 from webots_mcp.plugins.pool.postgres.postgres_reading import PostgresPool
 from webots_mcp.plugins.pool.shipped_tables import Table, table, tables
-from webots_mcp.store.rollup.rolling import roll
+from webots_mcp.store.chunks.making import make_chunks
 
 # What jsonb has not, or has otherwise; each comes back as it was, also where it is no JSON object.
 ODD_OBJECTS = ["", "no JSON", '{"a":', '{"a": "\\u0000"}', '"\\ud800"', "NaN", "[1, 2.50]", "-0.0"]
@@ -28,10 +28,10 @@ VALUES = ['"text"', '"3"', "3", "true", "null", '{"a": 1}', '"\\u0000"', '["\\u0
 
 @pytest.fixture(scope="module")
 def recording() -> Iterator[sqlite3.Connection]:
-    """The known story, rolled up, with parameters, a trial set and odd values."""
+    """The known story, in chunks, with parameters, a trial set and odd values."""
     with memory_connection() as connection:
         record_rover(connection)
-        assert roll(connection, 100_000).done
+        assert make_chunks(connection, 100_000).done
         connection.execute("UPDATE run SET uuid = 'run ' || id, label = 'first' WHERE id < 3")
         recorder = Recorder(connection)
         recorder.run_id, recorder.run_start_s = 3, recorder.wall_s
@@ -93,17 +93,17 @@ def test_every_row_comes_back_as_it_was_recorded(
 def test_rows_are_chosen_and_come_in_the_order_of_their_key(
     pool: PostgresPool, recording: sqlite3.Connection
 ) -> None:
-    uuid, states, rollups = uuid_of(recording), table("state"), table("rollup")
+    uuid, states, chunks = uuid_of(recording), table("state"), table("chunk")
     batches = list(pool.rows(uuid, states, {"run_id": [3, 2]}))
     ids = [row[0] for batch in batches for row in batch.rows]
     wanted = recording.execute("SELECT id FROM state WHERE run_id > 1 ORDER BY id").fetchall()
     assert ids == [row_id for (row_id,) in wanted]
     (signal_id,) = recording.execute("SELECT id FROM signal WHERE name = 'ir'").fetchone()
-    where = {"run_id": [1], "signal_id": [signal_id], "bucket": [1, 0, 99]}
-    some = pool.rows(uuid, rollups, where)
-    places = [rollups.columns.index(each) for each in rollups.key]
-    keys = [tuple(row[at] for at in places) for batch in some for row in batch.rows]
-    assert keys == [(1, signal_id, 0), (1, signal_id, 1)]
+    where = {"run_id": [1], "signal_id": [signal_id], "group_id": [2, 1, 99]}
+    places = [chunks.columns.index(each) for each in ("run_id", "signal_id", "group_id")]
+    some = [row for batch in pool.rows(uuid, chunks, where) for row in batch.rows]
+    keys = [tuple(row[at] for at in places) for row in some]
+    assert keys == [(1, signal_id, 1)]
     assert list(pool.rows("00000000-0000-4000-8000-000000000000", states, {})) == []
 
 
@@ -127,7 +127,7 @@ def test_what_is_there_is_listed(pool: PostgresPool, recording: sqlite3.Connecti
     sizes = {size.table: size for size in pool.sizes()}
     assert (sizes["state"].rows, sizes["trial"].rows, sizes["picture"].rows) == (2050, 3, 0)
     assert (sizes["state"].size_bytes or 0) > 2050 * 100
-    assert (sizes["rollup"].size_bytes or 0) > sizes["rollup"].rows * 50 > 0
+    assert (sizes["chunk"].size_bytes or 0) > sizes["chunk"].rows * 50 > 0
     assert pool.progress(found.uuid) == {"shipped": 1}
     assert pool.picture(found.uuid, "camera/1.png") is None
 

@@ -27,7 +27,7 @@ from tests.store.test_views import (
 )
 from webots_mcp.connection import connect
 from webots_mcp.plugins.pool.postgres.postgres_views import VIEWS
-from webots_mcp.store.rollup.rolling import roll
+from webots_mcp.store.chunks.making import make_chunks
 
 # Whole states, each other than those of `tests/store/test_views.py`.
 STATES: list[dict[str, Any]] = [
@@ -50,7 +50,7 @@ def recordings(bridge_recording: Path) -> Iterator[dict[str, sqlite3.Connection]
         memory_connection() as odd,
     ):
         record_rover(rover)
-        assert roll(rover, 100_000).done
+        assert make_chunks(rover, 100_000).done
         record_odd(odd)
         yield {"bridge": bridge, "rover": rover, "odd": odd}
 
@@ -85,7 +85,7 @@ def record_odd(connection: sqlite3.Connection) -> None:
     recorder.insert("kept_state", **recorder.at(2.5), call=3, data='{"x": 1}')
     recorder.end_run("finished")
     recorder.robot("idle")
-    assert roll(connection, 100_000).done
+    assert make_chunks(connection, 100_000).done
 
 
 def record_parameters(recorder: Recorder) -> None:

@@ -32,7 +32,7 @@ from webots_mcp.plugins.pool.postgres import postgres_writing as writing
 from webots_mcp.plugins.pool.postgres.postgres_writing import PostgresShipment, PostgresTarget
 from webots_mcp.plugins.pool.row_batch import Batch, Row
 from webots_mcp.plugins.pool.shipped_tables import table, tables
-from webots_mcp.store.rollup.rolling import roll
+from webots_mcp.store.chunks.making import make_chunks
 
 SECRET = "quite-a-secret-7"
 OTHER = "00000000-0000-4000-8000-00000000000a"
@@ -44,7 +44,7 @@ def rover() -> Iterator[sqlite3.Connection]:
     """The known story; do not change it."""
     with memory_connection() as connection:
         record_rover(connection)
-        assert roll(connection, 100_000).done
+        assert make_chunks(connection, 100_000).done
         connection.execute("UPDATE run SET uuid = 'run ' || id")
         yield connection
 

@@ -71,20 +71,20 @@ class Fetched:
     Attributes:
         runs: The ids here of those that are here now.
         known: Of them, those that were here before.
-        summaries: Of those that came now, the ones of which the pool has no rows.
+        only_chunks: Of those that came now, the ones of which the pool has no rows.
         going_on: Those that are not over.
         arriving: Those that are over, and not yet wholly shipped.
         nameless: How many have no UUID, which no recording could tell from those that are there.
-        unsummed: Of those in `summaries`, how many rows the summaries tell of, where not of all.
+        unchunked: Of those in `only_chunks`, how many rows are in chunks, where not all are.
     """
 
     runs: dict[str, int] = field(default_factory=dict[str, int])
     known: list[str] = field(default_factory=list[str])
-    summaries: list[str] = field(default_factory=list[str])
+    only_chunks: list[str] = field(default_factory=list[str])
     going_on: list[str] = field(default_factory=list[str])
     arriving: list[str] = field(default_factory=list[str])
     nameless: int = 0
-    unsummed: dict[str, int] = field(default_factory=dict[str, int])
+    unchunked: dict[str, int] = field(default_factory=dict[str, int])
 
     @property
     def come(self) -> list[int]:
@@ -209,8 +209,8 @@ class _Fetcher:
                 gone = rows
                 small.execute(_MOVE_KEPT, {"run": run_id})
                 small.execute(_DROP_STATES, {"run": run_id})
-                self.found.summaries.append(uuids[run_id])
-                self.found.unsummed |= {uuids[run_id]: chunked} if chunked < rows else {}
+                self.found.only_chunks.append(uuids[run_id])
+                self.found.unchunked |= {uuids[run_id]: chunked} if chunked < rows else {}
             elif left < rows - purged:
                 self.found.arriving.append(uuids[run_id])
                 small.execute(_DROP_RUN, {"run": run_id})

@@ -51,8 +51,8 @@ def fetch(
     """Bring runs of a pool back into a recording here, for every command, tool and plot.
 
     They come with their sessions, commands, trials and what was shipped of their pictures, each
-    once however often it is fetched; what is here is left as it is. Of a run of which summaries
-    were shipped and no rows, the summaries come, and every answer says so. A run that goes on or is
+    once however often it is fetched; what is here is left as it is. Of a run of which chunks
+    were shipped and no rows, the chunks come: the values of all of its signals. A run that goes on or is
     still being shipped is not taken: fetch it again when it is whole.
     """
     from webots_mcp.plugins.pool.engines import open_pool
@@ -77,8 +77,8 @@ def _as_data(found: Fetched) -> dict[str, Any]:
     return {
         "fetched_run_ids": found.come,
         "known_run_ids": [found.runs[uuid] for uuid in found.known],
-        "only_summaries_run_ids": [found.runs[uuid] for uuid in found.summaries],
-        "incomplete_summaries_run_ids": [found.runs[uuid] for uuid in found.unsummed],
+        "only_chunks_run_ids": [found.runs[uuid] for uuid in found.only_chunks],
+        "incomplete_chunks_run_ids": [found.runs[uuid] for uuid in found.unchunked],
         "not_taken": {
             "going_on": found.going_on,
             "not_wholly_shipped": found.arriving,
@@ -94,15 +94,15 @@ def _print_fetched(found: Fetched, address: str) -> None:
     print(f"fetched from {address}: run {id_ranges(found.come) or 'none'}")
     if found.known:
         print(f"here already: run {listed(found.known)}")
-    if found.summaries:
+    if found.only_chunks:
         print(
-            f"of run {listed(found.summaries)} only summaries were shipped, no rows "
+            f"of run {listed(found.only_chunks)} only chunks were shipped, no rows "
             "('webots-mcp ship --full' does)"
         )
-    if found.unsummed:
+    if found.unchunked:
         print(
-            f"of run {listed(found.unsummed)} not even summaries of all rows: those were not made "
-            "where it was recorded, which a server does ('webots-mcp serve')"
+            f"of run {listed(found.unchunked)} not all rows are in chunks: the recording could not "
+            "be written where it was shipped ('webots-mcp ship --full' ships them)"
         )
     if found.nameless:
         print(f"not taken: {found.nameless} runs without a UUID, which every bridge of today gives")
@@ -252,7 +252,7 @@ def ship(
         bool,
         Parameter(
             "--full",
-            help="Ship all states; else only those of kept stretches, and the rollups of all.",
+            help="Ship all states; else only those of kept stretches, and the chunks of all.",
         ),
     ] = False,
     pictures: Annotated[
@@ -277,7 +277,7 @@ def ship(
     is not sent again, so that this may be killed and started again at any time; a run that another
     recording has shipped stays that one's.
 
-    Runs, commands, events, log lines, parameters, trials, rollups and kept stretches are shipped,
+    Runs, commands, events, log lines, parameters, trials, chunks and kept stretches are shipped,
     with --full each state. A password comes from PGPASSWORD, ~/.pgpass or a service file, never
     from the URL.
     """

@@ -16,10 +16,9 @@ from webots_mcp.store.signals.registry import Count, enter_signals
 
 _TABLES: Final = ("rollup", "recent_rollup", "coarse_rollup", "change")
 _COUNTS: Final = (
-    "SELECT n.id, n.name, n.kind, s.kind, s.last_seen_wall_time_s, sum(u.rows), sum(u.present), "
-    "min(u.min), max(u.max) FROM (SELECT signal_id, rows, present, min, max FROM main.rollup "
-    "WHERE run_id = :run UNION ALL SELECT signal_id, rows, present, min, max "
-    "FROM main.recent_rollup WHERE run_id = :run) u "
+    "SELECT n.id, n.name, n.kind, s.kind, s.last_seen_wall_time_s, sum(u.row_count), "
+    "sum(u.value_count), min(u.min), max(u.max) FROM (SELECT signal_id, row_count, value_count, "
+    "min, max FROM main.chunk WHERE run_id = :run) u "
     "JOIN temp.signal_here m ON m.here = u.signal_id "
     "JOIN source.signal s ON s.id = m.there JOIN main.signal n ON n.id = m.here GROUP BY n.id"
 )

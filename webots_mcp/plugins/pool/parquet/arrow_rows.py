@@ -160,12 +160,12 @@ def footer_of(file: Any, path: str) -> Any:
     Raises:
         PoolError: The file is none, or is damaged.
     """
-    with _whole(path):
+    with clear_damage(path):
         return package("pyarrow.parquet").read_metadata(file)
 
 
 @contextmanager
-def _whole(path: str) -> Generator[None]:
+def clear_damage(path: str) -> Generator[None]:
     try:
         yield
     except package("pyarrow").ArrowException as error:
@@ -246,7 +246,7 @@ def pieces_of(table: Table, content: bytes, path: str) -> Iterator[Any]:
         PoolError: As `decoded`.
     """
     arrow, parquet = package("pyarrow"), package("pyarrow.parquet")
-    with _whole(path):
+    with clear_damage(path):
         file = parquet.ParquetFile(arrow.BufferReader(content))
         for piece in file.iter_batches(batch_size=_ROWS_AT_ONCE):
             yield conformed(table, arrow.Table.from_batches([piece]))

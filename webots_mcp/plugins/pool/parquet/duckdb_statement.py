@@ -15,7 +15,7 @@ from contextlib import closing, suppress
 from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plugins.pool.parquet.layout import files_of
+from webots_mcp.plugins.pool.parquet.layout import VALUES, files_of
 from webots_mcp.plugins.pool.parquet.packages import package
 from webots_mcp.plugins.pool.parquet.storage import Storage
 from webots_mcp.plugins.pool.pool_statement import Kind, answered, bounded
@@ -72,7 +72,8 @@ def _prepare(connection: Any, storage: Storage, sql: str) -> None:
     if not storage.is_local:
         connection.register_filesystem(storage.files)
     for table in tables():
-        is_named = re.search(rf"\b{table.name}\b", sql, re.IGNORECASE)
+        name = VALUES if table.name == "chunk" else table.name
+        is_named = re.search(rf"\b{name}\b", sql, re.IGNORECASE)
         paths = storage.find(files_of(table)) if is_named else []
         connection.execute(_view(table, [storage.url_of(path) for path in paths]))
     connection.execute(f"SET memory_limit = '{_MEMORY}'")
@@ -98,6 +99,8 @@ def _column(at: int, kind: str) -> tuple[str, Kind]:
 
 def _view(table: Table, paths: list[str]) -> str:
     """A table over its files; without any, a table without rows."""
+    if table.name == "chunk":
+        return _values_view(paths)
     if not paths:
         columns = ", ".join(
             f'CAST(NULL AS {_TYPES[kind]}) AS "{name}"'
@@ -116,6 +119,22 @@ def _view(table: Table, paths: list[str]) -> str:
         f'CREATE VIEW "{table.name}" AS SELECT recording AS recording_uuid, {columns}{day} '
         f"FROM read_parquet([{files}], union_by_name = true, hive_partitioning = true, "
         f"hive_types = {types})"
+    )
+
+
+def _values_view(paths: list[str]) -> str:
+    """What chunks hold: a column for each signal of any run."""
+    if not paths:
+        return (
+            f'CREATE VIEW "{VALUES}" AS SELECT CAST(NULL AS VARCHAR) AS recording_uuid, '
+            "CAST(NULL AS BIGINT) AS run_id, CAST(NULL AS DOUBLE) AS sim_time_s, "
+            "CAST(NULL AS DOUBLE) AS wall_time_s WHERE false"
+        )
+    return (
+        f'CREATE VIEW "{VALUES}" AS SELECT recording AS recording_uuid, run AS run_id, '
+        f'* EXCLUDE (recording, run, "table") FROM read_parquet([{", ".join(map(_quoted, paths))}], '
+        "union_by_name = true, hive_partitioning = true, "
+        "hive_types = {'recording': VARCHAR, 'table': VARCHAR, 'run': BIGINT})"
     )
 
 

@@ -7,6 +7,7 @@
     recording=UUID/_pictures/PATH
     recording=UUID/table=NAME/day=YYYY-MM-DD/part-NUMBER.parquet    rows that never change
     recording=UUID/table=NAME/part-BLOCK.parquet                    rows that change
+    recording=UUID/table=value/run=ID/part-NUMBER.parquet           a column for each signal
 
 A file is replaced as a whole, by itself with more rows. So whoever reads `*.parquet` while somebody
 ships sees each row once or, for a moment, not yet. Engines pass over names that begin with `_`.
@@ -33,6 +34,7 @@ POOL: Final = "_pool"
 RUNS: Final = "_runs"
 PROGRESS: Final = "_progress"
 LEASE: Final = "_lease"
+VALUES: Final = "value"  # a table of columns in the place of chunks
 NO_DAY: Final = "__HIVE_DEFAULT_PARTITION__"  # read as null by engines
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=timezone.utc)
@@ -71,8 +73,16 @@ def appended_file(table: Table, day: str, number: int) -> str:
     return f"table={table.name}/day={day}/part-{number:06}.parquet"
 
 
+def values_file(run_id: int | str, number: int | str) -> str:
+    """The values of a run, which chunks hold in a recording."""
+    part = f"{number:06}" if isinstance(number, int) else number
+    return f"table={VALUES}/run={run_id}/part-{part}.parquet"
+
+
 def files_of(table: Table, recording_uuid: str = "*") -> str:
     """The pattern of all files of a table, of one recording or of all."""
+    if table.name == "chunk":
+        return f"{folder_of(recording_uuid)}/{values_file('*', '*')}"
     day = "/day=*" if table.time_column else ""
     return f"{folder_of(recording_uuid)}/table={table.name}{day}/part-*.parquet"
 
@@ -83,9 +93,9 @@ def uuid_in(path: str) -> str:
 
 
 def part_of(path: str) -> tuple[str, int]:
-    """The day and the number of a part."""
+    """The day or the run, and the number of a part."""
     folder, _, name = path.rpartition("/part-")
-    return folder.rpartition("day=")[2], int(name.removesuffix(".parquet"))
+    return folder.rpartition("=")[2], int(name.removesuffix(".parquet"))
 
 
 def by_day(table: Table, rows: Iterable[Row]) -> Mapping[str, list[Row]]:

@@ -11,10 +11,17 @@ from typing import Any, Final, NamedTuple
 from webots_mcp.errors import PoolUnavailableError
 from webots_mcp.plugins.pool.parquet.arrow_rows import as_rows, decoded, footer_of, pieces_of, span
 from webots_mcp.plugins.pool.parquet.duckdb_statement import ask
-from webots_mcp.plugins.pool.parquet.layout import files_of, folder_of, picture_file, uuid_in
+from webots_mcp.plugins.pool.parquet.layout import (
+    files_of,
+    folder_of,
+    part_of,
+    picture_file,
+    uuid_in,
+)
 from webots_mcp.plugins.pool.parquet.packages import package
 from webots_mcp.plugins.pool.parquet.pool_state import read_progress, require_pool
 from webots_mcp.plugins.pool.parquet.storage import Storage
+from webots_mcp.plugins.pool.parquet.value_columns import chunks_of, read_columns
 from webots_mcp.plugins.pool.row_batch import Batch, Row, batches
 from webots_mcp.plugins.pool.shipped_tables import Table, table, tables
 from webots_mcp.plugins.pool.target import PooledRecording, PooledRun, PooledSize, PooledTrialSet
@@ -94,6 +101,9 @@ class ParquetPool:
         self, recording_uuid: str, table: Table, where: Mapping[str, Collection[int]]
     ) -> Iterator[Batch]:
         """Rows whose columns have one of these values, in the order of the key."""
+        if table.name == "chunk":
+            yield from batches(table, self._chunks(recording_uuid, table, where))
+            return
         part = None
         if table.time_column:
             part = read_progress(self._storage, recording_uuid).part(table.name)
@@ -119,6 +129,24 @@ class ParquetPool:
             PoolError: DuckDB is not installed.
         """
         return ask(self._url, sql, max_rows)
+
+    def _chunks(
+        self, recording_uuid: str, chunks: Table, where: Mapping[str, Collection[int]]
+    ) -> Iterator[Row]:
+        """Chunks made anew from the columns of their runs."""
+        part = read_progress(self._storage, recording_uuid).part(chunks.name)
+        wanted = [(chunks.columns.index(name), values) for name, values in where.items()]
+        for path in self._storage.find(files_of(chunks, recording_uuid)):
+            run_id = int(part_of(path)[0])
+            if run_id not in where.get("run_id", (run_id,)):
+                continue
+            content = self._storage.read(path)
+            if content is None:
+                raise PoolUnavailableError(f"{path} is gone from {self.address}: ask again")
+            held = read_columns(content, path).slice(0, part.counted(path))
+            for row in chunks_of(held, run_id):
+                if all(row[at] in values for at, values in wanted):
+                    yield row
 
     def _in_order(
         self, table: Table, pieces: Iterable[_Piece], where: Mapping[str, Collection[int]]

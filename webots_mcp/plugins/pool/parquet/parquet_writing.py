@@ -33,6 +33,7 @@ from webots_mcp.plugins.pool.parquet.layout import (
     files_of,
     folder_of,
     picture_file,
+    values_file,
 )
 from webots_mcp.plugins.pool.parquet.lease import Lease
 from webots_mcp.plugins.pool.parquet.packages import package
@@ -45,8 +46,14 @@ from webots_mcp.plugins.pool.parquet.pool_state import (
     require_pool,
 )
 from webots_mcp.plugins.pool.parquet.storage import Storage
+from webots_mcp.plugins.pool.parquet.value_columns import (
+    Named,
+    columns_of,
+    encoded_columns,
+    read_columns,
+)
 from webots_mcp.plugins.pool.row_batch import Batch, Row
-from webots_mcp.plugins.pool.shipped_tables import Table, tables
+from webots_mcp.plugins.pool.shipped_tables import Table, table, tables
 
 # A part is over when its file is so large, or its rows in memory are, or when what comes at a time
 # is so little beside it that it would be written again for almost nothing.
@@ -114,6 +121,7 @@ class ParquetShipment:
         self._own_runs: set[str] = set()
         self._altered = Counter[str]()  # in one `write`, by column
         self._spans: dict[str, tuple[int, int] | None] = {}
+        self._named: dict[int, Named] = {}
 
     def progress(self) -> dict[str, int]:
         """The numbers that `write` left."""
@@ -148,7 +156,9 @@ class ParquetShipment:
         for table, rows in _by_table(batches):
             if table.name == "run":
                 self._claim(table, rows)
-            if table.time_column:
+            if table.name == "chunk":
+                told = told.with_part(table.name, self._append_values(rows))
+            elif table.time_column:
                 told = told.with_part(table.name, self._append(table, rows))
             else:
                 self._replace(table, rows)
@@ -173,6 +183,35 @@ class ParquetShipment:
         if is_over:
             return Part(part.number + 1, {}, last_id)
         return Part(part.number, counts, last_id)
+
+    def _append_values(self, chunks: Iterable[Row]) -> Part:
+        """Add whole groups of chunks to the open part, as columns; what it is then."""
+        part = self._progress.part("chunk")
+        counts, is_over = dict(part.rows), False
+        for run_id, of_run in _by_run(chunks).items():
+            path = self._path(values_file(run_id, part.number))
+            content = self._storage.read(path) if str(run_id) in counts else None
+            held = None if content is None else read_columns(content, path)
+            whole = columns_of(of_run, self._signals(of_run), self._altered, held)
+            if whole is None:
+                continue
+            content = encoded_columns(whole)
+            self._place(path, content)
+            share = 1 - counts.get(str(run_id), 0) / max(1, whole.num_rows)
+            is_over |= _is_over(len(content), whole.nbytes, share)
+            counts[str(run_id)] = whole.num_rows
+        return Part(part.number + 1) if is_over else Part(part.number, counts)
+
+    def _signals(self, chunks: Iterable[Row]) -> Mapping[int, Named]:
+        """How the signals of chunks are called, which were shipped before them."""
+        at = table("chunk").columns.index("signal_id")
+        if any(int(str(row[at])) not in self._named for row in chunks if int(str(row[at])) > 0):
+            signals = table("signal")
+            for path in self._storage.find(files_of(signals, self._uuid)):
+                held = self._held(signals, path)
+                for row in [] if held is None else held.to_pylist():
+                    self._named[row["id"]] = Named(str(row["name"]), str(row["kind"]))
+        return self._named
 
     def _absent(self, table: Table, rows: dict[int, Row], part: Part) -> dict[int, Row]:
         """Without the rows that are there: those of a kept stretch come before the others."""
@@ -230,6 +269,9 @@ class ParquetShipment:
                 part = self._progress.part(table.name)
                 for path in self._storage.find(self._path(appended_file(table, "*", part.number))):
                     self._settle_file(table, path, part.counted(path) or 0)
+        part = self._progress.part("chunk")
+        for path in self._storage.find(self._path(values_file("*", part.number))):
+            self._settle_values(path, part.counted(path) or 0)
 
     def _settle_file(self, table: Table, path: str, count: int) -> None:
         if count == 0:
@@ -238,6 +280,14 @@ class ParquetShipment:
         held = self._held(table, path)
         if held is not None and held.num_rows > count:
             self._place(path, encoded(table, held.slice(0, count)))
+
+    def _settle_values(self, path: str, count: int) -> None:
+        content = self._storage.read(path) if count else None
+        if content is None:
+            return self._storage.remove(path)
+        held = read_columns(content, path)
+        if held.num_rows > count:
+            self._place(path, encoded_columns(held.slice(0, count)))
 
     def _claim(self, table: Table, rows: Iterable[Row]) -> None:
         """Say that the runs are this recording's, before any row of them is there."""
@@ -277,4 +327,12 @@ def _by_table(batches: Sequence[Batch]) -> Iterable[tuple[Table, list[Row]]]:
     found: dict[Table, list[Row]] = {}
     for batch in batches:
         found.setdefault(batch.table, []).extend(batch.rows)
-    return found.items()
+    # Chunks at last: their columns are called as the signals, which are there then.
+    return sorted(found.items(), key=lambda each: each[0].name == "chunk")
+
+
+def _by_run(chunks: Iterable[Row]) -> Mapping[int, list[Row]]:
+    at, found = table("chunk").columns.index("run_id"), dict[int, list[Row]]()
+    for row in chunks:
+        found.setdefault(int(str(row[at])), []).append(row)
+    return found

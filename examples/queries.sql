@@ -7,7 +7,7 @@
 -- in json_extract(data, '$...') are those that the controller publishes: here the demo's. The
 -- examples are the answers of one recording: `webots-mcp demo --keep`, ended after 86 s.
 
-CREATE TEMP VIEW IF NOT EXISTS chosen AS SELECT max(id) AS run_id FROM run WHERE rows >= 100;
+CREATE TEMP VIEW IF NOT EXISTS chosen AS SELECT max(id) AS run_id FROM run WHERE row_count >= 100;
 
 -- 1. What is each robot doing, and how old is that?
 -- Example:
@@ -126,22 +126,22 @@ WHERE e.event_id = (SELECT max(id) FROM event WHERE kind = 'change' AND name = '
 
 -- 13. How do the last two runs compare?
 -- Example:
---     run_id  label  start_reason  end_reason  duration_s  real_time_factor  rows  controller
+--     run_id  label  start_reason  end_reason  duration_s  real_time_factor  row_count  controller
 --     2              reset         finished    86.432      1.0               1106  2b061532
 --     1              start         reset       10.496      1.001             135   2b061532
-SELECT run_id, label, start_reason, end_reason, duration_s, real_time_factor, rows,
+SELECT run_id, label, start_reason, end_reason, duration_s, real_time_factor, row_count,
   substr(controller_sha256, 1, 8) AS controller
 FROM robot_run ORDER BY run_id DESC LIMIT 2;
 
 -- 14. How did the distances go, second by second? The last ten seconds.
 -- Example:
---     second  rows  least_left_m  least_right_m
+--     second  row_count  least_left_m  least_right_m
 --     76      7     0.411         1.0
 --     77      14    0.349         1.0
 --     78      12    1.0           1.0
 --     79      13    1.0           1.0
 --     80      12    1.0           1.0
-SELECT CAST(sim_time_s AS INTEGER) AS second, count(*) AS rows,
+SELECT CAST(sim_time_s AS INTEGER) AS second, count(*) AS row_count,
   round(min(json_extract(data, '$.distance_m.left')), 3) AS least_left_m,
   round(min(json_extract(data, '$.distance_m.right')), 3) AS least_right_m
 FROM state WHERE run_id = (SELECT run_id FROM chosen)
@@ -151,7 +151,7 @@ GROUP BY second;
 -- 15. Which values were not finite, how often, and from when to when?
 -- Example:
 --     (none)
-SELECT o.key AS path, o.value AS was, count(*) AS rows,
+SELECT o.key AS path, o.value AS was, count(*) AS row_count,
   min(s.sim_time_s) AS from_s, max(s.sim_time_s) AS to_s
-FROM state s JOIN json_each(s.odd) o WHERE s.run_id = (SELECT run_id FROM chosen)
+FROM state s JOIN json_each(s.replaced) o WHERE s.run_id = (SELECT run_id FROM chosen)
 GROUP BY path, was;

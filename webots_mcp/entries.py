@@ -45,7 +45,7 @@ STATEMENTS: Final[dict[Kind, str]] = {
         "AND NOT EXISTS (SELECT 1 FROM run WHERE uuid = :uuid)"
     ),
     "state": (
-        "INSERT INTO state (run_id, sim_time_s, wall_time_s, data, odd) VALUES (?, ?, ?, ?, ?)"
+        "INSERT INTO state (run_id, sim_time_s, wall_time_s, data, replaced) VALUES (?, ?, ?, ?, ?)"
     ),
     "event": (
         "INSERT INTO event (run_id, sim_time_s, wall_time_s, kind, name, data) "
@@ -57,13 +57,13 @@ STATEMENTS: Final[dict[Kind, str]] = {
     ),
     "image": (
         "INSERT INTO image (run_id, sim_time_s, wall_time_s, kind, device, path, width, height, "
-        "bytes) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
+        "size_bytes) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
     ),
     "image forgotten": "DELETE FROM image WHERE path = ?",
     # Without a number of rows they are counted: a dead process could not say how many.
     "run end": (
         "UPDATE run SET end_reason = :reason, ended_wall_time_s = :now, last_wall_time_s = :now, "
-        "last_sim_time_s = :sim_time, rows = coalesce(:rows, "
+        "last_sim_time_s = :sim_time, row_count = coalesce(:rows, "
         "purged_rows + (SELECT count(*) FROM state WHERE run_id = :run)) WHERE id = :run"
     ),
     "session end": (
@@ -101,7 +101,7 @@ STATEMENTS: Final[dict[Kind, str]] = {
     "command issued": queue.ISSUE,
     "command finished": queue.FINISH,
     "reload confirmed": queue.CONFIRM_RELOAD,
-    "breakpoint hit": "UPDATE breakpoint SET hits = hits + 1 WHERE id = ?",
+    "breakpoint hit": "UPDATE breakpoint SET hit_count = hit_count + 1 WHERE id = ?",
     "breakpoint failed": "UPDATE breakpoint SET enabled = 0, error = ? WHERE id = ?",
     # What a controller's code has set ends with its session.
     "breakpoints forgotten": (
@@ -114,7 +114,7 @@ STATEMENTS: Final[dict[Kind, str]] = {
         "DO UPDATE SET end_sim_time_s = excluded.end_sim_time_s, reason = excluded.reason"
     ),
     "kept state": (
-        "INSERT INTO kept_state (run_id, call, sim_time_s, wall_time_s, data, odd) "
+        "INSERT INTO kept_state (run_id, call, sim_time_s, wall_time_s, data, replaced) "
         "VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT (run_id, call) DO NOTHING"
     ),
 }

@@ -33,13 +33,13 @@ _ALIVE: Final = (
 )
 _BEAT_SESSION: Final = (
     "UPDATE session SET last_seen_wall_time_s = ?, last_seen_monotonic_s = ?, "
-    "last_poll_wall_time_s = ?, moved_wall_time_s = ?, sim_time_s = ?, hold = ?, "
+    "last_poll_wall_time_s = ?, moved_wall_time_s = ?, sim_time_s = ?, pause_state = ?, "
     "mode_before_pause = ?, rows_waiting = ?, rows_dropped = ?, last_error = ?, "
     f"ended_wall_time_s = {_ALIVE.format('session', 'id', 'ended_wall_time_s')}, "
     f"end_reason = {_ALIVE.format('session', 'id', 'end_reason')} WHERE id = ?"
 )
 _BEAT_RUN: Final = (
-    "UPDATE run SET last_wall_time_s = ?, last_sim_time_s = ?, rows = ?, "
+    "UPDATE run SET last_wall_time_s = ?, last_sim_time_s = ?, row_count = ?, "
     f"ended_wall_time_s = {_ALIVE.format('run', 'session_id', 'ended_wall_time_s')}, "
     f"end_reason = {_ALIVE.format('run', 'session_id', 'end_reason')} WHERE id = ?"
 )
@@ -62,7 +62,7 @@ _FOUND: Final = (
 )
 END_RUN: Final = (
     "UPDATE run SET ended_wall_time_s = :last_s, last_wall_time_s = :last_s, "
-    "last_sim_time_s = :last_sim_s, end_reason = :reason, rows = :rows "
+    "last_sim_time_s = :last_sim_s, end_reason = :reason, row_count = :rows "
     "WHERE id = :id AND ended_wall_time_s IS NULL"
 )
 EXTERN: Final = "Webots does not restart an extern controller: start it by hand"

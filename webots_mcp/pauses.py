@@ -4,14 +4,14 @@ Webots has one simulation mode `pause`. What is known of a pause depends on who 
 
 - A command (`pause`, the end of a `step`, that of a `run` whose `then` is "pause") or a breakpoint:
   the bridge stays in the loop and serves commands there. The event `pause` has the cause and the
-  moment, the heartbeat has `PAUSED` in `session.hold` with the mode to go back to. A session that
-  comes after a reload continues the pause of the one before. It ends with a command that lets the
-  simulation continue, with a person who presses play, or with the bridge: the event `resume` says
-  which.
+  moment, the heartbeat has `PAUSED` in `session.pause_state` with the mode to go back to. A session
+  that comes after a reload continues the pause of the one before. It ends with a command that lets
+  the simulation continue, with a person who presses play, or with the bridge: the event `resume`
+  says which.
 - A person in Webots, another controller, or the controller's own code: its bridge is not asked and
   may not get to run. Only an observer sees it (the event `mode`); press play, or ask the observer.
 
-While a `step` command lets the loop make its steps, `session.hold` has `STEPPING`.
+While a `step` command lets the loop make its steps, `session.pause_state` has `STEPPING`.
 
 Standard library only, because the bridge imports it inside a robot's controller.
 """
@@ -22,7 +22,7 @@ import math
 import sqlite3
 from typing import Final, NamedTuple
 
-PAUSED: Final = "paused"  # how a command controls the loop: the column session.hold
+PAUSED: Final = "paused"  # how a command controls the loop: the column session.pause_state
 STEPPING: Final = "stepping"
 PAUSE: Final = "pause"  # the kinds of the events
 RESUME: Final = "resume"

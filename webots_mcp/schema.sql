@@ -35,17 +35,17 @@ CREATE TABLE session (
 	last_poll_wall_time_s FLOAT /* newest get_command(); null if never called */, 
 	moved_wall_time_s FLOAT /* when simulation time was last seen to grow */, 
 	sim_time_s FLOAT /* simulation time at last_seen_wall_time_s */, 
-	hold TEXT /* paused or stepping while the bridge holds the loop */, 
+	pause_state TEXT /* paused or stepping while the bridge holds the loop */, 
 	rows_waiting INTEGER DEFAULT 0 NOT NULL /* rows that still waited in the file beside or in memory */, 
 	rows_dropped INTEGER DEFAULT 0 NOT NULL /* rows that could never be written */, 
 	last_error TEXT /* newest thing that could not be recorded, and why */, 
 	ended_wall_time_s FLOAT, 
-	end_reason TEXT /* finished, reload, crashed, replaced */, 
+	end_reason TEXT /* finished, reload, crashed, superseded */, 
 	uuid TEXT /* random (version 4); names the row among those of all machines */, 
 	process TEXT /* which process of that pid; null where the system does not tell */, 
 	last_seen_monotonic_s FLOAT /* the host's monotonic clock at last_seen_wall_time_s */, 
 	extern INTEGER /* 1 where nobody starts the controller again */, 
-	mode_before_pause TEXT /* simulation mode to go back to when the hold ends */, 
+	mode_before_pause TEXT /* simulation mode to go back to when the pause ends */, 
 	last_adopted_entry INTEGER DEFAULT 0 NOT NULL /* number of the last entry taken in from its file beside */, 
 	throttle_interval INTEGER /* of so many publish() calls one is recorded */, 
 	CONSTRAINT fk_session_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE
@@ -64,8 +64,8 @@ CREATE TABLE run (
 	last_wall_time_s FLOAT NOT NULL /* last sign of life */, 
 	last_sim_time_s FLOAT NOT NULL, 
 	ended_wall_time_s FLOAT, 
-	end_reason TEXT /* finished, reset, reload, crashed, replaced */, 
-	rows INTEGER DEFAULT 0 NOT NULL /* state rows, as of last_wall_time_s */, 
+	end_reason TEXT /* finished, reset, reload, crashed, superseded */, 
+	row_count INTEGER DEFAULT 0 NOT NULL /* state rows, as of last_wall_time_s */, 
 	label TEXT, 
 	note TEXT, 
 	keep INTEGER DEFAULT 0 NOT NULL /* 1: retention deletes nothing of this run */, 
@@ -86,7 +86,7 @@ CREATE TABLE state (
 	sim_time_s FLOAT NOT NULL, 
 	wall_time_s FLOAT NOT NULL, 
 	data TEXT NOT NULL /* JSON object */, 
-	odd TEXT /* JSON object: path of a replaced value to what it was (nan, inf, ...) */, 
+	replaced TEXT /* JSON object: path of a replaced value to what it was (nan, inf, ...) */, 
 	CONSTRAINT fk_state_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 );
 CREATE INDEX ix_state_run_id_sim_time_s ON state (run_id, sim_time_s);
@@ -97,11 +97,11 @@ CREATE TABLE signal (
 	kind TEXT NOT NULL /* num, bool, text, angle (radians), null (no value yet) */, 
 	unit TEXT /* where the name tells it */, 
 	path TEXT NOT NULL /* for json_extract(state.data, path) */, 
-	reduce TEXT /* count, min, max, mean or argmin of the long array at path */, 
+	reduction TEXT /* count, min, max, mean or argmin of the long array at path */, 
 	role TEXT /* x, y, z, yaw, mode, speed, commanded_speed, wheel or commanded_wheel; x2 without an x */, 
 	first_seen_wall_time_s FLOAT NOT NULL, 
 	last_seen_wall_time_s FLOAT NOT NULL, 
-	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held it, up to the watermark */, 
+	row_count INTEGER DEFAULT 0 NOT NULL /* state rows that held it, up to the watermark */, 
 	null_row_count INTEGER DEFAULT 0 NOT NULL /* of them without a value */, 
 	replaced_row_count INTEGER DEFAULT 0 NOT NULL /* of them with a value that JSON cannot hold (nan, inf, ...) */, 
 	min FLOAT, 
@@ -308,7 +308,7 @@ CREATE TABLE breakpoint (
 	action TEXT NOT NULL /* pause, log or keep */, 
 	after_hits INTEGER DEFAULT 1 NOT NULL /* the action is taken from this hit of a run on */, 
 	enabled INTEGER DEFAULT 1 NOT NULL /* 0 once the condition failed */, 
-	hits INTEGER DEFAULT 0 NOT NULL /* how often it began to hold, in all runs */, 
+	hit_count INTEGER DEFAULT 0 NOT NULL /* how often it began to hold, in all runs */, 
 	created_wall_time_s FLOAT NOT NULL, 
 	created_by TEXT /* mcp, cli or controller: its code, for session_id only */, 
 	error TEXT /* why the condition failed */, 
@@ -336,7 +336,7 @@ CREATE TABLE kept_state (
 	sim_time_s FLOAT NOT NULL, 
 	wall_time_s FLOAT NOT NULL, 
 	data TEXT NOT NULL /* JSON object */, 
-	odd TEXT /* as in state */, 
+	replaced TEXT /* as in state */, 
 	CONSTRAINT uq_kept_state_run_id UNIQUE (run_id, call), 
 	CONSTRAINT fk_kept_state_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 );
@@ -351,7 +351,7 @@ CREATE TABLE image (
 	path TEXT NOT NULL /* relative to the data folder */, 
 	width INTEGER NOT NULL /* pixels */, 
 	height INTEGER NOT NULL /* pixels */, 
-	bytes INTEGER NOT NULL /* size of the file */, 
+	size_bytes INTEGER NOT NULL /* of the file */, 
 	CONSTRAINT fk_image_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 );
 CREATE INDEX ix_image_run_id_sim_time_s ON image (run_id, sim_time_s);
@@ -434,9 +434,9 @@ CREATE TABLE lease (
 CREATE TABLE retention_limit (
 	kind TEXT NOT NULL /* state, chunk, log, event, image or run */, 
 	size_bytes BIGINT /* on the disk; of pictures their files */, 
-	rows BIGINT, 
+	row_count BIGINT, 
 	age_s FLOAT /* since it was recorded, in wall time */, 
-	times FLOAT /* run only: what is left of one stays so many times longer than its states; 0 for ever */, 
+	outlive_factor FLOAT /* run only: what is left of one stays so many times longer than its states; 0 for ever */, 
 	set_by TEXT NOT NULL /* serve, prune or retain */, 
 	set_wall_time_s FLOAT NOT NULL, 
 	PRIMARY KEY (kind)
@@ -448,8 +448,8 @@ SELECT r.name AS robot, u.id AS run_id, u.label, strftime('%Y-%m-%d %H:%M:%f', u
   round(u.last_wall_time_s - u.started_wall_time_s, 3) AS wall_duration_s,
   round((u.last_sim_time_s - u.started_sim_time_s)
     / nullif(u.last_wall_time_s - u.started_wall_time_s, 0), 3) AS real_time_factor,
-  u.rows, u.purged_rows,
-  round(u.rows / nullif(u.last_sim_time_s - u.started_sim_time_s, 0), 2) AS rows_per_s,
+  u.row_count, u.purged_rows,
+  round(u.row_count / nullif(u.last_sim_time_s - u.started_sim_time_s, 0), 2) AS rows_per_s,
   u.start_reason, u.end_reason, u.keep, u.note, u.world, s.controller, s.controller_sha256,
   s.git_commit, u.session_id
 FROM run u JOIN robot r ON r.id = u.robot_id JOIN session s ON s.id = u.session_id;
@@ -512,9 +512,9 @@ JOIN run u ON u.id = v.run_id JOIN robot r ON r.id = u.robot_id
 LEFT JOIN parameter p ON p.robot_id = u.robot_id AND p.name = v.name;
 CREATE VIEW all_state AS
 /* All states of a run, those that only kept stretches have included: they have no state_id. */
-SELECT id AS state_id, run_id, sim_time_s, wall_time_s, data, odd FROM state
+SELECT id AS state_id, run_id, sim_time_s, wall_time_s, data, replaced FROM state
 UNION ALL
-SELECT NULL, run_id, sim_time_s, wall_time_s, data, odd FROM kept_state;
+SELECT NULL, run_id, sim_time_s, wall_time_s, data, replaced FROM kept_state;
 CREATE VIEW robot_kept AS
 /* Stretches that are kept at full rate: from when to when, why, how many states each has. */
 SELECT r.name AS robot, k.run_id, k.id AS stretch_id, k.start_sim_time_s AS start_s,
@@ -554,10 +554,10 @@ SELECT robot, run_id, end_reason, sim_time_s, round((julianday('now') - 2440587.
   (SELECT json_extract(j, p.path) FROM signal p
     WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'commanded_speed' AND 'commanded_speed9'
       AND json_type(j, p.path) IN ('integer', 'real') ORDER BY p.role LIMIT 1) AS commanded_speed,
-  data, odd
+  data, replaced
 FROM (
   SELECT r.id AS robot_id, r.name AS robot, u.id AS run_id, u.end_reason, s.sim_time_s,
-    s.wall_time_s, s.data, s.odd, CASE WHEN json_valid(s.data) THEN s.data END AS j
+    s.wall_time_s, s.data, s.replaced, CASE WHEN json_valid(s.data) THEN s.data END AS j
   FROM robot r
   LEFT JOIN run u ON u.id = (SELECT max(id) FROM run WHERE robot_id = r.id)
   LEFT JOIN state s ON s.id = (
@@ -591,7 +591,7 @@ SELECT (SELECT r.name FROM robot r WHERE r.id = s.robot_id) AS robot,
       AND json_type(j, p.path) IN ('integer', 'real') ORDER BY p.role LIMIT 1) AS speed,
   (SELECT json_extract(j, p.path) FROM signal p
     WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'commanded_speed' AND 'commanded_speed9'
-      AND json_type(j, p.path) IN ('integer', 'real') ORDER BY p.role LIMIT 1) AS commanded_speed, s.odd
+      AND json_type(j, p.path) IN ('integer', 'real') ORDER BY p.role LIMIT 1) AS commanded_speed, s.replaced
 FROM (SELECT *, CASE WHEN json_valid(data) THEN data END AS j, (SELECT robot_id FROM run WHERE id = run_id) AS robot_id FROM state) s;
 CREATE VIEW robot_statistics AS
 /* What the numbers of a signal come to in each group of about 1,024 rows, also of purged rows. */

@@ -32,11 +32,11 @@ class Place(NamedTuple):
 
     Attributes:
         path: For `json_extract(state.data, path)`.
-        reduce: None, or how the long array at `path` becomes one number.
+        reduction: None, or how the long array at `path` becomes one number.
     """
 
     path: str
-    reduce: str | None
+    reduction: str | None
 
 
 def places(state: dict[str, Any]) -> dict[str, Place]:

@@ -23,7 +23,8 @@ _OF_ROBOT: Final = (
     "WHERE robot_id = ? AND typeof(name) = 'text' ORDER BY id"
 )
 _COLUMNS: Final = (
-    "robot_id, name, path, reduce, first_seen_wall_time_s, last_seen_wall_time_s, kind, unit, role"
+    "robot_id, name, path, reduction, first_seen_wall_time_s, last_seen_wall_time_s, "
+    "kind, unit, role"
 )
 _ADD: Final = f"INSERT OR IGNORE INTO signal ({_COLUMNS}) VALUES "
 _MARKS: Final = "(?, ?, ?, ?, ?, ?, ?, ?, ?)"
@@ -35,13 +36,13 @@ class Seen(NamedTuple):
 
     Attributes:
         path: For `json_extract(state.data, path)`.
-        reduce: None, or how the long array at `path` becomes one number.
+        reduction: None, or how the long array at `path` becomes one number.
         kind: Of these values.
         is_choice: They are whole numbers, and few different ones; as far as there are any.
     """
 
     path: str
-    reduce: str | None
+    reduction: str | None
     kind: Kind
     is_choice: bool
     first_wall_time_s: float

@@ -30,7 +30,7 @@ ARMED: Final = (
     f"AND (created_by IS NOT '{OF_CONTROLLER}' OR session_id = :session) ORDER BY id LIMIT :most"
 )
 _LISTED: Final = (
-    "SELECT b.id, b.robot_id, b.condition, b.action, b.after_hits, b.enabled, b.hits, "
+    "SELECT b.id, b.robot_id, b.condition, b.action, b.after_hits, b.enabled, b.hit_count, "
     f"b.created_wall_time_s, b.created_by, b.error {_OF_ROBOT} ORDER BY b.id"
 )
 _IDS: Final = f"SELECT b.id {_OF_ROBOT} ORDER BY b.id"
@@ -57,7 +57,7 @@ class StoredBreakpoint(NamedTuple):
 
     Attributes:
         enabled: False once its condition failed; `error` says why.
-        hits: How often the condition began to hold, in all runs.
+        hit_count: How often the condition began to hold, in all runs.
     """
 
     id: int
@@ -66,7 +66,7 @@ class StoredBreakpoint(NamedTuple):
     action: str
     after_hits: int
     enabled: bool
-    hits: int
+    hit_count: int
     created_wall_time_s: float
     created_by: str | None
     error: str | None

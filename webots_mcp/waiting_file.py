@@ -49,7 +49,7 @@ _RECOUNT: Final = (
     "SELECT purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id), id FROM run "
     "WHERE session_id = ? AND ended_wall_time_s IS NOT NULL"
 )
-_SET_ROWS: Final = "UPDATE run SET rows = ? WHERE id = ?"
+_SET_ROWS: Final = "UPDATE run SET row_count = ? WHERE id = ?"
 _KNOWN_ROBOT: Final = (
     "INSERT INTO robot (name, kind, devices, first_seen_wall_time_s, last_seen_wall_time_s) "
     "VALUES (:name, :kind, :devices, :now, :now) ON CONFLICT (name) DO UPDATE SET "

@@ -5,8 +5,8 @@ SELECT r.name AS robot, u.id AS run_id, u.label, strftime('%Y-%m-%d %H:%M:%f', u
   round(u.last_wall_time_s - u.started_wall_time_s, 3) AS wall_duration_s,
   round((u.last_sim_time_s - u.started_sim_time_s)
     / nullif(u.last_wall_time_s - u.started_wall_time_s, 0), 3) AS real_time_factor,
-  u.rows, u.purged_rows,
-  round(u.rows / nullif(u.last_sim_time_s - u.started_sim_time_s, 0), 2) AS rows_per_s,
+  u.row_count, u.purged_rows,
+  round(u.row_count / nullif(u.last_sim_time_s - u.started_sim_time_s, 0), 2) AS rows_per_s,
   u.start_reason, u.end_reason, u.keep, u.note, u.world, s.controller, s.controller_sha256,
   s.git_commit, u.session_id
 FROM run u JOIN robot r ON r.id = u.robot_id JOIN session s ON s.id = u.session_id;
@@ -69,9 +69,9 @@ JOIN run u ON u.id = v.run_id JOIN robot r ON r.id = u.robot_id
 LEFT JOIN parameter p ON p.robot_id = u.robot_id AND p.name = v.name;
 CREATE VIEW all_state AS
 /* All states of a run, those that only kept stretches have included: they have no state_id. */
-SELECT id AS state_id, run_id, sim_time_s, wall_time_s, data, odd FROM state
+SELECT id AS state_id, run_id, sim_time_s, wall_time_s, data, replaced FROM state
 UNION ALL
-SELECT NULL, run_id, sim_time_s, wall_time_s, data, odd FROM kept_state;
+SELECT NULL, run_id, sim_time_s, wall_time_s, data, replaced FROM kept_state;
 CREATE VIEW robot_kept AS
 /* Stretches that are kept at full rate: from when to when, why, how many states each has. */
 SELECT r.name AS robot, k.run_id, k.id AS stretch_id, k.start_sim_time_s AS start_s,
@@ -111,10 +111,10 @@ SELECT robot, run_id, end_reason, sim_time_s, round((julianday('now') - 2440587.
   (SELECT json_extract(j, p.path) FROM signal p
     WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'commanded_speed' AND 'commanded_speed9'
       AND json_type(j, p.path) IN ('integer', 'real') ORDER BY p.role LIMIT 1) AS commanded_speed,
-  data, odd
+  data, replaced
 FROM (
   SELECT r.id AS robot_id, r.name AS robot, u.id AS run_id, u.end_reason, s.sim_time_s,
-    s.wall_time_s, s.data, s.odd, CASE WHEN json_valid(s.data) THEN s.data END AS j
+    s.wall_time_s, s.data, s.replaced, CASE WHEN json_valid(s.data) THEN s.data END AS j
   FROM robot r
   LEFT JOIN run u ON u.id = (SELECT max(id) FROM run WHERE robot_id = r.id)
   LEFT JOIN state s ON s.id = (
@@ -148,7 +148,7 @@ SELECT (SELECT r.name FROM robot r WHERE r.id = s.robot_id) AS robot,
       AND json_type(j, p.path) IN ('integer', 'real') ORDER BY p.role LIMIT 1) AS speed,
   (SELECT json_extract(j, p.path) FROM signal p
     WHERE p.robot_id = s.robot_id AND p.role BETWEEN 'commanded_speed' AND 'commanded_speed9'
-      AND json_type(j, p.path) IN ('integer', 'real') ORDER BY p.role LIMIT 1) AS commanded_speed, s.odd
+      AND json_type(j, p.path) IN ('integer', 'real') ORDER BY p.role LIMIT 1) AS commanded_speed, s.replaced
 FROM (SELECT *, CASE WHEN json_valid(data) THEN data END AS j, (SELECT robot_id FROM run WHERE id = run_id) AS robot_id FROM state) s;
 CREATE VIEW robot_statistics AS
 /* What the numbers of a signal come to in each group of about 1,024 rows, also of purged rows. */

@@ -22,7 +22,7 @@ _REPEAT: Final = (
     "FROM state WHERE id <= :rows ORDER BY id"
 )
 _END_RUN: Final = (
-    "UPDATE run SET rows = :rows, last_sim_time_s = :sim_s, last_wall_time_s = :wall_s, "
+    "UPDATE run SET row_count = :rows, last_sim_time_s = :sim_s, last_wall_time_s = :wall_s, "
     "ended_wall_time_s = :wall_s"
 )
 _LOG: Final = (

@@ -190,7 +190,7 @@ def _count(file: Path, returned: list[int]) -> tuple[int, int, int]:
         texts = connection.execute("SELECT data FROM state").fetchall()
         miscounted = connection.execute(
             "SELECT count(*) FROM run WHERE ended_wall_time_s IS NOT NULL AND "
-            "rows <> (SELECT count(*) FROM state WHERE run_id = run.id)"
+            "row_count <> (SELECT count(*) FROM state WHERE run_id = run.id)"
         ).fetchone()[0]
     numbers = Counter(json.loads(text)["n"] for (text,) in texts)
     missing = sum(n not in numbers for n in returned)

@@ -251,7 +251,7 @@ def test_a_screenshot_is_done_when_its_file_is_complete(
     file = bridge.data_dir / result["path"]
     with Image.open(file) as picture:
         assert picture.size == (result["width"], result["height"])
-    sql = "SELECT kind, path, bytes FROM image"
+    sql = "SELECT kind, path, size_bytes FROM image"
     assert recording.rows(sql) == [("screenshot", result["path"], file.stat().st_size)]
 
 

@@ -95,9 +95,11 @@ def test_what_is_cut_is_counted_and_said_once(bridge: MCPBridge, recording: Reco
             {"l": circle(), "t": "x" * 200_000, "gaps": dict.fromkeys(range(900), math.nan)}
         )
     assert bridge.stats().values_replaced == 2 * 902
-    (odd, _) = [json.loads(odd) for odd in recording.rows("SELECT odd FROM state")]
-    assert odd["t"] == "text[200000]"
-    assert set(odd.values()) == {"too deep", "text[200000]", "nan"}
+    (replaced, _) = [
+        json.loads(replaced) for replaced in recording.rows("SELECT replaced FROM state")
+    ]
+    assert replaced["t"] == "text[200000]"
+    assert set(replaced.values()) == {"too deep", "text[200000]", "nan"}
     logged = recording.rows("SELECT message FROM log WHERE source = 'bridge'")
     assert len(logged) == 2
     assert "t was cut: text[200000]" in logged
@@ -108,9 +110,11 @@ def test_more_than_a_thousand_odd_values_are_counted(
     bridge: MCPBridge, recording: Recording
 ) -> None:
     bridge.publish({"gaps": dict.fromkeys(range(2000), math.nan)})
-    (odd,) = [json.loads(odd) for odd in recording.rows("SELECT odd FROM state")]
-    assert len(odd) == 1001
-    assert odd[""] == "1000 more"
+    (replaced,) = [
+        json.loads(replaced) for replaced in recording.rows("SELECT replaced FROM state")
+    ]
+    assert len(replaced) == 1001
+    assert replaced[""] == "1000 more"
     assert bridge.stats().values_replaced == 2000
     logged = recording.rows("SELECT message FROM log WHERE source = 'bridge'")
     assert logged == ["state could not be stored: 1000 more"]
@@ -118,16 +122,16 @@ def test_more_than_a_thousand_odd_values_are_counted(
 
 @pytest.mark.usefixtures("encoder")
 def test_of_a_state_with_too_many_keys_the_first_are_kept() -> None:
-    text, odd, _ = encoding.encode({f"key{i}": i for i in range(MANY)})
+    text, replaced, _ = encoding.encode({f"key{i}": i for i in range(MANY)})
     assert list(json.loads(text)) == [f"key{i}" for i in range(1000)]
-    assert odd == {"": f"dict[{MANY}]"}
+    assert replaced == {"": f"dict[{MANY}]"}
 
 
 @pytest.mark.usefixtures("encoder")
 def test_of_a_text_and_of_a_key_the_beginning_is_kept() -> None:
-    text, odd, _ = encoding.encode({"t": "ab" * 100_000, "k" * 300: 1})
+    text, replaced, _ = encoding.encode({"t": "ab" * 100_000, "k" * 300: 1})
     assert json.loads(text) == {"t": "ab" * 50_000, "k" * 200: 1}
-    assert odd == {"t": "text[200000]", "k" * 200: "key[300]"}
+    assert replaced == {"t": "text[200000]", "k" * 200: "key[300]"}
 
 
 @pytest.mark.usefixtures("encoder")
@@ -137,9 +141,9 @@ def test_a_row_as_large_as_the_table_says_is_stored_whole() -> None:
         "links": {f"link{i}": {"x": 0.5, "ok": True, "n": None} for i in range(450)},
         "note": "ä" * 50_000,
     }
-    text, odd, _ = encoding.encode(state)
+    text, replaced, _ = encoding.encode(state)
     assert json.loads(text) == state
-    assert odd == {}
+    assert replaced == {}
 
 
 @pytest.mark.usefixtures("encoder")
@@ -149,8 +153,8 @@ def test_twenty_levels_are_kept_with_and_without_odd_values(depth: int) -> None:
     for _ in range(depth - 1):
         value = [value]
     for gap in ({}, {"gap": math.nan}):
-        odd = encoding.encode({"a": value, **gap}).replaced
-        assert ("too deep" in odd.values()) == (depth > 20)
+        replaced = encoding.encode({"a": value, **gap}).replaced
+        assert ("too deep" in replaced.values()) == (depth > 20)
 
 
 def test_a_state_of_plain_values_is_looked_at_once_and_never_copied(
@@ -170,10 +174,10 @@ class LidarPoint:
 
 @pytest.mark.usefixtures("encoder")
 def test_the_points_of_a_lidar_are_recorded_as_numbers() -> None:
-    text, odd, _ = encoding.encode({"cloud": [LidarPoint(), LidarPoint()]})
+    text, replaced, _ = encoding.encode({"cloud": [LidarPoint(), LidarPoint()]})
     point = {"x": 0.5, "y": 1.5, "z": 2.5, "layer": 1, "time": 0.032}
     assert json.loads(text) == {"cloud": [point, point]}
-    assert odd == {}
+    assert replaced == {}
 
 
 LEAVES: st.SearchStrategy[Any] = (

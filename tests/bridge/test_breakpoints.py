@@ -76,11 +76,11 @@ def test_a_hit_tells_the_very_step_and_its_values_also_of_a_call_that_is_not_rec
     assert time_s == pytest.approx(start_s + 13 * STEP_MS / 1000)
     assert name == "n > 12 and mode == 'drive'"
     assert data == {
-        "breakpoint_id": number, "action": "log", "hits": 1,
+        "breakpoint_id": number, "action": "log", "hit_count": 1,
         "values": {"n": 13, "mode": "drive"},
     }  # fmt: skip
     assert [state["n"] for state in recording.states()] == [10, 13]
-    assert recording.rows("SELECT id, hits, created_by FROM breakpoint") == [
+    assert recording.rows("SELECT id, hit_count, created_by FROM breakpoint") == [
         (number, 1, "controller")
     ]
 
@@ -142,8 +142,8 @@ def test_it_is_hit_each_time_that_it_begins_to_hold(
 
     drive(robot, bridge, [{"near": near} for near in (True, True, False, True, False, True)])
 
-    assert [data["hits"] for _, _, data in hits(recording)] == [2, 3]
-    assert recording.rows("SELECT hits FROM breakpoint") == [3]
+    assert [data["hit_count"] for _, _, data in hits(recording)] == [2, 3]
+    assert recording.rows("SELECT hit_count FROM breakpoint") == [3]
 
 
 def test_a_stored_one_is_armed_by_command_and_goes_on_where_it_is_armed_already(
@@ -175,9 +175,9 @@ def test_after_a_reset_it_is_armed_again_and_one_stored_meanwhile_too(
 
     drive(robot, bridge, counted(range(4)))
 
-    told = [(name, data["hits"]) for _, name, data in hits(recording)]
+    told = [(name, data["hit_count"]) for _, name, data in hits(recording)]
     assert told == [("n == 1", 1), ("n == 1", 1), ("n == 2", 1)]
-    assert recording.rows("SELECT hits FROM breakpoint WHERE id = ?", stored) == [1]
+    assert recording.rows("SELECT hit_count FROM breakpoint WHERE id = ?", stored) == [1]
 
 
 def test_the_next_controller_arms_what_is_stored_and_not_what_the_code_of_the_last_one_set(

@@ -24,7 +24,7 @@ INTERVAL_S = 0.2
 Make = Callable[..., MCPBridge]
 
 FRAMES = (
-    "SELECT sim_time_s, device, path, width, height, bytes FROM image WHERE kind = 'kept' "
+    "SELECT sim_time_s, device, path, width, height, size_bytes FROM image WHERE kind = 'kept' "
     "ORDER BY sim_time_s"
 )
 STRETCHES = "SELECT start_sim_time_s, end_sim_time_s FROM kept_stretch ORDER BY id"

@@ -63,8 +63,8 @@ def test_what_ctypes_holds_is_recorded_as_numbers(bridge: MCPBridge, recording: 
             }
         ],
     }
-    (odd,) = recording.rows("SELECT odd FROM state")
-    assert json.loads(odd) == {
+    (replaced,) = recording.rows("SELECT replaced FROM state")
+    assert json.loads(replaced) == {
         "name": "bytes",
         "seen.0.colors": "null pointer",
         "seen.0._model": "pointer of unknown length",
@@ -88,9 +88,9 @@ NOWHERE = 8  # an address that ends the process when it is followed
     ids=lambda pointer: type(pointer).__name__,
 )
 def test_a_pointer_is_named_and_never_followed(pointer: Any) -> None:
-    text, odd, _ = encoding.encode({"touch": pointer, "pose": POSE})
+    text, replaced, _ = encoding.encode({"touch": pointer, "pose": POSE})
     assert json.loads(text) == {"touch": None, "pose": POSE}
-    assert odd == {"touch": "pointer of unknown length"}
+    assert replaced == {"touch": "pointer of unknown length"}
 
 
 def test_an_array_of_c_strings_is_not_read_through() -> None:

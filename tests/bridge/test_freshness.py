@@ -84,7 +84,7 @@ def test_a_loop_that_was_quit_while_held_may_say_its_last_words(
     bridge.close()
     assert numbers(recording) == [1, 2]
     assert recording.rows("SELECT message FROM log WHERE source = 'controller'") == ["last words"]
-    assert recording.rows("SELECT end_reason, rows FROM run") == [("finished", 2)]
+    assert recording.rows("SELECT end_reason, row_count FROM run") == [("finished", 2)]
 
 
 def test_what_is_published_after_the_bridge_ended_with_the_process_is_said(tmp_path: Path) -> None:

@@ -124,7 +124,7 @@ def test_what_controllers_have_is_stored_as_plain_json(
             "null": "none",
         }
     ]
-    assert recording.rows("SELECT odd FROM state") == [None]
+    assert recording.rows("SELECT replaced FROM state") == [None]
 
 
 @pytest.mark.usefixtures("encoder")
@@ -135,8 +135,8 @@ def test_nan_and_infinity_come_back_recognisable_and_do_not_break_sqlite(
     bridge.publish({"gap": math.nan, "far": -math.inf, "scan": scan, "mixed": [math.nan, None]})
     sql = "SELECT data ->> '$.scan[0]', data ->> '$.gap', json_valid(data) FROM state"
     assert recording.rows(sql) == [(0.5, None, 1)]
-    (odd,) = recording.rows("SELECT odd FROM state")
-    assert json.loads(odd) == {"gap": "nan", "far": "-inf", "scan.*": "inf", "mixed.0": "nan"}
+    (replaced,) = recording.rows("SELECT replaced FROM state")
+    assert json.loads(replaced) == {"gap": "nan", "far": "-inf", "scan.*": "inf", "mixed.0": "nan"}
 
 
 @pytest.mark.usefixtures("encoder")
@@ -150,16 +150,16 @@ def test_a_value_that_cannot_be_stored_costs_that_value_and_is_logged_once(
     assert bridge.stats().values_replaced == 6
     logged = recording.rows("SELECT message FROM log WHERE source = 'bridge'")
     assert logged == ["handle could not be stored: type object"]
-    (odd, *_) = recording.rows("SELECT odd FROM state")
-    assert json.loads(odd) == {"handle": "type object", "raw": "bytes"}
+    (replaced, *_) = recording.rows("SELECT replaced FROM state")
+    assert json.loads(replaced) == {"handle": "type object", "raw": "bytes"}
 
 
 @pytest.mark.usefixtures("encoder")
 def test_a_huge_array_costs_itself_and_not_the_row(bridge: MCPBridge, recording: Recording) -> None:
     bridge.publish({"x": 1, "image": np.zeros((640, 480, 3)), "list": [0.25] * 400_000})
     assert recording.states() == [{"x": 1, "image": None, "list": None}]
-    (odd,) = recording.rows("SELECT odd FROM state")
-    assert json.loads(odd) == {"image": "array[921600]", "list": "array[400000]"}
+    (replaced,) = recording.rows("SELECT replaced FROM state")
+    assert json.loads(replaced) == {"image": "array[921600]", "list": "array[400000]"}
 
 
 @pytest.mark.usefixtures("encoder")
@@ -168,15 +168,15 @@ def test_a_picture_as_nested_lists_costs_itself_and_not_the_row(
 ) -> None:
     bridge.publish({"x": 1, "depth": [[0.123456] * 640 for _ in range(480)]})
     assert recording.states() == [{"x": 1, "depth": None}]
-    assert recording.rows("SELECT odd FROM state") == ['{"depth":"array[307200]"}']
+    assert recording.rows("SELECT replaced FROM state") == ['{"depth":"array[307200]"}']
 
 
 def test_a_state_that_contains_itself_is_cut(bridge: MCPBridge, recording: Recording) -> None:
     state: dict[str, Any] = {"x": 1}
     state["self"] = state
     bridge.publish(state)
-    (odd,) = recording.rows("SELECT odd FROM state")
-    assert set(json.loads(odd).values()) == {"too deep"}
+    (replaced,) = recording.rows("SELECT replaced FROM state")
+    assert set(json.loads(replaced).values()) == {"too deep"}
 
 
 def test_the_callers_dict_is_never_changed(bridge: MCPBridge) -> None:
@@ -241,15 +241,15 @@ def test_a_key_without_text_costs_itself(bridge: MCPBridge, recording: Recording
 
     bridge.publish({"x": 1, "by key": {Key(): 2, 3: 4}})
     assert recording.states() == [{"x": 1, "by key": {"<Key>": 2, "3": 4}}]
-    assert recording.rows("SELECT odd FROM state") == ['{"by key.<Key>":"key"}']
+    assert recording.rows("SELECT replaced FROM state") == ['{"by key.<Key>":"key"}']
 
 
 def test_a_state_that_cannot_be_read_at_all_is_a_row_that_says_why(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(encoding, "orjson", None)
-    text, odd, _ = encoding.encode(Unreadable(x=1))
-    assert (text, odd) == ("{}", {"": "type Unreadable: no items"})
+    text, replaced, _ = encoding.encode(Unreadable(x=1))
+    assert (text, replaced) == ("{}", {"": "type Unreadable: no items"})
 
 
 @pytest.mark.usefixtures("encoder")
@@ -293,7 +293,7 @@ def test_both_encoders_store_the_same(bridge: MCPBridge, recording: Recording) -
             "range": [0, 1, 2],
         }
     ]
-    assert recording.rows("SELECT odd FROM state") == [None]
+    assert recording.rows("SELECT replaced FROM state") == [None]
 
 
 @pytest.mark.usefixtures("encoder")
@@ -311,8 +311,8 @@ def test_a_scan_with_several_kinds_of_gaps_names_each(
 ) -> None:
     bridge.publish({"scan": [0.5, math.inf, math.nan]})
     assert recording.states() == [{"scan": [0.5, None, None]}]
-    (odd,) = recording.rows("SELECT odd FROM state")
-    assert json.loads(odd) == {"scan.1": "inf", "scan.2": "nan"}
+    (replaced,) = recording.rows("SELECT replaced FROM state")
+    assert json.loads(replaced) == {"scan.1": "inf", "scan.2": "nan"}
 
 
 def test_a_dataclass_may_be_the_whole_state(bridge: MCPBridge, recording: Recording) -> None:

@@ -24,7 +24,7 @@ def test_a_reset_by_the_controller_begins_a_new_run_and_ends_the_old_one(
     robot.simulationReset()
     drive(3)
     bridge.close()
-    sql = "SELECT start_reason, end_reason, rows, last_sim_time_s FROM run ORDER BY id"
+    sql = "SELECT start_reason, end_reason, row_count, last_sim_time_s FROM run ORDER BY id"
     assert recording.rows(sql) == [
         ("start", "reset", 10, pytest.approx(0.16)),
         ("reset", "finished", 3, pytest.approx(0.048)),
@@ -169,7 +169,7 @@ def test_a_second_bridge_on_the_same_robot_takes_over(
     with MCPBridge(robot, database=database) as second:
         assert second.robot_name == first.robot_name
     sql = "SELECT end_reason FROM session ORDER BY id"
-    assert recording.rows(sql) == ["replaced", "finished"]
+    assert recording.rows(sql) == ["superseded", "finished"]
 
 
 def test_a_session_says_which_code_ran_where(bridge: MCPBridge, recording: Recording) -> None:

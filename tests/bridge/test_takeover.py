@@ -49,14 +49,14 @@ def test_a_successor_is_held_in_its_first_step_until_a_resume(
     leave_held(simulation, database)
     assert simulation.mode is Mode.PAUSE
     with succeed(simulation, database) as bridge:
-        assert recording.rows("SELECT hold, mode_before_pause FROM session WHERE id = 2") == [
-            ("paused", "fast")
-        ]
+        assert recording.rows(
+            "SELECT pause_state, mode_before_pause FROM session WHERE id = 2"
+        ) == [("paused", "fast")]
         resume = recording.send("resume")
         assert bridge.robot.step(STEP_MS) == 0
         assert recording.fate(resume)[0] == "done"
         assert bridge.robot.step(STEP_MS) == 0
-    assert recording.rows("SELECT hold FROM session WHERE id = 2") == [None]
+    assert recording.rows("SELECT pause_state FROM session WHERE id = 2") == [None]
 
 
 def test_a_successor_makes_the_steps_that_a_command_asks_for_and_is_held_again(
@@ -81,7 +81,7 @@ def test_where_a_person_pressed_play_meanwhile_there_is_nothing_to_take_over(
     simulation.resume()
     with succeed(simulation, database) as bridge:
         assert bridge.robot.step(STEP_MS) == 0
-        assert recording.rows("SELECT hold FROM session WHERE id = 2") == [None]
+        assert recording.rows("SELECT pause_state FROM session WHERE id = 2") == [None]
 
 
 def test_the_hold_of_a_controller_that_was_killed_is_taken_over_as_well(
@@ -118,7 +118,7 @@ def test_the_hold_of_another_simulator_is_not_taken_over(
     leave_held(simulation, database)
     monkeypatch.setenv("WEBOTS_CONTROLLER_URL", "ipc://1235/rover")
     with succeed(simulation, database):
-        assert recording.rows("SELECT hold FROM session WHERE id = 2") == [None]
+        assert recording.rows("SELECT pause_state FROM session WHERE id = 2") == [None]
 
 
 def test_a_bridge_that_is_closed_while_it_holds_lets_time_go_on(

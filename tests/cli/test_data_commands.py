@@ -308,7 +308,7 @@ def test_a_dry_run_tells_what_would_go_and_deletes_nothing(say: Say, database: P
 def test_prune_deletes_what_the_dry_run_told(say: Say, database: Path) -> None:
     text = say("prune", "--keep-states", "400rows", "--keep-images", "all")
     assert text.splitlines()[1].split()[:2] == ["state", "457"]
-    assert query(database, "SELECT run_id, rows, purged_rows FROM robot_run") == [
+    assert query(database, "SELECT run_id, row_count, purged_rows FROM robot_run") == [
         (1, 530, 457),
         (2, 327, 0),
     ]

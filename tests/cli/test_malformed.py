@@ -17,7 +17,7 @@ DAMAGES = (
     Damage("event", "data", "[1]"),
     Damage("session", "actions", "nonsense"),
     Damage("log", "wall_time_s", b"\x00"),
-    Damage("state", "odd", "[1]"),
+    Damage("state", "replaced", "[1]"),
     Damage("run", "rows", "many"),
 )
 ASKED = (
@@ -48,7 +48,9 @@ def test_an_export_is_whole_but_for_the_row_that_cannot_be_read(
             connection.execute(f"SELECT count(*) FROM {each} WHERE run_id = 2").fetchone()[0]
             for each in ("state", "kept_state")
         )
-        connection.execute("UPDATE state SET odd = '[1]' WHERE id = (SELECT max(id) FROM state)")
+        connection.execute(
+            "UPDATE state SET replaced = '[1]' WHERE id = (SELECT max(id) FROM state)"
+        )
         connection.execute(
             "UPDATE state SET data = CAST(x'7b22ff' AS TEXT) "
             "WHERE id = (SELECT max(id) - 5 FROM state)"

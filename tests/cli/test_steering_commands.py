@@ -163,10 +163,10 @@ def test_breakpoints_are_set_listed_hit_and_removed(
     assert "this robot has none: 'webots-mcp breakpoint' sets one" in capsys.readouterr().out
     assert main(["breakpoint", *where, "steps > 3", "--action", "log", "--after-hits", "1"]) == 0
     assert "breakpoint_id 1, condition steps > 3, action log, armed true" in capsys.readouterr().out
-    wait_for(lambda: recording.rows("SELECT hits FROM breakpoint") == [1])
+    wait_for(lambda: recording.rows("SELECT hit_count FROM breakpoint") == [1])
     assert main(["breakpoint", *where, "--json"]) == 0
     listed = listed_in(json.loads(capsys.readouterr().out)["breakpoints"])
-    assert (listed["condition"], listed["hits"], listed["set_by"]) == ("steps > 3", 1, "cli")
+    assert (listed["condition"], listed["hit_count"], listed["set_by"]) == ("steps > 3", 1, "cli")
     assert main(["breakpoint", *where]) == 0
     assert "steps > 3" in capsys.readouterr().out
     assert main(["breakpoint", *where, "--remove", "1"]) == 0
@@ -221,7 +221,7 @@ def test_ctrl_c_leaves_the_simulation_as_then_says(
     wait_for(lambda: recording.rows(wanted, "done") == [1])
     (result,) = recording.rows("SELECT result FROM command WHERE action = 'run'")
     assert json.loads(result)["why"] == "it was cancelled"
-    assert recording.rows("SELECT hold FROM session") == ["paused"]
+    assert recording.rows("SELECT pause_state FROM session") == ["paused"]
 
 
 def test_ctrl_c_ends_steps_and_leaves_the_simulation_paused(file: Path, driver: Driver) -> None:
@@ -236,7 +236,7 @@ def test_ctrl_c_ends_steps_and_leaves_the_simulation_paused(file: Path, driver: 
     wait_for(lambda: recording.rows(wanted, "done") == [1])
     (result,) = recording.rows("SELECT result FROM command WHERE action = 'step'")
     assert json.loads(result)["why"] == "it was cancelled before the last step"
-    assert recording.rows("SELECT hold FROM session") == ["paused"]
+    assert recording.rows("SELECT pause_state FROM session") == ["paused"]
 
 
 def test_send_needs_an_action_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:

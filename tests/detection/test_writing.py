@@ -21,7 +21,7 @@ RUN = LabelledRun(
 def test_rows_hold_what_was_drawn_and_name_what_was_no_number() -> None:
     with memory_connection() as connection:
         (run_id,) = write_all(connection, [RUN])
-        rows = connection.execute("SELECT run_id, sim_time_s, data, odd FROM state").fetchall()
+        rows = connection.execute("SELECT run_id, sim_time_s, data, replaced FROM state").fetchall()
     assert [row[:2] for row in rows] == [(run_id, time_s) for time_s in TIMES.tolist()]
     assert json.loads(rows[0][2]) == {"front": 1.0, "pose": [0, 1, 2]} and rows[0][3] is None
     assert json.loads(rows[1][2])["front"] is None and json.loads(rows[1][3]) == {"front": "nan"}
@@ -36,7 +36,8 @@ def test_runs_of_a_session_follow_each_other_and_an_edit_begins_another() -> Non
                 writer.begin_session(code)
             writer.write(RUN)
         runs = connection.execute(
-            "SELECT start_reason, rows, session_id, ended_wall_time_s - started_wall_time_s > 0, "
+            "SELECT start_reason, row_count, session_id, "
+            "ended_wall_time_s - started_wall_time_s > 0, "
             "started_wall_time_s >= coalesce(lag(ended_wall_time_s) OVER (ORDER BY id), 0) FROM run"
         ).fetchall()
     assert runs == [("start", 50, 1, 1, 1), ("reset", 50, 1, 1, 1), ("start", 50, 2, 1, 1)]

@@ -16,7 +16,7 @@ from webots_mcp.store.retention.purge import prune
 from webots_mcp.store.rollup.rolling import roll
 
 _INSERT: Final = (
-    "INSERT INTO state (run_id, sim_time_s, wall_time_s, data, odd) VALUES (?, ?, ?, ?, ?)"
+    "INSERT INTO state (run_id, sim_time_s, wall_time_s, data, replaced) VALUES (?, ?, ?, ?, ?)"
 )
 _PAUSE_S: Final = 1.0  # of wall time, between two runs
 
@@ -79,11 +79,11 @@ def _rows(run: LabelledRun, run_id: int, wall_start_s: float) -> Iterator[tuple[
     names = list(run.columns)
     for time_s, *values in zip(run.times.tolist(), *run.columns.values(), strict=True):
         state = dict(zip(names, values, strict=True))
-        odd = {name: "nan" for name, value in state.items() if _is_nan(value)}
-        state.update(dict.fromkeys(odd))
+        replaced = {name: "nan" for name, value in state.items() if _is_nan(value)}
+        state.update(dict.fromkeys(replaced))
         text = json.dumps(state, allow_nan=False, separators=(",", ":"))
         wall_s = wall_start_s + time_s * WALL_PER_SIM
-        yield run_id, time_s, wall_s, text, json.dumps(odd) if odd else None
+        yield run_id, time_s, wall_s, text, json.dumps(replaced) if replaced else None
 
 
 def _is_nan(value: object) -> bool:

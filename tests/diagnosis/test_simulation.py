@@ -83,7 +83,7 @@ def test_a_robot_whose_time_moves_is_well(look: Look, recorded: Recorded) -> Non
 
 
 def test_a_pause_by_command_names_what_ends_it(look: Look, recorded: Recorded) -> None:
-    recorded.robot(hold="paused")
+    recorded.robot(pause_state="paused")
     found = look("Simulation")
     assert (found.verdict, found.fix) == ("warning", "webots-mcp resume --robot rover")
 

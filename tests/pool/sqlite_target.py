@@ -184,7 +184,7 @@ class SQLitePool:
         query = (
             "SELECT r.recording_uuid, r.id, r.uuid, b.name, r.label, r.world, "
             "r.started_wall_time_s, r.last_wall_time_s, r.started_sim_time_s, r.last_sim_time_s, "
-            "r.end_reason, r.rows FROM run r JOIN robot b ON b.id = r.robot_id "
+            "r.end_reason, r.row_count FROM run r JOIN robot b ON b.id = r.robot_id "
             "AND b.recording_uuid = r.recording_uuid WHERE ?1 IS NULL OR r.recording_uuid = ?1 "
             "ORDER BY r.started_wall_time_s"
         )

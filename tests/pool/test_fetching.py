@@ -45,7 +45,7 @@ LOCAL = {"id", "run_id", "session_id", "robot_id", "command_id", "trial_set_id",
 
 STATES = ("state", "kept_state")
 IN_EACH_POOL = pytest.mark.parametrize("lab", ["parquet", "postgres"], indirect=True)
-KEPT = "SELECT sim_time_s, data, odd FROM {} WHERE run_id = ? ORDER BY sim_time_s"
+KEPT = "SELECT sim_time_s, data, replaced FROM {} WHERE run_id = ? ORDER BY sim_time_s"
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +146,7 @@ def test_each_value_of_a_state_comes_back(lab: Lab, runs: Recorded) -> None:
     for number, state in enumerate(ODD_STATES):
         publish(runs, float(number), state)
     runs.connection.execute(
-        "UPDATE run SET uuid = ?, rows = ? WHERE id = ?", (new_uuid(), len(ODD_STATES), run_id)
+        "UPDATE run SET uuid = ?, row_count = ? WHERE id = ?", (new_uuid(), len(ODD_STATES), run_id)
     )
     while not make_chunks(runs.connection).done:
         pass
@@ -176,7 +176,7 @@ def test_of_a_run_of_chunks_the_answers_are_those_after_all_its_rows_were_purged
         prune(there, rounds.parent, Retention(state=Limit(rows=0), outlive=0), rest=False)
         run = found.runs[uuid]
         info = run_info(here, run)
-        assert info.purged_rows == info.rows == run_info(there, 1).purged_rows
+        assert info.purged_rows == info.row_count == run_info(there, 1).purged_rows
         assert answers(here, run, PART) == answers(there, 1, PART)
 
 
@@ -300,7 +300,9 @@ def test_what_goes_on_or_is_not_wholly_shipped_is_fetched_when_it_is(
 ) -> None:
     database = runs.folder / DATABASE_NAME
     late = runs.add_run(5, end=None)
-    runs.connection.execute("UPDATE run SET uuid = ?, rows = 5 WHERE id = ?", (new_uuid(), late))
+    runs.connection.execute(
+        "UPDATE run SET uuid = ?, row_count = 5 WHERE id = ?", (new_uuid(), late)
+    )
     lab.ship(database, full=True)
     uuid = uuid_of(database, late)
     before = lab.everything()
@@ -337,7 +339,7 @@ def test_far_more_states_than_a_run_had_are_not_taken(
 ) -> None:
     lab.ship(runs.folder / DATABASE_NAME, full=True)
     with closing(sqlite3.connect(tmp_path / "pool")) as pool, pool:
-        pool.execute("UPDATE run SET rows = 1")
+        pool.execute("UPDATE run SET row_count = 1")
     before = lab.everything()
     monkeypatch.setattr(fetching, "_UNCOUNTED_ROWS", 0)
     with pytest.raises(PoolError, match="states of runs that had"):
@@ -393,7 +395,7 @@ def test_a_fetch_that_is_killed_leaves_whole_runs_and_is_gone_on_with(
         fetching.wait()
         some = count(here, "run")
         assert here.execute(
-            "SELECT count(*) FROM run WHERE rows <> (SELECT count(*) FROM state "
+            "SELECT count(*) FROM run WHERE row_count <> (SELECT count(*) FROM state "
             "WHERE run_id = run.id) OR NOT EXISTS (SELECT 1 FROM image WHERE run_id = run.id)"
         ).fetchone() == (0,)
 

@@ -74,7 +74,9 @@ def test_a_world_that_a_person_begins_anew_during_a_hold_can_be_resumed(
     if press == "reload":
         simulation.step()  # which starts the controllers of a world that was loaded in pause
     simulation.wait_for(lambda: filed.rows("SELECT count(*) FROM session") == [2], timeout_s=30)
-    simulation.wait_for(lambda: filed.rows("SELECT hold FROM session") == ["paused", "paused"])
+    simulation.wait_for(
+        lambda: filed.rows("SELECT pause_state FROM session") == ["paused", "paused"]
+    )
     assert wait(simulation, filed, filed.send("resume"))["mode"] == "real_time"
     simulation.wait_for(lambda: simulation.time_s > 0.3)
     assert sum("left the loop" in line for line in simulation.console) == 1
@@ -89,7 +91,9 @@ bridge.breakpoint("time > 2 for 0.1")
         mode="fast",
     )
     simulation.wait_for(lambda: has_states(filed), timeout_s=30)
-    simulation.wait_for(lambda: filed.rows("SELECT hold FROM session") == ["paused"], timeout_s=30)
+    simulation.wait_for(
+        lambda: filed.rows("SELECT pause_state FROM session") == ["paused"], timeout_s=30
+    )
     (hit_s,) = filed.rows("SELECT sim_time_s FROM event WHERE kind = 'breakpoint'")
     # 2.016 is the first step beyond 2 s; 7 steps later it has lasted for 0.1 s.
     assert hit_s == pytest.approx(2.128)

@@ -153,7 +153,7 @@ while robot.step(16) != -1:
         "its controller ended before it finished; it may have run in part",
     )
     assert filed.rows("SELECT end_reason FROM session") == ["crashed"]
-    sql = "SELECT end_reason, rows = (SELECT count(*) FROM state) FROM run"
+    sql = "SELECT end_reason, row_count = (SELECT count(*) FROM state) FROM run"
     assert filed.rows(sql) == [("crashed", 1)]
 
 

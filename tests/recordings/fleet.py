@@ -128,7 +128,7 @@ def _end(robot: RecordedRobot, seconds: float, rows: int) -> None:
     robot.now = STARTED_WALL_S + seconds
     robot.end_run("finished")
     robot.connection.execute(
-        "UPDATE run SET last_sim_time_s = ?, last_wall_time_s = ?, rows = ? WHERE id = ?",
+        "UPDATE run SET last_sim_time_s = ?, last_wall_time_s = ?, row_count = ? WHERE id = ?",
         (seconds, robot.now, rows, robot.run_id),
     )
     robot.beat(ended_wall_time_s=robot.now, end_reason="finished", sim_time_s=seconds)

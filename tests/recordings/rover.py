@@ -82,15 +82,20 @@ class Recorder:
         self.wall_s = self.run_start_s + time_s * WALL_PER_SIM
         return {"run_id": self.run_id, "sim_time_s": time_s, "wall_time_s": self.wall_s}
 
-    def publish(self, time_s: float, state: dict[str, Any], odd: dict[str, str] | None = None):
+    def publish(self, time_s: float, state: dict[str, Any], replaced: dict[str, str] | None = None):
         text = json.dumps(state, allow_nan=False, ensure_ascii=False)
-        self.insert("state", **self.at(time_s), data=text, odd=json.dumps(odd) if odd else None)
+        self.insert(
+            "state",
+            **self.at(time_s),
+            data=text,
+            replaced=json.dumps(replaced) if replaced else None,
+        )
 
     def end_run(self, reason: str) -> None:
         self.connection.execute(
             "UPDATE run SET end_reason = ?, ended_wall_time_s = ?, last_wall_time_s = ?, "
             "last_sim_time_s = (SELECT max(sim_time_s) FROM state WHERE run_id = run.id), "
-            "rows = (SELECT count(*) FROM state WHERE run_id = run.id) WHERE id = ?",
+            "row_count = (SELECT count(*) FROM state WHERE run_id = run.id) WHERE id = ?",
             (reason, self.wall_s, self.wall_s, self.run_id),
         )
 
@@ -131,9 +136,9 @@ def _record_cruise(recorder: Recorder, duration_s: float, speed_m_s: float) -> N
     recorder.insert("event", **recorder.at(0.0), kind="start")
     for step in range(round(duration_s / INTERVAL_S)):
         time_s = round(step * INTERVAL_S, 6)
-        state, odd = rover_state(0.0)
+        state, replaced = rover_state(0.0)
         state |= {"pose": [speed_m_s * time_s, 0.0], "commanded_m_s": speed_m_s}
-        recorder.publish(time_s, state | {"battery_v": 12.6 - 0.001 * time_s}, odd)
+        recorder.publish(time_s, state | {"battery_v": 12.6 - 0.001 * time_s}, replaced)
 
 
 def _record_incidents(recorder: Recorder, robot_id: int, session_id: int) -> None:
@@ -148,7 +153,7 @@ def _record_incidents(recorder: Recorder, robot_id: int, session_id: int) -> Non
     recorder.insert("event", **recorder.at(61.0), kind="dropped", data='{"rows": 3}')
     recorder.insert(
         "image", **recorder.at(30.0), kind="camera", device="cam", path="camera/1.png",
-        width=160, height=120, bytes=999,
+        width=160, height=120, size_bytes=999,
     )  # fmt: skip
     wall_s = recorder.at(20.0)["wall_time_s"]
     recorder.insert(
@@ -160,7 +165,7 @@ def _record_incidents(recorder: Recorder, robot_id: int, session_id: int) -> Non
 
 
 def rover_state(time_s: float) -> tuple[dict[str, Any], dict[str, str] | None]:
-    """What the rover of run 1 publishes at that time, and what was odd in it."""
+    """What the rover of run 1 publishes at that time, and what was replaced in it."""
     mode = rover_mode(time_s)
     blind = NAN_S[0] <= time_s < NAN_S[1]
     front = None if blind else 1.0 + 0.01 * math.sin(time_s * 7)

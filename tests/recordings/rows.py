@@ -90,7 +90,7 @@ class RecordedRobot:
         )
 
     def state(
-        self, sim_time_s: float, data: object, odd: object = None, at: float | None = None
+        self, sim_time_s: float, data: object, replaced: object = None, at: float | None = None
     ) -> int:
         wall_time_s = self.now if at is None else at
         values = {
@@ -98,10 +98,10 @@ class RecordedRobot:
             "sim_time_s": sim_time_s,
             "wall_time_s": wall_time_s,
             "data": json.dumps(data),
-            "odd": json.dumps(odd) if odd else None,
+            "replaced": json.dumps(replaced) if replaced else None,
         }
         self.connection.execute(
-            "UPDATE run SET last_sim_time_s = ?, last_wall_time_s = ?, rows = rows + 1 "
+            "UPDATE run SET last_sim_time_s = ?, last_wall_time_s = ?, row_count = row_count + 1 "
             "WHERE id = ?",
             (sim_time_s, wall_time_s, self.run_id),
         )
@@ -137,7 +137,7 @@ class RecordedRobot:
             "path": path,
             "width": 160,
             "height": 120,
-            "bytes": 1000,
+            "size_bytes": 1000,
         }
         return insert(self.connection, "image", values | changes)
 

@@ -45,7 +45,7 @@ class Recorded(Recorder):
         if end:
             self.connection.execute(
                 "UPDATE run SET end_reason = ?, ended_wall_time_s = ?, last_wall_time_s = ?, "
-                "last_sim_time_s = ?, rows = ? WHERE id = ?",
+                "last_sim_time_s = ?, row_count = ? WHERE id = ?",
                 (end, self.wall_s, self.wall_s, rows * ROW_S, rows, run_id),
             )
             self.connection.execute(
@@ -68,7 +68,7 @@ class Recorded(Recorder):
         file.write_bytes(b"picture")
         self.insert(
             "image", **self.at(1.0), kind="camera", device="c", path=path, width=1, height=1,
-            bytes=1000,
+            size_bytes=1000,
         )  # fmt: skip
 
     def rows(self) -> dict[int, int]:

@@ -31,7 +31,7 @@ ROWS: Final = 60
 LATE_S: Final = (12.0, 505.0, 512.0)  # rows that end a bucket of 10 s, and one of 500 s
 JSON_COLUMNS: Final = {
     ("robot", "devices"), ("session", "versions"), ("session", "actions"), ("state", "data"),
-    ("state", "odd"), ("kept_state", "data"), ("kept_state", "odd"), ("event", "data"),
+    ("state", "replaced"), ("kept_state", "data"), ("kept_state", "replaced"), ("event", "data"),
     ("command", "params"), ("command", "result"),
     ("trial_set", "plan"), ("trial_set", "former_values"), ("trial", "parameters"),
     ("parameter", "default_value"), ("parameter", "choices"), ("parameter", "next_value"),
@@ -157,9 +157,9 @@ def _fill(robot: RecordedRobot, folder: Path) -> None:
         robot.now = began + step * 0.1 - ROWS * 0.1
         mode = "cruise" if step // 20 % 2 else "turn"
         pose = [step * 0.1, 0.0, 0.1]
-        odd = {"lidar.0": "inf"} if step == ROWS - 1 else None
+        replaced = {"lidar.0": "inf"} if step == ROWS - 1 else None
         data = {"pose": pose, "mode": mode, "battery_v": 12 - step * 0.01, "front": 1.0}
-        robot.state(step * 0.1, data | {"lidar": [None, 1.0] if odd else [1.0, 1.0]}, odd)
+        robot.state(step * 0.1, data | {"lidar": [None, 1.0] if replaced else [1.0, 1.0]}, replaced)
         if step % 20 == 0:
             robot.log(step * 0.1, "hello", "warning")
             robot.event(step * 0.1, "change", "mode", {"from": "turn", "to": mode})
@@ -172,7 +172,7 @@ def _fill(robot: RecordedRobot, folder: Path) -> None:
     robot.kept_state(1.05, {"pose": [0.1, 0.0, 0.1], "mode": "turn", "front": 0.9})
     now = time.time()
     insert(robot.connection, "breakpoint", {
-        "robot_id": robot.id, "condition": "front < 0.5", "action": "log", "hits": 1,
+        "robot_id": robot.id, "condition": "front < 0.5", "action": "log", "hit_count": 1,
         "created_wall_time_s": now, "created_by": "mcp",
     })  # fmt: skip
     for status in ("done", "claimed", "pending"):

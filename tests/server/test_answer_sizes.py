@@ -111,7 +111,7 @@ def _add_runs(connection: Any) -> None:
     for run_id in range(2, 60):
         connection.execute(
             f"INSERT INTO run ({columns}, started_wall_time_s, started_sim_time_s, "
-            f"last_wall_time_s, last_sim_time_s, rows) SELECT {columns}, "
+            f"last_wall_time_s, last_sim_time_s, row_count) SELECT {columns}, "
             "started_wall_time_s + ?, 0, started_wall_time_s + ?, 900, 9 FROM run WHERE id = 1",
             (1000 * run_id, 1000 * run_id + 900),
         )

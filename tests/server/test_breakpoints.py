@@ -41,7 +41,7 @@ async def test_a_breakpoint_pauses_at_the_step_and_is_listed_and_removed(
         listed = await ask(client, "webots_list_breakpoints")
         row = dict(zip(listed["breakpoints"]["columns"], listed["breakpoints"]["rows"][0]))  # noqa: B905
         assert row["id"] == answer["breakpoint_id"]
-        assert (row["hits"], row["newest_hit_s"]) == (1, state["sim_time_s"])
+        assert (row["hit_count"], row["newest_hit_s"]) == (1, state["sim_time_s"])
 
         events = await ask(client, "webots_find_events", kinds=["noticed"])
         assert f"steps == {at}" in json.dumps(events["events"])

@@ -182,7 +182,7 @@ async def test_a_robot_whose_simulation_another_one_holds_refuses_at_once(
     connect: Connect, recorded: Recorded
 ) -> None:
     recorded.robot("rover", supervisor=0)
-    recorded.robot("referee", hold="paused")
+    recorded.robot("referee", pause_state="paused")
     async with connect() as client:
         text = await fail(client, "webots_send_command", action="go", robot="rover")
     assert (

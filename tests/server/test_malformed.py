@@ -76,7 +76,7 @@ async def test_trials_of_a_robot_that_cannot_be_read_are_told(base: Path, tmp_pa
     [
         (Damage("state", "data", "nonsense"), "state 2: data holds no valid JSON"),
         (Damage("state", "sim_time_s", "late"), "state 2: sim_time_s holds no valid number"),
-        (Damage("state", "odd", "[]"), "state 2: odd holds no valid JSON"),
+        (Damage("state", "replaced", "[]"), "state 2: replaced holds no valid JSON"),
     ],
 )
 async def test_a_row_that_is_left_out_is_named_and_the_others_are_told(
@@ -89,7 +89,7 @@ async def test_a_row_that_is_left_out_is_named_and_the_others_are_told(
     async with connect(read_only=True) as client:
         answer = await ask(client, "webots_get_full_state")
         assert answer["left_out"] == [said]
-        assert answer["state"] == {"x": 2 if damage.column == "odd" else 1}
+        assert answer["state"] == {"x": 2 if damage.column == "replaced" else 1}
         recorded.connection.execute("DELETE FROM state WHERE id = 2")
         assert "left_out" not in await ask(client, "webots_get_full_state")
 

@@ -49,8 +49,8 @@ async def test_of_many_replaced_values_the_number_of_those_not_shown_is_said(
     connect: Connect, recorded: Recorded
 ) -> None:
     names = [f"at_{number}" for number in range(50)]
-    odd = {f"front.{name}": "nan" for name in names}
-    recorded.robot().state(1.0, {"front": dict.fromkeys(names)}, odd=odd)
+    replaced = {f"front.{name}": "nan" for name in names}
+    recorded.robot().state(1.0, {"front": dict.fromkeys(names)}, replaced=replaced)
     async with connect() as client:
         for tool in ("webots_get_full_state", "webots_get_sensors"):
             replaced = (await ask(client, tool))["replaced"]
@@ -218,7 +218,7 @@ async def test_the_world_is_described_with_its_companions(
     assert answer["world"].endswith("arena.wbt")
     assert answer["basic_time_step_ms"] == 16.0
     assert answer["real_time_factor"] == 2.0
-    assert answer["run"]["rows"] == 5
+    assert answer["run"]["row_count"] == 5
     assert answer["other_robots"]["rows"] == [["referee", "Supervisor", ""]]
     assert answer["controller"]["file"].endswith("rover.py")
 

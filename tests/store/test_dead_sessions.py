@@ -73,7 +73,7 @@ def test_rows_that_are_adopted_after_a_crash_are_counted(recorded: Recorded) -> 
     recorded.connection.execute("UPDATE run SET uuid = 'r'")
     leave_waiting(recorded.database, [1, "state", "r", [2.0, time.time(), "{}", None]])
     assert adopt(recorded.connection, recorded.database) == 1
-    assert recorded.connection.execute("SELECT rows FROM run").fetchone() == (2,)
+    assert recorded.connection.execute("SELECT row_count FROM run").fetchone() == (2,)
 
 
 @pytest.mark.skipif(process_identity(os.getpid()) is None, reason="needs the system's word")
@@ -87,12 +87,15 @@ def test_rows_of_a_crashed_run_are_counted_by_no_statement_that_writes(recorded:
     robot = recorded.robot(pid=NOBODY)
     robot.state(1.0, {"x": 1})
     robot.state(2.0, {"x": 1})
-    recorded.connection.execute("UPDATE run SET rows = 0, purged_rows = 3")
+    recorded.connection.execute("UPDATE run SET row_count = 0, purged_rows = 3")
     writes: list[str] = []
     recorded.connection.set_trace_callback(writes.append)
     reap(recorded.connection, time.time())
     recorded.connection.set_trace_callback(None)
-    assert recorded.connection.execute("SELECT rows, last_sim_time_s FROM run").fetchone() == (5, 2)
+    assert recorded.connection.execute("SELECT row_count, last_sim_time_s FROM run").fetchone() == (
+        5,
+        2,
+    )
     assert not [sql for sql in writes if sql.startswith("UPDATE") and "FROM state" in sql]
 
 

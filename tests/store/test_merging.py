@@ -243,7 +243,7 @@ def test_camera_frames_come_with_their_kept_stretch(
     merge(target, tmp_path / "here", source)
 
     kept = target.execute(
-        "SELECT i.path, i.bytes FROM image i JOIN kept_stretch k ON k.run_id = i.run_id "
+        "SELECT i.path, i.size_bytes FROM image i JOIN kept_stretch k ON k.run_id = i.run_id "
         "AND i.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s WHERE i.kind = 'kept'"
     ).fetchall()
     assert len(kept) >= 7

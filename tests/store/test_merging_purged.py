@@ -28,7 +28,7 @@ from webots_mcp.store.retention.purge import prune
 from webots_mcp.store.rollup.rolling import roll
 
 SIGNALS = (
-    "SELECT name, kind, unit, path, reduce, rows, null_row_count, min, max FROM signal "
+    "SELECT name, kind, unit, path, reduction, row_count, null_row_count, min, max FROM signal "
     "WHERE robot_id = (SELECT id FROM robot WHERE name = 'rover') "
     "AND name NOT GLOB 'pose*' AND name <> 'mode'"
 )
@@ -128,7 +128,7 @@ def test_rows_that_were_not_rolled_up_there_are_rolled_up_here(
         late.run_id, late.run_start_s = 1, late.wall_s
         late.publish(ROWS * 0.2, *rover_state(0.0))
         late.end_run("finished")
-        there.execute("UPDATE run SET rows = purged_rows + rows WHERE id = 1")
+        there.execute("UPDATE run SET row_count = purged_rows + row_count WHERE id = 1")
     run = merge(target, tmp_path / "here", source, run_id=1).popitem()[1]
 
     assert roll(target, 100_000).done

@@ -79,12 +79,12 @@ def test_one_long_pause_among_the_last_rows_does_not_make_the_robot_look_slow(
 
 
 def test_a_held_loop_is_paused(recorded: Recorded) -> None:
-    robot = recorded.robot(now=NOW, hold="paused", moved_wall_time_s=NOW - 100)
+    robot = recorded.robot(now=NOW, pause_state="paused", moved_wall_time_s=NOW - 100)
     assert status_of(robot, after_s=0.5) == ("paused", None)
 
 
 def test_a_loop_that_steps_under_command_is_running(recorded: Recorded) -> None:
-    assert status_of(recorded.robot(now=NOW, hold="stepping")).text == "running"
+    assert status_of(recorded.robot(now=NOW, pause_state="stepping")).text == "running"
 
 
 def test_a_pause_counts_from_its_instant_not_from_the_next_heartbeat(recorded: Recorded) -> None:
@@ -95,7 +95,7 @@ def test_a_pause_counts_from_its_instant_not_from_the_next_heartbeat(recorded: R
 
 
 def test_a_resume_counts_from_its_instant_not_from_the_next_heartbeat(recorded: Recorded) -> None:
-    robot = recorded.robot(now=NOW - 0.2, hold="paused", moved_wall_time_s=NOW - 100)
+    robot = recorded.robot(now=NOW - 0.2, pause_state="paused", moved_wall_time_s=NOW - 100)
     robot.now = NOW
     robot.event(1.0, "pause", None, {"command_id": 1})
     robot.event(1.0, "resume", None, {"command_id": 2})
@@ -103,7 +103,7 @@ def test_a_resume_counts_from_its_instant_not_from_the_next_heartbeat(recorded: 
 
 
 def test_a_hold_whose_heartbeat_stopped_is_no_pause_any_more(recorded: Recorded) -> None:
-    robot = recorded.robot(now=NOW, hold="paused", moved_wall_time_s=NOW - 5)
+    robot = recorded.robot(now=NOW, pause_state="paused", moved_wall_time_s=NOW - 5)
     status = status_of(robot, after_s=30)
     assert status.text == "stopped 35 s ago"
     assert "loop is silent" in (status.why or "")
@@ -111,14 +111,14 @@ def test_a_hold_whose_heartbeat_stopped_is_no_pause_any_more(recorded: Recorded)
 
 def test_a_robot_is_paused_while_another_holds_the_same_simulation(recorded: Recorded) -> None:
     robot = recorded.robot("rover", now=NOW, last_seen_wall_time_s=NOW - 60)
-    recorded.robot("referee", now=NOW, hold="paused")
+    recorded.robot("referee", now=NOW, pause_state="paused")
     assert status_of(robot).text == "paused"
     assert "'referee'" in (status_of(robot).why or "")
 
 
 def test_a_hold_in_another_simulation_says_nothing_about_this_one(recorded: Recorded) -> None:
     robot = recorded.robot("rover", now=NOW)
-    recorded.robot("referee", now=NOW, hold="paused", instance="webots-2")
+    recorded.robot("referee", now=NOW, pause_state="paused", instance="webots-2")
     assert status_of(robot).text == "running"
 
 

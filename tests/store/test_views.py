@@ -298,7 +298,8 @@ def test_the_first_period_begins_with_the_first_row_not_with_the_controller(
 
 def test_runs_tell_durations_speed_and_rows(reader: sqlite3.Connection) -> None:
     sql = (
-        "SELECT robot, duration_s, round(wall_duration_s * real_time_factor), rows, purged_rows, "
+        "SELECT robot, duration_s, round(wall_duration_s * real_time_factor), row_count, "
+        "purged_rows, "
         "start_reason, end_reason FROM robot_run ORDER BY run_id"
     )
     first, second = rows(reader, sql)

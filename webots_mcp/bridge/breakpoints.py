@@ -34,7 +34,7 @@ class Breakpoint:
     Attributes:
         id: None where the database could not take it yet.
         of_code: The controller's own code has set it.
-        hits: How often its condition began to hold in this run.
+        hit_count: How often its condition began to hold in this run.
         holding: Its condition held in the previous state.
         asked_since_s: The simulation time of the first state that it was evaluated on in this run.
         unseen: Its signals that no state has contained yet.
@@ -56,7 +56,7 @@ class Breakpoint:
         self.evaluator = evaluator
         self.action = action
         self.after_hits = after_hits
-        self.hits = 0
+        self.hit_count = 0
         self.holding = False
         self.asked_since_s: float | None = None
         self.unseen = frozenset(condition.signals)
@@ -69,7 +69,7 @@ class Breakpoint:
     def begin_run(self) -> None:
         """Arm it again for a new run."""
         self.evaluator.forget()
-        self.hits, self.holding, self.asked_since_s = 0, False, None
+        self.hit_count, self.holding, self.asked_since_s = 0, False, None
 
     def begins(self, state: Any, sim_time_s: float) -> bool:
         """Evaluate the condition on a state; True if it begins to hold with it.
@@ -242,10 +242,10 @@ class Breakpoints:
         return hit
 
     def _count(self, each: Breakpoint, hit: list[Breakpoint]) -> None:
-        each.hits += 1
+        each.hit_count += 1
         if each.id is not None:
             self._recorder.record("breakpoint hit", None, (each.id,))
-        if each.hits >= each.after_hits:
+        if each.hit_count >= each.after_hits:
             hit.append(each)
 
     def act(self, hit: list[Breakpoint], state: Any) -> None:
@@ -253,7 +253,7 @@ class Breakpoints:
         for each in hit:
             if each.action in _KEEPING:
                 self._keeper.keep(f"breakpoint {each.id or ''}: {each.condition.text}")
-            if each.hits - each.after_hits < MOST_EVENTS:
+            if each.hit_count - each.after_hits < MOST_EVENTS:
                 self._record_hit(each, state)
         pausing = [each for each in hit if each.action == "pause"]
         if pausing and self._simulation.supervisor:
@@ -264,7 +264,7 @@ class Breakpoints:
         data: dict[str, object] = {
             "breakpoint_id": each.id,
             "action": each.action,
-            "hits": each.hits,
+            "hit_count": each.hit_count,
             "values": each.evaluator.values(state),
         }
         if each.action == "pause" and not self._simulation.supervisor:

@@ -2,9 +2,9 @@
 
 JSON has no NaN, no infinity and no bytes, and SQLite before 3.42 fails on every row whose text
 contains a NaN. A row that grows without bounds stops the control loop. So what JSON cannot hold is
-replaced, what is too large is cut, and the column `odd` names the path and the original value:
+replaced, what is too large is cut, and the column `replaced` names the path and the original value:
 
-    published value                    stored          odd
+    published value                    stored          replaced
     NaN, infinity, -infinity           null            "nan", "inf", "-inf"
     several, all of one kind, in       null each       "lidar.*": "inf" (every null in it)
     one array of numbers
@@ -32,14 +32,15 @@ replaced, what is too large is cut, and the column `odd` names the path and the 
 
 A row has room for 20,000: an item of an array of numbers takes 1, any other value (a number, a
 text, an array, a dict, ...) takes 5. All texts of a row take at most 300,000 bytes of JSON, all
-keys 150,000. Where there is no room for everything, the levels near the top come first. `odd`
+keys 150,000. Where there is no room for everything, the levels near the top come first. `replaced`
 names up to 1,000 places; the empty path has the number of further ones: "4000 more". A robot rarely
 publishes a tenth of that. A state that contains itself is cut like any other nested too deeply.
 
 Numpy scalars and arrays, ctypes numbers, arrays and structures, Webots' lidar points and radar
 targets, dataclasses, enums, tuples, sets, ranges, deques, dates, paths, UUIDs, decimals and keys
-that are not text are stored as their plain JSON counterparts and are not named in `odd`. Neither
-are integers beyond 64 bits: they become the nearest float, as SQLite would read them anyway.
+that are not text are stored as their plain JSON counterparts and are not named in `replaced`.
+Neither are integers beyond 64 bits: they become the nearest float, as SQLite would read them
+anyway.
 """
 
 from __future__ import annotations
@@ -103,7 +104,7 @@ class Encoded(NamedTuple):
 
     @property
     def replaced_text(self) -> str | None:
-        """The value of the column `odd`: null where nothing was replaced."""
+        """The value of the column `replaced`: null where nothing was replaced."""
         return _encode_plain(self.replaced) if self.replaced else None
 
 

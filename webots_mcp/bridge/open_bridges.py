@@ -47,7 +47,7 @@ def close_former(robot: object) -> None:
     """Close the robot's previous bridge, if it has one."""
     former = _bridges.get(id(robot))
     if former is not None:
-        former.close("replaced")
+        former.close("superseded")
 
 
 def _leave_to_parent() -> None:

@@ -61,7 +61,7 @@ class Album:
         kept.append(path)
         while len(kept) > max(1, max_frames):
             self._forget(kept.popleft())
-        return {"path": path, "width": width, "height": height, "bytes": size}
+        return {"path": path, "width": width, "height": height, "size_bytes": size}
 
     def add_kept(self, run: Run, stretch_uuid: str, frame: Frame) -> None:
         """Write a small frame of a kept stretch, which exists as long as the stretch.
@@ -88,7 +88,7 @@ class Album:
         clock = self._clock
         row = (clock.sim_time_s, time.time(), "screenshot", None, path, width, height, size)
         self._recorder.record("image", clock.run, row)
-        return {"path": path, "width": width, "height": height, "bytes": size}
+        return {"path": path, "width": width, "height": height, "size_bytes": size}
 
     def _name_of(self, device: str) -> str:
         """The beginning of a camera's file names."""

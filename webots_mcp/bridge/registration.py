@@ -40,7 +40,8 @@ _RELOADED_RUN: Final = (
 )
 _PAUSED_MODE: Final = (
     "SELECT coalesce(mode_before_pause, 'real_time') FROM session "
-    "WHERE id = (SELECT max(id) FROM session WHERE robot_id = ?) AND instance = ? AND hold = ?"
+    "WHERE id = (SELECT max(id) FROM session WHERE robot_id = ?) AND instance = ? "
+    "AND pause_state = ?"
 )
 _LONGEST_RELOAD_S: Final = 10.0  # from the end of the old controller to the start of the new one
 
@@ -66,7 +67,7 @@ def register(
 
     Everything that depends on each other is in one transaction, which takes the write lock first:
     sessions of dead processes are ended, an unfinished session of the same robot is ended as
-    `replaced`, and where a live process already has the name, `#2` (and so on) is appended.
+    `superseded`, and where a live process already has the name, `#2` (and so on) is appended.
     """
     now_s = time.time()
     # Before the transaction too: most of the work is then done without blocking other writers.
@@ -99,7 +100,7 @@ def _free_name(connection: sqlite3.Connection, identity: Identity, now_s: float)
         living = [row for row in sessions if _is_living(row, identity, now_s)]
         if not living:
             for row in sessions:
-                liveness.end_session(connection, row[0], "replaced")
+                liveness.end_session(connection, row[0], "superseded")
             return name
         number += 1
 

@@ -18,7 +18,7 @@ class RingRow(NamedTuple):
     Attributes:
         call: Its number in the session.
         data: The text that would have been recorded, or a copy of the state to encode later.
-        replaced: The value of the column `odd`, where `data` is a text.
+        replaced: The value of the column `replaced`, where `data` is a text.
     """
 
     call: int

@@ -44,4 +44,4 @@ class RowCounts:
     def report(self) -> str:
         """The data of the event that reports the unreported drops; none are left afterwards."""
         rows, self.unreported = self.unreported, 0
-        return json.dumps({"rows": rows, "why": self._why})
+        return json.dumps({"row_count": rows, "why": self._why})

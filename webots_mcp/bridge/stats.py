@@ -14,7 +14,7 @@ class BridgeStats(NamedTuple):
         rows_dropped: Rows that will never be in it.
         publish_calls: Calls of `publish` and `auto_publish` in the session.
         publish_throttled: Calls that the throttle did not record.
-        values_replaced: Values that JSON cannot hold; the column `odd` of their row names them.
+        values_replaced: Values that JSON cannot hold; `replaced` of their row names them.
         publish_mean_us: The mean duration of a recorded call, in microseconds.
         publish_max_us: The longest duration of a recorded call, in microseconds.
         ring_interval: One call of `auto_publish` in this many is held in the ring buffer.

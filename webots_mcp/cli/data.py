@@ -149,7 +149,7 @@ def _export_table(
             write(connection, wanted, form, binary_stdout(), progress, safe_cells=safe_cells)
             return _Written(None, "", {}, tuple(wanted.notes))
         rows = export_file(connection, wanted, form, file, progress, safe_cells=safe_cells)
-    return _Written(file, f"{rows} rows", {"rows": rows}, tuple(wanted.notes))
+    return _Written(file, f"{rows} rows", {"row_count": rows}, tuple(wanted.notes))
 
 
 def _export_for_viewers(recorded: Where, part: Range, file: Path, form: str) -> _Written:
@@ -383,7 +383,7 @@ def _as_data(wanted: Plan) -> dict[str, Any]:
     return {
         "goes": [
             {
-                "table": table, "rows": rows, "size_bytes": wanted.size_of(table),
+                "table": table, "row_count": rows, "size_bytes": wanted.size_of(table),
                 "run_ids": wanted.runs_of(table),
             }
             for table, rows in wanted.rows_by_table().items()

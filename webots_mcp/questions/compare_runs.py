@@ -65,7 +65,7 @@ from webots_mcp.store.trials import scored_runs
 
 RUN_COLUMNS: Final = (
     "run_id", "robot", "label", "parameters", "started", "began_by", "ended_by", "duration_s",
-    "real_time_factor", "rows", "purged_rows", "notable", "controller", "sha256", "git_commit",
+    "real_time_factor", "row_count", "purged_rows", "notable", "controller", "sha256", "git_commit",
     "world", "note",
 )  # fmt: skip
 GROUP_COLUMNS: Final = (
@@ -242,7 +242,7 @@ def _run_row(run: RunInfo) -> list[Any]:
         run.end_reason or _GOING_ON,
         seconds(run.duration_s),
         figure(run.real_time_factor),
-        run.rows,
+        run.row_count,
         run.purged_rows or None,
         shown(run.notable) or None,
         short_name(_file(run.controller)),

@@ -94,7 +94,7 @@ def trend_tables(run: RunTrends, limit: int, budget_tokens: int) -> RunTrendTabl
         run_id=run.run_id,
         start_s=seconds(run.start_s),
         end_s=seconds(run.end_s if run.cut_at_s is None else run.cut_at_s),
-        rows=run.rows,
+        row_count=run.rows,
         resolution_s=run.resolution_s,
         numbers=table(TREND_COLUMNS, rows),
         states=table(STATE_COLUMNS, states),

@@ -75,7 +75,7 @@ class RunSeries(Part):
     count: list[int] | None = Field(default=None, description="Values per bucket.")
     numbers: dict[str, NumberSeries] | None = None
     states: dict[str, ChangeSeries] | None = None
-    rows: int | None = None
+    row_count: int | None = None
     recording_gaps: list[list[float | None]] | None = Field(
         default=None, description="[from, to] where no row was recorded."
     )
@@ -112,7 +112,7 @@ class RunTrendTables(Part):
     run_id: int
     start_s: float | None
     end_s: float | None
-    rows: int
+    row_count: int
     resolution_s: float | None = Field(
         default=None, description="Shapes and slopes come from means over this many seconds."
     )
@@ -178,7 +178,7 @@ class MonitorAnswer(NotedAnswer):
     """What was recorded in a window of wall time: of exactly those rows."""
 
     window_s: float | None = Field(default=None, description="Wall time that was looked at.")
-    rows: int | None = Field(default=None, description="States recorded in the window.")
+    row_count: int | None = Field(default=None, description="States recorded in the window.")
     movement: dict[str, Any] | None = None
     trends: list[RunTrendTables] | None = Field(
         default=None, description="More than one: time went back in between."

@@ -127,7 +127,7 @@ def _found(view: View, wall_start_s: float) -> dict[str, Any]:
     of_a_run = int(room * (1 - _EVENTS_SHARE)) // max(len(newest), 1)
     rows = sum(run.rows for run in told)
     return {
-        "rows": rows,
+        "row_count": rows,
         "movement": moved,
         "trends": [trend_tables(run, _SHOWN_SIGNALS, of_a_run) for run in newest] or None,
         "events": events,

@@ -154,7 +154,7 @@ def _run_series(run: RunHistory) -> RunSeries:
         or None,
         states={str(short_name(columns.name)): _change_series(columns) for columns in run.changes}
         or None,
-        rows=run.rows,
+        row_count=run.rows,
         recording_gaps=[
             [seconds(gap.start_s), seconds(gap.end_s)] for gap in run.gaps[:_SHOWN_GAPS]
         ]

@@ -56,7 +56,7 @@ async def webots_query_sql(
 ) -> SqlAnswer:
     """Read by SQL (SQLite) what the others do not cover.
 
-    Tables: robot, session, run(id, robot_id, session_id, rows, label,
+    Tables: robot, session, run(id, robot_id, session_id, row_count, label,
     last_sim_time_s), state(run_id, sim_time_s, wall_time_s, data: JSON), signal(name, path),
     all_rollup(run_id, signal_id, bucket of 10 s, min, max, sum, present), change, log, event,
     command, image. Views: robot_now, robot_run, robot_trajectory, robot_period, robot_event,

@@ -39,7 +39,7 @@ _PUBLISH: Final = (
     "nothing was recorded in this run yet: of the calls of bridge.publish({...}) in the "
     "controller's loop every 5th is by default (throttle_interval), or each one with force=True"
 )
-_EARLIER: Final = "SELECT max(id) FROM run WHERE robot_id = ? AND id < ? AND rows > 0"
+_EARLIER: Final = "SELECT max(id) FROM run WHERE robot_id = ? AND id < ? AND row_count > 0"
 _PURGED: Final = "SELECT purged_rows FROM run WHERE id = ?"
 _EVENTS: Final = 10
 _EVENTS_TOKENS: Final = 250
@@ -129,7 +129,7 @@ def webots_get_full_state(
             raise InvalidInputError(f"offset: {path!r:.80} is a single value, not in pages")
         beside: dict[str, Any] = view.header()
         if not (path or offset):
-            beside |= {"replaced": _some_replaced(view.state.odd_paths())}
+            beside |= {"replaced": _some_replaced(view.state.replaced_paths())}
             beside |= {"events": _events(view), "recorder": _recorder(view)}
         most_tokens = ANSWER_TOKENS if limit is None else LARGE_ANSWER_TOKENS
         told = {
@@ -256,7 +256,7 @@ def _recorder(view: View) -> dict[str, Any] | None:
         return None
     error = cut_text(session.last_error, _ERROR_CHARACTERS) if session.last_error else None
     return {
-        "rows_recorded": view.run.rows if view.run else 0,
+        "rows_recorded": view.run.row_count if view.run else 0,
         **({"kept_at_full_rate": kept} if (kept := _kept(view)) else {}),
         **rows_waiting(view.connection, session),
         "rows_dropped": session.rows_dropped,
@@ -285,7 +285,7 @@ def _replaced_in(state: State, part: dict[str, Any]) -> dict[str, str] | None:
     """The replaced values among those members of the state."""
     replaced = {
         path: kind
-        for path, kind in state.odd_paths().items()
+        for path, kind in state.replaced_paths().items()
         if any(path == key or path.startswith(f"{key}.") for key in part)
     }
     return _some_replaced(replaced)
@@ -295,7 +295,7 @@ def _some_replaced(replaced: Mapping[str, str]) -> dict[str, str] | None:
     """The first of them, and how many more there are; None without any."""
     shown = dict(list(replaced.items())[:_SHOWN_REPLACED])
     if more := len(replaced) - len(shown):
-        shown["…"] = f"{more} more: webots_query_sql has all in column odd of table state"
+        shown["…"] = f"{more} more: webots_query_sql has all in column replaced of table state"
     return shown or None
 
 

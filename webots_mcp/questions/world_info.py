@@ -29,7 +29,7 @@ _DEVICES_TOKENS: Final = 300
 _COMPANIONS_TOKENS: Final = 200
 _LONGEST_NAME: Final = 100
 _RECORDER_COLUMNS: Final = (
-    "rows", "why", "rows_waiting", "waiting_in", "rows_dropped", "last_error",
+    "row_count", "why", "rows_waiting", "waiting_in", "rows_dropped", "last_error",
 )  # fmt: skip
 _LONGEST_ERROR: Final = 300
 _ROBOT_COLUMNS: Final = (
@@ -87,7 +87,9 @@ def webots_get_world_info(
             runs_recorded=count_runs(view.connection, view.robot.id),
             controller=_controller(session),
             devices=_devices(view.robot.devices),
-            other_robots=Table(columns=["robot", "kind", "hold"], rows=shown) if shown else None,
+            other_robots=Table(columns=["robot", "kind", "pause_state"], rows=shown)
+            if shown
+            else None,
             database=name_of(recording.database),
             retention=_retention(recording, view.connection),
             data_dir=str(recording.data_dir),
@@ -104,7 +106,7 @@ def _robots(views: list[View], *, told: bool) -> Table:
     recorders = [_recorder(view) for view in views]
     for name in _RECORDER_COLUMNS:
         values = [recorder[name] for recorder in recorders]
-        if any(values) and (told or name not in ("rows", "why")):
+        if any(values) and (told or name not in ("row_count", "why")):
             columns.append(name)
             for row, value in zip(rows, values, strict=True):
                 row.append(value)
@@ -116,7 +118,7 @@ def _recorder(view: View) -> dict[str, Any]:
     session = view.session
     error = session.last_error if session else None
     return {
-        "rows": view.run.rows if view.run else 0,
+        "row_count": view.run.row_count if view.run else 0,
         "why": view.header().get("why"),
         "waiting_in": None,
         **rows_waiting(view.connection, session),
@@ -203,7 +205,7 @@ def _run(view: View, run: Run) -> dict[str, Any]:
         "began_by": run.start_reason,
         "began_ago_s": view.age_s(run.started_wall_time_s),
         "sim_duration_s": round(run.last_sim_time_s - run.started_sim_time_s, 3),
-        "rows": run.rows,
+        "row_count": run.row_count,
         **ended,
     }
 
@@ -231,6 +233,6 @@ def _companions(view: View) -> list[list[str]]:
     others = companions(view.connection, view.session, view.now_s)
     robots = {robot.id: robot for robot in list_robots(view.connection, view.now_s)}
     return [
-        [robots[other.robot_id].name, robots[other.robot_id].kind, other.hold or ""]
+        [robots[other.robot_id].name, robots[other.robot_id].kind, other.pause_state or ""]
         for other in others
     ]

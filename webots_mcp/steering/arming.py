@@ -21,7 +21,7 @@ from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.signals.catalogue import catalogue
 
 COLUMNS: Final = (
-    "id", "condition", "action", "after_hits", "hits", "newest_hit_run_id", "newest_hit_s",
+    "id", "condition", "action", "after_hits", "hit_count", "newest_hit_run_id", "newest_hit_s",
     "set_by", "off_because",
 )  # fmt: skip
 _ARM: Final = "arm_breakpoints"
@@ -162,14 +162,14 @@ def _header(recording: Recording, robot: str) -> dict[str, Any]:
 
 
 def _row(connection: sqlite3.Connection, each: stored.StoredBreakpoint) -> list[Any]:
-    hit = stored.newest_hit(connection, each.robot_id, each.id) if each.hits else None
+    hit = stored.newest_hit(connection, each.robot_id, each.id) if each.hit_count else None
     run_id, time_s = hit or (None, None)
     return [
         each.id,
         cut_text(each.condition, _LONGEST_TEXT),
         each.action,
         each.after_hits,
-        each.hits,
+        each.hit_count,
         run_id,
         time_s if time_s is None else round(time_s, 3),
         each.created_by,

@@ -35,7 +35,7 @@ class StoredImage:
     path: str
     width: int
     height: int
-    bytes: int
+    size_bytes: int
 
     def file(self, data_dir: Path) -> Path:
         """The file itself; see `inside` for the errors."""

@@ -26,13 +26,15 @@ _MAX_FLOAT: Final = 1.7e308
 _SHOWN: Final = 5
 
 _OBJECTS: Final = frozenset(
-    {"robot.devices", "session.versions", "session.actions", "state.data", "state.odd",
-     "kept_state.data", "kept_state.odd",
+    {"robot.devices", "session.versions", "session.actions", "state.data", "state.replaced",
+     "kept_state.data", "kept_state.replaced",
      "event.data", "command.params", "trial_set.plan", "trial_set.former_values",
      "trial.parameters"}
 )  # fmt: skip
 _PLAIN: Final = (bool, int, float, str)
-_OF_TEXTS: Final = frozenset({"robot.devices", "session.actions", "state.odd", "kept_state.odd"})
+_OF_TEXTS: Final = frozenset(
+    {"robot.devices", "session.actions", "state.replaced", "kept_state.replaced"}
+)
 _SHAPES: Final = {  # of JSON that is no object
     "command.result": "any", "parameter.choices": "values", "parameter.default_value": "value",
     "parameter.next_value": "value", "parameter_value.value": "value",

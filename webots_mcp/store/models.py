@@ -118,19 +118,19 @@ class Session(SQLModel, table=True):
     last_poll_wall_time_s: float | None = _number("newest get_command(); null if never called")
     moved_wall_time_s: float | None = _number("when simulation time was last seen to grow")
     sim_time_s: float | None = _number("simulation time at last_seen_wall_time_s")
-    hold: str | None = _text("paused or stepping while the bridge holds the loop")
+    pause_state: str | None = _text("paused or stepping while the bridge holds the loop")
     rows_waiting: int = _count("rows that still waited in the file beside or in memory")
     rows_dropped: int = _count("rows that could never be written")
     last_error: str | None = _text("newest thing that could not be recorded, and why")
     ended_wall_time_s: float | None = _number()
-    end_reason: str | None = _text("finished, reload, crashed, replaced")
+    end_reason: str | None = _text("finished, reload, crashed, superseded")
     uuid: str | None = _text(_UUID)
     process: str | None = _text("which process of that pid; null where the system does not tell")
     last_seen_monotonic_s: float | None = _number(
         "the host's monotonic clock at last_seen_wall_time_s"
     )
     extern: bool | None = _column(Integer, "1 where nobody starts the controller again")
-    mode_before_pause: str | None = _text("simulation mode to go back to when the hold ends")
+    mode_before_pause: str | None = _text("simulation mode to go back to when the pause ends")
     last_adopted_entry: int = _count("number of the last entry taken in from its file beside")
     throttle_interval: int | None = _column(Integer, "of so many publish() calls one is recorded")
 
@@ -155,8 +155,8 @@ class Run(SQLModel, table=True):
     last_wall_time_s: float = _number("last sign of life", nullable=False)
     last_sim_time_s: float = _number(nullable=False)
     ended_wall_time_s: float | None = _number()
-    end_reason: str | None = _text("finished, reset, reload, crashed, replaced")
-    rows: int = _count("state rows, as of last_wall_time_s")
+    end_reason: str | None = _text("finished, reset, reload, crashed, superseded")
+    row_count: int = _count("state rows, as of last_wall_time_s")
     label: str | None = _text()
     note: str | None = _text()
     keep: bool = _count("1: retention deletes nothing of this run")
@@ -178,7 +178,9 @@ class State(SQLModel, table=True):
     sim_time_s: float = _number(nullable=False)
     wall_time_s: float = _number(nullable=False)
     data: str = _text("JSON object", nullable=False)
-    odd: str | None = _text("JSON object: path of a replaced value to what it was (nan, inf, ...)")
+    replaced: str | None = _text(
+        "JSON object: path of a replaced value to what it was (nan, inf, ...)"
+    )
 
 
 _HAS_ROLE = text("role IS NOT NULL")
@@ -198,13 +200,13 @@ class Signal(SQLModel, table=True):
     kind: str = _text("num, bool, text, angle (radians), null (no value yet)", nullable=False)
     unit: str | None = _text("where the name tells it")
     path: str = _text("for json_extract(state.data, path)", nullable=False)
-    reduce: str | None = _text("count, min, max, mean or argmin of the long array at path")
+    reduction: str | None = _text("count, min, max, mean or argmin of the long array at path")
     role: str | None = _text(
         "x, y, z, yaw, mode, speed, commanded_speed, wheel or commanded_wheel; x2 without an x"
     )
     first_seen_wall_time_s: float = _number(nullable=False)
     last_seen_wall_time_s: float = _number(nullable=False)
-    rows: int = _count("state rows that held it, up to the watermark")
+    row_count: int = _count("state rows that held it, up to the watermark")
     null_row_count: int = _count("of them without a value")
     replaced_row_count: int = _count("of them with a value that JSON cannot hold (nan, inf, ...)")
     min: float | None = _number()
@@ -458,7 +460,7 @@ class Breakpoint(SQLModel, table=True):
     enabled: bool = _column(
         Integer, "0 once the condition failed", nullable=False, server_default=text("1")
     )
-    hits: int = _count("how often it began to hold, in all runs")
+    hit_count: int = _count("how often it began to hold, in all runs")
     created_wall_time_s: float = _number(nullable=False)
     created_by: str | None = _text("mcp, cli or controller: its code, for session_id only")
     error: str | None = _text("why the condition failed")
@@ -499,7 +501,7 @@ class KeptState(SQLModel, table=True):
     sim_time_s: float = _number(nullable=False)
     wall_time_s: float = _number(nullable=False)
     data: str = _text("JSON object", nullable=False)
-    odd: str | None = _text("as in state")
+    replaced: str | None = _text("as in state")
 
 
 class Image(SQLModel, table=True):
@@ -515,7 +517,7 @@ class Image(SQLModel, table=True):
     path: str = _text("relative to the data folder", nullable=False)
     width: int = _column(Integer, "pixels", nullable=False)
     height: int = _column(Integer, "pixels", nullable=False)
-    bytes: int = _column(Integer, "size of the file", nullable=False)
+    size_bytes: int = _column(Integer, "of the file", nullable=False)
 
 
 class Parameter(SQLModel, table=True):
@@ -622,9 +624,9 @@ class RetentionLimit(SQLModel, table=True):
         sa_column=Column(Text, primary_key=True, comment="state, chunk, log, event, image or run")
     )
     size_bytes: int | None = _column(BigInteger, "on the disk; of pictures their files")
-    rows: int | None = _column(BigInteger)
+    row_count: int | None = _column(BigInteger)
     age_s: float | None = _number("since it was recorded, in wall time")
-    times: float | None = _number(
+    outlive_factor: float | None = _number(
         "run only: what is left of one stays so many times longer than its states; 0 for ever"
     )
     set_by: str = _text("serve, prune or retain", nullable=False)

@@ -33,31 +33,31 @@ class Run:
     last_sim_time_s: float
     ended_wall_time_s: float | None
     end_reason: str | None
-    rows: int
+    row_count: int
     label: str | None
 
 
 @dataclass(frozen=True)
 class State:
-    """What one `publish` recorded; `data` and `odd` are JSON text."""
+    """What one `publish` recorded; `data` and `replaced` are JSON text."""
 
     id: int
     run_id: int
     sim_time_s: float
     wall_time_s: float
     data: str
-    odd: str | None
+    replaced: str | None
 
     def value(self) -> dict[str, Any]:
         """The published dict, with "nan", "inf" and the like where JSON has to say null."""
         value = cast("dict[str, Any]", json.loads(self.data))
-        for path, kind in self.odd_paths().items():
+        for path, kind in self.replaced_paths().items():
             put_back(value, path.split("."), kind)
         return value
 
-    def odd_paths(self) -> dict[str, str]:
+    def replaced_paths(self) -> dict[str, str]:
         """Path of every replaced value, and what it was."""
-        return json.loads(self.odd) if self.odd else {}
+        return json.loads(self.replaced) if self.replaced else {}
 
 
 @dataclass(frozen=True)

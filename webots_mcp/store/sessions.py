@@ -37,7 +37,7 @@ class Session:
     last_poll_wall_time_s: float | None
     moved_wall_time_s: float | None
     sim_time_s: float | None
-    hold: str | None
+    pause_state: str | None
     rows_waiting: int
     rows_dropped: int
     last_error: str | None
@@ -78,7 +78,7 @@ _COMPANIONS: Final = (
     "AND id <> :id AND ended_wall_time_s IS NULL ORDER BY id"
 )
 _LEFT_HOLDING: Final = (
-    f"SELECT {_COLUMNS} FROM session WHERE instance = :instance AND hold = '{PAUSED}' "
+    f"SELECT {_COLUMNS} FROM session WHERE instance = :instance AND pause_state = '{PAUSED}' "
     "AND last_seen_wall_time_s >= :started AND id = (SELECT max(id) FROM session n "
     "WHERE n.robot_id = session.robot_id) ORDER BY id DESC LIMIT 1"
 )

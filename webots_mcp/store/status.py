@@ -58,7 +58,7 @@ _ENDED: Final = {
     "finished": "its controller finished",
     "reload": "the world was reloaded and no new controller session has appeared yet",
     "crashed": "its controller process is gone without having finished (killed or crashed)",
-    "replaced": "a newer session took its place",
+    "superseded": "a newer session took its place",
 }
 _ENDED_BY: Final = (
     "SELECT message FROM log WHERE run_id = (SELECT max(id) FROM run WHERE session_id = ?) "
@@ -260,7 +260,7 @@ def find_holder(connection: sqlite3.Connection, session: Session, now_s: float) 
 
 def _is_holding(connection: sqlite3.Connection, session: Session) -> bool:
     since = _change_since_beat(connection, session)
-    return session.hold == PAUSED if since is None else since == PAUSE
+    return session.pause_state == PAUSED if since is None else since == PAUSE
 
 
 def _change_since_beat(connection: sqlite3.Connection, session: Session) -> str | None:

@@ -220,7 +220,7 @@ class RecordedSimulation(Simulation):
                 session = resolve_robot(connection, name, time.time()).session
         except WebotsMCPError:  # nothing was recorded yet
             return False
-        return session is not None and session.hold == PAUSED
+        return session is not None and session.pause_state == PAUSED
 
     def _last_lines(self) -> str:
         return "\n".join(self.console[-_CONSOLE_LINES:])

@@ -46,7 +46,9 @@ _THIRTY: Final = (
 )  # fmt: skip
 _LAG: Final = "lag() over the mode alone"
 _WHOLE: Final = Window(-math.inf, math.inf)
-_NUMBERS: Final = "SELECT name, path FROM signal WHERE kind IN ('num', 'angle') AND reduce IS NULL"
+_NUMBERS: Final = (
+    "SELECT name, path FROM signal WHERE kind IN ('num', 'angle') AND reduction IS NULL"
+)
 _CHANGES: Final = (
     "SELECT * FROM (SELECT sim_time_s, json_extract(data, '$.mode') AS mode, "
     "lag(json_extract(data, '$.mode')) OVER (ORDER BY sim_time_s) AS before "
@@ -183,7 +185,7 @@ def _looks_back(db: sqlite3.Connection, file: Path) -> Iterator[Question]:
 
 
 def _rows_in(db: sqlite3.Connection) -> int:
-    return db.execute("SELECT rows FROM run").fetchone()[0]
+    return db.execute("SELECT row_count FROM run").fetchone()[0]
 
 
 def _of_signal(numbers: Mapping[str, str], signal: str) -> list[str]:

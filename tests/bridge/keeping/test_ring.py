@@ -146,10 +146,10 @@ def test_what_a_ring_holds_takes_no_more_memory_than_it_says(
     try:
         before, _ = tracemalloc.get_traced_memory()
         for number in range(1200):
-            held, odd = copy_or_encode(make_state(number)), None
+            held, replaced = copy_or_encode(make_state(number)), None
             if not isinstance(held, bytes):
-                held, odd = held.text, held.replaced_text
-            ring.add(RingRow(number, number / 100, number + 0.5, held, odd))
+                held, replaced = held.text, held.replaced_text
+            ring.add(RingRow(number, number / 100, number + 0.5, held, replaced))
         taken, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

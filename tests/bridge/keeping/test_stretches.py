@@ -20,7 +20,7 @@ from webots_mcp.contract import KEEP_AFTER_S, KEEP_LAST_S
 from webots_mcp.standin import InProcessSupervisor
 
 STEP_S = STEP_MS / 1000
-EVERY = "SELECT sim_time_s, data, odd FROM all_state WHERE run_id = ? ORDER BY sim_time_s"
+EVERY = "SELECT sim_time_s, data, replaced FROM all_state WHERE run_id = ? ORDER BY sim_time_s"
 
 
 def drive(robot: Any, bridge: MCPBridge, numbers: range) -> None:

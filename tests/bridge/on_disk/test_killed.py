@@ -99,7 +99,7 @@ def test_a_run_that_began_while_the_database_was_locked_is_taken_in_as_well(
     recording = Recording(file)
     per_run = recording.rows("SELECT run_id, count(*) FROM state GROUP BY run_id")
     assert [count for _, count in per_run] == [9, 3]
-    reasons = recording.rows("SELECT start_reason, end_reason, rows FROM run ORDER BY id")
+    reasons = recording.rows("SELECT start_reason, end_reason, row_count FROM run ORDER BY id")
     assert reasons[0] == ("start", "reset", 9)
     assert reasons[1][:2] == ("reset", None)
 
@@ -160,7 +160,7 @@ def test_rows_of_a_session_that_the_database_does_not_know_are_entered_with_it(
     recording = Recording(file)
     assert numbers(recording) == list(range(5, 9))
     told = recording.rows(
-        "SELECT r.name, s.end_reason, u.end_reason, u.rows FROM run u "
+        "SELECT r.name, s.end_reason, u.end_reason, u.row_count FROM run u "
         "JOIN session s ON s.id = u.session_id JOIN robot r ON r.id = s.robot_id "
         "WHERE r.name = 'rover'"
     )

@@ -73,7 +73,7 @@ def test_beyond_the_limit_the_oldest_rows_are_dropped_counted_and_told(
     assert numbers(filed) == list(range(15, 26))
     assert bridge.stats().rows_dropped == 15
     (told,) = filed.rows("SELECT data FROM event WHERE kind = 'dropped'")
-    assert json.loads(told)["rows"] == 15
+    assert json.loads(told)["row_count"] == 15
     assert capfd.readouterr().err.count("rows are being dropped") == 1
 
 

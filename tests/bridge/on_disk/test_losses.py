@@ -78,7 +78,7 @@ def test_a_run_counts_the_rows_that_are_in_the_database(
     catch_up(bridge)
     heartbeat_now(bridge)
     assert numbers(filed) == [6, 7, 8]
-    assert filed.rows("SELECT rows FROM run") == [3]
+    assert filed.rows("SELECT row_count FROM run") == [3]
 
 
 def test_what_is_told_of_dropped_rows_is_stamped_with_the_time_of_now(
@@ -119,7 +119,7 @@ def test_rows_that_went_into_a_deleted_file_are_counted_as_dropped(
     heartbeat_now(bridge)
     assert numbers(filed) == [7]
     assert bridge.stats().rows_dropped == 4
-    assert filed.rows("SELECT rows FROM run") == [1]
+    assert filed.rows("SELECT row_count FROM run") == [1]
     told = filed.rows(
         "SELECT sim_time_s, json_extract(data, '$.rows') FROM event WHERE name IS NULL"
     )

@@ -93,7 +93,7 @@ def test_breakpoints_of_the_code_stay_armed_in_a_new_database_and_others_are_tol
             robot.step(STEP_MS)
             bridge.publish({"n": n})
             catch_up(bridge)
-    assert filed.rows("SELECT condition, hits FROM breakpoint") == [("n == 1", 2)]
+    assert filed.rows("SELECT condition, hit_count FROM breakpoint") == [("n == 1", 2)]
     assert filed.rows("SELECT name FROM event WHERE kind = 'breakpoint'") == ["n == 1"] * 2
     (said,) = filed.rows("SELECT message FROM log WHERE level = 'warning'")
     assert "(n == 1 or n > 9) is off" in said

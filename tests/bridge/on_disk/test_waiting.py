@@ -57,7 +57,7 @@ def test_rows_that_waited_are_followed_by_later_ones_and_the_file_goes_with_the_
         assert path.exists()
     assert not path.exists()
     assert numbers(filed) == list(range(60))
-    assert filed.rows("SELECT rows FROM run") == [60]
+    assert filed.rows("SELECT row_count FROM run") == [60]
 
 
 def test_what_waits_when_a_bridge_closes_is_kept_and_said(

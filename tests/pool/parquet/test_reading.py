@@ -82,7 +82,7 @@ def _told(database: Path) -> Told:
         whole = find_range(connection, Scope(run_id=1))
         (run,) = trends(connection, whole, ("front_m",)).runs
         events = find_events(connection, whole, near, limit=200, group=False).events
-        rows = list_runs(connection).runs[0].rows
+        rows = list_runs(connection).runs[0].row_count
     mean = run.numbers[0].mean
     assert mean is not None
     return Told(rows, mean, [event.start_s for event in events])
@@ -115,11 +115,11 @@ def test_what_is_there_is_listed(pool: ParquetPool, many: Many) -> None:
     assert [run.started_wall_time_s for run in runs] == sorted(
         run.started_wall_time_s for run in runs
     )
-    assert {(run.robot, run.label, run.rows) for run in runs} == {
+    assert {(run.robot, run.label, run.row_count) for run in runs} == {
         (f"rover_{n % 10}", "lab", 200 + 3 * n) for n in range(RECORDINGS)
     }
     (own,) = pool.runs(uuid_of(many.databases[7]))
-    assert (own.rows, own.end_reason) == (221, "finished")
+    assert (own.row_count, own.end_reason) == (221, "finished")
 
 
 def test_sizes_are_those_of_the_rows_and_of_the_files(pool: ParquetPool, many: Many) -> None:

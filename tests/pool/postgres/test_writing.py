@@ -142,11 +142,13 @@ def test_a_text_that_postgresql_lacks_comes_near_and_is_counted(
 def test_numbers_that_are_none_come_near_and_are_counted(
     postgres: Server, pool: str, target: PostgresTarget
 ) -> None:
-    odd = batch("image", sim_time_s="soon", wall_time_s="2e9", width=3.0, height=2.75, bytes=b"x")
+    odd = batch(
+        "image", sim_time_s="soon", wall_time_s="2e9", width=3.0, height=2.75, size_bytes=b"x"
+    )
     with target.shipment(OTHER) as shipment:
-        shipment.write([odd, batch("image", id=2, bytes=2**62, width=float("inf"))], {})
+        shipment.write([odd, batch("image", id=2, size_bytes=2**62, width=float("inf"))], {})
         shipment.write([batch("run", label=b"x", coarse_end="late", basic_time_step_ms=8)], {})
-    sql = "SELECT sim_time_s, wall_time_s, width, height, bytes FROM image ORDER BY id"
+    sql = "SELECT sim_time_s, wall_time_s, width, height, size_bytes FROM image ORDER BY id"
     assert postgres.execute(pool, sql) == [(0, 2e9, 3, 2, 0), (0, 0, 0, 0, 2**62)]
     sql = "SELECT label, coarse_end, basic_time_step_ms FROM run"
     assert postgres.execute(pool, sql) == [("x", None, 8.0)]

@@ -124,7 +124,7 @@ async def test_the_timeline_goes_on_page_by_page(story: Path) -> None:
 async def test_looking_back_reports_at_once_on_exactly_those_rows(story: Path) -> None:
     answer = await tell(story, "webots_monitor", lookback_wall_s=15)
     (trend,) = answer["trends"]
-    assert answer["rows"] == trend["rows"] == 301
+    assert answer["row_count"] == trend["row_count"] == 301
     assert (trend["start_s"], trend["end_s"]) == (29.9, 59.9)
     assert answer["movement"]["distance_m"] == pytest.approx(9.0, abs=0.01)
     assert [row["details"]["what"] for row in rows_of(answer["events"])] == ["ended"]

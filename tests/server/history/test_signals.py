@@ -60,7 +60,7 @@ async def test_an_extreme_is_never_lost_in_a_bucket(story: Path) -> None:
     whole = run["numbers"]["ir"]["whole"]
     assert (whole["max"], whole["max_at_s"]) == (5.0, 70.0)
     assert run["recording_gaps"] == [[89.9, 95.0]]
-    assert sum(run["count"]) == run["rows"] == 1150
+    assert sum(run["count"]) == run["row_count"] == 1150
 
 
 async def test_rows_in_a_gap_are_null_and_modes_are_change_points(story: Path) -> None:

@@ -90,7 +90,7 @@ def test_a_silence_that_is_exactly_as_long_as_asked_for_is_told(
 
 
 def test_an_array_that_crosses_16_items_is_not_silent(empty: sqlite3.Connection, tier: str) -> None:
-    record(empty, lambda t: {"hits": [range_m(t)] * (14 if t % 40 < 20 else 20)})
+    record(empty, lambda t: {"hit_count": [range_m(t)] * (14 if t % 40 < 20 else 20)})
     assert told(ask(empty, "silent")) == []
 
 
@@ -352,8 +352,8 @@ def test_what_a_device_gave_that_is_no_number_is_told_of_its_silence(
     recorder = start_run(empty)
     for step in range(300):
         free = 100 <= step < 200
-        odd = {"front": "inf"} if free else None
-        recorder.publish(step / 10, {"front": None if free else range_m(step / 10)}, odd)
+        replaced = {"front": "inf"} if free else None
+        recorder.publish(step / 10, {"front": None if free else range_m(step / 10)}, replaced)
     (silent,) = ask(empty, "silent").events
     assert silent.details == {"value": "inf"}
 

@@ -45,7 +45,9 @@ def recorded_run() -> Generator[Recorder]:
 def publish(recorder: Recorder, time_s: float, state: dict[str, Any]) -> None:
     """As the bridge does, with whatever the state holds."""
     encoded = encode(state)
-    recorder.insert("state", **recorder.at(time_s), data=encoded.text, odd=encoded.replaced_text)
+    recorder.insert(
+        "state", **recorder.at(time_s), data=encoded.text, replaced=encoded.replaced_text
+    )
 
 
 def exported(connection: sqlite3.Connection, form: str, **wanted: Any) -> bytes:
@@ -97,7 +99,7 @@ def expected(state: dict[str, Any]) -> dict[str, Any]:
     leaves: dict[str, Any] = {}
     for name, value in flat(state):
         leaves.setdefault(name, with_64_bits(value))
-    return {f"state.{n}" if n in {*HEAD, "odd"} else n: v for n, v in leaves.items()}
+    return {f"state.{n}" if n in {*HEAD, "replaced"} else n: v for n, v in leaves.items()}
 
 
 def with_64_bits(value: Any) -> Any:
@@ -142,10 +144,10 @@ def test_json_lines_read_back_as_the_rows(states: list[dict[str, Any]]) -> None:
         for i, (line, state) in enumerate(zip(lines, states, strict=True)):
             head = [line.pop(name) for name in HEAD]
             assert head == [1, i + 1, float(i), recorder.run_start_s + i * 0.5]
-            odd = recorder.connection.execute(
-                "SELECT odd FROM state WHERE id = ?", (i + 1,)
+            replaced = recorder.connection.execute(
+                "SELECT replaced FROM state WHERE id = ?", (i + 1,)
             ).fetchone()[0]
-            assert line.pop("odd", None) == (json.loads(odd) if odd else None)
+            assert line.pop("replaced", None) == (json.loads(replaced) if replaced else None)
             assert same(line, without_odd(expected(state)))
 
 
@@ -212,7 +214,7 @@ def test_values_that_are_not_finite_come_back_as_such(recorder: Recorder) -> Non
     assert [second[name] for name in ("front", "lidar.0", "left")] == ["-inf", "1.0", ""]
     line = json_lines(recorder.connection)[0]
     assert line["front"] is None
-    assert line["odd"] == {"front": "nan", "lidar.*": "inf"}
+    assert line["replaced"] == {"front": "nan", "lidar.*": "inf"}
 
 
 def test_columns_come_in_the_order_in_which_they_first_appear(recorder: Recorder) -> None:
@@ -260,9 +262,9 @@ def test_a_long_array_is_one_column(recorder: Recorder) -> None:
 
 
 def test_a_signal_that_is_called_like_our_columns_gets_another_name(recorder: Recorder) -> None:
-    publish(recorder, 3.0, {"sim_time_s": 99, "odd": True})
+    publish(recorder, 3.0, {"sim_time_s": 99, "replaced": True})
     line = json_lines(recorder.connection)[0]
-    assert (line["sim_time_s"], line["state.sim_time_s"], line["state.odd"]) == (3.0, 99, True)
+    assert (line["sim_time_s"], line["state.sim_time_s"], line["state.replaced"]) == (3.0, 99, True)
 
 
 @pytest.mark.parametrize("data", ["", "no JSON", "[1]", "NaN", '{"a": NaN}'])

@@ -98,12 +98,15 @@ def test_states_read_back_as_they_were_published(
     with recorded_run() as recorder:
         for i, state in enumerate(states):
             publish(recorder, float(i), state)
-        rows = recorder.connection.execute("SELECT data, odd FROM state ORDER BY id").fetchall()
+        rows = recorder.connection.execute(
+            "SELECT data, replaced FROM state ORDER BY id"
+        ).fetchall()
         read = exported(recorder, tmp_path_factory.mktemp("mcap"))
-    for value, (data, odd) in zip(read.values("/rover/state"), rows, strict=True):
-        assert value.pop("odd", None) == (json.loads(odd) if odd else None)
+    for value, (data, replaced) in zip(read.values("/rover/state"), rows, strict=True):
+        assert value.pop("replaced", None) == (json.loads(replaced) if replaced else None)
         assert same(
-            value, {"state.odd" if k == "odd" else k: v for k, v in json.loads(data).items()}
+            value,
+            {"state.replaced" if k == "replaced" else k: v for k, v in json.loads(data).items()},
         )
     required_by_viewers(read.schemas["/rover/state"][1])
 
@@ -135,14 +138,14 @@ def test_log_time_is_simulation_time_and_publish_time_is_wall_time(
     assert message.publish_time == round((recorder.run_start_s + 0.008) * 1e9)
 
 
-@pytest.mark.parametrize("data", ["", "no JSON", "[1]", '{"a": NaN}', '{"a": 1, "odd": 2} '])
+@pytest.mark.parametrize("data", ["", "no JSON", "[1]", '{"a": NaN}', '{"a": 1, "replaced": 2} '])
 def test_a_row_that_no_bridge_has_written_is_valid_json_all_the_same(
     recorder: Recorder, tmp_path: Path, data: str
 ) -> None:
-    recorder.insert("state", **recorder.at(1.0), data=data, odd='{"b": "nan"}')
+    recorder.insert("state", **recorder.at(1.0), data=data, replaced='{"b": "nan"}')
     (value,) = exported(recorder, tmp_path).values("/rover/state")
-    assert value.pop("odd") == {"b": "nan"}
-    assert value in ({}, {"a": None}, {"a": 1, "state.odd": 2})
+    assert value.pop("replaced") == {"b": "nan"}
+    assert value in ({}, {"a": None}, {"a": 1, "state.replaced": 2})
 
 
 def test_everything_of_a_run_is_there(recorded: Recorded, tmp_path: Path) -> None:
@@ -205,7 +208,7 @@ def test_a_picture_that_is_gone_or_outside_is_counted_and_left_out(
     for path in ("camera/gone.png", "../secret.png"):
         recorder.insert(
             "image", **recorder.at(0.0), kind="camera", device="a b", path=path, width=1, height=1,
-            bytes=1,
+            size_bytes=1,
         )  # fmt: skip
     wanted = find_range(recorder.connection, Scope())
     (tmp_path / "data").mkdir()
@@ -224,7 +227,7 @@ def test_devices_with_names_alike_have_topics_of_their_own(
         (tmp_path / f"{number}.png").write_bytes(device.encode())
         recorder.insert(
             "image", **recorder.at(0.0), kind="camera", device=device, path=f"{number}.png",
-            width=1, height=1, bytes=3,
+            width=1, height=1, size_bytes=3,
         )  # fmt: skip
     read = exported(recorder, tmp_path)
     told = {
@@ -367,5 +370,5 @@ def test_values_that_are_not_finite_are_null_and_named(recorder: Recorder, tmp_p
     state = {"front": math.nan, "lidar": [math.inf, 1.0]}
     publish(recorder, 0.0, state)
     (value,) = exported(recorder, tmp_path).values("/rover/state")
-    assert value.pop("odd") == {"front": "nan", "lidar.*": "inf"}
+    assert value.pop("replaced") == {"front": "nan", "lidar.*": "inf"}
     assert value == without_odd(state)

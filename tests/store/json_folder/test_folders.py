@@ -23,9 +23,9 @@ def test_a_folder_becomes_a_finished_run(
     peer.everything()
     made = import_folder(database, peer.folder, data_dir, "old rover")
     assert made == ("old rover", 1, 1, 3, 1, 3)
-    run = rows(database, "SELECT robot, started_utc, duration_s, rows, end_reason FROM robot_run")[
-        0
-    ]
+    run = rows(
+        database, "SELECT robot, started_utc, duration_s, row_count, end_reason FROM robot_run"
+    )[0]
     started = datetime(2026, 5, 4, 11, 59).astimezone()
     assert run[0] == "old rover"
     assert datetime.fromisoformat(f"{run[1]}+00:00") == started
@@ -46,7 +46,7 @@ def test_pictures_are_copied_and_found_by_their_rows(
 ) -> None:
     peer.everything()
     import_folder(database, peer.folder, data_dir, "a/b")
-    images = rows(database, "SELECT kind, path, width, height, bytes FROM image")
+    images = rows(database, "SELECT kind, path, width, height, size_bytes FROM image")
     assert [image[:2] for image in images] == [
         ("camera", "camera/a_b/frame_0000.png"),
         ("camera", "camera/a_b/frame_0001.png"),
@@ -103,9 +103,9 @@ def test_a_state_with_nan_is_stored_as_the_bridge_stores_it(
 ) -> None:
     peer.write("status.json", '{"front": NaN, "lidar": [1.0, -Infinity], "deep": {"a": Infinity}}')
     import_folder(database, peer.folder, data_dir)
-    data, odd, wall_s = rows(database, "SELECT data, odd, wall_time_s FROM state")[0]
+    data, replaced, wall_s = rows(database, "SELECT data, replaced, wall_time_s FROM state")[0]
     assert json.loads(data) == {"front": None, "lidar": [1.0, None], "deep": {"a": None}}
-    assert json.loads(odd) == {"front": "nan", "lidar.1": "-inf", "deep.a": "inf"}
+    assert json.loads(replaced) == {"front": "nan", "lidar.1": "-inf", "deep.a": "inf"}
     assert wall_s == NOON.timestamp()  # without a timestamp the file's own time
 
 
@@ -172,9 +172,9 @@ def test_what_no_float_and_no_utf8_can_hold_is_replaced_and_named(
     at = "2026-05-04T11:59:59"
     peer.write("commands.json", f'{{"action": "gr\\ud800asp", "timestamp": "{at}", "x": {huge}}}')
     import_folder(database, peer.folder, data_dir)
-    ((data, odd),) = rows(database, "SELECT data, odd FROM state")
+    ((data, replaced),) = rows(database, "SELECT data, replaced FROM state")
     assert json.loads(data) == {"a": [None, None, None], "t": "x?", "?": 1}
-    assert json.loads(odd) == {
+    assert json.loads(replaced) == {
         "a.0": "int", "a.1": "inf", "a.2": "nan", "t": "surrogate", "?": "surrogate",
     }  # fmt: skip
     assert rows(database, "SELECT action, params FROM command") == [("gr?asp", '{"x":null}')]

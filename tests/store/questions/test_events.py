@@ -171,7 +171,7 @@ def test_a_limit_keeps_rare_kinds_and_says_what_is_left_out(rover: sqlite3.Conne
 def record_a_busy_run(connection: sqlite3.Connection) -> Recorder:
     """100 s in which a flag changes each second, with 3 warnings, and 2 pictures a second."""
     recorder = start_run(connection)
-    picture = {"kind": "camera", "width": 1, "height": 1, "bytes": 1}
+    picture = {"kind": "camera", "width": 1, "height": 1, "size_bytes": 1}
     for step in range(1000):
         recorder.publish(step * 0.1, {"lit": step // 10 % 2 == 0, "mode": "ab"[step // 20 % 2]})
         if step % 5 == 0:

@@ -28,7 +28,7 @@ def test_runs_are_listed_with_code_duration_and_end(rover: sqlite3.Connection) -
     assert (listed.total, listed.cursor) == (3, None)
     third, second, first = listed.runs
     assert (first.run_id, first.controller_sha256, first.git_commit) == (1, "a" * 64, "c0ffee")
-    assert (first.duration_s, first.rows) == (pytest.approx(119.9), 1150)
+    assert (first.duration_s, first.row_count) == (pytest.approx(119.9), 1150)
     assert first.real_time_factor == pytest.approx(2.0, rel=0.01)
     assert [run.end_reason for run in (first, second, third)] == ["reset", "crashed", "finished"]
     assert first.notable == {"log warning": 1, "log error": 1, "dropped": 1}
@@ -47,10 +47,10 @@ def test_a_run_that_goes_on_counts_its_newest_rows(empty: sqlite3.Connection) ->
     for step in range(20):
         recorder.publish(float(step), {"x": step})
         if step == 9:
-            beat = "UPDATE run SET rows = 10, last_sim_time_s = 9.0, last_wall_time_s = ?"
+            beat = "UPDATE run SET row_count = 10, last_sim_time_s = 9.0, last_wall_time_s = ?"
             empty.execute(beat, (recorder.wall_s,))
     run = run_info(empty, recorder.run_id)
-    assert (run.rows, run.duration_s, run.wall_duration_s) == (20, 19.0, 19.0 * WALL_PER_SIM)
+    assert (run.row_count, run.duration_s, run.wall_duration_s) == (20, 19.0, 19.0 * WALL_PER_SIM)
 
 
 def test_a_pause_is_no_part_of_the_real_time_factor(empty: sqlite3.Connection) -> None:

@@ -84,8 +84,8 @@ def test_a_value_that_is_no_number_is_named_within_its_array(empty: sqlite3.Conn
     recorder = start_run(empty)
     for step in range(30):
         state = {"short": [None, step, None if step < 9 else 1], "long": [1.0] * 30 + [None]}
-        odd = {"short.*": "nan", "long.*": "inf"}
-        recorder.publish(float(step), state, odd if step < 20 else {"short.0": "inf"})
+        replaced = {"short.*": "nan", "long.*": "inf"}
+        recorder.publish(float(step), state, replaced if step < 20 else {"short.0": "inf"})
     roll(empty)
     run = ask(empty, "short", "long.mean")
     assert column(run, "short.0").replaced == {"nan": 20, "inf": 10}

@@ -82,7 +82,7 @@ def numbers_read(connection: sqlite3.Connection, states: list[dict[str, Any]]) -
     numbers = [
         replace(signal, kind="num", decoded=False)
         for signal in known.values()
-        if signal.reduce is None
+        if signal.reduction is None
     ]
     return read_numbers(connection, segment, numbers, Deadline(math.inf))
 

@@ -136,7 +136,7 @@ def test_camera_frames_go_with_their_stretch_and_count_with_it(
 ) -> None:
     before = frames(filmed, "kept")
     prune(filmed, tmp_path, Retention(state=NONE, kept_state=ALL, outlive=0), rest=False)
-    ((pictures_bytes,),) = filmed.execute("SELECT sum(bytes) FROM image WHERE kind = 'kept'")
+    ((pictures_bytes,),) = filmed.execute("SELECT sum(size_bytes) FROM image WHERE kind = 'kept'")
     held_bytes = plan(filmed, Retention(outlive=0)).held_bytes["kept_state"]
     assert held_bytes > pictures_bytes > 0
     two = Limit(size_bytes=held_bytes * 5 // 6)

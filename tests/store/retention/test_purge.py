@@ -191,7 +191,7 @@ def test_no_write_of_a_purge_does_more_than_its_time_allows(filed: tuple[Path, R
 def test_a_robot_that_records_meanwhile_loses_no_row(filed: tuple[Path, Recorded]) -> None:
     file, recorded = filed
     recorded.end_run("finished")
-    recorded.connection.execute("UPDATE run SET rows = 5000 WHERE id = 2")
+    recorded.connection.execute("UPDATE run SET row_count = 5000 WHERE id = 2")
     robot, steps = InProcessSupervisor("other"), 0
     line = [sys.executable, "-m", "webots_mcp", "prune", "--keep-states", "0rows"]
     with MCPBridge(robot, throttle_interval=1, database=file) as bridge:
@@ -205,7 +205,8 @@ def test_a_robot_that_records_meanwhile_loses_no_row(filed: tuple[Path, Recorded
         assert bridge.stats().rows_dropped == 0
     assert said.splitlines()[1].split()[0] == "state"
     rows = recorded.connection.execute(
-        "SELECT rows, purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) FROM run"
+        "SELECT row_count, purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) "
+        "FROM run"
     ).fetchall()
     assert rows == [(5000, 5000), (steps, steps)]
     assert recorded.connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)

@@ -38,7 +38,7 @@ def test_the_number_of_purged_rows_stays_visible_beside_the_number_recorded(
     recorded.add_run(100)
     recorded.add_run(10)
     recorded.prune(states(rows=60, spared_rows=0))
-    sql = "SELECT run_id, rows, purged_rows FROM robot_run ORDER BY run_id"
+    sql = "SELECT run_id, row_count, purged_rows FROM robot_run ORDER BY run_id"
     assert recorded.connection.execute(sql).fetchall() == [(1, 100, 50), (2, 10, 0)]
 
 
@@ -47,7 +47,7 @@ def test_a_crashed_run_is_counted_with_its_purged_rows(recorded: Recorded) -> No
     recorded.connection.execute("UPDATE session SET host = 'elsewhere'")
     recorded.prune(states(rows=40, spared_rows=0))
     end_session(recorded.connection, 1, "crashed")
-    sql = "SELECT rows, purged_rows FROM run"
+    sql = "SELECT row_count, purged_rows FROM run"
     assert recorded.connection.execute(sql).fetchone() == (100, 60)
 
 

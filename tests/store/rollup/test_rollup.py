@@ -133,7 +133,9 @@ def test_two_callers_at_once_take_every_row_in_once(tmp_path: Path) -> None:
         for thread in threads:
             thread.join()
         rows = connection.execute("SELECT count(*) FROM state").fetchone()[0]
-        counted = connection.execute("SELECT rows FROM signal WHERE name = 'mode'").fetchone()[0]
+        counted = connection.execute("SELECT row_count FROM signal WHERE name = 'mode'").fetchone()[
+            0
+        ]
         assert counted == rows
         assert watermark(connection) == rows
 
@@ -179,7 +181,7 @@ def test_a_batch_that_is_stored_in_part_is_finished_later_and_counted_once(tmp_p
                 assert run.numbers[0].whole.present == 30
                 assert len(list_signals(writer, run_id=run_id).signals) == 2
             assert roll(writer).done
-        assert [row[0] for row in writer.execute("SELECT rows FROM signal")] == [30] * 6
+        assert [row[0] for row in writer.execute("SELECT row_count FROM signal")] == [30] * 6
         assert writer.execute("SELECT sum(rows) FROM all_rollup").fetchone() == (180,)
 
 
@@ -236,7 +238,7 @@ def test_an_unreadable_row_costs_itself_and_not_the_rollup(empty: sqlite3.Connec
     recorder.insert("state", **recorder.at(2.0), data="[1, 2]")
     recorder.publish(3.0, {"x": 3})
     assert roll(empty) == (4, True)
-    assert empty.execute("SELECT rows, min, max FROM signal").fetchall() == [(2, 1.0, 3.0)]
+    assert empty.execute("SELECT row_count, min, max FROM signal").fetchall() == [(2, 1.0, 3.0)]
 
 
 @pytest.mark.parametrize("power", [63, 64, 100, 1400])
@@ -269,7 +271,7 @@ def test_a_row_that_cannot_be_stored_costs_itself_and_not_the_rollup(
         recorder.insert("state", **recorder.at(float(step)), data=data)
     while not roll(empty, 3).done:
         pass
-    counted = empty.execute("SELECT name, rows FROM signal ORDER BY name").fetchall()
+    counted = empty.execute("SELECT name, row_count FROM signal ORDER BY name").fetchall()
     assert counted == [("text", 18), ("x", 18)]
 
 

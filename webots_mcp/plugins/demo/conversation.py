@@ -237,7 +237,7 @@ def _tell_where(data_dir: Path) -> None:
     for sql in (
         "SELECT sim_time_s, data ->> '$.mode' FROM state ORDER BY id DESC LIMIT 5",
         "SELECT action, status, result FROM command ORDER BY id DESC LIMIT 5",
-        "SELECT id, start_reason, rows, end_reason FROM run",
+        "SELECT id, start_reason, row_count, end_reason FROM run",
     ):
         _say(f'  sqlite3 {database} "{sql}"')
 

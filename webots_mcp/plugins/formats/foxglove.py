@@ -95,7 +95,7 @@ def _add_signals(panels: dict[str, dict[str, Any]], contents: Contents, topics: 
 
 
 def _paths(contents: Contents, topics: Topics, signal: Signal) -> list[dict[str, Any]]:
-    if signal.reduce or not _PLAIN_PATH.fullmatch(signal.path):
+    if signal.reduction or not _PLAIN_PATH.fullmatch(signal.path):
         return []
     return [
         {

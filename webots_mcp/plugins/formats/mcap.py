@@ -39,8 +39,8 @@ _NOT_IN_JSON: Final = re.compile("NaN|Infinity")  # Python reads them as numbers
 def write_mcap(contents: Contents, sink: BinaryIO) -> Counter[str]:
     """Everything of a range as messages: see `Topics` for the topics.
 
-    A state is the message as it was published, with `odd` beside, which names the path of every
-    value that JSON cannot hold (null in the message) and what it was.
+    A state is the message as it was published, with `replaced` beside, which names the path of
+    every value that JSON cannot hold (null in the message) and what it was.
 
     Returns:
         How many there are of each kind.
@@ -245,17 +245,19 @@ def _state_text(item: Recorded, state: dict[str, Any]) -> str:
     """The state as it is stored, unless it has to be written anew."""
     renamed = _renamed(state)
     if renamed is not state or not state or _NOT_IN_JSON.search(item.data):
-        return json_text(renamed | ({"odd": json.loads(item.odd)} if item.odd else {}))
-    if item.odd:
-        return f'{item.data.rstrip()[:-1]},"odd":{item.odd}}}'
+        return json_text(
+            renamed | ({"replaced": json.loads(item.replaced)} if item.replaced else {})
+        )
+    if item.replaced:
+        return f'{item.data.rstrip()[:-1]},"replaced":{item.replaced}}}'
     return item.data
 
 
 def _renamed(state: dict[str, Any]) -> dict[str, Any]:
-    """With `odd` called `state.odd`, as in all exports: the message has an `odd` of its own."""
-    if "odd" not in state:
+    """With `replaced` called `state.replaced`, as in all exports: the message has its own."""
+    if "replaced" not in state:
         return state
-    return {("state.odd" if key == "odd" else key): value for key, value in state.items()}
+    return {("state.replaced" if key == "replaced" else key): value for key, value in state.items()}
 
 
 def _pose(pose: Pose) -> dict[str, Any]:

@@ -44,7 +44,7 @@ _OF_RUN: Final = (
 _STATES: Final = ("state", "kept_state")
 _HERE: Final = "SELECT uuid, id FROM run WHERE uuid IS NOT NULL"
 _COUNTED: Final = (
-    "SELECT id, rows, purged_rows, (SELECT count(*) FROM state WHERE run_id = run.id), "
+    "SELECT id, row_count, purged_rows, (SELECT count(*) FROM state WHERE run_id = run.id), "
     "(SELECT count(*) FROM state s WHERE run_id = run.id AND EXISTS (SELECT 1 FROM kept_stretch k "
     "WHERE k.run_id = s.run_id AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s)), "
     "coalesce((SELECT sum(row_count) FROM row_group WHERE run_id = run.id), 0) "
@@ -52,8 +52,8 @@ _COUNTED: Final = (
 )
 _PURGED: Final = "UPDATE run SET purged_rows = ? WHERE id = ?"
 _MOVE_KEPT: Final = (
-    "INSERT INTO kept_state (run_id, sim_time_s, wall_time_s, data, odd) "
-    "SELECT run_id, sim_time_s, wall_time_s, data, odd FROM state s WHERE run_id = :run "
+    "INSERT INTO kept_state (run_id, sim_time_s, wall_time_s, data, replaced) "
+    "SELECT run_id, sim_time_s, wall_time_s, data, replaced FROM state s WHERE run_id = :run "
     "AND NOT EXISTS (SELECT 1 FROM kept_state k WHERE k.run_id = s.run_id AND k.call IS NULL "
     "AND k.sim_time_s = s.sim_time_s AND k.wall_time_s = s.wall_time_s) ORDER BY id"
 )
@@ -120,10 +120,10 @@ def fetch(
     found.going_on = [run.uuid for run in new if run.uuid and run.end_reason is None]
     ended = [run for run in new if run.uuid and run.end_reason is not None]
     whole, found.arriving = _shipped(pool, ended)
-    done, of = 0, sum(run.rows for run in whole)
+    done, of = 0, sum(run.row_count for run in whole)
     for part in _parts(whole):
         fetcher.take(part, lambda rows, before=done: progress(before + rows, of))
-        done += sum(run.rows for run in part)
+        done += sum(run.row_count for run in part)
         progress(done, of)
     fetcher.take_trials(meant)
     here = _here(connection)
@@ -147,11 +147,11 @@ def _parts(runs: Sequence[PooledRun]) -> Iterator[list[PooledRun]]:
     for _, group in groupby(runs, lambda run: run.recording_uuid):
         part, rows = list[PooledRun](), 0
         for run in group:
-            if part and (len(part) >= _MOST_RUNS or rows + run.rows > _MOST_ROWS):
+            if part and (len(part) >= _MOST_RUNS or rows + run.row_count > _MOST_ROWS):
                 yield part
                 part, rows = [], 0
             part.append(run)
-            rows += run.rows
+            rows += run.row_count
         yield part
 
 
@@ -321,7 +321,7 @@ def _up_to(runs: Sequence[PooledRun], told: Callable[[int], None]) -> Callable[[
 
     A run whose process was killed has a few more than the last heartbeat counted.
     """
-    counted = sum(run.rows for run in runs)
+    counted = sum(run.row_count for run in runs)
 
     def tell(copied: int) -> None:
         if copied > 2 * counted + _UNCOUNTED_ROWS:

@@ -182,7 +182,7 @@ def _listed(pool: Pool, part: str, choice: Choice) -> _List:
         columns = ("robot", "recordings", "runs", "rows", "first", "last")
         rows: list[list[Any]] = [
             [
-                each.robot, each.recordings, each.runs, each.rows,
+                each.robot, each.recordings, each.runs, each.row_count,
                 clock_text(each.started_wall_time_s), clock_text(each.last_wall_time_s),
             ]
             for each in found
@@ -204,7 +204,7 @@ def _listed(pool: Pool, part: str, choice: Choice) -> _List:
     rows = [
         [
             run.uuid[:_SHORT], run.robot, run.label, clock_text(run.started_wall_time_s),
-            run.last_sim_time_s - run.started_sim_time_s, run.rows,
+            run.last_sim_time_s - run.started_sim_time_s, run.row_count,
             run.end_reason or "going on", run.recording_uuid[:_SHORT],
         ]
         for run in runs

@@ -75,7 +75,7 @@ class PooledRobot:
     robot: str
     recordings: int
     runs: int
-    rows: int
+    row_count: int
     started_wall_time_s: float
     last_wall_time_s: float
 
@@ -143,7 +143,7 @@ def robots(runs: Iterable[PooledRun]) -> list[PooledRobot]:
             robot=name,
             recordings=len({run.recording_uuid for run in own}),
             runs=len(own),
-            rows=sum(run.rows for run in own),
+            row_count=sum(run.row_count for run in own),
             started_wall_time_s=min(run.started_wall_time_s for run in own),
             last_wall_time_s=max(run.last_wall_time_s for run in own),
         )

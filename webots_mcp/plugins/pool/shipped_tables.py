@@ -108,7 +108,7 @@ def _column_of(owner: str, name: str, columns: tuple[str, ...]) -> str | None:
 
 
 def _is_json(column: Any) -> bool:
-    return (column.comment or "").startswith("JSON") or column.name == "odd"
+    return (column.comment or "").startswith("JSON") or column.name == "replaced"
 
 
 def _is_value(column: Any) -> bool:

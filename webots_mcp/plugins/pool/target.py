@@ -130,7 +130,7 @@ class PooledRun:
     started_sim_time_s: float
     last_sim_time_s: float
     end_reason: str | None
-    rows: int
+    row_count: int
 
 
 @dataclass(frozen=True)

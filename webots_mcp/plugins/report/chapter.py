@@ -243,7 +243,7 @@ def _facts(info: RunInfo, session: Session | None, step_ms: float | None) -> dic
         "simulation time": length(info.duration_s),
         "wall time": length(info.wall_duration_s)
         + (f", of which {length(info.held_s)} paused by a command" if info.held_s else ""),
-        "rows": f"{info.rows:,}"
+        "rows": f"{info.row_count:,}"
         + (f" ({info.purged_rows:,} of them purged since)" if info.purged_rows else ""),
         "needs attention": listed(info.notable) or None,
     }

@@ -8,11 +8,11 @@ from typing import Any, Final
 
 from webots_mcp.naming import Value, flatten
 from webots_mcp.store.chunks.codec import ABSENT, Absent, Recorded, Replaced
-from webots_mcp.store.rollup.batch import is_odd, odd_names
+from webots_mcp.store.rollup.batch import is_replaced, replaced_names
 from webots_mcp.store.signals.flatten import parse
 
 _NUMBERS: Final = frozenset({int, float})
-STATE_COLUMNS: Final = "id, sim_time_s, wall_time_s, data, odd"
+STATE_COLUMNS: Final = "id, sim_time_s, wall_time_s, data, replaced"
 
 
 @dataclass
@@ -60,11 +60,11 @@ class StateColumns:
                 self._note_replaced(row, why)
 
     def _note_replaced(self, row: int, text: str) -> None:
-        reasons = odd_names(text)
+        reasons = replaced_names(text)
         for name in reasons.keys() & self.values.keys():
             values = self.values[name]
             value: Any = values[row]
-            if value is not ABSENT and is_odd(reasons, name, value) and value is None:
+            if value is not ABSENT and is_replaced(reasons, name, value) and value is None:
                 values[row] = Replaced(reasons[name])
 
     def sample(self, name: str) -> str:

@@ -39,7 +39,7 @@ _USED: Final = " OR ".join(
     for table in ("chunk", "rollup", "recent_rollup", "change")
 )
 _DESCRIBED: Final = (
-    "name, kind, unit, path, reduce, role, first_seen_wall_time_s, last_seen_wall_time_s"
+    "name, kind, unit, path, reduction, role, first_seen_wall_time_s, last_seen_wall_time_s"
 )
 _ENTER: Final = (
     f"INSERT INTO main.signal (robot_id, {_DESCRIBED}) SELECT :here, {_DESCRIBED} "

@@ -92,7 +92,7 @@ def _are_shorter(search: Search, signal: Signal, runs: Runs) -> Flags:
 
     A long one is reduced; whose items are all replaced (a lidar that sees nothing) has no number.
     """
-    if not len(runs) or not (signal.reduce or signal.path.endswith("]")):
+    if not len(runs) or not (signal.reduction or signal.path.endswith("]")):
         return np.zeros(len(runs), np.bool_)
     frame, array = search.frame, signal.name.rpartition(".")[0]
     others = frame.held(f"{array}.0") | frame.held(f"{array}.count")

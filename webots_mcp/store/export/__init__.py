@@ -59,7 +59,7 @@ def export(
     """Write the state rows of a range, as many as there are now, flattened.
 
     Columns are run, state id, simulation and wall time, then the dotted names in the order in
-    which they first appear; one that has the name of those or `odd` is called `state.NAME`.
+    which they first appear; one that has the name of those or `replaced` is called `state.NAME`.
 
     Args:
         connection: Any; it is never kept busy for more than an instant.

@@ -26,7 +26,7 @@ _IN_SEGMENT: Final = (
     "AND wall_time_s >= :wall_start_s AND wall_time_s < :wall_end_s"
 )
 _CHUNK: Final = (
-    f"SELECT id, sim_time_s, wall_time_s, data, odd FROM state WHERE {_IN_SEGMENT} "
+    f"SELECT id, sim_time_s, wall_time_s, data, replaced FROM state WHERE {_IN_SEGMENT} "
     "AND id <= :last_id AND (sim_time_s > :start_s OR id > :after_id) "
     "ORDER BY sim_time_s, id LIMIT :limit"
 )
@@ -34,9 +34,9 @@ _CHUNK: Final = (
 # step wall time gives the order.
 _AFTER_WALL: Final = "(sim_time_s > :start_s OR wall_time_s > :after_wall_s)"
 _CHUNK_WITH_KEPT: Final = (
-    f"SELECT id, sim_time_s, wall_time_s, data, odd FROM state WHERE {_IN_SEGMENT} "
+    f"SELECT id, sim_time_s, wall_time_s, data, replaced FROM state WHERE {_IN_SEGMENT} "
     f"AND id <= :last_id AND {_AFTER_WALL} UNION ALL "
-    f"SELECT -id, sim_time_s, wall_time_s, data, odd FROM kept_state WHERE {_IN_SEGMENT} "
+    f"SELECT -id, sim_time_s, wall_time_s, data, replaced FROM kept_state WHERE {_IN_SEGMENT} "
     f"AND id <= :last_kept_id AND {_AFTER_WALL} ORDER BY sim_time_s, wall_time_s LIMIT :limit"
 )
 _COUNT: Final = (
@@ -58,7 +58,7 @@ class Recorded(NamedTuple):
     sim_time_s: float
     wall_time_s: float
     data: str
-    odd: str | None
+    replaced: str | None
 
 
 class Row(NamedTuple):
@@ -68,12 +68,12 @@ class Row(NamedTuple):
         head: What `Table.head` names. The id of a state that only a kept stretch has is below 0.
         values: By dotted name. What was not finite is so again; an array of more than 16 items
             is one value.
-        odd: Path of every value that JSON could not hold, and what it was.
+        replaced: Path of every value that JSON could not hold, and what it was.
     """
 
     head: tuple[Any, ...]
     values: dict[str, Any]
-    odd: dict[str, str]
+    replaced: dict[str, str]
 
 
 class Column(NamedTuple):
@@ -89,7 +89,7 @@ _HEAD: Final = (
     Column("sim_time_s", "num"),
     Column("wall_time_s", "num"),
 )
-_RESERVED: Final = frozenset((*(column.name for column in _HEAD), "odd"))
+_RESERVED: Final = frozenset((*(column.name for column in _HEAD), "replaced"))
 
 
 class Table(ABC):
@@ -183,17 +183,17 @@ class Source(Table):
 
 def flat_row(recorded: Recorded) -> Row:
     """A stored row as one value per dotted name."""
-    *head, data, odd_text = recorded
+    *head, data, replaced_text = recorded
     state = parse(data)
-    odd = cast("dict[str, str]", json.loads(odd_text)) if odd_text else {}
-    for path, kind in odd.items():
+    replaced = cast("dict[str, str]", json.loads(replaced_text)) if replaced_text else {}
+    for path, kind in replaced.items():
         if kind in _NOT_FINITE:
             put_back(state, path.split("."), _NOT_FINITE[kind])
     values: dict[str, Any] = {}
     _spread("", state.items(), values)
     for name in _RESERVED.intersection(values):
         values[f"state.{name}"] = values.pop(name)
-    return Row(tuple(head), values, odd)
+    return Row(tuple(head), values, replaced)
 
 
 def value_at(state: dict[str, Any], name: str) -> Any:

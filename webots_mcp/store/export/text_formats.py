@@ -54,13 +54,14 @@ def _harmless(text: str | None) -> str | None:
 def write_json_lines(source: Table, sink: BinaryIO) -> None:
     """One JSON object per row and line: what it holds by dotted name, null where it is not finite.
 
-    `odd`, where a row has it, names the path of every value that JSON cannot hold, and what it was.
+    `replaced`, where a row has it, names the path of every value that JSON cannot hold, and what
+    it was.
     """
     head = [column.name for column in source.head]
     for row in source.rows():
         line: dict[str, Any] = dict(zip(head, row.head, strict=True)) | row.values
-        if row.odd:
-            line["odd"] = row.odd
+        if row.replaced:
+            line["replaced"] = row.replaced
         sink.write(_line(line))
 
 

@@ -191,11 +191,11 @@ class _Writer:
         self._insert("event", **self._at(self._first_s), kind="import", data=text)
         if state := self._found.state:
             at = self._at(state.wall_time_s)
-            state_id = self._insert("state", **at, data=state.data, odd=state.odd)
+            state_id = self._insert("state", **at, data=state.data, replaced=state.replaced)
             batch = Batch()
             batch.add(
                 state_id, self._robot_id, self.run_id, at["sim_time_s"], state.wall_time_s,
-                state.data, state.odd,
+                state.data, state.replaced,
             )  # fmt: skip
             enter_signals(self._connection, self._robot_id, batch.columns())
         for picture, path in zip(self._found.pictures, paths, strict=True):
@@ -228,12 +228,12 @@ class _Writer:
             started_sim_time_s=0.0,
             last_wall_time_s=self._last_s,
             last_sim_time_s=self._last_s - self._first_s,
-            rows=int(self._found.state is not None),
+            row_count=int(self._found.state is not None),
         )
         return session_id
 
     def _insert_picture(self, picture: FoundPicture, path: str) -> None:
-        size = {"width": picture.width, "height": picture.height, "bytes": picture.size_bytes}
+        size = {"width": picture.width, "height": picture.height, "size_bytes": picture.size_bytes}
         device = "camera" if picture.kind == "camera" else None
         at = self._at(picture.wall_time_s)
         self._insert("image", **at, kind=picture.kind, device=device, path=path, **size)

@@ -30,11 +30,11 @@ _STAMP: Final = re.compile(r"\[(\d\d):(\d\d):(\d\d)\] ?(.*)", re.DOTALL)
 
 
 class FoundState(NamedTuple):
-    """The newest state; `data` and `odd` are JSON text as the database holds them."""
+    """The newest state; `data` and `replaced` are JSON text as the database holds them."""
 
     wall_time_s: float
     data: str
-    odd: str | None
+    replaced: str | None
 
 
 class FoundCommand(NamedTuple):
@@ -152,10 +152,10 @@ def _read_state(file: Path) -> FoundState | None:
     state = _read_json(file)
     if not isinstance(state, dict):
         raise InvalidInputError(f"{file}: a state is an object, this is a {type(state).__name__}")
-    odd: dict[str, str] = {}
-    clean = _clean(cast("dict[str, Any]", state), (), odd, file)
+    replaced: dict[str, str] = {}
+    clean = _clean(cast("dict[str, Any]", state), (), replaced, file)
     wall_time_s = _moment(clean.get("timestamp"), file)
-    return FoundState(wall_time_s, _encode(clean), _encode(odd) if odd else None)
+    return FoundState(wall_time_s, _encode(clean), _encode(replaced) if replaced else None)
 
 
 def _read_commands(file: Path) -> Iterator[FoundCommand]:
@@ -190,8 +190,8 @@ def _read_json(file: Path) -> Any:
         raise InvalidInputError(f"{file}: not valid JSON: {error}") from error
 
 
-def _clean(value: Any, path: tuple[str, ...], odd: dict[str, str], file: Path) -> Any:
-    """A copy without what JSON cannot hold; `odd` names where that stood, as the bridge does."""
+def _clean(value: Any, path: tuple[str, ...], replaced: dict[str, str], file: Path) -> Any:
+    """A copy without what JSON cannot hold; `replaced` names where it stood, as in a bridge."""
     if len(path) > MAX_DEPTH:
         raise InvalidInputError(
             f"{file} is nested over {MAX_DEPTH} levels, at {path[0]!r:.{_SHOWN}}"
@@ -199,25 +199,25 @@ def _clean(value: Any, path: tuple[str, ...], odd: dict[str, str], file: Path) -
     if isinstance(value, dict):
         items = cast("dict[str, Any]", value).items()
         return {
-            _text(key, (*path, key), odd): _clean(item, (*path, key), odd, file)
+            _text(key, (*path, key), replaced): _clean(item, (*path, key), replaced, file)
             for key, item in items
         }
     if isinstance(value, list):
         array = cast("list[Any]", value)
-        return [_clean(item, (*path, str(i)), odd, file) for i, item in enumerate(array)]
+        return [_clean(item, (*path, str(i)), replaced, file) for i, item in enumerate(array)]
     if isinstance(value, str):
-        return _text(value, path, odd)
+        return _text(value, path, replaced)
     if isinstance(value, (int, float)) and (why := _no_number(value)):
-        odd[".".join(path)] = why
+        replaced[".".join(path)] = why
         return None
     return value
 
 
-def _text(text: str, path: tuple[str, ...], odd: dict[str, str]) -> str:
+def _text(text: str, path: tuple[str, ...], replaced: dict[str, str]) -> str:
     """Text that UTF-8 can hold."""
     if is_text(text):
         return text
-    odd[_readable(".".join(path))] = "surrogate"
+    replaced[_readable(".".join(path))] = "surrogate"
     return _readable(text)
 
 

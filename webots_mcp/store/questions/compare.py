@@ -44,7 +44,8 @@ _AS_LONG: Final = 1.01  # times the compared stretch: the ends of like runs diff
 
 _CODE_OF_RUNS: Final = (
     "SELECT r.id, s.controller_sha256 FROM run r JOIN session s ON s.id = r.session_id "
-    "WHERE r.robot_id = ? AND (r.rows > 0 OR EXISTS (SELECT 1 FROM state WHERE run_id = r.id)) "
+    "WHERE r.robot_id = ? "
+    "AND (r.row_count > 0 OR EXISTS (SELECT 1 FROM state WHERE run_id = r.id)) "
     "ORDER BY r.id DESC"
 )
 

@@ -26,8 +26,8 @@ _RUNS: Final = (
     "SELECT r.id, b.name, r.session_id, s.controller, s.controller_sha256, s.git_commit, r.world, "
     "r.start_reason, r.end_reason, r.label, r.note, r.purged_rows, "
     # Rows, times and what was said last are those of a heartbeat, which newer rows may follow.
-    "r.rows + CASE WHEN r.ended_wall_time_s IS NULL THEN (SELECT count(*) FROM state "
-    "WHERE run_id = r.id AND sim_time_s > CASE WHEN r.rows > 0 THEN r.last_sim_time_s "
+    "r.row_count + CASE WHEN r.ended_wall_time_s IS NULL THEN (SELECT count(*) FROM state "
+    "WHERE run_id = r.id AND sim_time_s > CASE WHEN r.row_count > 0 THEN r.last_sim_time_s "
     "ELSE -9e999 END) ELSE 0 END, "
     "r.started_wall_time_s, max(r.last_wall_time_s, coalesce((SELECT wall_time_s FROM state "
     "WHERE run_id = r.id ORDER BY sim_time_s DESC, id DESC LIMIT 1), 0)), "
@@ -37,7 +37,7 @@ _RUNS: Final = (
 )
 _WHAT: Final = (
     "run_id", "robot", "session_id", "controller", "controller_sha256", "git_commit", "world",
-    "start_reason", "end_reason", "label", "note", "purged_rows", "rows",
+    "start_reason", "end_reason", "label", "note", "purged_rows", "row_count",
 )  # fmt: skip
 _PAGE: Final = (
     f"{_RUNS} WHERE (:robot IS NULL OR r.robot_id = :robot) AND (:before IS NULL OR r.id < :before)"
@@ -71,7 +71,7 @@ class RunInfo:
         end_reason: None while it goes on; where its process is gone, how that will be judged.
         duration_s: Simulated seconds.
         held_s: Of the wall time, that for which the simulation was paused by a command.
-        rows: State rows; retention has deleted `purged_rows` of them.
+        row_count: State rows; retention has deleted `purged_rows` of them.
         notable: How often what needs attention was stored: warnings, errors, dropped rows,
             failed or lost commands, trouble with storage.
         parameters: Those that are not as the code declared them, or differ between the runs that
@@ -90,7 +90,7 @@ class RunInfo:
     label: str | None
     note: str | None
     purged_rows: int
-    rows: int
+    row_count: int
     started_wall_time_s: float
     wall_duration_s: float
     held_s: float

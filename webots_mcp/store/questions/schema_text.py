@@ -42,8 +42,7 @@ _BOOKKEEPING_COLUMNS: Final = (
     "standstills",
 )
 _COLUMNS: Final = "SELECT name FROM pragma_table_info(?) ORDER BY cid"
-# A column that was added later stands on the line of the last one, after a comma.
-_COMMENT: Final = re.compile(r'(?:^|,)\s*"?(\w+)"?\s[^\n,]*?/\* (.*?) \*/', re.MULTILINE)
+_COMMENT: Final = re.compile(r'^\s*"?(\w+)"?\s[^\n,]*?/\* (.*?) \*/', re.MULTILINE)
 _RULES: Final = (
     "Times are seconds: sim_time_s of the simulation, wall_time_s Unix. state.data is JSON: "
     "json_extract(data, '$.pose[0]'); signal.path has the path of each name. A range of a run is "

@@ -46,7 +46,7 @@ _FIRST_LABEL: Final = 2  # of the codes of a chunk
 _IN: Final = "run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
 _STATES: Final = f"SELECT {STATE_COLUMNS} FROM state WHERE {_IN} ORDER BY sim_time_s, id"
 _KEPT: Final = (
-    "SELECT -id, sim_time_s, wall_time_s, data, odd FROM kept_state "
+    "SELECT -id, sim_time_s, wall_time_s, data, replaced FROM kept_state "
     f"WHERE {_IN} ORDER BY sim_time_s, id LIMIT ?"
 )
 # Rows that were deleted, and of which no chunk is left. What is oldest goes first.

@@ -19,7 +19,7 @@ from webots_mcp.store.analysis.summary import aligned_numbers, usable_part
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.kept import kept_parts
 from webots_mcp.store.reading.ranges import Segment
-from webots_mcp.store.rollup.batch import is_odd, odd_names
+from webots_mcp.store.rollup.batch import is_replaced, replaced_names
 from webots_mcp.store.run_rows import State
 from webots_mcp.store.signals.flatten import parse, reductions, shown
 from webots_mcp.store.signals.registry import Signal
@@ -61,7 +61,7 @@ class Columns:
 
     Attributes:
         values: Per signal one value per row; None where the row has none.
-        odd: Per signal, how often each value that JSON cannot hold ("nan", "inf") stood there.
+        replaced: Per signal, how often each value that JSON cannot hold ("nan", "inf") stood there.
         cut_at_s: The deadline passed after this row, or before any where it is the begin of what
             was to be read; None where all was read.
     """
@@ -71,7 +71,7 @@ class Columns:
     times: list[float] = field(default_factory=list[float])
     walls: list[float] = field(default_factory=list[float])
     values: dict[str, list[Value]] = field(default_factory=dict[str, list[Value]])
-    odd: dict[str, Counter[str]] = field(default_factory=dict[str, Counter[str]])
+    replaced: dict[str, Counter[str]] = field(default_factory=dict[str, Counter[str]])
     cut_at_s: float | None = None
     _aligned: dict[str, Array] = field(default_factory=dict[str, Array], repr=False)
 
@@ -185,7 +185,7 @@ def read_numbers(
     deadline: Deadline,
 ) -> Numbers:
     """The numbers that `read_columns` reads of numeric signals, without their values as a list."""
-    if not signals or _are_decoded(signals) or any(signal.reduce for signal in signals):
+    if not signals or _are_decoded(signals) or any(signal.reduction for signal in signals):
         return numbers_of(read_columns(connection, segment, signals, deadline), signals)
     columns = Columns(segment.run_id)
     parts: list[Array] = []
@@ -280,19 +280,19 @@ def _read_extracted(
 ) -> None:
     """Each path is extracted once, all of a row in one call."""
     paths = tuple(dict.fromkeys(signal.path for signal in signals))
-    for odds, texts in _chunks(connection, asked, extracted("data", paths), columns, deadline):
+    for replaced, texts in _chunks(connection, asked, extracted("data", paths), columns, deadline):
         by_path = values_at(paths, texts)
         reduced = {
             path: [reductions(array) for array in by_path[path]]
-            for path in {signal.path for signal in signals if signal.reduce}
+            for path in {signal.path for signal in signals if signal.reduction}
         }
         for signal in signals:
-            if signal.reduce is None:
+            if signal.reduction is None:
                 columns.values[signal.name].extend(by_path[signal.path])
             else:
                 rows = reduced[signal.path]
-                columns.values[signal.name].extend([row.get(signal.reduce) for row in rows])
-        _count_odd(columns, signals, odds)
+                columns.values[signal.name].extend([row.get(signal.reduction) for row in rows])
+        _count_replaced(columns, signals, replaced)
 
 
 def _numbers_at(signals: Sequence[Signal], texts: Sequence[str]) -> Array:
@@ -354,12 +354,12 @@ def _read_decoded(
     columns: Columns,
     deadline: Deadline,
 ) -> None:
-    for odds, texts in _chunks(connection, asked, ("data", ()), columns, deadline):
+    for replaced, texts in _chunks(connection, asked, ("data", ()), columns, deadline):
         states = [flatten(parse(data)) for data in texts]
         for signal in signals:
             name = signal.name
             columns.values[name].extend([row.get(name) for row in states])
-        _count_odd(columns, signals, odds)
+        _count_replaced(columns, signals, replaced)
 
 
 def _chunks(
@@ -369,37 +369,39 @@ def _chunks(
     columns: Columns,
     deadline: Deadline,
 ) -> Iterator[tuple[Sequence[str | None], Sequence[str]]]:
-    """Some rows each, which are added to the columns: what was odd in them, and what is wanted.
+    """Some rows each, which are added to the columns: what was replaced, and what is wanted.
 
     The row after them is fetched first: without one, all was read whatever the time is.
     """
     what, paths = wanted
-    cursor = connection.execute(*asked.query(f"sim_time_s, wall_time_s, odd, {what}", paths))
+    cursor = connection.execute(*asked.query(f"sim_time_s, wall_time_s, replaced, {what}", paths))
     ahead = cursor.fetchmany(1)
     while ahead:
         chunk = [*ahead, *cursor.fetchmany(_CHUNK_ROWS - 1)]
         ahead = cursor.fetchmany(1)
-        ids, times, walls, odds, texts = zip(*chunk, strict=True)
+        ids, times, walls, replaced, texts = zip(*chunk, strict=True)
         columns.ids.extend(ids)
         columns.times.extend(times)
         columns.walls.extend(walls)
-        yield odds, texts
+        yield replaced, texts
         if ahead and deadline.passed:
             columns.cut_at_s = columns.times[-1]
             return
 
 
-def _count_odd(columns: Columns, signals: Sequence[Signal], odds: Sequence[str | None]) -> None:
-    """Count what was odd in the newest rows, whose values are there."""
-    if not any(odds):
+def _count_replaced(
+    columns: Columns, signals: Sequence[Signal], texts: Sequence[str | None]
+) -> None:
+    """Count what was replaced in the newest rows, whose values are there."""
+    if not any(texts):
         return
-    replaced = {odd: odd_names(odd) for odd in set(odds)}  # mostly the same in all rows
-    named = {odd: [each.name for each in signals if each.name in replaced[odd]] for odd in replaced}
-    for row, odd in enumerate(odds, len(columns.ids) - len(odds)):
-        reasons = replaced[odd]
-        for name in named[odd]:
-            if is_odd(reasons, name, columns.values[name][row]):
-                columns.odd.setdefault(name, Counter())[reasons[name]] += 1
+    known = {text: replaced_names(text) for text in set(texts)}  # mostly the same in all rows
+    named = {text: [each.name for each in signals if each.name in known[text]] for text in known}
+    for row, text in enumerate(texts, len(columns.ids) - len(texts)):
+        reasons = known[text]
+        for name in named[text]:
+            if is_replaced(reasons, name, columns.values[name][row]):
+                columns.replaced.setdefault(name, Counter())[reasons[name]] += 1
 
 
 def cleaned(signal: Signal, values: list[Any]) -> list[Value]:

@@ -28,11 +28,13 @@ _KIND_OF: Final = {**{kind: kind for kind in KINDS}, "outlive": "run"}
 _NAME_OF: Final = {kind: name for name, kind in _KIND_OF.items()}
 _SHOWN: Final = {"unshipped": "until_shipped"}  # only where it was set
 _READ: Final = (
-    "SELECT kind, size_bytes, rows, age_s, times, set_by, set_wall_time_s FROM retention_limit"
+    "SELECT kind, size_bytes, row_count, age_s, outlive_factor, set_by, set_wall_time_s "
+    "FROM retention_limit"
 )
 _SET: Final = (
     "INSERT OR REPLACE INTO retention_limit "
-    "(kind, size_bytes, rows, age_s, times, set_by, set_wall_time_s) VALUES (?, ?, ?, ?, ?, ?, ?)"
+    "(kind, size_bytes, row_count, age_s, outlive_factor, set_by, set_wall_time_s) "
+    "VALUES (?, ?, ?, ?, ?, ?, ?)"
 )
 _RESET: Final = "DELETE FROM retention_limit WHERE kind = ?"
 _SERVER: Final = (
@@ -56,11 +58,11 @@ def read_settings(connection: sqlite3.Connection) -> dict[str, Setting]:
         InvalidInputError: The table holds something that is not a limit.
     """
     settings: dict[str, Setting] = {}
-    for kind, size_bytes, rows, age_s, times, set_by, set_s in connection.execute(_READ):
+    for kind, size_bytes, rows, age_s, factor, set_by, set_s in connection.execute(_READ):
         try:
             name = _NAME_OF[kind]
             if name == "outlive":
-                value = replace(DEFAULT, outlive=times).outlive
+                value = replace(DEFAULT, outlive=factor).outlive
             else:
                 of_kind = getattr(DEFAULT, name)
                 value = replace(of_kind, size_bytes=size_bytes, rows=rows, age_s=age_s)

@@ -72,8 +72,8 @@ _COUNT_PURGED: Final = (
 # What goes from the states and lies in a kept stretch stays with it, under a limit of its own.
 # CROSS JOIN: SQLite would go through all states in their order rather than sort the few that go.
 _MOVE_KEPT: Final = (
-    "INSERT INTO kept_state (run_id, sim_time_s, wall_time_s, data, odd) "
-    "SELECT s.run_id, s.sim_time_s, s.wall_time_s, s.data, s.odd FROM going g "
+    "INSERT INTO kept_state (run_id, sim_time_s, wall_time_s, data, replaced) "
+    "SELECT s.run_id, s.sim_time_s, s.wall_time_s, s.data, s.replaced FROM going g "
     "CROSS JOIN state s ON s.id = g.id WHERE EXISTS (SELECT 1 FROM kept_stretch k "
     "WHERE k.run_id = s.run_id AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s) "
     "ORDER BY g.id"

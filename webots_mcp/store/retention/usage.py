@@ -21,7 +21,7 @@ UNBOUNDED: Final = 2**62
 _BLOCK_IDS: Final = 512
 
 _RUNS: Final = (
-    f"SELECT id, robot_id, rows, started_wall_time_s, last_wall_time_s, {KEPT}, "
+    f"SELECT id, robot_id, row_count, started_wall_time_s, last_wall_time_s, {KEPT}, "
     "ended_wall_time_s IS NULL OR id = (SELECT max(id) FROM run n WHERE n.robot_id = run.robot_id)"
     " AS is_current FROM run WHERE typeof(started_wall_time_s) IN ('real', 'integer') "
     "AND typeof(last_wall_time_s) IN ('real', 'integer') ORDER BY started_wall_time_s, id"

@@ -47,7 +47,7 @@ class Batch:
         sim_time_s: float,
         wall_time_s: float,
         data: str,
-        odd: str | None,
+        replaced: str | None,
     ) -> None:
         """Add a row; one whose data is no JSON object only counts."""
         self.rows += 1
@@ -59,10 +59,12 @@ class Batch:
                 column.first_wall_time_s = wall_time_s
             column.points.append((state_id, sim_time_s, value))
             column.last_wall_time_s = wall_time_s
-        reasons = odd_names(odd)
+        reasons = replaced_names(replaced)
         for name in reasons.keys() & columns.keys():
             state, _, value = columns[name].points[-1]
-            columns[name].replaced_row_count += state == state_id and is_odd(reasons, name, value)
+            columns[name].replaced_row_count += state == state_id and is_replaced(
+                reasons, name, value
+            )
 
     def columns(self) -> Iterator[BatchColumn]:
         """Every signal of every run."""
@@ -70,15 +72,15 @@ class Batch:
             yield from columns.values()
 
 
-def odd_names(odd: str | None) -> dict[str, str]:
-    """What was odd (nan, inf, ...) by signal: by its own name, or by an item of its array.
+def replaced_names(replaced: str | None) -> dict[str, str]:
+    """What was replaced (nan, inf, ...) by signal: by its own name, or by an item of its array.
 
     Of an array in which all nulls are of one kind it is named for every item, and under `name.*`.
     """
-    if odd is None:
+    if replaced is None:
         return {}
     reasons: dict[str, str] = {}
-    for path, reason in cast("dict[str, str]", parse(odd)).items():
+    for path, reason in cast("dict[str, str]", parse(replaced)).items():
         array, _, item = path.rpartition(".")
         if item == ANY_ITEM:
             reasons.update((f"{array}.{index}", reason) for index in range(LONGEST_SPREAD_ARRAY))
@@ -88,7 +90,7 @@ def odd_names(odd: str | None) -> dict[str, str]:
     return reasons
 
 
-def is_odd(reasons: dict[str, str], name: str, value: Value) -> bool:
+def is_replaced(reasons: dict[str, str], name: str, value: Value) -> bool:
     """Whether a value is what the reasons of its row are about: of `name.*` only the nulls are."""
     array, _, item = name.rpartition(".")
     return not item.isdecimal() or value is None or f"{array}.{ANY_ITEM}" not in reasons

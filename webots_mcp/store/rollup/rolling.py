@@ -44,7 +44,7 @@ _SET_WATERMARK: Final = (
     "ON CONFLICT (name) DO UPDATE SET state_id = "
     f"iif({IS_ID.format('state_id')}, max(state_id, excluded.state_id), excluded.state_id)"
 )
-_COLUMNS: Final = "s.id, r.robot_id, s.run_id, s.sim_time_s, s.wall_time_s, s.data, s.odd"
+_COLUMNS: Final = "s.id, r.robot_id, s.run_id, s.sim_time_s, s.wall_time_s, s.data, s.replaced"
 _ROWS: Final = (
     f"SELECT {_COLUMNS} FROM state s JOIN run r ON r.id = s.run_id "
     "WHERE s.id > ? ORDER BY s.id LIMIT ?"
@@ -60,7 +60,7 @@ _LAST_CHANGE: Final = (
 # The rollups were emptied by hand, although rows are there that they once held.
 _EMPTIED: Final = (
     "SELECT NOT EXISTS (SELECT 1 FROM rollup) "
-    "AND (SELECT total(rows) FROM signal) > (SELECT total(rows) FROM recent_rollup) "
+    "AND (SELECT total(row_count) FROM signal) > (SELECT total(rows) FROM recent_rollup) "
     "AND EXISTS (SELECT 1 FROM state WHERE id <= (SELECT state_id FROM watermark))"
 )
 

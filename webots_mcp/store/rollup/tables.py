@@ -45,7 +45,8 @@ _TEMPORARY: Final = {
     "new_count": ", ".join(Count._fields),
 }
 ADD_COUNTS: Final = (
-    "UPDATE signal SET kind = n.kind, unit = n.unit, rows = signal.rows + n.rows, "
+    "UPDATE signal SET kind = n.kind, unit = n.unit, "
+    "row_count = signal.row_count + n.row_count, "
     "null_row_count = signal.null_row_count + n.null_row_count, "
     "replaced_row_count = signal.replaced_row_count + n.replaced_row_count, "
     "last_seen_wall_time_s = max(signal.last_seen_wall_time_s, n.seen_wall_time_s), "
@@ -93,7 +94,7 @@ _FORGET: Final = (
     "DELETE FROM rollup",
     "DELETE FROM recent_rollup",
     "DELETE FROM change",
-    "UPDATE signal SET rows = 0, null_row_count = 0, replaced_row_count = 0, "
+    "UPDATE signal SET row_count = 0, null_row_count = 0, replaced_row_count = 0, "
     "min = NULL, max = NULL",
 )
 

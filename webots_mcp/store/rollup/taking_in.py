@@ -62,7 +62,7 @@ def _copy(connection: sqlite3.Connection, table: str, there: int, here: int, shi
 
 
 def _counts(connection: sqlite3.Connection, here: int) -> list[Count]:
-    """What the run adds to the register; how many of its values were odd summaries do not tell."""
+    """What the run adds to the register; how many values were replaced summaries do not tell."""
     counts: list[Count] = []
     for signal_id, name, kind, kind_there, seen_s, rows, present, least, most in connection.execute(
         _COUNTS, {"run": here}

@@ -28,11 +28,11 @@ SAMPLED_ROWS: Final = 200  # rows not yet rolled up that are searched for new na
 _MOST_OFFERED: Final = 5
 
 _NEWEST_ROWS: Final = (
-    "SELECT id, sim_time_s, wall_time_s, data, odd FROM state WHERE run_id = ? "
+    "SELECT id, sim_time_s, wall_time_s, data, replaced FROM state WHERE run_id = ? "
     "ORDER BY sim_time_s DESC, id DESC"
 )
 _OLDEST_AFTER: Final = (  # by ids, from the watermark on: see `reading.rollups`
-    "SELECT id, sim_time_s, wall_time_s, data, odd FROM state WHERE id > ? AND +run_id = ? "
+    "SELECT id, sim_time_s, wall_time_s, data, replaced FROM state WHERE id > ? AND +run_id = ? "
     "ORDER BY id LIMIT ?"
 )
 _FIGURES: Final = {
@@ -127,10 +127,10 @@ def other_form(known: dict[str, Signal], signal: Signal) -> Signal | None:
     Of more than 16 items an array is `lidar.min` and others, of fewer `lidar.0` and so on.
     """
     branch, _, last = signal.name.rpartition(".")
-    if signal.reduce is not None:
+    if signal.reduction is not None:
         return known.get(f"{branch}.0")
     other = known.get(f"{branch}.{REDUCTIONS[0]}")
-    return other if last.isdigit() and other is not None and other.reduce is not None else None
+    return other if last.isdigit() and other is not None and other.reduction is not None else None
 
 
 def _unrolled_sample(connection: sqlite3.Connection, robot_id: int, run_id: int) -> Batch:

@@ -29,7 +29,7 @@ from webots_mcp.store.rollup.batch import BatchColumn
 from webots_mcp.store.signals.flatten import parse
 
 _OF_ROBOT: Final = (
-    "SELECT id, robot_id, name, kind, unit, path, reduce, role FROM signal "
+    "SELECT id, robot_id, name, kind, unit, path, reduction, role FROM signal "
     "WHERE robot_id = ? AND typeof(name) = 'text' AND typeof(path) = 'text' ORDER BY id"
 )
 
@@ -48,7 +48,7 @@ class Signal:
     Attributes:
         id: In the register; None for one that was seen only in rows after the watermark.
         path: For `json_extract(state.data, path)`.
-        reduce: None, or how the long array at `path` becomes one number.
+        reduction: None, or how the long array at `path` becomes one number.
         role: What it tells of the robot's motion, as `signal_roles` decides; None of most.
         decoded: Rows must be decoded to read it: its array was at times long enough to be
             reduced, or its name holds what the paths of SQLite before 3.45 do not reach.
@@ -61,7 +61,7 @@ class Signal:
     kind: Kind
     unit: str | None
     path: str
-    reduce: str | None
+    reduction: str | None
     role: str | None = None
     decoded: bool = False
     is_choice: bool = False
@@ -69,7 +69,7 @@ class Signal:
     @property
     def is_plain(self) -> bool:
         """Whether `json_extract` alone gives the same as `flatten`."""
-        return self.reduce is None and not self.decoded
+        return self.reduction is None and not self.decoded
 
     @property
     def turn(self) -> float | None:
@@ -89,7 +89,7 @@ class Signal:
     @property
     def is_index(self) -> bool:
         """Whether it says which item of an array, not how much: it leaps and rests by nature."""
-        return self.reduce == "argmin"
+        return self.reduction == "argmin"
 
     @property
     def is_number(self) -> bool:
@@ -140,7 +140,7 @@ def _are_choices(column: BatchColumn) -> bool:
 
 def by_name(signals: Sequence[Signal]) -> dict[str, Signal]:
     """The signals by name, with what they tell about each other."""
-    arrays = tuple({f"{signal.path}[" for signal in signals if signal.reduce})
+    arrays = tuple({f"{signal.path}[" for signal in signals if signal.reduction})
     return {
         signal.name: replace(signal, decoded=True)
         if signal.path.startswith(arrays) or not is_reachable(signal.name)
@@ -229,7 +229,7 @@ class Count(NamedTuple):
     signal_id: int | None
     kind: Kind
     unit: str | None
-    rows: int
+    row_count: int
     null_row_count: int
     replaced_row_count: int
     seen_wall_time_s: float

@@ -264,7 +264,7 @@ def _pooled_run(recording_uuid: str, run: Record, robots: Mapping[int, str]) -> 
             name: run[name]
             for name in (
                 "label", "world", "started_wall_time_s", "last_wall_time_s",
-                "started_sim_time_s", "last_sim_time_s", "end_reason", "rows",
+                "started_sim_time_s", "last_sim_time_s", "end_reason", "row_count",
             )
         },
     )  # fmt: skip

@@ -43,7 +43,7 @@ FROM recording e ORDER BY e.created_wall_time_s, e.{OWNER}"""
 _RUNS: Final = f"""
 SELECT u.{OWNER}::text, u.id, coalesce(u.uuid, ''), r.name, u.label, u.world,
   u.started_wall_time_s, u.last_wall_time_s, u.started_sim_time_s, u.last_sim_time_s,
-  u.end_reason, u.rows
+  u.end_reason, u.row_count
 FROM run u JOIN robot r ON r.{OWNER} = u.{OWNER} AND r.id = u.robot_id
 WHERE %(uuid)s::uuid IS NULL OR u.{OWNER} = %(uuid)s::uuid
 ORDER BY u.started_wall_time_s, u.{OWNER}, u.id"""

@@ -95,13 +95,13 @@ def _first(
 
 # In the order in which they are made: what a view asks comes before it.
 _QUERIES: Final = {
-    "all_state": f"""SELECT {_KEY}, id AS state_id, run_id, sim_time_s, wall_time_s, data, odd
+    "all_state": f"""SELECT {_KEY}, id AS state_id, run_id, sim_time_s, wall_time_s, data, replaced
 FROM state
 UNION ALL
-SELECT {_KEY}, NULL, run_id, sim_time_s, wall_time_s, data, odd FROM kept_state""",
+SELECT {_KEY}, NULL, run_id, sim_time_s, wall_time_s, data, replaced FROM kept_state""",
     "robot_now": f"""SELECT r.{_KEY}, r.name AS robot, u.id AS run_id, u.end_reason, s.sim_time_s,
   rounded({_NOW_S} - s.wall_time_s, 1) AS age_s,{_motion("r.id")},
-  s.data, s.odd
+  s.data, s.replaced
 FROM robot r
 LEFT JOIN LATERAL (SELECT id, end_reason FROM run
   WHERE {_KEY} = r.{_KEY} AND robot_id = r.id ORDER BY id DESC LIMIT 1) u ON true
@@ -109,7 +109,7 @@ LEFT JOIN LATERAL (SELECT * FROM state
   WHERE {_KEY} = r.{_KEY} AND run_id = u.id ORDER BY sim_time_s DESC, id DESC LIMIT 1) s ON true""",
     "robot_trajectory": f"""SELECT s.{_KEY}, {_robot_of("s")},
   s.run_id, s.id AS state_id, s.sim_time_s, utc_text(s.wall_time_s) AS utc,{_motion("v.robot_id")},
-  s.odd
+  s.replaced
 FROM state s LEFT JOIN run v ON v.{_KEY} = s.{_KEY} AND v.id = s.run_id""",
     "robot_run": f"""SELECT u.{_KEY}, r.name AS robot, u.id AS run_id, u.label,
   utc_text(u.started_wall_time_s) AS started_utc,
@@ -117,8 +117,8 @@ FROM state s LEFT JOIN run v ON v.{_KEY} = s.{_KEY} AND v.id = s.run_id""",
   rounded(u.last_wall_time_s - u.started_wall_time_s, 3) AS wall_duration_s,
   rounded((u.last_sim_time_s - u.started_sim_time_s)
     / nullif(u.last_wall_time_s - u.started_wall_time_s, 0), 3) AS real_time_factor,
-  u.rows, u.purged_rows,
-  rounded(u.rows / nullif(u.last_sim_time_s - u.started_sim_time_s, 0), 2) AS rows_per_s,
+  u.row_count, u.purged_rows,
+  rounded(u.row_count / nullif(u.last_sim_time_s - u.started_sim_time_s, 0), 2) AS rows_per_s,
   u.start_reason, u.end_reason, u.keep, u.note, u.world, s.controller, s.controller_sha256,
   s.git_commit, u.session_id
 FROM run u JOIN robot r ON r.{_KEY} = u.{_KEY} AND r.id = u.robot_id

@@ -166,7 +166,7 @@ def test_export_tells_a_program_what_a_file_got(say: Say, tmp_path: Path) -> Non
         return json.loads(say("export", "--json", "-o", str(tmp_path / name), *more))
 
     table = told("run.jsonl", "--run", "1", "--end", "99")
-    assert (table["file"], table["rows"]) == (str(tmp_path / "run.jsonl"), 530)
+    assert (table["file"], table["row_count"]) == (str(tmp_path / "run.jsonl"), 530)
     assert "ends at" in table["notes"][0]
     counts = told("run.mcap", "--run", "1")["counts"]
     assert (counts["states"], " " in "".join(counts)) == (530, False)
@@ -322,7 +322,7 @@ def test_what_is_pruned_is_told_to_programs_in_bytes_and_ids(say: Say, database:
     assert limits["limits"]["states"].startswith("400rows (set by retain")
     tried = json.loads(say("prune", "--dry-run", "--json"))
     (states,) = tried["goes"]
-    assert (states["table"], states["rows"], states["run_ids"]) == ("state", 130, [1])
+    assert (states["table"], states["row_count"], states["run_ids"]) == ("state", 130, [1])
     assert tried["retained"]["run_ids"] == [2]
     assert tried["disk_bytes"]["file"] == database.stat().st_size
     done = json.loads(say("prune", "--json"))

@@ -49,7 +49,7 @@ def test_programs_read_json(ask: Ask, runs: Recorded) -> None:
     found = json.loads(ask("pool", "POOL", "runs", "--label", "wall 2", "--json"))
     (run,) = found["runs"]
     (uuid,) = runs.connection.execute("SELECT uuid FROM run WHERE id = 2").fetchone()
-    assert (run["uuid"], run["rows"], found["total"]) == (uuid, 6, 1)
+    assert (run["uuid"], run["row_count"], found["total"]) == (uuid, 6, 1)
     assert json.loads(ask("pool", "POOL", "trials", "--json"))["total"] == 1
     assert json.loads(ask("pool", "POOL", "sizes", "--json"))["tables"]
 

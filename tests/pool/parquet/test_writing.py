@@ -84,7 +84,7 @@ def write_all(url: str, steps: Sequence[list[Batch]]) -> None:
 
 def run_row(row_id: int, rows: int) -> dict[str, SQLValue]:
     return {
-        "id": row_id, "session_id": 1, "robot_id": 1, "start_reason": "start", "rows": rows,
+        "id": row_id, "session_id": 1, "robot_id": 1, "start_reason": "start", "row_count": rows,
         "started_wall_time_s": 1.0, "started_sim_time_s": 0.0, "last_wall_time_s": 2.0,
         "last_sim_time_s": 1.0, "keep": 0, "purged_rows": 0, "rolled_state_id": 0,
         "uuid": f"run-{row_id}",
@@ -115,7 +115,7 @@ def test_killed_at_any_put_a_shipper_goes_on_and_each_row_is_there_once() -> Non
         Bucket.store.pop(f"/pool/robots/recording={UUID}/_lease", None)  # it has run out
         write_all(url, STEPS)
         assert ids(pooled(url, UUID, "log")) == sorted(globbed_ids("log")) == [1, 2, 3, 4, 5, 6]
-        at = table("run").columns.index("rows")
+        at = table("run").columns.index("row_count")
         assert [row[at] for row in pooled(url, UUID, "run")] == [6, 0]
 
 

@@ -56,7 +56,7 @@ _IN_MOST_ROWS: Final = (
     "FROM {table} WHERE run_id = :run AND bucket >= :first AND bucket < :end AND signal_id = "
     "(SELECT id FROM signal s WHERE robot_id = (SELECT robot_id FROM run WHERE id = :run) "
     "AND EXISTS (SELECT 1 FROM all_rollup WHERE run_id = :run AND signal_id = s.id) "
-    "ORDER BY s.rows - s.null_row_count DESC LIMIT 1)"
+    "ORDER BY s.row_count - s.null_row_count DESC LIMIT 1)"
 )
 _BUCKETS: Final = (
     f"SELECT bucket, rows, first_sim_time_s, last_sim_time_s {_IN_MOST_ROWS} ORDER BY bucket"

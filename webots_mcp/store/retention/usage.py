@@ -49,7 +49,7 @@ _BLOCKS: Final = (
 )
 # The frames of a kept stretch count with its states, and go with them.
 _OWN: Final = f"AND kind <> '{KEPT_FRAME}'"
-_FILE_BYTES: Final = "iif(bytes BETWEEN 0 AND 1e12, bytes, 0)"
+_FILE_BYTES: Final = "iif(size_bytes BETWEEN 0 AND 1e12, size_bytes, 0)"
 _FRAMES: Final = (
     f"SELECT run_id, sum({_FILE_BYTES}) * 1.0 / max(1, (SELECT count(*) FROM kept_state k "
     f"WHERE k.run_id = image.run_id)) FROM image WHERE kind = '{KEPT_FRAME}' GROUP BY run_id"

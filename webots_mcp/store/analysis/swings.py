@@ -1,56 +1,77 @@
 """Regular swings: where a value goes to and fro, how fast and how far.
 
-The search is local: each stretch without recording gaps is looked at by itself, and in it each
-period has a band of its own, in which a swing shows as crossings of zero that come
-regularly and reach equally far. Where the course bends by more than noise makes it, swings are
-looked for next to its bends (`swings_on_bends`). What happens elsewhere in the stretch changes
-nothing, so that asking for more time never finds less.
+Looked at are second differences of means: x(t + lag) - 2 x(t) + x(t - lag) with a lag of about a
+quarter of a period. A sine stays a sine in them, a straight course is 0, and a bend of the course
+is short, so that swings are found over ramps, turns and slow drifts alike. Each octave of periods
+is searched in means of twice as many rows. Windows of two periods in which the sign changes as in
+a sine are fitted; what remains is judged by how well sines explain it, by how far it stands out of
+its surroundings, and by whether straight pieces that never turn back explain it as well.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
+from functools import lru_cache
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import Array, inner, median, np, sums_of
-from webots_mcp.store.analysis.noise import Roughness
+from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, median, np, sums_of
+from webots_mcp.store.analysis.noise import noise_of
 from webots_mcp.store.analysis.rhythm import gap_borders
-from webots_mcp.store.analysis.sines import TRIED_PERIODS, alike_rows, fit_sines, parabolas
-from webots_mcp.store.analysis.swings_on_bends import likely_swings, swings_on_bends
 
 LEAST_HALF_SWINGS: Final = 6  # four are made by a value that fell, rested, and rose again
 SLOW_PERIOD_S: Final = 5.0  # beyond, bends of a way come as regularly by chance ...
 SLOW_HALF_SWINGS: Final = 12  # ... but hardly ever so many
 SHORTEST_PERIOD_ROWS: Final = 8.0  # fewer rows a period do not show its shape
-SCALE_RATIO: Final = 2**0.5  # from one band to the next
-FINEST_SHARE: Final = 8  # of a band's period: what is shorter is smoothed away
-ROWS_PER_PERIOD: Final = 16  # of a band: of more, means are taken
-FITTED_PER_PERIOD: Final = 32  # the same where a sine is fitted; it loses 0.2 % of its height
-JOINED_PERIODS: Final = 1.5  # so near a gap a swing ends or begins that may go on across it
-LEAST_REST: Final = 0.6  # periods: the ends of swings are known to a quarter
-RESTING: Final = 0.5  # of the amplitude: while it swings, it is 0.7 away (root mean square)
-ALIKE: Final = (1.15, 1.5)  # ratio of periods and of amplitudes on both sides of a gap
-HALF_PERIODS: Final = (0.5 / 1.7, 0.5 * 1.5)  # of the band's period, that a half swing may last
-MOST_UNEVEN: Final = 1.8  # times as far as those before it may a half swing reach
-MOST_IRREGULAR: Final = 0.25  # coefficient of variation of the half periods
-MOST_VARIED: Final = 0.4  # and of how far the half swings reach
-LEAST_EXPLAINED: Final = (0.85, 0.70)  # of the variance by a sine, for 6 half swings and for 10
-PERIODS_FITTED: Final = 2.5  # at once: over more, a swing may change a little
-FEW_COLUMNS: Final = 8  # are added up faster one after the other than row by row
-PIECES_TRIED: Final = 16  # with each period; the whole with the best of them
-LEAST_TRIED: Final = 0.5  # explained of these pieces; less is not looked at further
-NOISE_BENDS: Final = 10.0  # deviations of the noise, over the root of the rows; it makes hardly 7
+
+# Means a period, half a period and a lag: two for each octave.
+LEVELS: Final = ((8.0, 4, 2), (8.0 * 2**0.5, 6, 3))
+BLOCK: Final = 4  # means; half of the shortest period
+AT_ONCE: Final = 32_768  # means, which stay in the cache of a processor
+SURROUNDING: Final = 32  # windows, every fourth, of which the quartile is taken
+LOUD: Final = 2.0
+REGULAR: Final = 0.6  # of the means have another sign half a period later ...
+VERY_REGULAR: Final = 0.8  # ... and so many over four periods, where nothing is louder
+WINDOW: Final = 2.2  # periods
+CLIPPED: Final = 1.5  # times the median magnitude: a sine has a height of 1.4 times its own
+LIKELY: Final = 0.6  # of a clipped window is explained by a sine ...
+MOST_LIKELY: Final = 0.7  # ... and so much somewhere in the stretch
+SEMITONES: Final = range(-5, 6)  # about the period of a level, which reaches from -3 to 3
+HIDDEN: Final = 1.0  # of a period, for which bends may hide a swing that goes on
+
+FITTED_ROWS: Final = 24  # means a period where ends and shape are measured
+LAG: Final = 0.25  # of the period
+EDGE: Final = 0.13  # of the period: a sine that begins at 0 shows so much earlier
+AT_END: Final = 0.5  # of the period: so near the end of what was recorded it reaches up to there
+PIECE: Final = 5.0  # periods of one phase: over more, a swing may change a little
+TRIED: Final = (0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08)
+OUTLYING: Final = (2.0, 2.5)  # median residuals: what is farther off is a bend
+MOST_NOISE: Final = 0.12  # of the squares of second differences, that is taken for noise
+QUIET: Final = 0.4  # of the usual magnitude for half a period: the value rests there
+REACH: Final = 30.0  # periods before and after are the surroundings
+FEW_PERIODS: Final = 1.5  # of surroundings say nothing
+LOUDEST: Final = 6.0  # times its surroundings: more is not more certain
+UNKNOWN_LOUDNESS: Final = 3.5  # where nothing surrounds it
+LEAST_LOUDNESS: Final = 0.5
+LOUDER: Final = 1.25  # times as loud a swing may be as it seems at first
+# Median magnitude of a normal variable over its lower quartile.
+_MEDIAN_TO_QUARTILE: Final = 0.6745 / 0.3186
+# Weight of evidence: a logistic regression on the labelled recordings of tests/detection.
+OF_LOUDNESS: Final = 5.9  # per logarithm of how much louder than its surroundings it is
+OF_ROBUST_FIT: Final = -2.4  # per logarithm of what sines leave of the median square
+OF_FIT: Final = -1.9  # ... and of all squares of clipped second differences
+OF_COUNT: Final = 4.1  # per logarithm of the half swings
+ENOUGH: Final = 26.4
+TURNS_BACK: Final = 0.08  # of the way there a value comes back that does not only go one way
+STRAIGHT: Final = 0.085  # of the sine its harmonics reach where straight pieces make it
 NOISE_AMPLITUDES: Final = 3.0  # a swing is at least so many deviations of the noise high ...
 MEAN_AMPLITUDES: Final = 12.0  # ... or so many of their means over half the swing
-WALK_CHANCE: Final = 1e-5  # that a random walk swings so far; it is asked thousands of times
-_QUARTILE: Final = 0.3186  # what a quarter of the magnitudes of a normal variable is below
 SAME_NUMBER: Final = 1e-9  # of the value: what adding up floating-point numbers makes of one
 SWITCHED_VALUES: Final = 3
-REACHES: Final = 2.0  # times as far as in its band a swing reaches at most
 MOST_OVERLAP: Final = 0.2  # of the shorter one
+ALIKE: Final = (1.15, 1.5)  # ratio of periods and of amplitudes of parts of one swing
 
 
 @dataclass(frozen=True)
@@ -58,9 +79,9 @@ class Swing:
     """A stretch in which a value went to and fro regularly.
 
     Attributes:
-        half_swings: How many there are between the first and the last crossing of its mean course.
+        half_swings: How many there are in the time that was recorded of it.
         amplitude: Half of the way from one turning point to the next.
-        explained: Share of the variance about a slow course that a sine explains, 0 to 1.
+        explained: Share of the second differences that sines explain, 0 to 1.
     """
 
     start_s: float
@@ -72,12 +93,33 @@ class Swing:
 
 
 @dataclass(frozen=True)
-class _Crossings:
-    """Where a band crosses zero, and how long and how far it goes between two crossings."""
+class EvenRows:
+    """The rows of several signals: where time moved on, in stretches without recording gaps."""
 
-    moments: Array
-    halves: Array
-    reaches: Array
+    times: Array
+    moving: Flags | None
+    borders: Indexes
+    interval_s: float
+
+    @classmethod
+    def of(cls, times: Array) -> EvenRows:
+        """Rows of a paused simulation count once."""
+        intervals = np.diff(times)
+        moving = None
+        if len(intervals) and not intervals.min() > 0:
+            moving = np.concatenate(([True], intervals > 0))
+            times = times[moving]
+            intervals = np.diff(times)
+        interval_s = median(intervals) if len(intervals) else 0.0
+        return cls(times, moving, gap_borders(times, interval_s), interval_s)
+
+    def stretches(self, values: Array) -> Iterator[tuple[Array, Array]]:
+        """Times and values of each stretch."""
+        if self.moving is not None:
+            values = values[self.moving]
+        edges = [0, *self.borders.tolist(), len(self.times)]
+        for start, stop in itertools.pairwise(edges):
+            yield self.times[start:stop], values[start:stop]
 
 
 def find_swings(
@@ -85,175 +127,156 @@ def find_swings(
 ) -> list[Swing]:
     """Swings of one signal, in order; angles have to be unwrapped.
 
-    A swing counts when at least so many half swings follow each other, alike in length and reach,
-    when a sine explains most of their variance about a parabola or about straight pieces, and when
-    it rises above the noise of its own stretch. Period and amplitude are those of the best sine.
-    With a period of more than 5 s at least 12 half swings have to. Each stretch between recording
-    gaps is looked at by itself; a swing that reaches a gap and is the same after it is one swing.
+    A swing has at least so many half swings that are alike, with a period of more than 5 s at
+    least 12, and rises above noise, rounding and what the value does around it anyway. A swing
+    that reaches a recording gap and is the same after it is one swing.
     """
-    moving = np.diff(times, prepend=-np.inf) > 0
-    times, values = times[moving], values[moving]
-    if len(times) <= SHORTEST_PERIOD_ROWS:
-        return []
-    interval_s = float(np.median(np.diff(times)))
-    borders = gap_borders(times, interval_s)
-    found: list[Swing] = []
-    for moments, stretch in zip(np.split(times, borders), np.split(values, borders), strict=True):
-        swings = _in_stretch(moments, stretch, least_half_swings, longest_period_s)
-        if found and swings and _goes_on(found[-1], swings[0], times):
-            swings[0] = _as_one(found.pop(), swings[0])
-        found += swings
-    return found
+    return swings_in(EvenRows.of(times), values, least_half_swings, longest_period_s)
 
 
-def joined_swings(found: Iterable[Swing]) -> list[Swing]:
-    """Swings of stretches that overlap, in order: what two stretches tell of one is one."""
-    joined: list[Swing] = []
-    for swing in sorted(found, key=lambda each: each.start_s):
-        before = joined[-1] if joined else None
-        if before is None or swing.start_s >= before.end_s or _are_two(before, swing):
-            joined.append(swing)
-        elif swing.end_s > before.end_s:
-            joined[-1] = _together(before, swing)
-    return joined
-
-
-def _are_two(before: Swing, after: Swing) -> bool:
-    """Whether a swing of another period follows: the ends of both are known to half a swing."""
-    periods = _ratio(before.period_s, after.period_s)
-    return periods > ALIKE[0] and _overlap(before, after) < MOST_OVERLAP
-
-
-def _together(before: Swing, after: Swing) -> Swing:
-    """Merge two that overlap; of different periods the one that lasted longer is reported."""
-    if _ratio(before.period_s, after.period_s) > ALIKE[0]:
-        return max(before, after, key=lambda each: each.half_swings * each.explained)
-    return _counted(_as_one(before, after))
-
-
-def _goes_on(before: Swing, after: Swing, times: Array) -> bool:
-    """Whether the next swing begins right after the gap that the one before reached."""
-    ended, began = np.searchsorted(times, [before.end_s, after.start_s])
-    between = times[max(0, ended - 1) : began + 1]
-    gap_s = float(np.max(np.diff(between)))
-    recorded_s = after.start_s - before.end_s - gap_s
-    if recorded_s > 2 * JOINED_PERIODS * before.period_s:
-        return False
-    return _is_alike(before, after)
-
-
-def _ratio(one: float, other: float) -> float:
-    return max(one, other) / min(one, other)
-
-
-def _as_one(before: Swing, after: Swing) -> Swing:
-    """Half swings are those that were seen; period, amplitude and share are weighted by them."""
-    count = before.half_swings + after.half_swings
-    share = before.half_swings / count
-    return replace(
-        before,
-        end_s=after.end_s,
-        half_swings=count,
-        period_s=share * before.period_s + (1 - share) * after.period_s,
-        amplitude=share * before.amplitude + (1 - share) * after.amplitude,
-        explained=share * before.explained + (1 - share) * after.explained,
-    )
-
-
-def _in_stretch(
-    times: Array, values: Array, least_half_swings: int, longest_period_s: float
+def swings_in(
+    rows: EvenRows,
+    values: Array,
+    least_half_swings: int,
+    longest_period_s: float,
+    is_over: Callable[[], bool] = lambda: False,
 ) -> list[Swing]:
-    """Swings in a stretch in which rows come evenly."""
-    if len(times) <= SHORTEST_PERIOD_ROWS or not np.ptp(values):
-        return []
-    whole = _Stretch(times, values)
-    interval_s = whole.interval_s
-    rounding = len(values) * float(np.spacing(np.abs(values).max()))
-    noise = np.maximum(whole.roughness.local_noise(), rounding)
+    """As `find_swings`, of one of several signals; less where it is over before the end."""
     found: list[Swing] = []
-    rows = SHORTEST_PERIOD_ROWS
-    while rows * interval_s <= longest_period_s * SCALE_RATIO and rows < len(values):
-        step = max(1, int(rows / ROWS_PER_PERIOD))
-        moments, means = _means(times, step), _means(values, step)
-        of_means = noise[: len(means) * step : step] / step**0.5
-        slow = _moving_mean(means, round(rows / step))
-        band = _moving_mean(means, round(rows / step) // FINEST_SHARE) - slow
-        if max(band.max(), -band.min()) > rounding:
-            for crossings in _regular(moments, band, rows * interval_s, least_half_swings):
-                if not any(_is_same(crossings, each) for each in found):
-                    found += _fitted(whole, crossings)
-        # Bends of a way come as often as the turns of a slow swing; a band reaches to both sides.
-        is_slow = rows * interval_s > SLOW_PERIOD_S * SCALE_RATIO**0.5
-        if not is_slow and _bends(slow, round(rows / step), of_means):
-            course = moments, means, of_means
-            for swing in _on_bends(*course, rows / step, least_half_swings, found):
-                if swing.period_s <= SLOW_PERIOD_S and _stands_out(whole, swing):
-                    found.append(swing)
-        rows *= SCALE_RATIO
-    lasting = [each for each in found if _lasts(each, longest_period_s)]
-    return _connected(_best(lasting), whole)
+    for times, part in rows.stretches(values):
+        if len(part) > 3 * SHORTEST_PERIOD_ROWS and part.min() < part.max():
+            stretch = _Stretch(times, part, least_half_swings, longest_period_s)
+            found += _best(list(stretch.swings(is_over)))
+    return _joined(found, rows)
 
 
-def _lasts(swing: Swing, longest_period_s: float) -> bool:
-    """Whether it counts: of slow ones more half swings have to follow each other."""
-    is_slow = swing.period_s > SLOW_PERIOD_S
-    return swing.period_s <= longest_period_s and (
-        not is_slow or swing.half_swings >= SLOW_HALF_SWINGS
+class _Stretch:
+    """Rows that come evenly, in which swings are looked for."""
+
+    def __init__(self, times: Array, values: Array, least: int, longest_s: float) -> None:
+        self.times, self.values = times, values
+        self.interval_s = float(times[-1] - times[0]) / (len(times) - 1)
+        self.least, self.longest_s = least, longest_s
+
+    def swings(self, is_over: Callable[[], bool]) -> Iterator[Swing]:
+        """Those of each octave of periods; what two of them see is found twice."""
+        means, rows = self.values, 1
+        shortest = LEVELS[0][0]
+        while rows * shortest * self.interval_s < 1.2 * self.longest_s:
+            if len(means) <= 3 * shortest or is_over():
+                return
+            for period, half, lag in LEVELS:
+                for start, stop, likely in _likely(means, period, half, lag, self.least):
+                    yield from self._measured(
+                        start * rows, stop * rows, likely * rows, (0, len(self.values))
+                    )
+            even = means[: len(means) // 2 * 2]
+            means = (even[::2] + even[1::2]) / 2
+            rows *= 2
+
+    def _measured(
+        self, start: int, stop: int, period: float, within: tuple[int, int]
+    ) -> Iterator[Swing]:
+        """The swing of about these rows and that period; two where the value rests between."""
+        low, high = max(within[0], int(start - period)), min(within[1], int(stop + period))
+        step = max(1, int(period / FITTED_ROWS))
+        lag = max(1, round(LAG * period / step))
+        bends = _bends(_means(self.values[low:high], step), lag)
+        first, last = max(0, (start - low) // step), (stop - low) // step - 2 * lag
+        core = bends[first:last]
+        if len(core) < 2 * period / step:
+            return
+        clipped = _clipped(bends, CLIPPED * median(np.abs(core)))
+        pieces = _pieces(clipped[first:last], period / step)
+        shown, _, _ = _sines(pieces, np.ones_like(pieces), period / step)
+        begin = _begin(clipped, first, shown)
+        end = len(bends) - _begin(clipped[::-1], len(bends) - last, shown)
+        quiet = _quiet(bends[begin:end], shown)
+        if quiet is not None:
+            ends = low + (begin + lag) * step, low + (end + lag) * step
+            middle = low + (begin + quiet + lag) * step
+            if min(middle - ends[0], ends[1] - middle) > period:
+                yield from self._measured(ends[0], middle, period, (low, middle))
+                yield from self._measured(middle, ends[1], period, (middle, high))
+                return
+        if end - begin < 2 * shown:
+            return
+        edge = EDGE * shown * step
+        from_row = round(low + (begin + lag) * step + edge)
+        to_row = round(low + (end + lag) * step - edge)
+        if from_row < AT_END * period:
+            from_row = 0
+        if to_row > len(self.values) - 1 - AT_END * period:
+            to_row = len(self.values) - 1
+        rows = slice(from_row, to_row + 1)
+        count = round(2 * (rows.stop - 1 - rows.start) / (shown * step))
+        if count >= self.least:
+            yield from self._judged(rows, bends[begin:end], lag, step, shown)
+
+    def _judged(
+        self, rows: slice, bends: Array, lag: int, step: int, period: float
+    ) -> Iterator[Swing]:
+        values = self.values[rows]
+        noise = noise_of(values)
+        fit = fit_sines(bends, period, 6 * noise**2 / step)
+        period = fit.period * step
+        count = round(2 * (len(values) - 1) / period)
+        length_s = period * self.interval_s
+        if length_s > self.longest_s or count < self.least:
+            return
+        if length_s > SLOW_PERIOD_S and count < SLOW_HALF_SWINGS:
+            return
+        loudness = self._loudness(rows, period)
+        if evidence(loudness, fit.robustly, fit.explained, count) < ENOUGH:
+            return
+        amplitude = fit.amplitude / (2 - 2 * math.cos(2 * math.pi * lag / fit.period))
+        amplitude /= float(np.sinc(step / period)) if step > 1 else 1.0
+        amplitude = min(amplitude, _highest(values, period))
+        least = min(NOISE_AMPLITUDES, MEAN_AMPLITUDES / (period * count / 2) ** 0.5) * noise
+        if amplitude < least or not _is_resolved(values, amplitude):
+            return
+        if _turns_back(values, period) < TURNS_BACK and _is_straight(values, period, noise):
+            return
+        start_s, end_s = float(self.times[rows.start]), float(self.times[rows.stop - 1])
+        yield Swing(start_s, end_s, count, length_s, amplitude, fit.explained)
+
+    def _loudness(self, rows: slice, period: float) -> float:
+        """How much larger its second differences are than the lower quartile around it."""
+        step = max(1, int(period / 16))
+        lag, far = max(1, round(LAG * period / step)), int(REACH * period)
+        parts = slice(max(0, rows.start - far), rows.start), slice(rows.stop, rows.stop + far)
+        around = [_bends(_means(self.values[part], step), lag) for part in parts]
+        inside = median(np.abs(_bends(_means(self.values[rows], step), lag)))
+        return _loudness(inside, np.abs(np.concatenate(around)), period / step)
+
+
+def _loudness(inside: float, around: Array, period: float) -> float:
+    """How much larger a median magnitude is than the lower quartile around it."""
+    if len(around) < FEW_PERIODS * period:
+        return UNKNOWN_LOUDNESS
+    quarter = len(around) // 4
+    usual = float(np.partition(around, quarter)[quarter]) * _MEDIAN_TO_QUARTILE
+    return inside / usual if usual * LOUDEST > inside else LOUDEST
+
+
+def evidence(loudness: float, robustly: float, explained: float, count: float) -> float:
+    """The weight of evidence for a swing."""
+    return (
+        OF_LOUDNESS * math.log(max(loudness, LEAST_LOUDNESS))
+        + OF_ROBUST_FIT * math.log(1.01 - max(0.0, robustly))
+        + OF_FIT * math.log(1.05 - min(explained, 1.0))
+        + OF_COUNT * math.log(count)
     )
 
 
-def _connected(swings: list[Swing], whole: _Stretch) -> list[Swing]:
-    """Two that are alike and follow each other closely as one, unless the value rests between."""
-    connected: list[Swing] = []
-    for swing in swings:
-        before = connected[-1] if connected else None
-        joined = before and _follows(before, swing) and _is_alike(before, swing)
-        if before and joined and not _rests_between(before, swing, whole):
-            connected[-1] = _counted(_as_one(before, swing))
-        else:
-            connected.append(swing)
-    return connected
-
-
-def _rests_between(before: Swing, after: Swing, whole: _Stretch) -> bool:
-    """Whether the value stays near the straight way from one swing's level to the other's."""
-    if after.start_s - before.end_s < LEAST_REST * before.period_s:
-        return False
-    times, values = whole.times, whole.values
-    last = (times > before.end_s - before.period_s) & (times <= before.end_s)
-    first = (times >= after.start_s) & (times < after.start_s + after.period_s)
-    between = (times > before.end_s) & (times < after.start_s)
-    moments = [float(times[part].mean()) for part in (last, first)]
-    levels = [float(values[part].mean()) for part in (last, first)]
-    away = values[between] - np.interp(times[between], moments, levels)
-    reach = RESTING * before.amplitude
-    return len(away) > 0 and inner(away, away) < len(away) * reach**2
-
-
-def _follows(before: Swing, after: Swing) -> bool:
-    return after.start_s - before.end_s < JOINED_PERIODS * before.period_s
-
-
-def _is_alike(before: Swing, after: Swing) -> bool:
-    periods = _ratio(before.period_s, after.period_s)
-    return periods <= ALIKE[0] and _ratio(before.amplitude, after.amplitude) <= ALIKE[1]
-
-
-def _counted(swing: Swing) -> Swing:
-    """With as many half swings as its time holds."""
-    count = round(2 * (swing.end_s - swing.start_s) / swing.period_s)
-    return replace(swing, half_swings=count)
-
-
-def _is_same(crossings: _Crossings, swing: Swing) -> bool:
-    """Whether the swing was found there already, in the band of a shorter period."""
-    first_s, last_s = crossings.moments[0], crossings.moments[-1]
-    near_s = swing.period_s / 4
-    return bool(
-        len(crossings.halves) == swing.half_swings
-        and abs(first_s - swing.start_s) < near_s
-        and abs(last_s - swing.end_s) < near_s
-    )
+def _bends(values: Array, lag: int) -> Array:
+    """Second differences; the first one is about value `lag`."""
+    if len(values) <= 2 * lag:
+        return values[:0]
+    bends = values[lag:-lag] * -2
+    bends += values[2 * lag :]
+    bends += values[: -2 * lag]
+    return bends
 
 
 def _means(values: Array, step: int) -> Array:
@@ -261,281 +284,201 @@ def _means(values: Array, step: int) -> Array:
     if step == 1:
         return values
     count = len(values) // step
-    parts: Array = np.reshape(values[: count * step], (count, step))
-    if step < FEW_COLUMNS:
-        return np.asarray(sum(parts[:, at] for at in range(step)) / step, np.float64)
-    return np.einsum("ij->i", parts) / step
+    return np.einsum("ij->i", np.reshape(values[: count * step], (count, step))) / step
 
 
-def _on_bends(
-    moments: Array, means: Array, noise: Array, period: float, least: int, found: list[Swing]
-) -> Iterator[Swing]:
-    """Swings on a course that bends, where they were not found without."""
-    interval_s = float(moments[-1] - moments[0]) / (len(moments) - 1)
-    for start, end, rows in likely_swings(means, noise, period):
-        ends_s = float(moments[start]), float(moments[end - 1])
-        if not _are_covering(found, *ends_s, rows * interval_s, least):
-            for bent in swings_on_bends(means, start, end, rows, least):
-                yield Swing(
-                    float(moments[bent.start]),
-                    float(moments[bent.end - 1]),
-                    bent.half_swings,
-                    bent.period * interval_s,
-                    bent.amplitude,
-                    bent.explained,
-                )
+def _clipped(values: Array, limit: float | Array) -> Array:
+    return np.asarray(np.minimum(np.maximum(values, -limit), limit), np.float64)
 
 
-def _are_covering(
-    swings: list[Swing], start_s: float, end_s: float, period_s: float, least: int
-) -> bool:
-    """Whether what seems to swing there is such swings, with what surrounds them.
-
-    What lies between two of them is too short for another one.
-    """
-    near_s = JOINED_PERIODS * period_s
-    alike = [each for each in swings if _ratio(each.period_s, period_s) < SCALE_RATIO]
-    reached_s = -math.inf
-    for swing in sorted(alike, key=lambda each: each.start_s):
-        if swing.start_s - near_s <= start_s or swing.start_s - reached_s < least * period_s / 2:
-            reached_s = max(reached_s, swing.end_s)
-    return reached_s >= end_s - near_s
-
-
-def _bends(slow: Array, rows: int, noise: Array) -> bool:
-    """Whether a course of means over so many rows bends anywhere by more than noise makes it."""
-    bends = slow[2 * rows :] - 2 * slow[rows:-rows]
-    bends += slow[: -2 * rows]
-    limits = noise[rows:-rows] * (NOISE_BENDS / rows**0.5)
-    return not len(bends) or bool(np.any(np.abs(bends, out=bends) > limits))
-
-
-def _moving_mean(values: Array, rows: int) -> Array:
-    """Twice the mean over about so many rows; beyond the ends the values go on point-mirrored."""
-    reach = min(rows // 2, len(values) - 1)
-    if reach < 1:
-        return values
-    for _ in range(2):
-        before = 2 * values[0] - values[reach:0:-1]
-        after = 2 * values[-1] - values[-2 : -reach - 2 : -1]
-        values = sums_of(np.concatenate((before, values, after)), 2 * reach + 1)
-        values /= 2 * reach + 1
-    return values
-
-
-def _regular(times: Array, band: Array, period_s: float, least: int) -> Iterator[_Crossings]:
-    """Stretches of at least so many half swings of about that period that reach equally far.
-
-    Between two rows the band is taken to be straight. At both ends it is 0, because values go on
-    point-mirrored there: a stretch that reaches an end is tried with that half swing and without.
-    """
-    above = band >= 0
-    above[0], above[-1] = above[1], above[-2]
-    (before,) = (above[1:] != above[:-1]).nonzero()
-    if len(before) + 1 < least:
+def _likely(
+    means: Array, period: float, half: int, lag: int, least: int
+) -> Iterator[tuple[int, int, float]]:
+    """Where means [start, stop) seem to swing with about that period, and with which one."""
+    rows = round(WINDOW * period)
+    starts = _regular_windows(means, half, lag)
+    starts = starts[starts + rows + 2 * lag <= len(means)]
+    if not len(starts):
         return
-    share = band[before] / (band[before] - band[before + 1])
-    crossed = times[before] + share * (times[before + 1] - times[before])
-    moments = np.concatenate((times[:1], crossed, times[-1:]))
-    rows = np.concatenate(([0], before + 1, [len(band)]))
-    halves = np.diff(moments)
-    for first, last in _fitting(halves, period_s, least):
-        borders = rows[first : last + 1]
-        sizes = np.abs(band[borders[0] : borders[-1]])
-        reaches = np.maximum.reduceat(sizes, borders[:-1] - borders[0])
-        for even in pairwise(_uneven(reaches.tolist())):
-            for start, end in _without_ends(first + even[0], first + even[1], len(halves)):
-                if end - start >= least:
-                    of_part = reaches[start - first : end - first]
-                    yield _Crossings(moments[start : end + 1], halves[start:end], of_part)
+    parts = np.lib.stride_tricks.sliding_window_view(means, rows + 2 * lag)[starts]
+    bends: Array = parts[:, 2 * lag :] - 2 * parts[:, lag:-lag] + parts[:, : -2 * lag]
+    middle = np.partition(np.abs(bends), rows // 2, axis=1)[:, rows // 2, None]
+    clipped = _clipped(bends, CLIPPED * middle)
+    squares: Array = np.einsum("ij,ij->i", clipped, clipped)
+    periods = [period * 2 ** (semitones / 12) for semitones in SEMITONES]
+    best = _explained(clipped, *periods[2::3]).max(axis=1)
+    good = np.flatnonzero((best > LIKELY * squares) & (squares > 0))
+    apart = np.flatnonzero(np.diff(starts[good]) > rows + HIDDEN * period) + 1
+    for part in np.split(good, apart) if len(good) else ():
+        first, last = int(starts[part[0]]), int(starts[part[-1]]) + rows + 2 * lag
+        if not np.any(best[part] > MOST_LIKELY * squares[part]):
+            continue
+        shares = np.mean(_explained(clipped[part], *periods) / squares[part, None], axis=0)
+        place = int(np.argmax(shares))
+        count = 2 * (last - first) / periods[place]
+        inside = period < first and last < len(means) - period
+        if count < least + (1 if inside else -1) or not 0 < place < len(periods) - 1:
+            continue  # at the end of the periods another level sees it better
+        far = round(REACH * period)
+        around = np.abs(
+            np.concatenate(
+                [
+                    _bends(means[max(0, first - far) : first], lag),
+                    _bends(means[last : last + far], lag),
+                ]
+            )
+        )
+        loudness = _loudness(float(np.median(middle[part])), around, period)
+        if evidence(LOUDER * loudness, 1.0, float(shares[place]) + 0.05, count) >= ENOUGH:
+            yield first, last, periods[place]
 
 
-def _without_ends(start: int, end: int, count: int) -> Iterator[tuple[int, int]]:
-    """Some of so many half swings, and the same without the first one of all, or the last one."""
-    starts = (0, 1) if start == 0 else (start,)
-    ends = (count, count - 1) if end == count else (end,)
-    return product(starts, ends)
+def _regular_windows(means: Array, half: int, lag: int) -> Indexes:
+    """Starts of windows of two periods that are louder than usual, with signs as of a sine.
 
-
-def _fitting(halves: Array, period_s: float, least: int) -> list[tuple[int, int]]:
-    """Where [start, end) at least so many half periods that follow each other are as long."""
-    low, high = (share * period_s for share in HALF_PERIODS)
-    fitting = np.zeros(len(halves) + 2, np.bool_)
-    fitting[1:-1] = (halves > low) & (halves < high)
-    edges = np.flatnonzero(fitting[1:] != fitting[:-1])
-    starts, ends = edges[::2], edges[1::2]
-    long = ends - starts >= least
-    return list(zip(starts[long].tolist(), ends[long].tolist(), strict=True))
-
-
-def _uneven(reaches: list[float]) -> list[int]:
-    """Where a half swing reaches much less or much farther than the few before it; and both ends.
-
-    Compared is with the (upper) median of up to five since the last such place.
+    In single precision, which counts from a value of each part.
     """
-    places = [0]
-    for index in range(1, len(reaches)):
-        usual = sorted(reaches[max(places[-1], index - 5) : index])
-        middle = usual[len(usual) // 2]
-        if not middle / MOST_UNEVEN < reaches[index] < middle * MOST_UNEVEN:
-            places.append(index)
-    return [*places, len(reaches)]
+    found: list[Indexes] = []
+    beyond = 4 * BLOCK * half
+    for begin in range(0, max(1, len(means) - beyond), AT_ONCE):
+        part = means[begin : begin + AT_ONCE + beyond]
+        regular = _regular_blocks(_bends((part - part[0]).astype(np.float32), lag), half)
+        most = AT_ONCE // BLOCK if begin + AT_ONCE < len(means) - beyond else None
+        found.append(np.flatnonzero(regular[:most]) * BLOCK + begin)
+    return np.concatenate(found)
 
 
-class _Stretch:
-    """Rows that come evenly, and what is asked of many parts of them."""
-
-    def __init__(self, times: Array, values: Array) -> None:
-        self.times, self.values = times, values
-        self.interval_s = float(np.median(np.diff(times)))
-        self.roughness = Roughness(values)
-        steps: Array = np.abs(np.diff(values))
-        self._steps = np.where(steps > SAME_NUMBER * np.abs(values).max(), steps, np.inf)
-
-    def rows_of(self, start_s: float, end_s: float) -> slice:
-        """The rows between two moments, with one before and one after."""
-        start, end = np.searchsorted(self.times, [start_s, end_s])
-        return slice(max(0, int(start) - 1), min(len(self.times), int(end) + 1))
-
-    def is_resolved(self, amplitude: float, rows: slice) -> bool:
-        """Whether it is more than the smallest step between two values, which most often shows.
-
-        Most often two rows that follow each other show one that is as small.
-        """
-        if amplitude > self._steps[rows.start : rows.stop - 1].min(initial=np.inf):
-            return True
-        return amplitude > _resolution(self.values[rows])
-
-    def least_amplitude(self, period_s: float, half_swings: int, rows: slice) -> float:
-        """How high so many half swings have to be, to rise above the noise."""
-        noise = self.roughness.noise(rows.start, rows.stop)
-        of_means = noise / (period_s / self.interval_s * half_swings / 2) ** 0.5
-        return min(NOISE_AMPLITUDES * noise, MEAN_AMPLITUDES * of_means)
+def _regular_blocks(bends: Array, half: int) -> Flags:
+    """In which blocks such windows begin."""
+    blocks, window = (len(bends) - half) // BLOCK, half  # blocks of two periods
+    if blocks < window:
+        return np.zeros(0, np.bool_)
+    whole = BLOCK * blocks
+    above = bends > 0
+    turned = np.bitwise_count((above[half : half + whole] != above[:whole]).view(np.uint32))
+    turns = sums_of(turned, window)
+    sizes = np.abs(bends[:whole:BLOCK])
+    sizes += np.abs(bends[2:whole:BLOCK])  # a quarter of a period later: of a sine never small
+    loud = sums_of((sizes > LOUD * _usual(sizes)).astype(np.uint8), window)
+    regular = (turns >= REGULAR * BLOCK * window) & (loud >= window - 1)
+    if len(turns) > window:
+        long = turns[:-window] + turns[window:] >= VERY_REGULAR * BLOCK * 2 * window
+        regular[:-window] |= long
+        regular[window:] |= long
+    else:
+        regular |= turns >= VERY_REGULAR * BLOCK * window
+    return regular
 
 
-def _fitted(whole: _Stretch, crossings: _Crossings) -> Iterator[Swing]:
-    """The swing of such a stretch, if a sine explains it."""
-    count = len(crossings.halves)
-    if _varies(crossings.halves) > MOST_IRREGULAR or _varies(crossings.reaches) > MOST_VARIED:
-        return
-    start_s, end_s = float(crossings.moments[0]), float(crossings.moments[-1])
-    period_s = 2 * (end_s - start_s) / count
-    rows = whole.rows_of(start_s, end_s)
-    farthest = REACHES * float(crossings.reaches.mean())
-    if farthest < whole.least_amplitude(period_s, count, rows):
-        return
-    if not whole.is_resolved(farthest, rows):
-        return
-    parts = whole.times[rows], whole.values[rows]
-    swing = Swing(start_s, end_s, count, *_best_sine(*parts, period_s, whole.interval_s))
-    if swing.explained >= _least_explained(count) and _stands_out(whole, swing):
-        yield swing
+def _usual(sizes: Array) -> Array | float:
+    """The lower quartile about each size, the least of three such stretches."""
+    some = sizes[::4]
+    count, quarter = len(some) // SURROUNDING, SURROUNDING // 4
+    if count < 2:
+        return float(np.partition(some, len(some) // 4)[len(some) // 4])
+    parts: Array = np.reshape(some[: count * SURROUNDING], (count, SURROUNDING))
+    padded: Array = np.pad(np.partition(parts, quarter, axis=1)[:, quarter], 1, mode="edge")
+    least = np.minimum(np.minimum(padded[:-2], padded[1:-1]), padded[2:])
+    usual = np.repeat(least, 4 * SURROUNDING)[: len(sizes)]
+    return np.pad(usual, (0, len(sizes) - len(usual)), mode="edge")
 
 
-def _stands_out(whole: _Stretch, swing: Swing) -> bool:
-    """Whether neither noise, nor rounding, nor a random walk makes such a swing."""
-    rows, count = whole.rows_of(swing.start_s, swing.end_s), swing.half_swings
-    if swing.amplitude < whole.least_amplitude(swing.period_s, count, rows):
-        return False
-    if not whole.is_resolved(swing.amplitude, rows):
-        return False
-    surroundings = whole.values[_surroundings(rows, len(whole.values))]
-    walked = _walked(surroundings, swing.period_s / whole.interval_s)
-    return not _is_as_of_walk(swing.amplitude, count, walked)
+@lru_cache(64)  # the same for all signals
+def _waves(rows: int, *periods: float) -> Array:
+    """Cosines and sines of length 1 as columns."""
+    places: Array = np.arange(rows, dtype=np.float64) - (rows - 1) / 2
+    angles: Array = 2 * np.pi * places[:, None] / np.array(periods)
+    waves = np.concatenate((np.cos(angles), np.sin(angles)), axis=1)
+    return np.asarray(waves / np.sqrt(np.einsum("ij,ij->j", waves, waves)), np.float64)
 
 
-def _resolution(values: Array) -> float:
-    """The smallest step between two values: a slow course that is rounded goes in steps.
+def _explained(windows: Array, *periods: float) -> Array:
+    """Of the squares in each window, what a sine of each period explains."""
+    squares = (windows @ _waves(windows.shape[1], *periods)) ** 2
+    return np.asarray(squares[:, : len(periods)] + squares[:, len(periods) :], np.float64)
 
-    Such a staircase swings about its course by half a step. 0 for up to three values, between
-    which something is switched to and fro.
+
+@dataclass(frozen=True)
+class Fit:
+    """Sines of one period, in pieces that each have a phase and a height of their own.
+
+    Attributes:
+        period: In values.
+        amplitude: The median of the pieces.
+        explained: Share of the squares, of values clipped at what a sine reaches.
+        robustly: Share of the squared median magnitude, without noise: bends do not lower it.
     """
-    apart = np.diff(np.unique(values))
-    told_apart = apart[apart > SAME_NUMBER * float(np.abs(values).max())]
-    return float(told_apart.min()) if len(told_apart) >= SWITCHED_VALUES else 0.0
+
+    period: float
+    amplitude: float
+    explained: float
+    robustly: float
 
 
-def _varies(sizes: Array) -> float:
-    """The coefficient of variation."""
-    mean = float(sizes.sum()) / len(sizes)
-    return math.sqrt(inner(sizes - mean, sizes - mean) / len(sizes)) / mean
+def fit_sines(values: Array, period: float, noise: float) -> Fit:
+    """Fitted to clipped values, then to those that the first fit is near to, of all values.
 
-
-def _least_explained(half_swings: int) -> float:
-    """The fewer there are, the more has to be explained: chance makes a few now and then."""
-    return float(np.interp(half_swings, (6, 10), LEAST_EXPLAINED))
-
-
-def _surroundings(rows: slice, count: int) -> slice:
-    """The rows with thrice as many before and after them."""
-    length = 3 * (rows.stop - rows.start)
-    return slice(max(0, rows.start - length), min(count, rows.stop + length))
-
-
-def _walked(course: Array, rows: float) -> float:
-    """How far a random walk beneath a swing of so many rows goes in one of its periods.
-
-    In the difference to one period later the swing is gone. How much more that bends over an
-    eighth of a period than over a sixteenth shows a random walk: noise bends both alike.
+    Args:
+        values: Second differences.
+        period: About which.
+        noise: Variance of the noise in them.
     """
-    step = max(1, int(rows / ROWS_PER_PERIOD))
-    means, period = _means(course, step), round(rows / step)
-    apart = means[period:] - means[:-period]
-    lag = max(1, period // ROWS_PER_PERIOD)
-    grown = _bending(apart, 2 * lag) - _bending(apart, lag)
-    return math.sqrt(max(0.0, grown) / 4 * period / lag)
+    pieces = _pieces(values, period)
+    magnitudes: Array = np.abs(pieces)
+    clipped = _clipped(pieces, CLIPPED * np.median(magnitudes, axis=1, keepdims=True))
+    usual = float(np.median(np.abs(clipped)))
+    everything = np.ones_like(clipped)
+    period, _, model = _sines(clipped, everything, period)
+    left = clipped - model
+    squares = float(np.einsum("ij,ij->", clipped, clipped))
+    explained = 1 - float(np.einsum("ij,ij->", left, left)) / squares if squares else 0.0
+    near = _near(pieces - model, OUTLYING[0], usual)
+    period, _, model = _sines(clipped, near, period)
+    rest = float(np.median(np.abs(clipped - model))) ** 2
+    rest -= min(MOST_NOISE * usual**2, 0.6745**2 * noise)
+    robustly = 1 - max(0.0, rest) / usual**2 if usual else 0.0
+    near = _near(pieces - model, OUTLYING[1], usual)
+    period, amplitudes, _ = _sines(pieces, near, period)
+    return Fit(period, float(np.median(amplitudes)), explained, robustly)
 
 
-def _bending(values: Array, lag: int) -> float:
-    """The variance of second differences; what happens now and then does not move a quartile."""
-    bends = np.abs(values[2 * lag :] - 2 * values[lag:-lag] + values[: -2 * lag])
-    quarter = len(bends) // 4
-    return float(np.partition(bends, quarter)[quarter] / _QUARTILE) ** 2 if len(bends) else 0.0
+def _pieces(values: Array, period: float) -> Array:
+    """Parts of a few periods, one in each row."""
+    count = max(1, round(len(values) / period / PIECE))
+    rows = len(values) // count
+    return np.reshape(values[: count * rows], (count, rows))
 
 
-def _is_as_of_walk(amplitude: float, half_swings: int, walked: float) -> bool:
-    """Whether a random walk swings as far now and then, as red noise does in climate series.
-
-    Its power spectrum falls with the square of the frequency: where it goes `walked` in a period
-    (standard deviation), a sine fitted to half swings of that period has the mean square amplitude
-    2 walked**2 / (pi**2 half_swings), and exceeds k times that with the chance exp(-k) (D. L.
-    Gilman, F. J. Fuglister, J. M. Mitchell, On the power spectrum of "red noise", Journal of the
-    Atmospheric Sciences 20, 1963).
-    """
-    return amplitude**2 < -math.log(WALK_CHANCE) * 2 * walked**2 / (np.pi**2 * half_swings)
+def _near(residuals: Array, times: float, usual: float) -> Array:
+    """1 where a residual is not much larger than most."""
+    sizes: Array = np.abs(residuals)
+    return np.asarray(sizes <= times * np.median(sizes) + usual / 20, np.float64)
 
 
-def _best_sine(
-    times: Array, values: Array, period_s: float, interval_s: float
-) -> tuple[float, float, float]:
-    """Period, amplitude and share of the variance of the best sine of about that period.
+def _sines(pieces: Array, weights: Array, period: float) -> tuple[float, Array, Array]:
+    """The best period about the given one, and the heights and values of its sines."""
+    _, _, gains = _fits(pieces, weights, period * np.array(TRIED))
+    total: Array = gains.sum(axis=0)
+    best = int(np.argmax(total))
+    share = TRIED[best] + _vertex(total, best) * (TRIED[1] - TRIED[0])
+    sines, cosines, _ = _fits(pieces, weights, np.array([period * share]))
+    places: Array = np.arange(pieces.shape[1], dtype=np.float64) - (pieces.shape[1] - 1) / 2
+    angles: Array = 2 * np.pi * places / (period * share)
+    model = sines * np.sin(angles) + cosines * np.cos(angles)
+    return period * share, np.hypot(sines, cosines), np.asarray(model, np.float64)
 
-    Sines and parabolas of least squares, in pieces of two to three periods.
-    """
-    step = max(1, int(period_s / interval_s / FITTED_PER_PERIOD))
-    times, values = _means(times, step), _means(values, step)
-    pieces = max(1, round((times[-1] - times[0]) / (PERIODS_FITTED * period_s)))
-    rows = len(values) // pieces
-    if rows < SHORTEST_PERIOD_ROWS:
-        return period_s, 0.0, 0.0
-    shape = pieces, rows
-    moments: Array = np.reshape(times[: pieces * rows], shape)
-    parts: Array = np.reshape(values[: pieces * rows], shape)
-    moments = alike_rows(moments)
-    basis = parabolas(moments)
-    periods = period_s * np.array(TRIED_PERIODS)
-    some = slice(None, None, -(-pieces // PIECES_TRIED))
-    tried = fit_sines(moments[some], parts[some], periods, basis[some]).explained
-    best = int(np.argmax(tried))
-    if tried[best] < LEAST_TRIED:
-        return period_s, 0.0, float(tried[best])
-    periods = periods[best : best + 1] + _vertex(tried, best) * (periods[1] - periods[0])
-    fit = fit_sines(moments, parts, periods, basis)
-    # Of a clipped one the sine is higher; the rows next to a turn are as far from it as the angle.
-    between = math.pi * step * interval_s / period_s
-    highest = median(np.ptp(parts, axis=1)) / 2 / math.cos(min(between, math.pi / 4))
-    amplitude = min(median(fit.amplitudes[:, 0]), highest)
-    return float(periods[0]), amplitude, float(fit.explained[0])
+
+def _fits(pieces: Array, weights: Array, periods: Array) -> tuple[Array, Array, Array]:
+    """Coefficients of sine and cosine and the squares they explain: pieces by periods."""
+    places: Array = np.arange(pieces.shape[1], dtype=np.float64) - (pieces.shape[1] - 1) / 2
+    angles: Array = 2 * np.pi * places[:, None] / periods
+    sine, cosine = np.sin(angles), np.cos(angles)
+    weighted = weights * pieces
+    ss, cc, sc = weights @ (sine * sine), weights @ (cosine * cosine), weights @ (sine * cosine)
+    sy, cy = weighted @ sine, weighted @ cosine
+    determinant: Array = np.maximum(ss * cc - sc * sc, 1e-12)
+    of_sine, of_cosine = (sy * cc - cy * sc) / determinant, (cy * ss - sy * sc) / determinant
+    return of_sine, of_cosine, of_sine * sy + of_cosine * cy
 
 
 def _vertex(heights: Array, highest: int) -> float:
@@ -546,6 +489,81 @@ def _vertex(heights: Array, highest: int) -> float:
     return (
         (after - before) / (4 * most - 2 * before - 2 * after) if 2 * most > before + after else 0.0
     )
+
+
+def _begin(bends: Array, inside: int, period: float) -> int:
+    """Where the sine begins that swings from there on: before, it explains nothing."""
+    settled = inside + int(period / 2)
+    part = slice(settled, settled + round(WINDOW * period))
+    angles: Array = 2 * np.pi * np.arange(len(bends), dtype=np.float64) / period
+    waves: Array = np.stack((np.cos(angles), np.sin(angles)))
+    squares = waves[:, part] @ np.transpose(waves[:, part])
+    end = inside + int(period)
+    swing: Array = np.linalg.solve(squares, waves[:, part] @ bends[part]) @ waves[:, :end]
+    gains = np.abs(bends[:end]) - np.abs(bends[:end] - swing)
+    return int(np.argmax(np.cumsum(gains[::-1])[::-1]))
+
+
+def _quiet(bends: Array, period: float) -> int | None:
+    """The middle of half a period in which hardly anything bends; None if there is none."""
+    half = max(1, round(period / 2))
+    if len(bends) < 2 * half:
+        return None
+    sizes = sums_of(np.abs(bends), half)
+    least = int(np.argmin(sizes))
+    return least + half // 2 if sizes[least] < QUIET * median(sizes) else None
+
+
+def _highest(values: Array, period: float) -> float:
+    """Half of what the values usually reach in a period: of a clipped one the sine is higher."""
+    rows = round(period)
+    count = len(values) // rows
+    slope = median(values[rows:] - values[:-rows]) / rows
+    level = values - slope * np.arange(len(values))
+    heights = np.ptp(np.reshape(level[: count * rows], (count, rows)), axis=1)
+    # The rows next to a turn are as far from it as the angle.
+    return median(heights) / 2 / math.cos(min(math.pi / period, math.pi / 4))
+
+
+def _is_resolved(values: Array, amplitude: float) -> bool:
+    """Whether it is more than the smallest step between two values: a course that is rounded.
+
+    Up to three values are switched to and fro.
+    """
+    apart = np.diff(np.unique(values))
+    apart = apart[apart > SAME_NUMBER * float(np.abs(values).max())]
+    return len(apart) < SWITCHED_VALUES or amplitude > float(apart.min())
+
+
+def _turns_back(values: Array, period: float) -> float:
+    """The share of its way there that a value comes back."""
+    steps = np.diff(_means(values, max(1, int(period / 8))))
+    up, down = float(steps[steps > 0].sum()), -float(steps[steps < 0].sum())
+    return min(up, down) / max(up, down) if max(up, down) > 0 else 0.0
+
+
+def _is_straight(values: Array, period: float, noise: float) -> bool:
+    """Whether it is a staircase of straight pieces: a sine on a ramp has no harmonics.
+
+    About its slope, a staircase of ramps that last half of its period is a triangle, of which the
+    third harmonic reaches a ninth of the first; of all others the second one reaches more.
+    """
+    step = max(1, int(period / FITTED_ROWS))
+    means = _means(values, step)
+    rows = round(2 * period / step)
+    count = len(means) // rows
+    places: Array = np.arange(rows, dtype=np.float64) - (rows - 1) / 2
+    angles: Array = 2 * np.pi * places * step / period
+    courses = [np.ones(rows), places / rows]
+    courses += [wave(order * angles) for order in (1, 2, 3) for wave in (np.cos, np.sin)]
+    pieces: Array = np.reshape(means[: count * rows], (count, rows))
+    fitted = pieces @ np.transpose(np.linalg.pinv(np.stack(courses, axis=1)))
+    first, second, third = (fitted[:, at] + 1j * fitted[:, at + 1] for at in (2, 4, 6))
+    height = np.abs(first)
+    of_second = np.mean(second * np.conj(first) ** 2 / height**3)
+    of_third = np.mean(third * np.conj(first) ** 3 / height**4)
+    of_noise = 4 * noise**2 / step / (rows * count) / float(np.median(height)) ** 2
+    return float(np.abs(of_second) ** 2 + np.abs(of_third) ** 2) - of_noise > STRAIGHT**2
 
 
 def _best(found: list[Swing]) -> list[Swing]:
@@ -560,3 +578,46 @@ def _best(found: list[Swing]) -> list[Swing]:
 def _overlap(one: Swing, other: Swing) -> float:
     common_s = min(one.end_s, other.end_s) - max(one.start_s, other.start_s)
     return common_s / min(one.end_s - one.start_s, other.end_s - other.start_s)
+
+
+def _joined(found: Sequence[Swing], rows: EvenRows) -> list[Swing]:
+    """Those that are alike and follow each other closely, or across a gap, as one."""
+    joined: list[Swing] = []
+    for swing in found:
+        if joined and _goes_on(joined[-1], swing, rows):
+            joined[-1] = _as_one(joined[-1], swing)
+        else:
+            joined.append(swing)
+    return joined
+
+
+def _goes_on(before: Swing, after: Swing, rows: EvenRows) -> bool:
+    if _ratio(before.period_s, after.period_s) > ALIKE[0]:
+        return False
+    if _ratio(before.amplitude, after.amplitude) > ALIKE[1]:
+        return False
+    ended, began = np.searchsorted(rows.times, [before.end_s, after.start_s])
+    recorded_s = max(0, int(began - ended)) * rows.interval_s
+    return recorded_s < HIDDEN * before.period_s * (2 if _has_gap(rows, ended, began) else 1)
+
+
+def _has_gap(rows: EvenRows, start: int, stop: int) -> bool:
+    return bool(np.any((rows.borders > start) & (rows.borders <= stop)))
+
+
+def _ratio(one: float, other: float) -> float:
+    return max(one, other) / min(one, other)
+
+
+def _as_one(before: Swing, after: Swing) -> Swing:
+    """Period, amplitude and share are weighted by the half swings."""
+    count = before.half_swings + after.half_swings
+    share = before.half_swings / count
+    return replace(
+        before,
+        end_s=after.end_s,
+        half_swings=count,
+        period_s=share * before.period_s + (1 - share) * after.period_s,
+        amplitude=share * before.amplitude + (1 - share) * after.amplitude,
+        explained=share * before.explained + (1 - share) * after.explained,
+    )

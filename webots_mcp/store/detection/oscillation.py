@@ -2,87 +2,112 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Final
 
-from webots_mcp.naming import listed
-from webots_mcp.store.analysis.swings import JOINED_PERIODS, Swing, joined_swings
+from webots_mcp.naming import in_snake_case, listed
+from webots_mcp.store.analysis.arrays import np
+from webots_mcp.store.analysis.features import unwrap
+from webots_mcp.store.analysis.summary import LARGEST
+from webots_mcp.store.analysis.swings import SLOW_HALF_SWINGS, EvenRows, Swing, swings_in
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import Alike, EventKind, NotSearchableError
-from webots_mcp.store.detection.search import Search
-from webots_mcp.store.rollup.swings import LONGEST_PERIOD_S, may_swing, swings_in
+from webots_mcp.store.detection.search import MOST_NAMED, Search
+from webots_mcp.store.reading.frame import Zones
 from webots_mcp.store.signals.registry import Signal
 
-_MOST_NAMED: Final = 5
+LONGEST_PERIOD_S: Final = 5.0  # that always counts; longer ones where enough of them fit
+_ENDS_WITHIN: Final = 1.5  # periods
+
+# Sensors swing by nature while a robot drives.
+_SWINGING: Final = re.compile(
+    r"(^|[._])(heading|yaw|roll|pitch|theta|bearing|steer\w*|wheels?|motors?|speed|velocity|pose|pos"
+    r"|position|odom|odometry|left|right|cmd|command\w*|error)([._]|$)",
+    re.IGNORECASE,
+)
 
 
 def oscillation_events(search: Search) -> Iterator[Event]:
     """Of heading, wheels, speed, position and the like, and of what is asked for."""
     signals = _swinging(search)
-    if search.is_purged and not search.view.stored_swings(signals)[1]:
-        search.require_rows()
     if left := [each.name for each in search.required_numbers() if each not in signals]:
         why = (
             f"not in {len(left)} of {len(search.numbers)} signals, whose names do not suggest "
-            f"motion: name them in signals ({listed(left, _MOST_NAMED)})"
+            f"motion: name them in signals ({listed(left, MOST_NAMED)})"
         )
         if not signals:
             raise NotSearchableError(why)
         search.not_searched("oscillation", why)
+    if not len(search.frame):
+        search.require_rows()
     _note_periods(search)
-    search.note_too_large("oscillation")
-    for name, swings in _found(search, signals).items():
-        for swing in joined_swings(swings):
-            details = {
-                "half_periods": swing.half_swings,
-                "period_s": swing.period_s,
-                "amplitude": swing.amplitude,
-            }
-            event = search.event("oscillation", swing.start_s, swing.end_s, name, **details)
-            goes_on = search.ended_s - swing.end_s < _ends_within_s(event)
-            yield replace(event, ongoing=goes_on)
+    for name, swing in _found(search, signals):
+        details = {
+            "half_periods": swing.half_swings,
+            "period_s": swing.period_s,
+            "amplitude": swing.amplitude,
+        }
+        event = search.event("oscillation", swing.start_s, swing.end_s, name, **details)
+        goes_on = search.ended_s - swing.end_s < _ends_within_s(event)
+        yield replace(event, ongoing=goes_on)
+    search.not_searched("oscillation", *map(str, search.frame.unread))
 
 
 def _note_periods(search: Search) -> None:
-    """Which periods are too long for the run to hold enough of them, or to be looked for at all."""
-    half_periods, longest_s = search.options.min_half_periods, _longest_period_s(search)
+    """Which periods are too long for the run to hold enough of them."""
+    half_periods = search.options.min_half_periods
     fitting_s = 2 * search.length_s / half_periods
-    if fitting_s < longest_s:
+    if fitting_s < _longest_period_s(search):
         search.not_searched(
             "oscillation",
             f"run {search.segment.run_id} lasted only {search.length_s:.3g} s, too short for "
             f"{half_periods} half periods where a period is over {fitting_s:.2g} s",
         )
-    elif search.view.is_long and search.options.oscillation_period_s is None:
-        search.not_searched(
-            "oscillation",
-            f"not with a period over {longest_s:g} s in so long a range: {search.less_time}",
-        )
 
 
 def _longest_period_s(search: Search) -> float:
-    asked_s = search.options.oscillation_period_s
-    return search.view.longest_period_s if asked_s is None else asked_s
+    if (asked_s := search.options.oscillation_period_s) is not None:
+        return asked_s
+    times = search.frame.times
+    length_s = float(times[-1] - times[0]) if len(times) else 0.0
+    return max(LONGEST_PERIOD_S, 2 * length_s / SLOW_HALF_SWINGS)
 
 
-def _found(search: Search, signals: Sequence[Signal]) -> dict[str, list[Swing]]:
-    """Those that are stored, and in the rows of which none are."""
-    options = search.options
-    asked = options.min_half_periods, _longest_period_s(search)
-    usual = asked == (EventOptions.min_half_periods, LONGEST_PERIOD_S)
-    stored, found = search.view.stored_swings(signals if usual else ())
-    for some, outside in (
-        ([each for each in signals if each.name in found], stored),
-        ([each for each in signals if each.name not in found], range(0)),
-    ):
-        at_rest = [0.0] * len(some)  # without any step there is no swing
-        for numbers in search.view.stretches(some, at_rest, outside) if some else ():
-            for index, signal in enumerate(some):
-                if search.is_over("oscillation", some[index:]):
-                    break
-                found.setdefault(signal.name, []).extend(swings_in(numbers, signal, *asked))
-    return found
+def _found(search: Search, signals: Sequence[Signal]) -> Iterator[tuple[str, Swing]]:
+    """The swings of each signal, in the chunks in which it changes."""
+    frame, too_large = search.frame, list[str]()
+    asked = search.options.min_half_periods, _longest_period_s(search)
+    rows: dict[tuple[int, int], EvenRows] = {}  # which signals share
+    for index, signal in enumerate(signals):
+        if search.is_over("oscillation", signals[index:]):
+            break
+        for span in _changing(frame.zones(signal.name), search.options.min_half_periods):
+            part = frame.rows(*span)
+            numbers = part.numbers(signal.name)
+            usable = np.abs(numbers) <= LARGEST
+            if usable.all():
+                even = rows.setdefault(span, EvenRows.of(part.times))
+            else:
+                if (np.abs(numbers) > LARGEST).any():
+                    too_large.append(signal.name)
+                even, numbers = EvenRows.of(part.times[usable]), numbers[usable]
+            if signal.turn:
+                numbers = unwrap(numbers, signal.turn)
+            for swing in swings_in(even, numbers, *asked, lambda: search.deadline.passed):
+                yield signal.name, swing
+    if too_large and search.only is None:
+        names = listed(list(dict.fromkeys(too_large)), MOST_NAMED)
+        search.not_searched("oscillation", f"not in {names}: numbers beyond {LARGEST:g}")
+
+
+def _changing(zones: Zones, least: int) -> list[tuple[int, int]]:
+    """Rows of the chunks in which the value changes, and of those next to them."""
+    if int(zones.change_count.sum()) < least:
+        return []
+    changes = np.pad(zones.change_count > 0, 1)
+    return zones.spans(changes[:-2] | changes[1:-1] | changes[2:])
 
 
 def _swinging(search: Search) -> list[Signal]:
@@ -90,12 +115,17 @@ def _swinging(search: Search) -> list[Signal]:
     return [each for each in search.numbers if asked or may_swing(each)]
 
 
+def may_swing(signal: Signal) -> bool:
+    """Whether it is named like something that a robot swings with."""
+    return signal.is_number and _SWINGING.search(in_snake_case(signal.name)) is not None
+
+
 def _around_s(options: EventOptions) -> float:
     return options.min_half_periods * (options.oscillation_period_s or LONGEST_PERIOD_S) / 2
 
 
 def _ends_within_s(event: Event) -> float:
-    return JOINED_PERIODS * event.details["period_s"]
+    return _ENDS_WITHIN * event.details["period_s"]
 
 
 OSCILLATION: Final = EventKind(
@@ -107,7 +137,6 @@ OSCILLATION: Final = EventKind(
     ends_within_s=_ends_within_s,
     of_numbers=True,
     drawn=3,
-    reads_through=_swinging,
     alike=Alike(lambda events, unit: "oscillations"),
     effort=1,
 )

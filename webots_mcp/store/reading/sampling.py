@@ -13,6 +13,8 @@ from webots_mcp.store.reading.rows import RAW_ROWS, Columns, cleaned, extracted,
 from webots_mcp.store.signals.registry import Signal
 
 MOST_SAMPLES: Final = 60_000  # about 12 us each
+STRETCH_ROWS: Final = 10_000  # that are searched at once
+ACROSS_S: Final = 20.0  # of the stretch next to it
 
 _TICKS: Final = (
     "WITH RECURSIVE tick(t) AS (SELECT ? UNION ALL SELECT t + ? FROM tick WHERE t < ?) "

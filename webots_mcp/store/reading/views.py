@@ -29,10 +29,13 @@ from webots_mcp.store.reading.sampling import newest_part
 from webots_mcp.store.rollup.buckets import BUCKET_S, FINE, bucket_of
 from webots_mcp.store.rollup.swings import (
     ACROSS_S,
-    LONGEST_PERIOD_S,
+    MOST_SAMPLES,
     STRETCH_ROWS,
-    stored_swings,
+    newest_part,
+    read_sampled,
 )
+from webots_mcp.store.reading.steps import BucketSteps, read_steps
+from webots_mcp.store.rollup.buckets import BUCKET_S, FINE, bucket_of, totals
 from webots_mcp.store.rollup.tables import watermark
 from webots_mcp.store.signals.registry import Signal
 

@@ -13,7 +13,7 @@ from typing import Final
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.reading.rows import Columns, read_columns
-from webots_mcp.store.reading.sampling import newest_part
+from webots_mcp.store.reading.sampling import ACROSS_S, STRETCH_ROWS, newest_part
 from webots_mcp.store.rollup.buckets import COARSE_S
 from webots_mcp.store.rollup.swings import ACROSS_S, STRETCH_ROWS, SwingsToStore
 from webots_mcp.store.signals.registry import Signal, registered

@@ -72,8 +72,6 @@ CREATE TABLE run (
 	purged_rows INTEGER DEFAULT 0 NOT NULL /* of the rows, those that retention has deleted */, 
 	is_chunked INTEGER DEFAULT 0 NOT NULL /* 1 once it has ended and none of its rows wait for a chunk */, 
 	uuid TEXT /* random (version 4); names the row among those of all machines */, 
-	rolled_state_id INTEGER DEFAULT 0 NOT NULL /* last state.id in the rollups, where beyond the watermark */, 
-	coarse_end INTEGER /* buckets of coarse_rollup below it are complete; null before the first */, 
 	CONSTRAINT fk_run_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE CASCADE, 
 	CONSTRAINT fk_run_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE
 );
@@ -100,95 +98,12 @@ CREATE TABLE signal (
 	reduction TEXT /* count, min, max, mean or argmin of the long array at path */, 
 	role TEXT /* x, y, z, yaw, mode, speed, commanded_speed, wheel or commanded_wheel; x2 without an x */, 
 	first_seen_wall_time_s FLOAT NOT NULL, 
-	last_seen_wall_time_s FLOAT NOT NULL, 
-	row_count INTEGER DEFAULT 0 NOT NULL /* state rows that held it, up to the watermark */, 
-	null_row_count INTEGER DEFAULT 0 NOT NULL /* of them without a value */, 
-	replaced_row_count INTEGER DEFAULT 0 NOT NULL /* of them with a value that JSON cannot hold (nan, inf, ...) */, 
-	min FLOAT, 
+	min FLOAT /* of all numbers that were put into chunks */, 
 	max FLOAT, 
 	CONSTRAINT uq_signal_robot_id UNIQUE (robot_id, name), 
 	CONSTRAINT fk_signal_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE
 );
 CREATE INDEX ix_signal_robot_id_role ON signal (robot_id, role) WHERE role IS NOT NULL;
-CREATE TABLE rollup (
-	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held the signal */, 
-	present INTEGER DEFAULT 0 NOT NULL /* of them with a value */, 
-	changes INTEGER DEFAULT 0 NOT NULL /* of the values, those unlike the one before in the bucket */, 
-	first FLOAT /* of numbers and flags (0, 1); null for text, as all that follows */, 
-	first_sim_time_s FLOAT, 
-	last FLOAT, 
-	last_sim_time_s FLOAT, 
-	min FLOAT, 
-	min_sim_time_s FLOAT /* of the first such extreme */, 
-	max FLOAT, 
-	max_sim_time_s FLOAT /* of the first such extreme */, 
-	sum FLOAT, 
-	squares FLOAT /* sum of squared deviations from sum / count */, 
-	sines FLOAT /* angles only: sum of sines */, 
-	cosines FLOAT /* angles only: sum of cosines */, 
-	largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */, 
-	first_until_sim_time_s FLOAT /* up to then it had its first number; null in older versions */, 
-	last_since_sim_time_s FLOAT /* from then on it had its last number; null in older versions */, 
-	run_id INTEGER NOT NULL, 
-	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
-	bucket INTEGER NOT NULL /* floor(sim_time_s / 10) */, 
-	PRIMARY KEY (run_id, signal_id, bucket), 
-	CONSTRAINT fk_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
-)
- WITHOUT ROWID;
-CREATE TABLE recent_rollup (
-	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held the signal */, 
-	present INTEGER DEFAULT 0 NOT NULL /* of them with a value */, 
-	changes INTEGER DEFAULT 0 NOT NULL /* of the values, those unlike the one before in the bucket */, 
-	first FLOAT /* of numbers and flags (0, 1); null for text, as all that follows */, 
-	first_sim_time_s FLOAT, 
-	last FLOAT, 
-	last_sim_time_s FLOAT, 
-	min FLOAT, 
-	min_sim_time_s FLOAT /* of the first such extreme */, 
-	max FLOAT, 
-	max_sim_time_s FLOAT /* of the first such extreme */, 
-	sum FLOAT, 
-	squares FLOAT /* sum of squared deviations from sum / count */, 
-	sines FLOAT /* angles only: sum of sines */, 
-	cosines FLOAT /* angles only: sum of cosines */, 
-	largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */, 
-	first_until_sim_time_s FLOAT /* up to then it had its first number; null in older versions */, 
-	last_since_sim_time_s FLOAT /* from then on it had its last number; null in older versions */, 
-	run_id INTEGER NOT NULL, 
-	bucket INTEGER NOT NULL /* floor(sim_time_s / 10) */, 
-	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
-	PRIMARY KEY (run_id, bucket, signal_id), 
-	CONSTRAINT fk_recent_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
-)
- WITHOUT ROWID;
-CREATE TABLE coarse_rollup (
-	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held the signal */, 
-	present INTEGER DEFAULT 0 NOT NULL /* of them with a value */, 
-	changes INTEGER DEFAULT 0 NOT NULL /* of the values, those unlike the one before in the bucket */, 
-	first FLOAT /* of numbers and flags (0, 1); null for text, as all that follows */, 
-	first_sim_time_s FLOAT, 
-	last FLOAT, 
-	last_sim_time_s FLOAT, 
-	min FLOAT, 
-	min_sim_time_s FLOAT /* of the first such extreme */, 
-	max FLOAT, 
-	max_sim_time_s FLOAT /* of the first such extreme */, 
-	sum FLOAT, 
-	squares FLOAT /* sum of squared deviations from sum / count */, 
-	sines FLOAT /* angles only: sum of sines */, 
-	cosines FLOAT /* angles only: sum of cosines */, 
-	largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */, 
-	first_until_sim_time_s FLOAT /* up to then it had its first number; null in older versions */, 
-	last_since_sim_time_s FLOAT /* from then on it had its last number; null in older versions */, 
-	run_id INTEGER NOT NULL, 
-	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
-	bucket INTEGER NOT NULL /* floor(sim_time_s / 500) */, 
-	swings TEXT /* JSON: the swings of what a robot swings with, each as [begin, end, half swings, period in s, amplitude, explained share]; null where they were not looked for */, 
-	PRIMARY KEY (run_id, signal_id, bucket), 
-	CONSTRAINT fk_coarse_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
-)
- WITHOUT ROWID;
 CREATE TABLE row_group (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
 	run_id INTEGER NOT NULL, 
@@ -228,18 +143,8 @@ CREATE TABLE chunk (
 );
 CREATE INDEX ix_chunk_group_id ON chunk (group_id);
 CREATE INDEX ix_chunk_statistics ON chunk (run_id, signal_id, group_id, row_count, value_count, change_count, first, last, min, max, sum, squared_deviations, largest_step);
-CREATE TABLE change (
-	run_id INTEGER NOT NULL, 
-	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
-	state_id INTEGER NOT NULL /* state.id of the row, which may have been deleted since */, 
-	sim_time_s FLOAT NOT NULL, 
-	value TEXT /* text (its first 200 characters), true, false or null */, 
-	PRIMARY KEY (run_id, signal_id, state_id), 
-	CONSTRAINT fk_change_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
-)
- WITHOUT ROWID;
 CREATE TABLE watermark (
-	name TEXT NOT NULL /* rollup */, 
+	name TEXT NOT NULL /* chunk */, 
 	state_id INTEGER NOT NULL, 
 	PRIMARY KEY (name)
 );
@@ -523,10 +428,6 @@ SELECT r.name AS robot, k.run_id, k.id AS stretch_id, k.start_sim_time_s AS star
     AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s) AS states,
   strftime('%Y-%m-%d %H:%M:%f', k.wall_time_s, 'unixepoch') AS utc, k.reason
 FROM kept_stretch k JOIN run u ON u.id = k.run_id JOIN robot r ON r.id = u.robot_id;
-CREATE VIEW all_rollup AS
-/* Rollups, those of buckets that are over and the newest. */
-SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step, first_until_sim_time_s, last_since_sim_time_s FROM rollup
-UNION ALL SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step, first_until_sim_time_s, last_since_sim_time_s FROM recent_rollup;
 CREATE VIEW robot_now AS
 /* The newest state of each robot, how old it is and how the robot moves. Speeds as published. */
 SELECT robot, run_id, end_reason, sim_time_s, round((julianday('now') - 2440587.5) * 86400.0 - wall_time_s, 1) AS age_s,

@@ -22,12 +22,9 @@ _OF_ROBOT: Final = (
     "SELECT name, kind, unit, role, max - min FROM signal "
     "WHERE robot_id = ? AND typeof(name) = 'text' ORDER BY id"
 )
-_COLUMNS: Final = (
-    "robot_id, name, path, reduction, first_seen_wall_time_s, last_seen_wall_time_s, "
-    "kind, unit, role"
-)
+_COLUMNS: Final = "robot_id, name, path, reduction, first_seen_wall_time_s, kind, unit, role"
 _ADD: Final = f"INSERT OR IGNORE INTO signal ({_COLUMNS}) VALUES "
-_MARKS: Final = "(?, ?, ?, ?, ?, ?, ?, ?, ?)"
+_MARKS: Final = "(?, ?, ?, ?, ?, ?, ?, ?)"
 _CHANGE: Final = "UPDATE signal SET kind = ?, unit = ?, role = ? WHERE robot_id = ? AND name = ?"
 
 
@@ -46,7 +43,6 @@ class Seen(NamedTuple):
     kind: Kind
     is_choice: bool
     first_wall_time_s: float
-    last_wall_time_s: float
 
 
 class Described(NamedTuple):
@@ -109,7 +105,7 @@ def _may_be_choice(known: Described | None, span: float) -> bool:
 def write_changes(connection: sqlite3.Connection, robot_id: int, changes: Changes) -> None:
     """Write them; names that another process has entered meanwhile stay as they are."""
     new = [
-        (robot_id, name, *seen[:2], *seen[-2:], *described)
+        (robot_id, name, *seen[:2], seen.first_wall_time_s, *described)
         for name, (seen, described) in changes.new.items()
     ]
     for start in range(0, len(new), ADDED_AT_ONCE):

@@ -80,10 +80,6 @@ SELECT r.name AS robot, k.run_id, k.id AS stretch_id, k.start_sim_time_s AS star
     AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s) AS states,
   strftime('%Y-%m-%d %H:%M:%f', k.wall_time_s, 'unixepoch') AS utc, k.reason
 FROM kept_stretch k JOIN run u ON u.id = k.run_id JOIN robot r ON r.id = u.robot_id;
-CREATE VIEW all_rollup AS
-/* Rollups, those of buckets that are over and the newest. */
-SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step, first_until_sim_time_s, last_since_sim_time_s FROM rollup
-UNION ALL SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step, first_until_sim_time_s, last_since_sim_time_s FROM recent_rollup;
 CREATE VIEW robot_now AS
 /* The newest state of each robot, how old it is and how the robot moves. Speeds as published. */
 SELECT robot, run_id, end_reason, sim_time_s, round((julianday('now') - 2440587.5) * 86400.0 - wall_time_s, 1) AS age_s,

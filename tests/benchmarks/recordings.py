@@ -7,11 +7,12 @@ from contextlib import closing
 from pathlib import Path
 from typing import Final
 
+from webots_mcp.store.rollup.rolling import roll
+
 from tests.recordings.long import CYCLE_S, INTERVAL_S, build
 from tests.recordings.rover import WALL_START_S
 from webots_mcp.connection import connect
 from webots_mcp.store.chunks.making import make_chunks
-from webots_mcp.store.rollup.rolling import roll
 
 LINE_INTERVAL_S: Final = 1.0
 _PART_ROWS: Final = 16 * round(CYCLE_S / INTERVAL_S)  # whole cycles: the story goes on at a seam

@@ -9,11 +9,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from webots_mcp.store.rollup.rolling import roll
+
 from tests.detection.labelled import LabelledRun
 from tests.recordings.rover import WALL_PER_SIM, Recorder
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.purge import prune
-from webots_mcp.store.rollup.rolling import roll
 
 _INSERT: Final = (
     "INSERT INTO state (run_id, sim_time_s, wall_time_s, data, replaced) VALUES (?, ?, ?, ?, ?)"

@@ -15,6 +15,8 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from webots_mcp.store.rollup.rolling import roll
+
 from tests.recordings import bridge as rover_on_the_stand_in
 from tests.recordings.long import build as build_long
 from tests.recordings.rounds import record_rounds
@@ -27,7 +29,6 @@ from webots_mcp.standin import InProcessRobot, InProcessSupervisor
 from webots_mcp.standin.in_process import InProcessSimulation
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.purge import prune
-from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.trials import Result, create_trial_set, finish_trial, trials_of
 
 CHECKOUT: Final = Path(__file__).parents[2]

@@ -10,6 +10,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.browsing import chromium
 from tests.recordings.rover import record_rover, start_run
@@ -18,7 +19,6 @@ from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME
 from webots_mcp.schema import create_schema
 from webots_mcp.standin import Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD
-from webots_mcp.store.rollup.rolling import roll
 
 __all__ = ["chromium"]
 NAME = "<img src=x onerror=hacked=1>"

@@ -8,11 +8,11 @@ from contextlib import ExitStack
 from typing import Any, Protocol
 
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.memory import memory_connection
 from tests.recordings.rover import Recorder, record_rover
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
-from webots_mcp.store.rollup.rolling import roll
 
 State = Callable[[float], dict[str, Any]]
 

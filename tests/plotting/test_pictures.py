@@ -20,6 +20,7 @@ from xml.etree import ElementTree
 import pytest
 from PIL import Image
 from pydantic import TypeAdapter
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.plotting.conftest import Record, whole
 from webots_mcp.errors import (
@@ -40,7 +41,6 @@ from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plotting.trajectory_axes import paint_trajectory
 from webots_mcp.questions.argument_types import RunIds
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.rollup.rolling import roll
 
 Ask = dict[str, Any]
 

@@ -29,10 +29,10 @@ from webots_mcp.plugins.pool import fetching
 from webots_mcp.plugins.pool.engines import open_pool, open_target
 from webots_mcp.plugins.pool.key_order import in_order
 from webots_mcp.standin import InProcessSupervisor
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.purge import prune
-from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.trials import (
     find_trial_set,
     trials_of,

@@ -10,8 +10,9 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
-from tests.recordings.rows import Recorded, RecordedRobot, insert
 from webots_mcp.store.rollup.rolling import roll
+
+from tests.recordings.rows import Recorded, RecordedRobot, insert
 
 CYCLE_S: Final = 40.0  # 32 s on the way, 8 s at a dock
 STAND_S: Final = 8.0

@@ -10,10 +10,11 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
+from webots_mcp.store.rollup.rolling import roll
+
 from tests.recordings.rover import WALL_START_S, start_run
 from webots_mcp.connection import connect
 from webots_mcp.schema import create_schema
-from webots_mcp.store.rollup.rolling import roll
 
 INTERVAL_S: Final = 0.032
 CYCLE_S: Final = 100.0  # 70 s cruise, 6 s stuck within it, 10 s back up, 20 s turn

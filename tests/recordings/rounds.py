@@ -6,11 +6,12 @@ from contextlib import closing
 from pathlib import Path
 from typing import Final
 
+from webots_mcp.store.rollup.rolling import roll
+
 from tests.recordings.rover import Recorder, rover_state, start_run
 from webots_mcp.connection import connect
 from webots_mcp.contract import new_uuid
 from webots_mcp.schema import create_schema
-from webots_mcp.store.rollup.rolling import roll
 
 ROWS: Final = 5200  # 1040 s: two coarse buckets and some
 PART: Final = (480.0, 720.0)  # within it, over the border of coarse buckets

@@ -20,12 +20,12 @@ from typing import Any, Final, NamedTuple
 import anyio
 from mcp import Client
 from PIL import Image
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rows import Recorded, RecordedRobot, insert
 from webots_mcp.server import create_server
 from webots_mcp.store.retention.limits import set_limits
 from webots_mcp.store.retention.policy import Limit
-from webots_mcp.store.rollup.rolling import roll
 
 ROWS: Final = 60
 LATE_S: Final = (12.0, 505.0, 512.0)  # rows that end a bucket of 10 s, and one of 500 s

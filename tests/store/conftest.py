@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.memory import memory_connection
 from tests.recordings.rover import record_rover
@@ -16,7 +17,6 @@ from webots_mcp.store.chunks import making
 from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.reading import frame, frame_summary
 from webots_mcp.store.reading import rows as columns
-from webots_mcp.store.rollup.rolling import roll
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rows import Recorded, insert
 from tests.server.malformed import NOT_UTF8, Damage
@@ -15,7 +16,6 @@ from webots_mcp.maintenance import Maintainer
 from webots_mcp.store.retention.planning import plan
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.purge import prune
-from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.waiting_file import FORMAT, adopt
 
 BLOB = b"\x00\xff\x01"

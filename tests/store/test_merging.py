@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.runs import Recorded
 from webots_mcp import MCPBridge
@@ -18,7 +19,6 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.schema import create_schema
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.merging import merge
-from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.trials import (
     Result,
     create_trial_set,

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.answers import answers
 from tests.recordings.rounds import PART, ROWS, record_rounds
@@ -25,7 +26,6 @@ from webots_mcp.store.merging import merge
 from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.purge import prune
-from webots_mcp.store.rollup.rolling import roll
 
 SIGNALS = (
     "SELECT name, kind, unit, path, reduction, row_count, null_row_count, min, max FROM signal "

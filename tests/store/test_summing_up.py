@@ -9,12 +9,12 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from webots_mcp.store.rollup.rolling import BATCH_ROWS, watermark
 
 from tests.recordings.long import build
 from webots_mcp.cli import main
 from webots_mcp.connection import connect
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.rollup.rolling import BATCH_ROWS, watermark
 from webots_mcp.store.summing_up import sum_up
 
 ROWS = 3 * BATCH_ROWS

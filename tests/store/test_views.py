@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.memory import memory_connection
 from tests.recordings.rover import Recorder, start_run
@@ -17,7 +18,6 @@ from webots_mcp.naming import USUAL_POSITIONS, find_position, flatten, metres_in
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.reading.subject import Subject
-from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.signals.catalogue import catalogue
 from webots_mcp.store.signals.registry import Signal
 

@@ -66,7 +66,7 @@ class SignalNames:
             is_whole = is_whole and (value is None or type(value) is int)
             if name not in self._known or (kind, is_whole) != before:
                 self._known[name] = kind, is_whole
-                self._waiting[name] = Seen(*found[name], kind, is_whole, now_s, now_s)
+                self._waiting[name] = Seen(*found[name], kind, is_whole, now_s)
 
     def _enter(self) -> None:
         some = dict(islice(self._waiting.items(), ADDED_AT_ONCE))

@@ -58,8 +58,8 @@ async def webots_query_sql(
 
     Tables: robot, session, run(id, robot_id, session_id, row_count, label,
     last_sim_time_s), state(run_id, sim_time_s, wall_time_s, data: JSON), signal(name, path),
-    all_rollup(run_id, signal_id, bucket of 10 s, min, max, sum, present), change, log, event,
-    command, image. Views: robot_now, robot_run, robot_trajectory, robot_period, robot_event,
+    log, event, command, image. Views: robot_now, robot_run, robot_trajectory, robot_statistics(
+    run_id, signal, start_s, end_s, min, max, mean of 1,024 rows), robot_period, robot_event,
     robot_log, robot_command. Indexed by run_id and sim_time_s. Values:
     json_extract(data, '$.pose[0]'). All columns: the resource webots://schema.
     """

@@ -28,7 +28,6 @@ from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.retention.limits import Asked, ask_where_unset
 from webots_mcp.store.retention.upkeep import Upkeep
-from webots_mcp.store.rollup.rolling import roll
 
 INSTRUCTIONS: Final = (
     "A flight recorder and remote control for Webots robot simulations. Begin with "
@@ -103,7 +102,6 @@ def _lifespan(
             ask_where_unset(connection, unasked)
             unasked.clear()
         reap_if_dead(connection)
-        roll(connection, pause_s=_PAUSE_S)
         make_chunks(connection, pause_s=_PAUSE_S)
         retain(connection)
 

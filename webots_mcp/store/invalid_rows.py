@@ -46,7 +46,7 @@ _REFERENCES: Final = {
     "trial": (("trial_set_id", "trial_set"),),
 }
 _TABLES: Final = ("robot", "session", "run", "state", "log", "event", "image", "command",
-                  "signal", "rollup", "recent_rollup", "coarse_rollup", "change", "watermark",
+                  "signal", "watermark",
                   "retention_limit", "parameter", "parameter_value", "breakpoint", "trial_set",
                   "trial", "kept_stretch", "kept_state", "console_line",
                   "row_group", "chunk")  # fmt: skip

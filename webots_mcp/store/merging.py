@@ -23,7 +23,6 @@ from webots_mcp.schema import require_shipped
 from webots_mcp.store.chunks.taking_in import take_in_chunks
 from webots_mcp.store.images import PICTURES, inside
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.rollup.taking_in import take_in_summaries
 from webots_mcp.store.trials import fetch_trial_set, is_at_work
 from webots_mcp.transactions import transaction
 from webots_mcp.waiting_file import adopt
@@ -193,7 +192,7 @@ def _take_in(
     else:
         owner = {"robot_id": connection.execute(_ROBOT_OF, (here,)).fetchone()[0]}
     commands = _copy_commands(connection, wanted, owner | {"session_id": here}, is_new=is_new)
-    own = owner | {"session_id": here, "is_chunked": 0, "rolled_state_id": 0, "coarse_end": None}
+    own = owner | {"session_id": here, "is_chunked": 0}
     for run_id, run_uuid in runs:
         run = _insert(connection, "run", "id = ?", run_id, own)
         _copy_states(connection, run_id, run, owner["robot_id"])
@@ -266,9 +265,7 @@ def _copy_states(connection: sqlite3.Connection, run_id: int, run: int, robot_id
     (is_purged,) = connection.execute(_IS_PURGED, (run,)).fetchone()
     shift = None
     if is_purged:
-        ids = take_in_chunks(connection, run_id, run, robot_id)
-        take_in_summaries(connection, run_id, run, robot_id, ids)
-        shift = ids.shift
+        shift = take_in_chunks(connection, run_id, run, robot_id)
     else:
         connection.execute(_TO_BE_CHUNKED, (run,))
     _insert(connection, "state", "run_id = ?", run_id, {"run_id": run}, shift)

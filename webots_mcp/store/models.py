@@ -47,13 +47,6 @@ def _to(table: str, comment: str | None = None, *, nullable: bool = False) -> An
     return Field(default=None, sa_column=Column(Integer, key, nullable=nullable, comment=comment))
 
 
-def _key(table: str | None, comment: str | None = None) -> Any:
-    """A part of a primary key of several columns, in the order in which they stand."""
-    to = [ForeignKey(f"{table}.id", ondelete="CASCADE")] if table else []
-    column = Column(Integer, *to, primary_key=True, autoincrement=False, comment=comment)
-    return Field(default=None, sa_column=column)
-
-
 def _column(kind: Any, comment: str | None = None, **options: Any) -> Any:
     options.setdefault("nullable", True)
     return Field(default=None, sa_column=Column(kind, comment=comment, **options))
@@ -163,10 +156,6 @@ class Run(SQLModel, table=True):
     purged_rows: int = _count("of the rows, those that retention has deleted")
     is_chunked: bool = _count("1 once it has ended and none of its rows wait for a chunk")
     uuid: str | None = _text(_UUID)
-    rolled_state_id: int = _count("last state.id in the rollups, where beyond the watermark")
-    coarse_end: int | None = _column(
-        Integer, "buckets of coarse_rollup below it are complete; null before the first"
-    )
 
 
 class State(SQLModel, table=True):
@@ -205,91 +194,8 @@ class Signal(SQLModel, table=True):
         "x, y, z, yaw, mode, speed, commanded_speed, wheel or commanded_wheel; x2 without an x"
     )
     first_seen_wall_time_s: float = _number(nullable=False)
-    last_seen_wall_time_s: float = _number(nullable=False)
-    row_count: int = _count("state rows that held it, up to the watermark")
-    null_row_count: int = _count("of them without a value")
-    replaced_row_count: int = _count("of them with a value that JSON cannot hold (nan, inf, ...)")
-    min: float | None = _number()
+    min: float | None = _number("of all numbers that were put into chunks")
     max: float | None = _number()
-
-
-def _figure(comment: str | None = None) -> Any:
-    """A number in a column that two tables have."""
-    return Field(default=None, sa_type=Float, sa_column_kwargs={"comment": comment})
-
-
-def _figure_count(comment: str) -> Any:
-    options = {"comment": comment, "nullable": False, "server_default": text("0")}
-    return Field(default=None, sa_type=Integer, sa_column_kwargs=options)
-
-
-class _Summary(SQLModel):
-    """What the state rows that held a signal come to."""
-
-    rows: int = _figure_count("state rows that held the signal")
-    present: int = _figure_count("of them with a value")
-    changes: int = _figure_count("of the values, those unlike the one before in the bucket")
-    first: float | None = _figure("of numbers and flags (0, 1); null for text, as all that follows")
-    first_sim_time_s: float | None = _figure()
-    last: float | None = _figure()
-    last_sim_time_s: float | None = _figure()
-    min: float | None = _figure()
-    min_sim_time_s: float | None = _figure("of the first such extreme")
-    max: float | None = _figure()
-    max_sim_time_s: float | None = _figure("of the first such extreme")
-    sum: float | None = _figure()
-    squares: float | None = _figure("sum of squared deviations from sum / count")
-    sines: float | None = _figure("angles only: sum of sines")
-    cosines: float | None = _figure("angles only: sum of cosines")
-    largest_step: float | None = _figure(
-        "largest difference of values that follow each other; null in those of older versions"
-    )
-    first_until_sim_time_s: float | None = _figure(
-        "up to then it had its first number; null in older versions"
-    )
-    last_since_sim_time_s: float | None = _figure(
-        "from then on it had its last number; null in older versions"
-    )
-
-
-class Rollup(_Summary, table=True):
-    """10 s of simulation time of one signal in one run: what its state rows come to.
-
-    Only buckets that are over; the others stand in `recent_rollup`, and in `all_rollup` both.
-    """
-
-    __table_args__ = {"sqlite_with_rowid": False}
-    run_id: int = _key("run")
-    signal_id: int = _key(None, "signal.id, of the run's robot")
-    bucket: int = _key(None, "floor(sim_time_s / 10)")
-
-
-class RecentRollup(_Summary, table=True):
-    """The newest rollups of a run, all its signals side by side.
-
-    In `rollup` the buckets of a signal stand together, which makes a long history of it fast to
-    read; but to write a bucket of 100 signals there is to write 100 pages.
-    """
-
-    __tablename__ = "recent_rollup"  # pyright: ignore[reportAssignmentType]
-    __table_args__ = {"sqlite_with_rowid": False}
-    run_id: int = _key("run")
-    bucket: int = _key(None, "floor(sim_time_s / 10)")
-    signal_id: int = _key(None, "signal.id, of the run's robot")
-
-
-class CoarseRollup(_Summary, table=True):
-    """500 s of one signal in one run: what its rollups of 10 s come to, for long recordings."""
-
-    __tablename__ = "coarse_rollup"  # pyright: ignore[reportAssignmentType]
-    __table_args__ = {"sqlite_with_rowid": False}
-    run_id: int = _key("run")
-    signal_id: int = _key(None, "signal.id, of the run's robot")
-    bucket: int = _key(None, "floor(sim_time_s / 500)")
-    swings: str | None = _text(
-        "JSON: the swings of what a robot swings with, each as [begin, end, half swings, period "
-        "in s, amplitude, explained share]; null where they were not looked for",
-    )
 
 
 class RowGroup(SQLModel, table=True):
@@ -349,21 +255,10 @@ class Chunk(SQLModel, table=True):
     labels: str | None = _text("JSON array; an item that is an array says what was replaced")
 
 
-class Change(SQLModel, table=True):
-    """A text or boolean signal took another value; its first value in a run counts as one."""
-
-    __table_args__ = {"sqlite_with_rowid": False}
-    run_id: int = _key("run")
-    signal_id: int = _key(None, "signal.id, of the run's robot")
-    state_id: int = _key(None, "state.id of the row, which may have been deleted since")
-    sim_time_s: float = _number(nullable=False)
-    value: str | None = _text("text (its first 200 characters), true, false or null")
-
-
 class Watermark(SQLModel, table=True):
-    """Up to which state row a derived table is complete, of all runs."""
+    """Up to which state row all rows were looked at for a derived table, of all runs."""
 
-    name: str = Field(sa_column=Column(Text, primary_key=True, comment="rollup"))
+    name: str = Field(sa_column=Column(Text, primary_key=True, comment="chunk"))
     state_id: int = _column(Integer, nullable=False)
 
 

@@ -1,7 +1,7 @@
-"""Rolling up on demand, where no server does it in the background.
+"""Making chunks on demand, where no server does it in the background.
 
-What is in no rollup is read row by row until a deadline, and what was not read is left out of the
-answer. A server rolls up what comes; of a recording that none looks after, who asks does it first.
+What is in no chunk is read row by row until a deadline, and what was not read is left out of the
+answer. A server makes chunks of what comes; of a recording that none looks after, who asks does it.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from webots_mcp.errors import DatabaseError
 from webots_mcp.leases import holder_of
 from webots_mcp.maintenance import Maintainer
 from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunks.stored import watermark
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.robots import list_robots
-from webots_mcp.store.rollup.rolling import BATCH_ROWS, roll, watermark
 
-LEAST_ROWS: Final = BATCH_ROWS  # a question reads fewer as they are
+LEAST_ROWS: Final = 2000  # a question reads fewer as they are
+_BATCH_ROWS: Final = 2000
 _PAUSE_S: Final = 0.002  # between two short writes, for robots to write theirs
 _NEWEST: Final = "SELECT coalesce(max(id), 0) FROM state"
 
@@ -34,10 +35,10 @@ def sum_up(
     limit_s: float = math.inf,
     called_off: Callable[[], bool] = lambda: False,
 ) -> str:
-    """Roll up the states that are there now and in no rollup yet, unless a server does.
+    """Put the states that are there now and in no chunk yet into chunks, unless a server does.
 
-    It may end at any moment, also by an exception: what is rolled up stays, and the next call goes
-    on from there.
+    It may end at any moment, also by an exception: the chunks that are made stay, and the next call
+    goes on from there.
 
     Args:
         recording: Of the current schema.
@@ -46,7 +47,7 @@ def sum_up(
         called_off: Asked between two batches whether to stop.
 
     Returns:
-        How many states are left in no rollup, and why; "" where there are none, or so few that a
+        How many states are left in no chunk, and why; "" where there are none, or so few that a
         question reads all of them.
 
     Raises:
@@ -61,15 +62,16 @@ def sum_up(
     if is_frozen:
         return _left(last - first, "the file cannot be written from here")
     if holder.startswith("server "):
-        return _left(last - first, "the server that maintains the recording is rolling them up")
+        return _left(
+            last - first, "the server that maintains the recording is putting them into chunks"
+        )
     until_s, mark, why = time.monotonic() + limit_s, first, ""
     try:
         with recording.writer() as connection, _checkpoints(recording):
             live = any(robot.live for robot in list_robots(connection, time.time()))
             while not why and mark <= last:
                 pause_s = _PAUSE_S if live else 0.0
-                done = roll(connection, BATCH_ROWS, pause_s).done
-                make_chunks(connection, BATCH_ROWS, pause_s)
+                done = make_chunks(connection, _BATCH_ROWS, pause_s).done
                 mark = watermark(connection)
                 if progress is not None:
                     progress(min(mark, last) - first, last - first)
@@ -97,4 +99,4 @@ def _checkpoints(recording: Recording) -> Generator[None]:
 
 
 def _left(rows: int, why: str) -> str:
-    return f"the newest {rows} rows are not rolled up yet: {why}"
+    return f"the newest {rows} rows are in no chunk yet: {why}"

@@ -9,7 +9,7 @@ from typing import Any, Final
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.naming import Value
 from webots_mcp.store.analysis.summary import usable_numbers
-from webots_mcp.store.reading.rows import Columns
+from webots_mcp.store.reading.frame import Frame
 
 _SHOWN_STATE_CHARACTERS: Final = 500
 
@@ -23,20 +23,27 @@ class RecordedSignal:
     """
 
     def __init__(
-        self, name: str, run: str, columns: Columns, state_of: Callable[[int], str]
+        self,
+        name: str,
+        run: str,
+        frame: Frame,
+        values: Sequence[Value],
+        state_of: Callable[[int], str],
     ) -> None:
         """Made by `Recording.signal`.
 
         Args:
             name: Dotted.
             run: How messages name the run.
-            columns: The rows, with the values of this signal among them.
+            frame: The rows of the run.
+            values: Those of this signal, one for each row.
             state_of: The JSON text of the state row with that id.
         """
         self.name = name
         self._run = run
-        self._columns = columns
-        self._values: Sequence[Value] = columns.values[name]
+        self._times: list[float] = frame.times.tolist()
+        self._ids: list[int] = frame.ids.tolist()
+        self._values = values
         self._state_of = state_of
 
     def __repr__(self) -> str:
@@ -48,7 +55,7 @@ class RecordedSignal:
 
     def times_s(self) -> list[float]:
         """The simulation time of each row, in seconds."""
-        return list(self._columns.times)
+        return list(self._times)
 
     def changes(self) -> list[Any]:
         """The values without those that equal the one before: `["cruise", "turn", "cruise"]`."""
@@ -87,9 +94,9 @@ class RecordedSignal:
         Raises:
             NothingRecordedError: The first row is younger.
         """
-        row = sum(time <= time_s for time in self._columns.times) - 1
+        row = sum(time <= time_s for time in self._times) - 1
         if row < 0:
-            first_s = self._columns.times[0]
+            first_s = self._times[0]
             raise NothingRecordedError(
                 f"{self._run} has no row up to {time_s:g} s: the first is at {first_s:g} s"
             )
@@ -102,7 +109,7 @@ class RecordedSignal:
             NothingRecordedError: There is none; the text tells which values there are.
         """
         if value in self._values:
-            return self._columns.times[self._values.index(value)]
+            return self._times[self._values.index(value)]
         seen = ", ".join(map(repr, list(dict.fromkeys(self._values))[:10]))
         raise NothingRecordedError(
             f"{self.name} was never {value!r} in the {len(self._values)} rows of {self._run}; "
@@ -111,7 +118,7 @@ class RecordedSignal:
 
     def duration_s(self, value: Value) -> float:
         """For how many simulated seconds it had this value; each row counts up to the next."""
-        steps = pairwise(self._columns.times)
+        steps = pairwise(self._times)
         return sum(
             after_s - before_s
             for (before_s, after_s), held in zip(steps, self._values, strict=False)
@@ -161,18 +168,18 @@ class RecordedSignal:
     def _fail_at(self, bad: Sequence[int], what: str, worst: int) -> None:
         if not bad:
             return
-        times, values, first = self._columns.times, self._values, bad[0]
+        times, values, first = self._times, self._values, bad[0]
         lines = [f"{self.name} {what} in {len(bad)} of {len(values)} rows of {self._run}"]
         lines += [f"first at {times[first]:g} s: {_shown(values[first])}"]
         if worst != first:
             lines += [f"furthest at {times[worst]:g} s: {_shown(values[worst])}"]
-        state = self._state_of(self._columns.ids[first])
+        state = self._state_of(self._ids[first])
         cut = " ..." if len(state) > _SHOWN_STATE_CHARACTERS else ""
         lines += [f"the state at {times[first]:g} s: {state[:_SHOWN_STATE_CHARACTERS]}{cut}"]
         raise AssertionError("\n  ".join(lines))
 
     def _numbers(self) -> Sequence[float]:
-        _, numbers = usable_numbers(self._columns.times, self._values)
+        _, numbers = usable_numbers(self._times, self._values)
         if not numbers:
             raise NothingRecordedError(self._no_number())
         return numbers

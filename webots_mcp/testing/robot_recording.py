@@ -22,13 +22,12 @@ from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines
 from webots_mcp.store.parameters import parameters_of
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, find_range, whole_run
-from webots_mcp.store.reading.rows import read_columns
 from webots_mcp.store.reading.subject import Subject, find_subject
-from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.run_rows import Event, fetch_state, newest_events, runs_of, states_of
-from webots_mcp.store.signals.catalogue import resolve_signals
-from webots_mcp.store.signals.registry import Signal, registered
+from webots_mcp.store.signals.catalogue import resolve_signals, signals_of_frame
+from webots_mcp.store.signals.registry import cleaned
 from webots_mcp.testing.recorded_signal import RecordedSignal
 
 COMMAND_TIME_TO_LIVE_S: Final = 60.0  # a test on a busy machine is slower than a person
@@ -95,10 +94,19 @@ class RobotRecording:
             UnknownSignalError: None matches.
             NoDatabaseError, NothingRecordedError: Nothing has been recorded yet.
         """
-        self._roll_up()
         with self._subject() as (connection, subject):
-            meant = resolve_signals(registered(connection, subject.robot_id), [pattern])
-            return self._read(connection, subject, meant)
+            run = f"run {subject.run_id} of robot {subject.robot!r}"
+            segment = whole_run(connection, subject.run_id)
+            if segment is None:
+                raise NothingRecordedError(f"{run} has no state row: was publish() called?")
+            frame = read_frame(connection, segment, Deadline(math.inf))
+            meant = resolve_signals(signals_of_frame(connection, subject, frame), [pattern])
+            return [
+                RecordedSignal(
+                    each.name, run, frame, cleaned(each, frame.values(each.name)), self._state
+                )
+                for each in meant
+            ]
 
     def states(self) -> list[dict[str, Any]]:
         """What was published, row by row; "nan", "inf" and the like where JSON holds null."""
@@ -126,7 +134,6 @@ class RobotRecording:
             NothingRecordedError: A named kind could not be looked for: without a position, say,
                 nobody knows whether the robot was stuck, and an empty list would claim to.
         """
-        self._roll_up()
         wanted = EventOptions(kinds=kinds, **options)
         with self._subject() as (connection, subject):
             whole = find_range(connection, Scope(), subject)
@@ -230,21 +237,6 @@ class RobotRecording:
             )
         require_current(connection)
         return connection
-
-    def _roll_up(self) -> None:
-        """Enter every signal that was ever published into the register."""
-        with closing(self._connect("writer")) as connection:
-            roll(connection, sys.maxsize)
-
-    def _read(
-        self, connection: sqlite3.Connection, subject: Subject, signals: list[Signal]
-    ) -> list[RecordedSignal]:
-        run = f"run {subject.run_id} of robot {subject.robot!r}"
-        segment = whole_run(connection, subject.run_id)
-        if segment is None:
-            raise NothingRecordedError(f"{run} has no state row: was publish() called?")
-        columns = read_columns(connection, segment, signals, Deadline(math.inf))
-        return [RecordedSignal(signal.name, run, columns, self._state) for signal in signals]
 
     def _state(self, state_id: int) -> str:
         with closing(self._connect("reader")) as connection:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rover import GAP_S, WALL_START_S
 from tests.recordings.rows import Recorded
@@ -14,7 +15,6 @@ from tests.server.story import client_on, copy_of, rows_of
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.rollup.rolling import roll
 
 pytestmark = pytest.mark.anyio
 

@@ -10,6 +10,7 @@ from contextlib import closing
 from typing import Any
 
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
@@ -17,7 +18,6 @@ from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.rollup.rolling import roll
 
 STOPS_S = 200.0  # the robot drives, then stands, at 300 s it drives on
 GOES_ON_S = 300.0

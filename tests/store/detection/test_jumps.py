@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rover import start_run
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.rollup.rolling import roll
 
 
 def record(

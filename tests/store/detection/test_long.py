@@ -8,6 +8,7 @@ from itertools import count
 from typing import Any
 
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp.store.detection.event import EventOptions
@@ -18,7 +19,6 @@ from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading import rows, views
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.signals.catalogue import known_signals
 
 SWING_S = (100.0, 130.0)

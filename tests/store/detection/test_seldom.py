@@ -6,6 +6,7 @@ import sqlite3
 from itertools import count
 
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rover import start_run
 from webots_mcp.store.detection.event import EventOptions
@@ -15,7 +16,6 @@ from webots_mcp.store.detection.verdict import Ledger
 from webots_mcp.store.reading import rows, views
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.signals.catalogue import known_signals
 
 STEP_S = 0.1

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rover import start_run
 from webots_mcp.errors import UnknownSignalError
@@ -17,7 +18,6 @@ from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading import rows
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.signals.catalogue import known_signals, list_signals, resolve_signals
 
 State = Callable[[float], dict[str, Any]]

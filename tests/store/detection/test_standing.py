@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rover import start_run
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.rollup.rolling import roll
 
 OPTIONS = EventOptions(kinds=("standstill", "stuck"))
 

@@ -9,6 +9,7 @@ from itertools import count
 
 import numpy as np
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from tests.store.questions.asking import ask, spans
@@ -22,7 +23,6 @@ from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.signals.catalogue import known_signals
 
 

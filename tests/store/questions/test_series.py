@@ -7,6 +7,7 @@ import sqlite3
 from typing import Any
 
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rover import start_run
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
@@ -14,7 +15,6 @@ from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.questions.series import NumberColumns, query_history
 from webots_mcp.store.reading.pages import query_rows
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.rollup.rolling import roll
 
 
 def ask(connection: sqlite3.Connection, *names: str, max_points: int = 50, **bounds: Any):

@@ -11,13 +11,13 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rover import start_run
 from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.questions.trend import Trend
 from webots_mcp.store.questions.trends import RunTrends, trends
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.rollup.rolling import roll
 
 Course = Callable[[float], float | None]  # from the time; None leaves the key out
 

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from functools import partial
 
 import pytest
+from webots_mcp.store.reading.rollups import read_pieces
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
@@ -22,8 +24,6 @@ from webots_mcp.store.reading.changes import change_points
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.pages import query_rows
 from webots_mcp.store.reading.ranges import Scope, Segment, find_range, whole_run
-from webots_mcp.store.reading.rollups import read_pieces
-from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.signals.catalogue import known_signals
 from webots_mcp.store.signals.registry import Signal
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
@@ -20,7 +21,6 @@ from webots_mcp.store.questions.timeline import timeline
 from webots_mcp.store.reading.moments import moment_of, shown_time
 from webots_mcp.store.reading.pages import query_rows
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.rollup.rolling import roll
 
 STEP_S = 0.032
 ROWS = 700

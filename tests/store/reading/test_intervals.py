@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
@@ -16,7 +17,6 @@ from webots_mcp.store.detection.event import EventOptions, Threshold
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading import rows as columns
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.rollup.rolling import roll
 
 Spans = list[tuple[str | None, float, float]]
 

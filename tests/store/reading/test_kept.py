@@ -12,6 +12,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.connection import connect
@@ -23,7 +24,6 @@ from webots_mcp.store.questions.series import query_history
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.pages import query_rows
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
-from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.run_rows import newest_state
 
 STEP_MS = 16

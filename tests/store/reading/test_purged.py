@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S, start_run
@@ -20,7 +21,6 @@ from webots_mcp.store.reading.coverage import less_time
 from webots_mcp.store.reading.ranges import Scope, Segment, find_range
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.purge import prune
-from webots_mcp.store.rollup.rolling import roll
 
 
 def overview(connection: sqlite3.Connection, start_s: float | None = None) -> RunHistory:

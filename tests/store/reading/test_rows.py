@@ -9,13 +9,13 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from webots_mcp.store.reading.rows import Columns, Numbers, read_columns, read_numbers
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rover import Recorder
 from webots_mcp.store.reading import rows
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment, whole_run
-from webots_mcp.store.reading.rows import Columns, Numbers, read_columns, read_numbers
-from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.signals.registry import Signal, registered
 
 HUGE = 2**70

@@ -13,6 +13,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.runs import Recorded
 from webots_mcp.cli import main
@@ -28,7 +29,6 @@ from webots_mcp.store.retention.limits import (
 )
 from webots_mcp.store.retention.policy import DEFAULT, Limit
 from webots_mcp.store.retention.upkeep import Upkeep
-from webots_mcp.store.rollup.rolling import roll
 
 Say = Callable[..., str]
 MB = 1_000_000

@@ -10,6 +10,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.runs import ROW_S, Recorded, states
 from webots_mcp import MCPBridge
@@ -21,7 +22,6 @@ from webots_mcp.store.retention.planning import plan
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.purge import prune, purge
 from webots_mcp.store.retention.upkeep import Upkeep
-from webots_mcp.store.rollup.rolling import roll
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.memory import memory_connection
 from tests.recordings.runs import ROW_S, Recorded, states
@@ -20,7 +21,6 @@ from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
 from webots_mcp.store.retention.planning import plan
 from webots_mcp.store.retention.policy import Limit, Retention, mark_kept
 from webots_mcp.store.retention.purge import purge
-from webots_mcp.store.rollup.rolling import roll
 
 
 def test_finished_runs_lose_their_oldest_rows_first(recorded: Recorded) -> None:

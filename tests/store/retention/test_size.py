@@ -7,6 +7,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.runs import Recorded, states
 from webots_mcp.connection import connect
@@ -14,7 +15,6 @@ from webots_mcp.schema import create_schema
 from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.retention.planning import plan
 from webots_mcp.store.retention.policy import Limit, Retention
-from webots_mcp.store.rollup.rolling import roll
 
 NO_LIMIT = Retention(Limit(), Limit(), Limit(), Limit(), Limit(), outlive=0)
 

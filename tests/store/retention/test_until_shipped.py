@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.runs import Recorded, states
 from webots_mcp.cli import main
@@ -17,7 +18,6 @@ from webots_mcp.store.retention.planning import plan
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.shipped import Shipped, write_shipped
 from webots_mcp.store.retention.upkeep import Upkeep
-from webots_mcp.store.rollup.rolling import roll
 
 MB = 1_000_000
 Say = Callable[..., str]

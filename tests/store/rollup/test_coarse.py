@@ -12,6 +12,9 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from webots_mcp.store.reading.rollups import Pieces, read_pieces
+from webots_mcp.store.rollup.buckets import COARSE, COARSE_BUCKETS, COARSE_S, FINE, by_grain
+from webots_mcp.store.rollup.rolling import forget, roll
 
 from tests.memory import memory_connection
 from tests.recordings.rover import Recorder, start_run
@@ -20,11 +23,8 @@ from webots_mcp.schema import create_schema
 from webots_mcp.store.analysis.summary import Summary, summarise
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment
-from webots_mcp.store.reading.rollups import Pieces, read_pieces
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.purge import prune
-from webots_mcp.store.rollup.buckets import COARSE, COARSE_BUCKETS, COARSE_S, FINE, by_grain
-from webots_mcp.store.rollup.rolling import forget, roll
 from webots_mcp.store.signals.registry import registered
 
 Row = tuple[float, dict[str, Any]]

@@ -13,6 +13,9 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from webots_mcp.store.rollup.buckets import BUCKET_S
+from webots_mcp.store.rollup.rolling import forget, roll, watermark
+from webots_mcp.store.rollup.tables import Addition, held, store
 
 from tests.memory import memory_connection
 from tests.recordings.rover import Recorder, record_rover, start_run
@@ -24,9 +27,6 @@ from webots_mcp.store.questions.series import query_history
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.pages import query_rows
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.rollup.buckets import BUCKET_S
-from webots_mcp.store.rollup.rolling import forget, roll, watermark
-from webots_mcp.store.rollup.tables import Addition, held, store
 from webots_mcp.store.signals.catalogue import list_signals
 from webots_mcp.transactions import never_wait
 

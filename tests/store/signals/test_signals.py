@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 
 import pytest
+from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rover import start_run
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
@@ -14,7 +15,6 @@ from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.pages import query_rows
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.reading.subject import find_subject
-from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.signals.catalogue import catalogue, list_signals, resolve_signals
 
 

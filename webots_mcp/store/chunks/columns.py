@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from webots_mcp.naming import Value, flatten
-from webots_mcp.store.chunks.codec import ABSENT, Absent, Recorded, Replaced
-from webots_mcp.store.rollup.batch import is_replaced, replaced_names
-from webots_mcp.store.signals.flatten import parse
+from webots_mcp.store.chunks.codec import ABSENT, Recorded, Replaced
+from webots_mcp.store.signals.flatten import is_replaced, parse, replaced_names
 
 _NUMBERS: Final = frozenset({int, float})
 STATE_COLUMNS: Final = "id, sim_time_s, wall_time_s, data, replaced"
@@ -67,28 +66,12 @@ class StateColumns:
             if value is not ABSENT and is_replaced(reasons, name, value) and value is None:
                 values[row] = Replaced(reasons[name])
 
-    def sample(self, name: str) -> str:
-        """The first state that has a signal."""
-        return next(
-            text
-            for text, value in zip(self.texts, self.values[name], strict=True)
-            if value is not ABSENT
-        )
-
     def part(self, start: int, rows: int) -> StateColumns:
         """Some of the rows."""
         inside = slice(start, start + rows)
         values = {name: values[inside] for name, values in self.values.items()}
         places = (self.ids[inside], self.times[inside], self.wall_times[inside])
         return StateColumns(*places, self.texts[inside], values)
-
-    def points(self, name: str) -> list[tuple[int, float, Value]]:
-        """Ids, times and values of the rows that have a signal; null where it was replaced."""
-        return [
-            (row_id, time_s, None if isinstance(value, Replaced) else value)
-            for row_id, time_s, value in zip(self.ids, self.times, self.values[name], strict=True)
-            if not isinstance(value, Absent)
-        ]
 
 
 def _transposed(states: Sequence[dict[str, Value]]) -> dict[str, list[Recorded]]:

@@ -22,14 +22,14 @@ from webots_mcp.store.chunks.stored import (
     SIM_TIMES,
     STATE_IDS,
     WALL_TIMES,
+    WIDEN_EXTREMES,
     Reached,
     reached,
     watermark,
 )
 from webots_mcp.store.invalid_rows import is_over_a_value, valid_rows
 from webots_mcp.store.retention.pages import INDEX_BYTES, disk_bytes
-from webots_mcp.store.rollup.batch import BatchColumn
-from webots_mcp.store.signals.registry import enter_signals, registered, tell_more
+from webots_mcp.store.signals.registry import enter_signals, registered, seen_in, tell_more
 from webots_mcp.transactions import LONGEST_WRITE_S, Step
 
 GROUP_ROWS: Final = 1024
@@ -246,9 +246,11 @@ class _RunChunks:
             return _STORE.run(self._connection, group_id, some[0], some[-1])
 
         in_short_steps(range(len(chunks)), store, self._pause_s)
-        return _COMPLETE.run(
-            self._connection, group_id, self._run_id, at.max_in_groups, len(chunks)
-        )
+        expected = (self._run_id, at.max_in_groups, len(chunks))
+        if not _COMPLETE.run(self._connection, group_id, *expected):
+            return False
+        self._connection.execute(WIDEN_EXTREMES, (group_id,))
+        return True
 
     def _room_of(
         self, columns: StateColumns, chunks: Sequence[tuple[Any, ...]]
@@ -298,16 +300,9 @@ def _signal_ids(
 ) -> dict[str, int]:
     """The ids of the signals of some rows, by name; what the rows tell of them is entered."""
     known = registered(connection, robot_id)
-    fresh = [
-        BatchColumn(robot_id, run_id, name, columns.sample(name), columns.points(name))
-        for name, values in columns.values.items()
-        if tell_more(known.get(name), values)
-    ]
+    fresh = [name for name, each in columns.values.items() if tell_more(known.get(name), each)]
     if fresh:
-        for column in fresh:
-            column.first_wall_time_s = columns.wall_times[0]
-            column.last_wall_time_s = columns.wall_times[-1]
-        known = enter_signals(connection, robot_id, fresh)
+        known = enter_signals(connection, robot_id, seen_in(columns, fresh))
     return {name: each.id for name, each in known.items() if each.id is not None}
 
 

@@ -10,21 +10,20 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Any, Final, NamedTuple, get_args
+from typing import Any, Final, get_args
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.signal_kinds import Kind
 from webots_mcp.signal_register import MAX_SIGNALS
 from webots_mcp.store.chunks.codec import DamagedChunkError, Encoded, decode, decoded_of, encode
 from webots_mcp.store.chunks.statistics import Statistics, statistics_of
-from webots_mcp.store.chunks.stored import SIM_TIMES, STATE_IDS, WALL_TIMES
-from webots_mcp.store.rollup.tables import IS_ID
+from webots_mcp.store.chunks.stored import SIM_TIMES, STATE_IDS, WALL_TIMES, WIDEN_EXTREMES
+from webots_mcp.store.signals.registry import enter_signals
 
 # Ids between the first and the last row of a run; other robots could not have recorded more.
 _MOST_IDS: Final = 2**40
 _IDS: Final = (
-    "SELECT min(id), max(id) FROM (SELECT id FROM source.state WHERE run_id = :run UNION ALL "
-    f"SELECT state_id FROM source.change WHERE run_id = :run AND {IS_ID.format('state_id')} "
+    "SELECT min(id), max(id) FROM (SELECT id FROM source.state WHERE run_id = :run "
     "UNION ALL SELECT max_state_id FROM source.row_group WHERE run_id = :run "
     f"UNION ALL SELECT CAST(min AS INTEGER) FROM source.chunk WHERE run_id = :run "
     f"AND signal_id = {STATE_IDS})"
@@ -34,17 +33,12 @@ _RESERVE: Final = (
     "DELETE FROM main.sqlite_sequence WHERE name = 'state'",
     "INSERT INTO main.sqlite_sequence (name, seq) VALUES ('state', ?)",
 )
-_USED: Final = " OR ".join(
-    f"EXISTS (SELECT 1 FROM source.{table} WHERE run_id = :run AND signal_id = s.id)"
-    for table in ("chunk", "rollup", "recent_rollup", "change")
-)
-_DESCRIBED: Final = (
-    "name, kind, unit, path, reduction, role, first_seen_wall_time_s, last_seen_wall_time_s"
-)
+_DESCRIBED: Final = "name, kind, unit, path, reduction, role, first_seen_wall_time_s"
 _ENTER: Final = (
     f"INSERT INTO main.signal (robot_id, {_DESCRIBED}) SELECT :here, {_DESCRIBED} "
     "FROM source.signal s WHERE robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
-    f"AND kind IN {get_args(Kind)} AND ({_USED}) "
+    f"AND kind IN {get_args(Kind)} "
+    "AND EXISTS (SELECT 1 FROM source.chunk WHERE run_id = :run AND signal_id = s.id) "
     "AND NOT EXISTS (SELECT 1 FROM main.signal WHERE robot_id = :here "
     "AND name = s.name) ORDER BY id "
     f"LIMIT max(0, {MAX_SIGNALS} - (SELECT count(*) FROM main.signal WHERE robot_id = :here))"
@@ -82,14 +76,7 @@ _INSERT: Final = (
 )
 
 
-class Ids(NamedTuple):
-    """The greatest id of the state rows of a run there, and by how much all of them rise here."""
-
-    last: int
-    shift: int
-
-
-def take_in_chunks(connection: sqlite3.Connection, there: int, here: int, robot_id: int) -> Ids:
+def take_in_chunks(connection: sqlite3.Connection, there: int, here: int, robot_id: int) -> int:
     """Take in the row groups and chunks of a run, and the names of their signals.
 
     Args:
@@ -98,25 +85,30 @@ def take_in_chunks(connection: sqlite3.Connection, there: int, here: int, robot_
         here: Its id here; none of its state rows is here yet.
         robot_id: Its robot here.
 
+    Returns:
+        By how much the ids of its state rows are to rise.
+
     Raises:
         InvalidInputError: Its ids are spread as no bridge gives them.
     """
-    ids = _reserved_ids(connection, there)
+    shift = _reserved_ids(connection, there)
     asked = {"run": there, "here": robot_id}
     connection.execute(_ENTER, asked)
     connection.execute(_MAP)
     connection.execute("DELETE FROM temp.signal_here")
     connection.execute(_FILL_MAP, asked)
     for group, rows in connection.execute(_GROUPS, (there,)).fetchall():
-        values: dict[str, Any] = {"run": here, "shift": ids.shift, "group": group}
+        values: dict[str, Any] = {"run": here, "shift": shift, "group": group}
         values["here"] = connection.execute(_COPY_GROUP, values).lastrowid
         connection.execute(_COPY_CHUNKS, values)
         packed = connection.execute(_STATE_IDS, (group,)).fetchone()
         if packed is not None:
             with suppress(DamagedChunkError):  # who reads them is told that they are missing
-                shifted = _shifted(packed, rows, ids.shift)
+                shifted = _shifted(packed, rows, shift)
                 connection.execute(_INSERT, (values["here"], here, STATE_IDS, *shifted))
-    return ids
+        connection.execute(WIDEN_EXTREMES, (values["here"],))
+    enter_signals(connection, robot_id, {})
+    return shift
 
 
 def _shifted(packed: Sequence[Any], rows: int, shift: int) -> tuple[Any, ...]:
@@ -126,11 +118,11 @@ def _shifted(packed: Sequence[Any], rows: int, shift: int) -> tuple[Any, ...]:
     return *statistics_of(decoded_of(ids)), *encode(ids)
 
 
-def _reserved_ids(connection: sqlite3.Connection, there: int) -> Ids:
+def _reserved_ids(connection: sqlite3.Connection, there: int) -> int:
     (last_here,) = connection.execute(_LAST_HERE).fetchone()
     first, last = connection.execute(_IDS, {"run": there}).fetchone()
     if first is None:
-        return Ids(last_here, 0)
+        return 0
     if last - first > _MOST_IDS:
         raise InvalidInputError(
             f"the ids of run {there}'s state rows reach from {first} to {last}, which no bridge "
@@ -140,4 +132,4 @@ def _reserved_ids(connection: sqlite3.Connection, there: int) -> Ids:
     delete, insert = _RESERVE
     connection.execute(delete)
     connection.execute(insert, (last + shift,))
-    return Ids(last, shift)
+    return shift

@@ -104,8 +104,6 @@ class Detection:
         before it have left.
         """
         efforts = sorted({kind.effort for kind in search.kinds})
-        if len(efforts) > 1 and not all(kind.of_frame for kind in search.kinds):
-            search.open_view()
         found: dict[str, list[Event]] = {}
         for index, effort in enumerate(efforts):
             with self.deadline.narrowed(1 / (len(efforts) - index)):
@@ -131,10 +129,8 @@ class Detection:
             search.not_searched(kind.name, _too_short(kind, search))
             return []
         search.ledger.searched.add(kind.name)
-        if kind.of_frame:
+        if not kind.stored:
             search.not_searched(kind.name, *search.unread())
-        elif not kind.stored:
-            search.not_searched(kind.name, *search.view.taken_notes())
         return found
 
     def _is_cut(self, event: Event, looked: Search) -> bool:

@@ -14,7 +14,6 @@ from webots_mcp.naming import FARTHEST_M, metres_in, unit_in
 from webots_mcp.signal_roles import first_in, pair_in
 from webots_mcp.store.analysis.arrays import Array, Indexes, np
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.signals.catalogue import one_signal
 from webots_mcp.store.signals.registry import Signal, roles_of, stored_roles
 
@@ -32,7 +31,7 @@ class Motion:
     """The signals that tell of a robot's motion; None or empty where there is none.
 
     Attributes:
-        position: x and y; see `places_of` for them in metres.
+        position: x and y.
         commanded: Speed that it should have; `speed` is one of which the name leaves open whether
             it is commanded or measured.
         mode: What it is doing.
@@ -144,22 +143,6 @@ def doubt_of_unit(position: tuple[Signal, Signal], speed_m_s: float) -> str | No
     )
 
 
-def places_of(columns: Columns, position: tuple[Signal, Signal]) -> tuple[Array, Array, Array]:
-    """Time, and x and y in metres, of the rows that have a position."""
-    x, y = (in_metres(each, columns.aligned(each.name)) for each in position)
-    there = np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M
-    return columns.moments[there], x[there], y[there]
-
-
-def tracks_in(
-    columns: Columns, position: tuple[Signal, Signal], noise_m: float | None = None
-) -> list[Track]:
-    """The way of the robot in each stretch without a gap; see `track.tracks_of`."""
-    from webots_mcp.store.analysis.track import tracks_of
-
-    return tracks_of(*places_of(columns, position), noise_m)
-
-
 def tracks_of_frame(
     frame: Frame, position: tuple[Signal, Signal]
 ) -> tuple[list[Track], list[Indexes]]:
@@ -171,21 +154,6 @@ def tracks_of_frame(
     tracks = tracks_of(frame.times[rows], x[rows], y[rows])
     ends = np.cumsum([len(track.times) for track in tracks])
     return tracks, np.split(rows, ends[:-1])
-
-
-def path_length(
-    columns: Columns, position: tuple[Signal, Signal], noise_m: float | None = None
-) -> PathLength:
-    """The way travelled, without what the noise of the position adds from row to row.
-
-    Args:
-        columns: Rows, or samples of a long run.
-        position: x and y.
-        noise_m: Of samples that lie far apart, what neighbouring rows tell.
-    """
-    from webots_mcp.store.analysis.track import travelled
-
-    return travelled(tracks_in(columns, position, noise_m))
 
 
 def doubt_of_length(way: PathLength) -> str | None:
@@ -204,9 +172,3 @@ def _more(way: PathLength) -> str:
     if way.longer_m > way.length_m:
         return f"{way.longer_m:.2g} m"
     return f"{10 * math.ceil(10 * way.longer_m / way.length_m)} %"
-
-
-def position_noise(columns: Columns, position: tuple[Signal, Signal]) -> float | None:
-    """Standard deviation of the noise in each coordinate, in metres; None without a position."""
-    tracks = tracks_in(columns, position)
-    return tracks[0].noise_m if tracks else None

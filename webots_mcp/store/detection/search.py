@@ -20,9 +20,7 @@ from webots_mcp.store.reading.coverage import less_time, purged_until_s
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import Segment, just_after, recorded_bounds
-from webots_mcp.store.reading.views import View, view_of
 from webots_mcp.store.reading.wall_time import UP_TO, RunClock
-from webots_mcp.store.rollup.buckets import EVER, totals
 from webots_mcp.store.signals.catalogue import resolve_signals
 from webots_mcp.store.signals.flatten import parse
 from webots_mcp.store.signals.registry import Signal
@@ -169,13 +167,6 @@ class Search:
         return quantities
 
     @cached_property
-    def extremes(self) -> dict[int, tuple[float | None, float | None]]:
-        """The least and the greatest number of each signal in the rollups of the run, by its id."""
-        figures = {"min": "min", "max": "max"}
-        found = totals(self.connection, self.segment.run_id, EVER, figures)
-        return {signal_id: (least, greatest) for signal_id, (least, greatest) in found.items()}
-
-    @cached_property
     def frame(self) -> Frame:
         """The rows of the segment.
 
@@ -211,19 +202,6 @@ class Search:
         if replace(self.segment, open_start=False, open_end=False) == part:
             return self.frame
         return read_frame(self.connection, part, self.deadline)
-
-    @cached_property
-    def view(self) -> View:
-        """The values of all signals that the kinds look at; read at the first use."""
-        wanted = any(kind.of_numbers and not kind.of_frame for kind in self.kinds)
-        numbers = self.numbers if wanted else []
-        needed = {each.name: each for each in (*numbers, *(self.motion.position or ()))}
-        through = [each for kind in self.kinds for each in kind.reads_through(self)]
-        return view_of(self.connection, self.segment, list(needed.values()), self.deadline, through)
-
-    def open_view(self) -> None:
-        """Read what serves all kinds before they share the time."""
-        assert self.view
 
     @cached_property
     def standstills(self) -> Findings:

@@ -22,6 +22,7 @@ from webots_mcp.contract import (
     new_uuid,
 )
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.store.chunks.columns import StateColumns
 from webots_mcp.store.json_folder.folder_reading import (
     COMMANDS,
     LOG,
@@ -33,8 +34,7 @@ from webots_mcp.store.json_folder.folder_reading import (
     is_there,
     read_folder,
 )
-from webots_mcp.store.rollup.batch import Batch
-from webots_mcp.store.signals.registry import enter_signals
+from webots_mcp.store.signals.registry import enter_signals, seen_in
 from webots_mcp.transactions import transaction
 
 Progress = Callable[[int, int], object]
@@ -192,12 +192,11 @@ class _Writer:
         if state := self._found.state:
             at = self._at(state.wall_time_s)
             state_id = self._insert("state", **at, data=state.data, replaced=state.replaced)
-            batch = Batch()
-            batch.add(
-                state_id, self._robot_id, self.run_id, at["sim_time_s"], state.wall_time_s,
-                state.data, state.replaced,
-            )  # fmt: skip
-            enter_signals(self._connection, self._robot_id, batch.columns())
+            columns = StateColumns()
+            times = at["sim_time_s"], state.wall_time_s
+            columns.add([(state_id, *times, state.data, state.replaced)])
+            seen = seen_in(columns, columns.values)
+            enter_signals(self._connection, self._robot_id, seen)
         for picture, path in zip(self._found.pictures, paths, strict=True):
             self._insert_picture(picture, path)
         self._insert_commands(session_id)

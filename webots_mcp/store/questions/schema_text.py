@@ -18,13 +18,9 @@ _BOOKKEEPING: Final = (
     "lease",
     "watermark",
     "recording",
-    "rollup",
-    "all_rollup",
-    "recent_rollup",
     "retention_limit",
     "kept_state",
     "row_group",
-    "coarse_rollup",
     "chunk",
 )
 _BOOKKEEPING_COLUMNS: Final = (
@@ -33,13 +29,7 @@ _BOOKKEEPING_COLUMNS: Final = (
     "last_adopted_entry",
     "last_seen_monotonic_s",
     "mode_before_pause",
-    "rolled_state_id",
     "is_chunked",
-    "coarse_end",
-    "first_until_sim_time_s",
-    "last_since_sim_time_s",
-    "swings",
-    "standstills",
 )
 _COLUMNS: Final = "SELECT name FROM pragma_table_info(?) ORDER BY cid"
 _COMMENT: Final = re.compile(r'^\s*"?(\w+)"?\s[^\n,]*?/\* (.*?) \*/', re.MULTILINE)

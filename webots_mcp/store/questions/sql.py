@@ -229,7 +229,7 @@ def too_slow(deadline_s: float) -> str:
     """What to do about a statement that gave no row in time."""
     return (
         f"no row within {deadline_s:g} s; narrow it by run_id and sim_time_s (there is an index), "
-        "use all_rollup for long ranges, and end every recursion"
+        "use robot_statistics for long ranges, and end every recursion"
     )
 
 

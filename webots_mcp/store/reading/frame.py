@@ -169,6 +169,11 @@ class Frame:
         return any(each is not None and name in each.values for each in columns)
 
     @property
+    def new_rows(self) -> list[StateColumns]:
+        """The rows that are in no chunk yet, a part at a time."""
+        return [part.columns for part in self._source.parts if part.columns is not None]
+
+    @property
     def unread(self) -> tuple[Unread, ...]:
         """What is not in it, as far as its values were asked for."""
         return tuple(self._source.unread)

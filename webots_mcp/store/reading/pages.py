@@ -15,11 +15,10 @@ from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import TimeRange
-from webots_mcp.store.reading.rows import cleaned
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.signals.catalogue import signals_of
 from webots_mcp.store.signals.flatten import parse
-from webots_mcp.store.signals.registry import Signal
+from webots_mcp.store.signals.registry import Signal, cleaned
 
 MOST_ROWS: Final = 1000
 _STATES: Final = "SELECT id, data FROM state WHERE id IN (SELECT value FROM json_each(?))"

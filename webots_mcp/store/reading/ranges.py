@@ -32,7 +32,7 @@ from webots_mcp.store.reading.wall_time import parse_wall_time, simulation_times
 
 _PURGED: Final = (
     "SELECT started_sim_time_s, last_sim_time_s FROM run WHERE id = ? AND purged_rows > 0 "
-    "AND EXISTS (SELECT 1 FROM all_rollup WHERE run_id = run.id)"
+    "AND EXISTS (SELECT 1 FROM chunk WHERE run_id = run.id)"
 )
 _RUN_BEFORE: Final = (
     "SELECT (SELECT max(id) FROM run b WHERE b.robot_id = run.robot_id AND b.id < run.id), "

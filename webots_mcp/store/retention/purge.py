@@ -24,12 +24,10 @@ from webots_mcp.store.retention.planning import OLD_COMMANDS, Plan, plan
 from webots_mcp.store.retention.planning import Step as Going
 from webots_mcp.store.retention.policy import DEFAULT, KEPT, Retention
 from webots_mcp.store.retention.usage import UNBOUNDED, Portion, rows_of
-from webots_mcp.store.rollup.rolling import roll, watermark
 from webots_mcp.transactions import LONGEST_WRITE_S, ShortWrites, Step, is_busy
 
 BATCH_ROWS: Final = 500
 CHUNKED_ROWS: Final = 4096
-ROLLED_ROWS: Final = 100
 REST_S: Final = 0.005  # at least, between two writes
 HURRIED_REST_S: Final = 0.001  # where no robot records: a checkpoint still gets its turn
 RESTS: Final = 9  # the lock is held for a tenth of the time at most
@@ -283,10 +281,7 @@ class _Purge:
             keys = [{"id": row_id, "run_id": portion.run.id} for (row_id,) in found]
             values["after"] = found[-1][0]
             while keys:
-                if portion.table == "state" and keys[-1]["id"] > watermark(self._connection):
-                    roll(self._connection, ROLLED_ROWS)  # questions that read rollups need them
-                else:
-                    keys = keys[self._delete_some(portion.table, keys, portion.group_id) :]
+                keys = keys[self._delete_some(portion.table, keys, portion.group_id) :]
                 yield self.purged
         if portion.table == "state" and bound == UNBOUNDED:  # what others deleted was not counted
             query = f"{_NONE_STORED} AND stored_row_count > 0 AND NOT EXISTS (SELECT 1 {rows})"

@@ -3,46 +3,33 @@
 from __future__ import annotations
 
 import fnmatch
+import math
 import sqlite3
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
-from webots_mcp.naming import REDUCTIONS, Value, flatten, nearest_first
+from webots_mcp.naming import REDUCTIONS, Value, nearest_first
 from webots_mcp.signal_kinds import Kind
 from webots_mcp.signal_register import MAX_SIGNALS
-from webots_mcp.store.analysis.summary import Summary, summarise
+from webots_mcp.store.analysis.arrays import Indexes, np
+from webots_mcp.store.chunks.columns import STATE_COLUMNS, StateColumns
+from webots_mcp.store.chunks.stored import reached, signals_in
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
-from webots_mcp.store.reading.ranges import TimeRange
-from webots_mcp.store.reading.rows import cleaned
+from webots_mcp.store.reading.frame import Frame, read_frame
+from webots_mcp.store.reading.ranges import Segment, TimeRange
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.reading.subject import Subject, find_subject
-from webots_mcp.store.rollup.batch import Batch, BatchColumn
-from webots_mcp.store.rollup.buckets import EVER, totals
-from webots_mcp.store.rollup.tables import watermark
-from webots_mcp.store.signals.flatten import parse
-from webots_mcp.store.signals.registry import Signal, registered, seen_with
+from webots_mcp.store.signals.registry import Signal, cleaned, registered, seen_with
 
-SAMPLED_ROWS: Final = 200  # rows not yet rolled up that are searched for new names and kinds
+SAMPLED_ROWS: Final = 200  # in no chunk yet, that are searched for new names and kinds
 _MOST_OFFERED: Final = 5
 
-_NEWEST_ROWS: Final = (
-    "SELECT id, sim_time_s, wall_time_s, data, replaced FROM state WHERE run_id = ? "
-    "ORDER BY sim_time_s DESC, id DESC"
+_NEW_ROWS: Final = (
+    f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
+    "ORDER BY sim_time_s {order}, id {order} LIMIT ?"
 )
-_OLDEST_AFTER: Final = (  # by ids, from the watermark on: see `reading.rollups`
-    "SELECT id, sim_time_s, wall_time_s, data, replaced FROM state WHERE id > ? AND +run_id = ? "
-    "ORDER BY id LIMIT ?"
-)
-_FIGURES: Final = {
-    "rows": "sum",
-    "present": "sum",
-    "first_sim_time_s": "min",
-    "last_sim_time_s": "max",
-    "min": "min",
-    "max": "max",
-}
 
 
 @dataclass(frozen=True)
@@ -87,12 +74,12 @@ class SignalList:
 
 
 def catalogue(connection: sqlite3.Connection, subject: Subject) -> dict[str, Signal]:
-    """Every signal of the subject's robot: the registered, and those in rows not rolled up yet."""
+    """Every signal of the subject's robot: the registered, and those in rows in no chunk."""
     return _signals_in(connection, subject.robot_id, [subject.run_id])
 
 
 def known_signals(connection: sqlite3.Connection, time_range: TimeRange) -> dict[str, Signal]:
-    """Every signal of a range's robot: the registered, and those in rows not rolled up yet."""
+    """Every signal of a range's robot: the registered, and those in rows in no chunk."""
     runs = [segment.run_id for segment in time_range.segments]
     return _signals_in(connection, time_range.robot_id, runs)
 
@@ -100,12 +87,33 @@ def known_signals(connection: sqlite3.Connection, time_range: TimeRange) -> dict
 def _signals_in(
     connection: sqlite3.Connection, robot_id: int, run_ids: Sequence[int]
 ) -> dict[str, Signal]:
-    columns = [
-        column
-        for run_id in run_ids
-        for column in _unrolled_sample(connection, robot_id, run_id).columns()
-    ]
-    return _without_placeholders(seen_with(registered(connection, robot_id), columns))
+    known = registered(connection, robot_id)
+    for run_id in run_ids:
+        known = seen_with(known, robot_id, _new_sample(connection, run_id))
+    return _without_placeholders(known)
+
+
+def _new_sample(connection: sqlite3.Connection, run_id: int) -> StateColumns:
+    """A run's rows after those in chunks; of many the oldest and the newest."""
+    at = reached(connection, run_id)
+    asked = (run_id, at.end_s, at.last_state_id, SAMPLED_ROWS // 2)
+    rows = dict[int, tuple[object, ...]]()
+    for order in ("ASC", "DESC"):
+        for row in connection.execute(_NEW_ROWS.format(order=order), asked):
+            rows[row[0]] = row
+    columns = StateColumns()
+    columns.add(list(rows.values()))
+    return columns
+
+
+def signals_of_frame(
+    connection: sqlite3.Connection, subject: Subject, frame: Frame
+) -> dict[str, Signal]:
+    """Every signal of the subject's robot: the registered, and those in all rows of a frame."""
+    known = registered(connection, subject.robot_id)
+    for rows in frame.new_rows:
+        known = seen_with(known, subject.robot_id, rows)
+    return _without_placeholders(known)
 
 
 def _without_placeholders(known: dict[str, Signal]) -> dict[str, Signal]:
@@ -131,21 +139,6 @@ def other_form(known: dict[str, Signal], signal: Signal) -> Signal | None:
         return known.get(f"{branch}.0")
     other = known.get(f"{branch}.{REDUCTIONS[0]}")
     return other if last.isdigit() and other is not None and other.reduction is not None else None
-
-
-def _unrolled_sample(connection: sqlite3.Connection, robot_id: int, run_id: int) -> Batch:
-    """A run's rows after the watermark; of many the newest and the oldest."""
-    mark = watermark(connection, run_id)
-    batch = Batch()
-    for state_id, *row in connection.execute(_NEWEST_ROWS, (run_id,)):
-        if state_id <= mark:
-            return batch
-        if batch.rows == SAMPLED_ROWS // 2:
-            break
-        batch.add(state_id, robot_id, run_id, *row)
-    for state_id, *row in connection.execute(_OLDEST_AFTER, (mark, run_id, SAMPLED_ROWS // 2)):
-        batch.add(state_id, robot_id, run_id, *row)
-    return batch
 
 
 def resolve_signals(known: dict[str, Signal], names: Sequence[str]) -> list[Signal]:
@@ -227,82 +220,60 @@ def list_signals(
         run_id: Which run; None for the robot's newest.
         pattern: Which names, with `*`.
         limit: At most so many.
-        deadline_s: After it, rows that are not rolled up yet are left out, and a note says so.
+        deadline_s: After it, rows that are in no chunk yet are left out, and a note says so.
 
     Raises:
         UnknownSignalError: The pattern meets no name.
         UnknownRobotError, AmbiguousRobotError, UnknownRunError, NothingRecordedError: As they say.
     """
     subject = find_subject(connection, robot, run_id)
-    stored = _stored(connection, subject.run_id)
-    batch, notes = _late(connection, subject, deadline_s)
-    late = {column.name: column for column in batch.columns()}
-    known = seen_with(registered(connection, subject.robot_id), late.values())
-    known = _without_placeholders(known)
-    there = {name: signal for name, signal in known.items() if signal.id in stored or name in late}
+    whole = Segment(subject.run_id, -math.inf, math.inf)
+    frame = read_frame(connection, whole, Deadline(deadline_s))
+    known = signals_of_frame(connection, subject, frame)
+    stored = signals_in(connection, subject.run_id)
+    here = {name for rows in frame.new_rows for name in rows.values}
+    there = {name: each for name, each in known.items() if each.id in stored or name in here}
     matching = resolve_signals(there, [pattern]) if pattern != "*" else list(there.values())
     matching.sort(key=lambda signal: signal.name)
-    newest = _newest_values(connection, subject.run_id)
-    rows = max((total.rows for total in stored.values()), default=0) + batch.rows
-    infos = tuple(
-        _info(signal, rows, stored.get(signal.id), late.get(signal.name), newest.get(signal.name))
-        for signal in matching[:limit]
-    )
+    infos = tuple(_info(frame, signal) for signal in matching[:limit])
+    notes = [str(each) for each in frame.unread]
     if len(known) >= MAX_SIGNALS:
         notes.append(f"only the first {MAX_SIGNALS} names of a robot are kept")
-    return SignalList(subject.robot, subject.run_id, rows, infos, len(matching), tuple(notes))
+    return SignalList(subject.robot, subject.run_id, len(frame), infos, len(matching), tuple(notes))
 
 
-def _stored(connection: sqlite3.Connection, run_id: int) -> dict[int | None, Summary]:
-    """What the rollups of a run come to, by signal id, as far as a list shows it."""
-    found = totals(connection, run_id, EVER, _FIGURES)
-    return {
-        signal_id: Summary(**dict(zip(_FIGURES, figures, strict=True)))
-        for signal_id, figures in found.items()
-    }
-
-
-def _late(
-    connection: sqlite3.Connection, subject: Subject, deadline_s: float
-) -> tuple[Batch, list[str]]:
-    """The run's rows after the watermark, newest first, until the deadline."""
-    mark = watermark(connection, subject.run_id)
-    batch = Batch()
-    limit = Deadline(deadline_s)
-    notes: list[str] = []
-    for state_id, *row in connection.execute(_NEWEST_ROWS, (subject.run_id,)):
-        if state_id <= mark:
-            break
-        if limit.passed:
-            notes.append(f"rows up to {row[0]:g} s are not counted: they are not rolled up yet")
-            break
-        batch.add(state_id, subject.robot_id, subject.run_id, *row)
-    return batch, notes
-
-
-def _newest_values(connection: sqlite3.Connection, run_id: int) -> dict[str, Value]:
-    row = connection.execute(f"{_NEWEST_ROWS} LIMIT 1", (run_id,)).fetchone()
-    return flatten(parse(row[3])) if row else {}
-
-
-def _info(
-    signal: Signal, run_rows: int, stored: Summary | None, late: BatchColumn | None, last: Value
-) -> SignalInfo:
-    parts = [stored] if stored else []
-    if late is not None:
-        _, times, values = zip(*reversed(late.points), strict=True)
-        parts.append(summarise(times, cleaned(signal, list(values))))
-    held = [part for part in parts if part.present]
-    numeric = () if signal.kind == "text" else held
+def _info(frame: Frame, signal: Signal) -> SignalInfo:
+    zones = frame.zones(signal.name)
+    held = np.flatnonzero(zones.value_count)
+    first, last = (_bound(frame, signal.name, held, at) for at in (0, -1))
+    (newest,) = frame.rows(len(frame) - 1, len(frame)).values(signal.name)
+    extremes = (zones.min[held], zones.max[held]) if signal.kind != "text" else ((), ())
+    least, greatest = (
+        float(reduce(each)) if len(each) and not np.isnan(each).all() else None
+        for reduce, each in zip((np.nanmin, np.nanmax), extremes, strict=True)
+    )
     return SignalInfo(
         name=signal.name,
         kind=signal.kind,
         unit=signal.unit,
-        rows=sum(part.rows for part in parts),
-        missing=run_rows - sum(part.present for part in parts),
-        first_s=held[0].first_sim_time_s if held else None,
-        last_s=held[-1].last_sim_time_s if held else None,
-        last=last,
-        min=min((part.min for part in numeric if part.min is not None), default=None),
-        max=max((part.max for part in numeric if part.max is not None), default=None),
+        rows=int(zones.held_count.sum()),
+        missing=len(frame) - int(zones.value_count.sum()),
+        first_s=first,
+        last_s=last,
+        last=cleaned(signal, [newest])[0],
+        min=least,
+        max=greatest,
     )
+
+
+def _bound(frame: Frame, name: str, held: Indexes, at: int) -> float | None:
+    """When a signal first, or last, had a value; a chunk is opened where not all of it has one."""
+    if not len(held):
+        return None
+    zones, place = frame.zones(name), int(held[at])
+    start, rows = int(zones.first_row[place]), int(zones.row_count[place])
+    if zones.value_count[place] == rows:
+        return float((zones.start_s if at == 0 else zones.end_s)[place])
+    part = frame.rows(start, start + rows)
+    codes, _ = part.coded(name)
+    return float(part.times[np.flatnonzero(codes)[at]])

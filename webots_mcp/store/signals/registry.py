@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import sqlite3
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from webots_mcp.naming import Value, find_mode
 from webots_mcp.signal_kinds import (
@@ -23,10 +22,9 @@ from webots_mcp.signal_kinds import (
 )
 from webots_mcp.signal_register import MOST_CHOICES, Seen, find_changes, write_changes
 from webots_mcp.signal_roles import decide_roles
-from webots_mcp.store.analysis.summary import Summary, summarise, usable_numbers
-from webots_mcp.store.chunks.codec import Absent, Replaced
-from webots_mcp.store.rollup.batch import BatchColumn
-from webots_mcp.store.signals.flatten import parse
+from webots_mcp.store.chunks.codec import ABSENT, Absent, Replaced
+from webots_mcp.store.chunks.columns import StateColumns
+from webots_mcp.store.signals.flatten import parse, shown
 
 _OF_ROBOT: Final = (
     "SELECT id, robot_id, name, kind, unit, path, reduction, role FROM signal "
@@ -76,16 +74,6 @@ class Signal:
         """A whole turn of an angle, in its unit; None of what is no angle."""
         return turn_of(self.name, self.kind)
 
-    def summarise(self, times: Sequence[float], values: Sequence[Value]) -> Summary:
-        """What values of it come to; of angles in degrees as well with the sums of sines."""
-        summary = summarise(times, values, angle=self.kind == "angle")
-        if self.turn is None or summary.sum is None or summary.sines is not None:
-            return summary
-        _, numbers = usable_numbers(times, values)
-        angles = [number * math.tau / self.turn for number in numbers]
-        sines, cosines = (math.fsum(map(each, angles)) for each in (math.sin, math.cos))
-        return summary._replace(sines=sines, cosines=cosines)
-
     @property
     def is_index(self) -> bool:
         """Whether it says which item of an array, not how much: it leaps and rests by nature."""
@@ -129,15 +117,6 @@ def with_roles(known: dict[str, Signal]) -> dict[str, Signal]:
     }
 
 
-def _are_choices(column: BatchColumn) -> bool:
-    """Whether the values of what may be a mode are few whole numbers, as far as they are known."""
-    if not find_mode([column.name]):
-        return False
-    values = {point[2] for point in column.points} - {None}
-    numbers = [value for value in values if type(value) is int] or [0]
-    return len(values.difference(numbers)) == 0 and max(numbers) - min(numbers) <= MOST_CHOICES
-
-
 def by_name(signals: Sequence[Signal]) -> dict[str, Signal]:
     """The signals by name, with what they tell about each other."""
     arrays = tuple({f"{signal.path}[" for signal in signals if signal.reduction})
@@ -149,31 +128,13 @@ def by_name(signals: Sequence[Signal]) -> dict[str, Signal]:
     }
 
 
-def _seen_in(column: BatchColumn) -> Kind:
-    """The kind of the values of a column."""
-    is_end = ends_pose(column.name, _places_of(column.sample))
-    found: Kind = "null"
-    for value in _telling(column):
-        found = widen(found, kind_of(column.name, value, ends_pose=is_end))
-    return found
-
-
-def _telling(column: BatchColumn) -> list[Any]:
-    """One value of each type, and the extremes, tell the kind as well as all values do."""
-    values = [point[2] for point in column.points]
-    by_type: dict[type, Any] = {type(value): value for value in values}
-    numbers = [value for value in values if type(value) is float or type(value) is int]
-    return [*by_type.values(), *([min(numbers), max(numbers)] if numbers else [])]
-
-
 def enter_signals(
-    connection: sqlite3.Connection, robot_id: int, columns: Iterable[BatchColumn]
+    connection: sqlite3.Connection, robot_id: int, seen: Mapping[str, Seen]
 ) -> dict[str, Signal]:
     """Enter what values of a robot's signals tell; return all that are registered, by name.
 
     Names beyond `MAX_SIGNALS` of a robot stay out.
     """
-    seen = {column.name: each for column in columns if (each := _seen(column))}
     write_changes(connection, robot_id, find_changes(connection, robot_id, seen))
     return registered(connection, robot_id)
 
@@ -185,37 +146,19 @@ def tell_more(signal: Signal | None, values: Iterable[object]) -> bool:
     return signal.kind != "text" and not _TYPES[signal.kind].issuperset(map(type, values))
 
 
-def _seen(column: BatchColumn) -> Seen | None:
-    """What a column tells of its signal; None where its value stands nowhere."""
-    place = _places_of(column.sample).get(column.name)
-    if place is None:
-        return None
-    times = (column.first_wall_time_s, column.last_wall_time_s)
-    return Seen(*place, _seen_in(column), _are_choices(column), *times)
-
-
-def seen_with(known: dict[str, Signal], columns: Iterable[BatchColumn]) -> dict[str, Signal]:
-    """Signals as they are known after these columns, also those that are not registered."""
-    found = dict(known)
-    for column in columns:
-        signal = _seen_now(found.get(column.name), column)
-        if signal is not None:
-            found[column.name] = signal
-    changed = any(signal is not known.get(name) for name, signal in found.items())
-    return with_roles(by_name([*found.values()])) if changed else found
-
-
-def _seen_now(signal: Signal | None, column: BatchColumn) -> Signal | None:
-    """A signal as it is known after a column of it; None where its value stands nowhere."""
-    seen = _seen(column)
-    if seen is None:
-        return signal
-    before = signal or Signal(None, column.robot_id, column.name, "null", None, *seen[:2])
-    kind = widen(before.kind, seen.kind)
-    is_choice = seen.is_choice and kind == "num" and (before.is_choice or before.kind == "null")
-    if (kind, is_choice) == (before.kind, before.is_choice):
-        return before
-    return replace(before, kind=kind, unit=unit_of(before.name, kind), is_choice=is_choice)
+def seen_in(columns: StateColumns, names: Iterable[str]) -> dict[str, Seen]:
+    """What rows tell of some signals; without those whose values stand nowhere."""
+    found: dict[str, Seen] = {}
+    for name in names:
+        row = next(row for row, value in enumerate(columns.values[name]) if value is not ABSENT)
+        known = _places_of(columns.texts[row])
+        if name in known:
+            values = [value for value in columns.values[name] if type(value) not in _NO_VALUES]
+            kind = _kind_of(name, values, ends_pose=ends_pose(name, known))
+            found[name] = Seen(
+                *known[name], kind, _are_choices(name, values), columns.wall_times[row]
+            )
+    return found
 
 
 @lru_cache(maxsize=8)  # a row that brings one new name mostly brings several
@@ -223,32 +166,45 @@ def _places_of(data: str) -> dict[str, Place]:
     return places(parse(data))
 
 
-class Count(NamedTuple):
-    """What the rows of a batch add to a registered signal."""
-
-    signal_id: int | None
-    kind: Kind
-    unit: str | None
-    row_count: int
-    null_row_count: int
-    replaced_row_count: int
-    seen_wall_time_s: float
-    min: float | None
-    max: float | None
+def _kind_of(name: str, values: Sequence[Any], *, ends_pose: bool) -> Kind:
+    """One value of each type, and the extremes, tell the kind as well as all values do."""
+    by_type: dict[type, Any] = {type(value): value for value in values}
+    numbers = [value for value in values if type(value) is float or type(value) is int]
+    found: Kind = "null"
+    for value in [*by_type.values(), *([min(numbers), max(numbers)] if numbers else [])]:
+        found = widen(found, kind_of(name, value, ends_pose=ends_pose))
+    return found
 
 
-def count(signal: Signal, column: BatchColumn) -> Count:
-    """Count the values of a signal that is known as it is after them."""
-    values = [point[2] for point in column.points]
-    _, numbers = usable_numbers(range(len(values)), values)
-    return Count(
-        signal.id,
-        signal.kind,
-        signal.unit,
-        len(values),
-        values.count(None),
-        column.replaced_row_count,
-        column.last_wall_time_s,
-        min(numbers, default=None),
-        max(numbers, default=None),
+def _are_choices(name: str, values: Sequence[Any]) -> bool:
+    """Whether the values of what may be a mode are few whole numbers, as far as they are known."""
+    if not find_mode([name]):
+        return False
+    numbers = [value for value in values if type(value) is int]
+    return len(numbers) == len(values) and (
+        not numbers or max(numbers) - min(numbers) <= MOST_CHOICES
     )
+
+
+def seen_with(known: dict[str, Signal], robot_id: int, columns: StateColumns) -> dict[str, Signal]:
+    """Signals as they are known after these rows, also those that are not registered."""
+    fresh = [name for name, each in columns.values.items() if tell_more(known.get(name), each)]
+    found = dict(known)
+    for name, seen in seen_in(columns, fresh).items():
+        before = known.get(name) or Signal(None, robot_id, name, "null", None, *seen[:2])
+        kind = widen(before.kind, seen.kind)
+        is_choice = seen.is_choice and kind == "num" and (before.is_choice or before.kind == "null")
+        if name not in known or (kind, is_choice) != (before.kind, before.is_choice):
+            unit = unit_of(name, kind)
+            found[name] = replace(before, kind=kind, unit=unit, is_choice=is_choice)
+    changed = any(signal is not known.get(name) for name, signal in found.items())
+    return with_roles(by_name([*found.values()])) if changed else found
+
+
+def cleaned(signal: Signal, values: Sequence[Any]) -> list[Value]:
+    """Every value of the type that the signal's kind promises."""
+    if signal.kind == "bool":
+        return [None if value is None else value in (1, True) for value in values]
+    if signal.kind == "text":
+        return [shown(value) for value in values]
+    return [None if isinstance(value, str) else value for value in values]

@@ -80,9 +80,7 @@ def columns_of(
     return arrow.concat_tables(made, promote_options="default") if made else None
 
 
-def _decoded(
-    chunks: Mapping[int, Mapping[str, Any]], altered: Counter[str]
-) -> dict[int, Decoded]:
+def _decoded(chunks: Mapping[int, Mapping[str, Any]], altered: Counter[str]) -> dict[int, Decoded]:
     """The values of the signals of a group, without those that cannot be read."""
     rows = int(chunks[SIM_TIMES]["row_count"]) if SIM_TIMES in chunks else 0
     found: dict[int, Decoded] = {}
@@ -180,9 +178,7 @@ def _signal_of(field: Any) -> int | None:
     return None if told is None else int(told)
 
 
-def _recorded(
-    column: Any, name: str, others: Sequence[Mapping[str, Any]]
-) -> list[Recorded]:
+def _recorded(column: Any, name: str, others: Sequence[Mapping[str, Any]]) -> list[Recorded]:
     """The values of a signal; whole numbers as such, which are smaller."""
     values: list[Any] = column.to_pylist()
     if str(column.type) == "double" and all(map(_is_whole, values)):

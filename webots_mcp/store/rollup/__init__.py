@@ -1,1 +1,0 @@
-"""Rollups: 10 s of each signal, kept in addition to the state rows by the maintainer."""

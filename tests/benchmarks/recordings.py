@@ -7,8 +7,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import Final
 
-from webots_mcp.store.rollup.rolling import roll
-
 from tests.recordings.long import CYCLE_S, INTERVAL_S, build
 from tests.recordings.rover import WALL_START_S
 from webots_mcp.connection import connect
@@ -44,7 +42,7 @@ def record(file: Path, rows: int) -> None:
         lines = range(int(end_s(rows) / LINE_INTERVAL_S))
         connection.executemany(_LOG, map(_log_line, lines))
         connection.execute("COMMIT")
-        while not roll(connection, _ROLLED_ROWS).done:
+        while not make_chunks(connection, _ROLLED_ROWS).done:
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
         while not make_chunks(connection, _ROLLED_ROWS).done:
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()

@@ -17,7 +17,6 @@ from tests.detection.labelled import Case, Incident, LabelledRun, Measure, repea
 from tests.detection.writing import purge, roll_up, write_all
 from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S
-from webots_mcp.store.reading import rows
 
 Summaries = Literal["long", "purged"]
 Key = tuple[str, Measure, str]  # kind of recording, what is judged, under which conditions

@@ -9,10 +9,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from webots_mcp.store.rollup.rolling import roll
-
 from tests.detection.labelled import LabelledRun
 from tests.recordings.rover import WALL_PER_SIM, Recorder
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.purge import prune
 
@@ -66,7 +65,7 @@ def write_all(connection: sqlite3.Connection, runs: Sequence[LabelledRun]) -> li
 
 def roll_up(connection: sqlite3.Connection) -> None:
     """Make the summaries of all rows, as the maintainer does."""
-    while not roll(connection, 100_000).done:
+    while not make_chunks(connection, 100_000).done:
         pass
 
 

@@ -15,8 +15,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.store.rollup.rolling import roll
-
 from tests.recordings import bridge as rover_on_the_stand_in
 from tests.recordings.long import build as build_long
 from tests.recordings.rounds import record_rounds
@@ -27,6 +25,7 @@ from webots_mcp.contract import new_uuid
 from webots_mcp.schema import create_schema
 from webots_mcp.standin import InProcessRobot, InProcessSupervisor
 from webots_mcp.standin.in_process import InProcessSimulation
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.purge import prune
 from webots_mcp.store.trials import Result, create_trial_set, finish_trial, trials_of
@@ -229,7 +228,7 @@ def _sum_up(connection: sqlite3.Connection) -> None:
     for table in ("session", "run"):
         for (key,) in connection.execute(f"SELECT id FROM {table} WHERE uuid IS NULL").fetchall():
             connection.execute(f"UPDATE {table} SET uuid = ? WHERE id = ?", (new_uuid(), key))
-    while not roll(connection, 100_000).done:
+    while not make_chunks(connection, 100_000).done:
         pass
 
 

@@ -10,7 +10,6 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.browsing import chromium
 from tests.recordings.rover import record_rover, start_run
@@ -19,6 +18,7 @@ from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME
 from webots_mcp.schema import create_schema
 from webots_mcp.standin import Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD
+from webots_mcp.store.chunks.making import make_chunks
 
 __all__ = ["chromium"]
 NAME = "<img src=x onerror=hacked=1>"
@@ -89,7 +89,7 @@ def write_story(data_dir: Path) -> None:
         ).fetchone()
         still.run(session_id, robot_id, "reset")
         still.publish(0.0, {"x": 1.0})
-        roll(connection, 100_000)
+        make_chunks(connection, 100_000)
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,6 @@ from typing import Any
 import anyio
 import pytest
 from bokeh.document import Document
-from webots_mcp.store.rollup.rolling import watermark
 
 from tests.recordings.long import build
 from tests.recordings.rover import start_run
@@ -19,6 +18,7 @@ from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.plugins.page.summing import Summing
 from webots_mcp.plugins.page.tab import Tab
 from webots_mcp.schema import create_schema
+from webots_mcp.store.chunks.stored import watermark
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.summing_up import LEAST_ROWS
 

@@ -8,10 +8,10 @@ from contextlib import ExitStack
 from typing import Any, Protocol
 
 import pytest
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.memory import memory_connection
 from tests.recordings.rover import Recorder, record_rover
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 
 State = Callable[[float], dict[str, Any]]
@@ -28,7 +28,7 @@ def rover() -> Iterator[sqlite3.Connection]:
     """The story of tests.recordings.rover: runs 1 to 3 of one robot."""
     with memory_connection() as connection:
         record_rover(connection)
-        roll(connection, 100_000)
+        make_chunks(connection, 100_000)
         yield connection
 
 

@@ -20,7 +20,6 @@ from xml.etree import ElementTree
 import pytest
 from PIL import Image
 from pydantic import TypeAdapter
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.plotting.conftest import Record, whole
 from webots_mcp.errors import (
@@ -40,6 +39,7 @@ from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plotting.trajectory_axes import paint_trajectory
 from webots_mcp.questions.argument_types import RunIds
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 Ask = dict[str, Any]
@@ -311,7 +311,7 @@ def test_matplotlib_waits_for_the_first_picture(module: str) -> None:
 
 def test_a_recording_too_long_to_be_read_is_drawn_from_its_rollups(record: Record) -> None:
     connection = record(lambda t: {"v": 3.0 if t == 160 else 12.0, "x": t, "y": 0.0}, 31_000)
-    assert roll(connection, 100_000).done
+    assert make_chunks(connection, 100_000).done
     axes, _ = compose_signals(connection, [whole(connection)], ["v", "x"])
     (curve,) = [c for panel in axes.panels for c in panel.curves if c.name == "v"]
     assert min(point[2] for point in curve.points) == curve.low == 3.0

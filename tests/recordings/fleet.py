@@ -10,9 +10,8 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
-from webots_mcp.store.rollup.rolling import roll
-
 from tests.recordings.rows import Recorded, RecordedRobot, insert
+from webots_mcp.store.chunks.making import make_chunks
 
 CYCLE_S: Final = 40.0  # 32 s on the way, 8 s at a dock
 STAND_S: Final = 8.0
@@ -37,7 +36,7 @@ def build_fleet(file: Path, robots: int, seconds: float, interval_s: float) -> N
             _note(robot, seconds)
             _end(robot, seconds, round(seconds / interval_s))
         connection.execute("COMMIT")
-        while not roll(connection, 100_000).done:
+        while not make_chunks(connection, 100_000).done:
             pass
 
 

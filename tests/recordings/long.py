@@ -10,11 +10,10 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
-from webots_mcp.store.rollup.rolling import roll
-
 from tests.recordings.rover import WALL_START_S, start_run
 from webots_mcp.connection import connect
 from webots_mcp.schema import create_schema
+from webots_mcp.store.chunks.making import make_chunks
 
 INTERVAL_S: Final = 0.032
 CYCLE_S: Final = 100.0  # 70 s cruise, 6 s stuck within it, 10 s back up, 20 s turn
@@ -31,7 +30,7 @@ def build(file: Path, rows: int, *, rolled: bool = True) -> None:
         recorder.wall_s = WALL_START_S + rows * INTERVAL_S
         recorder.end_run("finished")
         connection.execute("COMMIT")
-        while rolled and not roll(connection, 100_000).done:
+        while rolled and not make_chunks(connection, 100_000).done:
             pass
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
 

@@ -6,12 +6,11 @@ from contextlib import closing
 from pathlib import Path
 from typing import Final
 
-from webots_mcp.store.rollup.rolling import roll
-
 from tests.recordings.rover import Recorder, rover_state, start_run
 from webots_mcp.connection import connect
 from webots_mcp.contract import new_uuid
 from webots_mcp.schema import create_schema
+from webots_mcp.store.chunks.making import make_chunks
 
 ROWS: Final = 5200  # 1040 s: two coarse buckets and some
 PART: Final = (480.0, 720.0)  # within it, over the border of coarse buckets
@@ -37,5 +36,5 @@ def record_rounds(file: Path, rows: int = ROWS) -> None:
             for key in (1, 2):
                 connection.execute(f"UPDATE {table} SET uuid = ? WHERE id = ?", (new_uuid(), key))
         connection.execute("COMMIT")
-        assert roll(connection, 100_000).done
+        assert make_chunks(connection, 100_000).done
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()

@@ -20,28 +20,28 @@ from typing import Any, Final, NamedTuple
 import anyio
 from mcp import Client
 from PIL import Image
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rows import Recorded, RecordedRobot, insert
 from webots_mcp.server import create_server
+from webots_mcp.store.chunks.making import chunk_whole_run
 from webots_mcp.store.retention.limits import set_limits
 from webots_mcp.store.retention.policy import Limit
 
 ROWS: Final = 60
-LATE_S: Final = (12.0, 505.0, 512.0)  # rows that end a bucket of 10 s, and one of 500 s
 JSON_COLUMNS: Final = {
     ("robot", "devices"), ("session", "versions"), ("session", "actions"), ("state", "data"),
     ("state", "replaced"), ("kept_state", "data"), ("kept_state", "replaced"), ("event", "data"),
     ("command", "params"), ("command", "result"),
     ("trial_set", "plan"), ("trial_set", "former_values"), ("trial", "parameters"),
     ("parameter", "default_value"), ("parameter", "choices"), ("parameter", "next_value"),
-    ("parameter_value", "value"), ("coarse_rollup", "swings"), ("coarse_rollup", "standstills"),
+    ("parameter_value", "value"), ("chunk", "labels"),
 }  # fmt: skip
 _BLOB: Final = b"\x00\xff\x01"
 NOT_UTF8: Final = "CAST(x'7b22ff41227d' AS TEXT)"
 _WRONG_BY_TYPE: Final[dict[str, tuple[Any, ...]]] = {
     "INTEGER": ("yesterday", _BLOB, 2**63 - 1, -(2**63), 1e300, float("inf")),
     "FLOAT": ("yesterday", _BLOB, 2**63 - 1, 1e300, float("inf"), float("-inf"), -1e18),
+    "BLOB": (_BLOB, b"", "text", 7, b"\x00" * 100_000),
     "TEXT": (_BLOB, NOT_UTF8, "", "x" * 100_000, "a\0b"),
 }
 _WRONG_JSON: Final = (
@@ -53,7 +53,6 @@ _WRONG_JSON: Final = (
 )  # fmt: skip
 
 
-_KEYED: Final = ("rollup", "recent_rollup", "coarse_rollup", "change")
 READING: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
     ("webots_list_robots", {}),
     ("webots_get_world_info", {}),
@@ -88,7 +87,7 @@ ACTING: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
     ("webots_simulation_control", {"command": "pause", "timeout_wall_s": 0.1}),
 )
 _ACTED_ON: Final = ("robot", "session", "run", "command")
-_DRAWN: Final = ("state", "rollup", "run", "signal", "change")
+_DRAWN: Final = ("state", "chunk", "run", "signal", "row_group")
 _UNUSABLE: Final = ("a defect of webots-mcp", "is damaged", "cannot be used", "cannot be read")
 
 
@@ -101,9 +100,6 @@ class Damage(NamedTuple):
 
     def apply(self, connection: sqlite3.Connection) -> None:
         where = f"rowid = (SELECT max(rowid) FROM {self.table})"
-        if self.table in _KEYED:  # they have no rowid
-            newest = f"SELECT run_id, signal_id FROM {self.table} ORDER BY run_id DESC, "
-            where = f"(run_id, signal_id) = ({newest} signal_id DESC LIMIT 1)"
         new, values = ("?", (self.value,)) if self.value is not NOT_UTF8 else (NOT_UTF8, ())
         connection.execute("PRAGMA foreign_keys=OFF")
         sql = f"UPDATE {self.table} SET {self.column} = {new} WHERE {where}"
@@ -123,7 +119,8 @@ def record(file: Path) -> None:
             robot.end_run(reason)
             robot.begin_run(reason)
     _add_trials(recorded.connection, robot)
-    roll(recorded.connection)
+    for run_id in (1, 2):
+        assert chunk_whole_run(recorded.connection, run_id)
     recorded.connection.execute("INSERT INTO lease VALUES ('maintenance', 'x', 1.0)")
     set_limits(recorded.connection, {"log": Limit(rows=5)}, "retain")
     insert(recorded.connection, "console_line", {
@@ -163,8 +160,6 @@ def _fill(robot: RecordedRobot, folder: Path) -> None:
         if step % 20 == 0:
             robot.log(step * 0.1, "hello", "warning")
             robot.event(step * 0.1, "change", "mode", {"from": "turn", "to": mode})
-    for late_s in LATE_S:
-        robot.state(late_s, {"pose": [late_s, 0.0, 0.1], "mode": "cruise", "battery_v": 11.0})
     _set_parameter(robot)
     Image.new("RGB", (32, 24)).save(folder / "eye.png")
     robot.image(2.0, "eye.png")

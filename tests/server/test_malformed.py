@@ -14,17 +14,16 @@ from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask, fail, text_of
 from tests.server.malformed import Damage, Damaged, damages, record
 from webots_mcp.server import create_server
-from webots_mcp.store.reading import rows
 
 pytestmark = pytest.mark.anyio
 
 # Of each column one in turn, and of the tools each sixth: `python -m tests.server.malformed` tries
 # all there are.
 TRIED = (b"\x00\xff\x01", '{"x": ', "[1, 2]", '{"x": "\\ud800"}')
-ROLLUPS = ("rollup", "recent_rollup", "coarse_rollup", "change", "watermark")
 TABLES = ("robot", "session", "run", "state", "event", "command", "log", "image", "signal",
           "breakpoint", "parameter", "parameter_value", "trial_set", "trial", "kept_stretch",
-          "kept_state", "console_line", "recording", "retention_limit", *ROLLUPS)  # fmt: skip
+          "kept_state", "console_line", "recording", "retention_limit", "row_group", "chunk",
+          "watermark")  # fmt: skip
 KEPT_BY_OTHERS = {"alembic_version", "lease"}  # of Alembic; of who maintains, tested there
 
 
@@ -44,10 +43,8 @@ def test_every_table_is_tried(base: Path) -> None:
 
 @pytest.mark.parametrize("table", TABLES)
 async def test_a_wrong_value_anywhere_leaves_every_tool_with_an_answer(
-    base: Path, tmp_path: Path, table: str, monkeypatch: pytest.MonkeyPatch
+    base: Path, tmp_path: Path, table: str
 ) -> None:
-    if table in ROLLUPS:  # they are read where rows would be too many
-        monkeypatch.setattr(rows, "RAW_ROWS", 10)
     by_column: dict[str, list[Damage]] = {}
     for damage in damages(base / "webots.db"):
         if damage.table == table and damage.value in TRIED:

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.memory import memory_connection
 from tests.recordings.rover import record_rover
@@ -16,7 +15,6 @@ from webots_mcp.contract import Database, MemoryDatabase
 from webots_mcp.store.chunks import making
 from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.reading import frame, frame_summary
-from webots_mcp.store.reading import rows as columns
 
 
 @pytest.fixture
@@ -45,14 +43,13 @@ def empty() -> Iterator[sqlite3.Connection]:
 
 @pytest.fixture(scope="session")
 def _recorded() -> Iterator[dict[str, sqlite3.Connection]]:
-    with memory_connection() as raw, memory_connection() as rolled:
-        for connection in (raw, rolled):
+    with memory_connection() as raw, memory_connection() as chunked:
+        for connection in (raw, chunked):
             record_rover(connection)
-        assert roll(rolled, 100_000).done
         with pytest.MonkeyPatch.context() as patched:
             _shorten_chunks(patched)
-            assert make_chunks(rolled, 100_000).done
-        yield {"raw": raw, "rolled": rolled}
+            assert make_chunks(chunked, 100_000).done
+        yield {"raw": raw, "chunked": chunked}
 
 
 CHUNK_ROWS = 100
@@ -72,23 +69,9 @@ def looked_at(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -
     return request.param
 
 
-@pytest.fixture
-def long_ranges(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A range of more than 100 rows counts as one that is too long to be read row by row."""
-    monkeypatch.setattr(columns, "RAW_ROWS", 100)
-
-
-@pytest.fixture(params=["rows", "rollups"])
-def tier(request: pytest.FixtureRequest) -> str:
-    """Answers from rows; and from rollups, by letting a short range count as a long one."""
-    if request.param == "rollups":
-        request.getfixturevalue("long_ranges")
-    return request.param
-
-
-@pytest.fixture(params=["raw", "rolled"])
+@pytest.fixture(params=["raw", "chunked"])
 def rover(
     request: pytest.FixtureRequest, _recorded: dict[str, sqlite3.Connection]
 ) -> sqlite3.Connection:
-    """The known recording; every answer has to be the same before and after rolling up."""
+    """The known recording; every answer has to be the same before and after chunks were made."""
     return _recorded[request.param]

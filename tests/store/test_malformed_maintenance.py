@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rows import Recorded, insert
 from tests.server.malformed import NOT_UTF8, Damage
 from webots_mcp.liveness import dead_sessions
 from webots_mcp.maintenance import Maintainer
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.retention.planning import plan
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.purge import prune
@@ -43,11 +43,11 @@ def test_a_row_that_cannot_be_summed_up_costs_only_itself_and_is_named(
     robot.state(2.0, {"x": 2, "y": 0})
     damage.apply(recorded.connection)
     robot.state(3.0, {"x": 3})
-    assert roll(recorded.connection).rows == 3
+    assert make_chunks(recorded.connection).rows == 3
     rolled = dict(recorded.connection.execute(ROLLED).fetchall())
     assert rolled == {"x": 2}
     assert f"state 2: {damage.column} holds no valid" in capsys.readouterr().err
-    assert roll(recorded.connection) == (0, True)
+    assert make_chunks(recorded.connection) == (0, True)
 
 
 @pytest.mark.parametrize(
@@ -67,10 +67,10 @@ def test_a_wrong_value_in_what_rollups_are_kept_by_does_not_keep_new_rows_out(
 ) -> None:
     robot = recorded.robot()
     robot.state(1.0, {"x": 1})
-    roll(recorded.connection)
+    make_chunks(recorded.connection)
     damage.apply(recorded.connection)
     robot.state(2.0, {"x": 1, "fresh": 1})
-    roll(recorded.connection)
+    make_chunks(recorded.connection)
     found = dict(recorded.connection.execute(ROLLED).fetchall())
     assert found.pop("fresh") == 1
     assert damage.column in ("name", "path") or found == rolled

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.runs import Recorded
 from webots_mcp import MCPBridge
@@ -18,6 +17,7 @@ from webots_mcp.contract import new_uuid
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.schema import create_schema
 from webots_mcp.standin import InProcessSupervisor
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.merging import merge
 from webots_mcp.store.trials import (
     Result,
@@ -102,10 +102,10 @@ def test_all_of_a_recording_comes_in_and_comes_in_once(
 def test_its_rows_are_rolled_up_here(
     target: sqlite3.Connection, source: Path, tmp_path: Path
 ) -> None:
-    assert roll(target, 100_000).done
+    assert make_chunks(target, 100_000).done
     merge(target, tmp_path / "here", source)
 
-    assert roll(target, 100_000).done
+    assert make_chunks(target, 100_000).done
     rolled = (
         "SELECT sum(a.rows) FROM all_rollup a JOIN signal s ON s.id = a.signal_id "
         "WHERE s.name = 'x' AND a.run_id = 2"

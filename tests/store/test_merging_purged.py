@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.answers import answers
 from tests.recordings.rounds import PART, ROWS, record_rounds
@@ -70,7 +69,7 @@ def target(tmp_path: Path) -> Iterator[sqlite3.Connection]:
                 recorder.publish(step * 1.0, {"mode": "cruise", "pose": [step, 0.0]})
             recorder.end_run("finished")
         connection.execute("UPDATE session SET ended_wall_time_s = 2e9, end_reason = 'finished'")
-        assert roll(connection, 1000).done
+        assert make_chunks(connection, 1000).done
         yield connection
 
 
@@ -110,13 +109,13 @@ def test_what_was_taken_in_is_not_counted_again_by_who_maintains_the_recording(
     before = [rows_of(target, table, run) for table in ("rollup", "change", "coarse_rollup")]
     signals = target.execute("SELECT * FROM signal").fetchall()
 
-    assert roll(target, 100_000).done
+    assert make_chunks(target, 100_000).done
 
     assert [rows_of(target, each, run) for each in ("rollup", "change", "coarse_rollup")] == before
     assert target.execute("SELECT * FROM signal").fetchall() == signals
     recorder = start_run(target, "another")
     recorder.publish(0.0, {"x": 1})
-    assert roll(target, 1000).done
+    assert make_chunks(target, 1000).done
     assert rows_of(target, "recent_rollup", recorder.run_id) != []
 
 
@@ -131,7 +130,7 @@ def test_rows_that_were_not_rolled_up_there_are_rolled_up_here(
         there.execute("UPDATE run SET row_count = purged_rows + row_count WHERE id = 1")
     run = merge(target, tmp_path / "here", source, run_id=1).popitem()[1]
 
-    assert roll(target, 100_000).done
+    assert make_chunks(target, 100_000).done
 
     rolled = (
         "SELECT sum(a.rows), max(a.last_sim_time_s) FROM all_rollup a "
@@ -214,7 +213,7 @@ def test_a_signal_that_is_text_here_and_a_number_there_is_text(
     recorder = Recorder(target)
     recorder.run_id, recorder.run_start_s = 2, recorder.wall_s
     recorder.publish(41.0, {"battery_v": "full"})
-    assert roll(target, 1000).done
+    assert make_chunks(target, 1000).done
 
     run = merge(target, tmp_path / "here", source, run_id=1).popitem()[1]
 

@@ -62,9 +62,7 @@ def sum_up(
     if is_frozen:
         return _left(last - first, "the file cannot be written from here")
     if holder.startswith("server "):
-        return _left(
-            last - first, "the server that maintains the recording is putting them into chunks"
-        )
+        return _left(last - first, "the server that maintains the recording makes them")
     until_s, mark, why = time.monotonic() + limit_s, first, ""
     try:
         with recording.writer() as connection, _checkpoints(recording):

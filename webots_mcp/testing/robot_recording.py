@@ -101,12 +101,10 @@ class RobotRecording:
                 raise NothingRecordedError(f"{run} has no state row: was publish() called?")
             frame = read_frame(connection, segment, Deadline(math.inf))
             meant = resolve_signals(signals_of_frame(connection, subject, frame), [pattern])
-            return [
-                RecordedSignal(
-                    each.name, run, frame, cleaned(each, frame.values(each.name)), self._state
-                )
-                for each in meant
-            ]
+            values = {each.name: cleaned(each, frame.values(each.name)) for each in meant}
+        return [
+            RecordedSignal(name, run, frame, each, self._state) for name, each in values.items()
+        ]
 
     def states(self) -> list[dict[str, Any]]:
         """What was published, row by row; "nan", "inf" and the like where JSON holds null."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rover import GAP_S, WALL_START_S
 from tests.recordings.rows import Recorded
@@ -15,6 +14,7 @@ from tests.server.story import client_on, copy_of, rows_of
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
 from webots_mcp.standin import InProcessSupervisor
+from webots_mcp.store.chunks.making import make_chunks
 
 pytestmark = pytest.mark.anyio
 
@@ -159,7 +159,7 @@ async def test_answers_are_the_same_before_and_after_rolling_up(
 ) -> None:
     rolled = copy_of(story, tmp_path / "webots.db")
     with connect(rolled, "writer") as connection:
-        assert roll(connection, 100_000).done
+        assert make_chunks(connection, 100_000).done
     connection.close()
     for tool, arguments in (
         ("webots_list_signals", {"run_id": STORY}),

@@ -6,9 +6,9 @@ import math
 import sqlite3
 
 import pytest
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rover import start_run
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.questions.events import Events, find_events
@@ -33,7 +33,7 @@ def test_a_text_now_and_then_among_numbers_hides_no_change_of_the_mode(
         mixed = "n/a" if 100 <= step < 120 else step * 0.25
         mode = "drive" if step < 50 else "return"
         recorder.publish(step * 0.1, {"mode": mode, "mixed": mixed})
-    roll(empty, 100_000)
+    make_chunks(empty, 100_000)
     found = changes(empty)
     assert [(each.name, round(each.start_s, 1)) for each in found.events] == [
         ("mode", 5.0),
@@ -74,7 +74,7 @@ def test_few_whole_numbers_that_are_named_like_a_mode_are_one(
         others = {"phase": phase_rad, "action": command, "loop_status": step}
         recorder.publish(step * 0.1, {"arm": {"driveMode": step // 30}, **others})
     if rolled_up:
-        roll(empty, 100_000)
+        make_chunks(empty, 100_000)
     found = changes(empty)
     assert [(each.name, each.details["after"]) for each in found.events] == [
         ("arm.driveMode", "1"),

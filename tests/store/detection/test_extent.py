@@ -10,7 +10,6 @@ from contextlib import closing
 from typing import Any
 
 import pytest
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
@@ -33,7 +32,7 @@ def _standing() -> Iterator[sqlite3.Connection]:
 
 
 @pytest.fixture
-def standing(_standing: sqlite3.Connection, tier: str) -> sqlite3.Connection:
+def standing(_standing: sqlite3.Connection, looked_at: str) -> sqlite3.Connection:
     return _standing
 
 
@@ -53,7 +52,7 @@ def _stand(connection: sqlite3.Connection) -> None:
         }
         recorder.publish(time_s, state)
     recorder.end_run("finished")
-    roll(connection, 100_000)
+    make_chunks(connection, 100_000)
 
 
 def told(connection: sqlite3.Connection, kind: str, **bounds: Any) -> list[Event]:
@@ -104,14 +103,14 @@ def test_two_limits_on_one_signal_are_two_events(standing: sqlite3.Connection) -
 
 
 def test_a_signal_that_few_rows_of_the_run_hold_is_not_silent_in_the_others(
-    empty: sqlite3.Connection, tier: str
+    empty: sqlite3.Connection, looked_at: str
 ) -> None:
     recorder = start_run(empty)
     for step in range(2000):
         late = {"late_m": 1.0 + step} if step >= 1500 else {}
         recorder.publish(round(step * 0.1, 6), {"x": step, **late})
     recorder.end_run("finished")
-    roll(empty, 100_000)
+    make_chunks(empty, 100_000)
     asked = find_range(empty, Scope(start_s=70.0, end_s=80.0))
     assert find_events(empty, asked, EventOptions(kinds=("silent",))).events == ()
 
@@ -128,7 +127,7 @@ def after_so_many_rows(recorder: Recorder, connection: sqlite3.Connection, rows:
     for step in range(first, rows):
         state = {"pose": [step * 0.02, 0.0], "mode": "drive", "text": f"row {step}", "none": None}
         recorder.publish(step * 0.1, state)
-    roll(connection, 100_000)
+    make_chunks(connection, 100_000)
     make_chunks(connection, 100_000)
     return calls(connection)
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rover import start_run
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading.ranges import Scope, find_range
@@ -26,7 +26,7 @@ def record(
     for step in range(2000):
         if not (gap and 950 <= step < 1050):
             recorder.publish(step * 0.1, state(step * 0.1))
-    roll(connection, 100_000)
+    make_chunks(connection, 100_000)
 
 
 def jumps(connection: sqlite3.Connection, **options: Any) -> list[Event]:
@@ -35,7 +35,7 @@ def jumps(connection: sqlite3.Connection, **options: Any) -> list[Event]:
 
 
 def test_what_went_on_smoothly_during_a_gap_did_not_jump(
-    empty: sqlite3.Connection, tier: str
+    empty: sqlite3.Connection, looked_at: str
 ) -> None:
     def driving(time_s: float) -> dict[str, Any]:
         return {"pose": [0.3 * time_s, 0.0], "battery_v": 12 - 0.01 * time_s + 1e-4 * (time_s % 7)}
@@ -44,7 +44,9 @@ def test_what_went_on_smoothly_during_a_gap_did_not_jump(
     assert jumps(empty) == []
 
 
-def test_a_jump_at_the_border_of_two_rollups_is_found(empty: sqlite3.Connection, tier: str) -> None:
+def test_a_jump_at_the_border_of_two_rollups_is_found(
+    empty: sqlite3.Connection, looked_at: str
+) -> None:
     record(empty, lambda t: {"temp_c": 20 + 0.01 * t + (50 if t >= 100 else 0)})
     assert [(event.name, event.start_s) for event in jumps(empty)] == [("temp_c", 100.0)]
 
@@ -56,7 +58,7 @@ def test_a_value_that_is_elsewhere_after_a_gap_jumped(empty: sqlite3.Connection)
 
 @pytest.mark.parametrize(("name", "turn"), [("course", math.tau), ("course_deg", 360.0)])
 def test_a_heading_that_goes_over_the_end_of_its_scale_does_not_jump(
-    empty: sqlite3.Connection, tier: str, name: str, turn: float
+    empty: sqlite3.Connection, looked_at: str, name: str, turn: float
 ) -> None:
     record(empty, lambda t: {name: math.remainder(0.01 * turn * t, turn), "x": t})
     assert jumps(empty) == []
@@ -80,7 +82,7 @@ def test_a_value_that_is_back_only_after_a_gap_did_not_drop_out(empty: sqlite3.C
 
 
 def test_a_jump_exactly_at_the_begin_of_a_range_is_in_it(
-    empty: sqlite3.Connection, tier: str
+    empty: sqlite3.Connection, looked_at: str
 ) -> None:
     record(empty, lambda t: {"temp_c": 20 + 0.01 * t + (50 if t >= 100 else 0)})
     for start_s, end_s, count in ((100.0, 150.0, 1), (50.0, 100.0, 0), (99.9, 100.0, 0)):
@@ -89,7 +91,7 @@ def test_a_jump_exactly_at_the_begin_of_a_range_is_in_it(
 
 
 def test_dropouts_everywhere_in_a_long_range_are_found(
-    empty: sqlite3.Connection, tier: str
+    empty: sqlite3.Connection, looked_at: str
 ) -> None:
     record(empty, lambda t: {"front": 0.0 if round(10 * t) % 70 == 33 else 2 + 0.1 * math.sin(t)})
     (dropouts,) = jumps(empty)
@@ -111,7 +113,7 @@ def test_a_swing_whose_rows_meet_the_same_values_again_does_not_drop_out(
 
 
 def test_a_quick_swing_after_a_long_rest_is_a_motion_and_a_dropout_in_it_is_a_jump(
-    empty: sqlite3.Connection, tier: str
+    empty: sqlite3.Connection, looked_at: str
 ) -> None:
     dice = random.Random(3)
 
@@ -151,7 +153,7 @@ def test_the_steps_of_a_quick_swing_are_no_jumps_and_a_dropout_beside_it_is_one(
 
 
 def test_which_beam_is_the_shortest_neither_jumps_nor_freezes(
-    empty: sqlite3.Connection, tier: str
+    empty: sqlite3.Connection, looked_at: str
 ) -> None:
     nearest = random.Random(1)
 
@@ -172,7 +174,7 @@ def test_which_beam_is_the_shortest_neither_jumps_nor_freezes(
 
 
 def test_what_is_rarer_is_the_disturbance_wherever_it_begins(
-    empty: sqlite3.Connection, tier: str
+    empty: sqlite3.Connection, looked_at: str
 ) -> None:
     low_s = [(10.0, 14.0), (25.0, 27.5), (40.0, 46.0)]
 
@@ -189,7 +191,7 @@ def test_what_is_rarer_is_the_disturbance_wherever_it_begins(
 
 @pytest.mark.parametrize("rests", [True, False], ids=["rests", "noisy"])
 def test_an_excursion_is_told_with_where_it_came_from_and_to_and_back(
-    empty: sqlite3.Connection, tier: str, rests: bool
+    empty: sqlite3.Connection, looked_at: str, rests: bool
 ) -> None:
     away = {1000: 5.5, 1001: 10.8}
     noise = np.random.default_rng(1).normal(5.0, 0.0 if rests else 0.2, 2000).tolist()

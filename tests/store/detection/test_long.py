@@ -8,15 +8,14 @@ from itertools import count
 from typing import Any
 
 import pytest
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rover import Recorder, start_run
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.extent import Detection
 from webots_mcp.store.detection.registry import asked_kinds
 from webots_mcp.store.detection.verdict import Ledger
 from webots_mcp.store.questions.events import find_events
-from webots_mcp.store.reading import rows, views
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.signals.catalogue import known_signals
@@ -27,14 +26,12 @@ LEAP_S = 60.0
 
 
 @pytest.fixture
-def long(empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch) -> sqlite3.Connection:
+def long(empty: sqlite3.Connection) -> sqlite3.Connection:
     """500 s that are long: a leap and a swing are in the oldest part, another at a border."""
-    monkeypatch.setattr(rows, "RAW_ROWS", 1000)
-    monkeypatch.setattr(views, "STRETCH_ROWS", 1500)
     recorder = start_run(empty)
     for step in range(5000):
         recorder.publish(step * 0.1, state(step * 0.1))
-    roll(empty, 100_000)
+    make_chunks(empty, 100_000)
     return empty
 
 
@@ -118,7 +115,7 @@ def test_the_position_of_a_run_is_the_one_that_it_published(empty: sqlite3.Conne
         recorder.run(recorder.session(robot_id, name[0] * 64), robot_id)
         for step in range(300):
             recorder.publish(step * 0.1, {name: [min(step, 200) * 0.02, 0.0]})
-    roll(empty, 100_000)
+    make_chunks(empty, 100_000)
     for run_id in (1, 2):
         found = find_events(
             empty, find_range(empty, Scope(run_id=run_id)), EventOptions(kinds=("standstill",))
@@ -127,9 +124,8 @@ def test_the_position_of_a_run_is_the_one_that_it_published(empty: sqlite3.Conne
 
 
 @pytest.fixture
-def stopping(empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch) -> sqlite3.Connection:
+def stopping(empty: sqlite3.Connection) -> sqlite3.Connection:
     """A robot that stands for 30 s of each 60 s, in a run that is long."""
-    monkeypatch.setattr(rows, "RAW_ROWS", 1000)
     recorder = Recorder(empty)
     robot_id = recorder.robot("rover")
     recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
@@ -138,7 +134,7 @@ def stopping(empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch) -> sqli
         moving = step % 600 < 300
         x += 0.02 * moving
         recorder.publish(step * 0.1, {"pose": [round(x, 4), 0.0], "ticks": step * moving})
-    roll(empty, 100_000)
+    make_chunks(empty, 100_000)
     return empty
 
 

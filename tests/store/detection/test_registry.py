@@ -24,8 +24,7 @@ from webots_mcp.store.reading.ranges import Scope, find_range
 
 
 def tilted(search: Search) -> Iterator[Event]:
-    (numbers,) = search.view.stretches([search.known["tilt"]])
-    times, tilts = numbers.of("tilt")
+    times, tilts = search.frame.usable("tilt")
     for time_s, tilt in zip(times.tolist(), tilts.tolist(), strict=True):
         if tilt > 1:
             yield search.event("tilted", time_s, time_s, "tilt", tilt=tilt)

@@ -5,15 +5,12 @@ from __future__ import annotations
 import sqlite3
 from itertools import count
 
-import pytest
-from webots_mcp.store.rollup.rolling import roll
-
 from tests.recordings.rover import start_run
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.extent import Detection
 from webots_mcp.store.detection.registry import asked_kinds
 from webots_mcp.store.detection.verdict import Ledger
-from webots_mcp.store.reading import rows, views
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.signals.catalogue import known_signals
@@ -27,17 +24,14 @@ def record(connection: sqlite3.Connection, values: list[float]) -> None:
     for step, value in enumerate(values):
         recorder.publish(step * STEP_S, {"level": value, "pose": [step * 0.02, 0.0]})
     connection.execute("UPDATE run SET last_sim_time_s = ?", (len(values) * STEP_S,))
-    while not roll(connection, 100_000).done:
+    while not make_chunks(connection, 100_000).done:
         pass
 
 
 def test_the_rest_of_a_stretch_that_is_being_read_when_time_ends_is_named(
-    empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch
+    empty: sqlite3.Connection,
 ) -> None:
     record(empty, [step % 7 * 0.1 for step in range(ROWS)])
-    monkeypatch.setattr(rows, "RAW_ROWS", 500)
-    monkeypatch.setattr(rows, "_CHUNK_ROWS", 50)
-    monkeypatch.setattr(views, "STRETCH_ROWS", 2000)
     asked = find_range(empty, Scope())
     options = EventOptions(kinds=("oscillation",), signals=("level",), min_half_periods=8)
     kinds, cut = asked_kinds(options), set[str]()

@@ -9,11 +9,11 @@ from itertools import count
 
 import numpy as np
 import pytest
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from tests.store.questions.asking import ask, spans
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold
 from webots_mcp.store.detection.extent import Detection
 from webots_mcp.store.detection.jump_search import find_jumps
@@ -32,10 +32,10 @@ def is_unrolled(events: Events) -> bool:
 
 
 def test_a_robot_that_should_move_and_does_not_is_stuck(
-    rover: sqlite3.Connection, tier: str
+    rover: sqlite3.Connection, looked_at: str
 ) -> None:
     (stuck,) = ask(rover, "stuck").events
-    slack = 0.2 if tier == "rows" else 0.9
+    slack = 0.2 if looked_at == "values" else 0.9
     assert stuck.start_s == pytest.approx(40.0, abs=slack)
     assert stuck.end_s == pytest.approx(52.0, abs=slack)
     assert stuck.details["x_m"] == pytest.approx(8.0, abs=0.02)
@@ -51,7 +51,7 @@ def test_standing_in_a_mode_that_rests_is_not_stuck(rover: sqlite3.Connection) -
     assert moving.events == ()
 
 
-def test_mode_changes_have_their_duration(rover: sqlite3.Connection, tier: str) -> None:
+def test_mode_changes_have_their_duration(rover: sqlite3.Connection, looked_at: str) -> None:
     events = ask(rover, "change", signals=("mode",)).events
     assert [(e.start_s, e.end_s, e.details["after"]) for e in events] == [
         (52.0, 60.0, "back_up"), (60.0, 95.0, "avoid"), (95.0, pytest.approx(119.9), "cruise"),
@@ -59,11 +59,11 @@ def test_mode_changes_have_their_duration(rover: sqlite3.Connection, tier: str) 
     assert not any(event.ongoing for event in events)  # the run has ended
 
 
-def test_a_gap_is_an_event(rover: sqlite3.Connection, tier: str) -> None:
+def test_a_gap_is_an_event(rover: sqlite3.Connection, looked_at: str) -> None:
     assert spans(ask(rover, "gap")) == [(89.9, 95.0)]
 
 
-def test_a_silent_sensor_is_found(rover: sqlite3.Connection, tier: str) -> None:
+def test_a_silent_sensor_is_found(rover: sqlite3.Connection, looked_at: str) -> None:
     events = ask(rover, "silent")
     if is_unrolled(events):
         return
@@ -78,7 +78,7 @@ def test_a_flat_signal_is_found(rover: sqlite3.Connection) -> None:
 
 
 def test_a_crossed_threshold_lasts_as_long_as_it_holds(
-    rover: sqlite3.Connection, tier: str
+    rover: sqlite3.Connection, looked_at: str
 ) -> None:
     far = Threshold("pose.0", above=7.5, for_s=5.0)
     assert spans(ask(rover, "threshold", thresholds=(far,))) == [(37.6, 56.9), (75.1, 119.9)]
@@ -89,12 +89,12 @@ def test_a_crossed_threshold_lasts_as_long_as_it_holds(
 
 
 def test_numbers_too_large_to_reckon_with_cross_a_threshold_and_are_not_silent(
-    empty: sqlite3.Connection, tier: str
+    empty: sqlite3.Connection, looked_at: str
 ) -> None:
     recorder = start_run(empty)
     for step in range(300):
         recorder.publish(step / 10, {"big": 1e301 if 100 <= step < 200 else 1.0})
-    roll(empty)
+    make_chunks(empty)
     high = Threshold("big", above=5.0)
     assert spans(ask(empty, "threshold", thresholds=(high,))) == [(10.0, 19.9)]
     assert ask(empty, "silent").events == ()
@@ -107,7 +107,7 @@ def test_a_jump_of_the_position_is_found(rover: sqlite3.Connection) -> None:
     ]
 
 
-def test_a_spike_is_a_jump_there_and_back(rover: sqlite3.Connection, tier: str) -> None:
+def test_a_spike_is_a_jump_there_and_back(rover: sqlite3.Connection, looked_at: str) -> None:
     events = ask(rover, "jump", signals=("ir",))
     if is_unrolled(events):
         return
@@ -232,7 +232,7 @@ def test_a_cursor_of_find_events_that_is_none_is_refused(rover: sqlite3.Connecti
             find_events(rover, find_range(rover, Scope()), after=wrong)
 
 
-def test_what_there_was_no_time_for_is_named(rover: sqlite3.Connection, tier: str) -> None:
+def test_what_there_was_no_time_for_is_named(rover: sqlite3.Connection, looked_at: str) -> None:
     found = find_range(rover, Scope(run_id=1))
     told = find_events(rover, found, deadline_s=0.0)
     assert not told.events and not told.verdicts.absent and not told.verdicts.found
@@ -300,7 +300,7 @@ def test_a_wall_range_over_several_runs_knows_the_signals_of_each(
 
 
 def test_a_gap_is_an_event_also_where_the_range_lies_within_it(
-    rover: sqlite3.Connection, tier: str
+    rover: sqlite3.Connection, looked_at: str
 ) -> None:
     for start_s, end_s in ((91.0, 93.0), (88.0, 92.0), (94.0, 99.0)):
         asked = {"run_id": 1, "start_s": start_s, "end_s": end_s}

@@ -95,7 +95,7 @@ def medians(spreads: list[Spread | None]) -> list[float | None]:
     return [None if each is None else each.median for each in spreads]
 
 
-def test_two_runs_differ_in_what_was_changed(rover: sqlite3.Connection, tier: str) -> None:
+def test_two_runs_differ_in_what_was_changed(rover: sqlite3.Connection, looked_at: str) -> None:
     comparison = compare_runs(rover, [2, 3])
     assert comparison.compared_s == pytest.approx(29.9, abs=0.01)
     x = difference(comparison, "pose.0")

@@ -7,7 +7,6 @@ import sqlite3
 from typing import Any
 
 import pytest
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rover import start_run
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
@@ -86,7 +85,7 @@ def test_a_value_that_is_no_number_is_named_within_its_array(empty: sqlite3.Conn
         state = {"short": [None, step, None if step < 9 else 1], "long": [1.0] * 30 + [None]}
         replaced = {"short.*": "nan", "long.*": "inf"}
         recorder.publish(float(step), state, replaced if step < 20 else {"short.0": "inf"})
-    roll(empty)
+    make_chunks(empty)
     run = ask(empty, "short", "long.mean")
     assert column(run, "short.0").replaced == {"nan": 20, "inf": 10}
     assert column(run, "short.1").replaced == {}

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rover import start_run
 from webots_mcp.store.chunks.making import make_chunks
@@ -83,7 +82,7 @@ def record(
         present = {name: value for name, value in state.items() if value is not None}
         recorder.publish(time_s, present)
     connection.execute("COMMIT")
-    roll(connection, 100_000)
+    make_chunks(connection, 100_000)
     make_chunks(connection, 100_000)
 
 
@@ -280,7 +279,7 @@ def test_what_stepped_from_one_rest_to_another_is_flat_since_the_step(
     for row in range(1200):
         time_s = row / 10
         recorder.publish(time_s, {"x": min(time_s, 40.0) + step * (time_s >= 70.3)})
-    roll(empty, 100_000)
+    make_chunks(empty, 100_000)
     (x,) = trends(empty, find_range(empty, Scope())).runs[0].numbers
     assert x.flat_since_s == 70.3
 
@@ -323,7 +322,7 @@ def test_numbers_too_large_to_reckon_with_are_not_called_missing(
     empty: sqlite3.Connection, looked_at: str
 ) -> None:
     record(empty, rows=300, interval_s=0.1, big=lambda _: 1e308, x=lambda time_s: time_s)
-    roll(empty)
+    make_chunks(empty)
     assert ask(empty).silent == ("big (its numbers are beyond 1e100)",)
 
 
@@ -335,7 +334,7 @@ def test_whole_numbers_that_name_a_mode_have_times_and_no_slope(
         mode = min(step // 250, 3)
         named = {} if 300 <= step < 320 else {"drive_mode": 1 if step == 700 else mode}
         recorder.publish(round(0.1 * step, 6), {"count": mode, **named})
-    roll(empty, 100_000)
+    make_chunks(empty, 100_000)
     told = ask(empty)
     assert [each.name for each in told.numbers] == ["count"]
     (mode,) = told.states

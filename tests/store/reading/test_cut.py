@@ -9,8 +9,6 @@ from collections.abc import Iterator
 from functools import partial
 
 import pytest
-from webots_mcp.store.reading.rollups import read_pieces
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
@@ -23,7 +21,7 @@ from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.changes import change_points
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.pages import query_rows
-from webots_mcp.store.reading.ranges import Scope, Segment, find_range, whole_run
+from webots_mcp.store.reading.ranges import Scope, Segment, find_range
 from webots_mcp.store.signals.catalogue import known_signals
 from webots_mcp.store.signals.registry import Signal
 
@@ -104,41 +102,6 @@ def test_since_when_a_mode_is_in_force_is_looked_for_backwards(
     assert all(each.unread_from_s is None for each in told), "ten seconds are read at once"
     assert any("mode" in each.since_before for each in told)
     assert told[-1].points["mode"][0].sim_time_s == 1500.0
-
-
-def test_pieces_hold_the_rows_up_to_where_they_were_cut_and_none_behind(
-    unsummed: sqlite3.Connection,
-) -> None:
-    whole = whole_run(unsummed, 1)
-    assert whole is not None
-    for looks in (*SOME, ENOUGH):
-        pieces = read_pieces(unsummed, whole, signals_of(unsummed, "x"), after(looks))
-        last_s = [summary.last for _, summary in pieces.of("x")][-1:]
-        if pieces.cut_at_s is None:
-            assert (pieces.rows, last_s) == (ROWS, [1999.9])
-        else:
-            assert last_s == [pieces.cut_at_s] * bool(pieces.rows)
-            rows = unsummed.execute(
-                "SELECT count(*) FROM state WHERE sim_time_s <= ?", (last_s or [-1.0],)[0]
-            )
-            assert (pieces.rows,) == rows.fetchone()
-
-
-def test_rollups_of_all_signals_end_together() -> None:
-    with memory_connection() as connection:
-        recorder = start_run(connection)
-        for step in range(13_000):
-            recorder.publish(float(step), {"x": step, "y": -step})
-        assert roll(connection, 100_000).done
-        whole = whole_run(connection, 1)
-        assert whole is not None
-        x, y = signals_of(connection, "x", "y")
-        ends = set[float | None]()
-        for looks in range(20):
-            pieces = read_pieces(connection, whole, [x, y], after(looks))
-            assert pieces.summaries("x").rows == pieces.summaries("y").rows == pieces.rows
-            ends.add(pieces.cut_at_s)
-        assert {0.0, 5000.0, 10_000.0, None} <= ends
 
 
 def test_who_had_no_time_at_all_says_so_of_text_as_of_numbers(

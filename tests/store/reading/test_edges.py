@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.logs import window_of
 from webots_mcp.store.questions.events import find_events
@@ -48,7 +48,7 @@ def clock(request: pytest.FixtureRequest) -> Iterator[sqlite3.Connection]:
                 line = {"level": "warning", "source": "controller", "message": str(row)}
                 recorder.insert("log", **recorder.at(time_s), **line)
         if request.param == "rolled":
-            assert roll(connection, 100_000).done
+            assert make_chunks(connection, 100_000).done
         yield connection
 
 

@@ -9,13 +9,13 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
+from webots_mcp.store.chunks import making
+from webots_mcp.store.chunks.making import chunk_whole_run
 from webots_mcp.store.detection.event import EventOptions, Threshold
 from webots_mcp.store.questions.events import find_events
-from webots_mcp.store.reading import rows as columns
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 Spans = list[tuple[str | None, float, float]]
@@ -29,7 +29,6 @@ def record(
     for step, state in enumerate(states):
         recorder.publish(round(step * every_s, 6), {"row": step, **state})
     connection.execute("COMMIT")
-    roll(connection, 100_000)
 
 
 def spans(connection: sqlite3.Connection, **options: Any) -> Spans:
@@ -44,7 +43,7 @@ def spans(connection: sqlite3.Connection, **options: Any) -> Spans:
 
 
 def test_a_value_that_flickers_is_beyond_no_threshold_for_long(
-    empty: sqlite3.Connection, tier: str
+    empty: sqlite3.Connection, looked_at: str
 ) -> None:
     record(empty, [{"alt_m": 10.0 * (step % 2)} for step in range(2000)], 0.02)
     limits = (Threshold("alt_m", above=5, for_s=0.03), Threshold("alt_m", below=5, for_s=0.03))
@@ -52,7 +51,7 @@ def test_a_value_that_flickers_is_beyond_no_threshold_for_long(
 
 
 def test_a_sensor_that_is_slower_than_the_rows_is_not_silent(
-    empty: sqlite3.Connection, tier: str
+    empty: sqlite3.Connection, looked_at: str
 ) -> None:
     slow = [{"front_m": 1.0 + step / 999} if step % 2 else {} for step in range(2000)]
     record(empty, slow, 0.02)
@@ -60,7 +59,7 @@ def test_a_sensor_that_is_slower_than_the_rows_is_not_silent(
 
 
 def test_a_signal_that_is_not_published_any_more_is_silent(
-    empty: sqlite3.Connection, tier: str
+    empty: sqlite3.Connection, looked_at: str
 ) -> None:
     stops = [{"lidar_m": 1.0 + step % 5} if step < 250 else {} for step in range(400)]
     record(empty, stops, 0.1)
@@ -70,7 +69,7 @@ def test_a_signal_that_is_not_published_any_more_is_silent(
 
 
 def test_what_holds_throughout_is_one_span_across_every_border(
-    empty: sqlite3.Connection, tier: str
+    empty: sqlite3.Connection, looked_at: str
 ) -> None:
     record(empty, [{"alt_m": 0.0 if step in (5, 333) else 9.0} for step in range(500)], 0.1)
     high = (Threshold("alt_m", above=5, for_s=1.0),)
@@ -85,7 +84,7 @@ STRETCHES = st.lists(st.tuples(LEVELS, st.integers(1, 12)), min_size=1, max_size
 
 @settings(max_examples=40, deadline=None)
 @given(STRETCHES)
-def test_rollups_and_rows_tell_the_same_spans(stretches: list[tuple[Any, int]]) -> None:
+def test_chunks_and_rows_tell_the_same_spans(stretches: list[tuple[Any, int]]) -> None:
     levels = [level for level, rows in stretches for _ in range(rows)]
     states = [{} if level == () else {"alt_m": level} for level in levels]
     states += [{"alt_m": 0.0}]
@@ -97,5 +96,6 @@ def test_rollups_and_rows_tell_the_same_spans(stretches: list[tuple[Any, int]]) 
     with memory_connection() as connection, pytest.MonkeyPatch.context() as patch:
         record(connection, states, 1.0)
         from_rows = spans(connection, **asked)
-        patch.setattr(columns, "RAW_ROWS", 3)
+        patch.setattr(making, "GROUP_ROWS", 3)
+        assert chunk_whole_run(connection, 1)
         assert spans(connection, **asked) == from_rows

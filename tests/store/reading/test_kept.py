@@ -12,12 +12,12 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from webots_mcp.store.rollup.rolling import roll
 
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.standin import InProcessSupervisor
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.export.export_rows import Source
 from webots_mcp.store.questions.events import EventOptions, find_events
 from webots_mcp.store.questions.series import query_history
@@ -62,7 +62,7 @@ def connection(
 ) -> Iterator[sqlite3.Connection]:
     with closing(connect(recorded, "writer")) as connection:
         if request.param:
-            while not roll(connection).done:
+            while not make_chunks(connection).done:
                 pass
         yield connection
 

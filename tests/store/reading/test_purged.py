@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S, start_run
 from webots_mcp.store.analysis.spread import Spread
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.questions.compare import Comparison, compare_runs
 from webots_mcp.store.questions.events import Events, find_events
@@ -165,7 +165,7 @@ def patrol(empty: sqlite3.Connection, tmp_path: Path) -> sqlite3.Connection:
         front_m = None if 123.5 <= time_s < 200 else 3.0 if 233.5 <= time_s < 290 else 1 + step % 7
         recorder.publish(time_s, state | {"front_m": front_m})
     empty.execute("COMMIT")
-    roll(empty, 100_000)
+    make_chunks(empty, 100_000)
     keep_rows(empty, tmp_path, 500)
     return empty
 

@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.memory import memory_connection
 from tests.recordings.runs import ROW_S, Recorded, states
@@ -149,7 +148,7 @@ def test_a_run_that_is_marked_after_the_plan_was_made_loses_nothing_more(
 ) -> None:
     recorded.add_run(1200)
     recorded.add_run(1)
-    roll(recorded.connection, 10_000)
+    make_chunks(recorded.connection, 10_000)
     wanted = plan(recorded.connection, states(rows=0, spared_rows=0), recorded.wall_s)
     left = dict[int, int]()
     for number, _ in enumerate(purge(recorded.connection, wanted, recorded.folder)):
@@ -219,7 +218,7 @@ def test_what_was_planned_is_what_goes_and_kept_runs_stay_whole(
             # Beforehand: a plan cannot know how many chunks there will be.
             chunk_whole_run(connection, run_id)
         make_chunks(connection)
-        roll(connection, 10_000)
+        make_chunks(connection, 10_000)
         mark_kept(recorded.connection, kept)
         before = Counter({table: recorded.count(table) for table in TABLES})
         whole = recorded.of_runs(kept)

@@ -7,7 +7,6 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.runs import Recorded, states
 from webots_mcp.connection import connect
@@ -76,7 +75,7 @@ def test_the_file_of_long_rows_shrinks_to_the_limit(tmp_path: Path, length: int)
             recorded.run_id = run_ids[i % 6]
             recorded.publish(i // 6 * 0.016, {"text": "t" * length})
         connection.execute("COMMIT")
-        roll(connection, 10_000)
+        make_chunks(connection, 10_000)
         states_bytes = 2_000_000
         recorded.prune(states(size_bytes=states_bytes))
         rest_bytes = sum(

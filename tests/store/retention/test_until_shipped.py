@@ -8,12 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.runs import Recorded, states
 from webots_mcp.cli import main
 from webots_mcp.connection import connect
 from webots_mcp.schema import create_schema
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.retention.planning import plan
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.shipped import Shipped, write_shipped
@@ -30,7 +30,7 @@ def recorded(tmp_path: Path) -> Iterator[Recorded]:
         recorded = Recorded(connection, tmp_path)
         recorded.add_run(20)
         recorded.add_run(20)
-        while not roll(connection).done:
+        while not make_chunks(connection).done:
             pass
         yield recorded
 
@@ -93,7 +93,7 @@ def test_beyond_the_size_the_oldest_goes_all_the_same_and_the_plan_says_so(
 def test_a_run_is_not_forgotten_while_rows_of_it_wait(recorded: Recorded) -> None:
     for _ in range(4):
         recorded.add_run(20)
-    while not roll(recorded.connection).done:
+    while not make_chunks(recorded.connection).done:
         pass
     forgetting = replace(states(rows=10), outlive=2.0)
     recorded.prune(keeping(forgetting, MB))

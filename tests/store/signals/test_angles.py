@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rover import start_run
 from webots_mcp.store.analysis.arrays import Array
 from webots_mcp.store.analysis.features import unwrap
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.questions.trend import Trend
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.ranges import Scope, find_range
@@ -36,7 +36,7 @@ def test_the_third_item_of_a_planar_pose_is_an_angle(empty: sqlite3.Connection) 
     for second in range(200):
         recorder.publish(float(second), turning(float(second)))
     before = known_signals(empty, find_range(empty, Scope()))
-    roll(empty, 100_000)
+    make_chunks(empty, 100_000)
     for known in (before, known_signals(empty, find_range(empty, Scope()))):
         assert (known["pose.2"].kind, known["pose.2"].unit) == ("angle", "rad")
         assert known["arm.pose.2"].kind == "num"  # goes up to 10
@@ -54,13 +54,13 @@ def trend_of(connection: sqlite3.Connection, name: str, course: Callable[[float]
     recorder = start_run(connection)
     for step in range(600):
         recorder.publish(step * 0.1, {name: course(step * 0.1)})
-    roll(connection, 100_000)
+    make_chunks(connection, 100_000)
     return trends(connection, find_range(connection, Scope())).runs[0].numbers[0]
 
 
 @pytest.mark.parametrize(("name", "turn"), [("heading", math.tau), ("heading_deg", 360.0)])
 def test_a_heading_about_the_end_of_its_scale_is_one_course_in_the_means_of_a_long_run(
-    empty: sqlite3.Connection, long_ranges: None, name: str, turn: float
+    empty: sqlite3.Connection, name: str, turn: float
 ) -> None:
     heading = trend_of(
         empty, name, lambda t: (turn / 36 * math.sin(t * math.tau / 60) + turn * (t > 0)) % turn
@@ -105,7 +105,7 @@ def test_a_bearing_to_the_nearest_of_several_things_does_not_turn(
 
 @pytest.mark.parametrize(("name", "turn"), [("bearing_rad", math.tau), ("bearing_deg", 360.0)])
 def test_where_turns_are_not_counted_neither_extremes_nor_deviation_count_them(
-    empty: sqlite3.Connection, tier: str, name: str, turn: float
+    empty: sqlite3.Connection, looked_at: str, name: str, turn: float
 ) -> None:
     places = [0.45, -0.45, 0.1]
     bearing = trend_of(empty, f"lidar.{name}", lambda t: turn * places[int(10 * t) % 7 % 3])
@@ -117,7 +117,7 @@ def test_where_turns_are_not_counted_neither_extremes_nor_deviation_count_them(
 
 @pytest.mark.parametrize("name", ["heading", "heading_deg"])
 def test_the_deviation_of_a_course_is_that_of_its_values_in_a_long_range_too(
-    empty: sqlite3.Connection, tier: str, name: str
+    empty: sqlite3.Connection, looked_at: str, name: str
 ) -> None:
     half = 180.0 if name == "heading_deg" else math.pi
     heading = trend_of(

@@ -5,12 +5,12 @@ from __future__ import annotations
 import sqlite3
 
 import pytest
-from webots_mcp.store.rollup.rolling import roll
 
 from tests.recordings.rover import start_run
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.naming import flatten
 from webots_mcp.signal_kinds import Place, places
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.pages import query_rows
 from webots_mcp.store.reading.ranges import Scope, find_range
@@ -84,7 +84,7 @@ def test_whatever_a_key_is_called_it_is_a_signal(empty: sqlite3.Connection, roll
         flat = {name: step + index for index, name in enumerate(STRANGE)}
         recorder.publish(float(step), {**flat, "deep": flat})
     if rolled:
-        roll(empty)
+        make_chunks(empty)
     names = {*STRANGE, *(f"deep.{name}" for name in STRANGE)}
     assert {signal.name for signal in list_signals(empty).signals} == names
     for index, name in enumerate(STRANGE):
@@ -119,7 +119,7 @@ def test_rows_that_do_not_hold_a_signal_have_no_value_of_it(empty: sqlite3.Conne
         recorder.publish(float(step), {"x": step} | ({"lidar": 1.0} if step < 10 else {}))
         if step in (4, 25):
             missing = {signal.name: signal.missing for signal in list_signals(empty).signals}
-            roll(empty)
+            make_chunks(empty)
             rolled = {signal.name: signal.missing for signal in list_signals(empty).signals}
             assert missing == rolled == {"lidar": max(0, step + 1 - 10), "x": 0}
     assert list_signals(empty).signals[0].missing == 30
@@ -133,7 +133,7 @@ def test_numbers_too_large_to_reckon_with_are_values(
     for step in range(40):
         recorder.publish(float(step), {"big": 1e301})
     if rolled:
-        roll(empty)
+        make_chunks(empty)
     (big,) = list_signals(empty).signals
     assert (big.missing, big.first_s, big.last_s, big.last) == (0, 0.0, 39.0, 1e301)
 
@@ -148,7 +148,7 @@ def test_a_signal_that_changes_its_kind_is_told_the_same_before_and_after_rollin
         value = {"t": "word", "n": step // 50, "b": step % 100 < 50, "_": None}[kind]
         recorder.publish(step * 0.1, {"x": step, "value": value})
     before = (list_signals(empty), trends(empty, find_range(empty, Scope())))
-    while not roll(empty, 50).done:
+    while not make_chunks(empty, 50).done:
         pass
     assert (list_signals(empty), trends(empty, find_range(empty, Scope()))) == before
 
@@ -156,7 +156,7 @@ def test_a_signal_that_changes_its_kind_is_told_the_same_before_and_after_rollin
 def test_rows_not_rolled_up_yet_are_in_the_list(empty: sqlite3.Connection) -> None:
     recorder = start_run(empty)
     recorder.publish(0.0, {"x": 1.0})
-    roll(empty)
+    make_chunks(empty)
     recorder.publish(1.0, {"x": 5.0, "y": None})
     x, y = list_signals(empty).signals
     assert (x.rows, x.min, x.max, x.last) == (2, 1.0, 5.0, 5.0)

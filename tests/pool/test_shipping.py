@@ -163,7 +163,7 @@ def test_a_run_that_another_recording_has_shipped_stays_that_ones(
         own = other.add_run(20)
         shipped.connection.execute("UPDATE session SET uuid = ?", (new_uuid(),))
         merge(connection, folder, shipped.folder / "webots.db")
-        other.roll()
+        other.make_chunks()
         shipped.ship(full=True)
         report = other.ship(full=True)
         (run,) = other.pooled()["run"]

@@ -12,15 +12,15 @@ from tests.recordings.rows import Recorded, insert
 from tests.server.malformed import NOT_UTF8, Damage
 from webots_mcp.liveness import dead_sessions
 from webots_mcp.maintenance import Maintainer
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
 from webots_mcp.store.retention.planning import plan
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.purge import prune
 from webots_mcp.waiting_file import FORMAT, adopt
 
 BLOB = b"\x00\xff\x01"
-ROLLED = (
-    "SELECT name, sum(r.rows) FROM all_rollup r JOIN signal s ON s.id = r.signal_id "
+IN_CHUNKS = (
+    "SELECT name, sum(c.row_count) FROM chunk c JOIN signal s ON s.id = c.signal_id "
     "GROUP BY name ORDER BY name"
 )
 
@@ -30,12 +30,11 @@ ROLLED = (
     [
         Damage("state", "sim_time_s", "late"),
         Damage("state", "sim_time_s", BLOB),
-        Damage("state", "sim_time_s", 1e300),
         Damage("state", "data", NOT_UTF8),
     ],
     ids=str,
 )
-def test_a_row_that_cannot_be_summed_up_costs_only_itself_and_is_named(
+def test_a_row_that_cannot_be_put_into_a_chunk_costs_only_itself_and_is_named(
     recorded: Recorded, damage: Damage, capsys: pytest.CaptureFixture[str]
 ) -> None:
     robot = recorded.robot()
@@ -43,37 +42,37 @@ def test_a_row_that_cannot_be_summed_up_costs_only_itself_and_is_named(
     robot.state(2.0, {"x": 2, "y": 0})
     damage.apply(recorded.connection)
     robot.state(3.0, {"x": 3})
-    assert make_chunks(recorded.connection).rows == 3
-    rolled = dict(recorded.connection.execute(ROLLED).fetchall())
-    assert rolled == {"x": 2}
+    assert chunk_whole_run(recorded.connection, robot.run_id)
+    assert dict(recorded.connection.execute(IN_CHUNKS).fetchall()) == {"x": 2}
     assert f"state 2: {damage.column} holds no valid" in capsys.readouterr().err
-    assert make_chunks(recorded.connection) == (0, True)
 
 
 @pytest.mark.parametrize(
-    ("damage", "rolled"),
+    "damage",
     [
-        (Damage("run", "rolled_state_id", "yesterday"), {"x": 2}),
-        (Damage("watermark", "state_id", "yesterday"), {"x": 2}),
-        (Damage("watermark", "state_id", 2**63 - 1), {"x": 2}),
-        (Damage("signal", "rows", 2**63 - 1), {"x": 2}),
-        (Damage("signal", "name", BLOB), {"x": 1}),
-        (Damage("signal", "path", BLOB), {"x": 1}),
+        Damage("watermark", "state_id", "yesterday"),
+        Damage("watermark", "state_id", 2**63 - 1),
+        Damage("run", "is_chunked", "yesterday"),
+        Damage("signal", "min", "little"),
+        Damage("signal", "name", BLOB),
+        Damage("signal", "path", BLOB),
     ],
     ids=str,
 )
-def test_a_wrong_value_in_what_rollups_are_kept_by_does_not_keep_new_rows_out(
-    recorded: Recorded, damage: Damage, rolled: dict[str, int]
+def test_a_wrong_value_in_what_chunks_are_made_by_does_not_keep_new_rows_out(
+    recorded: Recorded, damage: Damage, capsys: pytest.CaptureFixture[str]
 ) -> None:
     robot = recorded.robot()
     robot.state(1.0, {"x": 1})
     make_chunks(recorded.connection)
+    assert chunk_whole_run(recorded.connection, robot.run_id)
     damage.apply(recorded.connection)
-    robot.state(2.0, {"x": 1, "fresh": 1})
-    make_chunks(recorded.connection)
-    found = dict(recorded.connection.execute(ROLLED).fetchall())
-    assert found.pop("fresh") == 1
-    assert damage.column in ("name", "path") or found == rolled
+    for step in range(1024):
+        robot.state(2.0 + step, {"x": 1, "fresh": 1})
+    assert make_chunks(recorded.connection).done
+    found = dict(recorded.connection.execute(IN_CHUNKS).fetchall())
+    assert found.pop("fresh") == 1024
+    assert damage.column in ("name", "path") or found == {"x": 1025}
 
 
 @pytest.mark.parametrize("table", ["state", "log", "event", "image"])

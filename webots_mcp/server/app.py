@@ -25,7 +25,7 @@ from webots_mcp.server.tools import ToolServer, tool_of
 from webots_mcp.steering.launcher import Companions, Launcher
 from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.chunks.making import make_chunks
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import OpenReaders, Recording
 from webots_mcp.store.retention.limits import Asked, ask_where_unset
 from webots_mcp.store.retention.upkeep import Upkeep
 
@@ -65,7 +65,8 @@ def create_server(
             keeps to those.
     """
     asked = dict(limits or {})
-    recording = Recording(database, data_dir, read_only, asked)
+    readers = OpenReaders()
+    recording = Recording(database, data_dir, read_only, asked, readers=readers)
     possible = [each for each in all_questions() if each.effect.reads or not read_only]
     shown = [each for each in listed(possible) if each.core or not core]
     mcp = ToolServer(
@@ -81,7 +82,7 @@ def create_server(
         },
         withheld={each.name for each in all_questions()} - {each.name for each in possible},
         cache_hints={"tools/list": _KEPT, "prompts/list": _KEPT, "resources/list": _KEPT},
-        lifespan=_lifespan(recording, Upkeep(data_dir), asked),
+        lifespan=_lifespan(recording, readers, Upkeep(data_dir), asked),
     )
     add_resources(mcp, recording)
     add_prompts(mcp)
@@ -89,7 +90,7 @@ def create_server(
 
 
 def _lifespan(
-    recording: Recording, retain: Upkeep, asked: Asked
+    recording: Recording, readers: OpenReaders, retain: Upkeep, asked: Asked
 ) -> Callable[[MCPServer], AbstractAsyncContextManager[Companions]]:
     """While a server runs, trials and Webots may; what may be written is maintained and followed.
 
@@ -121,5 +122,6 @@ def _lifespan(
                 await to_thread.run_sync(companions.stop)
             for watch in reversed(watches):
                 await to_thread.run_sync(watch.stop, abandon_on_cancel=True)
+            readers.close()
 
     return lifespan

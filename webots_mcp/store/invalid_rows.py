@@ -115,6 +115,11 @@ def valid_rows(connection: sqlite3.Connection) -> Generator[InvalidValues]:
             connection.execute(f"DROP VIEW temp.valid_{table}")
 
 
+def is_past_invalid_rows() -> bool:
+    """Whether this is inside `past_invalid_rows`."""
+    return _reading.get() is not None
+
+
 def shadow_if_asked(connection: sqlite3.Connection) -> None:
     """Inside `past_invalid_rows` give a reader views of the valid rows under the tables' names."""
     if (invalid := _reading.get()) is not None:

@@ -1,17 +1,23 @@
-"""A recording as questions are asked of it: opened anew for each."""
+"""A recording as questions are asked of it: opened anew for each, but by a server."""
 
 from __future__ import annotations
 
 import sqlite3
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp import liveness
-from webots_mcp.connection import LONGEST_READ_S, FrozenConnection, Role, connect
+from webots_mcp.connection import (
+    LONGEST_READ_S,
+    FrozenConnection,
+    Role,
+    connect,
+    identify_files,
+)
 from webots_mcp.contract import DATABASE_NAME, Database, MemoryDatabase
 from webots_mcp.errors import (
     DatabaseError,
@@ -21,7 +27,7 @@ from webots_mcp.errors import (
 )
 from webots_mcp.queue import any_unfinished
 from webots_mcp.schema import create_schema, require_current, schema_version
-from webots_mcp.store.invalid_rows import shadow_if_asked
+from webots_mcp.store.invalid_rows import is_past_invalid_rows, shadow_if_asked
 from webots_mcp.store.reading.subject import Subject, choose, require_run
 from webots_mcp.store.retention.limits import Asked
 from webots_mcp.store.robots import Robot
@@ -112,6 +118,53 @@ class View:
         return Subject(self.robot.id, self.robot.name, self.require_run().id)
 
 
+class OpenReaders:
+    """Connections that a server keeps open between its questions: as many as it asks at once.
+
+    One is used again as long as its file is the same, and so is the schema.
+    """
+
+    def __init__(self) -> None:
+        self._idle: list[tuple[object, sqlite3.Connection]] = []
+        self._is_closed = False
+
+    @contextmanager
+    def taken(
+        self, database: Path, open_one: Callable[[], sqlite3.Connection]
+    ) -> Generator[sqlite3.Connection]:
+        """One for a question; it is closed where the question fails."""
+        while True:
+            try:
+                known, connection = self._idle.pop()
+            except IndexError:
+                connection = open_one()
+                break
+            if known == _identity(database, connection):
+                break
+            connection.close()
+        try:
+            yield connection
+            known = _identity(database, connection)
+        except BaseException:
+            connection.close()
+            raise
+        if self._is_closed or isinstance(connection, FrozenConnection):
+            connection.close()
+        else:
+            self._idle.append((known, connection))
+
+    def close(self) -> None:
+        """Close all that are not in use, and those when they are given back."""
+        self._is_closed = True
+        while self._idle:
+            self._idle.pop()[1].close()
+
+
+def _identity(database: Path, connection: sqlite3.Connection) -> object:
+    """Of the files, and of the schema that SQLite counts the changes of."""
+    return identify_files(database), connection.execute("PRAGMA schema_version").fetchone()
+
+
 @dataclass(frozen=True)
 class Recording:
     """A database, the folder of its pictures, and whether the asker may write.
@@ -121,6 +174,7 @@ class Recording:
     Attributes:
         limits: Those of how much is kept that the asker would like to hold.
         asker: By whom commands are requested: `mcp` or `cli`.
+        readers: Keeps connections open; None to open one for each question.
     """
 
     database: Database
@@ -128,12 +182,20 @@ class Recording:
     read_only: bool = False
     limits: Asked = field(default_factory=dict[str, Any])
     asker: str = "mcp"
+    readers: OpenReaders | None = None
 
     @contextmanager
     def reader(self) -> Generator[sqlite3.Connection]:
-        """A connection of its own that cannot write."""
-        with self._opened("reader") as connection:
-            shadow_if_asked(connection)
+        """A connection that cannot write, and that no other uses meanwhile."""
+        if self.readers is None or not isinstance(self.database, Path) or is_past_invalid_rows():
+            with self._opened("reader") as connection:
+                shadow_if_asked(connection)
+                yield connection
+            return
+        with (
+            self._explained(),
+            self.readers.taken(self.database, lambda: self._open("reader")) as connection,
+        ):
             yield connection
 
     @contextmanager

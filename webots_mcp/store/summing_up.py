@@ -7,6 +7,7 @@ answer. A server makes chunks of what comes; of a recording that none looks afte
 from __future__ import annotations
 
 import math
+import sqlite3
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -25,7 +26,10 @@ from webots_mcp.store.robots import list_robots
 LEAST_ROWS: Final = 2000  # a question reads fewer as they are
 _BATCH_ROWS: Final = 2000
 _PAUSE_S: Final = 0.002  # between two short writes, for robots to write theirs
-_NEWEST: Final = "SELECT coalesce(max(id), 0) FROM state"
+_LEFT: Final = (  # ids are given without gaps, but for rows that were deleted
+    "SELECT max(0, (SELECT coalesce(max(id), 0) FROM state) - :mark - (SELECT "
+    "coalesce(sum(row_count), 0) FROM row_group WHERE is_complete = 1 AND max_state_id > :mark))"
+)
 
 
 def sum_up(
@@ -54,32 +58,36 @@ def sum_up(
         DatabaseError: There is no such recording, or it cannot be read.
     """
     with recording.reader() as connection:
-        first, last = watermark(connection), int(connection.execute(_NEWEST).fetchone()[0])
+        total = left = _rows_left(connection)
         holder = holder_of(connection, "maintainer") or ""
         is_frozen = isinstance(connection, FrozenConnection)
-    if last - first < LEAST_ROWS:
+    if total < LEAST_ROWS:
         return ""
     if is_frozen:
-        return _left(last - first, "the file cannot be written from here")
+        return _say(total, "the file cannot be written from here")
     if holder.startswith("server "):
-        return _left(last - first, "the server that maintains the recording makes them")
-    until_s, mark, why = time.monotonic() + limit_s, first, ""
+        return _say(total, "the server that maintains the recording makes them")
+    until_s, why = time.monotonic() + limit_s, ""
     try:
         with recording.writer() as connection, _checkpoints(recording):
             live = any(robot.live for robot in list_robots(connection, time.time()))
-            while not why and mark <= last:
-                pause_s = _PAUSE_S if live else 0.0
-                done = make_chunks(connection, _BATCH_ROWS, pause_s).done
-                mark = watermark(connection)
+            while not why:
+                done = make_chunks(connection, _BATCH_ROWS, _PAUSE_S if live else 0.0).done
+                left = 0 if done else min(left, _rows_left(connection))
                 if progress is not None:
-                    progress(min(mark, last) - first, last - first)
+                    progress(total - left, total)
                 if done:
                     return ""
                 if called_off() or time.monotonic() > until_s:
                     why = "ask again to continue"
     except DatabaseError as error:
         why = str(error)
-    return _left(last - mark, why) if last - mark >= LEAST_ROWS else ""
+    return _say(left, why) if left >= LEAST_ROWS else ""
+
+
+def _rows_left(connection: sqlite3.Connection) -> int:
+    """About how many rows are in no chunk."""
+    return int(connection.execute(_LEFT, {"mark": watermark(connection)}).fetchone()[0])
 
 
 @contextmanager
@@ -96,5 +104,5 @@ def _checkpoints(recording: Recording) -> Generator[None]:
         maintainer.stop()
 
 
-def _left(rows: int, why: str) -> str:
+def _say(rows: int, why: str) -> str:
     return f"the newest {rows} rows are in no chunk yet: {why}"

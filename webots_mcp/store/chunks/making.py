@@ -19,6 +19,7 @@ from webots_mcp.store.chunks.codec import decoded_of, encode
 from webots_mcp.store.chunks.columns import STATE_COLUMNS, StateColumns
 from webots_mcp.store.chunks.statistics import Statistics, statistics_of
 from webots_mcp.store.chunks.stored import (
+    IS_MARK,
     SIM_TIMES,
     STATE_IDS,
     WALL_TIMES,
@@ -55,7 +56,8 @@ _COLUMNS: Final = (
 _LIST: Final = ", ".join(_COLUMNS)
 _SET_WATERMARK: Final = (
     "INSERT INTO watermark (name, state_id) VALUES ('chunk', ?) "
-    "ON CONFLICT (name) DO UPDATE SET state_id = max(state_id, excluded.state_id)"
+    f"ON CONFLICT (name) DO UPDATE SET state_id = iif({IS_MARK}, "
+    "max(state_id, excluded.state_id), excluded.state_id)"
 )
 _LAST_ID: Final = "SELECT max(id) FROM (SELECT id FROM state WHERE id > ? ORDER BY id LIMIT ?)"
 _WITH_NEW_ROWS: Final = (

@@ -26,7 +26,11 @@ _LAST_AT: Final = (
     "SELECT max(last_state_id) FROM row_group WHERE run_id = ? AND is_complete = 1 "
     "AND end_sim_time_s = ?"
 )
-_WATERMARK: Final = "SELECT state_id FROM watermark WHERE name = 'chunk'"
+IS_MARK: Final = (  # no other program's value, beyond which no row would be looked at
+    "typeof(state_id) = 'integer' AND state_id >= 0 AND state_id <= "
+    "(SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = 'state')"
+)
+_WATERMARK: Final = f"SELECT state_id FROM watermark WHERE name = 'chunk' AND {IS_MARK}"
 _OF_SIGNAL: Final = "FROM chunk WHERE run_id = ? AND signal_id = ? AND group_id BETWEEN ? AND ?"
 _STATISTICS: Final = f"SELECT group_id, {', '.join(Statistics._fields)} {_OF_SIGNAL}"
 _VALUES: Final = f"SELECT group_id, codec, numbers, codes, labels {_OF_SIGNAL}"
@@ -87,7 +91,7 @@ def reached(connection: sqlite3.Connection, run_id: int) -> Reached:
 def watermark(connection: sqlite3.Connection) -> int:
     """Rows with ids up to it have been looked at, of all runs: none of them comes late any more."""
     row = connection.execute(_WATERMARK).fetchone()
-    return int(row[0]) if row and isinstance(row[0], int) else 0
+    return int(row[0]) if row else 0
 
 
 def signals_in(connection: sqlite3.Connection, run_id: int) -> set[int]:

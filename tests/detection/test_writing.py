@@ -49,5 +49,5 @@ def test_of_purged_rows_the_summaries_stay(tmp_path: Path) -> None:
         roll_up(connection)
         purge(connection, tmp_path, 20)
         assert connection.execute("SELECT count(*) FROM state").fetchone() == (20,)
-        found = connection.execute("SELECT sum(rows) FROM all_rollup GROUP BY signal_id").fetchall()
+        found = connection.execute("SELECT sum(row_count) FROM chunk GROUP BY signal_id").fetchall()
     assert set(found) == {(50,)}

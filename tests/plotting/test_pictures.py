@@ -309,7 +309,7 @@ def test_matplotlib_waits_for_the_first_picture(module: str) -> None:
 # Long and short recordings ------------------------------------------------------------------------
 
 
-def test_a_recording_too_long_to_be_read_is_drawn_from_its_rollups(record: Record) -> None:
+def test_a_recording_too_long_to_be_read_is_drawn_from_its_chunks(record: Record) -> None:
     connection = record(lambda t: {"v": 3.0 if t == 160 else 12.0, "x": t, "y": 0.0}, 31_000)
     assert make_chunks(connection, 100_000).done
     axes, _ = compose_signals(connection, [whole(connection)], ["v", "x"])

@@ -1,4 +1,4 @@
-"""A rover that drives the same round of 120 s again and again: long enough for coarse rollups."""
+"""A rover that drives the same round of 120 s again and again: long enough for many chunks."""
 
 from __future__ import annotations
 

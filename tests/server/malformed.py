@@ -23,7 +23,7 @@ from PIL import Image
 
 from tests.recordings.rows import Recorded, RecordedRobot, insert
 from webots_mcp.server import create_server
-from webots_mcp.store.chunks.making import chunk_whole_run
+from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
 from webots_mcp.store.retention.limits import set_limits
 from webots_mcp.store.retention.policy import Limit
 
@@ -119,6 +119,7 @@ def record(file: Path) -> None:
             robot.end_run(reason)
             robot.begin_run(reason)
     _add_trials(recorded.connection, robot)
+    make_chunks(recorded.connection)
     for run_id in (1, 2):
         assert chunk_whole_run(recorded.connection, run_id)
     recorded.connection.execute("INSERT INTO lease VALUES ('maintenance', 'x', 1.0)")

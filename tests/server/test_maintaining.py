@@ -22,11 +22,11 @@ async def test_a_server_that_may_write_maintains_the_database(
     connect: Connect, recorded: Recorded
 ) -> None:
     robot = recorded.robot()
-    for i in range(10):
+    for i in range(1024):
         robot.state(i * 1.0, {"x": float(i)})
     async with connect():
         with anyio.fail_after(60):
-            while not recorded.connection.execute("SELECT 1 FROM all_rollup").fetchone():
+            while not recorded.connection.execute("SELECT 1 FROM chunk").fetchone():
                 await anyio.sleep(0.02)
         holder = recorded.connection.execute("SELECT holder FROM lease").fetchone()[0]
         assert holder.startswith("server ")
@@ -47,7 +47,7 @@ async def test_sql_sees_how_a_killed_controllers_run_ended(
 
 async def test_the_server_keeps_as_much_as_it_was_told(file: Path, recorded: Recorded) -> None:
     robot = recorded.robot()
-    for i in range(10):
+    for i in range(1024):
         robot.state(i * 1.0, {"x": float(i)})
     limits = {"state": Limit(rows=4)}
     async with Client(create_server(file, file.parent, limits=limits)):

@@ -27,10 +27,10 @@ from webots_mcp.store.merging import merge, settled
 from webots_mcp.store.trials import Result, create_trial_set, finish_trial, trials_of
 
 OF_RUN = ("state", "kept_stretch", "kept_state", "log", "event", "image", "parameter_value")
-# What a row is called, and where it stands, in each recording; and how far its rollups are.
+# What a row is called, and where it stands, in each recording; and whether it is in chunks.
 LOCAL = {
     "id", "run_id", "session_id", "robot_id", "command_id", "trial_set_id", "path",
-    "rolled_state_id", "coarse_end", "idempotency_key",
+    "is_chunked", "idempotency_key",
 }  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from webots_mcp.contract import new_uuid
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.schema import create_schema
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
 from webots_mcp.store.merging import merge
 from webots_mcp.store.trials import (
     Result,
@@ -99,18 +99,18 @@ def test_all_of_a_recording_comes_in_and_comes_in_once(
         assert (tmp_path / "here" / path).read_bytes() == b"picture"
 
 
-def test_its_rows_are_rolled_up_here(
+def test_its_rows_are_put_into_chunks_here(
     target: sqlite3.Connection, source: Path, tmp_path: Path
 ) -> None:
     assert make_chunks(target, 100_000).done
     merge(target, tmp_path / "here", source)
 
-    assert make_chunks(target, 100_000).done
-    rolled = (
-        "SELECT sum(a.rows) FROM all_rollup a JOIN signal s ON s.id = a.signal_id "
-        "WHERE s.name = 'x' AND a.run_id = 2"
+    assert chunk_whole_run(target, 2)
+    in_chunks = (
+        "SELECT sum(c.row_count) FROM chunk c JOIN signal s ON s.id = c.signal_id "
+        "WHERE s.name = 'x' AND c.run_id = 2"
     )
-    assert target.execute(rolled).fetchone() == (10,)
+    assert target.execute(in_chunks).fetchone() == (10,)
 
 
 def test_what_broke_off_is_not_there_at_all(

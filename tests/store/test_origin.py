@@ -42,7 +42,7 @@ HOSTILE = {
     ),
     "table 'watermark'": (
         "DROP TABLE watermark",
-        "CREATE TABLE watermark (name TEXT NOT NULL /* rollup */, state_id INTEGER AS "
+        "CREATE TABLE watermark (name TEXT NOT NULL /* chunk */, state_id INTEGER AS "
         "(length(hex(zeroblob(1000000000)))), PRIMARY KEY (name))",
     ),
     "table 'recording'": (

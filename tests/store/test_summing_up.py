@@ -16,7 +16,7 @@ from webots_mcp.connection import connect
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.summing_up import LEAST_ROWS, sum_up
 
-ROWS = 3 * LEAST_ROWS
+ROWS = 4 * LEAST_ROWS
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +75,7 @@ def test_what_is_called_off_or_interrupted_goes_on_with_the_next_question(
 
     with pytest.raises(KeyboardInterrupt):
         sum_up(recording, interrupt)
-    assert first < in_chunks(recording) < ROWS
+    assert first < in_chunks(recording)
     assert sum_up(recording) == ""
     assert in_chunks(recording) == ROWS
 

@@ -14,7 +14,7 @@ import pytest
 from tests.memory import memory_connection
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp.naming import USUAL_POSITIONS, find_position, flatten, metres_in
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunks.making import chunk_whole_run
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.reading.subject import Subject
@@ -37,7 +37,7 @@ POSES: list[tuple[dict[str, Any], tuple[Any, ...]]] = [
 ]
 VIEWS = {
     "robot_now", "robot_trajectory", "robot_run", "robot_command", "robot_event", "robot_log",
-    "robot_period", "robot_statistics", "all_rollup", "robot_parameter", "all_state", "robot_kept",
+    "robot_period", "robot_statistics", "robot_parameter", "all_state", "robot_kept",
 }  # fmt: skip
 
 
@@ -58,7 +58,7 @@ def test_the_usual_ways_to_publish_a_pose_are_understood(
     recorder: Recorder, state: dict[str, Any], flat: tuple[Any, ...]
 ) -> None:
     recorder.publish(1.0, state)
-    make_chunks(recorder.connection)
+    assert chunk_whole_run(recorder.connection, 1)
     for view in ("robot_trajectory", "robot_now"):
         assert rows(recorder.connection, f"SELECT x_m, y_m, yaw_rad, mode FROM {view}") == [flat]
 
@@ -201,7 +201,8 @@ def test_the_views_and_the_tools_take_the_same_signals_for_the_same_roles() -> N
     with memory_connection() as connection:
         record_robots(connection, states)
         early = [seen_by_tools(connection, n + 1, state) for n, state in enumerate(states)]
-        assert make_chunks(connection, 10_000).done
+        for run_id in range(1, len(states) + 1):
+            assert chunk_whole_run(connection, run_id)
         for number, state in enumerate(states, start=1):
             wanted = seen_by_tools(connection, number, state)
             assert wanted == early[number - 1], state
@@ -236,7 +237,7 @@ def test_what_takes_a_role_in_one_run_leaves_the_others_theirs(recorder: Recorde
         {"pose": {"x": None, "y": None}, "pos": {"x": 5, "y": 6}, "mode": None, "state": "both"},
     )):  # fmt: skip
         recorder.publish(float(start_s), state)
-    make_chunks(recorder.connection)
+    assert chunk_whole_run(recorder.connection, 1)
     sql = "SELECT x_m, y_m, yaw_rad, mode FROM robot_trajectory"
     assert rows(recorder.connection, sql) == [
         (1, 2, None, "old"),
@@ -251,7 +252,7 @@ def test_a_row_whose_data_is_no_json_object_is_shown_without_values(
 ) -> None:
     recorder.publish(0.0, {"pose": [1, 2, 3]})
     recorder.insert("state", **recorder.at(1.0), data=data)
-    make_chunks(recorder.connection)
+    assert chunk_whole_run(recorder.connection, 1)
     recorder.insert("event", **recorder.at(1.0), kind="change", name="mode", data=data)
     connection = recorder.connection
     flat = "SELECT sim_time_s, x_m, mode FROM"

@@ -229,7 +229,7 @@ def _lines(question: Question, rows: int, taken: dict[str, Samples]) -> Iterable
 
 
 def _stuck(db: sqlite3.Connection, rows: int) -> Iterable[Line]:
-    """Of a long run the rollups tell where to look: nothing may be missed."""
+    """Of a long run the statistics of chunks tell where to look: nothing may be missed."""
     expected = max(0, math.ceil((end_s(rows) - 46) / CYCLE_S))  # each ends 46 s into its cycle
     stuck = find_events(db, find_range(db, Scope()), EventOptions(kinds=("stuck",)))
     found = stuck.totals.get("stuck", 0)

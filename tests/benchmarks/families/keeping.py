@@ -33,7 +33,7 @@ _SIZES: Final = (
     "SELECT name, sum(pgsize) FROM dbstat WHERE name NOT IN ('log', 'ix_log_run_id_sim_time_s') "
     "GROUP BY name"
 )
-_ROLLED: Final = ("rollup", "recent_rollup", "change")
+_CHUNKS: Final = ("chunk", "ix_chunk_statistics", "ix_chunk_group_id", "row_group")
 _TIME_INDEX: Final = "ix_state_run_id_sim_time_s"
 _READ: Final = "SELECT run_id, id, sim_time_s, wall_time_s, data FROM state"
 _INSERT_LINE: Final = (
@@ -177,8 +177,8 @@ def _disk(sizes: dict[str, int] | None, rows: int) -> Iterable[Line]:
     total = sum(sizes.values())
     ours = f"{total / rows:,.0f} bytes a row"
     yield Line(f"disk, {rows:,} rows", ours, beside, total / raw, target=Target(1.05))
-    rolled = sum(sizes[name] for name in _ROLLED)
-    for what, part in (("rollups and changes", rolled), ("time index", sizes[_TIME_INDEX])):
+    chunks = sum(sizes[name] for name in _CHUNKS)
+    for what, part in (("chunks", chunks), ("time index", sizes[_TIME_INDEX])):
         yield Line(f"of it {what}", f"{part / rows:.1f} bytes a row", "", 100 * part / total, "%")
 
 

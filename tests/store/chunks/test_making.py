@@ -89,7 +89,9 @@ def test_a_short_end_is_chunked_before_its_rows_go_and_answers_stay(
     before = contents(empty)
     assert chunk_whole_run(empty, 1)
     empty.execute("DELETE FROM state")
-    empty.execute("UPDATE run SET purged_rows = rows, last_sim_time_s = ?", (before["times"][-1],))
+    empty.execute(
+        "UPDATE run SET purged_rows = row_count, last_sim_time_s = ?", (before["times"][-1],)
+    )
     frame = read_frame(empty, making_segment(before["times"]), Deadline(60))
     assert frame.values("x") == before["x"]
     assert frame.values("mode") == before["mode"]

@@ -44,7 +44,7 @@ def test_what_went_on_smoothly_during_a_gap_did_not_jump(
     assert jumps(empty) == []
 
 
-def test_a_jump_at_the_border_of_two_rollups_is_found(
+def test_a_jump_at_the_border_of_two_chunks_is_found(
     empty: sqlite3.Connection, looked_at: str
 ) -> None:
     record(empty, lambda t: {"temp_c": 20 + 0.01 * t + (50 if t >= 100 else 0)})

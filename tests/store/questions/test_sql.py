@@ -35,7 +35,7 @@ def test_a_select_answers_with_columns_and_rows(rover: sqlite3.Connection) -> No
         "-- a comment\n /* and another */ SELECT 1",
         "VALUES (1), (2)",
         "EXPLAIN QUERY PLAN SELECT * FROM state WHERE run_id = 1 AND sim_time_s > 5",
-        "SELECT avg(sum / present) OVER (ORDER BY bucket) FROM rollup WHERE run_id = 1",
+        "SELECT avg(mean) OVER (ORDER BY start_s) FROM robot_statistics WHERE run_id = 1",
         "SELECT 1;",
     ],
 )

@@ -16,7 +16,6 @@ from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.logs import window_of
 from webots_mcp.store.questions.events import find_events
-from webots_mcp.store.questions.series import query_history
 from webots_mcp.store.questions.timeline import timeline
 from webots_mcp.store.reading.moments import moment_of, shown_time
 from webots_mcp.store.reading.pages import query_rows
@@ -122,16 +121,3 @@ def test_a_range_that_begins_with_the_first_row_is_within_the_recording(
 ) -> None:
     assert find_range(clock, Scope(start_s=0.0)).notes == ()
     assert "begins at 0 s" in find_range(clock, Scope(start_s=-0.001)).notes[0]
-
-
-@pytest.mark.parametrize(("first", "last"), [(0, 1), (1, 2), (0, 2)])
-def test_summaries_of_whole_buckets_hold_the_rows_that_are_shown_in_them(
-    clock: sqlite3.Connection, first: int, last: int
-) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        whole = find_range(clock, Scope(start_s=10.0 * first, end_s=10.0 * last))
-        from_rows = query_history(clock, whole, ["row"], max_points=1)
-        patch.setattr("webots_mcp.store.reading.rows.RAW_ROWS", 100)
-        from_rollups = query_history(clock, whole, ["row"], max_points=1)
-    expected = len(rows_of(clock, start_s=10.0 * first, end_s=10.0 * last))
-    assert from_rows.runs[0].rows == from_rollups.runs[0].rows == expected

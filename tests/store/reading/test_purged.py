@@ -1,4 +1,4 @@
-"""What is said of a run whose first rows, or all of them, were purged: its rollups stay."""
+"""What is said of a run whose first rows, or all of them, were purged: its chunks stay."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def keep_rows(connection: sqlite3.Connection, folder: Path, rows: int) -> None:
 
 @pytest.fixture
 def rover(_recorded: dict[str, sqlite3.Connection]) -> Iterator[sqlite3.Connection]:
-    with memory_connection(_recorded["rolled"]) as connection:
+    with memory_connection(_recorded["chunked"]) as connection:
         yield connection
 
 
@@ -114,7 +114,7 @@ def test_wall_time_reaches_into_what_was_purged(rover: sqlite3.Connection, tmp_p
     assert run.sim_time_s[0] <= 30.0
 
 
-def test_a_run_of_which_only_rollups_are_left_is_found_by_wall_time(
+def test_a_run_of_which_only_chunks_are_left_is_found_by_wall_time(
     rover: sqlite3.Connection, tmp_path: Path
 ) -> None:
     keep_rows(rover, tmp_path, 900)

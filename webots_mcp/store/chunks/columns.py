@@ -50,7 +50,7 @@ class StateColumns:
         self.wall_times += walls
         self.texts += texts
         columns = _transposed([flatten(parse(text)) for text in texts])
-        for name in columns.keys() - self.values.keys():
+        for name in [name for name in columns if name not in self.values]:
             self.values[name] = [ABSENT] * before
         for name, values in self.values.items():
             values += columns.get(name) or [ABSENT] * len(rows)

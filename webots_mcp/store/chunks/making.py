@@ -204,6 +204,8 @@ class _RunChunks:
             if tail is None or not len(tail):
                 self.done = True
                 if has_ended:
+                    left = self._tail(at, last_id)  # few, read as they are, whose names are entered
+                    _signal_ids(self._connection, self._robot_id, self._run_id, left)
                     self._connection.execute(_SET_CHUNKED, (self._run_id,))
                 return rows
             if not self._store(tail, at):

@@ -244,25 +244,24 @@ def list_signals(
 
 def _info(frame: Frame, signal: Signal) -> SignalInfo:
     zones = frame.zones(signal.name)
-    held = np.flatnonzero(zones.value_count)
+    counts, is_usable = zones.value_count, bool(zones.value_count.any())
+    if not is_usable and signal.is_number:  # all beyond 1e100, or null
+        counts = np.add.reduceat(~np.isnan(frame.numbers(signal.name)), zones.first_row, dtype=int)
+    held = np.flatnonzero(counts)
     first, last = (_bound(frame, signal.name, held, at) for at in (0, -1))
     (newest,) = frame.rows(len(frame) - 1, len(frame)).values(signal.name)
-    extremes = (zones.min[held], zones.max[held]) if signal.kind != "text" else ((), ())
-    least, greatest = (
-        float(reduce(each)) if len(each) and not np.isnan(each).all() else None
-        for reduce, each in zip((np.nanmin, np.nanmax), extremes, strict=True)
-    )
+    has_numbers = signal.kind != "text" and not np.isnan(zones.sum).all()
     return SignalInfo(
         name=signal.name,
         kind=signal.kind,
         unit=signal.unit,
         rows=int(zones.held_count.sum()),
-        missing=len(frame) - int(zones.value_count.sum()),
+        missing=len(frame) - int(counts.sum()),
         first_s=first,
         last_s=last,
         last=cleaned(signal, [newest])[0],
-        min=least,
-        max=greatest,
+        min=float(np.nanmin(zones.min)) if has_numbers else None,
+        max=float(np.nanmax(zones.max)) if has_numbers else None,
     )
 
 

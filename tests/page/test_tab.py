@@ -15,12 +15,12 @@ from tests.recordings.long import build
 from tests.recordings.rover import start_run
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.plugins.page.summing import Summing
+from webots_mcp.plugins.page.chunk_maker import ChunkMaker
 from webots_mcp.plugins.page.tab import Tab
 from webots_mcp.schema import create_schema
+from webots_mcp.store.chunks.on_demand import LEAST_ROWS
 from webots_mcp.store.chunks.stored import watermark
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.summing_up import LEAST_ROWS
 
 
 def record(folder: Path, robot: str, state: dict[str, Any]) -> None:
@@ -75,18 +75,18 @@ def test_what_no_bridge_writes_is_said_on_the_page_and_logged_once(
 def test_what_no_server_rolls_up_is_rolled_up_beside_the_page(tmp_path: Path) -> None:
     build(tmp_path / DATABASE_NAME, 2 * LEAST_ROWS, rolled=False)
     recording = Recording(tmp_path / DATABASE_NAME, tmp_path, read_only=True)
-    summing = Summing(recording)
-    summing.start()
-    while not summing.rounds:
-        assert summing.is_alive()
+    chunk_maker = ChunkMaker(recording)
+    chunk_maker.start()
+    while not chunk_maker.rounds:
+        assert chunk_maker.is_alive()
         threading.Event().wait(0.01)
-    summing.stop()
-    assert summing.says == ""
+    chunk_maker.stop()
+    assert chunk_maker.says == ""
     with recording.reader() as connection:
         assert watermark(connection) == 2 * LEAST_ROWS
 
 
 def test_of_a_page_without_a_recording_nothing_is_rolled_up(tmp_path: Path) -> None:
-    summing = Summing(Recording(tmp_path / DATABASE_NAME, tmp_path, read_only=True))
-    summing.look()
-    assert (summing.rounds, summing.says) == (0, "")
+    chunk_maker = ChunkMaker(Recording(tmp_path / DATABASE_NAME, tmp_path, read_only=True))
+    chunk_maker.look()
+    assert (chunk_maker.rounds, chunk_maker.says) == (0, "")

@@ -18,7 +18,7 @@ import anyio
 from pydantic import ValidationError
 from pydantic.json_schema import SkipJsonSchema
 
-from webots_mcp.cli.recordings import Json, Range, Where, sum_up_first
+from webots_mcp.cli.recordings import Json, Range, Where, make_chunks_first
 from webots_mcp.cli.rendering import print_answer, text_of
 from webots_mcp.cli.terminal import line_of_progress, show_progress, wait
 from webots_mcp.cli.values import Parameter, refuse_options, settings_of, value_of, whole_number
@@ -163,7 +163,7 @@ def ask(question: Question, given: Mapping[str, Any], where: Where) -> Reply:
     recording = where.recording(read_only=question.effect.reads and not asks_controllers)
     valid = _valid(question, given, recording)
     if not _OF_SIGNALS.isdisjoint(each.name for each in question.parameters):
-        sum_up_first(recording)
+        make_chunks_first(recording)
     with line_of_progress(), _caller(question, recording) as caller:
         return anyio.run(question.ask, recording, valid, caller)
 

@@ -16,9 +16,9 @@ from webots_mcp.cli.recordings import (
     Range,
     Robot,
     Where,
+    make_chunks_first,
     only_reading,
     past_wrong_values,
-    sum_up_first,
 )
 from webots_mcp.cli.rendering import print_json, print_notes, printable
 from webots_mcp.cli.terminal import wait
@@ -123,7 +123,7 @@ def plot(
     def draw() -> None:
         from webots_mcp import plotting
 
-        sum_up_first(recorded.recording())
+        make_chunks_first(recorded.recording())
         with recorded.reader() as connection:
             picture = plotting.plot(
                 connection,

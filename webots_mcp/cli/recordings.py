@@ -23,7 +23,7 @@ _Given = ParamSpec("_Given")
 # Not owed to a value in a row: reading past invalid rows would not help.
 _OF_NO_VALUE: Final = (WebotsMCPError, OSError, ImportError)
 
-_SUM_UP_S: Final = 300.0  # a million rows of 40 values take 100 s
+_MAKING_CHUNKS_S: Final = 300.0  # a million rows of 40 values take 100 s
 Json: TypeAlias = Annotated[bool, Parameter("--json", negative=(), help="Print JSON.")]
 Robot: TypeAlias = Annotated[
     str | None, Parameter("--robot", metavar="NAME", help="Only this robot.")
@@ -196,12 +196,12 @@ def past_invalid_rows(run: Callable[[], None]) -> None:
         print(f"webots-mcp: left out: {said}", file=sys.stderr)
 
 
-def sum_up_first(recording: Recording) -> None:
-    """Roll up what no server has rolled up, so that a question of any length is answered."""
+def make_chunks_first(recording: Recording) -> None:
+    """Put into chunks what no server has, so that a question of any length is answered."""
     from webots_mcp.cli.terminal import shown_progress
-    from webots_mcp.store.summing_up import sum_up
+    from webots_mcp.store.chunks.on_demand import make_missing_chunks
 
-    with shown_progress("summing up what was recorded") as progress:
-        left = sum_up(recording, progress, limit_s=_SUM_UP_S)
+    with shown_progress("making chunks of what was recorded") as progress:
+        left = make_missing_chunks(recording, progress, limit_s=_MAKING_CHUNKS_S)
     if left:
         print(f"webots-mcp: {left}", file=sys.stderr)

@@ -27,7 +27,7 @@ from tornado.web import Application as WebApplication
 from tornado.web import OutputTransform, RequestHandler
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plugins.page.summing import Summing
+from webots_mcp.plugins.page.chunk_maker import ChunkMaker
 from webots_mcp.plugins.page.tab import open_tab
 from webots_mcp.store.recording import Recording
 
@@ -93,7 +93,7 @@ class PageServer:
     server: BaseServer
     port: int
     token: str
-    summing: Summing
+    chunk_maker: ChunkMaker
 
     @property
     def url(self) -> str:
@@ -103,14 +103,14 @@ class PageServer:
     def run(self, ready: Callable[[str], object]) -> None:
         """Serve, and tell `ready` the address as soon as a browser may ask."""
         self.server.start()
-        self.summing.start()
+        self.chunk_maker.start()
         loop: Any = self.server.io_loop
         loop.add_callback(ready, self.url)
         try:
             loop.start()
         finally:
             self.server.stop(wait=False)
-            self.summing.stop()
+            self.chunk_maker.stop()
 
 
 def create_page_server(recording: Recording, port: int, *, read_only: bool = False) -> PageServer:
@@ -133,8 +133,8 @@ def create_page_server(recording: Recording, port: int, *, read_only: bool = Fal
             f"port {port} of {HOST} cannot be listened on: {error}; choose another by --port, or 0 "
             "for any that is free"
         ) from error
-    summing = Summing(recording)
-    application = Application(FunctionHandler(partial(open_tab, recording, read_only, summing)))
+    chunk_maker = ChunkMaker(recording)
+    application = Application(FunctionHandler(partial(open_tab, recording, read_only, chunk_maker)))
     port = int(listening.getsockname()[1])
     origins = [f"{name}:{port}" for name in _NAMES]
     token = secrets.token_urlsafe(18)
@@ -148,7 +148,7 @@ def create_page_server(recording: Recording, port: int, *, read_only: bool = Fal
     )
     http = HTTPServer(_router(token, pages))
     http.add_sockets([listening])
-    return PageServer(BaseServer(IOLoop.current(), pages, http), port, token, summing)
+    return PageServer(BaseServer(IOLoop.current(), pages, http), port, token, chunk_maker)
 
 
 def _router(token: str, pages: BokehTornado) -> RuleRouter:

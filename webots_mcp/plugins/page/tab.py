@@ -26,6 +26,7 @@ from webots_mcp.errors import (
 )
 from webots_mcp.parameter import Value
 from webots_mcp.plugins.page.choice import Choice
+from webots_mcp.plugins.page.chunk_maker import ChunkMaker
 from webots_mcp.plugins.page.controls import (
     NEWEST,
     NONE,
@@ -53,7 +54,6 @@ from webots_mcp.plugins.page.style import (
     page_sheet,
     sheet,
 )
-from webots_mcp.plugins.page.summing import Summing
 from webots_mcp.plugins.page.tab_data import (
     Drawing,
     Look,
@@ -83,10 +83,12 @@ _FIGURES_PX: Final = _HEIGHT_PX - 280  # of it for the signals
 _EMPTY: Final = "Nothing to draw yet: the figures appear with the first rows of a run."
 
 
-def open_tab(recording: Recording, read_only: bool, summing: Summing, document: Document) -> None:
+def open_tab(
+    recording: Recording, read_only: bool, chunk_maker: ChunkMaker, document: Document
+) -> None:
     """Make a document show a recording."""
     document.title = "webots-mcp"
-    tab = Tab(recording, document, read_only=read_only, summing=summing)
+    tab = Tab(recording, document, read_only=read_only, chunk_maker=chunk_maker)
     document.add_root(tab.layout)
     go_on: Any = tab.go_on
     document.add_periodic_callback(go_on, _PERIOD_MS)
@@ -99,7 +101,7 @@ class Tab:
         recording: What is shown.
         document: Where it is shown.
         read_only: Without buttons, and without inputs for parameters.
-        summing: What rolls up beside it, if anything does.
+        chunk_maker: What makes chunks meanwhile, if anything does.
     """
 
     def __init__(
@@ -108,12 +110,12 @@ class Tab:
         document: Document,
         *,
         read_only: bool,
-        summing: Summing | None = None,
+        chunk_maker: ChunkMaker | None = None,
     ) -> None:
         self._recording = recording
         self._steered = replace(recording, read_only=False)
         self._document = document
-        self._summing = summing or Summing(recording)
+        self._chunk_maker = chunk_maker or ChunkMaker(recording)
         self._rounds = 0  # of its, when the figures were drawn
         self._read_only = read_only
         self._choice = Choice(window_s=60.0)
@@ -185,7 +187,7 @@ class Tab:
         wanted = (shown.key, self._choice)
         self._look_at_cut()
         if wanted != self._drawn or (self._has_grown and time.monotonic() >= self._next_drawing_s):
-            self._rounds = self._summing.rounds
+            self._rounds = self._chunk_maker.rounds
             drawing = await to_thread.run_sync(gather, self._recording, shown, self._choice)
             is_other, self._drawn = wanted != self._drawn, wanted
             self._show(drawing, is_other=is_other)
@@ -195,14 +197,14 @@ class Tab:
             self._has_grown = (shown.header["sim_time_s"] or 0.0) > self._until_s
 
     def _look_at_cut(self) -> None:
-        """What could not be read in time is read again, at once where it was rolled up since."""
+        """What could not be read in time is read again, at once where chunks were made since."""
         drawing = self._drawing
         if drawing is None or not drawing.is_cut:
             return
         self._has_grown = True
-        if self._rounds != self._summing.rounds:
+        if self._rounds != self._chunk_maker.rounds:
             self._next_drawing_s = 0.0
-        said = [self._summing.says] if self._summing.says else []
+        said = [self._chunk_maker.says] if self._chunk_maker.says else []
         _say(self._notes, notes_markup([*said, *drawing.notes]))
 
     def _show(self, drawing: Drawing, *, is_other: bool) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from webots_mcp.cli.recordings import HERE, Json, Robot, Where, only_reading, sum_up_first
+from webots_mcp.cli.recordings import HERE, Json, Robot, Where, make_chunks_first, only_reading
 from webots_mcp.cli.rendering import print_json, print_notes, printable
 from webots_mcp.cli.terminal import shown_progress
 from webots_mcp.cli.values import Id, Parameter
@@ -60,7 +60,7 @@ def report(
     from webots_mcp.store.reading.subject import find_subject
 
     recording = recorded.recording()
-    sum_up_first(recording)
+    make_chunks_first(recording)
     with recorded.reader() as connection, shown_progress("reporting") as progress:
         chosen = run_ids or [find_subject(connection, robot).run_id]
         file = output or Path(file_name(chosen))

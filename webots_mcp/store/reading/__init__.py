@@ -1,1 +1,1 @@
-"""Ranges resolved once, and what was recorded in them: rows, rollups, changes and gaps."""
+"""Ranges resolved once, and what was recorded in them: frames of rows, changes and gaps."""

@@ -32,7 +32,7 @@ _LEFT: Final = (  # ids are given without gaps, but for rows that were deleted
 )
 
 
-def sum_up(
+def make_missing_chunks(
     recording: Recording,
     progress: Callable[[int, int], object] | None = None,
     *,

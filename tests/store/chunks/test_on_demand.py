@@ -13,8 +13,8 @@ import pytest
 from tests.recordings.long import build
 from webots_mcp.cli import main
 from webots_mcp.connection import connect
+from webots_mcp.store.chunks.on_demand import LEAST_ROWS, make_missing_chunks
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.summing_up import LEAST_ROWS, sum_up
 
 ROWS = 4 * LEAST_ROWS
 
@@ -45,7 +45,7 @@ def hold_lease(recording: Recording, holder: str) -> None:
 
 def test_all_rows_are_put_into_chunks_and_counted_on_the_way(recording: Recording) -> None:
     told: list[tuple[int, int]] = []
-    assert sum_up(recording, lambda done, of: told.append((done, of))) == ""
+    assert make_missing_chunks(recording, lambda done, of: told.append((done, of))) == ""
     assert in_chunks(recording) == ROWS
     assert told == sorted(told)
     assert told[-1] == (ROWS, ROWS)
@@ -53,20 +53,22 @@ def test_all_rows_are_put_into_chunks_and_counted_on_the_way(recording: Recordin
 
 def test_a_server_that_maintains_it_is_left_to_it(recording: Recording) -> None:
     hold_lease(recording, "server")
-    assert sum_up(recording).startswith(f"the newest {ROWS} rows are in no chunk yet: the serv")
+    assert make_missing_chunks(recording).startswith(
+        f"the newest {ROWS} rows are in no chunk yet: the serv"
+    )
     assert in_chunks(recording) == 0
 
 
 def test_beside_a_bridge_it_is_done_because_a_bridge_does_not(recording: Recording) -> None:
     hold_lease(recording, "bridge")
-    assert sum_up(recording) == ""
+    assert make_missing_chunks(recording) == ""
     assert in_chunks(recording) == ROWS
 
 
 def test_what_is_called_off_or_interrupted_goes_on_with_the_next_question(
     recording: Recording,
 ) -> None:
-    assert "ask again" in sum_up(recording, called_off=lambda: True)
+    assert "ask again" in make_missing_chunks(recording, called_off=lambda: True)
     first = in_chunks(recording)
     assert LEAST_ROWS <= first < ROWS
 
@@ -74,16 +76,16 @@ def test_what_is_called_off_or_interrupted_goes_on_with_the_next_question(
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        sum_up(recording, interrupt)
+        make_missing_chunks(recording, interrupt)
     assert first < in_chunks(recording)
-    assert sum_up(recording) == ""
+    assert make_missing_chunks(recording) == ""
     assert in_chunks(recording) == ROWS
 
 
 def test_a_database_that_another_holds_locked_is_read_as_it_is(recording: Recording) -> None:
     with closing(connect(recording.database, "writer")) as other:
         other.execute("BEGIN IMMEDIATE")
-        assert "stayed locked by another process" in sum_up(recording)
+        assert "stayed locked by another process" in make_missing_chunks(recording)
     assert in_chunks(recording) == 0
 
 

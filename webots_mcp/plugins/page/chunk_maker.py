@@ -1,4 +1,4 @@
-"""Rolling up while the page is served, where no server does: what is long is drawn whole then."""
+"""Making chunks while the page is served, where no server does: what is long is drawn whole."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import threading
 from typing import Final
 
 from webots_mcp.errors import WebotsMCPError
+from webots_mcp.store.chunks.on_demand import make_missing_chunks
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.summing_up import sum_up
 
 _PERIOD_S: Final = 1.0
 
 
-class Summing(threading.Thread):
-    """Looks once a second whether there is something to roll up.
+class ChunkMaker(threading.Thread):
+    """Looks once a second whether there is something to put into chunks.
 
     Attributes:
         says: How far it has come, or why it does not go on; "" where nothing is left.
-        rounds: How often it rolled up all that there was.
+        rounds: How often it put all that there was into chunks.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -34,16 +34,16 @@ class Summing(threading.Thread):
             self._ending.wait(_PERIOD_S)
 
     def look(self) -> None:
-        """Roll up what there is."""
+        """Put what there is into chunks."""
         worked = False
 
         def note(done: int, of: int) -> None:
             nonlocal worked
             worked = True
-            self.says = f"summing up what was recorded: {100 * done // max(of, 1)} %"
+            self.says = f"making chunks of what was recorded: {100 * done // max(of, 1)} %"
 
         try:
-            self.says = sum_up(self._recording, note, called_off=self._ending.is_set)
+            self.says = make_missing_chunks(self._recording, note, called_off=self._ending.is_set)
         except WebotsMCPError:  # the tabs say what it is
             self.says = ""
         self.rounds += worked

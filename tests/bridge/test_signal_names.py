@@ -34,9 +34,7 @@ def test_a_recording_that_no_server_has_opened_shows_how_the_robot_moves(
     assert dict(filed.rows(ROLES))["motors.left"] == "wheel"
     units = filed.rows("SELECT kind, unit, path FROM signal WHERE name = 'gps_mm.0'")
     assert units == [("num", "mm", "$.gps_mm[0]")]
-    assert filed.rows("SELECT rows, min, max FROM signal WHERE name = 'velocity'") == [
-        (0, None, None)
-    ]
+    assert filed.rows("SELECT min, max FROM signal WHERE name = 'velocity'") == [(None, None)]
 
 
 def test_a_better_name_takes_the_role_when_it_comes(

@@ -111,7 +111,7 @@ def test_compare_says_how_runs_ended_with_which_code_and_what_only_some_of_them_
 
 def test_json_names_the_fields_of_what_it_has(say: Say) -> None:
     run = json.loads(say("trends", "pose.0", "--run", "3", "--json"))["runs"][0]
-    assert (run["rows"], run["numbers"]["columns"][0]) == (600, "signal")
+    assert (run["row_count"], run["numbers"]["columns"][0]) == (600, "signal")
     measures = json.loads(say("compare", "1", "3", "--json"))["measures"]
     assert measures["columns"][:2] == ["name", "median"]
 

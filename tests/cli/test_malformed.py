@@ -18,7 +18,7 @@ DAMAGES = (
     Damage("session", "actions", "nonsense"),
     Damage("log", "wall_time_s", b"\x00"),
     Damage("state", "replaced", "[1]"),
-    Damage("run", "rows", "many"),
+    Damage("run", "row_count", "many"),
 )
 ASKED = (
     ("status",), ("status", "--json"), ("runs",), ("events",), ("trends",), ("history", "pose.0"),

@@ -316,7 +316,7 @@ def test_a_recording_too_long_to_be_read_is_drawn_from_its_chunks(record: Record
     (curve,) = [c for panel in axes.panels for c in panel.curves if c.name == "v"]
     assert min(point[2] for point in curve.points) == curve.low == 3.0
     picture = plot(connection, "trajectory")
-    assert picture.notes == ("run 1: one position every 10 s (too many rows to draw each)",)
+    assert picture.notes == ("run 1: one position every 0.2 s (too many rows to draw each)",)
 
 
 @pytest.mark.parametrize("rows", [1, 2])

@@ -129,11 +129,11 @@ async def test_watching_reports_what_was_recorded_meanwhile(
         arguments = {"duration_wall_s": 2}
         watch = client.call_tool("webots_monitor", arguments, progress_callback=on_progress)
         answer |= json.loads(text_of(await watch))
-    assert answer["rows"] > 10
+    assert answer["row_count"] > 10
     assert answer["movement"]["position"] == ["pose.0", "pose.1"]
     assert answer["movement"]["distance_m"] > 0
     (trend,) = answer["trends"]
-    assert trend["rows"] == answer["rows"]
+    assert trend["row_count"] == answer["row_count"]
     assert {row[0] for row in trend["numbers"]["rows"]} == {"pose.0", "steps"}
     columns, rows = answer["events"]["columns"], answer["events"]["rows"]
     events = [dict(zip(columns, row, strict=True)) for row in rows]
@@ -162,7 +162,7 @@ async def test_watching_a_paused_robot_says_that_nothing_was_recorded_and_why(
     async with connect() as client:
         await control(client, "pause")
         answer = await ask(client, "webots_monitor", duration_wall_s=1)
-        assert answer["rows"] == 0
+        assert answer["row_count"] == 0
         assert "paused" in answer["hint"]
         assert driver.is_alive()
 

@@ -35,7 +35,7 @@ async def test_a_way_there_and_back_has_a_distance_and_no_displacement(
         answer = await ask(client, "webots_monitor", lookback_wall_s=60)
     assert answer["movement"]["distance_m"] == 10.0
     assert answer["movement"]["displacement_m"] == 0.0
-    assert answer["rows"] == 3
+    assert answer["row_count"] == 3
 
 
 async def test_a_way_in_metres_that_no_robot_drives_is_doubted(
@@ -76,7 +76,7 @@ async def test_a_robot_without_a_position_has_no_movement(
     async with connect() as client:
         answer = await ask(client, "webots_monitor", lookback_wall_s=60)
     assert "movement" not in answer
-    assert answer["rows"] == 2
+    assert answer["row_count"] == 2
 
 
 async def test_rows_before_the_window_do_not_count_even_at_the_same_simulation_time(
@@ -88,7 +88,7 @@ async def test_rows_before_the_window_do_not_count_even_at_the_same_simulation_t
         answer = await ask(client, "webots_monitor", lookback_wall_s=3)
     (trend,) = answer["trends"]
     (count,) = rows_of(trend["numbers"])
-    assert answer["rows"] == 4
+    assert answer["row_count"] == 4
     assert count["last"] == 9 and "from 6 to 9" in count["says"]
 
 
@@ -169,6 +169,6 @@ async def test_a_robot_that_ended_is_not_waited_for_and_nothing_is_absent(
     recorded.connection.execute("UPDATE session SET ended_wall_time_s = last_seen_wall_time_s")
     async with connect() as client:
         answer = await ask(client, "webots_monitor", duration_wall_s=60)
-    assert (answer["rows"], answer["window_s"] < 30) == (0, True)
+    assert (answer["row_count"], answer["window_s"] < 30) == (0, True)
     (kinds,) = (k for k, why in answer["verdicts"]["not_searched"].items() if "no row" in why)
     assert {"gap", "silent", "flat", "jump", "standstill", "stuck"} <= set(kinds.split(", "))

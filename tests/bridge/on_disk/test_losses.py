@@ -121,7 +121,7 @@ def test_rows_that_went_into_a_deleted_file_are_counted_as_dropped(
     assert bridge.stats().rows_dropped == 4
     assert filed.rows("SELECT row_count FROM run") == [1]
     told = filed.rows(
-        "SELECT sim_time_s, json_extract(data, '$.rows') FROM event WHERE name IS NULL"
+        "SELECT sim_time_s, json_extract(data, '$.row_count') FROM event WHERE name IS NULL"
     )
     assert (pytest.approx(STEP_MS / 1000), 4) in told
 

@@ -17,7 +17,7 @@ from webots_mcp.schema import create_schema
 from webots_mcp.store.chunks.making import GROUP_ROWS, make_chunks
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import Frame, read_frame
-from webots_mcp.store.reading.ranges import whole_run
+from webots_mcp.store.reading.ranges import Segment, whole_run
 from webots_mcp.store.retention.planning import plan
 from webots_mcp.store.retention.policy import Limit, Retention
 
@@ -53,7 +53,8 @@ def record(recorded: Recorded, rows: int) -> int:
         recorded.publish(step * ROW_S, state, {"x": "nan"} if step == 77 else None)
     recorded.connection.execute("COMMIT")
     recorded.connection.execute(
-        "UPDATE run SET last_sim_time_s = ?, rows = ? WHERE id = ?", (rows * ROW_S, rows, run_id)
+        "UPDATE run SET last_sim_time_s = ?, row_count = ? WHERE id = ?",
+        (rows * ROW_S, rows, run_id),
     )
     return run_id
 
@@ -101,7 +102,7 @@ def test_a_run_of_which_nothing_is_left_is_wholly_unread(recorded: Recorded) -> 
     nothing = Retention(state=NO_STATES, chunk=Limit(rows=0, spared_rows=0), outlive=0)
     recorded.prune(nothing)  # puts the rows into chunks
     recorded.prune(nothing)
-    frame = framed(recorded.connection, run_id)
+    frame = read_frame(recorded.connection, Segment(run_id, 0, 50), Deadline(60))
     assert len(frame) == 0 and [each.why for each in frame.unread] == ["deleted by retention"]
 
 

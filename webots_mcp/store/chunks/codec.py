@@ -25,7 +25,7 @@ _FIRST_LABEL: Final = 2
 _LEVEL: Final = 4  # of pcodec: a quarter of the time of its default, for 2 % more bytes
 _CODES_LEVEL: Final = 1
 _CHECKSUM_BYTES: Final = 4  # CRC-32: a decompressor is not asked what it makes of damaged bytes
-_EXACT_INTEGERS: Final = 2**53  # beyond, a float does not hold every integer
+EXACT_INTEGERS: Final = 2**53  # beyond, a float does not hold every integer
 _FLOATS, _INTEGERS = "pcodec/float64", "pcodec/int64"
 _NOTHING: Final = "none"  # no row holds a number
 _NUMBERS: Final = frozenset({int, float})
@@ -209,7 +209,7 @@ def _compressed(values: Sequence[Any], types: set[type]) -> tuple[str, bytes | N
     pcodec = _pcodec()
     numbers: Any = _numbers(values)
     codec = _FLOATS
-    if types == {int} and np.abs(numbers).max() < _EXACT_INTEGERS:
+    if types == {int} and np.abs(numbers).max() < EXACT_INTEGERS:
         codec, numbers = _INTEGERS, np.array(values, np.int64)
     config = pcodec.ChunkConfig(compression_level=_LEVEL)
     packed = bytes(pcodec.standalone.simple_compress(numbers, config))

@@ -47,7 +47,8 @@ _FILL_MAP: Final = (
     f"UNION ALL VALUES ({SIM_TIMES}, {SIM_TIMES}), ({WALL_TIMES}, {WALL_TIMES})"
 )
 _GROUP: Final = (
-    "start_sim_time_s, end_sim_time_s, row_count, stored_row_count, stored_row_bytes, chunk_bytes, "
+    "start_sim_time_s, end_sim_time_s, row_count, stored_row_count, lost_value_count, "
+    "stored_row_bytes, chunk_bytes, "
     "is_complete"
 )
 _GROUPS: Final = "SELECT id, row_count FROM source.row_group WHERE run_id = ? AND is_complete = 1"

@@ -145,11 +145,13 @@ def _export_table(
             wanted = TrialTable.of(connection, trial_set)
         else:
             wanted = part.in_recording(connection)
+        notes = list(wanted.notes)
+        how: dict[str, Any] = {"safe_cells": safe_cells, "notes": notes}
         if file is None:
-            write(connection, wanted, form, binary_stdout(), progress, safe_cells=safe_cells)
-            return _Written(None, "", {}, tuple(wanted.notes))
-        rows = export_file(connection, wanted, form, file, progress, safe_cells=safe_cells)
-    return _Written(file, f"{rows} rows", {"row_count": rows}, tuple(wanted.notes))
+            write(connection, wanted, form, binary_stdout(), progress, **how)
+            return _Written(None, "", {}, tuple(notes))
+        rows = export_file(connection, wanted, form, file, progress, **how)
+    return _Written(file, f"{rows} rows", {"row_count": rows}, tuple(notes))
 
 
 def _export_for_viewers(recorded: Where, part: Range, file: Path, form: str) -> _Written:

@@ -73,11 +73,13 @@ class Decoded(NamedTuple):
         numbers: One for each row: NaN where it holds none; flags are 0 and 1.
         codes: One for each row; None where every row holds a number.
         labels: What codes from 2 on mean; of a replaced value `Replaced`.
+        is_whole: All numbers were integers when they were stored.
     """
 
     numbers: Array
     codes: Indexes | None
     labels: Sequence[Value | Replaced]
+    is_whole: bool = False
 
 
 def decoded_of(values: Sequence[Recorded]) -> Decoded:
@@ -122,7 +124,7 @@ def decode(encoded: Encoded, rows: int) -> Decoded:
         if encoded.codes is None:
             numbers = np.empty(rows)
             _decompress(encoded, numbers)
-            return Decoded(numbers, None, ())
+            return Decoded(numbers, None, (), encoded.codec == _INTEGERS)
         return _decode_coded(encoded, rows)
     except ModuleNotFoundError as error:
         raise DamagedChunkError(
@@ -149,7 +151,7 @@ def _decode_coded(encoded: Encoded, rows: int) -> Decoded:
         _decompress(encoded, found)
         numbers[held] = found
     _fill_flags(numbers, codes, labels)
-    return Decoded(numbers, codes, labels)
+    return Decoded(numbers, codes, labels, encoded.codec == _INTEGERS)
 
 
 def _labels(text: str | None) -> list[Value | Replaced]:

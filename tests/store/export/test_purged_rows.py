@@ -1,4 +1,4 @@
-"""Rows that retention has deleted come back from their chunks, as they were but for what is said."""
+"""Rows that retention has deleted come back from their chunks; what they lack is said."""
 
 from __future__ import annotations
 

@@ -223,7 +223,8 @@ def import_(
     """Import another recording, or the data folder of a bridge that writes JSON files.
 
     A recording that is over comes with all of its runs and trial sets, a bundle with its run; what
-    is there already is left as it is, so that it may be imported again.
+    is there already is left as it is, so that it may be imported again. One of the schema before
+    is only read; of states that were deleted there nothing is left to search, and answers say so.
 
     Of such a folder status.json, logs/controller.log, commands.json and the .png files of camera/
     and screenshots/ become one finished run; if a file is damaged, nothing does. It has no
@@ -260,6 +261,18 @@ def _import_folder(recorded: Where, folder: Path, robot: str, *, as_json: bool) 
 
 def _import_recording(recorded: Where, source: Path) -> dict[str, Any]:
     """What the import has brought, of the runs that are in both recordings now."""
+    from webots_mcp.store.older_recording import converted, copy_breakpoints, is_older
+
+    if not is_older(source):
+        return _take_in(recorded, source, source.parent)
+    with converted(source) as database:
+        found = _take_in(recorded, database, source.parent)
+        with recorded.writer() as (_, connection):
+            copy_breakpoints(connection, database)
+    return found
+
+
+def _take_in(recorded: Where, source: Path, pictures: Path) -> dict[str, Any]:
     from webots_mcp.store.merging import merge, settled
 
     settled(source)  # first: no database is made for what is no recording
@@ -268,7 +281,7 @@ def _import_recording(recorded: Where, source: Path) -> dict[str, Any]:
             raise InvalidInputError(f"{source} is the recording itself: choose another file")
         (newest,) = connection.execute("SELECT coalesce(max(id), 0) FROM run").fetchone()
         changes = connection.total_changes
-        runs = sorted(merge(connection, recording.data_dir, source).values())
+        runs = sorted(merge(connection, recording.data_dir, source, pictures=pictures).values())
         return {
             "new_run_ids": [run_id for run_id in runs if run_id > newest],
             "known_run_ids": [run_id for run_id in runs if run_id <= newest],

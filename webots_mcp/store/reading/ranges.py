@@ -31,8 +31,7 @@ from webots_mcp.store.reading.subject import Subject, find_subject
 from webots_mcp.store.reading.wall_time import parse_wall_time, simulation_times
 
 _PURGED: Final = (
-    "SELECT started_sim_time_s, last_sim_time_s FROM run WHERE id = ? AND purged_rows > 0 "
-    "AND EXISTS (SELECT 1 FROM row_group WHERE run_id = run.id)"
+    "SELECT started_sim_time_s, last_sim_time_s FROM run WHERE id = ? AND purged_rows > 0"
 )
 _RUN_BEFORE: Final = (
     "SELECT (SELECT max(id) FROM run b WHERE b.robot_id = run.robot_id AND b.id < run.id), "
@@ -218,7 +217,7 @@ def _told(time_s: float) -> str:
 def recorded_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float, float] | None:
     """Simulation times between which a run recorded; None if it has no row.
 
-    Rows that retention deleted count: their rollups are still there.
+    Rows that retention deleted count: their chunks are there, or a frame says what is not.
     """
     rows = _row_bounds(connection, run_id)
     purged = connection.execute(_PURGED, (run_id,)).fetchone()

@@ -206,7 +206,7 @@ class _RunChunks:
                 self.done = True
                 if has_ended:
                     left = self._tail(at, last_id)  # few, read as they are, whose names are entered
-                    _signal_ids(self._connection, self._robot_id, self._run_id, left)
+                    _signals_of(self._connection, self._robot_id, left)
                     self._connection.execute(_SET_CHUNKED, (self._run_id,))
                 return rows
             if not self._store(tail, at):

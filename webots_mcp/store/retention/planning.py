@@ -96,11 +96,6 @@ class Plan:
         """All rows that go."""
         return sum(step.rows for step in self.steps)
 
-    @property
-    def size_bytes(self) -> int:
-        """About so much is freed."""
-        return sum(step.size_bytes for step in self.steps)
-
     def rows_by_table(self) -> Counter[str]:
         """How many rows of each table go."""
         rows = Counter[str]()

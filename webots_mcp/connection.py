@@ -118,8 +118,9 @@ def connect(
         raise DatabaseError(f"{database} cannot be opened: {error}; check the folder") from error
     try:
         if create:
-            schema_version(connection)  # first: another application's file stays as it is
-            _make_wal(connection)
+            # First: another application's file stays as it is, and one of another version too.
+            if schema_version(connection) in (0, SCHEMA_VERSION):
+                _make_wal(connection)
         _prepare(connection, role)
     except Exception as error:
         connection.close()

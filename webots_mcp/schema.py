@@ -31,8 +31,10 @@ SCHEMA_FILE: Final = Path(__file__).with_name("schema.sql")
 OLDER_SCHEMA: Final = 9  # of the recordings before the values lay in chunks
 _FROM_OLDER: Final = (
     "{file} has schema {version}, of an older webots-mcp, and this one knows {known}: move it "
-    "aside, so that a new one is begun, and read it with the webots-mcp that made it"
+    "aside, so that a new one is begun, and {then}"
 )
+_THEN: Final = "take it in with 'webots-mcp import FILE'"
+_IF_OLDEST: Final = "read it with the webots-mcp that made it"
 _MADE: Final = re.compile(r'CREATE (?:UNIQUE )?(?:TABLE|VIEW|INDEX|TRIGGER) "?(\w+)', re.IGNORECASE)
 _TOKENS: Final = re.compile(
     r"('(?:[^']|'')*'|\"[^\"]*\"|`[^`]*`|\[[^\]]*\]|\w+|/\*.*?\*/|--[^\n]*|[^\s\w])", re.DOTALL
@@ -96,7 +98,10 @@ def require_current(connection: sqlite3.Connection) -> None:
     if version < SCHEMA_VERSION:
         raise SchemaTooOldError(
             _FROM_OLDER.format(
-                file=_file(connection, "main"), version=version, known=SCHEMA_VERSION
+                file=_file(connection, "main"),
+                version=version,
+                known=SCHEMA_VERSION,
+                then=_THEN if version == OLDER_SCHEMA else _IF_OLDEST,
             )
         )
 

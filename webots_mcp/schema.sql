@@ -114,6 +114,7 @@ CREATE TABLE row_group (
 	row_count INTEGER NOT NULL, 
 	stored_row_count INTEGER NOT NULL /* of them, those that retention has left in state */, 
 	stored_row_bytes FLOAT NOT NULL /* that one of those takes on the disk */, 
+	lost_value_count INTEGER NOT NULL /* that states of it had and chunks cannot hold as they were */, 
 	chunk_bytes INTEGER NOT NULL /* that its chunks take on the disk */, 
 	is_complete INTEGER NOT NULL /* 1 once all of its chunks are there */, 
 	CONSTRAINT fk_row_group_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE

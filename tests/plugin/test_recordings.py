@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from contextlib import closing
+from pathlib import Path
+
 import pytest
 
 from webots_mcp import MCPBridge
+from webots_mcp.connection import connect
 from webots_mcp.errors import (
     InvalidInputError,
     NothingRecordedError,
     UnknownSignalError,
 )
 from webots_mcp.standin import InProcessSupervisor
+from webots_mcp.store.retention.policy import Limit, Retention
+from webots_mcp.store.retention.purge import prune
 from webots_mcp.testing import RobotRecording
 
 
@@ -130,6 +136,19 @@ def test_states_come_as_they_were_published(story: RobotRecording) -> None:
     states = story.states()
     assert len(states) == 10
     assert states[2] == {"mode": "cruise", "sensors": {"front_m": "nan"}, "blind": True}
+
+
+def test_states_and_signals_are_the_same_once_their_rows_are_deleted(
+    story: RobotRecording, tmp_path: Path
+) -> None:
+    states, front = story.states(), story.signal("sensors.front_m").values()
+    with closing(connect(story.database, "writer")) as connection:
+        prune(connection, tmp_path, Retention(state=Limit(rows=0)), rest=False)
+        assert connection.execute("SELECT count(*) FROM state").fetchone() == (0,)
+    assert story.states() == states
+    assert story.signal("sensors.front_m").values() == front
+    with pytest.raises(AssertionError, match=r'the state at 0.384 s: {"mode":"cruise"'):
+        story.signal("sensors.front_m").assert_never_below(0.65)
 
 
 def test_events_and_logs_come_in_order_and_by_kind(story: RobotRecording) -> None:

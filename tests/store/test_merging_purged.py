@@ -7,7 +7,6 @@ import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -20,16 +19,16 @@ from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.schema import create_schema
 from webots_mcp.store.bundle import unpacked, write_bundle
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
 from webots_mcp.store.merging import merge
 from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.purge import prune
 
 SIGNALS = (
-    "SELECT name, kind, unit, path, reduction, row_count, null_row_count, min, max FROM signal "
-    "WHERE robot_id = (SELECT id FROM robot WHERE name = 'rover') "
-    "AND name NOT GLOB 'pose*' AND name <> 'mode'"
+    "SELECT name, kind, unit, path, reduction, role FROM signal "
+    "WHERE robot_id = (SELECT id FROM robot WHERE name = 'rover') AND name NOT GLOB 'pose*' "
+    "AND name <> 'mode'"
 )
 
 
@@ -73,19 +72,6 @@ def target(tmp_path: Path) -> Iterator[sqlite3.Connection]:
         yield connection
 
 
-def rows_of(connection: sqlite3.Connection, table: str, run_id: int) -> list[Any]:
-    """Without ids: signals by their names."""
-    listed = connection.execute(f"PRAGMA table_info({table})").fetchall()
-    columns = [name for _, name, *_ in listed if name not in ("run_id", "signal_id", "state_id")]
-    shown = ", ".join("NULL" if each == "standstills" else f"t.{each}" for each in columns)
-    order = "t.state_id" if table == "change" else "t.bucket"
-    return connection.execute(
-        f"SELECT s.name, {shown} FROM {table} t JOIN signal s ON s.id = t.signal_id "
-        f"WHERE t.run_id = ? ORDER BY s.name, {order}",
-        (run_id,),
-    ).fetchall()
-
-
 @NONE_OR_SOME_LEFT
 def test_every_answer_about_a_purged_run_is_what_it_was_there(
     target: sqlite3.Connection, source: Path, tmp_path: Path
@@ -95,48 +81,38 @@ def test_every_answer_about_a_purged_run_is_what_it_was_there(
         run = merge(target, tmp_path / "here", source)[uuid]
         before, after = run_info(there, 1), run_info(target, run)
         assert after.purged_rows == before.purged_rows > 0
-        for table in ("rollup", "recent_rollup", "coarse_rollup", "change"):
-            assert rows_of(target, table, run) == rows_of(there, table, 1)
         assert answers(target, run, PART) == answers(there, 1, PART)
         assert target.execute(SIGNALS).fetchall() == there.execute(SIGNALS).fetchall()
 
 
 @NONE_OR_SOME_LEFT
-def test_what_was_taken_in_is_not_counted_again_by_who_maintains_the_recording(
+def test_what_was_taken_in_is_left_as_it_is_by_who_makes_chunks(
     target: sqlite3.Connection, source: Path, tmp_path: Path
 ) -> None:
     run = merge(target, tmp_path / "here", source, run_id=1).popitem()[1]
-    before = [rows_of(target, table, run) for table in ("rollup", "change", "coarse_rollup")]
-    signals = target.execute("SELECT * FROM signal").fetchall()
-
+    tables = [f"SELECT * FROM {table} WHERE run_id = {run}" for table in ("row_group", "chunk")]
+    before = [target.execute(each).fetchall() for each in tables]
+    assert len(before[0]) >= 5
     assert make_chunks(target, 100_000).done
-
-    assert [rows_of(target, each, run) for each in ("rollup", "change", "coarse_rollup")] == before
-    assert target.execute("SELECT * FROM signal").fetchall() == signals
-    recorder = start_run(target, "another")
-    recorder.publish(0.0, {"x": 1})
-    assert make_chunks(target, 1000).done
-    assert rows_of(target, "recent_rollup", recorder.run_id) != []
+    assert [target.execute(each).fetchall() for each in tables] == before
 
 
-def test_rows_that_were_not_rolled_up_there_are_rolled_up_here(
+def test_rows_that_were_in_no_chunk_there_are_put_into_one_here(
     target: sqlite3.Connection, source: Path, tmp_path: Path
 ) -> None:
     with closing(connect(source, "writer")) as there:
         late = Recorder(there)
         late.run_id, late.run_start_s = 1, late.wall_s
-        late.publish(ROWS * 0.2, *rover_state(0.0))
+        for step in range(300):
+            late.publish((ROWS + step) * 0.2, *rover_state(0.0))
         late.end_run("finished")
-        there.execute("UPDATE run SET row_count = purged_rows + row_count WHERE id = 1")
+        there.execute("UPDATE run SET row_count = row_count + 300, is_chunked = 0 WHERE id = 1")
     run = merge(target, tmp_path / "here", source, run_id=1).popitem()[1]
 
     assert make_chunks(target, 100_000).done
 
-    rolled = (
-        "SELECT sum(a.rows), max(a.last_sim_time_s) FROM all_rollup a "
-        "JOIN signal s ON s.id = a.signal_id WHERE s.name = 'battery_v' AND a.run_id = ?"
-    )
-    assert target.execute(rolled, (run,)).fetchone() == (ROWS + 1, ROWS * 0.2)
+    chunked = "SELECT sum(row_count), max(end_sim_time_s) FROM row_group WHERE run_id = ?"
+    assert target.execute(chunked, (run,)).fetchone() == (ROWS + 300, (ROWS + 299) * 0.2)
 
 
 @NONE_OR_SOME_LEFT
@@ -166,7 +142,7 @@ def test_a_whole_run_is_put_into_chunks_here(
 
 @NONE_OR_SOME_LEFT
 def test_a_purged_run_comes_once(target: sqlite3.Connection, source: Path, tmp_path: Path) -> None:
-    tables = ("state", "signal", "rollup", "coarse_rollup", "change", "run")
+    tables = ("state", "signal", "row_group", "chunk", "run")
     merged = merge(target, tmp_path / "here", source)
     everything = [target.execute(f"SELECT * FROM {table}").fetchall() for table in tables]
 
@@ -177,10 +153,10 @@ def test_a_purged_run_comes_once(target: sqlite3.Connection, source: Path, tmp_p
 def test_what_broke_off_leaves_nothing_of_a_purged_run(
     target: sqlite3.Connection, source: Path, tmp_path: Path
 ) -> None:
-    tables = ("state", "signal", "rollup", "coarse_rollup", "change", "run")
+    tables = ("state", "signal", "row_group", "chunk", "run")
     before = [target.execute(f"SELECT * FROM {table}").fetchall() for table in tables]
     target.execute(
-        "CREATE TEMP TRIGGER full BEFORE INSERT ON main.change "
+        "CREATE TEMP TRIGGER full BEFORE INSERT ON main.chunk "
         "BEGIN SELECT raise(ABORT, 'the disk is full'); END"
     )
     with pytest.raises(sqlite3.Error, match="the disk is full"):
@@ -213,7 +189,7 @@ def test_a_signal_that_is_text_here_and_a_number_there_is_text(
     recorder = Recorder(target)
     recorder.run_id, recorder.run_start_s = 2, recorder.wall_s
     recorder.publish(41.0, {"battery_v": "full"})
-    assert make_chunks(target, 1000).done
+    assert chunk_whole_run(target, 2)
 
     run = merge(target, tmp_path / "here", source, run_id=1).popitem()[1]
 
@@ -226,7 +202,7 @@ def test_ids_that_no_bridge_gives_are_refused(
     target: sqlite3.Connection, source: Path, tmp_path: Path
 ) -> None:
     with closing(connect(source, "writer")) as there:
-        there.execute("UPDATE change SET state_id = ? WHERE state_id = 1", (2**52,))
+        there.execute("UPDATE row_group SET max_state_id = ? WHERE id = 1", (2**52,))
     with pytest.raises(InvalidInputError, match=f"to {2**52}, which no bridge gives"):
         merge(target, tmp_path / "here", source)
     assert target.execute("SELECT count(*) FROM run").fetchone() == (2,)

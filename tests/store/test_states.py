@@ -13,7 +13,7 @@ from webots_mcp.bridge.encoding import encode
 from webots_mcp.errors import InvalidInputError, InvalidRangeError
 from webots_mcp.store.logs import LogFilter, Window, count_lines, newest_lines, window_of
 from webots_mcp.store.reading.ranges import Scope
-from webots_mcp.store.run_rows import State, newest_state, real_time_factor, select, states_of
+from webots_mcp.store.run_rows import State, newest_state, real_time_factor, select
 
 
 def recorded_state(published: dict[str, Any]) -> State:
@@ -77,15 +77,6 @@ def test_a_part_of_a_state_is_found_by_its_path() -> None:
 def test_a_wrong_path_is_answered_with_what_there_is(path: str, said: str) -> None:
     with pytest.raises(InvalidInputError, match=said):
         select({"sensors": [1, 2]}, path)
-
-
-def test_the_rows_of_a_run_come_in_order_and_without_those_of_others(recorded: Recorded) -> None:
-    robot, other = recorded.robot(), recorded.robot("other")
-    for time_s, x in ((1.0, 1), (1.0, 2), (2.0, 3)):
-        robot.state(time_s, {"x": x})
-        other.state(time_s, {"x": 0})
-    rows = states_of(recorded.connection, robot.run_id)
-    assert [row.value()["x"] for row in rows] == [1, 2, 3]
 
 
 def test_the_real_time_factor_is_that_of_the_last_seconds(recorded: Recorded) -> None:

@@ -145,11 +145,13 @@ def _export_table(
             wanted = TrialTable.of(connection, trial_set)
         else:
             wanted = part.in_recording(connection)
+        notes = list(wanted.notes)
+        how: dict[str, Any] = {"safe_cells": safe_cells, "notes": notes}
         if file is None:
-            write(connection, wanted, form, binary_stdout(), progress, safe_cells=safe_cells)
-            return _Written(None, "", {}, tuple(wanted.notes))
-        rows = export_file(connection, wanted, form, file, progress, safe_cells=safe_cells)
-    return _Written(file, f"{rows} rows", {"row_count": rows}, tuple(wanted.notes))
+            write(connection, wanted, form, binary_stdout(), progress, **how)
+            return _Written(None, "", {}, tuple(notes))
+        rows = export_file(connection, wanted, form, file, progress, **how)
+    return _Written(file, f"{rows} rows", {"row_count": rows}, tuple(notes))
 
 
 def _export_for_viewers(recorded: Where, part: Range, file: Path, form: str) -> _Written:
@@ -221,7 +223,8 @@ def import_(
     """Import another recording, or the data folder of a bridge that writes JSON files.
 
     A recording that is over comes with all of its runs and trial sets, a bundle with its run; what
-    is there already is left as it is, so that it may be imported again.
+    is there already is left as it is, so that it may be imported again. One of the schema before
+    is only read; of states that were deleted there nothing is left to search, and answers say so.
 
     Of such a folder status.json, logs/controller.log, commands.json and the .png files of camera/
     and screenshots/ become one finished run; if a file is damaged, nothing does. It has no
@@ -258,6 +261,18 @@ def _import_folder(recorded: Where, folder: Path, robot: str, *, as_json: bool) 
 
 def _import_recording(recorded: Where, source: Path) -> dict[str, Any]:
     """What the import has brought, of the runs that are in both recordings now."""
+    from webots_mcp.store.older_recording import converted, copy_breakpoints, is_older
+
+    if not is_older(source):
+        return _take_in(recorded, source, source.parent)
+    with converted(source) as database:
+        found = _take_in(recorded, database, source.parent)
+        with recorded.writer() as (_, connection):
+            copy_breakpoints(connection, database)
+    return found
+
+
+def _take_in(recorded: Where, source: Path, pictures: Path) -> dict[str, Any]:
     from webots_mcp.store.merging import merge, settled
 
     settled(source)  # first: no database is made for what is no recording
@@ -266,7 +281,7 @@ def _import_recording(recorded: Where, source: Path) -> dict[str, Any]:
             raise InvalidInputError(f"{source} is the recording itself: choose another file")
         (newest,) = connection.execute("SELECT coalesce(max(id), 0) FROM run").fetchone()
         changes = connection.total_changes
-        runs = sorted(merge(connection, recording.data_dir, source).values())
+        runs = sorted(merge(connection, recording.data_dir, source, pictures=pictures).values())
         return {
             "new_run_ids": [run_id for run_id in runs if run_id > newest],
             "known_run_ids": [run_id for run_id in runs if run_id <= newest],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import threading
 from collections.abc import AsyncGenerator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
@@ -15,6 +16,7 @@ from mcp.server import CacheHint, MCPServer
 from webots_mcp import __version__
 from webots_mcp.console.console_follower import ConsoleWatch
 from webots_mcp.contract import Database
+from webots_mcp.errors import WebotsMCPError, warn
 from webots_mcp.liveness import reap_if_dead
 from webots_mcp.maintenance import Maintainer
 from webots_mcp.questions import all_questions
@@ -25,6 +27,7 @@ from webots_mcp.server.tools import ToolServer, tool_of
 from webots_mcp.steering.launcher import Companions, Launcher
 from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunks.on_demand import make_missing_chunks
 from webots_mcp.store.recording import OpenReaders, Recording
 from webots_mcp.store.retention.limits import Asked, ask_where_unset
 from webots_mcp.store.retention.upkeep import Upkeep
@@ -89,6 +92,22 @@ def create_server(
     return mcp
 
 
+class _ChunkMaker(threading.Thread):
+    """Makes the chunks that a recording lacks which is only read, once, in a temporary file."""
+
+    def __init__(self, recording: Recording) -> None:
+        super().__init__(name="webots-mcp chunks", daemon=True)
+        self._recording = recording
+        self.ending = threading.Event()
+
+    def run(self) -> None:
+        """Until all are made, or the server ends; questions say what they do not read."""
+        try:
+            make_missing_chunks(self._recording, called_off=self.ending.is_set, write=False)
+        except WebotsMCPError as error:
+            warn(f"no chunks are made: {error}")
+
+
 def _lifespan(
     recording: Recording, readers: OpenReaders, retain: Upkeep, asked: Asked
 ) -> Callable[[MCPServer], AbstractAsyncContextManager[Companions]]:
@@ -110,7 +129,10 @@ def _lifespan(
     async def lifespan(_: MCPServer) -> AsyncGenerator[Companions]:
         companions = Companions(TrialWorkers(recording), Launcher(recording))
         watches = list[Maintainer | ConsoleWatch]()
-        if isinstance(recording.database, Path) and not recording.read_only:
+        chunk_maker = _ChunkMaker(recording)
+        if isinstance(recording.database, Path) and recording.read_only:
+            chunk_maker.start()
+        elif isinstance(recording.database, Path):
             maintainer = Maintainer(recording.database, "server", work=work)
             watches = [maintainer, ConsoleWatch(recording)]
         for watch in watches:
@@ -120,6 +142,7 @@ def _lifespan(
         finally:
             with CancelScope(shield=True):
                 await to_thread.run_sync(companions.stop)
+            chunk_maker.ending.set()
             for watch in reversed(watches):
                 await to_thread.run_sync(watch.stop, abandon_on_cancel=True)
             readers.close()

@@ -57,7 +57,6 @@ _SAME_COMMAND: Final = (
     "AND params = ?"
 )
 _IS_PURGED: Final = "SELECT purged_rows > 0 FROM main.run WHERE id = ?"
-_TO_BE_CHUNKED: Final = "UPDATE main.run SET is_chunked = 0 WHERE id = ?"
 _OF_RUN: Final = ("kept_stretch", "kept_state", "log", "event", "parameter_value")
 _BUSY: Final = (
     "SELECT EXISTS (SELECT 1 FROM main.session s JOIN main.robot b ON b.id = s.robot_id "
@@ -266,8 +265,6 @@ def _copy_states(connection: sqlite3.Connection, run_id: int, run: int, robot_id
     shift = None
     if is_purged:
         shift = take_in_chunks(connection, run_id, run, robot_id)
-    else:
-        connection.execute(_TO_BE_CHUNKED, (run,))
     _insert(connection, "state", "run_id = ?", run_id, {"run_id": run}, shift)
 
 

@@ -217,6 +217,9 @@ class RowGroup(SQLModel, table=True):
         Integer, "of them, those that retention has left in state", nullable=False
     )
     stored_row_bytes: float = _number("that one of those takes on the disk", nullable=False)
+    lost_value_count: int = _column(
+        Integer, "that states of it had and chunks cannot hold as they were", nullable=False
+    )
     chunk_bytes: int = _column(Integer, "that its chunks take on the disk", nullable=False)
     is_complete: bool = _column(Integer, "1 once all of its chunks are there", nullable=False)
 

@@ -27,6 +27,7 @@ from webots_mcp.errors import (
 )
 from webots_mcp.queue import any_unfinished
 from webots_mcp.schema import create_schema, require_current, schema_version
+from webots_mcp.store.chunks.aside import is_chunked_aside, show_chunks_aside
 from webots_mcp.store.invalid_rows import is_past_invalid_rows, shadow_if_asked
 from webots_mcp.store.reading.subject import Subject, choose, require_run
 from webots_mcp.store.retention.limits import Asked
@@ -162,7 +163,8 @@ class OpenReaders:
 
 def _identity(database: Path, connection: sqlite3.Connection) -> object:
     """Of the files, and of the schema that SQLite counts the changes of."""
-    return identify_files(database), connection.execute("PRAGMA schema_version").fetchone()
+    version = connection.execute("PRAGMA schema_version").fetchone()
+    return identify_files(database), version, is_chunked_aside(database)
 
 
 @dataclass(frozen=True)
@@ -257,6 +259,8 @@ class Recording:
             raise NoDatabaseError(f"{error}. {GETTING_STARTED}") from error
         try:
             self._require_ours(connection)
+            if role == "reader" and isinstance(self.database, Path) and not is_past_invalid_rows():
+                show_chunks_aside(connection, self.database)
         except BaseException:
             connection.close()
             raise

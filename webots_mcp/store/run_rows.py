@@ -98,14 +98,6 @@ _RECENT_TIMES: Final = (
     "SELECT sim_time_s, wall_time_s FROM state WHERE run_id = ? "
     "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
 )
-_STATE_BY_ID: Final = f"SELECT {_STATE_COLUMNS} FROM state WHERE id = ?"
-_KEPT_STATE_BY_ID: Final = (
-    f"SELECT -id, {_STATE_COLUMNS.partition(', ')[2]} FROM kept_state WHERE id = -?"
-)
-_STATES_OF_RUN: Final = (
-    f"SELECT {_STATE_COLUMNS} FROM state WHERE run_id = ? ORDER BY sim_time_s, id"
-)
-
 # A blob is greater than any number or text: a time that is not a number is found too, and reported.
 _LATER_THAN_ANY: Final = b"\xff"
 PACE_ROWS: Final = 6
@@ -173,18 +165,6 @@ def state_at(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> 
 def _state_up_to(connection: sqlite3.Connection, run_id: int, until: float | bytes) -> State | None:
     row = connection.execute(_NEWEST_STATE, {"run": run_id, "until": until}).fetchone()
     return State(*row) if row else None
-
-
-def fetch_state(connection: sqlite3.Connection, state_id: int) -> State | None:
-    """The row of that id; None where it was deleted."""
-    query = _STATE_BY_ID if state_id > 0 else _KEPT_STATE_BY_ID
-    row = connection.execute(query, (state_id,)).fetchone()
-    return State(*row) if row else None
-
-
-def states_of(connection: sqlite3.Connection, run_id: int) -> list[State]:
-    """All rows of a run, in order."""
-    return [State(*row) for row in connection.execute(_STATES_OF_RUN, (run_id,)).fetchall()]
 
 
 def recent_interval_s(connection: sqlite3.Connection, run_id: int) -> float | None:

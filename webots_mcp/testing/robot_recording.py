@@ -6,8 +6,9 @@ import json
 import math
 import sqlite3
 import sys
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from contextlib import closing, contextmanager
+from functools import partial
 from typing import Any, Final, Literal
 
 from webots_mcp.connection import Role, connect
@@ -18,6 +19,7 @@ from webots_mcp.queue import Command, CommandQueue, fetch_command, list_commands
 from webots_mcp.schema import require_current, schema_version
 from webots_mcp.store.detection.event import Event as FoundEvent
 from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.export.export_rows import Source
 from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines
 from webots_mcp.store.parameters import parameters_of
 from webots_mcp.store.questions.events import find_events
@@ -25,7 +27,7 @@ from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, find_range, whole_run
 from webots_mcp.store.reading.subject import Subject, find_subject
-from webots_mcp.store.run_rows import Event, fetch_state, newest_events, runs_of, states_of
+from webots_mcp.store.run_rows import Event, State, newest_events, runs_of
 from webots_mcp.store.signals.catalogue import resolve_signals, signals_of_frame
 from webots_mcp.store.signals.registry import cleaned
 from webots_mcp.testing.recorded_signal import RecordedSignal
@@ -101,15 +103,22 @@ class RobotRecording:
                 raise NothingRecordedError(f"{run} has no state row: was publish() called?")
             frame = read_frame(connection, segment, Deadline(math.inf))
             meant = resolve_signals(signals_of_frame(connection, subject, frame), [pattern])
-            values = {each.name: cleaned(each, frame.values(each.name)) for each in meant}
-        return [
-            RecordedSignal(name, run, frame, each, self._state) for name, each in values.items()
-        ]
+            state_of = partial(self._state, subject.run_id)
+            return [
+                RecordedSignal(
+                    each.name, run, frame, cleaned(each, frame.values(each.name)), state_of
+                )
+                for each in meant
+            ]
 
     def states(self) -> list[dict[str, Any]]:
-        """What was published, row by row; "nan", "inf" and the like where JSON holds null."""
+        """What was published, row by row; "nan", "inf" and the like where JSON holds null.
+
+        Rows that retention has deleted come from their chunks, without long arrays and texts.
+        """
         with self._subject() as (connection, subject):
-            return [state.value() for state in states_of(connection, subject.run_id)]
+            rows = _rows(connection, subject.run_id)
+            return [row.value() for row in rows if row.id > 0]
 
     # -- what happened -------------------------------------------------------------------------
 
@@ -236,10 +245,17 @@ class RobotRecording:
         require_current(connection)
         return connection
 
-    def _state(self, state_id: int) -> str:
+    def _state(self, run_id: int, state_id: int) -> str:
         with closing(self._connect("reader")) as connection:
-            state = fetch_state(connection, state_id)
-        return state.data if state else "deleted since"
+            rows = _rows(connection, run_id)
+            return next((row.data for row in rows if row.id == state_id), "deleted since")
+
+
+def _rows(connection: sqlite3.Connection, run_id: int) -> Iterator[State]:
+    """The rows of a run, in order; those that were deleted come from their chunks."""
+    segment = whole_run(connection, run_id)
+    source = Source.of(connection, [segment] if segment else [], 1, None)
+    return (State(row.state_id, row.run_id, *row[2:]) for row in source.recorded())
 
 
 class CommandStatus(str):

@@ -10,16 +10,21 @@ from typing import Any
 
 import pytest
 
+from tests.recordings.answers import answers
+from tests.recordings.rounds import PART, record_rounds
 from tests.recordings.runs import ROW_S, Recorded, states
 from tests.store.retention.test_size import bytes_by_name
+from webots_mcp import signal_register
 from webots_mcp.connection import connect
 from webots_mcp.schema import create_schema
 from webots_mcp.store.chunks.making import GROUP_ROWS, make_chunks
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import Frame, read_frame
-from webots_mcp.store.reading.ranges import whole_run
+from webots_mcp.store.reading.ranges import Segment, whole_run
 from webots_mcp.store.retention.planning import plan
 from webots_mcp.store.retention.policy import Limit, Retention
+from webots_mcp.store.retention.purge import prune
+from webots_mcp.store.signals.catalogue import list_signals
 
 NO_STATES = Limit(rows=0, spared_rows=0)
 
@@ -53,7 +58,8 @@ def record(recorded: Recorded, rows: int) -> int:
         recorded.publish(step * ROW_S, state, {"x": "nan"} if step == 77 else None)
     recorded.connection.execute("COMMIT")
     recorded.connection.execute(
-        "UPDATE run SET last_sim_time_s = ?, rows = ? WHERE id = ?", (rows * ROW_S, rows, run_id)
+        "UPDATE run SET last_sim_time_s = ?, row_count = ? WHERE id = ?",
+        (rows * ROW_S, rows, run_id),
     )
     return run_id
 
@@ -101,7 +107,7 @@ def test_a_run_of_which_nothing_is_left_is_wholly_unread(recorded: Recorded) -> 
     nothing = Retention(state=NO_STATES, chunk=Limit(rows=0, spared_rows=0), outlive=0)
     recorded.prune(nothing)  # puts the rows into chunks
     recorded.prune(nothing)
-    frame = framed(recorded.connection, run_id)
+    frame = read_frame(recorded.connection, Segment(run_id, 0, 50), Deadline(60))
     assert len(frame) == 0 and [each.why for each in frame.unread] == ["deleted by retention"]
 
 
@@ -145,3 +151,47 @@ def test_what_chunks_take_is_known_within_a_twentieth_of_what_sqlite_says(
         held = plan(connection).held_bytes["chunk"]
         on_disk = sum(size for name, size in bytes_by_name(connection).items() if "chunk" in name)
     assert held == pytest.approx(on_disk, rel=0.05)
+
+
+def test_what_chunks_cannot_hold_of_a_state_is_counted(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(signal_register, "MAX_SIGNALS", 8)
+    recorded.add_run(0)
+    held = {"x": 1.5, "ok": True, "text": "t" * 200, "whole": 2**53}
+    lost = {"x": 1.5, "text": "t" * 201, "whole": 2**53 + 1, "ok": True, "scan": [0.5] * 17}
+    for step, state in enumerate([held, lost, lost | {"beyond": 1}]):
+        recorded.publish(step * ROW_S, state)
+    recorded.prune(Retention(state=NO_STATES, outlive=0))
+    assert recorded.connection.execute("SELECT lost_value_count FROM row_group").fetchall() == [
+        (2 * 3 + 2 + 1,)  # of a scan argmin is beyond the limit as well
+    ]
+
+
+@pytest.mark.parametrize(
+    "questions",
+    [
+        ("trends", "trends of a part", "history"),
+        pytest.param(
+            ("events", "events of a part", "timeline", "comparison"),
+            marks=pytest.mark.xfail(
+                strict=True, reason="what is around an event, and evidence of a command, is read "
+                "from states; a comparison leaves out the events of purged runs",
+            ),
+        ),
+    ],
+)  # fmt: skip
+def test_questions_are_answered_after_a_purge_as_before_it(
+    tmp_path: Path, questions: tuple[str, ...]
+) -> None:
+    file = tmp_path / "webots.db"
+    record_rounds(file)
+    with closing(connect(file, "writer")) as connection:
+        before = answers(connection, 1, PART)
+        listed = list_signals(connection, run_id=1)
+        prune(connection, tmp_path, Retention(state=NO_STATES, outlive=0), rest=False)
+        assert connection.execute("SELECT count(*) FROM state").fetchone() == (0,)
+        after = answers(connection, 1, PART)
+        assert list_signals(connection, run_id=1) == listed
+        for question in questions:
+            assert after[question] == before[question], question

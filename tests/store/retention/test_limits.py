@@ -19,7 +19,6 @@ from webots_mcp.cli import main
 from webots_mcp.connection import connect
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.schema import create_schema
-from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.retention.limits import (
     ask_at_start,
     ask_where_unset,
@@ -78,7 +77,6 @@ def test_retain_sets_a_limit_and_deletes_nothing(say: Say, recorded: Recorded) -
 
 
 def test_who_maintains_keeps_to_what_was_set(say: Say, recorded: Recorded) -> None:
-    make_chunks(recorded.connection, 1000)
     upkeep = Upkeep(recorded.folder, interval_s=0, budget_s=60)
     upkeep(recorded.connection)
     assert recorded.rows() == {1: 20, 2: 20}

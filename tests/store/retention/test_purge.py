@@ -16,7 +16,7 @@ from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
 from webots_mcp.schema import create_schema
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
+from webots_mcp.store.chunks.making import chunk_whole_run
 from webots_mcp.store.retention.planning import plan
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.purge import prune, purge
@@ -40,7 +40,6 @@ def filed(tmp_path: Path) -> Iterator[tuple[Path, Recorded]]:
 
 def summed_up(recorded: Recorded) -> None:
     """Nothing is left to do for the maker of chunks: what a purge does is to delete."""
-    make_chunks(recorded.connection, 10_000)
     for run_id in recorded.rows():
         chunk_whole_run(recorded.connection, run_id)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -14,6 +15,7 @@ from webots_mcp.schema import create_schema
 from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.retention.planning import plan
 from webots_mcp.store.retention.policy import Limit, Retention
+from webots_mcp.store.retention.upkeep import Upkeep
 
 NO_LIMIT = Retention(Limit(), Limit(), Limit(), Limit(), Limit(), outlive=0)
 
@@ -75,7 +77,6 @@ def test_the_file_of_long_rows_shrinks_to_the_limit(tmp_path: Path, length: int)
             recorded.run_id = run_ids[i % 6]
             recorded.publish(i // 6 * 0.016, {"text": "t" * length})
         connection.execute("COMMIT")
-        make_chunks(connection, 10_000)
         states_bytes = 2_000_000
         recorded.prune(states(size_bytes=states_bytes))
         rest_bytes = sum(
@@ -84,3 +85,31 @@ def test_the_file_of_long_rows_shrinks_to_the_limit(tmp_path: Path, length: int)
         )  # fmt: skip
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     assert file.stat().st_size - rest_bytes == pytest.approx(states_bytes, rel=0.05)
+
+
+def test_the_file_of_a_recording_that_goes_on_stays_within_a_twentieth_of_its_limits(
+    tmp_path: Path,
+) -> None:
+    file, noise = tmp_path / "webots.db", random.Random(5)
+    sizes_of = {"state": 2_000_000, "chunk": 1_200_000, "log": 600_000}
+    limits = Retention(**{kind: Limit(size_bytes=size) for kind, size in sizes_of.items()})
+    upkeep = Upkeep(tmp_path, lambda _: limits, interval_s=0, budget_s=60)
+    sizes: list[int] = []
+    with closing(connect(file, "writer", create=True)) as connection:
+        create_schema(connection)
+        recorded = Recorded(connection, tmp_path)
+        for number in range(25_000):
+            if number % 4000 == 0:
+                recorded.add_run(0, end="reset")
+            if number % 1000 == 0:
+                make_chunks(connection, 10_000)
+                upkeep(connection)
+                connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+                sizes.append(file.stat().st_size)
+            time_s = number * 0.016
+            recorded.publish(time_s, {f"s{i}": noise.gauss(i, 0.1) for i in range(10)})
+            line = {"level": "info", "source": "controller", "message": "m" * 60}
+            recorded.insert("log", **recorded.at(time_s), **line)
+    empty_bytes, limit_bytes = sizes[0], sum(sizes_of.values())
+    assert max(sizes) - empty_bytes <= 1.05 * limit_bytes
+    assert min(sizes[-5:]) - empty_bytes >= 0.95 * limit_bytes

@@ -13,7 +13,6 @@ from tests.recordings.runs import Recorded, states
 from webots_mcp.cli import main
 from webots_mcp.connection import connect
 from webots_mcp.schema import create_schema
-from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.retention.planning import plan
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.shipped import Shipped, write_shipped
@@ -30,8 +29,6 @@ def recorded(tmp_path: Path) -> Iterator[Recorded]:
         recorded = Recorded(connection, tmp_path)
         recorded.add_run(20)
         recorded.add_run(20)
-        while not make_chunks(connection).done:
-            pass
         yield recorded
 
 
@@ -93,8 +90,6 @@ def test_beyond_the_size_the_oldest_goes_all_the_same_and_the_plan_says_so(
 def test_a_run_is_not_forgotten_while_rows_of_it_wait(recorded: Recorded) -> None:
     for _ in range(4):
         recorded.add_run(20)
-    while not make_chunks(recorded.connection).done:
-        pass
     forgetting = replace(states(rows=10), outlive=2.0)
     recorded.prune(keeping(forgetting, MB))
     assert (recorded.count("run"), recorded.count("state")) == (6, 120)

@@ -25,7 +25,7 @@ _FIRST_LABEL: Final = 2
 _LEVEL: Final = 4  # of pcodec: a quarter of the time of its default, for 2 % more bytes
 _CODES_LEVEL: Final = 1
 _CHECKSUM_BYTES: Final = 4  # CRC-32: a decompressor is not asked what it makes of damaged bytes
-_EXACT_INTEGERS: Final = 2**53  # beyond, a float does not hold every integer
+EXACT_INTEGERS: Final = 2**53  # beyond, a float does not hold every integer
 _FLOATS, _INTEGERS = "pcodec/float64", "pcodec/int64"
 _NOTHING: Final = "none"  # no row holds a number
 _NUMBERS: Final = frozenset({int, float})
@@ -73,11 +73,13 @@ class Decoded(NamedTuple):
         numbers: One for each row: NaN where it holds none; flags are 0 and 1.
         codes: One for each row; None where every row holds a number.
         labels: What codes from 2 on mean; of a replaced value `Replaced`.
+        is_whole: All numbers were integers when they were stored.
     """
 
     numbers: Array
     codes: Indexes | None
     labels: Sequence[Value | Replaced]
+    is_whole: bool = False
 
 
 def decoded_of(values: Sequence[Recorded]) -> Decoded:
@@ -122,7 +124,7 @@ def decode(encoded: Encoded, rows: int) -> Decoded:
         if encoded.codes is None:
             numbers = np.empty(rows)
             _decompress(encoded, numbers)
-            return Decoded(numbers, None, ())
+            return Decoded(numbers, None, (), encoded.codec == _INTEGERS)
         return _decode_coded(encoded, rows)
     except ModuleNotFoundError as error:
         raise DamagedChunkError(
@@ -149,7 +151,7 @@ def _decode_coded(encoded: Encoded, rows: int) -> Decoded:
         _decompress(encoded, found)
         numbers[held] = found
     _fill_flags(numbers, codes, labels)
-    return Decoded(numbers, codes, labels)
+    return Decoded(numbers, codes, labels, encoded.codec == _INTEGERS)
 
 
 def _labels(text: str | None) -> list[Value | Replaced]:
@@ -209,7 +211,7 @@ def _compressed(values: Sequence[Any], types: set[type]) -> tuple[str, bytes | N
     pcodec = _pcodec()
     numbers: Any = _numbers(values)
     codec = _FLOATS
-    if types == {int} and np.abs(numbers).max() < _EXACT_INTEGERS:
+    if types == {int} and np.abs(numbers).max() < EXACT_INTEGERS:
         codec, numbers = _INTEGERS, np.array(values, np.int64)
     config = pcodec.ChunkConfig(compression_level=_LEVEL)
     packed = bytes(pcodec.standalone.simple_compress(numbers, config))

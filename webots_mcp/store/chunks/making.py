@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final, NamedTuple, TypeVar
 
 from webots_mcp.errors import warn
-from webots_mcp.store.chunks.codec import decoded_of, encode
+from webots_mcp.store.chunks.codec import ABSENT, EXACT_INTEGERS, decoded_of, encode
 from webots_mcp.store.chunks.columns import STATE_COLUMNS, StateColumns
 from webots_mcp.store.chunks.statistics import Statistics, statistics_of
 from webots_mcp.store.chunks.stored import (
@@ -30,7 +30,8 @@ from webots_mcp.store.chunks.stored import (
 )
 from webots_mcp.store.invalid_rows import is_over_a_value, valid_rows
 from webots_mcp.store.retention.pages import INDEX_BYTES, disk_bytes
-from webots_mcp.store.signals.registry import enter_signals, registered, seen_in, tell_more
+from webots_mcp.store.signals.flatten import MAX_TEXT
+from webots_mcp.store.signals.registry import Signal, enter_signals, registered, seen_in, tell_more
 from webots_mcp.transactions import LONGEST_WRITE_S, Step
 
 GROUP_ROWS: Final = 1024
@@ -88,8 +89,8 @@ _TEMPORARY: Final = (
 _PREPARE: Final = f"INSERT INTO temp.new_chunk VALUES ({', '.join('?' * (len(_COLUMNS) + 1))})"
 _BEGIN_GROUP: Final = (
     "INSERT INTO row_group (run_id, start_sim_time_s, end_sim_time_s, last_state_id, "
-    "max_state_id, row_count, stored_row_count, stored_row_bytes, chunk_bytes, is_complete) "
-    "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, 0)"
+    "max_state_id, row_count, stored_row_count, lost_value_count, stored_row_bytes, chunk_bytes, "
+    "is_complete) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, 0)"
 )
 _STORE: Final = Step(
     "store_chunks",
@@ -205,7 +206,7 @@ class _RunChunks:
                 self.done = True
                 if has_ended:
                     left = self._tail(at, last_id)  # few, read as they are, whose names are entered
-                    _signal_ids(self._connection, self._robot_id, self._run_id, left)
+                    _signals_of(self._connection, self._robot_id, left)
                     self._connection.execute(_SET_CHUNKED, (self._run_id,))
                 return rows
             if not self._store(tail, at):
@@ -238,12 +239,14 @@ class _RunChunks:
 
     def _store(self, columns: StateColumns, at: Reached) -> bool:
         """Store a group; False where another process has stored some of its rows meanwhile."""
-        ids = _signal_ids(self._connection, self._robot_id, self._run_id, columns)
+        signals = _signals_of(self._connection, self._robot_id, columns)
+        ids = {name: each.id for name, each in signals.items() if each.id is not None}
         chunks = list(_chunks_of(self._run_id, columns, ids))
         self._prepare(chunks)
         rows = len(columns)
         group = (self._run_id, columns.times[0], columns.times[-1], columns.ids[-1])
-        values = (*group, max(columns.ids), rows, rows, *self._room_of(columns, chunks))
+        lost = _count_lost(columns, signals)
+        values = (*group, max(columns.ids), rows, rows, lost, *self._room_of(columns, chunks))
         group_id = self._connection.execute(_BEGIN_GROUP, values).lastrowid
 
         def store(some: Sequence[int]) -> bool:
@@ -299,15 +302,30 @@ def _read(connection: sqlite3.Connection, query: str, values: tuple[object, ...]
     return columns
 
 
-def _signal_ids(
-    connection: sqlite3.Connection, robot_id: int, run_id: int, columns: StateColumns
-) -> dict[str, int]:
-    """The ids of the signals of some rows, by name; what the rows tell of them is entered."""
+def _signals_of(
+    connection: sqlite3.Connection, robot_id: int, columns: StateColumns
+) -> dict[str, Signal]:
+    """The robot's signals by name; what some rows tell of them is entered."""
     known = registered(connection, robot_id)
     fresh = [name for name, each in columns.values.items() if tell_more(known.get(name), each)]
     if fresh:
         known = enter_signals(connection, robot_id, seen_in(columns, fresh))
-    return {name: each.id for name, each in known.items() if each.id is not None}
+    return known
+
+
+def _count_lost(columns: StateColumns, signals: dict[str, Signal]) -> int:
+    """How many values of some rows chunks do not hold as they were (docs/database.md)."""
+    lost = 0
+    for name, values in columns.values.items():
+        signal = signals.get(name)
+        types = set(map(type, values))
+        if signal is None or signal.reduction == "count":  # beyond the limit, or a long array
+            lost += sum(value is not ABSENT for value in values)
+        if str in types:
+            lost += sum(isinstance(value, str) and len(value) > MAX_TEXT for value in values)
+        if int in types:
+            lost += sum(type(value) is int and abs(value) > EXACT_INTEGERS for value in values)
+    return lost
 
 
 def _chunks_of(

@@ -18,10 +18,12 @@ from webots_mcp.connection import FrozenConnection
 from webots_mcp.errors import DatabaseError
 from webots_mcp.leases import holder_of
 from webots_mcp.maintenance import Maintainer
+from webots_mcp.store.chunks.aside import chunks_aside
 from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.chunks.stored import watermark
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.robots import list_robots
+from webots_mcp.transactions import FAILURES
 
 LEAST_ROWS: Final = 2000  # a question reads fewer as they are
 _BATCH_ROWS: Final = 2000
@@ -38,6 +40,7 @@ def make_missing_chunks(
     *,
     limit_s: float = math.inf,
     called_off: Callable[[], bool] = lambda: False,
+    write: bool = True,
 ) -> str:
     """Put the states that are there now and in no chunk yet into chunks, unless a server does.
 
@@ -49,6 +52,8 @@ def make_missing_chunks(
         progress: Called now and then with how many rows are done, and how many there are to do.
         limit_s: Wall seconds after which it stops.
         called_off: Asked between two batches whether to stop.
+        write: Where false, or where the file cannot be written, the chunks are made in a temporary
+            file of this process.
 
     Returns:
         How many states are left in no chunk, and why; "" where there are none, or so few that a
@@ -63,14 +68,14 @@ def make_missing_chunks(
         is_frozen = isinstance(connection, FrozenConnection)
     if total < LEAST_ROWS:
         return ""
-    if is_frozen:
-        return _say(total, "the file cannot be written from here")
-    if holder.startswith("server "):
+    if holder.startswith("server ") and not is_frozen:
         return _say(total, "the server that maintains the recording makes them")
     until_s, why = time.monotonic() + limit_s, ""
     try:
-        with recording.writer() as connection, _checkpoints(recording):
-            live = any(robot.live for robot in list_robots(connection, time.time()))
+        with _opened(recording, write=write, frozen=is_frozen) as connection:
+            live = not is_frozen and any(
+                robot.live for robot in list_robots(connection, time.time())
+            )
             while not why:
                 done = make_chunks(connection, _BATCH_ROWS, _PAUSE_S if live else 0.0).done
                 left = 0 if done else min(left, _rows_left(connection))
@@ -80,7 +85,7 @@ def make_missing_chunks(
                     return ""
                 if called_off() or time.monotonic() > until_s:
                     why = "ask again to continue"
-    except DatabaseError as error:
+    except (DatabaseError, *FAILURES) as error:
         why = str(error)
     return _say(left, why) if left >= LEAST_ROWS else ""
 
@@ -91,17 +96,23 @@ def _rows_left(connection: sqlite3.Connection) -> int:
 
 
 @contextmanager
-def _checkpoints(recording: Recording) -> Generator[None]:
-    """With a maintainer that keeps the database's log short meanwhile."""
-    if not isinstance(recording.database, Path):
-        yield
+def _opened(recording: Recording, *, write: bool, frozen: bool) -> Generator[sqlite3.Connection]:
+    """A connection to make chunks on, with a maintainer that keeps the log short meanwhile."""
+    database = recording.database
+    if isinstance(database, Path) and (frozen or not write):
+        with chunks_aside(database, frozen=frozen) as connection:
+            yield connection
         return
-    maintainer = Maintainer(recording.database, "question")  # idle while a bridge is it
-    maintainer.start()
-    try:
-        yield
-    finally:
-        maintainer.stop()
+    # Idle while a bridge is it.
+    maintainer = Maintainer(database, "question") if isinstance(database, Path) else None
+    with recording.writer() as connection:
+        if maintainer is not None:
+            maintainer.start()
+        try:
+            yield connection
+        finally:
+            if maintainer is not None:
+                maintainer.stop()
 
 
 def _say(rows: int, why: str) -> str:

@@ -14,17 +14,17 @@ from typing import Any, Final, get_args
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.signal_kinds import Kind
-from webots_mcp.signal_register import MAX_SIGNALS
+from webots_mcp.signal_register import Seen
 from webots_mcp.store.chunks.codec import DamagedChunkError, Encoded, decode, decoded_of, encode
 from webots_mcp.store.chunks.statistics import Statistics, statistics_of
-from webots_mcp.store.chunks.stored import SIM_TIMES, STATE_IDS, WALL_TIMES, WIDEN_EXTREMES
+from webots_mcp.store.chunks.stored import SIM_TIMES, STATE_IDS, WALL_TIMES
 from webots_mcp.store.signals.registry import enter_signals
 
 # Ids between the first and the last row of a run; other robots could not have recorded more.
 _MOST_IDS: Final = 2**40
 _IDS: Final = (
-    "SELECT min(id), max(id) FROM (SELECT id FROM source.state WHERE run_id = :run "
-    "UNION ALL SELECT max_state_id FROM source.row_group WHERE run_id = :run "
+    "SELECT min(id), max(id) FROM (SELECT id FROM source.state WHERE run_id = :run UNION ALL "
+    "SELECT max_state_id FROM source.row_group WHERE run_id = :run "
     f"UNION ALL SELECT CAST(min AS INTEGER) FROM source.chunk WHERE run_id = :run "
     f"AND signal_id = {STATE_IDS})"
 )
@@ -33,15 +33,11 @@ _RESERVE: Final = (
     "DELETE FROM main.sqlite_sequence WHERE name = 'state'",
     "INSERT INTO main.sqlite_sequence (name, seq) VALUES ('state', ?)",
 )
-_DESCRIBED: Final = "name, kind, unit, path, reduction, role, first_seen_wall_time_s"
-_ENTER: Final = (
-    f"INSERT INTO main.signal (robot_id, {_DESCRIBED}) SELECT :here, {_DESCRIBED} "
-    "FROM source.signal s WHERE robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
-    f"AND kind IN {get_args(Kind)} "
-    "AND EXISTS (SELECT 1 FROM source.chunk WHERE run_id = :run AND signal_id = s.id) "
-    "AND NOT EXISTS (SELECT 1 FROM main.signal WHERE robot_id = :here "
-    "AND name = s.name) ORDER BY id "
-    f"LIMIT max(0, {MAX_SIGNALS} - (SELECT count(*) FROM main.signal WHERE robot_id = :here))"
+_SIGNALS: Final = (
+    "SELECT name, path, reduction, kind, role, first_seen_wall_time_s FROM source.signal s "
+    "WHERE robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
+    f"AND typeof(name) = 'text' AND kind IN {get_args(Kind)} "
+    "AND EXISTS (SELECT 1 FROM source.chunk WHERE run_id = :run AND signal_id = s.id) ORDER BY id"
 )
 _MAP: Final = "CREATE TEMP TABLE IF NOT EXISTS signal_here (there INTEGER PRIMARY KEY, here)"
 _FILL_MAP: Final = (
@@ -51,7 +47,8 @@ _FILL_MAP: Final = (
     f"UNION ALL VALUES ({SIM_TIMES}, {SIM_TIMES}), ({WALL_TIMES}, {WALL_TIMES})"
 )
 _GROUP: Final = (
-    "start_sim_time_s, end_sim_time_s, row_count, stored_row_count, stored_row_bytes, chunk_bytes, "
+    "start_sim_time_s, end_sim_time_s, row_count, stored_row_count, lost_value_count, "
+    "stored_row_bytes, chunk_bytes, "
     "is_complete"
 )
 _GROUPS: Final = "SELECT id, row_count FROM source.row_group WHERE run_id = ? AND is_complete = 1"
@@ -86,14 +83,18 @@ def take_in_chunks(connection: sqlite3.Connection, there: int, here: int, robot_
         robot_id: Its robot here.
 
     Returns:
-        By how much the ids of its state rows are to rise.
+        By how much the ids of its state rows rise here.
 
     Raises:
         InvalidInputError: Its ids are spread as no bridge gives them.
     """
-    shift = _reserved_ids(connection, there)
+    shift = _reserve_ids(connection, there)
     asked = {"run": there, "here": robot_id}
-    connection.execute(_ENTER, asked)
+    seen = {
+        name: Seen(path, reduction, kind, (role or "").startswith("mode"), first_s)
+        for name, path, reduction, kind, role, first_s in connection.execute(_SIGNALS, asked)
+    }
+    enter_signals(connection, robot_id, seen)
     connection.execute(_MAP)
     connection.execute("DELETE FROM temp.signal_here")
     connection.execute(_FILL_MAP, asked)
@@ -106,8 +107,6 @@ def take_in_chunks(connection: sqlite3.Connection, there: int, here: int, robot_
             with suppress(DamagedChunkError):  # who reads them is told that they are missing
                 shifted = _shifted(packed, rows, shift)
                 connection.execute(_INSERT, (values["here"], here, STATE_IDS, *shifted))
-        connection.execute(WIDEN_EXTREMES, (values["here"],))
-    enter_signals(connection, robot_id, {})
     return shift
 
 
@@ -118,7 +117,7 @@ def _shifted(packed: Sequence[Any], rows: int, shift: int) -> tuple[Any, ...]:
     return *statistics_of(decoded_of(ids)), *encode(ids)
 
 
-def _reserved_ids(connection: sqlite3.Connection, there: int) -> int:
+def _reserve_ids(connection: sqlite3.Connection, there: int) -> int:
     (last_here,) = connection.execute(_LAST_HERE).fetchone()
     first, last = connection.execute(_IDS, {"run": there}).fetchone()
     if first is None:

@@ -55,8 +55,11 @@ def export(
     progress: Progress | None = None,
     *,
     safe_cells: bool = False,
+    notes: list[str] | None = None,
 ) -> int:
     """Write the state rows of a range, as many as there are now, flattened.
+
+    Those that retention has deleted are given back from their chunks.
 
     Columns are run, state id, simulation and wall time, then the dotted names in the order in
     which they first appear; one that has the name of those or `replaced` is called `state.NAME`.
@@ -68,6 +71,7 @@ def export(
         sink: Takes bytes; need not be seekable.
         progress: Called now and then with the rows read so far and in all.
         safe_cells: See `write_csv`; the other formats have no cells that could be formulas.
+        notes: Takes what could not be given back of deleted rows.
 
     Returns:
         The number of rows.
@@ -87,6 +91,8 @@ def export(
         write_csv(source, sink, safe_cells=True)
     else:
         load(chosen.write)(source, sink)
+    if notes is not None and isinstance(source, Source):
+        notes += source.notes
     return source.total
 
 
@@ -98,6 +104,7 @@ def export_file(
     progress: Progress | None = None,
     *,
     safe_cells: bool = False,
+    notes: list[str] | None = None,
 ) -> int:
     """As `export`, into a file of its owner alone that appears only when it is complete.
 
@@ -105,7 +112,7 @@ def export_file(
         InvalidInputError: Also where the file cannot be written.
     """
     with placed(file) as aside, aside.open("wb") as sink:
-        return export(connection, wanted, form, sink, progress, safe_cells=safe_cells)
+        return export(connection, wanted, form, sink, progress, safe_cells=safe_cells, notes=notes)
 
 
 def export_for_viewers(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import json
 import math
 import sqlite3
@@ -11,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Final, Literal, NamedTuple, cast
 
 from webots_mcp.naming import LONGEST_SPREAD_ARRAY, flatten
+from webots_mcp.store.export.purged_rows import PurgedRows
 from webots_mcp.store.reading.kept import kept_parts
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.run_rows import put_back
@@ -122,6 +124,7 @@ class Source(Table):
 
     Attributes:
         passes: How often they will be read, so that progress can be reported.
+        purged: Of each segment the rows that only its chunks have.
     """
 
     head: ClassVar[tuple[Column, ...]] = _HEAD
@@ -131,6 +134,7 @@ class Source(Table):
     last_kept_id: int
     total: int
     passes: int
+    purged: Sequence[PurgedRows]
     progress: Progress | None = None
 
     @classmethod
@@ -148,8 +152,15 @@ class Source(Table):
             last_ids[table] = connection.execute(_LAST_ID.format(table=table)).fetchone()[0]
             count = _COUNT.format(table=table)
             total += sum(connection.execute(count, bound).fetchone()[0] for bound in bounds)
+        purged = [PurgedRows(connection, segment) for segment in segments]
+        total += sum(map(len, purged))
         newest = (last_ids["state"], last_ids["kept_state"])
-        return cls(connection, segments, *newest, total, passes, progress)
+        return cls(connection, segments, *newest, total, passes, purged, progress)
+
+    @property
+    def notes(self) -> list[str]:
+        """What could not be given back of rows that retention has deleted, once they were read."""
+        return [note for each in self.purged for note in (*each.notes, *map(str, each.unread))]
 
     def rows(self, pass_number: int = 1) -> Iterator[Row]:
         """All of them, run by run, in the order of simulation time."""
@@ -158,13 +169,16 @@ class Source(Table):
     def recorded(self, pass_number: int = 1) -> Iterator[Recorded]:
         """The same rows as they are stored."""
         done = (pass_number - 1) * self.total
-        for segment in self.segments:
-            for chunk in self._chunks(segment):
-                for stored in chunk:
-                    yield Recorded(segment.run_id, *stored)
-                done += len(chunk)
-                if self.progress is not None:
+        for segment, purged in zip(self.segments, self.purged, strict=True):
+            stored = (row for chunk in self._chunks(segment) for row in chunk)
+            # Ids fall where only a kept stretch has a row.
+            for row in heapq.merge(purged, stored, key=lambda row: (row[1], row[2])):
+                yield Recorded(segment.run_id, *row)
+                done += 1
+                if self.progress is not None and done % CHUNK_ROWS == 0:
                     self.progress(done, self.total * self.passes)
+        if self.progress is not None:
+            self.progress(done, self.total * self.passes)
 
     def _chunks(self, segment: Segment) -> Iterator[list[Any]]:
         values: dict[str, Any] = {

@@ -68,7 +68,6 @@ def coverage_notes(
             yield f"the recording of {run} begins at {first_s:g} s, within the range"
         if end_s > math.nextafter(newest_s, math.inf):
             yield f"the recording of {run} ends at {newest_s:g} s, within the range"
-        yield from purge_notes(connection, run_id, start_s)
         yield from _gap_notes(connection, run_id, start_s, end_s)
 
 
@@ -91,16 +90,6 @@ def less_time(connection: sqlite3.Connection, segment: Segment) -> str:
     if until_s >= segment.end_s:
         return "its rows were purged"
     return f"ask for less time from {until_s:.6g} s on: the rows before were purged"
-
-
-def purge_notes(connection: sqlite3.Connection, run_id: int, start_s: float) -> Iterator[str]:
-    """That rows from `start_s` on were purged, and what is left of that time."""
-    until_s = purged_until_s(connection, run_id, start_s)
-    if until_s is None:
-        return
-    when = "" if until_s == math.inf else f" before {until_s:g} s"
-    left = "numbers, flags and texts of that time are read from chunks, but not exported"
-    yield f"the rows of run {run_id}{when} were purged: {left}"
 
 
 def _gap_notes(

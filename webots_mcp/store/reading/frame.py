@@ -453,7 +453,7 @@ def read_frame(
     parts += _rows_in_parts(columns, parts[-1].start + parts[-1].rows if parts else 0)
     names = dict(connection.execute(_SIGNALS, (run_id,)).fetchall())
     source = FrameSource(connection, run_id, parts, names)
-    if lost := _lost(connection, segment):
+    if lost := deleted_part(connection, segment):
         source.unread[lost] = None
     return _framed(source, segment, _said(source, segment, cut_at_s))
 
@@ -467,7 +467,7 @@ def _said(source: FrameSource, segment: Segment, cut_at_s: float | None) -> floa
     return reached_s
 
 
-def _lost(connection: sqlite3.Connection, segment: Segment) -> Unread | None:
+def deleted_part(connection: sqlite3.Connection, segment: Segment) -> Unread | None:
     """The part of a segment whose rows and chunks retention has deleted."""
     row = connection.execute(_LOST, (segment.run_id,)).fetchone()
     if row is None:

@@ -12,6 +12,9 @@ import math
 import sqlite3
 from typing import Final, NamedTuple
 
+from webots_mcp.store.chunks.codec import Decoded
+from webots_mcp.store.chunks.stored import SIM_TIMES, groups_in, values_in
+
 MOST_STRETCHES: Final = 200  # newest of a range that are looked at
 MOST_ROWS: Final = 30_000  # of a range that is answered from each call
 _NAMED: Final = 2
@@ -85,7 +88,10 @@ def is_at_full_rate(
     """Whether [start_s, end_s) holds nothing but rows of one stretch, and not too many of them."""
     for each in kept_parts(connection, run_id, start_s, end_s):
         outside = ((start_s, each.start_s), (_after(each.end_s), end_s))
-        if not any(_any(connection, "state", run_id, *span) for span in outside):
+        if not any(
+            _any(connection, "state", run_id, *span) or _any_in_chunks(connection, run_id, *span)
+            for span in outside
+        ):
             bounds = (run_id, start_s, end_s)
             counts = [
                 connection.execute(_COUNT.format(table=table), bounds).fetchone()[0]
@@ -112,6 +118,21 @@ def _any(
 ) -> bool:
     query = _ANY.format(table=table)
     return bool(connection.execute(query, (run_id, start_s, end_s)).fetchone()[0])
+
+
+def _any_in_chunks(
+    connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
+) -> bool:
+    """Whether a row is there that may have been deleted since it was put into a chunk."""
+    groups = groups_in(connection, run_id, start_s, end_s) if start_s < end_s else []
+    if any(group.start_s >= start_s or group.end_s < end_s for group in groups):
+        return True
+    times = (values for _, values in values_in(connection, run_id, SIM_TIMES, groups))
+    return any(
+        bool(((each.numbers >= start_s) & (each.numbers < end_s)).any())
+        for each in times
+        if isinstance(each, Decoded)
+    )
 
 
 def _after(time_s: float) -> float:

@@ -24,15 +24,14 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from webots_mcp.errors import InvalidRangeError, NothingRecordedError
-from webots_mcp.store.reading.coverage import coverage_notes, hit_notes, purge_notes
+from webots_mcp.store.reading.coverage import coverage_notes, hit_notes
 from webots_mcp.store.reading.kept import is_at_full_rate, kept_notes
 from webots_mcp.store.reading.moments import moment_of, shown_time
 from webots_mcp.store.reading.subject import Subject, find_subject
 from webots_mcp.store.reading.wall_time import parse_wall_time, simulation_times
 
 _PURGED: Final = (
-    "SELECT started_sim_time_s, last_sim_time_s FROM run WHERE id = ? AND purged_rows > 0 "
-    "AND EXISTS (SELECT 1 FROM chunk WHERE run_id = run.id)"
+    "SELECT started_sim_time_s, last_sim_time_s FROM run WHERE id = ? AND purged_rows > 0"
 )
 _RUN_BEFORE: Final = (
     "SELECT (SELECT max(id) FROM run b WHERE b.robot_id = run.robot_id AND b.id < run.id), "
@@ -40,7 +39,9 @@ _RUN_BEFORE: Final = (
 )
 _BOUND: Final = (
     "SELECT {0}(time_s) FROM (SELECT {0}(sim_time_s) AS time_s FROM state WHERE run_id = :run "
-    "UNION ALL SELECT {0}(sim_time_s) FROM kept_state WHERE run_id = :run)"
+    "UNION ALL SELECT {0}(sim_time_s) FROM kept_state WHERE run_id = :run UNION ALL SELECT "
+    "{0}(end_sim_time_s) FROM row_group WHERE run_id = :run AND is_complete = 1 "
+    "AND stored_row_count = 0)"
 )
 _RUNS_IN: Final = (
     "SELECT id FROM run WHERE robot_id = ? AND started_wall_time_s < ? "
@@ -216,7 +217,7 @@ def _told(time_s: float) -> str:
 def recorded_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float, float] | None:
     """Simulation times between which a run recorded; None if it has no row.
 
-    Rows that retention deleted count: their rollups are still there.
+    Rows that retention deleted count: their chunks are there, or a frame says what is not.
     """
     rows = _row_bounds(connection, run_id)
     purged = connection.execute(_PURGED, (run_id,)).fetchone()
@@ -327,7 +328,6 @@ def _in_wall_time(
     segments = tuple(segment for segment in cuts if segment is not None)
     notes = [] if segments else [f"no row of robot {subject.robot!r} in that wall time"]
     for segment in segments:
-        notes += purge_notes(connection, segment.run_id, segment.start_s)
         notes += _rate_notes(connection, segment)
     if len(runs) > MOST_RUNS:
         notes.append(f"only the newest {MOST_RUNS} runs in that wall time are looked at")

@@ -8,22 +8,13 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate
 from typing import Final
 
 from webots_mcp.contract import FINAL_STATUSES
+from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.retention.policy import DEFAULT, KEPT, Limit, Retention
 from webots_mcp.store.retention.shipped import Shipped, complete_until_s, last_shipped, shipped_of
-from webots_mcp.store.retention.usage import (
-    TABLES,
-    UNBOUNDED,
-    Portion,
-    nth_id,
-    portions_of,
-    read_runs,
-    rows_before,
-    rows_up_to,
-)
+from webots_mcp.store.retention.usage import TABLES, Holdings, Portion, read_runs, rows_of
 
 # Those that were created during a kept run stay with it.
 OLD_COMMANDS: Final = (
@@ -56,12 +47,17 @@ class Step:
     size_bytes: int
     newest_s: float
     portion: Portion | None = None
-    bound: int = UNBOUNDED
+    bound: int = 0
 
     @property
     def row_bytes(self) -> float:
         """About what one of them takes; at least a byte."""
         return max(self.size_bytes / max(self.rows, 1), 1.0)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all of the portion goes."""
+        return self.portion is not None and self.bound >= self.portion.last_id
 
 
 @dataclass(frozen=True)
@@ -100,11 +96,6 @@ class Plan:
         """All rows that go."""
         return sum(step.rows for step in self.steps)
 
-    @property
-    def size_bytes(self) -> int:
-        """About so much is freed."""
-        return sum(step.size_bytes for step in self.steps)
-
     def rows_by_table(self) -> Counter[str]:
         """How many rows of each table go."""
         rows = Counter[str]()
@@ -124,29 +115,36 @@ class Plan:
 
 
 def plan(
-    connection: sqlite3.Connection, retention: Retention = DEFAULT, now_s: float | None = None
+    connection: sqlite3.Connection,
+    retention: Retention = DEFAULT,
+    now_s: float | None = None,
+    holdings: Holdings | None = None,
 ) -> Plan:
     """Find what is beyond the limits; nothing is changed.
-
-    Costs a look at each row group, and a pass over logs, events, pictures and kept stretches.
 
     Args:
         connection: Any.
         retention: The limits.
         now_s: Unix time, from which ages are counted; None for now.
+        holdings: What was counted before, so that only new rows are looked at; None for a look at
+            all logs, events, pictures and kept stretches.
     """
-    return _Planner(connection, retention, time.time() if now_s is None else now_s).plan()
+    now_s = time.time() if now_s is None else now_s
+    return _Planner(connection, retention, now_s, holdings or Holdings()).plan()
 
 
 class _Planner:
     """The recording at one moment, against the limits."""
 
-    def __init__(self, connection: sqlite3.Connection, retention: Retention, now_s: float) -> None:
+    def __init__(
+        self, connection: sqlite3.Connection, retention: Retention, now_s: float, held: Holdings
+    ) -> None:
         self._connection = connection
         self._retention = retention
         self._now_s = now_s
         self._runs = read_runs(connection)
-        self._held = portions_of(connection, self._runs)
+        self._held = held.portions(connection, self._runs)
+        self._rows: dict[Portion, tuple[Array, Array]] = {}  # of the few that are looked into
         self._spared = dict[tuple[str, str], list[float]]()
         self._unshipped = dict[tuple[str, str], list[float]]()
         self._forgotten = self._find_forgotten() if retention.outlive else set[int]()
@@ -154,61 +152,61 @@ class _Planner:
     def plan(self) -> Plan:
         steps: list[Step] = []
         for table in TABLES:
-            gone = {step.portion.group_id for step in steps if _is_whole(step) and step.portion}
-            steps += reversed(list(self._beyond(table, gone)))
-        for run in self._runs:
-            if run.id in self._forgotten:
-                steps.append(Step("run", run.id, 1, 0, run.last_wall_time_s))
-        for robot_id in {run.robot_id: None for run in self._runs}:
+            gone = [each.portion for each in steps if each.portion and each.is_whole]
+            whole_groups = {portion.group_id for portion in gone if portion.table == "state"}
+            steps += reversed(list(self._beyond(table, whole_groups)))
+        for run_id in self._runs:
+            if run_id in self._forgotten:
+                steps.append(Step("run", run_id, 1, 0, self._runs[run_id].last_wall_time_s))
+        for robot_id in {run.robot_id: None for run in self._runs.values()}:
             steps += self._commands(robot_id)
         if limit_bytes := self._retention.unshipped.size_bytes:
             steps = self._after_shipping(steps, limit_bytes)
-        every = [portion for portions in self._held.values() for portion in portions]
+        sizes = {table: _size_of(portions) for table, portions in self._held.items()}
+        kept = [self._kept(table, is_kept=True) for table in TABLES]
         return Plan(
             tuple(steps),
-            {table: round(_size_of(portions)) for table, portions in self._held.items()},
+            {table: round(size_bytes) for table, size_bytes in sizes.items()},
             _listed(self._spared),
-            tuple(run.id for run in self._runs if run.is_kept),
-            round(_size_of([portion for portion in every if portion.run.is_kept])),
+            tuple(run.id for run in self._runs.values() if run.is_kept),
+            round(sum(map(_size_of, kept))),
             _listed(self._unshipped),
         )
+
+    def _kept(self, table: str, *, is_kept: bool) -> list[Portion]:
+        """Portions of the runs that are retention's to judge, or of those that are not."""
+        return [each for each in self._held[table] if self._runs[each.run_id].is_kept == is_kept]
 
     def _find_forgotten(self) -> set[int]:
         """Finished runs after which `outlive` times the limits of state was recorded.
 
         As of states, age alone does not do it where few were recorded since.
         """
-        states = [portion for portion in self._held["state"] if not portion.run.is_kept]
+        states = self._kept("state", is_kept=False)
         row_bytes = _size_of(states) / max(sum(portion.rows for portion in states), 1)
-        free = [run for run in self._runs if not run.is_kept]
-        newest_first = sorted(free, key=lambda run: (-run.started_wall_time_s, -run.id))
-        rows_after = accumulate((run.recorded_rows for run in newest_first), initial=0)
-        limit = self._retention.state
-        return {
-            run.id
-            for run, after in zip(newest_first, rows_after, strict=False)
-            if not run.is_current
-            and limit.is_exceeded(
-                size_bytes=after * row_bytes,
-                rows=after,
-                age_s=self._now_s - run.last_wall_time_s if after >= limit.spared_rows else 0,
-                times=self._retention.outlive,
-            )
-        }
+        limit, after, forgotten = self._retention.state, 0, set[int]()
+        free = [run for run in self._runs.values() if not run.is_kept]
+        for run in sorted(free, key=lambda run: (-run.started_wall_time_s, -run.id)):
+            age_s = self._now_s - run.last_wall_time_s if after >= limit.spared_rows else 0
+            if not run.is_current and limit.is_exceeded(
+                size_bytes=after * row_bytes, rows=after, age_s=age_s, times=self._retention.outlive
+            ):
+                forgotten.add(run.id)
+            after += run.recorded_rows
+        return forgotten
 
-    def _beyond(self, table: str, gone_groups: set[int]) -> Iterator[Step]:
+    def _beyond(self, table: str, whole_groups: set[int]) -> Iterator[Step]:
         """What goes of a table, the newest first; all of runs that are forgotten."""
         limit: Limit = getattr(self._retention, table)
-        free = [portion for portion in self._held[table] if not portion.run.is_kept]
-        staying = [portion for portion in free if portion.run.id not in self._forgotten]
+        free = self._kept(table, is_kept=False)
+        staying = [portion for portion in free if portion.run_id not in self._forgotten]
         before_s = -math.inf if limit.age_s is None else self._now_s - limit.age_s
         bound, rows = self._bound(staying, limit), 0
         for portion in free:
-            if portion.run.id in self._forgotten:
+            if portion.run_id in self._forgotten:
                 yield self._step(portion, portion.rows)
                 continue
-            over = rows_up_to(self._connection, portion, bound)
-            old = rows_before(self._connection, portion, before_s)
+            over, old = self._up_to(portion, bound), self._before(portion, before_s)
             aged = min(old, max(portion.rows - max(limit.spared_rows - rows, 0), 0))
             going = max(over, aged)
             why = f"too old, but among the newest {limit.spared_rows}"
@@ -216,7 +214,7 @@ class _Planner:
             rows += portion.rows
             if table == "chunk":
                 going = portion.rows if over or aged == portion.rows else 0
-                if portion.is_held and portion.group_id not in gone_groups:
+                if portion.is_held and portion.group_id not in whole_groups:
                     _add(self._spared, portion, going, "the states are still there")
                     going = 0
             if going:
@@ -224,31 +222,60 @@ class _Planner:
 
     def _bound(self, held: Sequence[Portion], limit: Limit) -> int:
         """The id up to which rows have to go, of all runs, for a size and a number of rows."""
+        if not limit.is_exceeded(size_bytes=_size_of(held), rows=sum(each.rows for each in held)):
+            return 0
+        facts = [(each.first_id, each.last_id, each.rows, each.size_bytes) for each in held]
+        first, last, rows, size = np.transpose(np.reshape(np.array(facts, np.float64), (-1, 4)))
         low, high = 0, held[0].last_id if held else 0
         while low < high:
             middle = (low + high) // 2
-            rows, size_bytes = 0, 0.0
-            for portion in held:
-                if portion.last_id <= middle:
-                    break
-                stays = portion.rows - rows_up_to(self._connection, portion, middle)
-                rows, size_bytes = rows + stays, size_bytes + stays * portion.row_bytes
-            if limit.is_exceeded(size_bytes=size_bytes, rows=rows):
+            whole = first > middle
+            rows_left, bytes_left = float(rows[whole].sum()), float(size[whole].sum())
+            cut: list[int] = np.flatnonzero(~whole & (last > middle)).tolist()
+            for place in cut:
+                stays = held[place].rows - self._up_to(held[place], middle)
+                rows_left += stays
+                bytes_left += stays * held[place].row_bytes
+            if limit.is_exceeded(size_bytes=bytes_left, rows=rows_left):
                 low = middle + 1
             else:
                 high = middle
         return low
 
+    def _up_to(self, portion: Portion, last_id: float) -> int:
+        """How many of its rows have ids up to that."""
+        if portion.last_id <= last_id:
+            return portion.rows
+        if portion.first_id > last_id or portion.table == "chunk":
+            return 0
+        return int(np.count_nonzero(self._rows_of(portion)[0] <= last_id))
+
+    def _before(self, portion: Portion, wall_time_s: float) -> int:
+        """How many of its rows are older than that."""
+        if portion.newest_s < wall_time_s:
+            return portion.rows
+        if portion.oldest_s >= wall_time_s or portion.table == "chunk":
+            return 0
+        return int(np.count_nonzero(self._rows_of(portion)[1] < wall_time_s))
+
+    def _rows_of(self, portion: Portion) -> tuple[Array, Array]:
+        if portion not in self._rows:
+            self._rows[portion] = rows_of(self._connection, portion)
+        return self._rows[portion]
+
     def _step(self, portion: Portion, rows: int) -> Step:
-        is_part = rows < portion.rows
-        bound = nth_id(self._connection, portion, rows) if is_part else UNBOUNDED
-        size_bytes = round(rows * portion.row_bytes)
-        run_id, newest_s = portion.run.id, portion.newest_s
-        return Step(portion.table, run_id, rows, size_bytes, newest_s, portion, bound)
+        bound = portion.last_id
+        if rows < portion.rows:
+            ids = self._rows_of(portion)[0]
+            bound = int(ids[min(rows, len(ids)) - 1]) if len(ids) else 0
+        size_bytes = round(rows * portion.size_bytes / portion.rows)
+        return Step(
+            portion.table, portion.run_id, rows, size_bytes, portion.newest_s, portion, bound
+        )
 
     def _commands(self, robot_id: int) -> Iterator[Step]:
         """Finished commands from before all runs of the robot that stay, or older than events."""
-        runs = [run for run in self._runs if run.robot_id == robot_id]
+        runs = [run for run in self._runs.values() if run.robot_id == robot_id]
         staying = [run.started_wall_time_s for run in runs if run.id not in self._forgotten]
         before_s = min(staying) if len(staying) < len(runs) else -math.inf
         if self._retention.event.age_s is not None:
@@ -286,12 +313,8 @@ class _Planner:
         """How many of a step's rows are not in all pools."""
         if step.portion is None:
             return step.rows if step.newest_s > complete_until_s(pools) else 0
-        last = last_shipped(pools, step.table)
-        return max(step.rows - rows_up_to(self._connection, step.portion, last), 0)
-
-
-def _is_whole(step: Step) -> bool:
-    return step.table == "state" and step.bound == UNBOUNDED
+        shipped = self._up_to(step.portion, last_shipped(pools, step.table))
+        return max(step.rows - shipped, 0)
 
 
 def _add(

@@ -8,6 +8,7 @@ State rows go only after their values were put into chunks.
 
 from __future__ import annotations
 
+import json
 import sqlite3
 import time
 from collections import Counter
@@ -23,7 +24,7 @@ from webots_mcp.store.images import inside
 from webots_mcp.store.retention.planning import OLD_COMMANDS, Plan, plan
 from webots_mcp.store.retention.planning import Step as Going
 from webots_mcp.store.retention.policy import DEFAULT, KEPT, Retention
-from webots_mcp.store.retention.usage import UNBOUNDED, Portion, rows_of
+from webots_mcp.store.retention.usage import Holdings, Portion, rows_of
 from webots_mcp.transactions import LONGEST_WRITE_S, ShortWrites, Step, is_busy
 
 BATCH_ROWS: Final = 500
@@ -49,10 +50,13 @@ _HIDE_GROUP: Final = (
 _CHUNKS: Final = "SELECT id FROM chunk WHERE group_id = ?"
 _DELETE_GROUP: Final = "DELETE FROM row_group WHERE id = ? AND is_complete = 0"
 _GROUPS_WITH_ROWS: Final = (
-    "SELECT id FROM row_group WHERE run_id = ? AND is_complete = 1 AND stored_row_count > 0 "
-    "ORDER BY max_state_id"
+    "SELECT id, stored_row_count, max_state_id FROM row_group WHERE run_id = ? AND is_complete = 1 "
+    "AND stored_row_count > 0 ORDER BY max_state_id"
 )
-_NONE_STORED: Final = "UPDATE row_group SET stored_row_count = 0 WHERE id = :group_id"
+_SET_STORED: Final = (  # what others deleted was not counted
+    "UPDATE row_group SET stored_row_count = (SELECT count(*) FROM json_each(?) j "
+    "CROSS JOIN state s ON s.id = j.value) WHERE id = ?"
+)
 # Rows without files go many at once, in one statement: see `Step`. What is left in `going` went.
 _GOING: Final = "CREATE TEMP TABLE IF NOT EXISTS going (id INTEGER PRIMARY KEY, run_id INTEGER)"
 _NOT_GOING: Final = (
@@ -174,7 +178,11 @@ def prune(
 
 
 def purge(
-    connection: sqlite3.Connection, wanted: Plan, data_dir: Path, spare_pages: int = 0
+    connection: sqlite3.Connection,
+    wanted: Plan,
+    data_dir: Path,
+    spare_pages: int = 0,
+    holdings: Holdings | None = None,
 ) -> Iterator[Purged]:
     """Carry out a plan, write by write; the caller rests wherever this yields.
 
@@ -183,6 +191,7 @@ def purge(
         wanted: The plan.
         data_dir: The folder that the paths of pictures are relative to.
         spare_pages: So many free pages stay in the file, for the rows to come.
+        holdings: Those of the plan; what has gone is counted again.
 
     Yields:
         What was deleted so far; always the same object, and once at least.
@@ -199,6 +208,10 @@ def purge(
         yield from work.in_turn([work.carry_out(its) for its in steps.values() if its])
         if steps.get("kept_state"):
             yield from work.forget_frames()
+    if holdings is not None:
+        for step in wanted.steps:
+            if step.portion is not None:
+                holdings.recount(connection, step.portion)
     yield from work.give_back()
 
 
@@ -257,14 +270,17 @@ class _Purge:
     def _states(self, step: Going) -> Iterator[Purged]:
         """Rows of a group; those that are in none become one first."""
         assert step.portion is not None
-        groups: list[int] = [step.portion.group_id]
-        if not step.portion.group_id:
-            while not self._unless_locked(lambda: self._chunked(step.owner_id)):
-                yield self.purged
-            found = self._connection.execute(_GROUPS_WITH_ROWS, (step.owner_id,)).fetchall()
-            groups = [group_id for (group_id,) in found]
-        for group_id in groups:
-            yield from self._rows(step.portion._replace(group_id=group_id), step.bound)
+        portion, run_id = step.portion, step.owner_id
+        if portion.group_id:
+            yield from self._rows(portion, step.bound)
+            return
+        while not self._unless_locked(lambda: self._chunked(run_id)):
+            yield self.purged
+        found = self._connection.execute(_GROUPS_WITH_ROWS, (run_id,)).fetchall()
+        for group_id, rows, last_id in found:
+            group = portion._replace(group_id=group_id, rows=rows, last_id=last_id)
+            yield from self._rows(group, step.bound)
+        yield from self._rows(portion, step.bound)  # what no bridge writes is in no chunk
 
     def _chunked(self, run_id: int) -> bool:
         """Put rows into chunks for a moment; whether all rows of a run are in one."""
@@ -274,18 +290,14 @@ class _Purge:
 
     def _rows(self, portion: Portion, bound: int) -> Iterator[Purged]:
         """Rows of a portion up to an id, in the order of their ids."""
-        rows, values = rows_of(portion)
-        query = f"SELECT s.id {rows} AND s.id > :after AND s.id <= :bound ORDER BY s.id LIMIT :most"
-        values |= {"after": 0, "bound": bound, "most": BATCH_ROWS}
-        while found := self._connection.execute(query, values).fetchall():
-            keys = [{"id": row_id, "run_id": portion.run.id} for (row_id,) in found]
-            values["after"] = found[-1][0]
-            while keys:
-                keys = keys[self._delete_some(portion.table, keys, portion.group_id) :]
-                yield self.purged
-        if portion.table == "state" and bound == UNBOUNDED:  # what others deleted was not counted
-            query = f"{_NONE_STORED} AND stored_row_count > 0 AND NOT EXISTS (SELECT 1 {rows})"
-            self._unless_locked(lambda: self._connection.execute(query, values).rowcount)
+        ids = [int(row_id) for row_id in rows_of(self._connection, portion)[0] if row_id <= bound]
+        keys = [{"id": row_id, "run_id": portion.run_id} for row_id in ids]
+        while keys:
+            keys = keys[self._delete_some(portion.table, keys, portion.group_id) :]
+            yield self.purged
+        if portion.group_id and bound >= portion.last_id:
+            stored = (json.dumps(ids), portion.group_id)
+            self._unless_locked(lambda: self._connection.execute(_SET_STORED, stored).rowcount)
 
     def _chunks(self, step: Going) -> Iterator[Purged]:
         """The chunks of a group, which no reader sees any more."""

@@ -13,12 +13,13 @@ from webots_mcp.store.retention.limits import in_force
 from webots_mcp.store.retention.planning import Plan, plan
 from webots_mcp.store.retention.policy import Retention
 from webots_mcp.store.retention.purge import Purged, purge
+from webots_mcp.store.retention.usage import Holdings
 
 INTERVAL_S: Final = 2.0
 PLANNING_SHARE: Final = 0.02  # of the time: looking at ten million rows takes a second
 BUDGET_S: Final = 0.75  # of each round of the maintainer, nine tenths of it at rest
-# What stays free in the file for the rows to come: a tenth of it, but no more than 10 MB.
-SPARE_SHARE: Final = 10
+# What stays free in the file for the rows to come: a fortieth of it, but no more than 10 MB.
+SPARE_SHARE: Final = 40
 MOST_SPARE_PAGES: Final = 2500
 
 
@@ -48,6 +49,7 @@ class Upkeep:
         self._budget_s = budget_s
         self._next_plan_s = 0.0
         self._connection: sqlite3.Connection | None = None
+        self._holdings = Holdings()
         self._under_way: Iterator[Purged] | None = None
         self._has_warned = False
 
@@ -59,6 +61,7 @@ class Upkeep:
         """
         if connection is not self._connection:
             self._connection, self._under_way, self._next_plan_s = connection, None, 0.0
+            self._holdings = Holdings()
         try:
             self._work(connection)
         except BaseException:
@@ -89,10 +92,10 @@ class Upkeep:
 
     def _planned(self, connection: sqlite3.Connection) -> Iterator[Purged]:
         started_s = time.monotonic()
-        wanted = plan(connection, self._limits(connection))
+        wanted = plan(connection, self._limits(connection), holdings=self._holdings)
         self._warn_of(wanted)
         took_s = time.monotonic() - started_s
         self._next_plan_s = started_s + max(self._interval_s, took_s / PLANNING_SHARE)
         pages = int(connection.execute("PRAGMA page_count").fetchone()[0])
         spare_pages = min(pages // SPARE_SHARE, MOST_SPARE_PAGES)
-        return purge(connection, wanted, self._data_dir, spare_pages)
+        return purge(connection, wanted, self._data_dir, spare_pages, self._holdings)

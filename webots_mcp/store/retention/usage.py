@@ -1,68 +1,71 @@
 """What a recording holds, in portions small enough to be deleted one after the other.
 
-State rows and chunks are counted by their row groups, which know what they take on the disk; only
-rows that are in no group yet, and the smaller tables, are counted row by row.
+State rows and chunks are counted by their row groups, which know what they take on the disk. Other
+rows are counted once, when they have come: a `Holdings` that is kept reads only what is new.
 """
 
 from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.contract import KEPT_FRAME
+from webots_mcp.store.analysis.arrays import Array, np
+from webots_mcp.store.chunks.codec import Decoded
+from webots_mcp.store.chunks.stored import STATE_IDS, WALL_TIMES, Group, values_in
 from webots_mcp.store.retention.pages import INDEX_BYTES, disk_bytes
 from webots_mcp.store.retention.policy import KEPT
 
 TABLES: Final = ("state", "chunk", "kept_state", "log", "event", "image")
-UNBOUNDED: Final = 2**62
+_COUNTED: Final = ("kept_state", "log", "event", "image")
 _BLOCK_IDS: Final = 512
 
 _RUNS: Final = (
     f"SELECT id, robot_id, row_count, started_wall_time_s, last_wall_time_s, {KEPT}, "
     "ended_wall_time_s IS NULL OR id = (SELECT max(id) FROM run n WHERE n.robot_id = run.robot_id)"
-    " AS is_current FROM run WHERE typeof(started_wall_time_s) IN ('real', 'integer') "
+    " AS is_current, is_chunked FROM run WHERE typeof(started_wall_time_s) IN ('real', 'integer') "
     "AND typeof(last_wall_time_s) IN ('real', 'integer') ORDER BY started_wall_time_s, id"
 )
+_STORED: Final = "SELECT id, stored_row_count FROM row_group WHERE is_complete = 1"
 _GROUPS: Final = (
-    "SELECT g.id, g.run_id, g.max_state_id, g.row_count, g.stored_row_count, g.stored_row_bytes, "
-    "g.chunk_bytes, coalesce(i.min, 0), w.min, w.max FROM row_group g "
+    "SELECT g.id, g.run_id, g.max_state_id, g.row_count, g.stored_row_bytes, g.chunk_bytes, "
+    "coalesce(i.min, 0), w.min, w.max FROM row_group g "
     "LEFT JOIN chunk i ON i.run_id = g.run_id AND i.signal_id = -2 AND i.group_id = g.id "
     "LEFT JOIN chunk w ON w.run_id = g.run_id AND w.signal_id = -1 AND w.group_id = g.id "
-    "WHERE g.is_complete = 1"
+    "WHERE g.is_complete = 1 AND g.id > ?"
+)
+_PLACE: Final = (
+    "SELECT id, start_sim_time_s, end_sim_time_s, last_state_id, max_state_id, row_count "
+    "FROM row_group WHERE id = ?"
+)
+_SUMS: Final = (
+    "run_id, min(id), max(id), json_group_array({payload}), min(CAST(wall_time_s AS REAL)), "
+    "max(CAST(wall_time_s AS REAL))"
 )
 _IN_NO_GROUP: Final = (
-    "s.run_id = r.id AND s.sim_time_s >= coalesce((SELECT max(end_sim_time_s) FROM row_group g "
-    "WHERE g.run_id = r.id AND g.is_complete = 1), -9e999) AND s.id > coalesce((SELECT "
-    "max(max_state_id) FROM row_group g WHERE g.run_id = r.id AND g.is_complete = 1), 0)"
-)
-_WALLS: Final = "min(CAST(wall_time_s AS REAL)), max(CAST(wall_time_s AS REAL))"
-_TAILS: Final = (
-    f"SELECT r.id, min(s.id), max(s.id), json_group_array({{payload}}), {_WALLS} "
-    f"FROM run r CROSS JOIN state s ON {_IN_NO_GROUP} GROUP BY r.id"
+    f"SELECT {_SUMS} FROM state WHERE run_id = :run AND sim_time_s >= coalesce((SELECT "
+    "max(end_sim_time_s) FROM row_group WHERE run_id = :run AND is_complete = 1), -9e999) "
+    "AND id > coalesce((SELECT max(max_state_id) FROM row_group WHERE run_id = :run "
+    "AND is_complete = 1), 0)"
 )
 _BLOCKS: Final = (
-    f"SELECT run_id, min(id), max(id), json_group_array({{payload}}), {_WALLS} FROM {{table}} "
-    f"WHERE 1 {{own}} GROUP BY id / {_BLOCK_IDS}, run_id"
+    f"SELECT {_SUMS} FROM {{table}} WHERE id > ? {{own}} GROUP BY id / {_BLOCK_IDS}, run_id"
+)
+_ROWS: Final = (
+    "SELECT id, CAST(wall_time_s AS REAL) FROM {table} WHERE +run_id = ? AND id BETWEEN ? "
+    "AND ? {own} ORDER BY id"
 )
 # The frames of a kept stretch count with its states, and go with them.
 _OWN: Final = f"AND kind <> '{KEPT_FRAME}'"
 _FILE_BYTES: Final = "iif(size_bytes BETWEEN 0 AND 1e12, size_bytes, 0)"
 _FRAMES: Final = (
-    f"SELECT run_id, sum({_FILE_BYTES}) * 1.0 / max(1, (SELECT count(*) FROM kept_state k "
-    f"WHERE k.run_id = image.run_id)) FROM image WHERE kind = '{KEPT_FRAME}' GROUP BY run_id"
+    f"SELECT run_id, sum({_FILE_BYTES}) FROM image WHERE kind = '{KEPT_FRAME}' GROUP BY run_id"
 )
 _COLUMNS: Final = "SELECT name, type, pk FROM pragma_table_info(?)"
-_ROWS: Final = {
-    "group": "FROM state s JOIN row_group g ON g.id = :group_id WHERE s.run_id = g.run_id "
-    "AND s.sim_time_s BETWEEN g.start_sim_time_s AND g.end_sim_time_s "
-    "AND (s.sim_time_s, s.id) <= (g.end_sim_time_s, g.last_state_id) AND s.id <= g.max_state_id",
-    "tail": f"FROM run r CROSS JOIN state s ON {_IN_NO_GROUP} WHERE r.id = :run_id",
-    "block": "FROM {table} s WHERE s.run_id = :run_id AND s.id >= :first_id AND s.id <= :last_id "
-    "{own}",
-}
 
 
 class Run(NamedTuple):
@@ -75,6 +78,7 @@ class Run(NamedTuple):
     last_wall_time_s: float
     is_kept: bool
     is_current: bool
+    is_chunked: bool
 
 
 class Portion(NamedTuple):
@@ -82,130 +86,214 @@ class Portion(NamedTuple):
 
     Attributes:
         group_id: Of states and chunks their row group; 0 of states that are in none.
-        first_id: No row of it is below; `last_id` none is beyond.
+        first_id: No row of it is below; `last_id` none is beyond. Of chunks that of their states.
         rows: So many; of chunks the states that they stand for.
-        row_bytes: What one of them takes on the disk.
+        size_bytes: What all of it takes on the disk.
         oldest_s: Wall time of the oldest one; `newest_s` of the newest one.
         is_held: Of chunks: the states that they stand for are there as well.
     """
 
     table: str
-    run: Run
+    run_id: int
     group_id: int
     first_id: int
     last_id: int
     rows: int
-    row_bytes: float
+    size_bytes: float
     oldest_s: float
     newest_s: float
     is_held: bool = False
 
     @property
-    def size_bytes(self) -> float:
-        """What all of it takes on the disk."""
-        return self.rows * self.row_bytes
+    def row_bytes(self) -> float:
+        """What one of them takes on the disk; at least a byte."""
+        return max(self.size_bytes / max(self.rows, 1), 1.0)
 
 
-def read_runs(connection: sqlite3.Connection) -> list[Run]:
-    """All runs in the order in which they began.
+class Holdings:
+    """What a recording holds; whoever keeps it reads only what has come since.
+
+    Rows that others delete are noticed when they should go.
+    """
+
+    def __init__(self) -> None:
+        self._groups: dict[int, tuple[Any, ...]] = {}
+        self._in_no_group: dict[int, tuple[Run, Portion | None]] = {}
+        self._counted: dict[str, dict[int, Portion]] = {table: {} for table in _COUNTED}
+        self._last_ids: dict[str, int] = dict.fromkeys(_COUNTED, 0)
+
+    def portions(
+        self, connection: sqlite3.Connection, runs: dict[int, Run]
+    ) -> dict[str, list[Portion]]:
+        """What these runs hold, by table, the newest first."""
+        found: dict[str, list[Portion]] = {table: [] for table in TABLES}
+        for portion in self._grouped(connection, runs):
+            found[portion.table].append(portion)
+        sizes = _Sizes(connection)
+        found["state"] += self._states_in_no_group(sizes, runs)
+        for table in _COUNTED:
+            self._count_new(sizes, table)
+            held = self._counted[table].values()
+            found[table] += [portion for portion in held if portion.run_id in runs]
+        frame_bytes: dict[int, float] = dict(connection.execute(_FRAMES).fetchall())
+        found["kept_state"] = _with_frames(found["kept_state"], frame_bytes)
+        for portions in found.values():
+            portions.sort(key=lambda each: -each.last_id)
+        return found
+
+    def recount(self, connection: sqlite3.Connection, portion: Portion) -> None:
+        """Count a portion again from which rows may have gone."""
+        if portion.table in self._counted:
+            held = self._counted[portion.table]
+            held.pop(portion.first_id, None)
+            sizes, bounds = _Sizes(connection), (portion.first_id, portion.last_id)
+            for each in sizes.blocks(portion.table, "AND run_id = ? AND id BETWEEN ? AND ?", 0,
+                                     portion.run_id, *bounds):  # fmt: skip
+                held[each.first_id] = each
+        self._in_no_group.pop(portion.run_id, None)
+
+    def _grouped(self, connection: sqlite3.Connection, runs: dict[int, Run]) -> Iterator[Portion]:
+        for group_id, *facts in connection.execute(_GROUPS, (max(self._groups, default=0),)):
+            self._groups[group_id] = tuple(facts)
+            self._in_no_group.pop(facts[0], None)
+        stored = dict(connection.execute(_STORED).fetchall())
+        self._groups = {each: facts for each, facts in self._groups.items() if each in stored}
+        for group_id, facts in self._groups.items():
+            run_id, last_id, rows, row_bytes, chunk_bytes, first_id, *walls = facts
+            if run_id not in runs:
+                continue
+            of = (run_id, group_id, int(first_id), last_id)
+            own_s = runs[run_id].last_wall_time_s
+            oldest_s, newest_s = (own_s if wall is None else wall for wall in walls)
+            times = (oldest_s, newest_s)
+            if left := stored[group_id]:
+                yield Portion("state", *of, left, left * row_bytes, *times)
+            yield Portion("chunk", *of, rows, chunk_bytes, *times, is_held=left > 0)
+
+    def _states_in_no_group(self, sizes: _Sizes, runs: dict[int, Run]) -> Iterator[Portion]:
+        """The newest rows of each run; those of one that is in chunks are counted once."""
+        for run in runs.values():
+            known, portion = self._in_no_group.get(run.id, (None, None))
+            if known != run or not run.is_chunked:
+                query = _IN_NO_GROUP.format(payload=sizes.payload("state"))
+                row = sizes.connection.execute(query, {"run": run.id}).fetchone()
+                portion = None if row[0] is None else sizes.portion("state", *row)
+                self._in_no_group[run.id] = run, portion
+            if portion is not None:
+                yield portion
+
+    def _count_new(self, sizes: _Sizes, table: str) -> None:
+        held = self._counted[table]
+        newest = {each.run_id: each for each in held.values()}
+        for each in sizes.blocks(table, "", self._last_ids[table]):
+            self._last_ids[table] = max(self._last_ids[table], each.last_id)
+            before = newest.get(each.run_id)
+            if before is not None and before.rows + each.rows <= _BLOCK_IDS:
+                each = before._replace(
+                    last_id=each.last_id,
+                    rows=before.rows + each.rows,
+                    size_bytes=before.size_bytes + each.size_bytes,
+                    newest_s=max(before.newest_s, each.newest_s),
+                    oldest_s=min(before.oldest_s, each.oldest_s),
+                )
+            held[each.first_id] = newest[each.run_id] = each
+
+
+class _Sizes:
+    """What rows take on the disk."""
+
+    def __init__(self, connection: sqlite3.Connection) -> None:
+        self.connection = connection
+        self._payloads: dict[str, str] = {"image": _FILE_BYTES}
+
+    @cached_property
+    def _page_bytes(self) -> int:
+        return int(self.connection.execute("PRAGMA page_size").fetchone()[0])
+
+    def blocks(self, table: str, where: str, after: int, *values: int) -> Iterator[Portion]:
+        """The rows after an id, in portions."""
+        own = where + (f" {_OWN}" if table == "image" else "")
+        query = _BLOCKS.format(table=table, own=own, payload=self.payload(table))
+        for row in self.connection.execute(query, (after, *values)).fetchall():
+            yield self.portion(table, *row)
+
+    def portion(
+        self,
+        table: str,
+        run_id: int,
+        first_id: int,
+        last_id: int,
+        sizes: str,
+        oldest_s: float,
+        newest_s: float,
+    ) -> Portion:
+        """A portion of rows that were looked at one by one."""
+        each: list[int] = json.loads(sizes)
+        size_bytes = sum(each) + 0.0
+        if table != "image":
+            size_bytes = disk_bytes(each, self._page_bytes) + INDEX_BYTES * len(each)
+        ids = (first_id, last_id)
+        return Portion(table, run_id, 0, *ids, len(each), size_bytes, oldest_s, newest_s)
+
+    def payload(self, table: str) -> str:
+        """SQL for the bytes of a record: each column takes a byte or two in its head too."""
+        if table not in self._payloads:
+            parts = ["2"]
+            for name, kind, is_key in self.connection.execute(_COLUMNS, (table,)).fetchall():
+                if kind == "TEXT":
+                    parts.append(f"coalesce(length(CAST({name} AS BLOB)) + 1, 1)")
+                elif not is_key:
+                    parts.append("9" if kind == "FLOAT" else "3")
+            self._payloads[table] = " + ".join(parts)
+        return self._payloads[table]
+
+
+def _with_frames(stretches: list[Portion], frame_bytes: dict[int, float]) -> list[Portion]:
+    """Rows of kept stretches with their share of the run's frames."""
+    rows = dict[int, int]()
+    for each in stretches:
+        rows[each.run_id] = rows.get(each.run_id, 0) + each.rows
+    return [
+        each._replace(
+            size_bytes=each.size_bytes
+            + frame_bytes.get(each.run_id, 0.0) * each.rows / rows[each.run_id]
+        )
+        for each in stretches
+    ]
+
+
+def read_runs(connection: sqlite3.Connection) -> dict[int, Run]:
+    """All runs by their ids, in the order in which they began.
 
     A run whose times are no numbers, which no bridge writes, has no place in it: it stays.
     """
-    return [Run(*row) for row in connection.execute(_RUNS).fetchall()]
+    return {row[0]: Run(*row) for row in connection.execute(_RUNS).fetchall()}
 
 
-def portions_of(connection: sqlite3.Connection, runs: Sequence[Run]) -> dict[str, list[Portion]]:
-    """What these runs hold, by table, the newest first."""
-    by_id = {run.id: run for run in runs}
-    found: dict[str, list[Portion]] = {table: [] for table in TABLES}
-    for portion in (*_grouped(connection, by_id), *_counted(connection, by_id)):
-        found[portion.table].append(portion)
-    for portions in found.values():
-        portions.sort(key=lambda each: -each.last_id)
-    return found
-
-
-def _grouped(connection: sqlite3.Connection, runs: Mapping[int, Run]) -> Iterator[Portion]:
-    for row in connection.execute(_GROUPS).fetchall():
-        group_id, run_id, last_id, rows, stored, row_bytes, chunk_bytes, first_id, *walls = row
-        if (run := runs.get(run_id)) is None:
-            continue
-        oldest_s, newest_s = (run.last_wall_time_s if wall is None else wall for wall in walls)
-        last, times = (group_id, last_id), (oldest_s, newest_s)
-        if stored:
-            yield Portion("state", run, group_id, int(first_id), last_id, stored, row_bytes, *times)
-        yield Portion("chunk", run, *last, last_id, rows, chunk_bytes / rows, *times, stored > 0)
-
-
-def _counted(connection: sqlite3.Connection, runs: Mapping[int, Run]) -> Iterator[Portion]:
-    (page_bytes,) = connection.execute("PRAGMA page_size").fetchone()
-    frame_bytes: dict[int, float] = dict(connection.execute(_FRAMES).fetchall())
-    for table in ("state", "kept_state", "log", "event", "image"):
-        query = _TAILS if table == "state" else _BLOCKS
-        payload = _FILE_BYTES if table == "image" else _payload(connection, table)
-        asked = query.format(table=table, payload=payload, own=_OWN if table == "image" else "")
-        for run_id, first_id, last_id, sizes, *times in connection.execute(asked).fetchall():
-            if run_id not in runs:
-                continue
-            each: list[int] = json.loads(sizes)
-            row_bytes = sum(each) / len(each)
-            if table != "image":
-                row_bytes = disk_bytes(each, page_bytes) / len(each) + INDEX_BYTES
-            if table == "kept_state":
-                row_bytes += frame_bytes.get(run_id, 0.0)
-            yield Portion(table, runs[run_id], 0, first_id, last_id, len(each), row_bytes, *times)
-
-
-def _payload(connection: sqlite3.Connection, table: str) -> str:
-    """SQL for the bytes of a record: each column takes a byte or two in its head, and its value."""
-    parts = ["2"]
-    for name, kind, is_key in connection.execute(_COLUMNS, (table,)).fetchall():
-        if kind == "TEXT":
-            parts.append(f"coalesce(length(CAST({name} AS BLOB)) + 1, 1)")
-        elif not is_key:
-            parts.append("9" if kind == "FLOAT" else "3")
-    return " + ".join(parts)
-
-
-def rows_of(portion: Portion) -> tuple[str, dict[str, Any]]:
-    """The rows of a portion that are there now: SQL from FROM on, of `s`, and its values."""
-    values = {
-        "run_id": portion.run.id, "group_id": portion.group_id,
-        "first_id": portion.first_id, "last_id": portion.last_id,
-    }  # fmt: skip
-    kind = "block" if portion.table != "state" else "group" if portion.group_id else "tail"
+def rows_of(connection: sqlite3.Connection, portion: Portion) -> tuple[Array, Array]:
+    """Ids of the rows that a portion had when it was counted, rising, and their wall times."""
+    if portion.group_id:
+        group = Group(*connection.execute(_PLACE, (portion.group_id,)).fetchone())
+        ids, walls = (_times(connection, portion.run_id, each, group)
+                      for each in (STATE_IDS, WALL_TIMES))  # fmt: skip
+        if ids is not None:
+            order = np.argsort(ids)[-portion.rows :]  # the oldest of a group go first
+            known = np.full(len(ids), portion.newest_s) if walls is None else walls
+            return ids[order], known[order]
     own = _OWN if portion.table == "image" else ""
-    return _ROWS[kind].format(table=portion.table, own=own), values
+    bounds = (portion.run_id, portion.first_id, portion.last_id)
+    found = connection.execute(_ROWS.format(table=portion.table, own=own), bounds).fetchall()
+    table: Array = np.reshape(np.array(found, np.float64), (-1, 2))
+    return table[:, 0], table[:, 1]
 
 
-def nth_id(connection: sqlite3.Connection, portion: Portion, number: int) -> int:
-    """The id of the row of that number, from 1, counted from the oldest."""
-    rows, values = rows_of(portion)
-    query = f"SELECT s.id {rows} ORDER BY s.id LIMIT 1 OFFSET :number - 1"
-    row = connection.execute(query, values | {"number": number}).fetchone()
-    return row[0] if row else UNBOUNDED
-
-
-def rows_before(connection: sqlite3.Connection, portion: Portion, wall_time_s: float) -> int:
-    """How many of the rows are older than that."""
-    if portion.newest_s < wall_time_s:
-        return portion.rows
-    if portion.oldest_s >= wall_time_s or portion.table == "chunk":
-        return 0
-    rows, values = rows_of(portion)
-    query = f"SELECT count(*) {rows} AND s.wall_time_s < :before_s"
-    return int(connection.execute(query, values | {"before_s": wall_time_s}).fetchone()[0])
-
-
-def rows_up_to(connection: sqlite3.Connection, portion: Portion, last_id: float) -> int:
-    """How many of the rows have ids up to that."""
-    if portion.last_id <= last_id:
-        return portion.rows
-    if portion.first_id > last_id or portion.table == "chunk":
-        return 0
-    rows, values = rows_of(portion)
-    query = f"SELECT count(*) {rows} AND s.id <= :until"
-    return int(connection.execute(query, values | {"until": last_id}).fetchone()[0])
+def _times(
+    connection: sqlite3.Connection, run_id: int, signal_id: int, group: Group
+) -> Array | None:
+    """Numbers of a chunk; None where it is missing or damaged."""
+    for _, values in values_in(connection, run_id, signal_id, [group]):
+        return values.numbers if isinstance(values, Decoded) else None
+    return None
 
 
 def file_sizes(connection: sqlite3.Connection) -> dict[str, int]:

@@ -1,0 +1,96 @@
+"""A recording that is only read gets its chunks in a temporary file of the process, once."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import subprocess
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from tests import unprivileged
+from tests.recordings.long import build
+from webots_mcp.connection import connect
+from webots_mcp.store.chunks.on_demand import LEAST_ROWS, make_missing_chunks
+from webots_mcp.store.questions.trends import trends
+from webots_mcp.store.reading.ranges import Scope, find_range
+from webots_mcp.store.recording import OpenReaders, Recording
+
+ROWS = 3 * LEAST_ROWS
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("long") / "webots.db"
+    build(file, ROWS, rolled=False)
+    with closing(connect(file, "writer")) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    return file
+
+
+@pytest.fixture
+def recording(built: Path, tmp_path: Path) -> Iterator[Recording]:
+    shutil.copy(built, tmp_path / "webots.db")
+    readers = OpenReaders()
+    yield Recording(tmp_path / "webots.db", tmp_path, read_only=True, readers=readers)
+    readers.close()
+
+
+def in_chunks(recording: Recording) -> int:
+    with recording.reader() as connection:
+        return connection.execute("SELECT total(row_count) FROM row_group").fetchone()[0]
+
+
+def test_readers_see_chunks_that_the_file_has_not(recording: Recording) -> None:
+    assert isinstance(recording.database, Path)
+    before = recording.database.read_bytes()
+    with recording.reader() as connection:
+        expected = trends(connection, find_range(connection, Scope()))
+    told: list[tuple[int, int]] = []
+    assert make_missing_chunks(recording, lambda *done: told.append(done), write=False) == ""
+    assert told[-1] == (ROWS, ROWS)
+    assert in_chunks(recording) == ROWS
+    assert recording.database.read_bytes() == before
+    with recording.reader() as connection:
+        assert trends(connection, find_range(connection, Scope())) == expected
+        with pytest.raises(sqlite3.OperationalError):
+            connection.execute("DELETE FROM aside.chunk")
+
+
+def test_they_are_made_once_and_what_broke_off_goes_on(recording: Recording) -> None:
+    assert "ask again" in make_missing_chunks(recording, called_off=lambda: True, write=False)
+    assert LEAST_ROWS <= in_chunks(recording) < ROWS
+    assert make_missing_chunks(recording, write=False) == ""
+    assert in_chunks(recording) == ROWS
+    told: list[tuple[int, int]] = []
+    assert make_missing_chunks(recording, lambda *done: told.append(done), write=False) == ""
+    assert told == []
+
+
+def test_rows_that_robots_record_after_that_are_read_beside_them(recording: Recording) -> None:
+    make_missing_chunks(recording, write=False)
+    with closing(connect(recording.database, "writer")) as robot:
+        robot.execute(
+            "INSERT INTO state (run_id, sim_time_s, wall_time_s, data) "
+            "SELECT run_id, sim_time_s + 1, wall_time_s + 1, '{\"new\": 5}' FROM state "
+            "ORDER BY id DESC LIMIT 1"
+        )
+    with recording.reader() as connection:
+        (run,) = trends(connection, find_range(connection, Scope(last_s=2)), ["new"]).runs
+        assert run.numbers[0].mean == 5
+
+
+@pytest.mark.skipif(not unprivileged.POSSIBLE, reason="permissions do not stop this user here")
+def test_a_question_of_the_command_line_makes_them_where_nothing_can_be_written(
+    recording: Recording, tmp_path: Path
+) -> None:
+    command = ["-m", "webots_mcp", "trends", "--database", str(recording.database)]
+    with unprivileged.unwritable(tmp_path):
+        done = subprocess.run(
+            unprivileged.line(*command), capture_output=True, text=True, check=False
+        )
+    assert done.returncode == 0, done.stderr
+    assert "in no chunk yet" not in done.stderr

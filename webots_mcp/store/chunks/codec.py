@@ -93,21 +93,22 @@ def decoded_of(values: Sequence[Recorded]) -> Decoded:
 
 
 def encode(values: Sequence[Recorded]) -> Encoded:
-    """Compress the values of some rows.
+    """Compress the values of some rows; see `pack`.
 
-    What is lost: integers beyond 2^53 become floats, texts are cut after 200 characters, and where
-    integers and floats are mixed all are floats.
+    What is lost: integers beyond 2^53 become floats, and texts are cut after 200 characters.
     """
-    types = set(map(type, values))
-    if _NUMBERS.issuperset(types):
-        return Encoded(*_compressed(values, types), None, None)
-    codes, labels = _coded(values)
-    numbers = [value for value in values if type(value) in _NUMBERS]
-    listed = [[label.why] if isinstance(label, Replaced) else label for label in labels]
-    width = np.uint8 if len(labels) + _FIRST_LABEL < 2**8 else np.uint16
+    return pack(decoded_of(values))
+
+
+def pack(values: Decoded) -> Encoded:
+    """Compress values that are numbers and codes already; whether a number was 1 or 1.0 is lost."""
+    if values.codes is None:
+        return Encoded(*_compressed(values.numbers), None, None)
+    listed = [[label.why] if isinstance(label, Replaced) else label for label in values.labels]
+    width = np.uint8 if len(listed) + _FIRST_LABEL < 2**8 else np.uint16
     return Encoded(
-        *_compressed(numbers, set(map(type, numbers))),
-        zlib.compress(codes.astype(width).tobytes(), _CODES_LEVEL),
+        *_compressed(values.numbers[values.codes == IS_NUMBER]),
+        zlib.compress(values.codes.astype(width).tobytes(), _CODES_LEVEL),
         json.dumps(listed, separators=(",", ":"), ensure_ascii=False),
     )
 
@@ -203,17 +204,20 @@ def _pcodec() -> Any:
     return import_module("pcodec")
 
 
-def _compressed(values: Sequence[Any], types: set[type]) -> tuple[str, bytes | None]:
-    if not values:
+def _compressed(numbers: Any) -> tuple[str, bytes | None]:
+    if not len(numbers):
         return _NOTHING, None
     pcodec = _pcodec()
-    numbers: Any = _numbers(values)
-    codec = _FLOATS
-    if types == {int} and np.abs(numbers).max() < _EXACT_INTEGERS:
-        codec, numbers = _INTEGERS, np.array(values, np.int64)
+    codec, whole = _FLOATS, np.trunc(numbers) == numbers
+    if whole.all() and np.abs(numbers).max() < _EXACT_INTEGERS and not _has_negative_zero(numbers):
+        codec, numbers = _INTEGERS, numbers.astype(np.int64)
     config = pcodec.ChunkConfig(compression_level=_LEVEL)
     packed = bytes(pcodec.standalone.simple_compress(numbers, config))
     return codec, zlib.crc32(packed).to_bytes(_CHECKSUM_BYTES, "little") + packed
+
+
+def _has_negative_zero(numbers: Array) -> bool:
+    return bool(np.signbit(numbers[numbers == 0]).any())
 
 
 def _decompress(encoded: Encoded, into: Array) -> None:

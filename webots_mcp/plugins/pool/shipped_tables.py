@@ -17,6 +17,10 @@ _LOCAL: Final = (
     "lease", "watermark", "retention_limit", "console_line", "rollup", "recent_rollup",
     "coarse_rollup", "change",
 )  # fmt: skip
+# What the rows and chunks take on the disk there, and how many of the rows are left.
+_LOCAL_COLUMNS: Final = {
+    "row_group": ("stored_row_count", "stored_row_bytes", "chunk_bytes", "is_complete")
+}
 _OF_TRIALS: Final = ("trial_set", "trial")
 _TYPES: Final[dict[str, Kind]] = {
     "INTEGER": int, "BIGINT": int, "FLOAT": float, "TEXT": str, "VARCHAR": str, "BLOB": bytes,
@@ -29,7 +33,7 @@ class Table:
 
     Attributes:
         key: Its primary key in a recording; in a pool the recording's UUID stands before it.
-        columns: All columns, those of the key included, by their names in the recording.
+        columns: Those of the key and all others that are shipped, by their names in the recording.
         types: Of the columns, as the model declares them; SQLite may hold others.
         json_columns: Those that hold JSON as text.
         json_values: Of them, those in which a text is as good as an object.
@@ -82,16 +86,18 @@ def table(name: str) -> Table:
 
 def _table(model: Any) -> Table:
     name: str = model.name
-    columns = tuple(str(column.name) for column in model.columns)
+    local = _LOCAL_COLUMNS.get(name, ())
+    shipped: list[Any] = [column for column in model.columns if column.name not in local]
+    columns = tuple(str(column.name) for column in shipped)
     return Table(
         name=name,
         key=tuple(column.name for column in model.primary_key.columns),
         columns=columns,
-        types=tuple(_TYPES[str(column.type)] for column in model.columns),
-        json_columns=frozenset(column.name for column in model.columns if _is_json(column)),
-        json_values=frozenset(column.name for column in model.columns if _is_value(column)),
-        nullable=frozenset(column.name for column in model.columns if column.nullable),
-        lasting=frozenset(column.name for column in model.columns if _is_lasting(column)),
+        types=tuple(_TYPES[str(column.type)] for column in shipped),
+        json_columns=frozenset(column.name for column in shipped if _is_json(column)),
+        json_values=frozenset(column.name for column in shipped if _is_value(column)),
+        nullable=frozenset(column.name for column in shipped if column.nullable),
+        lasting=frozenset(column.name for column in shipped if _is_lasting(column)),
         is_appended=name in _DATED + CHUNKS,
         full_rate_only=name == "state",
         time_column="wall_time_s" if name in _DATED else None,

@@ -33,11 +33,7 @@ MEANS = """
     SELECT recording_uuid, avg(CAST(data ->> '$.front_m' AS DOUBLE)) FROM state
     GROUP BY recording_uuid
 """
-MEANS_OF_CHUNKS = """
-    SELECT recording_uuid, sum(c.sum) / sum(c.value_count)
-    FROM chunk c JOIN signal s USING (recording_uuid)
-    WHERE s.id = c.signal_id AND s.name = 'front_m' GROUP BY recording_uuid
-"""
+MEANS_OF_VALUES = "SELECT recording_uuid, avg(front_m) FROM value GROUP BY recording_uuid"
 WALLS = """
     WITH seen AS (
         SELECT recording_uuid, sim_time_s, CAST(data ->> '$.front_m' AS DOUBLE) < 0.3 AS is_near
@@ -93,7 +89,7 @@ def test_as_many_states_as_the_tools_count(pool: ParquetPool, told: dict[str, To
     assert asked(pool, COUNTS) == {uuid: each.rows for uuid, each in told.items()}
 
 
-@pytest.mark.parametrize("sql", [MEANS, MEANS_OF_CHUNKS])
+@pytest.mark.parametrize("sql", [MEANS, MEANS_OF_VALUES])
 def test_the_means_of_a_signal_are_those_of_the_tools(
     pool: ParquetPool, told: dict[str, Told], sql: str
 ) -> None:

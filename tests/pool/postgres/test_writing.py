@@ -147,10 +147,12 @@ def test_numbers_that_are_none_come_near_and_are_counted(
     )
     with target.shipment(OTHER) as shipment:
         shipment.write([odd, batch("image", id=2, size_bytes=2**62, width=float("inf"))], {})
-        shipment.write([batch("run", label=b"x", coarse_end="late", basic_time_step_ms=8)], {})
+        shipment.write(
+            [batch("run", label=b"x", ended_wall_time_s="late", basic_time_step_ms=8)], {}
+        )
     sql = "SELECT sim_time_s, wall_time_s, width, height, size_bytes FROM image ORDER BY id"
     assert postgres.execute(pool, sql) == [(0, 2e9, 3, 2, 0), (0, 0, 0, 0, 2**62)]
-    sql = "SELECT label, coarse_end, basic_time_step_ms FROM run"
+    sql = "SELECT label, ended_wall_time_s, basic_time_step_ms FROM run"
     assert postgres.execute(pool, sql) == [("x", None, 8.0)]
     assert replaced(postgres, pool) == 7
 

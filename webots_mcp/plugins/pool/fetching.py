@@ -29,6 +29,7 @@ from webots_mcp.plugins.pool.row_batch import Batch
 from webots_mcp.plugins.pool.shipped_tables import SQLValue, table
 from webots_mcp.plugins.pool.target import Pool, PooledRun, is_whole
 from webots_mcp.store.bundle import END_SESSIONS, small_recording
+from webots_mcp.store.chunks.making import chunk_whole_run
 from webots_mcp.store.chunks.stored import STATE_IDS
 from webots_mcp.store.images import PICTURES
 from webots_mcp.store.merging import merge
@@ -38,6 +39,7 @@ _FOLDER: Final = ".fetch-"
 _MOST_RUNS: Final = 100  # that are written into one small recording,
 _MOST_ROWS: Final = 200_000  # unless one of them has more rows by itself
 _UNCOUNTED_ROWS: Final = 10_000
+_PAUSE_S: Final = 0.002  # between two short writes, for robots that record here
 _OF_RUN: Final = ("kept_stretch", "kept_state", "log", "event", "parameter_value", "image")
 _STATES: Final = ("state", "kept_state")
 _HERE: Final = "SELECT uuid, id FROM run WHERE uuid IS NOT NULL"
@@ -195,7 +197,9 @@ class _Fetcher:
                 copy.pictures(folder)
                 copy.chunks(self._settle(small, {run.run_id: run.uuid for run in runs}))
                 self._note_unchunked(small, runs)
-            merge(self._connection, self._data_dir, folder / DATABASE_NAME)
+            here = merge(self._connection, self._data_dir, folder / DATABASE_NAME)
+        for run_id in here.values():
+            chunk_whole_run(self._connection, run_id, _PAUSE_S)
 
     def take_trials(self, meant: Meant) -> None:
         """Take in the trials of runs that are here by now, and others of a set that is meant."""

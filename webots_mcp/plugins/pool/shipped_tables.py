@@ -12,14 +12,12 @@ Kind: TypeAlias = type[int] | type[float] | type[str] | type[bytes]
 _DATED: Final = ("state", "kept_state", "log", "event", "image", "parameter_value")
 CHUNKS: Final = ("row_group", "chunk")
 # Of one machine or one moment: who maintains it, what is kept there, and console lines that wait
-# to become log lines; and what chunks hold as well.
-_LOCAL: Final = (
-    "lease", "watermark", "retention_limit", "console_line", "rollup", "recent_rollup",
-    "coarse_rollup", "change",
-)  # fmt: skip
-# What the rows and chunks take on the disk there, and how many of the rows are left.
+# to become log lines.
+_LOCAL: Final = ("lease", "watermark", "retention_limit", "console_line")
+# How many rows wait for chunks there, how many of a group are left, and what they take on the disk.
 _LOCAL_COLUMNS: Final = {
-    "row_group": ("stored_row_count", "stored_row_bytes", "chunk_bytes", "is_complete")
+    "run": ("is_chunked",),
+    "row_group": ("stored_row_count", "stored_row_bytes", "chunk_bytes", "is_complete"),
 }
 _OF_TRIALS: Final = ("trial_set", "trial")
 _TYPES: Final[dict[str, Kind]] = {

@@ -73,41 +73,46 @@ class Decoded(NamedTuple):
         numbers: One for each row: NaN where it holds none; flags are 0 and 1.
         codes: One for each row; None where every row holds a number.
         labels: What codes from 2 on mean; of a replaced value `Replaced`.
+        is_whole: All numbers were integers when they were stored.
     """
 
     numbers: Array
     codes: Indexes | None
     labels: Sequence[Value | Replaced]
+    is_whole: bool = False
 
 
 def decoded_of(values: Sequence[Recorded]) -> Decoded:
     """The same of values that were not stored: nothing is compressed."""
     types = set(map(type, values))
     if _NUMBERS.issuperset(types):
-        return Decoded(_numbers(values), None, ())
+        held = _numbers(values)
+        return Decoded(held, None, (), types == {int} and _is_exact(held))
     codes, labels = _coded(values)
     numbers = np.full(len(values), np.nan)
-    numbers[codes == IS_NUMBER] = _numbers([v for v in values if type(v) in _NUMBERS])
+    held = _numbers([value for value in values if type(value) in _NUMBERS])
+    numbers[codes == IS_NUMBER] = held
     _fill_flags(numbers, codes, labels)
-    return Decoded(numbers, codes, labels)
+    return Decoded(numbers, codes, labels, float not in types and _is_exact(held))
 
 
 def encode(values: Sequence[Recorded]) -> Encoded:
     """Compress the values of some rows; see `pack`.
 
-    What is lost: integers beyond 2^53 become floats, and texts are cut after 200 characters.
+    What is lost: integers beyond 2^53 become floats, texts are cut after 200 characters, and where
+    integers and floats are mixed all are floats.
     """
     return pack(decoded_of(values))
 
 
 def pack(values: Decoded) -> Encoded:
-    """Compress values that are numbers and codes already; whether a number was 1 or 1.0 is lost."""
+    """Compress values that are numbers and codes already."""
     if values.codes is None:
-        return Encoded(*_compressed(values.numbers), None, None)
+        return Encoded(*_compressed(values.numbers, values.is_whole), None, None)
     listed = [[label.why] if isinstance(label, Replaced) else label for label in values.labels]
     width = np.uint8 if len(listed) + _FIRST_LABEL < 2**8 else np.uint16
     return Encoded(
-        *_compressed(values.numbers[values.codes == IS_NUMBER]),
+        *_compressed(values.numbers[values.codes == IS_NUMBER], values.is_whole),
         zlib.compress(values.codes.astype(width).tobytes(), _CODES_LEVEL),
         json.dumps(listed, separators=(",", ":"), ensure_ascii=False),
     )
@@ -123,7 +128,7 @@ def decode(encoded: Encoded, rows: int) -> Decoded:
         if encoded.codes is None:
             numbers = np.empty(rows)
             _decompress(encoded, numbers)
-            return Decoded(numbers, None, ())
+            return Decoded(numbers, None, (), encoded.codec == _INTEGERS)
         return _decode_coded(encoded, rows)
     except ModuleNotFoundError as error:
         raise DamagedChunkError(
@@ -150,7 +155,7 @@ def _decode_coded(encoded: Encoded, rows: int) -> Decoded:
         _decompress(encoded, found)
         numbers[held] = found
     _fill_flags(numbers, codes, labels)
-    return Decoded(numbers, codes, labels)
+    return Decoded(numbers, codes, labels, encoded.codec == _INTEGERS)
 
 
 def _labels(text: str | None) -> list[Value | Replaced]:
@@ -204,20 +209,20 @@ def _pcodec() -> Any:
     return import_module("pcodec")
 
 
-def _compressed(numbers: Any) -> tuple[str, bytes | None]:
+def _is_exact(numbers: Array) -> bool:
+    """Whether these integers are the same as floats."""
+    return bool(np.abs(numbers).max(initial=0) < _EXACT_INTEGERS)
+
+
+def _compressed(numbers: Any, is_whole: bool) -> tuple[str, bytes | None]:
     if not len(numbers):
         return _NOTHING, None
     pcodec = _pcodec()
-    codec, whole = _FLOATS, np.trunc(numbers) == numbers
-    if whole.all() and np.abs(numbers).max() < _EXACT_INTEGERS and not _has_negative_zero(numbers):
-        codec, numbers = _INTEGERS, numbers.astype(np.int64)
+    codec = _INTEGERS if is_whole else _FLOATS
     config = pcodec.ChunkConfig(compression_level=_LEVEL)
+    numbers = numbers.astype(np.int64) if is_whole else numbers
     packed = bytes(pcodec.standalone.simple_compress(numbers, config))
     return codec, zlib.crc32(packed).to_bytes(_CHECKSUM_BYTES, "little") + packed
-
-
-def _has_negative_zero(numbers: Array) -> bool:
-    return bool(np.signbit(numbers[numbers == 0]).any())
 
 
 def _decompress(encoded: Encoded, into: Array) -> None:

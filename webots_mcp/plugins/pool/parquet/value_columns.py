@@ -173,6 +173,7 @@ def _signal_of(field: Any) -> int | None:
 
 
 def _values(column: Any, name: str, others: Mapping[int, Mapping[str, Any]]) -> Decoded:
+    """The values of a column; whole numbers as integers, which are smaller."""
     known: dict[tuple[type, Value | Replaced], int] = {}
 
     def code_of(label: Value | Replaced) -> int:
@@ -195,4 +196,10 @@ def _values(column: Any, name: str, others: Mapping[int, Mapping[str, Any]]) -> 
     for (_, label), code in known.items():
         if isinstance(label, bool):
             numbers[codes == code] = label
-    return Decoded(numbers, codes if codes.any() else None, [label for _, label in known])
+    held = numbers[codes == IS_NUMBER]
+    signs = np.signbit(held[held == 0])  # an integer has no -0.0
+    is_whole = bool((np.trunc(held) == held).all() and not signs.any()) and (
+        np.abs(held).max(initial=0) < 2.0**53
+    )
+    labels = [label for _, label in known]
+    return Decoded(numbers, codes if codes.any() else None, labels, bool(is_whole))

@@ -167,15 +167,23 @@ def test_each_value_of_a_state_comes_back(lab: Lab, runs: Recorded) -> None:
 def test_a_fetched_run_has_the_answers_of_the_recording(lab: Lab, rounds: Path, full: bool) -> None:
     lab.ship(rounds, full=full)
     uuid = uuid_of(rounds, 1)
+    with closing(connect(rounds, "writer")) as there:
+        before = answers(there, 1, PART)
+        if not full:
+            prune(there, rounds.parent, Retention(state=Limit(rows=0), outlive=0), rest=False)
+        expected = answers(there, 1, PART)
 
     found = lab.fetch(run_uuid=uuid)
 
     assert (found.only_chunks, found.unchunked) == ([] if full else [uuid], {})
-    with closing(connect(rounds, "reader")) as there, lab.opened() as here:
+    with lab.opened() as here:
         run = found.runs[uuid]
         info = run_info(here, run)
-        assert info.purged_rows == (0 if full else info.row_count)
-        assert without_notes(answers(here, run, PART)) == without_notes(answers(there, 1, PART))
+        fetched = answers(here, run, PART)
+    assert info.purged_rows == (0 if full else info.row_count)
+    assert fetched == expected
+    for name in ("trends", "trends of a part", "history"):
+        assert without_notes(fetched[name]) == without_notes(before[name])
 
 
 def without_notes(value: Any) -> Any:

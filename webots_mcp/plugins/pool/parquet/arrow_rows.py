@@ -20,6 +20,7 @@ from webots_mcp.plugins.pool.shipped_tables import SQLValue, Table
 
 _APPENDED_GROUP_ROWS: Final = 20_000
 _CHANGING_GROUP_ROWS: Final = 4_000  # those of many files are read side by side
+_VALUES_LEVEL: Final = 9  # of zstd: 97 bytes a row of 39 numbers instead of 128, in 6 us
 _ROWS_AT_ONCE: Final = 1000
 _MOST_BYTES: Final = 1_000_000_000  # in memory, of a file that is read as a whole
 _FINE: Final[dict[type, frozenset[type]]] = {
@@ -121,15 +122,17 @@ def _text(value: SQLValue) -> str:
 
 
 def encoded(table: Table, arrow_table: Any) -> bytes:
-    """The rows as one file of Parquet. JSON differs from row to row: a dictionary is no use."""
-    parquet = package("pyarrow.parquet")
+    """The rows as one file of Parquet.
 
+    JSON differs from row to row, and so do measured values: a dictionary is no use for either.
+    """
     sink = io.BytesIO()
-    alike = [name for name in arrow_table.column_names if name not in table.json_columns]
-    group_rows = _APPENDED_GROUP_ROWS if table.is_appended else _CHANGING_GROUP_ROWS
-    parquet.write_table(
-        arrow_table, sink, compression="zstd", use_dictionary=alike, row_group_size=group_rows
-    )
+    options: dict[str, Any] = {"use_dictionary": False, "compression_level": _VALUES_LEVEL}
+    if table.name != CHUNK:
+        alike = [name for name in table.columns if name not in table.json_columns]
+        group_rows = _APPENDED_GROUP_ROWS if table.time_column else _CHANGING_GROUP_ROWS
+        options = {"use_dictionary": alike, "row_group_size": group_rows}
+    package("pyarrow.parquet").write_table(arrow_table, sink, compression="zstd", **options)
     return sink.getvalue()
 
 

@@ -28,6 +28,7 @@ from webots_mcp.errors import InvalidInputError, PoolError
 from webots_mcp.plugins.pool import fetching
 from webots_mcp.plugins.pool.engines import open_pool, open_target
 from webots_mcp.plugins.pool.key_order import in_order
+from webots_mcp.plugins.pool.pool_contents import pooled_runs
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.questions.runs import run_info
@@ -366,7 +367,7 @@ def test_a_run_without_a_uuid_is_listed_and_not_taken(lab: Lab, runs: Recorded) 
     runs.connection.execute("UPDATE run SET uuid = NULL WHERE id = 1")
     lab.ship(runs.folder / DATABASE_NAME, full=True)
     with lab.pool() as pool:
-        assert [run.uuid for run in pool.runs() if run.run_id == 1] == [""]
+        assert [run.uuid for run in pooled_runs(pool) if run.run_id == 1] == [""]
 
     found = lab.fetch(robot="rover")
 

@@ -24,6 +24,7 @@ from webots_mcp.errors import (
     SchemaTooOldError,
 )
 from webots_mcp.plugins.pool.following import follow
+from webots_mcp.plugins.pool.pool_contents import pooled_runs
 from webots_mcp.plugins.pool.reading import Source
 from webots_mcp.plugins.pool.report import Report
 from webots_mcp.plugins.pool.row_batch import BATCH_BYTES
@@ -55,7 +56,7 @@ def test_a_run_whose_process_was_killed_is_over_in_the_pool(shipped: Shipped) ->
     )
     shipped.ship()
     with SQLitePool(shipped.pool) as pool:
-        (run,) = pool.runs()
+        (run,) = pooled_runs(pool)
         assert run.end_reason == "crashed"
         assert is_whole(pool.progress(shipped.uuid), run.run_id)
 

@@ -237,7 +237,7 @@ def test_what_a_column_cannot_hold_becomes_what_comes_nearest_and_is_counted(
     (row,) = globbed(tmp_path, "log")
     assert row == {
         "id": 1, "run_id": None, "sim_time_s": None, "wall_time_s": float(2**60), "level": "5",
-        "source": "\ufffd", "message": "lone ?", "logger": None,
+        "source": "\ufffd", "message": "lone \ufffd\ufffd\ufffd", "logger": None,
     }  # fmt: skip
     odd_columns = ("run_id", "sim_time_s", "wall_time_s", "level", "source", "message")
     assert altered == {f"log.{column}": 1 for column in odd_columns}

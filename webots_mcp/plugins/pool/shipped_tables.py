@@ -40,7 +40,6 @@ class Table:
             does not replace the value that the pool has.
         is_appended: Rows come with rising ids and never change; otherwise a row replaces the one
             of the same key.
-        full_rate_only: Shipped only at full rate, but for the rows of kept stretches.
         time_column: The wall time by which a pool may cut it into parts, of appended tables but
             row groups and chunks.
         run_column: The column that names the row's run, where it belongs to one.
@@ -57,7 +56,6 @@ class Table:
     nullable: frozenset[str]
     lasting: frozenset[str]
     is_appended: bool
-    full_rate_only: bool
     time_column: str | None
     run_column: str | None
     session_column: str | None
@@ -97,7 +95,6 @@ def _table(model: Any) -> Table:
         nullable=frozenset(column.name for column in shipped if column.nullable),
         lasting=frozenset(column.name for column in shipped if _is_lasting(column)),
         is_appended=name in _DATED + CHUNKS,
-        full_rate_only=name == "state",
         time_column="wall_time_s" if name in _DATED else None,
         run_column=_column_of("run", name, columns),
         session_column=_column_of("session", name, columns),

@@ -198,8 +198,8 @@ class Shipper:
     def _appended(self) -> list[Table]:
         """States last: others should not wait for the largest table."""
         wanted = [each for each in tables() if each.is_appended and each.name not in CHUNKS]
-        wanted = [each for each in wanted if self._order.full or not each.full_rate_only]
-        return sorted(wanted, key=lambda each: each.full_rate_only)
+        others = [each for each in wanted if each.name != "state"]
+        return [*others, table("state")] if self._order.full else others
 
     def _require_the_same(self, source: Source) -> None:
         """That the recording is the one of before, and not an older copy of it.

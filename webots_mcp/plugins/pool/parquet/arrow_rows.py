@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -15,7 +14,7 @@ from webots_mcp.errors import PoolError
 from webots_mcp.naming import unit_in
 from webots_mcp.plugins.pool.parquet.layout import CHUNK
 from webots_mcp.plugins.pool.parquet.packages import package
-from webots_mcp.plugins.pool.row_batch import Row
+from webots_mcp.plugins.pool.row_batch import Row, nearest
 from webots_mcp.plugins.pool.shipped_tables import SQLValue, Table
 
 _APPENDED_GROUP_ROWS: Final = 20_000
@@ -92,33 +91,12 @@ def _array(
             return arrow.array(values, type=field.type)
         except (ValueError, OverflowError):  # a lone surrogate; an integer no double has
             pass
-    nearest = [_nearest(value, kind) for value in values]
-    pairs = zip(nearest, values, strict=True)
+    held = [nearest(value, kind, nullable=True) for value in values]
+    pairs = zip(held, values, strict=True)
     altered[f"{table.name}.{field.name}"] += sum(
         new is not old and new != old for new, old in pairs
     )
-    return arrow.array(nearest, type=field.type)
-
-
-def _nearest(value: SQLValue, kind: type) -> SQLValue:
-    if value is None:
-        return None
-    if kind is str:
-        return _text(value)
-    if kind is bytes:
-        return value if isinstance(value, bytes) else None
-    if not isinstance(value, int | float):
-        return None
-    if kind is float:
-        return float(value)
-    return int(value) if math.isfinite(value) and abs(value) < 2**63 else None
-
-
-def _text(value: SQLValue) -> str:
-    if isinstance(value, bytes):
-        return value.decode("utf-8", "replace")
-    text = str(value)
-    return text if text.isascii() else text.encode("utf-8", "replace").decode()
+    return arrow.array(held, type=field.type)
 
 
 def encoded(table: Table, arrow_table: Any) -> bytes:

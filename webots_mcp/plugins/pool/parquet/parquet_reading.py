@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Final
 
@@ -26,7 +25,7 @@ from webots_mcp.plugins.pool.parquet.storage import Storage
 from webots_mcp.plugins.pool.parquet.value_columns import chunks_of
 from webots_mcp.plugins.pool.row_batch import Batch, batches
 from webots_mcp.plugins.pool.shipped_tables import Table, table, tables
-from webots_mcp.plugins.pool.target import PooledRecording, PooledRun, PooledSize, PooledTrialSet
+from webots_mcp.plugins.pool.target import PooledSize
 from webots_mcp.store.questions.sql import Result
 
 _AT_ONCE: Final = 16  # footers that are read at the same time: most of it is waiting
@@ -56,36 +55,16 @@ class ParquetPool:
     def __exit__(self, *exception: object) -> None:
         pass
 
-    def recordings(self) -> Iterator[PooledRecording]:
-        """All recordings."""
-        made = self._records("recording")
-        robots, runs = self._records("robot"), self._records("run")
-        for uuid, (own, *_) in sorted(made.items()):
-            names = tuple(str(robot["name"]) for robot in robots.get(uuid, ()))
-            created_s = own["created_wall_time_s"]
-            yield PooledRecording(
-                uuid, created_s, names, len(runs.get(uuid, ())), "state" in self.progress(uuid)
-            )
-
-    def runs(self, recording_uuid: str | None = None) -> Iterator[PooledRun]:
-        """All runs, or those of a recording, by when they began."""
-        robots = self._records("robot", recording_uuid)
-        found = [
-            _pooled_run(uuid, run, {robot["id"]: robot["name"] for robot in robots.get(uuid, ())})
-            for uuid, runs in self._records("run", recording_uuid).items()
-            for run in runs
-        ]
-        yield from sorted(found, key=lambda run: (run.started_wall_time_s, run.uuid))
-
-    def trial_sets(self) -> Iterator[PooledTrialSet]:
-        """All trial sets, by when they were made."""
-        trials = self._records("trial")
-        found = [
-            _pooled_trial_set(uuid, each, trials.get(uuid, ()))
-            for uuid, sets in self._records("trial_set").items()
-            for each in sets
-        ]
-        yield from sorted(found, key=lambda each: (each.created_wall_time_s, each.uuid))
+    def records(self, name: str) -> Iterator[tuple[str, Record]]:
+        """All rows of a table that changes, each behind its recording's UUID."""
+        each = table(name)
+        paths = self._storage.find(files_of(each))
+        with ThreadPoolExecutor(_AT_ONCE) as workers:
+            for path, content in zip(paths, workers.map(self._storage.read, paths), strict=True):
+                held: list[Record] = []
+                if content is not None:
+                    held = decoded(each, content, path).to_pylist()
+                yield from ((uuid_in(path), row) for row in held)
 
     def sizes(self) -> Iterator[PooledSize]:
         """How much of each table there is; the end of each file is read for it."""
@@ -132,17 +111,6 @@ class ParquetPool:
         """
         return ask(self._url, sql, max_rows)
 
-    def _records(self, name: str, recording_uuid: str | None = None) -> Mapping[str, list[Record]]:
-        """The rows of a table that changes, by recording."""
-        each = table(name)
-        paths = self._storage.find(files_of(each, recording_uuid or "*"))
-        found: dict[str, list[Record]] = defaultdict(list)
-        with ThreadPoolExecutor(_AT_ONCE) as workers:
-            for path, content in zip(paths, workers.map(self._storage.read, paths), strict=True):
-                if content is not None:
-                    found[uuid_in(path)] += decoded(each, content, path).to_pylist()
-        return found
-
     def _row_count(self, path: str) -> int:
         return int(self._footer(path).num_rows)
 
@@ -169,30 +137,3 @@ def _filter(where: Mapping[str, Collection[int]]) -> Any:
     for name, values in where.items():
         chosen &= compute.field(name).isin(arrow.array(values, arrow.int64()))
     return chosen
-
-
-def _pooled_run(recording_uuid: str, run: Record, robots: Mapping[int, str]) -> PooledRun:
-    return PooledRun(
-        recording_uuid=recording_uuid,
-        run_id=run["id"],
-        uuid=run["uuid"] or "",
-        robot=robots.get(run["robot_id"], ""),
-        **{
-            name: run[name]
-            for name in (
-                "label", "world", "started_wall_time_s", "last_wall_time_s",
-                "started_sim_time_s", "last_sim_time_s", "end_reason", "row_count",
-            )
-        },
-    )  # fmt: skip
-
-
-def _pooled_trial_set(
-    recording_uuid: str, trial_set: Record, trials: Iterable[Record]
-) -> PooledTrialSet:
-    own = [trial for trial in trials if trial["trial_set_id"] == trial_set["id"]]
-    runs = [(recording_uuid, trial["run_id"]) for trial in own if trial["run_id"] is not None]
-    created_s = trial_set["created_wall_time_s"]
-    return PooledTrialSet(
-        recording_uuid, trial_set["id"], trial_set["uuid"], created_s, len(own), tuple(runs)
-    )

@@ -247,6 +247,29 @@ def test_kept_stretches_come_whole_though_only_chunks_were_shipped(
     assert found.unchunked == {}
 
 
+@pytest.mark.parametrize("full", [True, False])
+def test_states_that_retention_moved_after_they_were_shipped_come_once(
+    lab: Lab, rounds: Path, full: bool
+) -> None:
+    with closing(connect(rounds, "writer")) as there:
+        there.execute(
+            "INSERT INTO kept_stretch (run_id, uuid, start_sim_time_s, end_sim_time_s, "
+            "wall_time_s, reason) VALUES (1, ?, 10, 20, 0, 'a bump')",
+            (new_uuid(),),
+        )
+        lab.ship(rounds, full=full)
+        prune(there, rounds.parent, Retention(state=Limit(rows=0), outlive=0), rest=False)
+        expected = there.execute("SELECT data FROM kept_state ORDER BY sim_time_s").fetchall()
+    lab.ship(rounds, full=full)
+
+    run = lab.fetch(run_uuid=uuid_of(rounds, 1)).runs[uuid_of(rounds, 1)]
+
+    stretch = "SELECT data FROM all_state WHERE run_id = ? AND sim_time_s BETWEEN 10 AND 20"
+    with lab.opened() as here:
+        found = here.execute(f"{stretch} ORDER BY sim_time_s", (run,)).fetchall()
+    assert found == expected != []
+
+
 @IN_EACH_POOL
 def test_a_label_a_set_a_robot_and_a_time_say_which_runs_come(lab: Lab, runs: Recorded) -> None:
     database = runs.folder / DATABASE_NAME

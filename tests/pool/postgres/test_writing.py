@@ -175,6 +175,18 @@ def test_what_jsonb_lacks_is_held_as_text(
     assert first(postgres, pool, "SELECT x_m FROM robot_trajectory WHERE state_id = 1") == 1
 
 
+def test_a_state_that_retention_moved_after_it_was_shipped_is_there_once(
+    postgres: Server, pool: str, target: PostgresTarget
+) -> None:
+    with target.shipment(OTHER) as shipment:
+        shipment.write([batch("state", sim_time_s=1.5, wall_time_s=3.0)], {})
+        moved = [batch("kept_state", id=n, sim_time_s=n + 0.5, wall_time_s=3.0) for n in (1, 2)]
+        called = batch("kept_state", id=3, sim_time_s=1.5, wall_time_s=3.0, call=7)
+        shipment.write([*moved, called], {})
+    sql = "SELECT sim_time_s, state_id FROM all_state ORDER BY 1, 2"
+    assert postgres.execute(pool, sql) == [(1.5, 1), (1.5, None), (2.5, None)]
+
+
 def test_rows_stand_in_the_partition_of_their_month(
     postgres: Server, pool: str, target: PostgresTarget
 ) -> None:

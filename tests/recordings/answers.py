@@ -25,14 +25,15 @@ def answers(connection: sqlite3.Connection, run_id: int, part: tuple[float, floa
     """Trends, events, timeline, history and comparison of a run; the first two also of a part."""
     whole = find_range(connection, Scope(run_id=run_id))
     some = find_range(connection, Scope(run_id=run_id, start_s=part[0], end_s=part[1]))
+    long = {"deadline_s": 600.0}  # a slow machine answers in full as well
     found = {
-        "trends": trends(connection, whole),
-        "trends of a part": trends(connection, some),
-        "events": find_events(connection, whole, limit=200),
-        "events of a part": find_events(connection, some, limit=200),
-        "timeline": timeline(connection, whole, limit=200),
-        "history": query_history(connection, whole, ["*"], max_points=40),
-        "comparison": compare_runs(connection, [run_id]),
+        "trends": trends(connection, whole, **long),
+        "trends of a part": trends(connection, some, **long),
+        "events": find_events(connection, whole, limit=200, **long),
+        "events of a part": find_events(connection, some, limit=200, **long),
+        "timeline": timeline(connection, whole, limit=200, **long),
+        "history": query_history(connection, whole, ["*"], max_points=40, **long),
+        "comparison": compare_runs(connection, [run_id], **long),
     }
     return _portable(found)
 

@@ -19,9 +19,6 @@ attributes = context.config.attributes
 context.configure(
     connection=attributes["connection"],
     transactional_ddl=True,
-    **attributes.get("options", {}),
 )
-if adapt := attributes.get("adapt"):  # a pool's tables differ a little
-    adapt(context.get_context())
 with context.begin_transaction():
     context.run_migrations()

@@ -26,8 +26,7 @@ VIEWS = Path(__file__).with_name("0010_views.sql")
 def upgrade() -> None:
     for table in SQLModel.metadata.tables.values():
         op.get_context().impl.create_table(table)
-    if op.get_context().dialect.name == "sqlite":
-        for view in VIEWS.read_text("utf-8").split(";\n"):
-            op.get_bind().exec_driver_sql(view)
-        op.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-        op.execute(f"PRAGMA user_version = {int(revision)}")
+    for view in VIEWS.read_text("utf-8").split(";\n"):
+        op.get_bind().exec_driver_sql(view)
+    op.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+    op.execute(f"PRAGMA user_version = {int(revision)}")

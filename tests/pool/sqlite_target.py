@@ -7,11 +7,12 @@ import sqlite3
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from webots_mcp.errors import PoolBusyError, PoolError, PoolUnavailableError
 from webots_mcp.plugins.pool.row_batch import Batch, batches
-from webots_mcp.plugins.pool.shipped_tables import SQLValue, Table, tables
-from webots_mcp.plugins.pool.target import PooledRecording, PooledRun, PooledSize, PooledTrialSet
+from webots_mcp.plugins.pool.shipped_tables import SQLValue, Table, table, tables
+from webots_mcp.plugins.pool.target import PooledSize
 from webots_mcp.store.questions.sql import Result, query_sql
 
 
@@ -169,34 +170,11 @@ class SQLitePool:
     def __exit__(self, *exception: object) -> None:
         self._connection.close()
 
-    def recordings(self) -> Iterator[PooledRecording]:
-        query = (
-            "SELECT c.uuid, c.created_wall_time_s, (SELECT count(*) FROM run r WHERE "
-            "r.recording_uuid = c.uuid), EXISTS (SELECT 1 FROM state s WHERE s.recording_uuid = "
-            "c.uuid) FROM recording c ORDER BY 2"
-        )
-        names = "SELECT name FROM robot WHERE recording_uuid = ? ORDER BY id"
-        for uuid, created_s, runs, full in self._connection.execute(query).fetchall():
-            robots = tuple(name for (name,) in self._connection.execute(names, (uuid,)))
-            yield PooledRecording(uuid, created_s, robots, runs, bool(full))
-
-    def runs(self, recording_uuid: str | None = None) -> Iterator[PooledRun]:
-        query = (
-            "SELECT r.recording_uuid, r.id, r.uuid, b.name, r.label, r.world, "
-            "r.started_wall_time_s, r.last_wall_time_s, r.started_sim_time_s, r.last_sim_time_s, "
-            "r.end_reason, r.row_count FROM run r JOIN robot b ON b.id = r.robot_id "
-            "AND b.recording_uuid = r.recording_uuid WHERE ?1 IS NULL OR r.recording_uuid = ?1 "
-            "ORDER BY r.started_wall_time_s"
-        )
-        yield from (PooledRun(*row) for row in self._connection.execute(query, (recording_uuid,)))
-
-    def trial_sets(self) -> Iterator[PooledTrialSet]:
-        sets = "SELECT recording_uuid, id, uuid, created_wall_time_s FROM trial_set ORDER BY 4"
-        trials = "SELECT run_id FROM trial WHERE recording_uuid = ? AND trial_set_id = ?"
-        for recording, set_id, uuid, created_s in self._connection.execute(sets).fetchall():
-            runs = self._connection.execute(trials, (recording, set_id)).fetchall()
-            known = tuple((recording, run) for (run,) in runs if run is not None)
-            yield PooledTrialSet(recording, set_id, uuid, created_s, len(runs), known)
+    def records(self, name: str) -> Iterator[tuple[str, dict[str, Any]]]:
+        columns = table(name).columns
+        query = f"SELECT recording_uuid, {', '.join(columns)} FROM {name}"
+        for owner, *row in self._connection.execute(query).fetchall():
+            yield owner, dict(zip(columns, row, strict=True))
 
     def sizes(self) -> Iterator[PooledSize]:
         for each in tables():

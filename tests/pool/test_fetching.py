@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -28,6 +28,7 @@ from webots_mcp.errors import InvalidInputError, PoolError
 from webots_mcp.plugins.pool import fetching
 from webots_mcp.plugins.pool.engines import open_pool, open_target
 from webots_mcp.plugins.pool.key_order import in_order
+from webots_mcp.plugins.pool.pool_contents import pooled_runs
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.questions.runs import run_info
@@ -40,7 +41,7 @@ from webots_mcp.store.trials import (
 
 OF_RUN = ("kept_stretch", "kept_state", "log", "event", "image", "parameter_value", "state")
 LOCAL = {"id", "run_id", "session_id", "robot_id", "command_id", "trial_set_id", "path",
-         "rolled_state_id", "coarse_end", "idempotency_key"}  # fmt: skip
+         "is_chunked", "idempotency_key"}  # fmt: skip
 
 
 STATES = ("state", "kept_state")
@@ -163,21 +164,35 @@ def test_each_value_of_a_state_comes_back(lab: Lab, runs: Recorded) -> None:
 
 
 @IN_EACH_POOL
-def test_of_a_run_of_chunks_the_answers_are_those_after_all_its_rows_were_purged(
-    lab: Lab, rounds: Path
-) -> None:
-    lab.ship(rounds)
+@pytest.mark.parametrize("full", [True, False])
+def test_a_fetched_run_has_the_answers_of_the_recording(lab: Lab, rounds: Path, full: bool) -> None:
+    lab.ship(rounds, full=full)
     uuid = uuid_of(rounds, 1)
+    with closing(connect(rounds, "writer")) as there:
+        before = answers(there, 1, PART)
+        if not full:
+            prune(there, rounds.parent, Retention(state=Limit(rows=0), outlive=0), rest=False)
+        expected = answers(there, 1, PART)
 
     found = lab.fetch(run_uuid=uuid)
 
-    assert (found.only_chunks, found.unchunked) == ([uuid], {})
-    with closing(connect(rounds, "writer")) as there, lab.opened() as here:
-        prune(there, rounds.parent, Retention(state=Limit(rows=0), outlive=0), rest=False)
+    assert (found.only_chunks, found.unchunked) == ([] if full else [uuid], {})
+    with lab.opened() as here:
         run = found.runs[uuid]
         info = run_info(here, run)
-        assert info.purged_rows == info.row_count == run_info(there, 1).purged_rows
-        assert answers(here, run, PART) == answers(there, 1, PART)
+        fetched = answers(here, run, PART)
+    assert info.purged_rows == (0 if full else info.row_count)
+    assert fetched == expected
+    for name in ("trends", "trends of a part", "history"):
+        assert without_notes(fetched[name]) == without_notes(before[name])
+
+
+def without_notes(value: Any) -> Any:
+    """Answers without what is said of rows that are here or not."""
+    if isinstance(value, dict):
+        named = cast("dict[str, Any]", value)
+        return {key: without_notes(each) for key, each in named.items() if key != "notes"}
+    return [without_notes(each) for each in value] if isinstance(value, list) else value
 
 
 def test_of_a_run_whose_first_rows_were_purged_before_they_were_shipped_the_others_come(
@@ -230,6 +245,29 @@ def test_kept_stretches_come_whole_though_only_chunks_were_shipped(
     for name in ("log", "event", "image", "parameter_value", "parameter", "session", "pictures"):
         assert after[name] == before[name] != []
     assert found.unchunked == {}
+
+
+@pytest.mark.parametrize("full", [True, False])
+def test_states_that_retention_moved_after_they_were_shipped_come_once(
+    lab: Lab, rounds: Path, full: bool
+) -> None:
+    with closing(connect(rounds, "writer")) as there:
+        there.execute(
+            "INSERT INTO kept_stretch (run_id, uuid, start_sim_time_s, end_sim_time_s, "
+            "wall_time_s, reason) VALUES (1, ?, 10, 20, 0, 'a bump')",
+            (new_uuid(),),
+        )
+        lab.ship(rounds, full=full)
+        prune(there, rounds.parent, Retention(state=Limit(rows=0), outlive=0), rest=False)
+        expected = there.execute("SELECT data FROM kept_state ORDER BY sim_time_s").fetchall()
+    lab.ship(rounds, full=full)
+
+    run = lab.fetch(run_uuid=uuid_of(rounds, 1)).runs[uuid_of(rounds, 1)]
+
+    stretch = "SELECT data FROM all_state WHERE run_id = ? AND sim_time_s BETWEEN 10 AND 20"
+    with lab.opened() as here:
+        found = here.execute(f"{stretch} ORDER BY sim_time_s", (run,)).fetchall()
+    assert found == expected != []
 
 
 @IN_EACH_POOL
@@ -352,7 +390,7 @@ def test_a_run_without_a_uuid_is_listed_and_not_taken(lab: Lab, runs: Recorded) 
     runs.connection.execute("UPDATE run SET uuid = NULL WHERE id = 1")
     lab.ship(runs.folder / DATABASE_NAME, full=True)
     with lab.pool() as pool:
-        assert [run.uuid for run in pool.runs() if run.run_id == 1] == [""]
+        assert [run.uuid for run in pooled_runs(pool) if run.run_id == 1] == [""]
 
     found = lab.fetch(robot="rover")
 

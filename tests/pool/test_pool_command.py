@@ -94,9 +94,7 @@ def test_what_came_is_said_and_what_is_missing_of_it(ask: Ask, lab: Lab) -> None
     words = ("fetch", "--from", "POOL", "--data-dir", str(lab.here), "--robot", "rover")
     assert ask(*words).splitlines() == [
         f"fetched from {lab.pool().address}: run 1 to 2",
-        "of run 1 to 2 only summaries were shipped, no rows ('webots-mcp ship --full' does)",
-        "of run 1 to 2 not even summaries of all rows: those were not made where it was recorded, "
-        "which a server does ('webots-mcp serve')",
+        "of run 1 to 2 only chunks were shipped, no rows ('webots-mcp ship --full' does)",
     ]
     assert ask(*words).splitlines()[1] == "here already: run 1 to 2"
     told = json.loads(ask(*words, "--json"))

@@ -18,6 +18,7 @@ _LOCAL: Final = {
     "id", "ids", "run_id", "run_ids", "session_id", "robot_id", "cursor", "path",
     "age_s",  # told by the clock
 }  # fmt: skip
+_LONG_S: Final = 600.0  # for slow machines to answer in full as well
 _RUN: Final = re.compile(r"\b(runs?) \d+")
 
 
@@ -26,13 +27,13 @@ def answers(connection: sqlite3.Connection, run_id: int, part: tuple[float, floa
     whole = find_range(connection, Scope(run_id=run_id))
     some = find_range(connection, Scope(run_id=run_id, start_s=part[0], end_s=part[1]))
     found = {
-        "trends": trends(connection, whole),
-        "trends of a part": trends(connection, some),
-        "events": find_events(connection, whole, limit=200),
-        "events of a part": find_events(connection, some, limit=200),
-        "timeline": timeline(connection, whole, limit=200),
-        "history": query_history(connection, whole, ["*"], max_points=40),
-        "comparison": compare_runs(connection, [run_id]),
+        "trends": trends(connection, whole, deadline_s=_LONG_S),
+        "trends of a part": trends(connection, some, deadline_s=_LONG_S),
+        "events": find_events(connection, whole, limit=200, deadline_s=_LONG_S),
+        "events of a part": find_events(connection, some, limit=200, deadline_s=_LONG_S),
+        "timeline": timeline(connection, whole, limit=200, deadline_s=_LONG_S),
+        "history": query_history(connection, whole, ["*"], max_points=40, deadline_s=_LONG_S),
+        "comparison": compare_runs(connection, [run_id], deadline_s=_LONG_S),
     }
     return _portable(found)
 

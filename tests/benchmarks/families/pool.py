@@ -1,31 +1,44 @@
-"""How fast a pool in PostgreSQL takes rows: ours beside a bare COPY of the same rows."""
+"""Pools: how fast PostgreSQL takes rows beside a bare COPY, and what a recording takes there."""
 
 from __future__ import annotations
 
 import json
 import time
 from collections.abc import Callable, Iterable
+from contextlib import ExitStack, closing
+from functools import partial
+from itertools import product
 from typing import Any, Final, NamedTuple
 
 import psutil
 
 from tests.benchmarks.measuring import Samples, alternate, ratio
+from tests.benchmarks.recordings import record
 from tests.benchmarks.registry import Bench, NotMeasurableError, benchmark
 from tests.benchmarks.states import make_states
 from tests.benchmarks.table import Line, Target
 from tests.postgres import NoServerError, Server, running_server
-from webots_mcp.contract import new_uuid
+from webots_mcp.connection import connect as connect_recording
+from webots_mcp.contract import DATABASE_NAME, new_uuid
+from webots_mcp.plugins.pool.engines import open_pool, open_target
+from webots_mcp.plugins.pool.fetching import fetch
+from webots_mcp.plugins.pool.pool_contents import Choice, meant
 from webots_mcp.plugins.pool.postgres.connecting import Connection, connect
 from webots_mcp.plugins.pool.postgres.postgres_schema import prepare
 from webots_mcp.plugins.pool.postgres.postgres_writing import PostgresShipment
+from webots_mcp.plugins.pool.report import Report
 from webots_mcp.plugins.pool.row_batch import Batch, batches
 from webots_mcp.plugins.pool.shipped_tables import Table, table
+from webots_mcp.plugins.pool.shipping import Order, ship
+from webots_mcp.schema import create_schema
+from webots_mcp.store.recording import Recording
 
 _ROWS: Final = 20_000
 _BLOCKS: Final = 5
 _WALL_S: Final = 1.7e9
 _RESOLUTION_S: Final = 0.01  # of a process's times
 _LEAST: Final = Target(0.5, least=True)
+_VALUES: Final = ("state", "row_group", "chunk", "value")
 
 
 class _Taken(NamedTuple):
@@ -46,6 +59,59 @@ def measure_pool(bench: Bench) -> Iterable[Line]:
             yield from _measure(bench, server)
     except NoServerError as reason:
         raise NotMeasurableError(str(reason)) from reason
+
+
+@benchmark(
+    "pool_room", "a recording of 39 signals in pools: room, and processor time of ship and fetch"
+)
+def measure_room(bench: Bench) -> Iterable[Line]:
+    rows = bench.rows or bench.count(100_000, least=2000)
+    bench.say(f"building {rows:,} rows")
+    database = bench.place("there") / DATABASE_NAME
+    record(database, rows)
+    with closing(connect_recording(database, "writer")) as db:
+        db.execute("UPDATE run SET uuid = ?, end_reason = 'finished'", (new_uuid(),))
+        db.execute("UPDATE session SET uuid = ?, ended_wall_time_s = 2e9", (new_uuid(),))
+        held = dict(db.execute("SELECT name, sum(pgsize) FROM dbstat GROUP BY name").fetchall())
+    states = sum(size for name, size in held.items() if "state" in name)
+    chunks = sum(size for name, size in held.items() if "chunk" in name or "row_group" in name)
+    yield _room("SQLite, states", states, rows, states)
+    yield _room("SQLite, chunks", chunks, rows, states)
+    with ExitStack() as stack:
+        urls = {"Parquet": lambda: str(bench.place(f"files{len(list(bench.folder.iterdir()))}"))}
+        try:
+            server = stack.enter_context(running_server())
+            urls["PostgreSQL"] = lambda: server.url(server.new_database())
+        except NoServerError as reason:
+            bench.say(str(reason))
+        for (name, make), full in product(urls.items(), (False, True)):
+            what = f"{name}, {'states and chunks' if full else 'chunks'}"
+            bench.say(what)
+            url = make()
+            recording = Recording(database, database.parent, read_only=True)
+            order = Order(recording, partial(open_target, url), full=full)
+            shipped_s = _processor_s(lambda order=order: ship(order, Report()))
+            here = bench.place(what)
+            with closing(connect_recording(here / DATABASE_NAME, "writer", create=True)) as db:
+                create_schema(db)
+                with open_pool(url) as pool:
+                    sizes = sum(each.size_bytes or 0 for each in pool.sizes()
+                                if each.table in _VALUES)  # fmt: skip
+                    wanted = meant(pool, Choice(since="0"))
+                    fetched_s = _processor_s(partial(fetch, pool, db, here, wanted))
+            yield _room(what, sizes, rows, states)
+            yield Line(f"{what}: ship", "", "", 1e6 * shipped_s / rows, "us/row")
+            yield Line(f"{what}: fetch", "", "", 1e6 * fetched_s / rows, "us/row")
+
+
+def _room(what: str, size: int, rows: int, states: int) -> Line:
+    return Line(what, f"{size / rows:.0f} bytes/row", f"of JSON {states / rows:.0f}", size / states)
+
+
+def _processor_s(work: Callable[[], object]) -> float:
+    started_s = time.process_time()
+    work()
+    return time.process_time() - started_s
 
 
 def _measure(bench: Bench, server: Server) -> Iterable[Line]:

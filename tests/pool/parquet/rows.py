@@ -51,10 +51,14 @@ def ship(file: Path, url: str) -> None:
 def pooled(
     url: str, uuid: str, name: str, where: Mapping[str, tuple[int, ...]] | None = None
 ) -> list[Row]:
-    """Rows of a table as the pool gives them."""
+    """Rows of a table as the pool gives them, in the order of the key."""
+    each = table(name)
+    places = [each.columns.index(column) for column in each.key]
     with ParquetPool(url) as pool:
-        found = pool.rows(uuid, table(name), where or {})
-        return [row for batch in found for row in batch.rows]
+        found = [row for batch in pool.rows(uuid, each, where or {}) for row in batch.rows]
+    if name == "chunk":  # they are made anew, and have no ids
+        return found
+    return sorted(found, key=lambda row: [f"{row[at]:>20}" for at in places])
 
 
 @contextmanager

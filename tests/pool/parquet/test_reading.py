@@ -20,6 +20,7 @@ from webots_mcp.errors import InvalidInputError, PoolError
 from webots_mcp.plugins.pool.parquet import duckdb_statement as asking
 from webots_mcp.plugins.pool.parquet.parquet_reading import ParquetPool
 from webots_mcp.plugins.pool.parquet.storage import Storage
+from webots_mcp.plugins.pool.pool_contents import pooled_runs, pooled_trial_sets
 from webots_mcp.plugins.pool.shipped_tables import table
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.questions.events import find_events
@@ -33,11 +34,7 @@ MEANS = """
     SELECT recording_uuid, avg(CAST(data ->> '$.front_m' AS DOUBLE)) FROM state
     GROUP BY recording_uuid
 """
-MEANS_OF_CHUNKS = """
-    SELECT recording_uuid, sum(c.sum) / sum(c.value_count)
-    FROM chunk c JOIN signal s USING (recording_uuid)
-    WHERE s.id = c.signal_id AND s.name = 'front_m' GROUP BY recording_uuid
-"""
+MEANS_OF_VALUES = "SELECT recording_uuid, avg(front_m) FROM value GROUP BY recording_uuid"
 WALLS = """
     WITH seen AS (
         SELECT recording_uuid, sim_time_s, CAST(data ->> '$.front_m' AS DOUBLE) < 0.3 AS is_near
@@ -93,7 +90,7 @@ def test_as_many_states_as_the_tools_count(pool: ParquetPool, told: dict[str, To
     assert asked(pool, COUNTS) == {uuid: each.rows for uuid, each in told.items()}
 
 
-@pytest.mark.parametrize("sql", [MEANS, MEANS_OF_CHUNKS])
+@pytest.mark.parametrize("sql", [MEANS, MEANS_OF_VALUES])
 def test_the_means_of_a_signal_are_those_of_the_tools(
     pool: ParquetPool, told: dict[str, Told], sql: str
 ) -> None:
@@ -107,18 +104,15 @@ def test_events_are_those_that_the_tools_find(pool: ParquetPool, told: dict[str,
 
 
 def test_what_is_there_is_listed(pool: ParquetPool, many: Many) -> None:
-    recordings = list(pool.recordings())
-    assert {each.uuid for each in recordings} == {uuid_of(file) for file in many.databases}
-    assert {each.robots for each in recordings} == {(f"rover_{n}",) for n in range(10)}
-    assert all(each.runs == 1 and each.full_rate for each in recordings)
-    runs = list(pool.runs())
+    runs = pooled_runs(pool)
+    assert {run.recording_uuid for run in runs} == {uuid_of(file) for file in many.databases}
     assert [run.started_wall_time_s for run in runs] == sorted(
         run.started_wall_time_s for run in runs
     )
     assert {(run.robot, run.label, run.row_count) for run in runs} == {
         (f"rover_{n % 10}", "lab", 200 + 3 * n) for n in range(RECORDINGS)
     }
-    (own,) = pool.runs(uuid_of(many.databases[7]))
+    (own,) = (run for run in runs if run.recording_uuid == uuid_of(many.databases[7]))
     assert (own.row_count, own.end_reason) == (221, "finished")
 
 
@@ -139,11 +133,11 @@ def test_trial_sets_are_told_with_their_runs(tmp_path: Path) -> None:
         waiting = trial | {"id": 3, "uuid": "t3", "number": 3, "status": "waiting"}
         shipment.write([batch("trial_set", trial_set), batch("trial", *trials, waiting)], {})
     with ParquetPool(str(tmp_path)) as pool:
-        (told,) = pool.trial_sets()
+        (told,) = pooled_trial_sets(pool)
     assert (told.uuid, told.trials, [run for _, run in told.runs]) == ("set", 3, [1, 2])
 
 
-def test_the_rows_of_some_runs_come_back_in_the_order_of_the_key(bridge_recording: Path) -> None:
+def test_the_rows_of_some_runs_come_back(bridge_recording: Path) -> None:
     url = bucket.empty()
     ship(bridge_recording, url)
     for name in ("state", "event", "image"):

@@ -6,6 +6,7 @@ import errno
 import io
 import json
 import os
+import shutil
 import stat
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import closing
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,6 +23,7 @@ from typing import Any
 import pytest
 
 from tests import unprivileged
+from tests.pool.chunk_values import chunk_values
 from tests.pool.parquet import bucket
 from tests.pool.parquet.bucket import Bucket, KilledError
 from tests.pool.parquet.rows import (
@@ -37,6 +40,7 @@ from tests.pool.parquet.rows import (
     shipping,
     uuid_of,
 )
+from webots_mcp.connection import connect
 from webots_mcp.errors import InvalidInputError, PoolBusyError, PoolError, PoolUnavailableError
 from webots_mcp.plugins.pool.parquet import arrow_rows
 from webots_mcp.plugins.pool.parquet.lease import LEASE_S
@@ -44,6 +48,7 @@ from webots_mcp.plugins.pool.parquet.parquet_reading import ParquetPool
 from webots_mcp.plugins.pool.parquet.parquet_writing import PART_BYTES, ParquetTarget
 from webots_mcp.plugins.pool.row_batch import Batch, Row
 from webots_mcp.plugins.pool.shipped_tables import SQLValue, table, tables
+from webots_mcp.store.chunks.making import chunk_whole_run
 
 DAY_S = 86_400.0
 MIDNIGHT_S = 19_700 * DAY_S
@@ -69,9 +74,18 @@ def test_each_table_of_a_recording_is_in_the_pool_row_by_row(
     bridge_recording: Path, tmp_path: Path, kind: str
 ) -> None:
     url = str(tmp_path / "pool") if kind == "folder" else bucket.empty()
-    ship(bridge_recording, url)
+    recording = Path(shutil.copy(bridge_recording, tmp_path))
+    with closing(connect(recording, "writer")) as connection:
+        for (run_id,) in connection.execute("SELECT id FROM run").fetchall():
+            assert chunk_whole_run(connection, run_id)
+    ship(recording, url)
     for each in tables():
-        assert pooled(url, uuid_of(bridge_recording), each.name) == rows_of(bridge_recording, each)
+        found = pooled(url, uuid_of(recording), each.name)
+        expected = rows_of(recording, each)
+        if each.name == "chunk":
+            assert chunk_values(found) == chunk_values(expected) != {}
+        else:
+            assert found == expected
 
 
 def write_all(url: str, steps: Sequence[list[Batch]]) -> None:
@@ -86,7 +100,7 @@ def run_row(row_id: int, rows: int) -> dict[str, SQLValue]:
     return {
         "id": row_id, "session_id": 1, "robot_id": 1, "start_reason": "start", "row_count": rows,
         "started_wall_time_s": 1.0, "started_sim_time_s": 0.0, "last_wall_time_s": 2.0,
-        "last_sim_time_s": 1.0, "keep": 0, "purged_rows": 0, "rolled_state_id": 0,
+        "last_sim_time_s": 1.0, "keep": 0, "purged_rows": 0,
         "uuid": f"run-{row_id}",
     }  # fmt: skip
 
@@ -172,31 +186,26 @@ def test_a_large_file_is_over_and_another_begins(tmp_path: Path) -> None:
     assert ids(pooled(str(tmp_path), UUID, "log")) == list(range(1, 8))
 
 
-def test_rows_that_are_there_are_left_alone_and_a_table_may_come_twice_in_a_write(
-    tmp_path: Path,
-) -> None:
+def test_a_table_may_come_twice_in_a_write(tmp_path: Path) -> None:
     with shipping(tmp_path) as shipment:
-        shipment.write([logs(1, 2), logs(2, 3)], {})
-        shipment.write([logs(1, 2, 3, message="another")], {})
+        shipment.write([logs(1, 2), logs(3)], {})
     rows = globbed(tmp_path, "log")
     assert [row["message"] for row in rows] == ["driving 1", "driving 2", "driving 3"]
 
 
-def test_rows_may_come_that_lie_before_others_and_each_is_there_once_in_order(
-    tmp_path: Path,
-) -> None:
+def test_rows_may_come_that_lie_before_others_and_each_is_there_once(tmp_path: Path) -> None:
+    kept = {*range(1, 900, 9), 500, 501, 505}
     with shipping(tmp_path) as shipment:
-        shipment.write([logs(*range(1, 900, 9), message="kept")], {})
-        shipment.write([logs(500, 501, 505, message="kept")], {})
+        shipment.write([logs(*sorted(kept), message="kept")], {})
         for first in range(1, 1000, 100):
             noise = os.urandom(PART_BYTES // 2).hex() if first % 300 == 1 else ""
-            shipment.write([logs(*range(first, first + 99)), logs(first + 99, message=noise)], {})
+            *others, last = sorted({*range(first, first + 100)} - kept)
+            shipment.write([logs(*others), logs(last, message=noise)], {})
     assert len(list(tmp_path.rglob("table=log/*/*.parquet"))) > 1
     assert ids(pooled(str(tmp_path), UUID, "log")) == list(range(1, 1001))
     rows = globbed(tmp_path, "log")
     assert Counter(row["id"] for row in rows) == Counter(range(1, 1001))
-    kept = [row["id"] for row in rows if row["message"].startswith("kept")]
-    assert len(kept) == 100 + 2
+    assert {row["id"] for row in rows if row["message"].startswith("kept")} == kept
 
 
 def test_a_row_replaces_the_one_of_its_key_but_what_lasts_is_not_lost(tmp_path: Path) -> None:
@@ -228,7 +237,7 @@ def test_what_a_column_cannot_hold_becomes_what_comes_nearest_and_is_counted(
     (row,) = globbed(tmp_path, "log")
     assert row == {
         "id": 1, "run_id": None, "sim_time_s": None, "wall_time_s": float(2**60), "level": "5",
-        "source": "\ufffd", "message": "lone ?", "logger": None,
+        "source": "\ufffd", "message": "lone \ufffd\ufffd\ufffd", "logger": None,
     }  # fmt: skip
     odd_columns = ("run_id", "sim_time_s", "wall_time_s", "level", "source", "message")
     assert altered == {f"log.{column}": 1 for column in odd_columns}

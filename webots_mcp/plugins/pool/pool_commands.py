@@ -51,9 +51,9 @@ def fetch(
     """Bring runs of a pool back into a recording here, for every command, tool and plot.
 
     They come with their sessions, commands, trials and what was shipped of their pictures, each
-    once however often it is fetched; what is here is left as it is. Of a run of which chunks
-    were shipped and no rows, the chunks come: the values of all of its signals. A run that goes on or is
-    still being shipped is not taken: fetch it again when it is whole.
+    once however often it is fetched; what is here is left as it is. Of a run of which chunks were
+    shipped and no states, the chunks come: the values of all of its signals. A run that goes on or
+    is still being shipped is not taken: fetch it again when it is whole.
     """
     from webots_mcp.plugins.pool.engines import open_pool
     from webots_mcp.plugins.pool.fetching import fetch as fetch_runs

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final
@@ -15,6 +16,10 @@ from webots_mcp.plugins.pool.target import Pool, PooledRun, PooledTrialSet
 from webots_mcp.store.reading.wall_time import parse_wall_time
 
 _MOST_OFFERED: Final = 3
+_OF_RUN: Final = (
+    "label", "world", "started_wall_time_s", "last_wall_time_s", "started_sim_time_s",
+    "last_sim_time_s", "end_reason", "row_count",
+)  # fmt: skip
 _MOST_COMPARED: Final = 2000  # names or UUIDs, with one that is not there
 
 
@@ -80,13 +85,48 @@ class PooledRobot:
     last_wall_time_s: float
 
 
+def pooled_runs(pool: Pool) -> list[PooledRun]:
+    """All runs, by when they began."""
+    robots = {(owner, row["id"]): row["name"] for owner, row in pool.records("robot")}
+    found = [
+        PooledRun(
+            recording_uuid=owner,
+            run_id=row["id"],
+            uuid=row["uuid"] or "",
+            robot=robots.get((owner, row["robot_id"]), ""),
+            **{name: row[name] for name in _OF_RUN},
+        )
+        for owner, row in pool.records("run")
+    ]
+    return sorted(found, key=lambda run: (run.started_wall_time_s, run.recording_uuid, run.run_id))
+
+
+def pooled_trial_sets(pool: Pool) -> list[PooledTrialSet]:
+    """All trial sets, by when they were made."""
+    trials = defaultdict[tuple[str, int], list[int | None]](list)
+    for owner, row in pool.records("trial"):
+        trials[owner, row["trial_set_id"]].append(row["run_id"])
+    found = [
+        PooledTrialSet(
+            recording_uuid=owner,
+            trial_set_id=row["id"],
+            uuid=row["uuid"],
+            created_wall_time_s=row["created_wall_time_s"],
+            trials=len(own := trials[owner, row["id"]]),
+            runs=tuple((owner, run_id) for run_id in own if run_id is not None),
+        )
+        for owner, row in pool.records("trial_set")
+    ]
+    return sorted(found, key=lambda each: (each.created_wall_time_s, each.uuid))
+
+
 def chosen_runs(pool: Pool, choice: Choice) -> list[PooledRun]:
     """The runs that are meant, by when they began.
 
     Raises:
         InvalidInputError: There is none; the text names what comes nearest.
     """
-    runs = list(pool.runs())
+    runs = pooled_runs(pool)
     if not runs:
         raise InvalidInputError(f"the pool {pool.address} holds no run yet")
     found = runs
@@ -124,7 +164,7 @@ def meant(pool: Pool, choice: Choice) -> Meant:
 
 def chosen_trial_sets(pool: Pool, choice: Choice) -> list[PooledTrialSet]:
     """The trial sets that are meant: all, or the one of that UUID, as each recording has it."""
-    sets = list(pool.trial_sets())
+    sets = pooled_trial_sets(pool)
     if choice.trials is None:
         return sets
     if not sets:

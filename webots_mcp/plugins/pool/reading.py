@@ -6,11 +6,10 @@ meanwhile, and the robot's disk would fill up because a server is slow.
 
 from __future__ import annotations
 
-import math
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from hashlib import blake2b
-from typing import Any, Final, NamedTuple, TypeGuard
+from typing import Any, Final, NamedTuple
 
 from webots_mcp.errors import DatabaseError
 from webots_mcp.plugins.pool.row_batch import (
@@ -60,6 +59,15 @@ class Stretch(NamedTuple):
     start_sim_time_s: float
     end_sim_time_s: float
     is_over: bool
+
+    def holds(self, run_id: SQLValue, sim_time_s: SQLValue) -> bool:
+        """Whether a state is one of them."""
+        is_time = isinstance(sim_time_s, int | float)
+        return (
+            is_time
+            and run_id == self.run_id
+            and (self.start_sim_time_s <= sim_time_s <= self.end_sim_time_s)
+        )
 
 
 class Source:
@@ -188,8 +196,9 @@ class Source:
         found = map(Stretch._make, self._connection.execute(_STRETCHES).fetchall())
         return [stretch for stretch in found if stretch.run_id not in self.foreign]
 
-    def kept(self, states: Table, stretch: Stretch, after: int, upto: int) -> tuple[Batch, bool]:
+    def kept(self, stretch: Stretch, after: int, upto: int) -> tuple[Batch, bool]:
         """The next states of a kept stretch, and whether they are all."""
+        states = table("state")
         query = _IN_STRETCH.format(columns=", ".join(states.columns))
         bounds = (stretch.start_sim_time_s, stretch.end_sim_time_s)
         rows, is_all = self._some(query, (stretch.run_id, *bounds, after, upto))
@@ -231,11 +240,6 @@ def _without(table: Table, rows: Sequence[Row], column: str | None, foreign: set
     if table.outlasts_runs:
         return [(*row[:at], None, *row[at + 1 :]) if row[at] in foreign else row for row in rows]
     return [row for row in rows if row[at] not in foreign]
-
-
-def is_finite(value: SQLValue) -> TypeGuard[int | float]:
-    """Whether it is a number that can be reckoned with, as all that a bridge writes."""
-    return isinstance(value, int | float) and math.isfinite(value)
 
 
 def digest(rows: Sequence[Sequence[SQLValue]]) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -41,6 +42,35 @@ def batches(table: Table, rows: Iterable[Row]) -> Iterator[Batch]:
         size += added
     if held:
         yield Batch(table, held)
+
+
+def nearest(value: SQLValue, kind: type, *, nullable: bool) -> SQLValue:
+    """The value of a type that comes nearest to one that SQLite holds."""
+    if value is None:
+        return None if nullable else kind()
+    if kind is str:
+        text = value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+        return text.encode("utf-8", "surrogatepass").decode("utf-8", "replace")
+    if kind is bytes:
+        return value if isinstance(value, bytes) else None
+    number = number_in(value)
+    if number is None:
+        return None if nullable else kind()
+    if kind is float:
+        return float(number)
+    if math.isfinite(number) and abs(number) < 2**63:
+        return int(number)
+    return None if nullable else 0
+
+
+def number_in(value: SQLValue) -> int | float | None:
+    """The number that it is, or says; None of what is none."""
+    if isinstance(value, int | float):
+        return value
+    try:
+        return float(value or "")
+    except ValueError:
+        return None
 
 
 def row_bytes(row: Row) -> int:

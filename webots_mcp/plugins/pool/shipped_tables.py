@@ -12,11 +12,13 @@ Kind: TypeAlias = type[int] | type[float] | type[str] | type[bytes]
 _DATED: Final = ("state", "kept_state", "log", "event", "image", "parameter_value")
 CHUNKS: Final = ("row_group", "chunk")
 # Of one machine or one moment: who maintains it, what is kept there, and console lines that wait
-# to become log lines; and what chunks hold as well.
-_LOCAL: Final = (
-    "lease", "watermark", "retention_limit", "console_line", "rollup", "recent_rollup",
-    "coarse_rollup", "change",
-)  # fmt: skip
+# to become log lines.
+_LOCAL: Final = ("lease", "watermark", "retention_limit", "console_line")
+# How many rows wait for chunks there, how many of a group are left, and what they take on the disk.
+_LOCAL_COLUMNS: Final = {
+    "run": ("is_chunked",),
+    "row_group": ("stored_row_count", "stored_row_bytes", "chunk_bytes", "is_complete"),
+}
 _OF_TRIALS: Final = ("trial_set", "trial")
 _TYPES: Final[dict[str, Kind]] = {
     "INTEGER": int, "BIGINT": int, "FLOAT": float, "TEXT": str, "VARCHAR": str, "BLOB": bytes,
@@ -29,7 +31,7 @@ class Table:
 
     Attributes:
         key: Its primary key in a recording; in a pool the recording's UUID stands before it.
-        columns: All columns, those of the key included, by their names in the recording.
+        columns: Those of the key and all others that are shipped, by their names in the recording.
         types: Of the columns, as the model declares them; SQLite may hold others.
         json_columns: Those that hold JSON as text.
         json_values: Of them, those in which a text is as good as an object.
@@ -38,7 +40,6 @@ class Table:
             does not replace the value that the pool has.
         is_appended: Rows come with rising ids and never change; otherwise a row replaces the one
             of the same key.
-        full_rate_only: Shipped only at full rate, but for the rows of kept stretches.
         time_column: The wall time by which a pool may cut it into parts, of appended tables but
             row groups and chunks.
         run_column: The column that names the row's run, where it belongs to one.
@@ -55,7 +56,6 @@ class Table:
     nullable: frozenset[str]
     lasting: frozenset[str]
     is_appended: bool
-    full_rate_only: bool
     time_column: str | None
     run_column: str | None
     session_column: str | None
@@ -82,18 +82,19 @@ def table(name: str) -> Table:
 
 def _table(model: Any) -> Table:
     name: str = model.name
-    columns = tuple(str(column.name) for column in model.columns)
+    local = _LOCAL_COLUMNS.get(name, ())
+    shipped: list[Any] = [column for column in model.columns if column.name not in local]
+    columns = tuple(str(column.name) for column in shipped)
     return Table(
         name=name,
         key=tuple(column.name for column in model.primary_key.columns),
         columns=columns,
-        types=tuple(_TYPES[str(column.type)] for column in model.columns),
-        json_columns=frozenset(column.name for column in model.columns if _is_json(column)),
-        json_values=frozenset(column.name for column in model.columns if _is_value(column)),
-        nullable=frozenset(column.name for column in model.columns if column.nullable),
-        lasting=frozenset(column.name for column in model.columns if _is_lasting(column)),
+        types=tuple(_TYPES[str(column.type)] for column in shipped),
+        json_columns=frozenset(column.name for column in shipped if _is_json(column)),
+        json_values=frozenset(column.name for column in shipped if _is_value(column)),
+        nullable=frozenset(column.name for column in shipped if column.nullable),
+        lasting=frozenset(column.name for column in shipped if _is_lasting(column)),
         is_appended=name in _DATED + CHUNKS,
-        full_rate_only=name == "state",
         time_column="wall_time_s" if name in _DATED else None,
         run_column=_column_of("run", name, columns),
         session_column=_column_of("session", name, columns),

@@ -24,12 +24,11 @@ from webots_mcp.errors import (
     PoolError,
 )
 from webots_mcp.liveness import dead_sessions
-from webots_mcp.plugins.pool.kept_states import Kept
 from webots_mcp.plugins.pool.outbox import WRITE_BYTES, Outbox
 from webots_mcp.plugins.pool.reading import GROUPS_AT_ONCE, Source, digest
 from webots_mcp.plugins.pool.report import Report
 from webots_mcp.plugins.pool.row_batch import Batch
-from webots_mcp.plugins.pool.shipped_tables import CHUNKS, Table, table, tables
+from webots_mcp.plugins.pool.shipped_tables import CHUNKS, SQLValue, Table, table, tables
 from webots_mcp.plugins.pool.target import Shipment, Target, is_whole, whole_runs
 from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
 from webots_mcp.store.images import MAX_FILE_BYTES, PICTURES, inside
@@ -41,7 +40,9 @@ MOST_BATCHES: Final = 8  # of a table in a round, before the others get their tu
 _HANDOVER_S: Final = (0.02, 0.1, 0.3, 0.6)
 _UNCHECKED: Final = -1
 _PAUSE_S: Final = 0.002  # between two short writes, for robots to write theirs
-_PICTURE: Final = "picture"  # of the progress: the last one whose file was shipped
+# Of the progress: the last picture whose file was shipped, and the last state of a kept stretch.
+_PICTURE: Final = "picture"
+_STRETCH: Final = "kept_stretch/{}"
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,6 @@ class Shipper:
         self._owners = dict[str, str | None]()
         self._is_checked = False
         self._last_ids = dict[str, int]()
-        self._kept = Kept(self._progress, self._put)
         self._ended = set[int]()
         self.address = target.address
 
@@ -147,7 +147,7 @@ class Shipper:
             self._ship_changing(source, thorough=thorough)
             is_complete = self._ship_groups(source) and self._ship_all_appended(source)
             if is_complete and not self._order.full:
-                self._kept.ship(source, self._last_ids["state"], thorough=thorough)
+                self._ship_kept(source, thorough=thorough)
             if self._order.pictures:
                 self._ship_pictures(source)
             is_whole = is_complete and thorough  # else some of what may change was not looked at
@@ -198,8 +198,8 @@ class Shipper:
     def _appended(self) -> list[Table]:
         """States last: others should not wait for the largest table."""
         wanted = [each for each in tables() if each.is_appended and each.name not in CHUNKS]
-        wanted = [each for each in wanted if self._order.full or not each.full_rate_only]
-        return sorted(wanted, key=lambda each: each.full_rate_only)
+        others = [each for each in wanted if each.name != "state"]
+        return [*others, table("state")] if self._order.full else others
 
     def _require_the_same(self, source: Source) -> None:
         """That the recording is the one of before, and not an older copy of it.
@@ -289,13 +289,9 @@ class Shipper:
         return count < GROUPS_AT_ONCE
 
     def _ship_all_appended(self, source: Source) -> bool:
-        """Ship the next rows of the appended tables; returns whether these were all.
-
-        States come after all others: where retention moves one, it is looked for among them.
-        """
-        *others, last = self._appended()
-        are_all = [self._ship_appended(source, each) for each in others]
-        return all(are_all) and self._ship_appended(source, last)
+        """Ship the next rows of the appended tables; returns whether these were all."""
+        are_all = [self._ship_appended(source, each) for each in self._appended()]
+        return all(are_all)
 
     def _ship_appended(self, source: Source, each: Table) -> bool:
         """Ship the next rows; returns whether these were all."""
@@ -308,13 +304,38 @@ class Shipper:
             lost = last - after - found
             if lost:
                 self._report.lost[each.name] += lost
-            if each.name == "state":
-                told |= self._kept.told_of(batch.rows, lost, after)
-            elif each.name == "kept_state":
-                batch = self._kept.without_moved(source, batch)
-            self._put(batch, told)
+            self._put(self._unsent(source, batch), told)
             after = last
         return after >= upto
+
+    def _ship_kept(self, source: Source, *, thorough: bool) -> None:
+        """Ship the states of kept stretches, where not all states are shipped."""
+        for stretch in source.stretches():
+            name = _STRETCH.format(stretch.id)
+            after, is_all = self._progress.get(name, 0), False
+            if name in self._progress and stretch.is_over and not thorough:
+                continue
+            while not is_all:
+                batch, is_all = source.kept(stretch, after, self._last_ids["state"])
+                if batch.rows:
+                    after = int(str(batch.rows[-1][0]))
+                    self._put(self._unsent(source, batch), {name: after})
+
+    def _unsent(self, source: Source, batch: Batch) -> Batch:
+        """Without the states that were shipped before, with all others or with a kept stretch."""
+        if batch.table.name != "state":
+            return batch
+        last = self._progress.get("state", 0)
+        known = [(each, self._progress.get(_STRETCH.format(each.id), 0)) for each in
+                 source.stretches()]  # fmt: skip
+
+        def is_sent(row_id: int, run_id: SQLValue, sim_time_s: SQLValue) -> bool:
+            return row_id <= last or any(
+                row_id <= upto and each.holds(run_id, sim_time_s) for each, upto in known
+            )
+
+        rows = [row for row in batch.rows if not is_sent(int(str(row[0])), row[1], row[2])]
+        return Batch(batch.table, rows)
 
     def _ship_pictures(self, source: Source) -> None:
         """Ship the files of the pictures whose rows are shipped."""

@@ -6,7 +6,7 @@ import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 from urllib.parse import parse_qsl
 
 from webots_mcp.errors import InvalidInputError
@@ -102,17 +102,6 @@ class Target(Protocol):
 
 
 @dataclass(frozen=True)
-class PooledRecording:
-    """A recording in a pool; `full_rate` where states were shipped as well."""
-
-    uuid: str
-    created_wall_time_s: float
-    robots: tuple[str, ...]
-    runs: int
-    full_rate: bool
-
-
-@dataclass(frozen=True)
 class PooledRun:
     """A run in a pool, with what is needed to choose it and to fetch it.
 
@@ -170,16 +159,8 @@ class Pool(Protocol):
     def __enter__(self) -> Pool: ...
     def __exit__(self, *exception: object) -> None: ...
 
-    def recordings(self) -> Iterator[PooledRecording]:
-        """All recordings."""
-        ...
-
-    def runs(self, recording_uuid: str | None = None) -> Iterator[PooledRun]:
-        """All runs, or those of a recording, by when they began."""
-        ...
-
-    def trial_sets(self) -> Iterator[PooledTrialSet]:
-        """All trial sets, by when they were made."""
+    def records(self, name: str) -> Iterator[tuple[str, dict[str, Any]]]:
+        """All rows of a table that changes, each behind its recording's UUID."""
         ...
 
     def sizes(self) -> Iterator[PooledSize]:
@@ -193,7 +174,7 @@ class Pool(Protocol):
     def rows(
         self, recording_uuid: str, table: Table, where: Mapping[str, Collection[int]]
     ) -> Iterator[Batch]:
-        """Rows whose columns have one of these values, in the order of the key."""
+        """Rows whose columns have one of these values, in any order."""
         ...
 
     def picture(self, recording_uuid: str, path: str) -> bytes | None:

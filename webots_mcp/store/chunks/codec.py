@@ -86,30 +86,34 @@ def decoded_of(values: Sequence[Recorded]) -> Decoded:
     """The same of values that were not stored: nothing is compressed."""
     types = set(map(type, values))
     if _NUMBERS.issuperset(types):
-        return Decoded(_numbers(values), None, ())
+        held = _numbers(values)
+        return Decoded(held, None, (), types == {int} and _is_exact(held))
     codes, labels = _coded(values)
     numbers = np.full(len(values), np.nan)
-    numbers[codes == IS_NUMBER] = _numbers([v for v in values if type(v) in _NUMBERS])
+    held = _numbers([value for value in values if type(value) in _NUMBERS])
+    numbers[codes == IS_NUMBER] = held
     _fill_flags(numbers, codes, labels)
-    return Decoded(numbers, codes, labels)
+    return Decoded(numbers, codes, labels, float not in types and _is_exact(held))
 
 
 def encode(values: Sequence[Recorded]) -> Encoded:
-    """Compress the values of some rows.
+    """Compress the values of some rows; see `pack`.
 
     What is lost: integers beyond 2^53 become floats, texts are cut after 200 characters, and where
     integers and floats are mixed all are floats.
     """
-    types = set(map(type, values))
-    if _NUMBERS.issuperset(types):
-        return Encoded(*_compressed(values, types), None, None)
-    codes, labels = _coded(values)
-    numbers = [value for value in values if type(value) in _NUMBERS]
-    listed = [[label.why] if isinstance(label, Replaced) else label for label in labels]
-    width = np.uint8 if len(labels) + _FIRST_LABEL < 2**8 else np.uint16
+    return pack(decoded_of(values))
+
+
+def pack(values: Decoded) -> Encoded:
+    """Compress values that are numbers and codes already."""
+    if values.codes is None:
+        return Encoded(*_compressed(values.numbers, values.is_whole), None, None)
+    listed = [[label.why] if isinstance(label, Replaced) else label for label in values.labels]
+    width = np.uint8 if len(listed) + _FIRST_LABEL < 2**8 else np.uint16
     return Encoded(
-        *_compressed(numbers, set(map(type, numbers))),
-        zlib.compress(codes.astype(width).tobytes(), _CODES_LEVEL),
+        *_compressed(values.numbers[values.codes == IS_NUMBER], values.is_whole),
+        zlib.compress(values.codes.astype(width).tobytes(), _CODES_LEVEL),
         json.dumps(listed, separators=(",", ":"), ensure_ascii=False),
     )
 
@@ -200,21 +204,23 @@ def _float(value: float) -> float:
         return float("inf") if value > 0 else float("-inf")
 
 
-def _pcodec() -> Any:
+def _pcodec(module: str = "pcodec.standalone") -> Any:
     """The library, which has no types; imported where the first chunk is made or read."""
-    return import_module("pcodec")
+    return import_module(module)
 
 
-def _compressed(values: Sequence[Any], types: set[type]) -> tuple[str, bytes | None]:
-    if not values:
+def _is_exact(numbers: Array) -> bool:
+    """Whether these integers are the same as floats."""
+    return bool(np.abs(numbers).max(initial=0) < EXACT_INTEGERS)
+
+
+def _compressed(numbers: Any, is_whole: bool) -> tuple[str, bytes | None]:
+    if not len(numbers):
         return _NOTHING, None
-    pcodec = _pcodec()
-    numbers: Any = _numbers(values)
-    codec = _FLOATS
-    if types == {int} and np.abs(numbers).max() < EXACT_INTEGERS:
-        codec, numbers = _INTEGERS, np.array(values, np.int64)
-    config = pcodec.ChunkConfig(compression_level=_LEVEL)
-    packed = bytes(pcodec.standalone.simple_compress(numbers, config))
+    codec = _INTEGERS if is_whole else _FLOATS
+    config = _pcodec("pcodec").ChunkConfig(compression_level=_LEVEL)
+    numbers = numbers.astype(np.int64) if is_whole else numbers
+    packed = bytes(_pcodec().simple_compress(numbers, config))
     return codec, zlib.crc32(packed).to_bytes(_CHECKSUM_BYTES, "little") + packed
 
 
@@ -229,7 +235,7 @@ def _decompress(encoded: Encoded, into: Array) -> None:
     if zlib.crc32(packed).to_bytes(_CHECKSUM_BYTES, "little") != checksum:
         raise DamagedChunkError("damaged: its bytes do not match their checksum")
     whole: Any = into if encoded.codec == _FLOATS else np.empty(len(into), np.int64)
-    progress = _pcodec().standalone.simple_decompress_into(packed, whole)
+    progress = _pcodec().simple_decompress_into(packed, whole)
     if progress.n_processed != len(into) or not progress.finished:
         raise DamagedChunkError("damaged: it holds fewer numbers than its rows")
     if whole is not into:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final, NamedTuple, TypeVar
 
 from webots_mcp.errors import warn
-from webots_mcp.store.chunks.codec import ABSENT, EXACT_INTEGERS, decoded_of, encode
+from webots_mcp.store.chunks.codec import ABSENT, EXACT_INTEGERS, decoded_of, pack
 from webots_mcp.store.chunks.columns import STATE_COLUMNS, StateColumns
 from webots_mcp.store.chunks.statistics import Statistics, statistics_of
 from webots_mcp.store.chunks.stored import (
@@ -339,7 +339,8 @@ def _chunks_of(
     )
     values = [(ids[name], values) for name, values in columns.values.items() if name in ids]
     for signal_id, of_rows in (*places, *values):
-        yield (run_id, signal_id, *statistics_of(decoded_of(of_rows)), *encode(of_rows))
+        held = decoded_of(of_rows)
+        yield (run_id, signal_id, *statistics_of(held), *pack(held))
 
 
 def in_short_steps(

@@ -15,7 +15,7 @@ from contextlib import closing, suppress
 from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plugins.pool.parquet.layout import VALUES, files_of
+from webots_mcp.plugins.pool.parquet.layout import CHUNK, files_of, name_of
 from webots_mcp.plugins.pool.parquet.packages import package
 from webots_mcp.plugins.pool.parquet.storage import Storage
 from webots_mcp.plugins.pool.pool_statement import Kind, answered, bounded
@@ -72,8 +72,7 @@ def _prepare(connection: Any, storage: Storage, sql: str) -> None:
     if not storage.is_local:
         connection.register_filesystem(storage.files)
     for table in tables():
-        name = VALUES if table.name == "chunk" else table.name
-        is_named = re.search(rf"\b{name}\b", sql, re.IGNORECASE)
+        is_named = re.search(rf"\b{name_of(table)}\b", sql, re.IGNORECASE)
         paths = storage.find(files_of(table)) if is_named else []
         connection.execute(_view(table, [storage.url_of(path) for path in paths]))
     connection.execute(f"SET memory_limit = '{_MEMORY}'")
@@ -99,42 +98,24 @@ def _column(at: int, kind: str) -> tuple[str, Kind]:
 
 def _view(table: Table, paths: list[str]) -> str:
     """A table over its files; without any, a table without rows."""
-    if table.name == "chunk":
-        return _values_view(paths)
+    columns = dict(zip(table.columns, (_TYPES[kind] for kind in table.types), strict=True))
+    shown, cut = ", ".join(f'"{name}"' for name in columns), ""
+    if table.name == CHUNK:  # a column for each signal, of any run
+        columns = {"run_id": "BIGINT", "sim_time_s": "DOUBLE", "wall_time_s": "DOUBLE"}
+        shown, cut = 'run AS run_id, * EXCLUDE (recording, run, "table")', ", 'run': BIGINT"
+    elif table.time_column:
+        columns["day"] = "DATE"
+        shown, cut = f"{shown}, day", ", 'day': DATE"
+    made = f'CREATE VIEW "{name_of(table)}" AS SELECT'
     if not paths:
-        columns = ", ".join(
-            f'CAST(NULL AS {_TYPES[kind]}) AS "{name}"'
-            for name, kind in zip(table.columns, table.types, strict=True)
-        )
-        day = ", CAST(NULL AS DATE) AS day" if table.time_column else ""
-        return (
-            f'CREATE VIEW "{table.name}" AS SELECT CAST(NULL AS VARCHAR) AS recording_uuid, '
-            f"{columns}{day} WHERE false"
-        )
-    columns = ", ".join(f'"{name}"' for name in table.columns)
-    day = ", day" if table.time_column else ""
-    types = "{'recording': VARCHAR, 'table': VARCHAR" + (", 'day': DATE}" if day else "}")
+        columns = {"recording_uuid": "VARCHAR", **columns}
+        nothing = [f'CAST(NULL AS {kind}) AS "{name}"' for name, kind in columns.items()]
+        return f"{made} {', '.join(nothing)} WHERE false"
     files = ", ".join(map(_quoted, paths))
     return (
-        f'CREATE VIEW "{table.name}" AS SELECT recording AS recording_uuid, {columns}{day} '
-        f"FROM read_parquet([{files}], union_by_name = true, hive_partitioning = true, "
-        f"hive_types = {types})"
-    )
-
-
-def _values_view(paths: list[str]) -> str:
-    """What chunks hold: a column for each signal of any run."""
-    if not paths:
-        return (
-            f'CREATE VIEW "{VALUES}" AS SELECT CAST(NULL AS VARCHAR) AS recording_uuid, '
-            "CAST(NULL AS BIGINT) AS run_id, CAST(NULL AS DOUBLE) AS sim_time_s, "
-            "CAST(NULL AS DOUBLE) AS wall_time_s WHERE false"
-        )
-    return (
-        f'CREATE VIEW "{VALUES}" AS SELECT recording AS recording_uuid, run AS run_id, '
-        f'* EXCLUDE (recording, run, "table") FROM read_parquet([{", ".join(map(_quoted, paths))}], '
+        f"{made} recording AS recording_uuid, {shown} FROM read_parquet([{files}], "
         "union_by_name = true, hive_partitioning = true, "
-        "hive_types = {'recording': VARCHAR, 'table': VARCHAR, 'run': BIGINT})"
+        f"hive_types = {{'recording': VARCHAR, 'table': VARCHAR{cut}}})"
     )
 
 

@@ -34,7 +34,8 @@ POOL: Final = "_pool"
 RUNS: Final = "_runs"
 PROGRESS: Final = "_progress"
 LEASE: Final = "_lease"
-VALUES: Final = "value"  # a table of columns in the place of chunks
+CHUNK: Final = "chunk"
+VALUES: Final = "value"  # in the place of chunks a table with a column for each signal
 NO_DAY: Final = "__HIVE_DEFAULT_PARTITION__"  # read as null by engines
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=timezone.utc)
@@ -68,23 +69,26 @@ def picture_file(path: str) -> str:
     return f"_pictures/{'/'.join(parts)}"
 
 
-def appended_file(table: Table, day: str, number: int) -> str:
+def name_of(table: Table) -> str:
+    """What a table is called in a pool of files."""
+    return VALUES if table.name == CHUNK else table.name
+
+
+def is_cut(table: Table) -> bool:
+    """Whether its rows never change and are in parts, of a day or of a run."""
+    return table.name == CHUNK or table.time_column is not None
+
+
+def appended_file(table: Table, folder: str, number: int | str) -> str:
     """The part of a table whose rows never change."""
-    return f"table={table.name}/day={day}/part-{number:06}.parquet"
-
-
-def values_file(run_id: int | str, number: int | str) -> str:
-    """The values of a run, which chunks hold in a recording."""
     part = f"{number:06}" if isinstance(number, int) else number
-    return f"table={VALUES}/run={run_id}/part-{part}.parquet"
+    return f"table={name_of(table)}/{folder}/part-{part}.parquet"
 
 
 def files_of(table: Table, recording_uuid: str = "*") -> str:
     """The pattern of all files of a table, of one recording or of all."""
-    if table.name == "chunk":
-        return f"{folder_of(recording_uuid)}/{values_file('*', '*')}"
-    day = "/day=*" if table.time_column else ""
-    return f"{folder_of(recording_uuid)}/table={table.name}{day}/part-*.parquet"
+    cut = "day=*/" if table.time_column else "run=*/" if table.name == CHUNK else ""
+    return f"{folder_of(recording_uuid)}/table={name_of(table)}/{cut}part-*.parquet"
 
 
 def uuid_in(path: str) -> str:
@@ -93,18 +97,24 @@ def uuid_in(path: str) -> str:
 
 
 def part_of(path: str) -> tuple[str, int]:
-    """The day or the run, and the number of a part."""
+    """The folder (`day=...`, `run=...`) and the number of a part."""
     folder, _, name = path.rpartition("/part-")
-    return folder.rpartition("=")[2], int(name.removesuffix(".parquet"))
+    return folder.rpartition("/")[2], int(name.removesuffix(".parquet"))
 
 
-def by_day(table: Table, rows: Iterable[Row]) -> Mapping[str, list[Row]]:
-    """Rows of an appended table by their days."""
-    assert table.time_column is not None
-    place = table.columns.index(table.time_column)
+def run_of(path: str) -> int | None:
+    """The run of a part, where it has the rows of one only."""
+    name, _, run_id = path.rpartition("/")[0].rpartition("/")[2].partition("=")
+    return int(run_id) if name == "run" else None
+
+
+def by_folder(table: Table, rows: Iterable[Row]) -> Mapping[str, list[Row]]:
+    """Rows that never change by their folders: those of a day, chunks of a run."""
+    place = table.columns.index(table.time_column or "run_id")
     found: dict[str, list[Row]] = defaultdict(list)
     for row in rows:
-        found[day_of(row[place])].append(row)
+        name = f"day={day_of(row[place])}" if table.time_column else f"run={row[place]}"
+        found[name].append(row)
     return found
 
 

@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
-import heapq
-from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from webots_mcp.errors import PoolUnavailableError
-from webots_mcp.plugins.pool.parquet.arrow_rows import as_rows, decoded, footer_of, pieces_of, span
+from webots_mcp.plugins.pool.parquet.arrow_rows import as_rows, decoded, footer_of, span
 from webots_mcp.plugins.pool.parquet.duckdb_statement import ask
 from webots_mcp.plugins.pool.parquet.layout import (
+    CHUNK,
     files_of,
     folder_of,
-    part_of,
+    is_cut,
+    name_of,
     picture_file,
+    run_of,
     uuid_in,
 )
 from webots_mcp.plugins.pool.parquet.packages import package
 from webots_mcp.plugins.pool.parquet.pool_state import read_progress, require_pool
 from webots_mcp.plugins.pool.parquet.storage import Storage
-from webots_mcp.plugins.pool.parquet.value_columns import chunks_of, read_columns
-from webots_mcp.plugins.pool.row_batch import Batch, Row, batches
+from webots_mcp.plugins.pool.parquet.value_columns import chunks_of
+from webots_mcp.plugins.pool.row_batch import Batch, batches
 from webots_mcp.plugins.pool.shipped_tables import Table, table, tables
-from webots_mcp.plugins.pool.target import PooledRecording, PooledRun, PooledSize, PooledTrialSet
+from webots_mcp.plugins.pool.target import PooledSize
 from webots_mcp.store.questions.sql import Result
 
 _AT_ONCE: Final = 16  # footers that are read at the same time: most of it is waiting
@@ -54,36 +55,16 @@ class ParquetPool:
     def __exit__(self, *exception: object) -> None:
         pass
 
-    def recordings(self) -> Iterator[PooledRecording]:
-        """All recordings."""
-        made = self._records("recording")
-        robots, runs = self._records("robot"), self._records("run")
-        for uuid, (own, *_) in sorted(made.items()):
-            names = tuple(str(robot["name"]) for robot in robots.get(uuid, ()))
-            created_s = own["created_wall_time_s"]
-            yield PooledRecording(
-                uuid, created_s, names, len(runs.get(uuid, ())), "state" in self.progress(uuid)
-            )
-
-    def runs(self, recording_uuid: str | None = None) -> Iterator[PooledRun]:
-        """All runs, or those of a recording, by when they began."""
-        robots = self._records("robot", recording_uuid)
-        found = [
-            _pooled_run(uuid, run, {robot["id"]: robot["name"] for robot in robots.get(uuid, ())})
-            for uuid, runs in self._records("run", recording_uuid).items()
-            for run in runs
-        ]
-        yield from sorted(found, key=lambda run: (run.started_wall_time_s, run.uuid))
-
-    def trial_sets(self) -> Iterator[PooledTrialSet]:
-        """All trial sets, by when they were made."""
-        trials = self._records("trial")
-        found = [
-            _pooled_trial_set(uuid, each, trials.get(uuid, ()))
-            for uuid, sets in self._records("trial_set").items()
-            for each in sets
-        ]
-        yield from sorted(found, key=lambda each: (each.created_wall_time_s, each.uuid))
+    def records(self, name: str) -> Iterator[tuple[str, Record]]:
+        """All rows of a table that changes, each behind its recording's UUID."""
+        each = table(name)
+        paths = self._storage.find(files_of(each))
+        with ThreadPoolExecutor(_AT_ONCE) as workers:
+            for path, content in zip(paths, workers.map(self._storage.read, paths), strict=True):
+                held: list[Record] = []
+                if content is not None:
+                    held = decoded(each, content, path).to_pylist()
+                yield from ((uuid_in(path), row) for row in held)
 
     def sizes(self) -> Iterator[PooledSize]:
         """How much of each table there is; the end of each file is read for it."""
@@ -91,7 +72,7 @@ class ParquetPool:
             files = self._storage.sizes(files_of(each))
             with ThreadPoolExecutor(_AT_ONCE) as workers:
                 rows = sum(workers.map(self._row_count, files))
-            yield PooledSize(each.name, rows, sum(files.values()))
+            yield PooledSize(name_of(each), rows, sum(files.values()))
 
     def progress(self, recording_uuid: str) -> dict[str, int]:
         """How far the recording was shipped."""
@@ -100,22 +81,22 @@ class ParquetPool:
     def rows(
         self, recording_uuid: str, table: Table, where: Mapping[str, Collection[int]]
     ) -> Iterator[Batch]:
-        """Rows whose columns have one of these values, in the order of the key."""
-        if table.name == "chunk":
-            yield from batches(table, self._chunks(recording_uuid, table, where))
-            return
-        part = None
-        if table.time_column:
-            part = read_progress(self._storage, recording_uuid).part(table.name)
+        """Rows whose columns have one of these values."""
+        part = read_progress(self._storage, recording_uuid).part(table.name)
         paths = self._storage.find(files_of(table, recording_uuid))
         with ThreadPoolExecutor(_AT_ONCE) as workers:
             footers = [*zip(paths, workers.map(self._footer, paths), strict=True)]
-        pieces = [
-            _Piece(_first(table, footer), path, part.counted(path) if part else None)
-            for path, footer in footers
-            if footer.num_rows and _may_hold(footer, where)
-        ]
-        yield from batches(table, self._in_order(table, sorted(pieces), where))
+        for path, footer in footers:
+            counted = part.counted(path) if is_cut(table) else None
+            if counted != 0 and footer.num_rows and _may_hold(path, footer, where):
+                content = self._storage.read(path)  # whole: it may be replaced by a larger one
+                if content is None:
+                    raise PoolUnavailableError(f"{path} is gone from {self.address}: ask again")
+                held = decoded(table, content, path, counted)
+                if table.name == CHUNK:
+                    yield from batches(table, chunks_of(held, run_of(path)))
+                else:
+                    yield from batches(table, as_rows(table, held.filter(_filter(where))))
 
     def picture(self, recording_uuid: str, path: str) -> bytes | None:
         """A picture that was shipped, by the path in its row."""
@@ -130,61 +111,6 @@ class ParquetPool:
         """
         return ask(self._url, sql, max_rows)
 
-    def _chunks(
-        self, recording_uuid: str, chunks: Table, where: Mapping[str, Collection[int]]
-    ) -> Iterator[Row]:
-        """Chunks made anew from the columns of their runs."""
-        part = read_progress(self._storage, recording_uuid).part(chunks.name)
-        wanted = [(chunks.columns.index(name), values) for name, values in where.items()]
-        for path in self._storage.find(files_of(chunks, recording_uuid)):
-            run_id = int(part_of(path)[0])
-            if run_id not in where.get("run_id", (run_id,)):
-                continue
-            content = self._storage.read(path)
-            if content is None:
-                raise PoolUnavailableError(f"{path} is gone from {self.address}: ask again")
-            held = read_columns(content, path).slice(0, part.counted(path))
-            for row in chunks_of(held, run_id):
-                if all(row[at] in values for at, values in wanted):
-                    yield row
-
-    def _in_order(
-        self, table: Table, pieces: Iterable[_Piece], where: Mapping[str, Collection[int]]
-    ) -> Iterator[Row]:
-        """Rows in the order of the key: a file is opened when its first row is near."""
-        key = _key_of(table)
-        waiting: list[tuple[Any, int, Row, Iterator[Row]]] = []
-        for number, piece in enumerate(pieces):
-            yield from _before(waiting, piece.first, key)
-            _push(waiting, number, self._rows_of(table, piece, where), key)
-        yield from _before(waiting, None, key)
-
-    def _rows_of(
-        self, table: Table, piece: _Piece, where: Mapping[str, Collection[int]]
-    ) -> Iterator[Row]:
-        """Rows of a file in the order of the key, a few at a time."""
-        content = self._storage.read(piece.path)  # whole: it may be replaced by a larger one
-        if content is None:
-            raise PoolUnavailableError(f"{piece.path} is gone from {self.address}: ask again")
-        if table.time_column:  # those of a kept stretch may stand before older ones
-            held = decoded(table, content, piece.path, piece.counted)
-            found = iter([held.sort_by("id")])
-        else:
-            found = pieces_of(table, content, piece.path)
-        for some in found:
-            yield from as_rows(table, some.filter(_filter(where)) if where else some)
-
-    def _records(self, name: str, recording_uuid: str | None = None) -> Mapping[str, list[Record]]:
-        """The rows of a table that changes, by recording."""
-        each = table(name)
-        paths = self._storage.find(files_of(each, recording_uuid or "*"))
-        found: dict[str, list[Record]] = defaultdict(list)
-        with ThreadPoolExecutor(_AT_ONCE) as workers:
-            for path, content in zip(paths, workers.map(self._storage.read, paths), strict=True):
-                if content is not None:
-                    found[uuid_in(path)] += decoded(each, content, path).to_pylist()
-        return found
-
     def _row_count(self, path: str) -> int:
         return int(self._footer(path).num_rows)
 
@@ -193,21 +119,11 @@ class ParquetPool:
             return footer_of(file, path)
 
 
-class _Piece(NamedTuple):
-    """A file, with the least value of the first column of its key, and how many rows count."""
-
-    first: int
-    path: str
-    counted: int | None
-
-
-def _first(table: Table, footer: Any) -> int:
-    ends = span(footer, table.key[0])
-    return ends[0] if ends else -(2**63)
-
-
-def _may_hold(footer: Any, where: Mapping[str, Collection[int]]) -> bool:
-    """Whether a file may have rows with these values, by what its end tells."""
+def _may_hold(path: str, footer: Any, where: Mapping[str, Collection[int]]) -> bool:
+    """Whether a file may have rows with these values, by its path and what its end tells."""
+    run_id = run_of(path)
+    if run_id is not None and run_id not in where.get("run_id", (run_id,)):
+        return False
     for name, values in where.items():
         ends = span(footer, name)
         if ends and not any(ends[0] <= value <= ends[1] for value in values):
@@ -215,67 +131,9 @@ def _may_hold(footer: Any, where: Mapping[str, Collection[int]]) -> bool:
     return True
 
 
-def _push(
-    waiting: list[tuple[Any, int, Row, Iterator[Row]]],
-    number: int,
-    rows: Iterator[Row],
-    key: Callable[[Row], Any],
-) -> None:
-    row = next(rows, None)
-    if row is not None:
-        heapq.heappush(waiting, (key(row), number, row, rows))
-
-
-def _before(
-    waiting: list[tuple[Any, int, Row, Iterator[Row]]],
-    first: int | None,
-    key: Callable[[Row], Any],
-) -> Iterator[Row]:
-    """The rows whose key begins below that value; all without one."""
-    while waiting and (first is None or waiting[0][0][0] < first):
-        _, number, row, rows = heapq.heappop(waiting)
-        yield row
-        _push(waiting, number, rows, key)
-
-
 def _filter(where: Mapping[str, Collection[int]]) -> Any:
-    arrow, field = package("pyarrow"), package("pyarrow.compute").field
-    wanted = [
-        field(name).isin(arrow.array(values, arrow.int64())) for name, values in where.items()
-    ]
-    chosen = wanted[0]
-    for each in wanted[1:]:
-        chosen &= each
+    arrow, compute = package("pyarrow"), package("pyarrow.compute")
+    chosen = compute.scalar(True)
+    for name, values in where.items():
+        chosen &= compute.field(name).isin(arrow.array(values, arrow.int64()))
     return chosen
-
-
-def _key_of(table: Table) -> Callable[[Row], Any]:
-    places = [table.columns.index(name) for name in table.key]
-    return lambda row: tuple(row[place] for place in places)
-
-
-def _pooled_run(recording_uuid: str, run: Record, robots: Mapping[int, str]) -> PooledRun:
-    return PooledRun(
-        recording_uuid=recording_uuid,
-        run_id=run["id"],
-        uuid=run["uuid"] or "",
-        robot=robots.get(run["robot_id"], ""),
-        **{
-            name: run[name]
-            for name in (
-                "label", "world", "started_wall_time_s", "last_wall_time_s",
-                "started_sim_time_s", "last_sim_time_s", "end_reason", "row_count",
-            )
-        },
-    )  # fmt: skip
-
-
-def _pooled_trial_set(
-    recording_uuid: str, trial_set: Record, trials: Iterable[Record]
-) -> PooledTrialSet:
-    own = [trial for trial in trials if trial["trial_set_id"] == trial_set["id"]]
-    runs = [(recording_uuid, trial["run_id"]) for trial in own if trial["run_id"] is not None]
-    created_s = trial_set["created_wall_time_s"]
-    return PooledTrialSet(
-        recording_uuid, trial_set["id"], trial_set["uuid"], created_s, len(own), tuple(runs)
-    )

@@ -19,21 +19,20 @@ from webots_mcp.plugins.pool.parquet.arrow_rows import (
     as_arrow,
     decoded,
     encoded,
-    footer_of,
     joined,
     replaced,
-    span,
 )
 from webots_mcp.plugins.pool.parquet.layout import (
+    CHUNK,
     LEASE,
     RUNS,
     appended_file,
     by_block,
-    by_day,
+    by_folder,
     files_of,
     folder_of,
+    is_cut,
     picture_file,
-    values_file,
 )
 from webots_mcp.plugins.pool.parquet.lease import Lease
 from webots_mcp.plugins.pool.parquet.packages import package
@@ -46,12 +45,7 @@ from webots_mcp.plugins.pool.parquet.pool_state import (
     require_pool,
 )
 from webots_mcp.plugins.pool.parquet.storage import Storage
-from webots_mcp.plugins.pool.parquet.value_columns import (
-    Named,
-    columns_of,
-    encoded_columns,
-    read_columns,
-)
+from webots_mcp.plugins.pool.parquet.value_columns import NameAndKind, columns_of
 from webots_mcp.plugins.pool.row_batch import Batch, Row
 from webots_mcp.plugins.pool.shipped_tables import Table, table, tables
 
@@ -120,8 +114,7 @@ class ParquetShipment:
         self._is_settled = False
         self._own_runs: set[str] = set()
         self._altered = Counter[str]()  # in one `write`, by column
-        self._spans: dict[str, tuple[int, int] | None] = {}
-        self._named: dict[int, Named] = {}
+        self._named: dict[int, NameAndKind] = {}
 
     def progress(self) -> dict[str, int]:
         """The numbers that `write` left."""
@@ -153,15 +146,13 @@ class ParquetShipment:
             self._settle()
         self._is_settled = False
         told = Progress({**self._progress.numbers, **progress}, self._progress.parts)
-        for table, rows in _by_table(batches):
-            if table.name == "run":
-                self._claim(table, rows)
-            if table.name == "chunk":
-                told = told.with_part(table.name, self._append_values(rows))
-            elif table.time_column:
-                told = told.with_part(table.name, self._append(table, rows))
+        for each, rows in _by_table(batches):
+            if each.name == "run":
+                self._claim(each, rows)
+            if is_cut(each):
+                told = told.with_part(each.name, self._append(each, rows))
             else:
-                self._replace(table, rows)
+                self._replace(each, rows)
         if told != self._progress:
             self._lease.require_mine()
             place_progress(self._storage, self._uuid, told)
@@ -170,80 +161,33 @@ class ParquetShipment:
         return +self._altered
 
     def _append(self, table: Table, rows: Iterable[Row]) -> Part:
-        """Add the rows that are not there yet to the open part; what it is then."""
+        """Add rows to the open part of a table; what it is then."""
         part = self._progress.part(table.name)
-        new = self._absent(table, {int(str(row[0])): row for row in rows}, part)
         counts, is_over = dict(part.rows), False
-        for day, added in by_day(table, (new[row_id] for row_id in sorted(new))).items():
-            path = self._path(appended_file(table, day, part.number))
-            held = self._held(table, path) if day in counts else None
-            is_over |= self._place_part(table, path, held, added)
-            counts[day] = counts.get(day, 0) + len(added)
-        last_id = max(part.last_id, *new) if new else part.last_id
-        if is_over:
-            return Part(part.number + 1, {}, last_id)
-        return Part(part.number, counts, last_id)
-
-    def _append_values(self, chunks: Iterable[Row]) -> Part:
-        """Add whole groups of chunks to the open part, as columns; what it is then."""
-        part = self._progress.part("chunk")
-        counts, is_over = dict(part.rows), False
-        for run_id, of_run in _by_run(chunks).items():
-            path = self._path(values_file(run_id, part.number))
-            content = self._storage.read(path) if str(run_id) in counts else None
-            held = None if content is None else read_columns(content, path)
-            whole = columns_of(of_run, self._signals(of_run), self._altered, held)
-            if whole is None:
-                continue
-            content = encoded_columns(whole)
+        for folder, added in by_folder(table, rows).items():
+            path = self._path(appended_file(table, folder, part.number))
+            held = self._held(table, path) if folder in counts else None
+            if table.name == CHUNK:
+                whole = columns_of(added, self._signals(added), self._altered, held)
+            else:
+                whole = as_arrow(table, added, self._altered)
+                whole = whole if held is None else joined(held, whole)
+            content = encoded(table, whole)
             self._place(path, content)
-            share = 1 - counts.get(str(run_id), 0) / max(1, whole.num_rows)
-            is_over |= _is_over(len(content), whole.nbytes, share)
-            counts[str(run_id)] = whole.num_rows
+            is_over |= _is_over(content, whole, counts.get(folder, 0))
+            counts[folder] = whole.num_rows
         return Part(part.number + 1) if is_over else Part(part.number, counts)
 
-    def _signals(self, chunks: Iterable[Row]) -> Mapping[int, Named]:
+    def _signals(self, chunks: Iterable[Row]) -> Mapping[int, NameAndKind]:
         """How the signals of chunks are called, which were shipped before them."""
-        at = table("chunk").columns.index("signal_id")
-        if any(int(str(row[at])) not in self._named for row in chunks if int(str(row[at])) > 0):
+        at = table(CHUNK).columns.index("signal_id")
+        if not self._named.keys() >= {row[at] for row in chunks if int(str(row[at])) > 0}:
             signals = table("signal")
             for path in self._storage.find(files_of(signals, self._uuid)):
-                held = self._held(signals, path)
-                for row in [] if held is None else held.to_pylist():
-                    self._named[row["id"]] = Named(str(row["name"]), str(row["kind"]))
+                held: Any = self._held(signals, path)
+                rows: list[dict[str, Any]] = held.to_pylist()
+                self._named |= {row["id"]: (row["name"], row["kind"]) for row in rows}
         return self._named
-
-    def _absent(self, table: Table, rows: dict[int, Row], part: Part) -> dict[int, Row]:
-        """Without the rows that are there: those of a kept stretch come before the others."""
-        late = [row_id for row_id in rows if row_id <= part.last_id]
-        if not late:
-            return rows
-        first, last = min(late), max(late)
-        for path in self._storage.find(files_of(table, self._uuid)):
-            ids = self._span(path)
-            if ids is None or (ids[0] <= last and first <= ids[1]):
-                for row_id in self._ids(path):
-                    rows.pop(row_id, None)
-        return rows
-
-    def _span(self, path: str) -> tuple[int, int] | None:
-        if path not in self._spans:
-            with self._storage.opened(path) as file:
-                self._spans[path] = span(footer_of(file, path), "id")
-        return self._spans[path]
-
-    def _ids(self, path: str) -> list[int]:
-        with self._storage.opened(path) as file:
-            held = package("pyarrow.parquet").ParquetFile(file).read(columns=["id"])
-            return held.column("id").to_pylist()
-
-    def _place_part(self, table: Table, path: str, held: Any | None, added: list[Row]) -> bool:
-        """Put a file in its own place with these rows behind its own; whether it is large."""
-        whole = as_arrow(table, added, self._altered)
-        whole = whole if held is None else joined(held, whole)
-        content = encoded(table, whole)
-        self._place(path, content)
-        return _is_over(len(content), whole.nbytes, len(added) / whole.num_rows)
 
     def _replace(self, table: Table, rows: Iterable[Row]) -> None:
         for name, changed in by_block(table, rows).items():
@@ -259,35 +203,19 @@ class ParquetShipment:
 
     def _place(self, path: str, content: bytes) -> None:
         self._lease.renew()
-        self._spans.pop(path, None)
         self._storage.place(path, content)
 
     def _settle(self) -> None:
         """Take out what was placed and never counted."""
-        for table in tables():
-            if table.time_column:
-                part = self._progress.part(table.name)
-                for path in self._storage.find(self._path(appended_file(table, "*", part.number))):
-                    self._settle_file(table, path, part.counted(path) or 0)
-        part = self._progress.part("chunk")
-        for path in self._storage.find(self._path(values_file("*", part.number))):
-            self._settle_values(path, part.counted(path) or 0)
-
-    def _settle_file(self, table: Table, path: str, count: int) -> None:
-        if count == 0:
-            self._storage.remove(path)
-            return
-        held = self._held(table, path)
-        if held is not None and held.num_rows > count:
-            self._place(path, encoded(table, held.slice(0, count)))
-
-    def _settle_values(self, path: str, count: int) -> None:
-        content = self._storage.read(path) if count else None
-        if content is None:
-            return self._storage.remove(path)
-        held = read_columns(content, path)
-        if held.num_rows > count:
-            self._place(path, encoded_columns(held.slice(0, count)))
+        for each in filter(is_cut, tables()):
+            part = self._progress.part(each.name)
+            for path in self._storage.find(self._path(appended_file(each, "*", part.number))):
+                count = part.counted(path) or 0
+                held = self._held(each, path) if count else None
+                if held is None:
+                    self._storage.remove(path)
+                elif held.num_rows > count:
+                    self._place(path, encoded(each, held.slice(0, count)))
 
     def _claim(self, table: Table, rows: Iterable[Row]) -> None:
         """Say that the runs are this recording's, before any row of them is there."""
@@ -317,9 +245,11 @@ class ParquetShipment:
         return f"{folder_of(self._uuid)}/{name}"
 
 
-def _is_over(file_bytes: int, memory_bytes: int, added_share: float) -> bool:
-    is_seldom_more = file_bytes > _SMALL_PART_BYTES and added_share * _MOST_TIMES < 1
-    return file_bytes > PART_BYTES or memory_bytes > _PART_MEMORY_BYTES or is_seldom_more
+def _is_over(content: bytes, whole: Any, rows_before: int) -> bool:
+    """Whether the part that a file is in is over; so many rows were in the file before."""
+    added_share = 1 - rows_before / max(1, whole.num_rows)
+    is_seldom_more = len(content) > _SMALL_PART_BYTES and added_share * _MOST_TIMES < 1
+    return len(content) > PART_BYTES or whole.nbytes > _PART_MEMORY_BYTES or is_seldom_more
 
 
 def _by_table(batches: Sequence[Batch]) -> Iterable[tuple[Table, list[Row]]]:
@@ -328,11 +258,4 @@ def _by_table(batches: Sequence[Batch]) -> Iterable[tuple[Table, list[Row]]]:
     for batch in batches:
         found.setdefault(batch.table, []).extend(batch.rows)
     # Chunks at last: their columns are called as the signals, which are there then.
-    return sorted(found.items(), key=lambda each: each[0].name == "chunk")
-
-
-def _by_run(chunks: Iterable[Row]) -> Mapping[int, list[Row]]:
-    at, found = table("chunk").columns.index("run_id"), dict[int, list[Row]]()
-    for row in chunks:
-        found.setdefault(int(str(row[at])), []).append(row)
-    return found
+    return sorted(found.items(), key=lambda each: each[0].name == CHUNK)

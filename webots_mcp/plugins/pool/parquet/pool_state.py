@@ -21,20 +21,18 @@ class Part:
 
     Attributes:
         number: Of the part; those before it are over.
-        rows: By the day of its files, how many rows of each count.
-        last_id: The largest id that ever came.
+        rows: By the folder of its files, how many rows of each count.
     """
 
     number: int = 1
     rows: Mapping[str, int] = field(default_factory=dict[str, int])
-    last_id: int = 0
 
     def counted(self, path: str) -> int | None:
         """How many rows of a file count; None where all do."""
-        day, number = part_of(path)
+        folder, number = part_of(path)
         if number < self.number:
             return None
-        return self.rows.get(day, 0) if number == self.number else 0
+        return self.rows.get(folder, 0) if number == self.number else 0
 
 
 @dataclass(frozen=True)

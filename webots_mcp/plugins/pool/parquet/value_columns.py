@@ -1,35 +1,33 @@
 """The chunks of a run as columns of Parquet, a row for each state, and chunks again.
 
-Each signal has a column of its name, of one type: double, boolean or string. What else it held in
-a row (null, a text among numbers, what JSON cannot hold) stands in the column `others`, as JSON by
-the name of the column: an array says what was replaced, as in `chunk.labels`. A signal that is
-called as one of the columns that every file has has its id behind its name.
+Each signal has a column of its name, of one type, that of most of its values: double, boolean or
+string. What else it held in a row (null, a text among numbers, what JSON cannot hold) stands in the
+column `others`, as JSON by the name of the column: an array says what was replaced, as in
+`chunk.labels`. A signal that is called as one of the columns that every file has has its id behind
+its name.
 """
 
 from __future__ import annotations
 
-import io
 import json
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, Final, TypeAlias
 
-from webots_mcp.plugins.pool.parquet.arrow_rows import clear_damage
+from webots_mcp.naming import Value
 from webots_mcp.plugins.pool.parquet.packages import package
 from webots_mcp.plugins.pool.row_batch import Row
 from webots_mcp.plugins.pool.shipped_tables import table
 from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.chunks.codec import (
-    ABSENT,
+    IS_ABSENT,
     IS_NUMBER,
     DamagedChunkError,
     Decoded,
     Encoded,
-    Recorded,
     Replaced,
     decode,
-    decoded_of,
-    encode,
+    pack,
 )
 from webots_mcp.store.chunks.statistics import statistics_of
 from webots_mcp.store.chunks.stored import SIM_TIMES, STATE_IDS, WALL_TIMES
@@ -38,22 +36,16 @@ _PLACES: Final = {"state_id": STATE_IDS, "sim_time_s": SIM_TIMES, "wall_time_s":
 _FIXED: Final = frozenset({"group_id", "others", *_PLACES, "recording", "recording_uuid", "run",
                            "run_id", "table"})  # fmt: skip
 _FIRST_LABEL: Final = 2
-_EXACT: Final = 2.0**53
-_TIMES: Final = frozenset(_PLACES.values())
-_KINDS: Final = {"bool": "bool", "text": "string"}  # the others are doubles
-_HOLDS: Final[Mapping[str, type]] = {"bool": bool, "string": str}
+_TYPES: Final = {"bool": "bool", "text": "string"}  # of kinds of signals; the others are doubles
+_HELD: Final[Mapping[str, type]] = {"bool": bool, "string": str}
 
 
-class Named(NamedTuple):
-    """A signal as the pool has it."""
-
-    name: str
-    kind: str
+NameAndKind: TypeAlias = "tuple[str, str]"
 
 
 def columns_of(
     chunks: Iterable[Row],
-    signals: Mapping[int, Named],
+    signals: Mapping[int, NameAndKind],
     altered: Counter[str],
     held: Any | None = None,
 ) -> Any:
@@ -61,153 +53,153 @@ def columns_of(
 
     Args:
         chunks: Rows of the table `chunk`: of each group all.
-        signals: By their ids.
+        signals: Their names and kinds by their ids.
         altered: Counts chunks that cannot be read, whose values are left out.
-        held: Columns that these are to be put behind, so that they have their types.
+        held: Columns that these are put behind, with the types that they have there.
     """
-    names, arrow = table("chunk").columns, package("pyarrow")
+    arrow = package("pyarrow")
+    types = {} if held is None else {_signal_of(field): field.type for field in held.schema}
     groups: dict[int, dict[int, dict[str, Any]]] = defaultdict(dict)
     for row in chunks:
-        chunk = dict(zip(names, row, strict=True))
+        chunk: dict[str, Any] = dict(zip(table("chunk").columns, row, strict=True))
         groups[chunk["group_id"]][chunk["signal_id"]] = chunk
-    found = {_signal_of(field): field.type for field in held.schema} if held is not None else {}
-    types = {each: found.get(each) or _type_of(signal) for each, signal in signals.items()}
-    made: list[Any] = [] if held is None else [held]
+    made: list[Any] = [
+        arrow.table({"group_id": arrow.array([], arrow.int64())}) if held is None else held
+    ]
     for group_id, of_group in groups.items():
         values = _decoded(of_group, altered)
-        if values.keys() >= _TIMES:  # else nobody knows of when the others are
+        if values.keys() >= set(_PLACES.values()):  # else nobody knows of when the others are
             made.append(_group(group_id, values, signals, types))
-    return arrow.concat_tables(made, promote_options="default") if made else None
+    return arrow.concat_tables(made, promote_options="default").combine_chunks()
 
 
 def _decoded(chunks: Mapping[int, Mapping[str, Any]], altered: Counter[str]) -> dict[int, Decoded]:
-    """The values of the signals of a group, without those that cannot be read."""
+    """The values of a group by signals, without those that cannot be read."""
     rows = int(chunks[SIM_TIMES]["row_count"]) if SIM_TIMES in chunks else 0
-    found: dict[int, Decoded] = {}
-    for signal_id, chunk in chunks.items():
+
+    def values_of(chunk: Mapping[str, Any]) -> Decoded | None:
         try:
-            found[signal_id] = decode(Encoded(*(chunk[name] for name in Encoded._fields)), rows)
+            return decode(Encoded(*(chunk[name] for name in Encoded._fields)), rows)
         except DamagedChunkError:
             altered["chunk.numbers"] += 1
-    return found
+            return None
 
-
-def read_columns(content: bytes, path: str) -> Any:
-    """The columns of a file.
-
-    Raises:
-        PoolError: The file is none, or is damaged.
-    """
-    with clear_damage(path):
-        return package("pyarrow.parquet").read_table(package("pyarrow").BufferReader(content))
+    found = {signal_id: values_of(chunk) for signal_id, chunk in chunks.items()}
+    return {signal_id: values for signal_id, values in found.items() if values is not None}
 
 
 def _group(
     group_id: int,
     decoded: dict[int, Decoded],
-    signals: Mapping[int, Named],
-    types: Mapping[int, Any],
+    signals: Mapping[int, NameAndKind],
+    types: dict[int | None, Any],
 ) -> Any:
     arrow = package("pyarrow")
     rows = len(decoded[SIM_TIMES].numbers)
     fields = [arrow.field("group_id", arrow.int64())]
     arrays = [arrow.array(np.full(rows, group_id, np.int64))]
     for name, signal_id in _PLACES.items():
-        numbers = decoded.pop(signal_id).numbers
         fields.append(arrow.field(name, arrow.int64() if name == "state_id" else arrow.float64()))
-        arrays.append(arrow.array(numbers).cast(fields[-1].type))
+        arrays.append(arrow.array(decoded.pop(signal_id).numbers).cast(fields[-1].type))
     others: dict[int, dict[str, Any]] = defaultdict(dict)
-    for signal_id, values in decoded.items():
-        if signal_id not in signals:  # another program deleted it
-            continue
-        name = signals[signal_id].name
-        name = f"{name} ({signal_id})" if name.lower() in _FIXED else name
-        metadata = {"signal_id": str(signal_id)}
-        fields.append(arrow.field(name, types[signal_id], metadata=metadata))
-        arrays.append(_array(values, name, fields[-1].type, others))
+    for signal_id, values in sorted(decoded.items()):
+        if signal_id in signals:  # else another program deleted it
+            name, kind = signals[signal_id]
+            types.setdefault(signal_id, _type_of(values, kind))
+            name = f"{name} ({signal_id})" if name.lower() in _FIXED else name
+            metadata = {"signal_id": str(signal_id)}
+            fields.append(arrow.field(name, types[signal_id], metadata=metadata))
+            arrays.append(_array(values, name, types[signal_id], others))
     texts = [json.dumps(others[row]) if row in others else None for row in range(rows)]
     fields.append(arrow.field("others", arrow.string()))
     arrays.append(arrow.array(texts, arrow.string()))
     return arrow.table(arrays, schema=arrow.schema(fields))
 
 
-def _type_of(signal: Named) -> Any:
-    arrow = package("pyarrow")
-    return arrow.type_for_alias(_KINDS.get(signal.kind, "double"))
+def _type_of(values: Decoded, kind: str) -> Any:
+    """The type that most values have; where there is none, the one of the signal's kind."""
+    codes = np.zeros(len(values.numbers), np.intp) if values.codes is None else values.codes
+    counts = np.bincount(codes, minlength=len(values.labels) + _FIRST_LABEL).tolist()
+    found = Counter({"double": counts[IS_NUMBER]})
+    for label, count in zip(values.labels, counts[_FIRST_LABEL:], strict=True):
+        found.update({name: count for name, held in _HELD.items() if isinstance(label, held)})
+    ((most, count),) = found.most_common(1)
+    return package("pyarrow").type_for_alias(most if count else _TYPES.get(kind, "double"))
 
 
 def _array(values: Decoded, name: str, kind: Any, others: dict[int, dict[str, Any]]) -> Any:
     """A column; what it cannot hold goes to the others."""
     arrow = package("pyarrow")
-    holds = _HOLDS.get(str(kind))
+    held = _HELD.get(str(kind))
     codes = np.zeros(len(values.numbers), np.intp) if values.codes is None else values.codes
+    fitting: list[Any] = [None, None]
     for code, label in enumerate(values.labels, _FIRST_LABEL):
-        if holds is None or not isinstance(label, holds):
-            told = [label.why] if isinstance(label, Replaced) else label
-            for row in np.flatnonzero(codes == code).tolist():
-                others[row][name] = told
-    if holds is None:
+        fits = held is not None and isinstance(label, held)
+        fitting.append(label if fits else None)
+        for row in () if fits else np.flatnonzero(codes == code).tolist():
+            others[row][name] = [label.why] if isinstance(label, Replaced) else label
+    if held is None:
         return arrow.array(values.numbers, mask=codes != IS_NUMBER)
     for row in np.flatnonzero(codes == IS_NUMBER).tolist():
-        others[row][name] = values.numbers[row]
-    fitting = [each if isinstance(each, holds) else None for each in values.labels]
-    by_code = [None, None, *fitting]
-    return arrow.array([by_code[code] for code in codes.tolist()], kind)
+        others[row][name] = float(values.numbers[row])
+    return arrow.array(fitting, kind).take(arrow.array(codes))
 
 
-def chunks_of(held: Any, run_id: int) -> Iterator[Row]:
-    """The rows of the table `chunk` that columns were made of; their ids are given anew."""
-    compute = package("pyarrow.compute")
-    for group_id in compute.unique(held.column("group_id")).to_pylist():
-        group = held.filter(compute.equal(held.column("group_id"), group_id))
-        others: list[dict[str, Any]] = [
-            json.loads(text) if text else {} for text in group.column("others").to_pylist()
-        ]
+def chunks_of(held: Any, run_id: int | None) -> Iterator[Row]:
+    """The rows of the table `chunk` that columns were made of, without ids of their own."""
+    names = table("chunk").columns
+    groups = held.column("group_id").to_numpy()
+    starts = [0, *(np.flatnonzero(np.diff(groups)) + 1).tolist()] if len(groups) else []
+    for start, stop in zip(starts, [*starts[1:], len(groups)], strict=True):
+        group = held.slice(start, stop - start).combine_chunks()
+        texts = group.column("others").to_pylist()
+        others = {row: json.loads(text) for row, text in enumerate(texts) if text}
         for field in group.schema:
-            signal_id = _signal_of(field)
-            if signal_id is not None:
-                values = _recorded(group.column(field.name), field.name, others)
-                if any(value is not ABSENT for value in values):
-                    yield _chunk(group_id, run_id, signal_id, values)
+            if (signal_id := _signal_of(field)) is None:
+                continue
+            values = _values(group.column(field.name), field.name, others)
+            if values.codes is None or (values.codes != IS_ABSENT).any():
+                row: dict[str, Any] = {"group_id": int(groups[start]), "run_id": run_id}
+                row |= statistics_of(values)._asdict() | pack(values)._asdict()
+                yield tuple((row | {"signal_id": signal_id}).get(name) for name in names)
 
 
 def _signal_of(field: Any) -> int | None:
     if field.name in _PLACES:
         return _PLACES[field.name]
-    told = (field.metadata or {}).get(b"signal_id")
+    metadata: Mapping[bytes, bytes] = field.metadata or {}
+    told = metadata.get(b"signal_id")
     return None if told is None else int(told)
 
 
-def _recorded(column: Any, name: str, others: Sequence[Mapping[str, Any]]) -> list[Recorded]:
-    """The values of a signal; whole numbers as such, which are smaller."""
-    values: list[Any] = column.to_pylist()
-    if str(column.type) == "double" and all(map(_is_whole, values)):
-        values = [None if value is None else int(value) for value in values]
-    return [
-        _other(other[name]) if name in other else ABSENT if value is None else value
-        for value, other in zip(values, others, strict=True)
-    ]
+def _values(column: Any, name: str, others: Mapping[int, Mapping[str, Any]]) -> Decoded:
+    """The values of a column; whole numbers as integers, which are smaller."""
+    known: dict[tuple[type, Value | Replaced], int] = {}
 
+    def code_of(label: Value | Replaced) -> int:
+        return known.setdefault((type(label), label), len(known) + _FIRST_LABEL)
 
-def _is_whole(value: float | None) -> bool:
-    if value is None:
-        return True
-    return value.is_integer() and abs(value) < _EXACT and (value != 0 or str(value) == "0.0")
-
-
-def _other(value: Any) -> Recorded:
-    return Replaced(value[0]) if isinstance(value, list) else value
-
-
-def _chunk(group_id: int, run_id: int, signal_id: int, values: Sequence[Recorded]) -> Row:
-    figures = statistics_of(decoded_of(values))
-    named = {"group_id": group_id, "run_id": run_id, "signal_id": signal_id}
-    named |= figures._asdict() | encode(values)._asdict()
-    return tuple(named.get(column) for column in table("chunk").columns)
-
-
-def encoded_columns(held: Any) -> bytes:
-    """As one file of Parquet."""
-    sink = io.BytesIO()
-    package("pyarrow.parquet").write_table(held, sink, compression="zstd")
-    return sink.getvalue()
+    if str(column.type) in _HELD:
+        listed = column.combine_chunks().dictionary_encode()
+        found = [code_of(label) for label in listed.dictionary.to_pylist()]
+        places = listed.indices.fill_null(len(found)).to_numpy()
+        codes, numbers = np.array([*found, IS_ABSENT])[places], np.full(len(places), np.nan)
+    else:
+        numbers = np.array(column.to_numpy(), np.float64)
+        codes = np.where(column.is_null().to_numpy(), IS_ABSENT, IS_NUMBER)
+    for row in (row for row, other in others.items() if name in other):
+        value = others[row][name]
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            numbers[row], codes[row] = value, IS_NUMBER
+        else:
+            codes[row] = code_of(Replaced(value[0]) if isinstance(value, list) else value)
+    for (_, label), code in known.items():
+        if isinstance(label, bool):
+            numbers[codes == code] = label
+    held = numbers[codes == IS_NUMBER]
+    signs = np.signbit(held[held == 0])  # an integer has no -0.0
+    is_whole = bool((np.trunc(held) == held).all() and not signs.any()) and (
+        np.abs(held).max(initial=0) < 2.0**53
+    )
+    labels = [label for _, label in known]
+    return Decoded(numbers, codes if codes.any() else None, labels, bool(is_whole))

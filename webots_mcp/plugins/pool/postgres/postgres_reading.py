@@ -20,39 +20,14 @@ from webots_mcp.plugins.pool.pool_statement import Kind, answered, bounded
 from webots_mcp.plugins.pool.postgres.connecting import Connection, clear_errors, connect, one_line
 from webots_mcp.plugins.pool.postgres.postgres_schema import OWNER, require_current
 from webots_mcp.plugins.pool.row_batch import Batch, Row, batches
-from webots_mcp.plugins.pool.shipped_tables import Table, tables
-from webots_mcp.plugins.pool.target import (
-    PooledRecording,
-    PooledRun,
-    PooledSize,
-    PooledTrialSet,
-    redacted,
-)
+from webots_mcp.plugins.pool.shipped_tables import Table, table, tables
+from webots_mcp.plugins.pool.target import PooledSize, redacted
 from webots_mcp.store.questions.sql import Result, require_max_rows
 
 SELECT_S: Final = 60
 _FETCHED: Final = 2000  # rows that are asked of the server at a time
 _COUNTED_BYTES: Final = 200_000_000  # larger tables are not counted, which would take long
 _SESSION: Final = "SET idle_in_transaction_session_timeout = '15min'"
-_RECORDINGS: Final = f"""
-SELECT e.{OWNER}::text, e.created_wall_time_s,
-  ARRAY(SELECT DISTINCT name FROM robot r WHERE r.{OWNER} = e.{OWNER} ORDER BY name),
-  (SELECT count(*) FROM run u WHERE u.{OWNER} = e.{OWNER}),
-  EXISTS (SELECT 1 FROM progress p WHERE p.{OWNER} = e.{OWNER} AND p.name = 'state')
-FROM recording e ORDER BY e.created_wall_time_s, e.{OWNER}"""
-_RUNS: Final = f"""
-SELECT u.{OWNER}::text, u.id, coalesce(u.uuid, ''), r.name, u.label, u.world,
-  u.started_wall_time_s, u.last_wall_time_s, u.started_sim_time_s, u.last_sim_time_s,
-  u.end_reason, u.row_count
-FROM run u JOIN robot r ON r.{OWNER} = u.{OWNER} AND r.id = u.robot_id
-WHERE %(uuid)s::uuid IS NULL OR u.{OWNER} = %(uuid)s::uuid
-ORDER BY u.started_wall_time_s, u.{OWNER}, u.id"""
-_TRIAL_SETS: Final = f"""
-SELECT s.{OWNER}::text, s.id, s.uuid, s.created_wall_time_s,
-  (SELECT count(*) FROM trial t WHERE t.{OWNER} = s.{OWNER} AND t.trial_set_id = s.id),
-  ARRAY(SELECT t.run_id FROM trial t WHERE t.{OWNER} = s.{OWNER} AND t.trial_set_id = s.id
-    AND t.run_id IS NOT NULL ORDER BY t.number)
-FROM trial_set s ORDER BY s.created_wall_time_s, s.{OWNER}, s.id"""
 _SIZE: Final = """
 SELECT sum(pg_total_relation_size(oid))::bigint,
   sum(reltuples) FILTER (WHERE relkind = 'r')::bigint,
@@ -117,25 +92,16 @@ class PostgresPool:
             raise PoolError(f"{self.address} is not open")
         return self._opened
 
-    def recordings(self) -> Iterator[PooledRecording]:
-        """All, by when they were made."""
-        for uuid, created_s, robots, *others in self._asked(_RECORDINGS):
-            yield PooledRecording(uuid, created_s, tuple(robots), *others)
-
-    def runs(self, recording_uuid: str | None = None) -> Iterator[PooledRun]:
-        """All, or those of a recording, by when they began."""
-        for row in self._asked(_RUNS, {"uuid": recording_uuid}):
-            yield PooledRun(*row)
-
-    def trial_sets(self) -> Iterator[PooledTrialSet]:
-        """All, by when they were made."""
-        for owner, *of_set, run_ids in self._asked(_TRIAL_SETS):
-            runs = tuple((str(owner), int(run_id)) for run_id in run_ids)
-            yield PooledTrialSet(owner, *of_set, runs=runs)
+    def records(self, name: str) -> Iterator[tuple[str, dict[str, Any]]]:
+        """All rows of a table that changes, each behind its recording's UUID."""
+        columns = table(name).columns
+        asked = ", ".join(map('"{}"'.format, columns))
+        for owner, *row in self._asked(f"SELECT {OWNER}::text, {asked} FROM {name}"):
+            yield owner, dict(zip(columns, row, strict=True))
 
     def sizes(self) -> Iterator[PooledSize]:
         """Bytes with those of indexes; rows of large tables as PostgreSQL last estimated them."""
-        for each in (*(table.name for table in tables()), "picture"):
+        for each in (*(each.name for each in tables()), "picture"):
             ((size_bytes, estimate, is_estimated),) = self._asked(_SIZE, {"name": each})
             rows = estimate
             if size_bytes < _COUNTED_BYTES or not is_estimated:
@@ -154,8 +120,7 @@ class PostgresPool:
         conditions = "".join(f' AND "{column}" = ANY(%s)' for column in where)
         query = (
             f"SELECT {', '.join(_as_recorded(table, each) for each in table.columns)} "
-            f"FROM {table.name} WHERE {OWNER} = %s{conditions} "
-            f"ORDER BY {', '.join(table.key)}"
+            f"FROM {table.name} WHERE {OWNER} = %s{conditions}"
         )
         asked = (recording_uuid, *(list(ids) for ids in where.values()))
         yield from batches(table, cast("Iterator[Row]", self._asked(query, asked)))

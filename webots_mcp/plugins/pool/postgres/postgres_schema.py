@@ -1,40 +1,30 @@
-"""The tables of a pool in PostgreSQL: those of a recording, by the same Alembic migrations.
+"""The tables of a pool in PostgreSQL, made from the models of those of a recording.
 
-What differs stands in `PoolImpl`, through which Alembic makes them: the recording's UUID comes
-before every key, integers have 64 bits, JSON is jsonb, and appended tables are partitioned by wall
-time, a month each. A pool outlives what retention deletes at the edge, and has runs of which
-another recording shipped the rest: so rows may refer to what is not there, names may come again,
-and there are no foreign keys and no unique columns but the keys. `run_owner` holds that a run is in
-a pool once.
+What differs: the recording's UUID comes before every key, integers have 64 bits, JSON is jsonb, and
+appended tables are partitioned by wall time, a month each. A pool outlives what retention deletes
+at the edge, and has runs of which another recording shipped the rest: so rows may refer to what is
+not there, names may come again, and there are no foreign keys and no unique columns but the keys.
+`run_owner` holds that a run is in a pool once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator
-from contextlib import contextmanager
 from datetime import datetime, timezone
 from typing import Any, Final
 
-import psycopg
 import sqlalchemy as sa
-from alembic import command
-from alembic.config import Config
-from alembic.ddl.postgresql import PostgresqlImpl
-from alembic.runtime.migration import MigrationContext
 from sqlalchemy.dialects import postgresql
-from sqlalchemy.exc import DBAPIError
-from sqlalchemy.pool import StaticPool
+from sqlmodel import SQLModel
 
 from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.errors import PoolError
 from webots_mcp.plugins.pool.postgres.connecting import Connection, clear_errors, connect
 from webots_mcp.plugins.pool.postgres.postgres_views import VIEWS, make_views
-from webots_mcp.plugins.pool.shipped_tables import Table, table, tables
-from webots_mcp.store.migrate import migration_config
+from webots_mcp.plugins.pool.shipped_tables import Table, tables
 from webots_mcp.store.models import STATISTICS
 
 OWNER: Final = "recording_uuid"
-VERSION: Final = "pool_version"  # Alembic's, under a name that says whose tables these are
+VERSION: Final = "pool_version"
 FIRST_YEAR: Final = 2000
 LAST_YEAR: Final = 2099
 FIRST_S: Final = datetime(FIRST_YEAR, 1, 1, tzinfo=timezone.utc).timestamp()
@@ -45,6 +35,7 @@ _ENCODING: Final = "UTF8"
 # What a pool has beside the tables of a recording. `make_partition` belongs to the owner of the
 # tables, so that whoever ships need not own them.
 _OWN: Final = f"""
+CREATE TABLE {VERSION} AS SELECT '{SCHEMA_VERSION}' AS version_num;
 CREATE TABLE shipment (
   {OWNER} uuid PRIMARY KEY,
   replaced_values bigint NOT NULL DEFAULT 0,
@@ -131,13 +122,13 @@ def prepare(url: str, address: str) -> None:
             _require_writable(connection, address)
             return require_current(connection, address)
         _require_create(connection, address)
-    with clear_errors(address), _transaction(url, address) as (engine, connection):
+    with clear_errors(address), connect(url, address, autocommit=False) as connection:
         connection.execute("SELECT pg_advisory_xact_lock(%s)", (_LOCK,))
         if _is_pool(connection):  # another was faster
             return
         _require_nothing_foreign(connection, address)
-        command.upgrade(_config(engine), "head")
-        connection.execute(_OWN.encode())
+        for statement in (*_table_statements(), _OWN):
+            connection.execute(statement.encode())
         make_views(connection)
 
 
@@ -255,66 +246,42 @@ def _first(connection: Connection, sql: str, *arguments: Any) -> Any:
     return row[0] if row else None
 
 
-@contextmanager
-def _transaction(url: str, address: str) -> Generator[tuple[sa.Connection, Connection]]:
-    """One transaction, for Alembic and for us."""
-    connection = connect(url, address, autocommit=False)
-    engine = sa.create_engine(
-        "postgresql+psycopg://", creator=lambda: connection, poolclass=StaticPool
-    )
-    try:
-        with engine.begin() as bound:
-            yield bound, connection
-    except DBAPIError as error:  # psycopg's, wrapped
-        raise (error.orig if isinstance(error.orig, psycopg.Error) else error) from None
-    finally:
-        engine.dispose()
-        connection.close()
+def _table_statements() -> list[str]:
+    """The statements that make the tables, with their indexes and the comments of their columns."""
+    metadata, made = sa.MetaData(), list[str]()
+    for each in tables():
+        _pooled(metadata, SQLModel.metadata.tables[each.name], each)
+
+    def note(statement: Any, *_: Any, **__: Any) -> None:
+        made.append(str(statement.compile(dialect=engine.dialect)))
+
+    engine = sa.create_mock_engine("postgresql+psycopg://", note)
+    metadata.create_all(engine, checkfirst=False)
+    for each in tables():
+        made += [outer.format(each.name) for outer in _OUTER_PARTITIONS if each.time_column]
+    return made
 
 
-def _config(connection: sa.Connection) -> Config:
-    config = migration_config()
-    config.attributes["connection"] = connection
-    config.attributes["options"] = {"version_table": VERSION}
-    config.attributes["adapt"] = _adapt
-    return config
-
-
-def _adapt(context: MigrationContext) -> None:
-    context.impl = PoolImpl(
-        context.dialect, context.connection, False, True, None, dict(context.opts)
-    )
-
-
-class PoolImpl(PostgresqlImpl):
-    """Makes of a recording's tables those of a pool."""
-
-    def create_table(self, table: sa.Table, **kw: Any) -> None:
-        """Only those that are shipped."""
-        if found := _shipped(table.name):
-            super().create_table(_pooled(table, found), **kw)
-            for outer in _OUTER_PARTITIONS if found.time_column else ():
-                super().execute(outer.format(table.name))
-            for index in sorted(table.indexes, key=str):
-                super().create_index(_index(index))
-        elif table.name == VERSION:
-            super().create_table(table, **kw)
-
-
-def _shipped(name: str) -> Table | None:
-    return table(name) if name in {each.name for each in tables()} else None
-
-
-def _pooled(made: sa.Table, shipped: Table) -> sa.Table:
-    key = [OWNER, *(column.name for column in made.primary_key.columns)]
+def _pooled(metadata: sa.MetaData, made: sa.Table, shipped: Table) -> sa.Table:
+    key = [OWNER, *shipped.key]
     options: dict[str, Any] = {}
     if shipped.time_column:
         key.append(shipped.time_column)
         options["postgresql_partition_by"] = f"RANGE ({shipped.time_column})"
-    columns = (_column(column, shipped) for column in made.columns)
+    columns = [_column(made.columns[name], shipped) for name in shipped.columns]
     owner = sa.Column(OWNER, postgresql.UUID(), nullable=False)
     constraint = sa.PrimaryKeyConstraint(*key)
-    return sa.Table(made.name, sa.MetaData(), owner, *columns, constraint, **options)
+    pooled = sa.Table(made.name, metadata, owner, *columns, constraint, **options)
+    for index in sorted(made.indexes, key=str):
+        indexed = [
+            pooled.c[column.name]
+            for column in index.columns
+            if column.name == "uuid" or not isinstance(column.type, sa.Text)
+            if column.name not in STATISTICS
+        ]
+        where = index.dialect_kwargs.get("postgresql_where")
+        sa.Index(index.name, pooled.c[OWNER], *indexed, postgresql_where=where)
+    return pooled
 
 
 def _column(column: sa.Column[Any], shipped: Table) -> sa.Column[Any]:
@@ -328,21 +295,3 @@ def _column(column: sa.Column[Any], shipped: Table) -> sa.Column[Any]:
         column.name, kind, nullable=column.nullable, comment=column.comment, autoincrement=False,
         server_default=default.arg if default is not None else None,
     )  # fmt: skip
-
-
-def _index(index: sa.Index) -> sa.Index:
-    assert index.table is not None
-    columns = [
-        sa.Column(column.name, column.type)
-        for column in index.columns
-        if column.name == "uuid" or not isinstance(column.type, sa.Text)
-        if column.name not in STATISTICS
-    ]
-    table = sa.Table(index.table.name, sa.MetaData(), sa.Column(OWNER, postgresql.UUID()), *columns)
-    where = index.dialect_kwargs.get("postgresql_where")
-    return sa.Index(
-        index.name,
-        table.c[OWNER],
-        *(table.c[each.name] for each in columns),
-        postgresql_where=where,
-    )

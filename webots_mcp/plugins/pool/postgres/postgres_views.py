@@ -98,7 +98,10 @@ _QUERIES: Final = {
     "all_state": f"""SELECT {_KEY}, id AS state_id, run_id, sim_time_s, wall_time_s, data, replaced
 FROM state
 UNION ALL
-SELECT {_KEY}, NULL, run_id, sim_time_s, wall_time_s, data, replaced FROM kept_state""",
+SELECT {_KEY}, NULL, run_id, sim_time_s, wall_time_s, data, replaced FROM kept_state k
+WHERE call IS NOT NULL OR NOT EXISTS (SELECT 1 FROM state s /* retention moved it there */
+  WHERE s.{_KEY} = k.{_KEY} AND s.run_id = k.run_id AND s.sim_time_s = k.sim_time_s
+    AND s.wall_time_s = k.wall_time_s)""",
     "robot_now": f"""SELECT r.{_KEY}, r.name AS robot, u.id AS run_id, u.end_reason, s.sim_time_s,
   rounded({_NOW_S} - s.wall_time_s, 1) AS age_s,{_motion("r.id")},
   s.data, s.replaced

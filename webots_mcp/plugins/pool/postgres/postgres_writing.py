@@ -8,7 +8,6 @@ temporary table, where JSON is text still, and from there row by row.
 from __future__ import annotations
 
 import contextlib
-import math
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
@@ -28,7 +27,7 @@ from webots_mcp.plugins.pool.postgres.postgres_schema import (
     prepare,
     require_current,
 )
-from webots_mcp.plugins.pool.row_batch import Batch, Row
+from webots_mcp.plugins.pool.row_batch import Batch, Row, nearest, number_in
 from webots_mcp.plugins.pool.shipped_tables import SQLValue, Table
 from webots_mcp.plugins.pool.target import redacted
 
@@ -307,43 +306,18 @@ def _parts(batch: Batch) -> set[tuple[str, int, int]]:
 
 def _day(value: SQLValue) -> int | None:
     """The day of a wall time; None of those that are in no month of a pool."""
-    number = value if isinstance(value, float | int) else _number(value) or 0.0
+    number = number_in(value) or 0.0
     return int(number // 86_400) if FIRST_S <= number < END_S else None
 
 
 def _nearest(value: SQLValue, kind: type, nullable: bool) -> SQLValue:
-    """The value of a type that comes nearest to one that SQLite holds."""
-    if value is None:
-        return None if nullable else kind()
-    if kind is str:
-        return _text(value)
-    if kind is bytes:
-        return value if isinstance(value, bytes) else None
-    number = _number(value)
-    if number is None:
-        return None if nullable else kind()
-    return number if kind is float else _whole(number)
+    held = nearest(value, kind, nullable=nullable)
+    return _text(held) if isinstance(held, str) else held
 
 
-def _text(value: SQLValue) -> str:
-    """A text without what PostgreSQL's have not: NUL, and halves of characters."""
-    if isinstance(value, bytes):
-        value = value.decode("utf-8", "replace")
-    text = str(value).replace("\0", _REPLACEMENT)
-    return text.encode("utf-8", "surrogatepass").decode("utf-8", "replace")
-
-
-def _number(value: SQLValue) -> int | float | None:
-    if isinstance(value, int | float):
-        return value
-    try:
-        return float(value or "")
-    except ValueError:
-        return None
-
-
-def _whole(number: float) -> int:
-    return int(number) if math.isfinite(number) and abs(number) < 2**63 else 0
+def _text(text: str) -> str:
+    """A text without NUL, which PostgreSQL's have not."""
+    return text.replace("\0", _REPLACEMENT)
 
 
 def _quoted(name: str) -> str:

@@ -12,7 +12,7 @@ from tests.detection.asking import Answer, Claim, ask_run, ask_since
 from tests.detection.drawing import draw_case
 from tests.detection.judging import Tally, Verdict, judge
 from tests.detection.labelled import Case, Incident, LabelledRun, Measure, repeated
-from tests.detection.writing import purge, roll_up, write_all
+from tests.detection.writing import purge, put_in_chunks, write_all
 from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S
 
@@ -103,7 +103,7 @@ def _measure_whole(case: Case, report: Report) -> None:
     with memory_connection() as connection:
         run_ids = write_all(connection, case.runs)
         if case.number % 2:
-            roll_up(connection)
+            put_in_chunks(connection)
         answer = ask_since(connection, case.asked, WALL_START_S)
     for run_id, run in zip(run_ids, case.runs, strict=True):
         for asked in (Asked(each, answer) for each in case.asked):
@@ -119,8 +119,9 @@ def _measure_long(case: Case, summaries: Summaries, report: Report) -> None:
     long = repeated(short, LONG_ROWS)
     with memory_connection() as connection, tempfile.TemporaryDirectory() as folder:
         (run_id,) = write_all(connection, [long])
-        of_rows = ask_run(connection, case.asked, run_id)
-        roll_up(connection)
+        put_in_chunks(connection)
+        with _read_row_by_row():
+            of_rows = ask_run(connection, case.asked, run_id)
         if summaries == "purged":
             purge(connection, Path(folder), len(long.times) - len(short.times))
         of_summaries = ask_run(connection, case.asked, run_id)

@@ -28,10 +28,7 @@ def missed_goals(key: Key, tally: Tally) -> list[str]:
 def _missed(key: Key, tally: Tally) -> Iterator[str]:
     _, measure, condition = key
     least = LEAST_SHARE_NOISY if "to 30 mm" in condition else LEAST_SHARE
-    if "purged" in condition:  # what is gone cannot be found, but it is not passed over
-        if (tally.said_share if tally.said_share is not None else 1.0) < 1:
-            yield "said"
-    elif (tally.recall if tally.recall is not None else 1.0) < least:
+    if (tally.recall if tally.recall is not None else 1.0) < least:
         yield "recall"
     if (tally.precision if tally.precision is not None else 1.0) < least:
         yield "precision"

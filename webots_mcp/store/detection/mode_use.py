@@ -17,10 +17,9 @@ from webots_mcp.store.reading.ranges import Segment, just_after, recorded_bounds
 from webots_mcp.store.signals.flatten import shown
 
 ROLLS_OUT_S: Final = 1.5  # after a mode began, the motion of the mode before may go on
-LEAST_MOVED_M: Final = 0.1  # or so many deviations of what is left of the noise
-LEAST_NOISE: Final = 8.0
-AWAY_S: Final = 20.0  # within so long, and no slower than this on average: who drifts does not move
-LEAST_M_S: Final = 0.0125
+LEAST_MOVED_M: Final = 0.3  # within so long: who drifts about a place does not move
+AWAY_S: Final = 20.0
+LEAST_NOISE: Final = 8.0  # deviations of what is left of the noise
 USUALLY_STANDS: Final = 4  # times as many visits as it moves in, of at least so many visits
 LEAST_VISITS: Final = 3
 EARLIER_RUNS: Final = 3
@@ -147,10 +146,7 @@ def _uses_of(
         later = np.minimum(np.searchsorted(times, times + over_s), last)
         return np.hypot(x[later] - x, y[later] - y), times[later] - times
 
-    went_m, took_s = way_m(AWAY_S)
-    got_away = went_m >= np.maximum(
-        max(LEAST_MOVED_M, LEAST_NOISE * track.left_m), LEAST_M_S * took_s
-    )
+    got_away = way_m(AWAY_S)[0] >= max(LEAST_MOVED_M, LEAST_NOISE * track.left_m)
     moved = np.add.reduceat(got_away * 1.0, firsts) >= _MOVES_SHARE * np.minimum(lengths, _ENOUGH)
     slow = way_m(options.stuck_s)[0] <= max(options.stuck_m, LEAST_NOISE * track.left_m)
     stood = np.add.reduceat(slow * 1.0, firsts) >= _STANDS_SHARE * lengths

@@ -237,5 +237,4 @@ FLAT: Final = EventKind(
     of_numbers=True,
     drawn=7,
     alike=Alike(_alike, of_arrays=True),
-    of_frame=True,
 )

@@ -7,9 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 from webots_mcp.store.detection.event import Event
-from webots_mcp.store.detection.kind import Alike
+from webots_mcp.store.detection.kind import Alike, told_together
 from webots_mcp.store.detection.registry import kind_named
-from webots_mcp.store.detection.together import told_together
 from webots_mcp.store.signals.registry import Signal
 
 
@@ -68,7 +67,6 @@ def _as_one(alike: Sequence[Event], how: Alike, known: dict[str, Signal]) -> Eve
             what,
             [event.start_s for event in alike],
             [event.duration_s for event in alike],
-            max(event.details.get("within_s", 0.0) for event in alike),
         ),
     }
     return replace(

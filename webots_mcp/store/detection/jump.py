@@ -89,5 +89,4 @@ JUMP: Final = EventKind(
     drawn=1,
     alike=Alike(_alike, sort=_is_back),
     effort=2,
-    of_frame=True,
 )

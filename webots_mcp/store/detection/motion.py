@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Final
 
 from webots_mcp.naming import FARTHEST_M, metres_in, unit_in
 from webots_mcp.signal_roles import first_in, pair_in
-from webots_mcp.store.analysis.arrays import Array, Indexes, np
+from webots_mcp.store.analysis.arrays import Array, Indexes, median, np
+from webots_mcp.store.analysis.noise import noise_of
+from webots_mcp.store.analysis.summary import LARGEST
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.signals.catalogue import one_signal
 from webots_mcp.store.signals.registry import Signal, roles_of, stored_roles
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
 
 TRUE_WITHIN: Final = 0.05  # a distance that may be short by less, or by less than so many metres,
 TRUE_WITHIN_M: Final = 0.1  # is reported without a doubt
+SAMPLES: Final = 8  # parts of a run that tell how noisy it is
+SAMPLE_ROWS: Final = 1024  # of each
 IMPLAUSIBLE_M_S: Final = 50.0  # a mean speed beyond is hardly that of a robot
 
 
@@ -143,15 +147,43 @@ def doubt_of_unit(position: tuple[Signal, Signal], speed_m_s: float) -> str | No
     )
 
 
-def tracks_of_frame(
-    frame: Frame, position: tuple[Signal, Signal]
+class RunNoise:
+    """How noisy a run's signals are, by some of its rows: the same of whatever part is asked for.
+
+    Attributes:
+        position_m: Standard deviation of the noise in each of x and y.
+        interval_s: The usual one between rows.
+        rows: Of the run.
+    """
+
+    def __init__(self, run: Frame, motion: Motion) -> None:
+        starts = np.linspace(0, len(run), SAMPLES, endpoint=False) // SAMPLE_ROWS
+        rows = (np.unique(starts) * SAMPLE_ROWS).astype(np.intp).tolist()
+        self._parts = [run.rows(row, row + SAMPLE_ROWS) for row in rows]
+        self._known: dict[str, float] = {}
+        self.rows = len(run)
+        intervals = np.concatenate([np.zeros(0), *(np.diff(part.times) for part in self._parts)])
+        self.interval_s = median(intervals) if len(intervals) else 0.0
+        noises = [self.of(each.name) * metres_in(each.name) for each in motion.position or ()]
+        self.position_m = math.hypot(*noises) / math.sqrt(2)
+
+    def of(self, name: str) -> float:
+        """Standard deviation of the noise of a signal."""
+        if name not in self._known:
+            values = np.concatenate([np.zeros(0), *(part.numbers(name) for part in self._parts)])
+            self._known[name] = noise_of(values[np.abs(values) <= LARGEST])
+        return self._known[name]
+
+
+def tracks_in(
+    frame: Frame, position: tuple[Signal, Signal], noise: RunNoise
 ) -> tuple[list[Track], list[Indexes]]:
     """The way of the robot in each stretch without a gap, and the rows of the frame in it."""
     from webots_mcp.store.analysis.track import tracks_of
 
     x, y = (in_metres(each, frame.numbers(each.name)) for each in position)
     rows = np.flatnonzero(np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M)
-    tracks = tracks_of(frame.times[rows], x[rows], y[rows])
+    tracks = tracks_of(frame.times[rows], x[rows], y[rows], noise.position_m, noise.rows)
     ends = np.cumsum([len(track.times) for track in tracks])
     return tracks, np.split(rows, ends[:-1])
 

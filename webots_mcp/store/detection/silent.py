@@ -139,5 +139,4 @@ SILENT: Final = EventKind(
     of_numbers=True,
     drawn=2,
     alike=Alike(lambda events, unit: "stretches without a value", of_arrays=True),
-    of_frame=True,
 )

@@ -17,10 +17,9 @@ from webots_mcp.store.detection.kind import (
     EventKind,
     NotSearchableError,
     but_for_numbers,
-    only_if_named,
+    told_together,
 )
 from webots_mcp.store.detection.search import Search
-from webots_mcp.store.detection.together import told_together
 from webots_mcp.store.reading.changes import MOST_VALUES, Point, change_points, value_ended_s
 from webots_mcp.store.reading.gaps import frame_around, rhythm_in
 from webots_mcp.store.reading.ranges import Segment, just_after
@@ -377,7 +376,7 @@ IMAGE: Final = EventKind(
     "",
     image_events,
     stored=True,
-    usual=only_if_named,
+    usual=lambda options: False,  # no news, and there may be thousands
     routine=True,
     counted=False,
 )

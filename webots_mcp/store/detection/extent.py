@@ -78,13 +78,15 @@ class Detection:
 def _found(search: Search) -> list[Event]:
     """The events in the segment of a search, cut off at its ends.
 
-    What costs least is searched first: each kind gets an equal part of the time that those before
+    What costs least is searched first: each rank gets an equal part of the time that those before
     it have left.
     """
     found: dict[str, list[Event]] = {}
-    for index, kind in enumerate(sorted(search.kinds, key=lambda kind: kind.effort)):
-        with search.deadline.narrowed(1 / (len(search.kinds) - index)):
-            found[kind.name] = _found_of(kind, search)
+    efforts = sorted({kind.effort for kind in search.kinds})
+    for index, effort in enumerate(efforts):
+        with search.deadline.narrowed(1 / (len(efforts) - index)):
+            same = (kind for kind in search.kinds if kind.effort == effort)
+            found |= {kind.name: _found_of(kind, search) for kind in same}
     return [event for kind in search.kinds for event in found[kind.name]]
 
 

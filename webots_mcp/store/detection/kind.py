@@ -69,7 +69,8 @@ class EventKind:
         counted: Comparisons of runs count it.
         drawn: Its place among the rows below a plot, the least first; None if it has none there.
         alike: How similar ones are reported as one; None where each is reported by itself.
-        effort: Its rank by what it costs to look for: the least is searched first.
+        effort: Its rank by what it costs to look for: the least is searched first. Kinds of one
+            rank share their part of the time.
     """
 
     name: str

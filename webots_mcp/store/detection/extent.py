@@ -85,8 +85,12 @@ def _found(search: Search) -> list[Event]:
     efforts = sorted({kind.effort for kind in search.kinds})
     for index, effort in enumerate(efforts):
         with search.deadline.narrowed(1 / (len(efforts) - index)):
-            same = (kind for kind in search.kinds if kind.effort == effort)
-            found |= {kind.name: _found_of(kind, search) for kind in same}
+            over = search.deadline.passed
+            for kind in [kind for kind in search.kinds if kind.effort == effort]:
+                found[kind.name] = [] if over else _found_of(kind, search)
+                if over:
+                    why = "time limit reached: ask for this kind alone"
+                    search.not_searched(kind.name, why)
     return [event for kind in search.kinds for event in found[kind.name]]
 
 

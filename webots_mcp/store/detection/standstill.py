@@ -51,10 +51,8 @@ def standstills_in(search: Search) -> Findings:
     """Those that touch the segment of a search, from as many rows as bear on them.
 
     Raises:
-        NotSearchableError: No position is known, there is none, or the time is over.
+        NotSearchableError: No position is known, or there is none.
     """
-    if search.deadline.passed:
-        raise NotSearchableError("time limit reached: ask for this kind alone")
     motion, run, asked = search.motion, search.frame, search.asked or search.segment
     if search.whole.cut_at_s is None and not asked.full_rate:
         run = search.whole

@@ -152,7 +152,8 @@ class Search:
     def whole(self) -> Frame:
         """The rows of the whole run."""
         part = Segment(self.segment.run_id, self.began_s, just_after(self.ended_s))
-        return read_frame(self.connection, part, self.deadline)
+        is_all = replace(self.segment, open_start=False, open_end=False) == part
+        return self.frame if is_all else read_frame(self.connection, part, self.deadline)
 
     @cached_property
     def standstills(self) -> Findings:

@@ -299,16 +299,15 @@ def _to(values: Sequence[tuple[Value, float]]) -> dict[str, Any]:
     return {"to": to | ({"other values": rest} if rest > 0 else {})}
 
 
-def _stored(name: str, means: str, find: Any, **others: Any) -> EventKind:
-    return EventKind(name, means, find, stored=True, **others)
-
-
-RUN: Final = _stored("run", "began or ended", run_events, counted=False)
-GAP: Final = _stored("gap", "no rows", gap_events, alike=Alike(lambda events, unit: "gaps"))
-CHANGE: Final = _stored(
+RUN: Final = EventKind("run", "began or ended", run_events, stored=True, counted=False)
+GAP: Final = EventKind(
+    "gap", "no rows", gap_events, stored=True, alike=Alike(lambda events, unit: "gaps")
+)
+CHANGE: Final = EventKind(
     "change",
     "of a text or flag",
     change_events,
+    stored=True,
     routine=True,
     alike=Alike(
         lambda events, unit: "changes",
@@ -316,20 +315,22 @@ CHANGE: Final = _stored(
         most_single=10,
     ),
 )
-COMMAND: Final = _stored(
+COMMAND: Final = EventKind(
     "command",
     "",
     command_events,
+    stored=True,
     drawn=5,
     alike=Alike(
         lambda events, unit: "commands",
         sort=lambda e: (e.details["status"], but_for_numbers(e.details.get("error"))),
     ),
 )
-LOG: Final = _stored(
+LOG: Final = EventKind(
     "log",
     "",
     log_events,
+    stored=True,
     drawn=4,
     alike=Alike(
         lambda events, unit: "similar lines",
@@ -337,26 +338,28 @@ LOG: Final = _stored(
         adds=lambda events: {"message": events[0].details["message"]},
     ),
 )
-NOTICED: Final = _stored(
+NOTICED: Final = EventKind(
     "noticed",
     "by the bridge",
     noticed_events,
+    stored=True,
     drawn=6,
     alike=Alike(
         lambda events, unit: f"times {events[0].details['what']}",
         sort=lambda e: e.details["what"],
     ),
 )
-KEPT: Final = _stored(
+KEPT: Final = EventKind(
     "kept",
     "at full rate",
     kept_events,
+    stored=True,
     routine=True,
     counted=False,
     alike=Alike(
         lambda events, unit: "kept stretches", sort=lambda e: but_for_numbers(e.details["reason"])
     ),
 )
-IMAGE: Final = _stored(  # no news, and there may be thousands
-    "image", "", image_events, usual=lambda options: False, routine=True, counted=False
+IMAGE: Final = EventKind(  # no news, and there may be thousands
+    "image", "", image_events, stored=True, usual=lambda options: False, routine=True, counted=False
 )

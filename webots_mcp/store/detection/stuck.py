@@ -146,7 +146,7 @@ class Standings:
         """Where parts of about two seconds of each standstill begin, how many rows each has, and
         whether it is of the same standstill as the next one.
         """
-        begins = [
+        begins: list[Array] = [
             np.linspace(place.times[0], place.times[-1], parts, endpoint=False)
             for place in self.places
             for parts in [max(1, round(place.lasts_s / CELL_S))]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,7 +12,6 @@ from webots_mcp.naming import find_targets
 from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.noise import noise_of
 from webots_mcp.store.analysis.runs import MOSTLY, runs_alike
-from webots_mcp.store.conditions_on_arrays import compared
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import Alike, EventKind
 from webots_mcp.store.detection.search import Search
@@ -200,15 +198,15 @@ class _Resting:
 
     def _rows_elsewhere(self, rest: Rest) -> int:
         """How many other rows of the run have the same value."""
-        if rest.value not in self._alike:
-            there = compared(self.search.whole, self.signal.name, ast.Eq, rest.value)
-            self._alike[rest.value] = int(np.count_nonzero(there))
-        return self._alike[rest.value] - (rest.stop - rest.start)
+        first, stop = (
+            np.searchsorted(self._sorted, rest.value, side) for side in ("left", "right")
+        )
+        return int(stop - first) - (rest.stop - rest.start)
 
     @cached_property
-    def _alike(self) -> dict[float, int]:
-        """How many rows have a value."""
-        return {}
+    def _sorted(self) -> Array:
+        """All values of the run."""
+        return np.sort(self.search.whole.numbers(self.signal.name))
 
     @cached_property
     def _targets(self) -> tuple[Signal | None, Signal | None]:

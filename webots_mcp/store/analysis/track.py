@@ -158,11 +158,6 @@ def path_length(track: Track) -> PathLength:
     return PathLength(length_m + least_m, max(shortest_m, most_m - least_m), track.noise_m)
 
 
-def path_length_m(track: Track) -> float:
-    """Metres travelled, as `path_length` measures them."""
-    return path_length(track).length_m
-
-
 def _leg_lengths(track: Track, corners: Indexes) -> Array:
     """How long the ways from corner to corner are.
 

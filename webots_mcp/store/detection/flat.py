@@ -42,6 +42,11 @@ class Rest(NamedTuple):
     value: float
 
     @property
+    def rows(self) -> int:
+        """How many."""
+        return self.stop - self.start
+
+    @property
     def duration_s(self) -> float:
         """From the first row to the last."""
         return self.end_s - self.start_s
@@ -236,7 +241,7 @@ class _Resting:
         motion = self.search.motion
         if self.signal in (motion.commanded, motion.speed, *motion.wheels):
             return []
-        held = [rest for rest in rests if rest.stop - rest.start >= FEWEST_ROWS]
+        held = [rest for rest in rests if rest.rows >= FEWEST_ROWS]
         keys = [rest.value for rest in held]
         # What it comes back to is a value by nature, and 0 is what does nothing gives.
         once = [rest for rest in held if keys.count(rest.value) == 1 and rest.value != 0]

@@ -211,7 +211,9 @@ class _Resting:
     @cached_property
     def _sorted(self) -> Array:
         """All values of the run."""
-        return np.sort(self.search.whole.numbers(self.signal.name))
+        values: Array = np.array(self.search.whole.numbers(self.signal.name))
+        values.sort()
+        return values
 
     @cached_property
     def _targets(self) -> tuple[Signal | None, Signal | None]:

@@ -165,10 +165,7 @@ def _rests_among(count: int) -> tuple[Indexes, Indexes, Array]:
     firsts = np.concatenate((firsts, inner, nothing))
     lasts = np.concatenate((lasts, all_of_it, inner))
     times = np.arange(count, dtype=np.float64)
-    ramps = (
-        np.minimum(times - firsts[:, None], 0.0),
-        np.maximum(times - lasts[:, None] + 1, 0.0),
-    )
+    ramps = (np.minimum(times - firsts[:, None], 0.0), np.maximum(times - lasts[:, None] + 1, 0.0))
     left, sizes, _ = np.linalg.svd(
         np.stack((np.ones_like(ramps[0]), *ramps), axis=-1), full_matrices=False
     )

@@ -203,10 +203,8 @@ class _Resting:
 
     def _rows_elsewhere(self, rest: Rest) -> int:
         """How many other rows of the run have the same value."""
-        first, stop = (
-            np.searchsorted(self._sorted, rest.value, side) for side in ("left", "right")
-        )
-        return int(stop - first) - (rest.stop - rest.start)
+        first = int(np.searchsorted(self._sorted, rest.value))
+        return int(np.searchsorted(self._sorted, rest.value, "right")) - first - rest.rows
 
     @cached_property
     def _sorted(self) -> Array:

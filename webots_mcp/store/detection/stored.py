@@ -345,8 +345,7 @@ NOTICED: Final = EventKind(
     stored=True,
     drawn=6,
     alike=Alike(
-        lambda events, unit: f"times {events[0].details['what']}",
-        sort=lambda e: e.details["what"],
+        lambda events, unit: f"times {events[0].details['what']}", sort=lambda e: e.details["what"]
     ),
 )
 KEPT: Final = EventKind(

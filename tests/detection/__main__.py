@@ -48,15 +48,16 @@ def _judged(chosen: Sequence[str], options: argparse.Namespace) -> tuple[str, in
     kinds = [kind for kind in chosen if kind in KINDS]
     if not kinds:
         return None
-    report = measure(kinds, options.cases, options.seed, options.summaries, _show)
+    report = measure(kinds, options.cases, options.seed, _show, long=options.long)
     shown = "\n".join([*report.wrong, ""]) if options.wrong else ""
     missed = sum(bool(missed_goals(key, tally)) for key, tally in report.tallies.items())
+    missed += sum(map(bool, report.disagreed.values()))
     text = "\n".join([f"{shown}{render(report)}", "", *LEGEND])
-    return "\n\n".join([text, render_agreement(report)] if options.summaries else [text]), missed
+    return "\n\n".join([text, render_agreement(report)] if options.long else [text]), missed
 
 
 def _widened(chosen: Sequence[str], options: argparse.Namespace) -> tuple[str, int] | None:
-    if _WIDENED not in chosen or options.summaries:
+    if _WIDENED not in chosen or options.long:
         return None
     kinds = [kind for kind in chosen if kind in KINDS] or list(KINDS)
     report = measure_widened(kinds, options.cases, options.seed, _show)
@@ -66,14 +67,14 @@ def _widened(chosen: Sequence[str], options: argparse.Namespace) -> tuple[str, i
 
 
 def _travelled(chosen: Sequence[str], options: argparse.Namespace) -> tuple[str, int] | None:
-    if _TRAVELLED not in chosen or options.summaries:
+    if _TRAVELLED not in chosen or options.long:
         return None
     lines = list(measure_travelled(options.cases, options.seed, _show))
     return render_travelled(lines), sum(bool(each.missed) for each in lines)
 
 
 def _compared(chosen: Sequence[str], options: argparse.Namespace) -> tuple[str, int] | None:
-    if _PAIRS not in chosen or options.summaries:
+    if _PAIRS not in chosen or options.long:
         return None
     pairs = measure_pairs(options.seed, say=_show)
     return render_pairs(pairs), len(pairs.missed)
@@ -100,12 +101,9 @@ def _parser() -> argparse.ArgumentParser:
         "--kinds", nargs="+", choices=_ALL, metavar="KIND", help=f"only these: {', '.join(_ALL)}"
     )
     parser.add_argument(
-        "--summaries",
-        nargs="?",
-        const="long",
-        choices=("long", "purged"),
-        help="ask rows and summaries about the same: of runs that are too long to be read row by "
-        "row, or whose rows were purged",
+        "--long",
+        action="store_true",
+        help="long runs, each asked of its rows, of its chunks, and after its rows were purged",
     )
     parser.add_argument("--wrong", action="store_true", help="name each thing that was wrong")
     parser.add_argument("--check", action="store_true", help="fail below the goals")

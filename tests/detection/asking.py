@@ -121,14 +121,18 @@ def _asked(
 
 
 def claims_of(events: Iterable[Event], measure: Measure) -> list[Claim]:
-    """The events of a measure; what several signals of one array tell at once is one claim."""
+    """The events of a measure; what several signals of one array tell at once is one claim.
+
+    So is a standstill with the parts of it in which the robot was stuck.
+    """
     found: list[Claim] = []
     for claim in sorted(_claims(events, measure), key=lambda each: each.start_s):
         same = (at for at, each in enumerate(found) if _is_one(each, claim))
         if (at := next(same, None)) is None:
             found.append(claim)
         else:
-            found[at] = replace(found[at], end_s=max(found[at].end_s, claim.end_s))
+            end_s = max(found[at].end_s, claim.end_s)
+            found[at] = replace(found[at], end_s=end_s, source=claim.source)
     return found
 
 

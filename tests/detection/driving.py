@@ -24,7 +24,10 @@ _FINE_S: Final = 0.005
 _WHEEL_RADIUS_M: Final = 0.05
 _FORMS: Final = ("pose", "position", "gps", "odom")
 _EVIDENCE: Final = ("commanded", "wheels", "mode", "measured", "none")
-_TOLD: Final = ("commanded", "wheels")  # these show that it was told to stand
+_TOLD: Final = ("commanded", "wheels", "pushing")  # these show that it was told to stand
+_MODELESS: Final = ("pushing", "speed_alone", "nothing")  # nor is anything taken for a mode
+_UNTOLD: Final = ("none", "speed_alone", "nothing")  # these never show that it should move
+TWITCHES_M: Final = (0.005, 0.025)
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,9 @@ def driven(
         interval_s: Between two rows.
         noise_m: Standard deviation in each coordinate.
         evidence: What tells whether it should move: its commanded speed, its wheels' speeds, its
-            mode, a measured speed beside the mode, or none; None draws one of these.
+            mode, a measured speed beside the mode, or none; None draws one of these. Besides
+            there is a measured speed with noise, beside the mode ("noisy") or without one
+            ("speed_alone"), and what wheels are told beside what they do ("pushing").
         form: Under which name the position is published; None draws one.
     """
     evidence = evidence or str(rng.choice(_EVIDENCE))
@@ -91,8 +96,8 @@ def driven(
     noise = rng.normal(0, noise_m, (2, len(times)))
     columns = {
         **_position(form or str(rng.choice(_FORMS)), x + noise[0], y + noise[1], heading),
-        **_evidence(evidence, [phases[index] for index in at]),
-        **_unrelated(rng, len(times)),
+        **_evidence(rng, evidence, [phases[index] for index in at]),
+        **({} if evidence in _MODELESS else _unrelated(rng, len(times))),
     }
     incidents = _standstills(phases, interval_s, noise_m, evidence)
     return LabelledRun(times, columns, interval_s, tuple(incidents), noise_m, way_m)
@@ -137,11 +142,19 @@ def _position(form: str, x: Array, y: Array, heading: Array) -> dict[str, Any]:
     return {"odom": [{"x": a, "y": b, "theta": c} for (a, b), c in zip(places, yaw, strict=True)]}
 
 
-def _evidence(evidence: str, rows: Sequence[Phase]) -> dict[str, Any]:
+def _evidence(rng: np.random.Generator, evidence: str, rows: Sequence[Phase]) -> dict[str, Any]:
     """What is published of what the robot is told, and in which mode it is."""
     found: dict[str, Any] = {"mode": [row.mode for row in rows]}
-    if evidence == "none":
+    if evidence in ("none", "nothing"):
         return {}
+    if evidence == "pushing":
+        told = [round(row.told_m_s / _WHEEL_RADIUS_M, 4) for row in rows]
+        turned = [round(row.speed_m_s / _WHEEL_RADIUS_M, 4) for row in rows]
+        return {"cmd": [[each] * 2 for each in told], "wheels": [[each] * 2 for each in turned]}
+    if evidence in ("noisy", "speed_alone"):
+        noise_m_s = rng.normal(0, rng.uniform(0.002, 0.02), len(rows))
+        speeds = [row.speed_m_s + each for row, each in zip(rows, noise_m_s.tolist(), strict=True)]
+        return {"speed": speeds} | (found if evidence == "noisy" else {})
     if evidence == "commanded":
         found["commanded_m_s"] = [row.told_m_s for row in rows]
     if evidence == "wheels":
@@ -174,7 +187,7 @@ def _standstills(
     Standing while it turns is told or not, and is not stuck. Who stands at the end of a way in the
     same mode is stuck or has come: where the mode is all that is published, nobody can tell.
     """
-    known = evidence != "none"
+    known = evidence not in _UNTOLD
     driven_in = set() if evidence in _TOLD else {each.mode for each in phases if each.speed_m_s}
     found: list[Incident] = []
     start_s = 0.0
@@ -193,7 +206,7 @@ def _standstills(
             stop = Incident("standstill", start_s, end_s, optional=optional)
             found.append(replace(stop, begin_error_s=begin_s, end_error_s=last_s))
             come = not told and any(each.mode in driven_in for each in part)
-            if told or come or not known:
+            if evidence not in ("speed_alone", "nothing") and (told or come or not known):
                 unclear = optional or come or not known
                 found.append(Incident("stuck", start_s, end_s, optional=unclear))
         start_s, before = end_s, part[-1]
@@ -301,6 +314,82 @@ def draw_turning(rng: np.random.Generator) -> LabelledRun:
     return driven(rng, phases, interval_s, noise_m)
 
 
+def draw_noisy_speed(rng: np.random.Generator) -> LabelledRun:
+    """Stops that are meant, of a robot whose measured speed is noise of 2 to 20 mm/s then."""
+    interval_s, noise_m, speed = _setting(rng)
+    driving, resting = _modes(rng)
+    phases = drive_of(rng, float(rng.uniform(5, 12)), speed, driving)
+    while sum(each.duration_s for each in phases) < 150:
+        phases.append(phase(float(rng.uniform(4, 15)), 0.0, resting))
+        phases += drive_of(rng, float(rng.uniform(2, 15)), speed, driving)
+    return driven(rng, phases, interval_s, noise_m, str(rng.choice(["noisy", "speed_alone"])))
+
+
+def draw_pushing(rng: np.random.Generator) -> LabelledRun:
+    """Wheels that are told to turn and do not; in half of the cases it never moved before."""
+    interval_s, noise_m, speed = _setting(rng)
+    drive = drive_of(rng, 20.0, speed, "") if rng.random() < 0.5 else []
+    phases = [*drive, held(float(rng.uniform(20, 60)), speed, "")]
+    return driven(rng, phases, interval_s, noise_m, "pushing")
+
+
+def draw_twitching(rng: np.random.Generator) -> LabelledRun:
+    """A robot that stands and is told to drive after a while, which moves it by 5 and 25 mm."""
+    interval_s, noise_m, speed = _setting(rng)
+    driving, resting = _modes(rng)
+    waits_s, told_s, rests_s = (float(rng.uniform(*each)) for each in ((5, 40), (25, 50), (10, 40)))
+    drive = drive_of(rng, 20.0, speed, driving) if rng.random() < 0.5 else []
+    phases = [*drive, phase(waits_s, 0.0, resting), held(told_s, speed, resting)]
+    run = driven(
+        rng, [*phases, phase(rests_s, 0.0, resting)], interval_s, noise_m, "commanded", "pose"
+    )
+    told_from_s = sum(each.duration_s for each in drive) + waits_s
+    for share, far_m in zip((0.4, 0.95), TWITCHES_M, strict=True):
+        run = moved(run, int((told_from_s + share * told_s) / interval_s), (far_m, 0.0))
+    stuck = [each for each in run.incidents if each.measure == "stuck"]
+    stands = replace(stuck[0], measure="standstill", start_s=told_from_s - waits_s,
+                     end_s=float(run.times[-1]))  # fmt: skip
+    return replace(run, incidents=(stands, *stuck))
+
+
+def draw_hovering(rng: np.random.Generator) -> LabelledRun:
+    """A drone with a row a second or two between flights: it drifts by 5 cm about its place."""
+    interval_s, speed = float(rng.choice([0.5, 1.0])), float(rng.uniform(0.3, 1.0))
+    driving, resting = _modes(rng)
+    phases = drive_of(rng, 20.0, speed, driving)
+    while sum(each.duration_s for each in phases) < 300:
+        phases.append(phase(float(rng.uniform(30, 90)), 0.0, resting))
+        phases += drive_of(rng, 20.0, speed, driving)
+    evidence = str(rng.choice(["nothing", "noisy", "mode"]))
+    run = driven(rng, phases, interval_s, 0.005, evidence, "pose")
+    drift = rng.normal(0, 0.05 * 0.6, (len(run.times), 2))
+    for row in range(1, len(drift)):
+        drift[row] += 0.8 * drift[row - 1]
+    pose = [
+        [x + dx, y + dy, yaw]
+        for (x, y, yaw), (dx, dy) in zip(run.columns["pose"], drift.tolist(), strict=True)
+    ]
+    optional = tuple(
+        replace(each, optional=True) for each in run.incidents if each.measure == "standstill"
+    )
+    return replace(run, columns={**run.columns, "pose": pose}, incidents=optional)
+
+
+def moved(run: LabelledRun, first: int, by_m: tuple[float, float]) -> LabelledRun:
+    """The run with every position from that row on elsewhere."""
+    name = next(each for each in ("pose", "position", "gps", "odom") if each in run.columns)
+    places = [
+        _place(value, by_m) if at >= first else value for at, value in enumerate(run.columns[name])
+    ]
+    return replace(run, columns={**run.columns, name: places})
+
+
+def _place(value: Any, by_m: tuple[float, float]) -> Any:
+    if isinstance(value, dict):
+        return {**value, "x": value["x"] + by_m[0], "y": value["y"] + by_m[1]}
+    return [value[0] + by_m[0], value[1] + by_m[1], value[2]]
+
+
 def draw_rest(rng: np.random.Generator) -> LabelledRun:
     """Two minutes at rest."""
     interval_s, noise_m, _ = _setting(rng)
@@ -322,4 +411,8 @@ DRAWN: Final[dict[str, Callable[[np.random.Generator], LabelledRun]]] = {
     "turning": draw_turning,
     "rest": draw_rest,
     "drive": draw_drive,
+    "noisy_speed": draw_noisy_speed,
+    "pushing": draw_pushing,
+    "twitching": draw_twitching,
+    "hovering": draw_hovering,
 }

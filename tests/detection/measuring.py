@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final
 
 from tests.detection.asking import Answer, Claim, ask_run, ask_since
 from tests.detection.drawing import draw_case
 from tests.detection.judging import Tally, Verdict, judge
 from tests.detection.labelled import Case, Incident, LabelledRun, Measure, repeated
-from tests.detection.writing import purge, roll_up, write_all
+from tests.detection.writing import purge, put_in_chunks, write_all
 from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S
 
-Summaries = Literal["long", "purged"]
 Key = tuple[str, Measure, str]  # kind of recording, what is judged, under which conditions
 
 NOISY_M: Final = 0.01  # more noise than this has goals of its own
-LONG_ROWS: Final = 36_000  # longer than what any question reads row by row
-PART_ROWS: Final = 12_000  # of it, which then repeats; purging takes the first
+LONG_ROWS: Final = 12_000  # a dozen chunks
+LEFT_ROWS: Final = 3_000  # of them, when the others were purged
 MOST_ALONE: Final = 4  # incidents of a run that are asked about one by one
 AROUND_S: Final = 10.0  # before and after each
 _MOST_VALUES: Final = 0  # no further signals in long recordings: their rows cost enough
@@ -32,16 +31,16 @@ class Report:
     """What came of all cases.
 
     Attributes:
-        agreements: By kind of recording and what is judged: what rows and summaries both tell,
-            and what only the rows or only the summaries do.
+        disagreed: By kind of recording and what is judged: how many long runs were told otherwise
+            from chunks, or after their rows were purged, than from their rows.
         widened: By kind of recording and what is judged: what was told where only the time about
             it was asked for, and how much of that was told of the whole run too.
         wrong: A line for each thing that was missed or wrongly told.
     """
 
     tallies: dict[Key, Tally] = field(default_factory=dict[Key, Tally])
-    agreements: dict[tuple[str, Measure], tuple[int, int, int]] = field(
-        default_factory=dict[tuple[str, Measure], tuple[int, int, int]]
+    disagreed: dict[tuple[str, Measure], int] = field(
+        default_factory=dict[tuple[str, Measure], int]
     )
     widened: dict[tuple[str, Measure], tuple[int, int]] = field(
         default_factory=dict[tuple[str, Measure], tuple[int, int]]
@@ -57,11 +56,9 @@ class Report:
         tally.add(verdict, minutes, asked.answer.took_s, admitted=admitted)
         self.wrong += _lines(case, run, verdict, asked)
 
-    def add_agreement(self, key: tuple[str, Measure], told: Verdict) -> None:
-        """Count what summaries tell, judged by what rows tell."""
-        both, missing, more = self.agreements.get(key, (0, 0, 0))
-        new = (both + len(told.found), missing + len(told.missed), more + told.false)
-        self.agreements[key] = new
+    def add_agreement(self, key: tuple[str, Measure], *, agree: bool) -> None:
+        """Count whether a run was told alike however it is stored."""
+        self.disagreed[key] = self.disagreed.get(key, 0) + (not agree)
 
     def add_widened(self, key: tuple[str, Measure], *, of_whole: bool) -> None:
         """Count what was told when asked about alone."""
@@ -71,7 +68,7 @@ class Report:
 
 @dataclass(frozen=True)
 class Asked:
-    """What was asked about a run, and how: of rows, of summaries, or as it came."""
+    """What was asked about a run, and how it was stored: its rows, chunks, or chunks alone."""
 
     measure: Measure
     answer: Answer
@@ -82,60 +79,50 @@ def measure(
     kinds: Sequence[str],
     cases: int,
     seed: int,
-    summaries: Summaries | None = None,
     say: Callable[[str], None] = lambda text: None,
+    *,
+    long: bool = False,
 ) -> Report:
-    """Ask about so many cases of each kind."""
+    """Ask about so many cases of each kind, or about each as a long run in all ways of storing."""
     report = Report()
     for kind in kinds:
         for index in range(cases):
             say(f"{kind} {index + 1}/{cases}")
-            if summaries is None:
-                _measure_whole(draw_case(kind, seed, index), report)
+            if long:
+                _measure_long(draw_case(kind, seed, index, most_values=_MOST_VALUES), report)
             else:
-                case = draw_case(kind, seed, index, most_values=_MOST_VALUES)
-                _measure_long(case, summaries, report)
+                _measure_whole(draw_case(kind, seed, index), report)
     return report
 
 
 def _measure_whole(case: Case, report: Report) -> None:
-    """All runs of a case in one question; of every second case the summaries are made before."""
+    """All runs of a case in one question; every second case is put into chunks before."""
     with memory_connection() as connection:
         run_ids = write_all(connection, case.runs)
         if case.number % 2:
-            roll_up(connection)
+            put_in_chunks(connection)
         answer = ask_since(connection, case.asked, WALL_START_S)
     for run_id, run in zip(run_ids, case.runs, strict=True):
         for asked in (Asked(each, answer) for each in case.asked):
             _judge(case, run, run_id, asked, report)
 
 
-def _measure_long(case: Case, summaries: Summaries, report: Report) -> None:
-    """A long run, asked of all of its rows and of its summaries.
-
-    What happens often is told as one event that counts it, so that both are asked of the same time.
-    """
-    short = repeated(case.runs[-1], min(PART_ROWS, 4 * len(case.runs[-1].times)))
-    long = repeated(short, LONG_ROWS)
+def _measure_long(case: Case, report: Report) -> None:
+    """A long run, asked of its rows, of its chunks, and when most of its rows were purged."""
+    run = repeated(case.runs[-1], LONG_ROWS)
+    answers: dict[str, Answer] = {}
     with memory_connection() as connection, tempfile.TemporaryDirectory() as folder:
-        (run_id,) = write_all(connection, [long])
-        of_rows = ask_run(connection, case.asked, run_id)
-        roll_up(connection)
-        if summaries == "purged":
-            purge(connection, Path(folder), len(long.times) - len(short.times))
-        of_summaries = ask_run(connection, case.asked, run_id)
+        (run_id,) = write_all(connection, [run])
+        answers["rows"] = ask_run(connection, case.asked, run_id)
+        put_in_chunks(connection)
+        answers["chunks"] = ask_run(connection, case.asked, run_id)
+        purge(connection, Path(folder), LEFT_ROWS)
+        answers["purged"] = ask_run(connection, case.asked, run_id)
     for each in case.asked:
-        _judge(case, long, run_id, Asked(each, of_rows, "rows"), report)
-        _judge(case, long, run_id, Asked(each, of_summaries, summaries), report)
-        told = [_as_incident(claim) for claim in of_rows.of(each, run_id)]
-        # One event that counts many stands for itself, on both sides.
-        alike = [replace(claim, count=1) for claim in of_summaries.of(each, run_id)]
-        agreed = judge(told, alike, long.interval_s)
-        report.add_agreement((case.kind, each), agreed)
-
-
-def _as_incident(claim: Claim) -> Incident:
-    return Incident(claim.measure, claim.start_s, claim.end_s, claim.name)
+        for how, answer in answers.items():
+            _judge(case, run, run_id, Asked(each, answer, how), report)
+        told = [answer.of(each, run_id) for answer in answers.values()]
+        report.add_agreement((case.kind, each), agree=told[0] == told[1] == told[2])
 
 
 def measure_widened(

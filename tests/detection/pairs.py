@@ -13,7 +13,7 @@ from tests.detection.asking import claimed_differences, compared_edits, undecide
 from tests.detection.driving import drive_of, driven, phase
 from tests.detection.labelled import LabelledRun
 from tests.detection.sensing import sensors
-from tests.detection.writing import Writer, roll_up
+from tests.detection.writing import Writer, put_in_chunks
 from tests.memory import memory_connection
 from webots_mcp.store.questions.compare import Comparison
 
@@ -79,7 +79,7 @@ def _compared(seed: int, index: int, faster: float) -> Comparison:
             writer.begin_session(code)
             for _ in range(RUNS):
                 writer.write(_run(rng, SPEED_M_S * factor))
-        roll_up(connection)
+        put_in_chunks(connection)
         return compared_edits(connection)
 
 

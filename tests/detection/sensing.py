@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from tests.detection.driving import drive_of, driven, times_of
+from tests.detection.driving import drive_of, driven, moved, times_of
 from tests.detection.labelled import Flags, Incident, LabelledRun
 
 RANGE_M: Final = 2.0  # of the distance sensor: what it reads where it sees nothing
@@ -176,24 +176,9 @@ def draw_leaps(rng: np.random.Generator) -> LabelledRun:
         first = int(np.searchsorted(run.times, start_s))
         at_s = float(run.times[first])
         away = rng.uniform(0.5, 2.0, 2) * rng.choice([-1, 1], 2)
-        run = _moved(run, first, (float(away[0]), float(away[1])))
+        run = replace(moved(run, first, (float(away[0]), float(away[1]))), distance_m=None)
         run = with_incidents(run, Incident("leap", at_s, at_s))
     return run
-
-
-def _moved(run: LabelledRun, first: int, by_m: tuple[float, float]) -> LabelledRun:
-    """The run with every position from that row on elsewhere."""
-    name = next(each for each in ("pose", "position", "gps", "odom") if each in run.columns)
-    places = [
-        _place(value, by_m) if at >= first else value for at, value in enumerate(run.columns[name])
-    ]
-    return replace(run, columns={**run.columns, name: places}, distance_m=None)
-
-
-def _place(value: Any, by_m: tuple[float, float]) -> Any:
-    if isinstance(value, dict):
-        return {**value, "x": value["x"] + by_m[0], "y": value["y"] + by_m[1]}
-    return [value[0] + by_m[0], value[1] + by_m[1], value[2]]
 
 
 def draw_healthy(rng: np.random.Generator) -> LabelledRun:

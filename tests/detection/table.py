@@ -33,12 +33,9 @@ def render(report: Report) -> str:
 
 
 def render_agreement(report: Report) -> str:
-    """How far rows and summaries tell the same, whether true or not."""
-    head = ("recording", "judged", "both tell", "only rows", "only summaries")
-    counted = (
-        (*key, *map(str, counts)) for key, counts in report.agreements.items() if any(counts)
-    )
-    return _aligned([head, *counted])
+    """How many long runs were told otherwise of chunks or after a purge than of rows."""
+    head = ("recording", "judged", "told otherwise when stored otherwise")
+    return _aligned([head, *((*key, str(count)) for key, count in report.disagreed.items())])
 
 
 def render_widened(report: Report) -> str:

@@ -61,16 +61,15 @@ def test_an_unknown_kind_is_refused_with_those_that_there_are(
     assert refused.value.code == 2 and "gaps" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("summaries", ["long", "purged"])
-def test_rows_and_summaries_are_asked_about_the_same(
-    summaries: str, capsys: pytest.CaptureFixture[str]
+def test_a_long_run_is_told_alike_of_rows_of_chunks_and_after_a_purge(
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert main(["--kinds", "swing_gap", "--cases", "1", "--summaries", summaries]) == 0
+    assert main(["--kinds", "gaps", "--cases", "1", "--long", "--check"]) == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    gaps = {line[2]: line for line in lines if line[:2] == ["swing_gap", "gap"]}
-    truth = {name: line[4] for name, line in gaps.items() if len(line) > 4}
-    assert truth["rows"] == truth[summaries] != "0"  # as much happened in both
-    assert gaps["rows"][5] == "1.00"
+    gaps = {line[2]: line[3:] for line in lines if line[:2] == ["gaps", "gap"] and len(line) > 3}
+    assert gaps["rows"][1] != "0" and gaps["rows"][2] == "1.00"
+    assert gaps["rows"][:-2] == gaps["chunks"][:-2] == gaps["purged"][:-2]
+    assert ["gaps", "gap", "0"] in lines
 
 
 def test_what_is_told_of_a_stretch_is_looked_for_in_the_whole_run(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sqlite3
 from itertools import pairwise
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.detection import driving
 from tests.detection.asking import Answer, ask_since
 from tests.detection.drawing import KINDS, draw_case
 from tests.detection.judging import judge
@@ -16,6 +18,9 @@ from tests.detection.measuring import measure
 from tests.detection.writing import write_all
 from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S
+from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.reading.ranges import Scope, find_range
 
 _REPEATABLE = settings.default is not None and settings.default.derandomize
 EXAMPLES = 4 if _REPEATABLE else 100
@@ -46,6 +51,35 @@ def test_an_answer_keeps_to_the_recording_and_tells_nothing_twice(kind: str, see
     for before, after in pairwise(told):
         if (before.source, before.run_id) == (after.source, after.run_id):
             assert before.end_s <= after.start_s
+
+
+STANDING = EventOptions(kinds=("standstill", "stuck"))
+
+
+def stood(connection: sqlite3.Connection, *span_s: float) -> list[tuple[str, float, float]]:
+    """The kind, begin and end of what is told of all of the run, or of a part of it."""
+    bounds = dict(zip(("start_s", "end_s"), span_s, strict=False))
+    asked = find_range(connection, Scope(run_id=1, **bounds))  # pyright: ignore[reportArgumentType]
+    found = find_events(connection, asked, STANDING, limit=1000, around=(), group=False)
+    return [(each.kind, each.start_s, each.end_s) for each in found.events]
+
+
+@given(kind=st.sampled_from(list(driving.DRAWN)), seed=SEEDS, share=st.floats(0.0, 0.9))
+@settings(max_examples=4 * EXAMPLES, deadline=None)
+def test_a_robot_stood_as_long_whatever_part_of_its_run_is_asked_for(
+    kind: str, seed: int, share: float
+) -> None:
+    run = draw_case(kind, seed, 0, most_values=0).runs[-1]
+    with memory_connection() as connection:
+        write_all(connection, [run])
+        whole = stood(connection)
+        start_s = float(run.times[0]) + share * run.duration_s
+        for lasts_s in (0.5, 10.0, 60.0):
+            end_s = start_s + lasts_s
+            here = [each for each in whole if each[1] < end_s and each[2] >= start_s]
+            assert stood(connection, start_s, end_s) == here
+    for before, after in pairwise(sorted(whole, key=lambda each: each[1])):
+        assert before[2] <= after[1]  # none is told within another
 
 
 @given(kind=st.sampled_from(["gaps", "swing_gap"]), seed=SEEDS)

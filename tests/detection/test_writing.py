@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.detection.labelled import LabelledRun
-from tests.detection.writing import Writer, purge, roll_up, write_all
+from tests.detection.writing import Writer, purge, put_in_chunks, write_all
 from tests.memory import memory_connection
 
 TIMES = np.round(0.1 * np.arange(50, dtype=np.float64), 6)
@@ -46,7 +46,7 @@ def test_runs_of_a_session_follow_each_other_and_an_edit_begins_another() -> Non
 def test_of_purged_rows_the_summaries_stay(tmp_path: Path) -> None:
     with memory_connection() as connection:
         write_all(connection, [RUN])
-        roll_up(connection)
+        put_in_chunks(connection)
         purge(connection, tmp_path, 20)
         assert connection.execute("SELECT count(*) FROM state").fetchone() == (20,)
         found = connection.execute("SELECT sum(row_count) FROM chunk GROUP BY signal_id").fetchall()

@@ -63,15 +63,15 @@ def write_all(connection: sqlite3.Connection, runs: Sequence[LabelledRun]) -> li
     return [writer.write(run) for run in runs]
 
 
-def roll_up(connection: sqlite3.Connection) -> None:
-    """Make the summaries of all rows, as the maintainer does."""
+def put_in_chunks(connection: sqlite3.Connection) -> None:
+    """Put all rows of runs that are over into chunks, as the maintainer does."""
     while not make_chunks(connection, 100_000).done:
         pass
 
 
 def purge(connection: sqlite3.Connection, folder: Path, kept_rows: int) -> None:
-    """Let retention delete all but the newest rows; their summaries stay."""
-    limits = Retention(state=Limit(rows=kept_rows), outlive=0)
+    """Let retention delete all but the newest rows; their chunks stay."""
+    limits = Retention(state=Limit(rows=kept_rows))
     prune(connection, folder, limits, rest=False)
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.store.analysis.driving import noisy_track
 from webots_mcp.store.analysis.noise import noise_of, smooth
-from webots_mcp.store.analysis.track import path_length, path_length_m, track_of
+from webots_mcp.store.analysis.track import path_length, track_of
 
 DRIVE = [
     phase
@@ -48,7 +48,7 @@ def test_an_outlier_is_no_noise() -> None:
 def test_the_shortest_tracks_are_tracks(rows: int) -> None:
     times = np.arange(rows, dtype=np.float64)
     track = track_of(times, times, 0 * times)
-    assert path_length_m(track) == max(0, rows - 1)
+    assert path_length(track).length_m == max(0, rows - 1)
 
 
 @pytest.mark.parametrize("interval_s", INTERVALS_S)
@@ -57,7 +57,7 @@ def test_a_robot_at_rest_for_two_minutes_has_not_travelled(
     interval_s: float, noise_m: float
 ) -> None:
     track, _ = noisy_track([(120.0, 0.0, 0.0)], interval_s, noise_m)
-    assert path_length_m(track) <= (0.1 if noise_m <= 0.01 else 0.5)
+    assert path_length(track).length_m <= (0.1 if noise_m <= 0.01 else 0.5)
 
 
 @pytest.mark.parametrize("interval_s", INTERVALS_S)
@@ -66,7 +66,7 @@ def test_the_way_of_a_driving_robot_is_as_long_as_it_was(
     interval_s: float, noise_m: float, share: float
 ) -> None:
     track, length_m = noisy_track(DRIVE, interval_s, noise_m)
-    assert path_length_m(track) == pytest.approx(length_m, rel=share)
+    assert path_length(track).length_m == pytest.approx(length_m, rel=share)
 
 
 @given(st.integers(0, 50), st.floats(-100, 100), st.floats(-100, 100), st.floats(0, 6.28))
@@ -77,8 +77,8 @@ def test_the_length_of_a_way_hangs_neither_on_where_nor_on_whither(
     cos, sin = np.cos(angle), np.sin(angle)
     x = cos * track.raw_x - sin * track.raw_y + east_m
     y = sin * track.raw_x + cos * track.raw_y + north_m
-    elsewhere = path_length_m(track_of(track.times, x, y))
-    assert elsewhere == pytest.approx(path_length_m(track), rel=0.05)
+    elsewhere = path_length(track_of(track.times, x, y)).length_m
+    assert elsewhere == pytest.approx(path_length(track).length_m, rel=0.05)
 
 
 @pytest.mark.parametrize("noise_m", [0.0, 0.002, 0.005])
@@ -86,27 +86,27 @@ def test_in_bends_the_way_is_longer_than_the_straight_lines_between_its_rows(
     noise_m: float,
 ) -> None:
     track, length_m = noisy_track([(60.0, 0.3, 1.5)], 0.5, noise_m)
-    assert path_length_m(track) == pytest.approx(length_m, rel=0.015)
+    assert path_length(track).length_m == pytest.approx(length_m, rel=0.015)
 
 
 @pytest.mark.parametrize("noise_m", [0.002, 0.005, 0.02])
 def test_noise_across_the_way_adds_nothing_to_it(noise_m: float) -> None:
     track, length_m = noisy_track([(120.0, 0.25, 0.0)], 0.008, noise_m)
-    assert path_length_m(track) == pytest.approx(length_m, rel=0.008)
+    assert path_length(track).length_m == pytest.approx(length_m, rel=0.008)
 
 
 def test_narrow_bends_of_a_slow_robot_are_no_turns_on_the_spot() -> None:
     """At 30 mm of noise a leg between two places that differ is a second long: 1.5 rad of turn."""
     bends = [(4.0, 0.16, 1.5), (3.0, 0.16, 0.0), (4.0, 0.16, -1.5), (2.0, 0.16, 0.5)] * 9
     tracks = [noisy_track(bends, 0.5, 0.03, seed) for seed in range(8)]
-    ratios = [path_length_m(track) / length_m for track, length_m in tracks]
+    ratios = [path_length(track).length_m / length_m for track, length_m in tracks]
     assert float(np.median(ratios)) == pytest.approx(1.0, abs=0.05)
 
 
 @pytest.mark.parametrize("noise_m", [0.005, 0.01, 0.03])
 def test_of_many_robots_at_rest_hardly_one_is_said_to_have_moved(noise_m: float) -> None:
     tracks = [noisy_track([(120.0, 0.0, 0.0)], 0.008, noise_m, seed)[0] for seed in range(15)]
-    moved_m = [path_length_m(track) for track in tracks]
+    moved_m = [path_length(track).length_m for track in tracks]
     assert np.count_nonzero(moved_m) <= 1
 
 
@@ -134,7 +134,7 @@ def test_slow_ways_without_narrow_bends_are_as_long_as_they_were(
 ) -> None:
     turns = [(10.0, speed_m_s, turn) for turn in (0.0, 0.1, 0.0, -0.1)] * 3
     track, length_m = noisy_track(turns, interval_s, 0.03)
-    assert path_length_m(track) == pytest.approx(length_m, rel=0.05)
+    assert path_length(track).length_m == pytest.approx(length_m, rel=0.05)
 
 
 @pytest.mark.parametrize(("speed_m_s", "interval_s"), [(0.03, 0.08), (0.05, 0.08), (0.1, 0.5)])
@@ -144,7 +144,7 @@ def test_most_of_the_bends_that_noise_hides_are_counted(
     """Circles with a radius of 20 to 67 mm at 30 mm of noise: places alone show 0.6 to 0.8."""
     bends = [(5.0, speed_m_s, turn) for turn in (0.0, 1.5, 0.5, -1.5)] * 6
     tracks = [noisy_track(bends, interval_s, 0.03, seed) for seed in range(8)]
-    ratios = [path_length_m(track) / length_m for track, length_m in tracks]
+    ratios = [path_length(track).length_m / length_m for track, length_m in tracks]
     assert 0.85 < float(np.median(ratios)) < 1.05
 
 
@@ -152,6 +152,6 @@ def test_most_of_the_bends_that_noise_hides_are_counted(
 def test_who_drove_and_then_rested_travels_no_farther_meanwhile(interval_s: float) -> None:
     phases = [(10.0, 0.3, 0.0), (110.0, 0.0, 0.0)]
     tracks = [noisy_track(phases, interval_s, 0.03, seed)[0] for seed in range(15)]
-    lengths_m = [path_length_m(track) for track in tracks]
+    lengths_m = [path_length(track).length_m for track in tracks]
     assert float(np.median(lengths_m)) == pytest.approx(3.0, rel=0.05)
     assert max(lengths_m) < 3.5

@@ -33,6 +33,7 @@ def test_a_text_now_and_then_among_numbers_hides_no_change_of_the_mode(
         mixed = "n/a" if 100 <= step < 120 else step * 0.25
         mode = "drive" if step < 50 else "return"
         recorder.publish(step * 0.1, {"mode": mode, "mixed": mixed})
+    recorder.end_run("finished")
     make_chunks(empty, 100_000)
     found = changes(empty)
     assert [(each.name, round(each.start_s, 1)) for each in found.events] == [

@@ -32,7 +32,7 @@ def _standing() -> Iterator[sqlite3.Connection]:
 
 
 @pytest.fixture
-def standing(_standing: sqlite3.Connection, looked_at: str) -> sqlite3.Connection:
+def standing(_standing: sqlite3.Connection) -> sqlite3.Connection:
     return _standing
 
 
@@ -103,7 +103,7 @@ def test_two_limits_on_one_signal_are_two_events(standing: sqlite3.Connection) -
 
 
 def test_a_signal_that_few_rows_of_the_run_hold_is_not_silent_in_the_others(
-    empty: sqlite3.Connection, looked_at: str
+    empty: sqlite3.Connection,
 ) -> None:
     recorder = start_run(empty)
     for step in range(2000):
@@ -127,7 +127,6 @@ def after_so_many_rows(recorder: Recorder, connection: sqlite3.Connection, rows:
     for step in range(first, rows):
         state = {"pose": [step * 0.02, 0.0], "mode": "drive", "text": f"row {step}", "none": None}
         recorder.publish(step * 0.1, state)
-    make_chunks(connection, 100_000)
     make_chunks(connection, 100_000)
     return calls(connection)
 

@@ -9,7 +9,6 @@ import pytest
 
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.grouping import grouped
 from webots_mcp.store.detection.stored import MOST_CHANGES
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.reading.ranges import Scope, find_range
@@ -74,18 +73,6 @@ def test_a_flag_that_flickers_is_one_event_with_its_values(docking: Recorder) ->
     assert near.details["to"] == {"false": "667 times, 133.2 s", "true": "666 times, 66.6 s"}
     assert told.verdicts.not_searched == {}
     assert told.verdicts.found["change"] == sum(each.count for each in told.events)
-
-
-def test_a_group_says_how_exactly_its_begins_are_known() -> None:
-    rough = {"within_s": 0.6}
-    events = [
-        Event(
-            "silent", 1, at_s, at_s + 9.0, 0.0, "front", details=rough if at_s else {"mode": "dock"}
-        )
-        for at_s in (0.0, 20.0, 40.0, 60.0)
-    ]
-    (group,) = grouped(events, {})
-    assert (group.count, group.details["within_s"]) == (4, 0.6)
 
 
 def test_a_mode_that_changes_now_and_then_is_told_change_by_change(

@@ -43,14 +43,14 @@ def flight(time_s: float) -> dict[str, Any]:
 
 
 def test_a_drone_that_climbs_or_sinks_does_not_stand_still(
-    empty: sqlite3.Connection, looked_at: str
+    empty: sqlite3.Connection,
 ) -> None:
     (hovers,) = ask(empty, flight).events
     assert (hovers.start_s, hovers.end_s) == pytest.approx((10.0, 20.0), abs=0.3)
 
 
 def test_a_drone_that_hovers_with_noise_and_a_little_drift_in_its_height_stands(
-    empty: sqlite3.Connection, looked_at: str
+    empty: sqlite3.Connection,
 ) -> None:
     noise = np.random.default_rng(1).normal(0, 0.01, 600)
 
@@ -173,7 +173,7 @@ def test_who_stands_while_rows_come_seldom_stands(empty: sqlite3.Connection) -> 
     [("x_mm", "y_mm", 1000), ("x_cm", "y_cm", 100), ("odom.x_mm", "odom.y_mm", 1000)],
 )
 def test_a_position_in_another_unit_is_understood_by_its_name(
-    empty: sqlite3.Connection, looked_at: str, x: str, y: str, per_m: float
+    empty: sqlite3.Connection, x: str, y: str, per_m: float
 ) -> None:
     def drives_then_stands(time_s: float) -> dict[str, Any]:
         return {x: 0.02 * min(30.0, time_s) * per_m, y: 0.0}
@@ -196,7 +196,7 @@ def test_who_turns_in_place_is_not_stuck_in_degrees_either(empty: sqlite3.Connec
 
 @pytest.mark.parametrize("period_s", [0.8, 2.0, 5.0])
 def test_who_goes_to_and_fro_in_a_place_is_not_stuck(
-    empty: sqlite3.Connection, looked_at: str, period_s: float
+    empty: sqlite3.Connection, period_s: float
 ) -> None:
     def drives_then_sways(time_s: float) -> dict[str, Any]:
         swing = math.sin(math.tau * (time_s - 30) / period_s) if time_s > 30 else 0.0
@@ -209,7 +209,7 @@ def test_who_goes_to_and_fro_in_a_place_is_not_stuck(
     assert "it moved back and forth within 0.06 m" in still.details["why_not_stuck"]
 
 
-def test_who_trembles_at_a_wall_is_stuck(empty: sqlite3.Connection, looked_at: str) -> None:
+def test_who_trembles_at_a_wall_is_stuck(empty: sqlite3.Connection) -> None:
     def drives_then_pushes(time_s: float) -> dict[str, Any]:
         trembling_m = 0.002 * math.sin(40 * time_s) if time_s > 30 else 0.0
         x_m = 0.2 * min(30.0, time_s) + trembling_m

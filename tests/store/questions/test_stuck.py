@@ -167,8 +167,8 @@ def test_a_mode_that_was_not_looked_at_in_time_is_not_said_to_be_one_in_which_it
     asked = find_range(empty, Scope(run_id=1))
     motion = find_motion(known_signals(empty, asked), EventOptions())
     frame = read_frame(empty, asked.segments[0], Deadline(math.inf))
-    uses = ModeUses(1, motion, frames_of_runs(empty, 1, Deadline(0.0)), EventOptions())
-    (standstill,) = judge_standstills(frame, motion, EventOptions(), uses).events
+    uses = ModeUses(1, motion, frames_of_runs(empty, frame, Deadline(0.0)), EventOptions())
+    standstill, _ = judge_standstills(frame, motion, EventOptions(), uses).events
     why = standstill.details["why_not_stuck"]
     assert why == "not checked whether it moves in mode go: time limit reached"
 

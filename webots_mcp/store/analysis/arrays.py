@@ -23,17 +23,12 @@ else:
 
     np = _AtFirstUse()
 
-__all__ = ["Array", "Flags", "Indexes", "inner", "mean", "median", "np", "sums_of"]
+__all__ = ["Array", "Flags", "Indexes", "inner", "median", "np", "sums_of"]
 
 
 def inner(one: Array, other: Array) -> float:
     """The sum of products, without the threads of `@`, which wait for each other actively."""
     return float(np.einsum("i,i->", one, other))
-
-
-def mean(values: Array) -> float:
-    """That of all items, as numpy's, for few of them in less time."""
-    return float(values.sum()) / values.size
 
 
 def median(values: Array) -> float:

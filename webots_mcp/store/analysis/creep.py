@@ -15,7 +15,8 @@ SAME_COURSE: Final = 1.25  # times the noise: the residual of a motion that expl
 REST_SHARE: Final = 0.5  # of the speed next to it: a part that is certainly slower is a rest
 CERTAINLY_SLOWER: Final = 3.0  # standard errors: the ramps next to it are certain already
 # So many times its own length before and after a stretch is looked for the same motion.
-_AROUND: Final = ((1, 1), (0.5, 0.5), (0, 2), (2, 0), (3, 3), (0, 5), (5, 0))
+_AROUND: Final = ((1, 1), (0, 5), (5, 0))
+MOST_AROUND: Final = 5
 _MEANS: Final = 30  # of neighbouring rows, that a line is laid through
 _FINE_MEANS: Final = 120  # in which a rest is looked for
 _BORDERS: Final = 25  # at which a rest between two ramps may begin and end
@@ -164,10 +165,7 @@ def _rests_among(count: int) -> tuple[Indexes, Indexes, Array]:
     firsts = np.concatenate((firsts, inner, nothing))
     lasts = np.concatenate((lasts, all_of_it, inner))
     times = np.arange(count, dtype=np.float64)
-    ramps = (
-        np.minimum(times - firsts[:, None], 0.0),
-        np.maximum(times - lasts[:, None] + 1, 0.0),
-    )
+    ramps = (np.minimum(times - firsts[:, None], 0.0), np.maximum(times - lasts[:, None] + 1, 0.0))
     left, sizes, _ = np.linalg.svd(
         np.stack((np.ones_like(ramps[0]), *ramps), axis=-1), full_matrices=False
     )

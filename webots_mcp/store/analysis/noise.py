@@ -10,7 +10,6 @@ _ORDER: Final = 4
 # The fourth difference of independent noise has sqrt(1 + 16 + 36 + 16 + 1) = sqrt(70) times its
 # standard deviation, and a normal variable has a median magnitude of 0.6745 of it.
 _GAIN: Final = 0.6745 * 70**0.5
-_BLOCK_ROWS: Final = 128
 LEAST_ROWS: Final = 3 * _ORDER
 FEWEST_SMOOTHED: Final = 5  # rows: through fewer a parabola leaves the noise
 
@@ -24,31 +23,8 @@ def noise_of(values: Array) -> float:
     Biometrika 73, 1986, of which this is the robust form with a higher order). 0 for fewer than
     12 values.
     """
-    return Roughness(values).noise()
-
-
-class Roughness:
-    """The fourth differences of values, for the noise of many parts of them."""
-
-    def __init__(self, values: Array) -> None:
-        self._count = len(values)
-        self._sizes: Array = np.abs(np.diff(values, _ORDER))
-
-    def noise(self, start: int = 0, end: int | None = None) -> float:
-        """As `noise_of` the values [start, end)."""
-        last = (self._count if end is None else end) - _ORDER
-        sizes = self._sizes[start : max(start, last)]
-        return median(sizes) / _GAIN if len(sizes) >= LEAST_ROWS - _ORDER else 0.0
-
-    def local_noise(self) -> Array:
-        """The noise about each of the values, the least of those in the stretches around it."""
-        blocks = len(self._sizes) // _BLOCK_ROWS
-        if blocks < 2:
-            return np.full(self._count, self.noise())
-        parts: Array = np.reshape(self._sizes[: blocks * _BLOCK_ROWS], (blocks, _BLOCK_ROWS))
-        padded: Array = np.pad(np.median(parts, axis=1) / _GAIN, 1, mode="edge")
-        least = np.minimum(np.minimum(padded[:-2], padded[1:-1]), padded[2:])
-        return least[np.minimum(np.arange(self._count) // _BLOCK_ROWS, blocks - 1)]
+    sizes = np.abs(np.diff(values, _ORDER))
+    return median(sizes) / _GAIN if len(sizes) >= LEAST_ROWS - _ORDER else 0.0
 
 
 def smooth(values: Array, rows: int) -> tuple[Array, float]:
@@ -59,11 +35,10 @@ def smooth(values: Array, rows: int) -> tuple[Array, float]:
     Chemistry 36, 1964): a bend that is long compared to the window is kept. At the ends the
     parabola through the first or last window is taken.
     """
-    rows = _fitting(rows, len(values))
+    rows = min(rows, len(values) - 1 + len(values) % 2)
     if rows < FEWEST_SMOOTHED:
         return values, 1.0
-    fit = _parabola(rows)
-    half = rows // 2
+    fit, half = _parabola(rows), rows // 2
     smoothed = np.asarray(np.convolve(values, fit[half, ::-1], "same"), np.float64)
     smoothed[:half] = (fit @ values[:rows])[:half]
     smoothed[-half:] = (fit @ values[-rows:])[-half:]
@@ -75,18 +50,12 @@ def variance_along(count: int, rows: int) -> Array:
 
     The parabola is less certain at the ends: there it is up to four times as much.
     """
-    variance = np.ones(count)
-    rows = _fitting(rows, count)
+    variance, rows = np.ones(count), min(rows, count - 1 + count % 2)
     if rows >= FEWEST_SMOOTHED:
         fit, half = _parabola(rows), rows // 2
         ratios = np.einsum("ij,ij->i", fit, fit) / (fit[half] @ fit[half])
         variance[:half], variance[-half:] = ratios[:half], ratios[-half:]
     return variance
-
-
-def _fitting(rows: int, count: int) -> int:
-    """An odd number of rows that are not more than there are."""
-    return min(rows, count - 1 + count % 2)
 
 
 def kept_alike(rows: int) -> Array:

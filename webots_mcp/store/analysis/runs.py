@@ -41,9 +41,8 @@ class Runs:
 
     def only(self, wanted: Flags) -> Runs:
         """Some of them."""
-        return Runs(
-            self.starts[wanted], self.stops[wanted], self.starts_s[wanted], self.ends_s[wanted]
-        )
+        rows, times = (self.starts[wanted], self.stops[wanted]), (self.starts_s, self.ends_s)
+        return Runs(*rows, times[0][wanted], times[1][wanted])
 
     def each(self) -> Iterator[Run]:
         """One by one."""
@@ -57,25 +56,24 @@ class Runs:
 def runs_of(holds: Flags, times: Array) -> Runs:
     """Where something holds in each row."""
     edges = np.flatnonzero(np.diff(holds, prepend=False, append=False))
-    return runs_between(edges[::2], edges[1::2], times)
+    return _runs(edges[::2], edges[1::2], times)
 
 
-def runs_between(starts: Indexes, stops: Indexes, times: Array) -> Runs:
-    """Given their rows [start, stop)."""
+def _runs(starts: Indexes, stops: Indexes, times: Array) -> Runs:
     return Runs(starts, stops, times[starts], times[stops - 1])
 
 
 def extremes_in(runs: Runs, numbers: Array) -> tuple[Array, Array]:
     """The least and the greatest number of each run, given those of all rows."""
-    edges, padded = np.stack((runs.starts, runs.stops), 1).ravel(), np.append(numbers, 0.0)
-    if not len(edges):
+    if not len(runs):
         return np.zeros(0), np.zeros(0)
+    edges, padded = np.stack((runs.starts, runs.stops), 1).ravel(), np.append(numbers, 0.0)
     return np.minimum.reduceat(padded, edges)[::2], np.maximum.reduceat(padded, edges)[::2]
 
 
-def runs_alike(numbers: Array, times: Array, least_rows: int = 2) -> Runs:
-    """Where a number stays exactly the same; NaN is never the same."""
+def runs_alike(numbers: Array, times: Array) -> Runs:
+    """Where a number stays exactly the same in two rows at least; NaN is never the same."""
     edges = np.flatnonzero(np.append(True, numbers[1:] != numbers[:-1]))
     stops = np.append(edges[1:], len(numbers))
-    long = (stops - edges >= least_rows) if len(numbers) else np.zeros(1, np.bool_)
-    return runs_between(edges[long], stops[long], times)
+    long = stops - edges >= 2
+    return _runs(edges[long], stops[long], times)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, median, np
-from webots_mcp.store.analysis.creep import Rows, is_creep, rest_within
+from webots_mcp.store.analysis.creep import MOST_AROUND, Rows, is_creep, rest_within
 from webots_mcp.store.analysis.track import Track
 
 WIDENED_BY: Final = 5.0  # a place is at least so many deviations of the smoothed position wide
@@ -18,7 +17,7 @@ UNSEEN_SLOPE: Final = 3.0  # deviations: a speed that is less may be noise alone
 _SAMPLES: Final = 12  # of the shortest standstill: so finely places are compared at first
 _NEAR_SHARE: Final = 0.9  # of the shortest standstill that it has to stay within the radius
 _LEAST_RAMP_ROWS: Final = 4
-_MOST_RAMP_ROWS: Final = 2**14
+_MOST_RAMP_ROWS: Final = 2**12
 _AGREEING: Final = 3.0  # standard deviations: ends of one ramp in more and more rows
 _RAMP_SHARE: Final = 0.75  # of the smoothed rows: so far a ramp is looked for at first
 _REST_SHARE: Final = 4  # times as many rows as the ramp's tell the place of the rest after it
@@ -28,20 +27,23 @@ _ROUNDING_M: Final = 1e-6
 _MOST_AT_ONCE: Final = 2**20  # positions
 
 
-@dataclass(frozen=True)
-class Standstill:
+class Standstill(NamedTuple):
     """A robot stayed about one place.
 
     Attributes:
         start: Index of the first row in which it stood; `last` of the last one.
         x_m: Where: the mean of its positions.
         y_m: As well.
+        seen_from: Index of the first row that bears on all that; `seen_to` of the last one. They
+            may lie beyond the rows that there are: then more rows might tell something else.
     """
 
     start: int
     last: int
     x_m: float
     y_m: float
+    seen_from: int
+    seen_to: int
 
 
 def find_standstills(track: Track, radius_m: float, least_s: float) -> list[Standstill]:
@@ -60,12 +62,29 @@ def find_standstills(track: Track, radius_m: float, least_s: float) -> list[Stan
     if not len(stays):
         return []
     rows = Rows(track)
-    firsts, lasts = _resting(track, rows, grid, stays, radius_m)
+    firsts, lasts, of = _resting(track, rows, grid, stays, radius_m)
     starts = _begins_of_rest(track, firsts, lasts, grid.rows)
     newest = len(track.times) - 1
     ends = newest - _begins_of_rest(track.reversed, newest - lasts, newest - firsts, grid.rows)
-    long_enough = track.times[ends] - track.times[starts] >= NEARLY * least_s
-    return _joined(track, rows, starts[long_enough], ends[long_enough], grid.rows, radius_m)
+    long = track.times[ends] - track.times[starts] >= NEARLY * least_s
+    seen = _seen(track, grid, stays)[of[long]]
+    near_m = SETTLED_SHARE * radius_m + 3 * track.left_m
+    return _joined(track, rows, starts[long], ends[long], seen, grid.rows, near_m)
+
+
+def _seen(track: Track, grid: _Grid, stays: Indexes) -> Indexes:
+    """The first and the last row that bear on each stay, which may lie beyond those of the track.
+
+    Where stays follow each other at once, each begins where the one before ended. About each it is
+    looked for a motion, in so many times its length, and for ramps.
+    """
+    follows = np.append(False, stays[1:, 0] - stays[:-1, 1] <= grid.window)
+    chain, heads = np.cumsum(~follows) - 1, np.flatnonzero(~follows)
+    ends = np.stack((stays[heads, 0], stays[np.append(heads[1:], len(stays)) - 1, 1]), axis=1)
+    rows = np.searchsorted(track.times, grid.times[np.minimum(ends, len(grid.times) - 1)])[chain]
+    around = grid.rows * np.maximum(MOST_AROUND * np.diff(stays), 2 * grid.window)
+    margins = np.maximum(around, _MOST_RAMP_ROWS) * np.array([-1, 1])
+    return np.asarray(rows + margins, np.intp)
 
 
 def shortest_seen_s(noise_m: float, interval_s: float, radius_m: float, least_s: float) -> float:
@@ -79,7 +98,7 @@ def shortest_seen_s(noise_m: float, interval_s: float, radius_m: float, least_s:
 
 
 class _Grid(NamedTuple):
-    """Smoothed positions at even times.
+    """Smoothed positions at even times, which are multiples of the step in any part of a way.
 
     Attributes:
         window: How many of them a standstill lasts at least.
@@ -96,12 +115,12 @@ class _Grid(NamedTuple):
 def _grid_of(track: Track, least_s: float) -> _Grid:
     interval_s = median(np.diff(track.times))
     step_s = max(least_s / _SAMPLES, interval_s)
-    lasts_s = float(track.times[-1] - track.times[0])
-    times = track.times[0] + step_s * np.arange(int(lasts_s / step_s * (1 + 1e-9)) + 1)
-    places: list[Array] = [np.interp(times, track.times, each) for each in (track.x, track.y)]
+    first, last = track.times[[0, -1]] / step_s
+    steps = np.arange(math.ceil(first * (1 - 1e-9)), int(last * (1 + 1e-9)) + 1, dtype=np.float64)
+    times: Array = step_s * steps
+    x, y = (np.interp(times, track.times, each) for each in (track.x, track.y))
     window = max(2, math.ceil(_NEAR_SHARE * least_s / step_s))
-    rows = math.ceil(step_s / interval_s) if interval_s else 1
-    return _Grid(times, places[0], places[1], window, rows)
+    return _Grid(times, x, y, window, math.ceil(step_s / interval_s) if interval_s else 1)
 
 
 def _stays(grid: _Grid, radius_m: float) -> Iterator[tuple[int, int]]:
@@ -132,31 +151,34 @@ def _stays(grid: _Grid, radius_m: float) -> Iterator[tuple[int, int]]:
 
 def _resting(
     track: Track, rows: Rows, grid: _Grid, stays: Indexes, radius_m: float
-) -> tuple[Indexes, Indexes]:
+) -> tuple[Indexes, Indexes, Indexes]:
     """About the first and the last row of the rest in each stay in which it does not only creep.
 
     It begins near the place of the first seconds and ends near that of the last: a robot that
-    twitched in between stands elsewhere.
+    twitched in between stands elsewhere. With them, of which of the stays they are.
     """
     limit_m = max(SETTLED_SHARE * radius_m, 3 * track.left_m)
     first = stays[:, 0] + _settled(grid, stays[:, :1] + np.arange(grid.window), limit_m)
     last = stays[:, 1] - 1 - _settled(grid, stays[:, 1:] - 1 - np.arange(grid.window), limit_m)
-    edges = np.searchsorted(track.times, grid.times[stays % len(grid.times)])
-    edges[stays == len(grid.times)] = newest = len(track.times)
     firsts = np.searchsorted(track.times, grid.times[first])
     lasts = np.searchsorted(track.times, grid.times[last], "right") - 1
     # At the ends of the track smoothing leaves more of the noise.
-    slack = track.smoothed_rows // 2 + grid.rows
-    firsts[(edges[:, 0] == 0) & (firsts <= slack)] = 0
-    lasts[(edges[:, 1] == newest) & (lasts >= newest - 1 - slack)] = newest - 1
-    rests = [
-        rest_within(rows, *_touching(edges, at)) or rest_within(rows, *edges[at].tolist())
-        if creeps
-        else (int(firsts[at]), int(lasts[at]) + 1)
-        for at, creeps in enumerate(is_creep(rows, firsts, lasts + 1, radius_m))
-    ]
-    known = _pairs([rest for rest in rests if rest])
-    return known[:, 0], known[:, 1] - 1
+    newest, slack = len(track.times) - 1, track.smoothed_rows // 2 + grid.rows
+    firsts[(stays[:, 0] == 0) & (firsts <= slack)] = 0
+    lasts[(stays[:, 1] == len(grid.times)) & (lasts >= newest - slack)] = newest
+    creeps = is_creep(rows, firsts, lasts + 1, radius_m)
+    edges = np.searchsorted(track.times, np.append(grid.times, np.inf)[stays])
+    touching = np.append(edges[1:, 0] == edges[:-1, 1], False)
+    for at in np.flatnonzero(creeps).tolist():
+        # With those right before and after it: between them it can only have crept.
+        start, end = (
+            edges[at - 1 if at and touching[at - 1] else at, 0],
+            edges[at + touching[at], 1],
+        )
+        if rest := rest_within(rows, start, end) or rest_within(rows, *edges[at].tolist()):
+            firsts[at], lasts[at], creeps[at] = rest[0], rest[1] - 1, False
+    of = np.flatnonzero(~creeps)
+    return firsts[of], lasts[of], of
 
 
 def _pairs(ranges: Sequence[tuple[int, int]]) -> Indexes:
@@ -171,40 +193,29 @@ def _settled(grid: _Grid, window: Indexes, limit_m: float) -> Indexes:
     return np.argmax(away_m2 <= limit_m**2, axis=1)
 
 
-def _touching(edges: Indexes, at: int) -> tuple[int, int]:
-    """A stay with those right before and after it: between them it can only have crept."""
-    start, end = edges[at].tolist()
-    if at and edges[at - 1, 1] == start:
-        start = int(edges[at - 1, 0])
-    if at + 1 < len(edges) and edges[at + 1, 0] == end:
-        end = int(edges[at + 1, 1])
-    return start, end
-
-
 def _joined(
-    track: Track, rows: Rows, starts: Indexes, ends: Indexes, slack: int, radius_m: float
+    track: Track,
+    rows: Rows,
+    starts: Indexes,
+    ends: Indexes,
+    seen: Indexes,
+    slack: int,
+    far_m: float,
 ) -> list[Standstill]:
     """Each standstill once: who creeps up to a place leaves a stay there, and stands on."""
     found: list[Standstill] = []
     _, _, x, y = (each[:, 0] for each in rows.means(starts, ends + 1, 1))
-    near_m = SETTLED_SHARE * radius_m + 3 * track.left_m
-    for at in np.lexsort((ends, starts)).tolist():
-        start, end, x_m, y_m = (
-            int(starts[at]),
-            int(ends[at]),
-            round(float(x[at]), 6),
-            round(float(y[at]), 6),
-        )
-        new = Standstill(start, end, x_m, y_m)
-        before = found[-1] if found else None
-        if (
-            before
-            and start - before.last <= track.smoothed_rows + slack
-            and (start <= before.last or math.hypot(before.x_m - x_m, before.y_m - y_m) <= near_m)
-        ):
-            found[-1] = Standstill(before.start, max(end, before.last), before.x_m, before.y_m)
-        else:
-            found.append(new)
+    columns = (starts, ends, np.round(x, 6), np.round(y, 6), *np.transpose(seen))
+    new = sorted(map(Standstill, *(each.tolist() for each in columns)))
+    for each in new:
+        was = found[-1] if found else each
+        apart_m = math.hypot(was.x_m - each.x_m, was.y_m - each.y_m) * (each.start > was.last)
+        if not found or apart_m > far_m or each.start - was.last > track.smoothed_rows + slack:
+            found.append(each)
+            continue
+        seen_from, seen_to = min(was.seen_from, each.seen_from), max(was.seen_to, each.seen_to)
+        last = max(each.last, was.last)
+        found[-1] = was._replace(last=last, seen_from=seen_from, seen_to=seen_to)
     return found
 
 

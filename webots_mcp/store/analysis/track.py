@@ -23,6 +23,7 @@ GAP_NOISE: Final = 7.0  # deviations of the position: so far it went at least du
 FINEST_LEG_M: Final = 0.02  # smoothing that makes legs so short is enough
 SHARPEST_ARC_RAD: Final = 2.7  # from leg to leg; who turns farther went back
 LONGEST_SMOOTHING_S: Final = 1.2  # a turn of 1.5 rad/s is cut by 0.7 % then, by 5 % in 2 s
+_PLACES: Final = ("x", "y", "raw_x", "raw_y")
 _PARABOLA_GAIN: Final = 2.25  # the variance that a parabola over n rows leaves is 2.25 / n of it
 
 
@@ -49,27 +50,30 @@ class Track:
     @property
     def reversed(self) -> Track:
         """The same way, gone backwards in time."""
-        return replace(
-            self,
-            times=-self.times[::-1],
-            x=self.x[::-1],
-            y=self.y[::-1],
-            raw_x=self.raw_x[::-1],
-            raw_y=self.raw_y[::-1],
-        )
+        places = {name: getattr(self, name)[::-1] for name in _PLACES}
+        return replace(self, times=-self.times[::-1], **places)
+
+    def part(self, start: int, stop: int) -> Track:
+        """Some of its rows."""
+        columns = {name: getattr(self, name)[start:stop] for name in ("times", *_PLACES)}
+        return replace(self, **columns)
 
 
-def track_of(times: Array, x: Array, y: Array, noise_m: float | None = None) -> Track:
+def track_of(
+    times: Array, x: Array, y: Array, noise_m: float | None = None, of_rows: int | None = None
+) -> Track:
     """Estimate the noise of a position and smooth it by no more than that asks for.
 
     Args:
         times: Seconds; they do not fall.
         x: Metres, finite, and so is `y`.
         y: As many.
-        noise_m: Where it is known from other rows: between samples far apart, turns look like it.
+        noise_m: Where it is known from other rows.
+        of_rows: How many rows there are in all, where these are some of them: with both, a part of
+            a way is smoothed as the whole is.
     """
     noise_m = position_noise_m(x, y) if noise_m is None else noise_m
-    rows = _smoothing_rows(times, noise_m)
+    rows = _smoothing_rows(times, noise_m, of_rows or len(times))
     (smooth_x, gain), (smooth_y, _) = smooth(x, rows), smooth(y, rows)
     return Track(times, smooth_x, smooth_y, x, y, noise_m, noise_m * gain, rows)
 
@@ -79,7 +83,9 @@ def position_noise_m(x: Array, y: Array) -> float:
     return float(np.hypot(noise_of(x), noise_of(y)) / np.sqrt(2))
 
 
-def tracks_of(times: Array, x: Array, y: Array, noise_m: float | None = None) -> list[Track]:
+def tracks_of(
+    times: Array, x: Array, y: Array, noise_m: float | None = None, of_rows: int | None = None
+) -> list[Track]:
     """One track per stretch without a gap.
 
     A gap is an interval of more than three median ones: what happened in it is unknown. The
@@ -92,14 +98,14 @@ def tracks_of(times: Array, x: Array, y: Array, noise_m: float | None = None) ->
     if noise_m is None and parts:
         longest = max(parts, key=lambda part: part.stop - part.start)
         noise_m = position_noise_m(x[longest], y[longest])
-    return [track_of(times[part], x[part], y[part], noise_m) for part in parts]
+    return [track_of(times[part], x[part], y[part], noise_m, of_rows) for part in parts]
 
 
-def _smoothing_rows(times: Array, noise_m: float) -> int:
+def _smoothing_rows(times: Array, noise_m: float, of_rows: int) -> int:
     interval_s = median(np.diff(times)) if len(times) > 1 else 0.0
     if noise_m == 0 or interval_s <= 0:
         return 1
-    wanted = _PARABOLA_GAIN * (_leg_noise(len(times), 1) * noise_m / FINEST_LEG_M) ** 2
+    wanted = _PARABOLA_GAIN * (_leg_noise(of_rows, 1) * noise_m / FINEST_LEG_M) ** 2
     most = max(FEWEST_SMOOTHED, LONGEST_SMOOTHING_S / interval_s)
     return 2 * int(min(wanted, most) / 2) + 1
 
@@ -150,11 +156,6 @@ def path_length(track: Track) -> PathLength:
     counted_m = float(legs_m[within.legs].sum())
     least_m, most_m = (max(0.0, each - counted_m) for each in (within.least_m, within.most_m))
     return PathLength(length_m + least_m, max(shortest_m, most_m - least_m), track.noise_m)
-
-
-def path_length_m(track: Track) -> float:
-    """Metres travelled, as `path_length` measures them."""
-    return path_length(track).length_m
 
 
 def _leg_lengths(track: Track, corners: Indexes) -> Array:

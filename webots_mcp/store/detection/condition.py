@@ -66,7 +66,8 @@ def _read(search: Search, segment: Segment, condition: Condition) -> Frame:
     longer = replace(segment, start_s=min(known_from_s, start_s - condition.remembers_s))
     every_call = bool(kept_parts(search.connection, run_id, longer.start_s, segment.end_s))
     frame = read_frame(search.connection, longer, search.deadline, every_call=every_call)
-    search.require_read(frame)
+    if not len(frame) and frame.unread:
+        raise NotSearchableError("; ".join(map(str, frame.unread)))
     return frame
 
 
@@ -125,5 +126,4 @@ CONDITION: Final = EventKind(
     counted=False,
     alike=Alike(lambda events, unit: "stretches"),
     effort=4,
-    of_frame=True,
 )

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
-from typing import Final
+from typing import Final, NamedTuple
 
+from webots_mcp.naming import find_targets
 from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.noise import noise_of
 from webots_mcp.store.analysis.runs import MOSTLY, runs_alike
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import Alike, EventKind
-from webots_mcp.store.detection.resting import Rest, Resting
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.frame import Frame, Zones
+from webots_mcp.store.reading.ranges import just_after
 from webots_mcp.store.signals.registry import Signal
 
 LEAST_CHANGES: Final = 10  # of who mostly changes
@@ -25,32 +27,29 @@ MOST_REPEATED: Final = 0.02  # of the other rows that repeat the value before: n
 LEAST_NOISE: Final = 0.3  # of the usual step: the steps of noise alone are as large as it is
 LIVELY_S: Final = 10.0  # who mostly changes for so long somewhere changes otherwise
 MOST_OPENED: Final = 8  # chunks with most changes in which that is looked for
+HABITUAL_ROWS: Final = 10  # with the same value at other times: it comes back to it
+TARGET_WENT: Final = 0.1  # of the whole range of a target: so far it goes on, to show something
+LONGEST_READ_S: Final = 120.0  # of a rest: longer ones show it in their first part
 
 
-@dataclass(frozen=True)
-class Rests:
-    """Where a signal kept its value for long, and how it changes otherwise.
+class Rest(NamedTuple):
+    """Rows [start, stop) with the same value, and the times of the first and the last of them."""
 
-    Attributes:
-        changes: Values unlike the one before, in all rows.
-        present: Rows with a value.
-        whole_s: From the first row to the last.
-    """
+    start: int
+    stop: int
+    start_s: float
+    end_s: float
+    value: float
 
-    rests: list[Rest]
-    changes: int
-    present: int
-    whole_s: float
+    @property
+    def rows(self) -> int:
+        """How many."""
+        return self.stop - self.start
 
-    def changes_but_for(self, rests: Sequence[Rest]) -> bool:
-        """Whether it changed in most of the rows outside of those rests, and in ten at least.
-
-        What goes from one of them right to the next, as a counter does, has not changed otherwise.
-        """
-        flat_s = sum(rest.duration_s for rest in rests)
-        outside = max(0.0, 1 - flat_s / self.whole_s) if self.whole_s > 0 else 0.0
-        changes = self.changes - sum(a.stop == b.start for a, b in pairwise(rests))
-        return changes >= max(LEAST_CHANGES, MOSTLY * self.present * outside)
+    @property
+    def duration_s(self) -> float:
+        """From the first row to the last."""
+        return self.end_s - self.start_s
 
 
 def flat_events(search: Search) -> Iterator[Event]:
@@ -63,62 +62,35 @@ def flat_events(search: Search) -> Iterator[Event]:
     least_s = FROZEN_SHARE * flat_s
     search.note_too_large("flat")
     resting: dict[str, list[Rest]] = {}
-    frozen: list[tuple[Resting, Rest]] = []
+    frozen: list[tuple[_Resting, Rest]] = []
     for index, signal in enumerate(signals):
         if search.is_over("flat", signals[index:]):
             break
-        if not any(_changes(frame, signal.name) for frame in (search.frame, search.whole)):
+        zones = (frame.zones(signal.name) for frame in (search.frame, search.whole))
+        if not any(changes_in(each) >= LEAST_CHANGES for each in zones):
             continue
         # Rests of others count where they cover most of one that counts.
-        found = find_rests(search.frame, signal.name, MOSTLY * least_s)
-        if found.changes >= LEAST_CHANGES:
-            resting[signal.name] = found.rests
-        if not found.rests:
-            continue
-        shown = Resting(search, signal)
-        flat = [rest for rest in found.rests if rest.duration_s >= flat_s]
+        shown = _Resting(search, signal, MOSTLY * least_s)
+        if shown.changes >= LEAST_CHANGES:
+            resting[signal.name] = shown.rests
+        flat = [rest for rest in shown.rests if rest.duration_s >= flat_s]
         if flat:
-            if found.changes_but_for(flat) or _is_lively(search.whole, signal.name):
-                yield from (_event(search, shown, rest) for rest in flat)
-        elif found.changes >= LEAST_CHANGES:
-            soon = [rest for rest in found.rests if rest.duration_s >= least_s]
-            left = [
-                each for each in soon if shown.target_went_on(each) and not shown.is_limit(each)
-            ]
-            yield from (_event(search, shown, rest) for rest in left)
-            own = _frozen(search, signal, [rest for rest in soon if rest not in left])
+            if shown.changes_but_for(flat) or is_lively(search.whole, signal.name):
+                yield from map(shown.event, flat)
+        elif shown.rests and shown.changes >= LEAST_CHANGES:
+            soon = [rest for rest in shown.rests if rest.duration_s >= least_s]
+            left = [e for e in soon if shown.target_went_on(e) and not shown.is_limit(e)]
+            yield from map(shown.event, left)
+            own = shown.frozen([rest for rest in soon if rest not in left])
             frozen += [(shown, rest) for rest in own]
-            if not own and not left:
-                _note_longest(search, found, signal)
+            longest = max(shown.rests, key=lambda rest: rest.duration_s)
+            if not own and not left and shown.changes_but_for([longest]):
+                shown.note_near(longest)
     for shown, rest in frozen:
         if _rests_with_others(shown.signal, rest, resting):
-            _note_near(search, shown.signal, rest)
+            shown.note_near(rest)
         else:
-            yield _event(search, shown, rest)
-
-
-def _changes(frame: Frame, name: str) -> bool:
-    return changes_in(frame.zones(name)) >= LEAST_CHANGES
-
-
-def find_rests(frame: Frame, name: str, least_s: float) -> Rests:
-    """Where a signal kept its value for so long.
-
-    Opened are only the chunks with so many rows that repeat the one before, and their neighbours.
-    """
-    zones = frame.zones(name)
-    changes, present = changes_in(zones), int(zones.value_count.sum())
-    rests: list[Rest] = []
-    if changes < present - 1:
-        # Of a rest across a border one of both chunks has at least half.
-        lasts_s = np.maximum(zones.end_s - zones.start_s, least_s)
-        least_rows = np.maximum(2, least_s / 2 * zones.row_count / lasts_s)
-        may_rest = zones.value_count - zones.change_count >= least_rows
-        may_rest |= np.append(may_rest[1:], False) | np.append(False, may_rest[:-1])
-        for start, stop in zones.spans(may_rest):
-            rests += _rests_in(frame.rows(start, stop), name, least_s, start)
-    whole_s = float(frame.times[-1] - frame.times[0]) if len(frame) else 0.0
-    return Rests(rests, changes, present, whole_s)
+            yield shown.event(rest)
 
 
 def changes_in(zones: Zones) -> int:
@@ -128,44 +100,166 @@ def changes_in(zones: Zones) -> int:
     return int(zones.change_count.sum() + over_borders)
 
 
-def _rests_in(frame: Frame, name: str, least_s: float, first_row: int) -> Iterator[Rest]:
-    numbers = frame.numbers(name)
-    runs = runs_alike(numbers, frame.times)
-    for run in runs.only(runs.durations_s >= least_s).each():
-        value = float(numbers[run.start])
-        yield Rest(first_row + run.start, first_row + run.stop, run.start_s, run.end_s, value)
+def find_rests(frame: Frame, name: str, least_s: float) -> Iterator[Rest]:
+    """Where a signal kept its value for so long.
 
-
-def _event(search: Search, shown: Resting, rest: Rest) -> Event:
-    says = shown.says(rest)
-    details = {"value": rest.value} | ({"says": says} if says else {})
-    return search.event("flat", rest.start_s, rest.end_s, shown.signal.name, **details)
-
-
-def _frozen(search: Search, signal: Signal, rests: Sequence[Rest]) -> list[Rest]:
-    """Of the rests of a signal those that noise never makes, if it is noisy but for them."""
-    moved_with = (search.motion.commanded, search.motion.speed, *search.motion.wheels)
-    held = [rest for rest in rests if rest.stop - rest.start >= FEWEST_ROWS]
-    if signal in moved_with:
-        return []
-    keys = [rest.value for rest in held]
-    # What it comes back to is a value by nature, and 0 is what does nothing gives.
-    once = [rest for rest in held if keys.count(rest.value) == 1 and rest.value != 0]
-    return [rest for rest in once if _is_frozen(search.frame, signal.name, rest, held)]
-
-
-def _is_frozen(frame: Frame, name: str, rest: Rest, held: Sequence[Rest]) -> bool:
-    """Whether the rows around it are noisy, and beyond its value on both sides.
-
-    The lowest or the highest of all is where a sensor ends.
+    Opened are only the chunks with so many rows that repeat the one before, and their neighbours.
     """
-    first = max(0, rest.start - OTHER_ROWS)
-    numbers = frame.rows(first, rest.stop + OTHER_ROWS).numbers(name)
-    outside = ~np.isnan(numbers)
-    for each in held:
-        outside[max(0, each.start - first) : max(0, each.stop - first)] = False
-    others = numbers[outside]
-    return is_noisy(others) and bool(others.min() < rest.value < others.max())
+    zones = frame.zones(name)
+    # Of a rest across a border one of both chunks has at least half.
+    lasts_s = np.maximum(zones.end_s - zones.start_s, least_s)
+    least_rows = np.maximum(2, least_s / 2 * zones.row_count / lasts_s)
+    may_rest = zones.value_count - zones.change_count >= least_rows
+    may_rest |= np.append(may_rest[1:], False) | np.append(False, may_rest[:-1])
+    for first, stop in zones.spans(may_rest):
+        part = frame.rows(first, stop)
+        numbers = part.numbers(name)
+        runs = runs_alike(numbers, part.times)
+        for run in runs.only(runs.durations_s >= least_s).each():
+            value = float(numbers[run.start])
+            yield Rest(first + run.start, first + run.stop, run.start_s, run.end_s, value)
+
+
+@dataclass
+class _Resting:
+    """A signal that rests at times: what its rests show, and how it changes otherwise.
+
+    Attributes:
+        least_s: Shorter rests are none.
+    """
+
+    search: Search
+    signal: Signal
+    least_s: float
+
+    @cached_property
+    def rests(self) -> list[Rest]:
+        """All of them."""
+        return list(find_rests(self.search.frame, self.signal.name, self.least_s))
+
+    @cached_property
+    def changes(self) -> int:
+        """Values unlike the one before, in all rows."""
+        return changes_in(self.search.frame.zones(self.signal.name))
+
+    def changes_but_for(self, rests: Sequence[Rest]) -> bool:
+        """Whether it changed in most of the rows outside of those rests, and in ten at least.
+
+        What goes from one of them right to the next, as a counter does, has not changed otherwise.
+        """
+        frame = self.search.frame
+        present = int(frame.zones(self.signal.name).value_count.sum())
+        first_s, last_s = frame.bounds_s
+        flat_s = sum(rest.duration_s for rest in rests)
+        outside = max(0.0, 1 - flat_s / (last_s - first_s)) if last_s > first_s else 0.0
+        changes = self.changes - sum(a.stop == b.start for a, b in pairwise(rests))
+        return changes >= max(LEAST_CHANGES, MOSTLY * present * outside)
+
+    def event(self, rest: Rest) -> Event:
+        """One of its rests, and what there is to say of it, but that it is frozen."""
+        value, why = f"{rest.value:.6g}", self.target_went_on(rest)
+        value += f" {self.signal.unit}" if self.signal.unit else ""
+        says = ""
+        if self.is_limit(rest):
+            says = f"at its limit of {value}" + (f", though {why}" if why else "")
+        elif why:
+            says = f"frozen: {why}"
+        elif self._rows_elsewhere(rest) >= HABITUAL_ROWS:
+            says = f"at {value}, as at other times"
+        details = {"value": rest.value} | ({"says": says} if says else {})
+        return self.search.event("flat", rest.start_s, rest.end_s, self.signal.name, **details)
+
+    def note_near(self, rest: Rest) -> None:
+        """It came near to an event."""
+        lasted = f"for {rest.duration_s:.3g} s from {rest.start_s:.6g} s"
+        what = f"{self.signal.name} stayed at {rest.value:.4g} {lasted}"
+        self.search.came_near("flat", rest.duration_s / self.search.options.flat_s, what)
+
+    def is_limit(self, rest: Rest) -> bool:
+        """Whether it was never beyond the value that it kept, and was there at other times too.
+
+        Only then it is where a sensor ends, or what a gate lets through: what counts or creeps is
+        at its extreme wherever it stops.
+        """
+        return rest.value in self._extremes(self.signal) and self._rows_elsewhere(rest) > 0
+
+    def target_went_on(self, rest: Rest) -> str | None:
+        """Whether its target moved, or it was commanded to move, while it stayed; None if neither.
+
+        For a position in the plane `stuck` reports that.
+        """
+        target, speed = self._targets
+        values = self._values(target, rest)
+        far = np.abs(values - values[:1])
+        low, high = self._extremes(target) if len(values) and target else (0.0, 0.0)
+        if target and len(far) and far.max() > TARGET_WENT * (high - low):
+            span = f"{values[0]:.4g} to {values[far.argmax()]:.4g}"
+            return f"its target {target.name} went from {span}"
+        values = self._values(speed, rest)
+        nonzero = values[values != 0]
+        if speed and len(nonzero) and len(nonzero) >= MOSTLY * len(values):
+            return f"{speed.name} was {float(np.median(nonzero)):.4g}"
+        return None
+
+    def _rows_elsewhere(self, rest: Rest) -> int:
+        """How many other rows of the run have the same value."""
+        first = int(np.searchsorted(self._sorted, rest.value))
+        return int(np.searchsorted(self._sorted, rest.value, "right")) - first - rest.rows
+
+    @cached_property
+    def _sorted(self) -> Array:
+        """All values of the run."""
+        values: Array = np.array(self.search.whole.numbers(self.signal.name))
+        values.sort()
+        return values
+
+    @cached_property
+    def _targets(self) -> tuple[Signal | None, Signal | None]:
+        """Its target, and its commanded speed; of a position in the plane none."""
+        known = self.search.known
+        if self.signal in (self.search.motion.position or ()):
+            return None, None
+        numbers = [name for name, each in known.items() if each.kind in ("num", "angle")]
+        target, speed = find_targets(self.signal.name, numbers)
+        return known.get(target or ""), known.get(speed or "")
+
+    def _values(self, signal: Signal | None, rest: Rest) -> Array:
+        """The numbers of a signal in a rest, which may be none of those that are looked at."""
+        if signal is None:
+            return np.zeros(0)
+        end_s = min(just_after(rest.end_s), rest.start_s + LONGEST_READ_S)
+        return self.search.frame.between(rest.start_s, end_s).usable(signal.name)[1]
+
+    def _extremes(self, signal: Signal) -> tuple[float, float]:
+        """Of the whole run."""
+        zones = self.search.whole.zones(signal.name)
+        low, high = (each[~np.isnan(each)] for each in (zones.min, zones.max))
+        return float(low.min(initial=np.inf)), float(high.max(initial=-np.inf))
+
+    def frozen(self, rests: Sequence[Rest]) -> list[Rest]:
+        """Of some rests those that noise never makes, if it is noisy but for them."""
+        motion = self.search.motion
+        if self.signal in (motion.commanded, motion.speed, *motion.wheels):
+            return []
+        held = [rest for rest in rests if rest.rows >= FEWEST_ROWS]
+        keys = [rest.value for rest in held]
+        # What it comes back to is a value by nature, and 0 is what does nothing gives.
+        once = [rest for rest in held if keys.count(rest.value) == 1 and rest.value != 0]
+        return [rest for rest in once if self._is_frozen(rest, held)]
+
+    def _is_frozen(self, rest: Rest, held: Sequence[Rest]) -> bool:
+        """Whether the rows around it are noisy, and beyond its value on both sides.
+
+        The lowest or the highest of all is where a sensor ends.
+        """
+        first = max(0, rest.start - OTHER_ROWS)
+        around = self.search.frame.rows(first, rest.stop + OTHER_ROWS)
+        numbers = around.numbers(self.signal.name)
+        outside = ~np.isnan(numbers)
+        for each in held:
+            outside[max(0, each.start - first) : max(0, each.stop - first)] = False
+        others = numbers[outside]
+        return is_noisy(others) and bool(others.min() < rest.value < others.max())
 
 
 def is_noisy(values: Array) -> bool:
@@ -179,17 +273,15 @@ def is_noisy(values: Array) -> bool:
     return noise_of(values) >= LEAST_NOISE * float(np.median(steps))
 
 
-def _is_lively(run: Frame, name: str) -> bool:
+def is_lively(run: Frame, name: str) -> bool:
     """Whether it mostly changed for 10 s somewhere in the run."""
     zones = run.zones(name)
     for chunk in np.argsort(-zones.change_count, kind="stable")[:MOST_OPENED].tolist():
         first = int(zones.first_row[chunk])
         times, values = run.rows(first, first + int(zones.row_count[chunk])).usable(name)
+        _, stretch, rows = np.unique(times // LIVELY_S, return_inverse=True, return_counts=True)
         changed = np.diff(values, prepend=values[:1]) != 0
-        stretch = np.floor(times / LIVELY_S)
-        starts = np.flatnonzero(np.diff(stretch, prepend=-np.inf))
-        rows = np.diff(np.append(starts, len(times)))
-        changes = np.add.reduceat(changed, starts, dtype=np.intp) if len(starts) else rows
+        changes = np.bincount(stretch, changed)
         if ((rows >= LEAST_CHANGES) & (changes >= MOSTLY * rows)).any():
             return True
     return False
@@ -209,19 +301,6 @@ def _rests_with_others(signal: Signal, rest: Rest, resting: dict[str, list[Rest]
     )
 
 
-def _note_longest(search: Search, found: Rests, signal: Signal) -> None:
-    """What came nearest, where it is not how the signal is."""
-    longest = max(found.rests, key=lambda rest: rest.duration_s)
-    if found.changes_but_for([longest]):
-        _note_near(search, signal, longest)
-
-
-def _note_near(search: Search, signal: Signal, rest: Rest) -> None:
-    lasted = f"for {rest.duration_s:.3g} s from {rest.start_s:.6g} s"
-    what = f"{signal.name} stayed at {rest.value:.4g} {lasted}"
-    search.came_near("flat", rest.duration_s / search.options.flat_s, what)
-
-
 def _alike(events: Sequence[Event], unit: str) -> str:
     said = {event.details.get("says") for event in events}
     what = said.pop() if len(said) == 1 else None
@@ -237,5 +316,4 @@ FLAT: Final = EventKind(
     of_numbers=True,
     drawn=7,
     alike=Alike(_alike, of_arrays=True),
-    of_frame=True,
 )

@@ -7,9 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 from webots_mcp.store.detection.event import Event
-from webots_mcp.store.detection.kind import Alike
+from webots_mcp.store.detection.kind import Alike, told_together
 from webots_mcp.store.detection.registry import kind_named
-from webots_mcp.store.detection.together import told_together
 from webots_mcp.store.signals.registry import Signal
 
 
@@ -61,23 +60,11 @@ def _as_one(alike: Sequence[Event], how: Alike, known: dict[str, Signal]) -> Eve
     first, last = alike[0], max(alike, key=lambda event: event.end_s)
     signal = known.get(first.name or "")
     what = how.says(alike, f" {signal.unit}" if signal and signal.unit else "")
-    details = {
-        **_in_common([event.details for event in alike]),
-        **how.adds(alike),
-        **told_together(
-            what,
-            [event.start_s for event in alike],
-            [event.duration_s for event in alike],
-            max(event.details.get("within_s", 0.0) for event in alike),
-        ),
-    }
-    return replace(
-        first,
-        end_s=last.end_s,
-        ongoing=last.ongoing,
-        details=details,
-        count=len(alike),
-    )
+    starts_s, lengths_s = zip(*((each.start_s, each.duration_s) for each in alike), strict=True)
+    details = _in_common([event.details for event in alike]) | how.adds(alike)
+    details |= told_together(what, starts_s, lengths_s)
+    ends = {"end_s": last.end_s, "ongoing": last.ongoing}
+    return replace(first, **ends, details=details, count=len(alike))
 
 
 def _in_common(all_details: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
+from statistics import median
 from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.errors import NothingRecordedError
@@ -12,8 +13,9 @@ from webots_mcp.store.detection.event import Event, EventOptions
 
 if TYPE_CHECKING:
     from webots_mcp.store.detection.search import Search
-    from webots_mcp.store.signals.registry import Signal
 
+MOST_TIMES: Final = 3  # of a group that are named
+_SAME_LENGTH: Final = 0.05  # of the longest: so near each other they last equally long
 _NUMBER: Final = re.compile(r"\d+(\.\d+)?")
 
 
@@ -21,38 +23,9 @@ class NotSearchableError(NothingRecordedError):
     """Nothing was recorded in which a kind could be looked for; the text says what is missing."""
 
 
-def _no_time(options: EventOptions) -> float:
-    return 0.0
-
-
-def _to_the_row(event: Event) -> float:
-    return 0.0
-
-
-def _nothing(search: Search) -> Sequence[Signal]:
-    return ()
-
-
-def _always(options: EventOptions) -> bool:
-    return True
-
-
-def only_if_named(options: EventOptions) -> bool:
-    """For a kind that is no news, and of which there may be thousands."""
-    return False
-
-
 def but_for_numbers(text: object) -> str:
     """What texts that differ in their numbers only have in common."""
     return _NUMBER.sub("#", str(text))
-
-
-def _as_others(event: Event) -> Hashable:
-    return None
-
-
-def _nothing_more(events: Sequence[Event]) -> dict[str, Any]:
-    return {}
 
 
 @dataclass(frozen=True)
@@ -68,8 +41,8 @@ class Alike:
     """
 
     says: Callable[[Sequence[Event], str], str]
-    sort: Callable[[Event], Hashable] = _as_others
-    adds: Callable[[Sequence[Event]], dict[str, Any]] = _nothing_more
+    sort: Callable[[Event], Hashable] = lambda event: None
+    adds: Callable[[Sequence[Event]], dict[str, Any]] = lambda events: {}
     most_single: int = 3
     of_arrays: bool = False
 
@@ -96,28 +69,49 @@ class EventKind:
         counted: Comparisons of runs count it.
         drawn: Its place among the rows below a plot, the least first; None if it has none there.
         alike: How similar ones are reported as one; None where each is reported by itself.
-        reads_through: Signals of which it reads all rows, also of a long segment.
-        of_frame: It reads nothing but the frame of a search.
         effort: Its rank by what it costs to look for: the least is searched first. Kinds of one
-            rank find things together, and share their part of the time.
-        of_frame: It reads the frame of a search alone.
+            rank share their part of the time.
     """
 
     name: str
     means: str
     find: Callable[[Search], Iterable[Event]]
     stored: bool = False
-    usual: Callable[[EventOptions], bool] = _always
+    usual: Callable[[EventOptions], bool] = lambda options: True
     lasts: bool = False
-    least_s: Callable[[EventOptions], float] = _no_time
-    around_s: Callable[[EventOptions], float] = _no_time
-    ends_within_s: Callable[[Event], float] = _to_the_row
+    least_s: Callable[[EventOptions], float] = lambda options: 0.0
+    around_s: Callable[[EventOptions], float] = lambda options: 0.0
+    ends_within_s: Callable[[Event], float] = lambda event: 0.0
     of_numbers: bool = False
     routine: bool = False
     counted: bool = True
     drawn: int | None = None
     alike: Alike | None = None
-    reads_through: Callable[[Search], Sequence[Signal]] = _nothing
-    of_frame: bool = False
     effort: int = 0
-    of_frame: bool = False
+
+
+def told_together(
+    what: str, starts_s: Sequence[float], lengths_s: Sequence[float]
+) -> dict[str, Any]:
+    """How many there are, when, and how long they lasted, as details of an event.
+
+    Args:
+        what: What they are, in the plural.
+        starts_s: When each began, in order.
+        lengths_s: How long each lasted.
+    """
+    times_s = [round(start_s, 3) for start_s in starts_s]
+    span = f"the first at {times_s[0]:.6g} s, the last at {times_s[-1]:.6g} s"
+    says = f"{len(times_s)} {what}, {span}{_lengths(lengths_s)}"
+    return {"says": says, "first_times_s": times_s[:MOST_TIMES]}
+
+
+def _lengths(lengths_s: Sequence[float]) -> str:
+    """How long they lasted, where they did."""
+    least_s, most_s, middle_s = min(lengths_s), max(lengths_s), median(lengths_s)
+    if not most_s:
+        return ""
+    if most_s - least_s <= _SAME_LENGTH * most_s:
+        return f", each {middle_s:.3g} s long"
+    total = f"{sum(lengths_s):.4g} s in total"
+    return f", {least_s:.3g} to {most_s:.3g} s long (median {middle_s:.3g} s), {total}"

@@ -10,17 +10,16 @@ from typing import Final
 from webots_mcp.store.analysis.arrays import Array, Indexes, median, np
 from webots_mcp.store.analysis.track import Track
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.detection.motion import Motion, tracks_of_frame
+from webots_mcp.store.detection.motion import Motion, RunNoise, tracks_in
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import Segment, just_after, recorded_bounds
 from webots_mcp.store.signals.flatten import shown
 
 ROLLS_OUT_S: Final = 1.5  # after a mode began, the motion of the mode before may go on
-LEAST_MOVED_M: Final = 0.1  # or so many deviations of what is left of the noise
-LEAST_NOISE: Final = 8.0
-AWAY_S: Final = 20.0  # within so long, and no slower than this on average: who drifts does not move
-LEAST_M_S: Final = 0.0125
+LEAST_MOVED_M: Final = 0.3  # within so long: who drifts about a place does not move
+AWAY_S: Final = 20.0
+LEAST_NOISE: Final = 8.0  # deviations of what is left of the noise
 USUALLY_STANDS: Final = 4  # times as many visits as it moves in, of at least so many visits
 LEAST_VISITS: Final = 3
 EARLIER_RUNS: Final = 3
@@ -60,10 +59,8 @@ class ModeUse:
 
     def with_more(self, other: ModeUse) -> ModeUse:
         """Together with another; the speed is the first that is known."""
-        of = self if self.moving else other
-        return replace(
-            of, moving=self.moving + other.moving, standing=self.standing + other.standing
-        )
+        moving, standing = self.moving + other.moving, self.standing + other.standing
+        return replace(self if self.moving else other, moving=moving, standing=standing)
 
 
 class ModeUses:
@@ -100,16 +97,19 @@ class ModeUses:
 
 
 def frames_of_runs(
-    connection: sqlite3.Connection, run_id: int, deadline: Deadline
+    connection: sqlite3.Connection, run: Frame, deadline: Deadline
 ) -> Iterator[Frame | None]:
     """A run and a few of the same robot before it; None where there is no time for more."""
-    earlier = connection.execute(_EARLIER, (run_id, run_id, EARLIER_RUNS)).fetchall()
-    for each in (run_id, *(earlier_id for (earlier_id,) in earlier)):
+    earlier = connection.execute(_EARLIER, (run.run_id, run.run_id, EARLIER_RUNS)).fetchall()
+    for run_id in (run.run_id, *(run_id for (run_id,) in earlier)):
         if deadline.passed:
             yield None
             return
-        if (bounds := recorded_bounds(connection, each)) is not None:
-            whole = Segment(each, bounds[0], just_after(bounds[1]))
+        bounds = recorded_bounds(connection, run_id)
+        if run_id == run.run_id:
+            yield run.rows(0, MOST_ROWS)
+        elif bounds is not None:
+            whole = Segment(run_id, bounds[0], just_after(bounds[1]))
             yield read_frame(connection, whole, deadline).rows(0, MOST_ROWS)
 
 
@@ -118,7 +118,7 @@ def uses_in(frame: Frame, motion: Motion, options: EventOptions) -> Iterator[tup
     if motion.mode is None or motion.position is None:
         return
     codes, labels = frame.coded(motion.mode.name)
-    tracks, rows = tracks_of_frame(frame, motion.position)
+    tracks, rows = tracks_in(frame, motion.position, RunNoise(frame, motion))
     for track, here in zip(tracks, rows, strict=True):
         for code, use in _uses_of(track, codes[here], frame.run_id, options):
             if (mode := shown(labels[code])) is not None:
@@ -147,21 +147,18 @@ def _uses_of(
         later = np.minimum(np.searchsorted(times, times + over_s), last)
         return np.hypot(x[later] - x, y[later] - y), times[later] - times
 
-    went_m, took_s = way_m(AWAY_S)
-    got_away = went_m >= np.maximum(
-        max(LEAST_MOVED_M, LEAST_NOISE * track.left_m), LEAST_M_S * took_s
-    )
+    noise_m = LEAST_NOISE * track.left_m
+    got_away = way_m(AWAY_S)[0] >= max(LEAST_MOVED_M, noise_m)
     moved = np.add.reduceat(got_away * 1.0, firsts) >= _MOVES_SHARE * np.minimum(lengths, _ENOUGH)
-    slow = way_m(options.stuck_s)[0] <= max(options.stuck_m, LEAST_NOISE * track.left_m)
+    slow = way_m(options.stuck_s)[0] <= max(options.stuck_m, noise_m)
     stood = np.add.reduceat(slow * 1.0, firsts) >= _STANDS_SHARE * lengths
     stood &= times[firsts + lengths - 1] - times[firsts] >= options.stuck_s
     paced_m, took_s = way_m(pace_s := max(_PACE_S, _PACE_S_PER_M * track.left_m))
     speeds = paced_m / np.maximum(took_s, pace_s / 2)
     for code in np.unique(codes).tolist():
-        of_code = codes[firsts] == code
-        some = speeds[np.repeat(of_code & moved, lengths)]
+        own = codes[firsts] == code
+        some = speeds[np.repeat(own & moved, lengths)]
         # Not beside the greatest one: where it was put elsewhere it seems to be very fast.
         fast = float(np.quantile(some, _FAST)) if len(some) else 0.0
         speed_m_s = median(some[some >= fast / 2]) if len(some) else 0.0
-        counts = int((of_code & moved).sum()), int((of_code & stood).sum())
-        yield code, ModeUse(*counts, speed_m_s, run_id)
+        yield code, ModeUse(int((own & moved).sum()), int((own & stood).sum()), speed_m_s, run_id)

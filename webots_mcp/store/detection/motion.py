@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Final
 
 from webots_mcp.naming import FARTHEST_M, metres_in, unit_in
 from webots_mcp.signal_roles import first_in, pair_in
-from webots_mcp.store.analysis.arrays import Array, Indexes, np
+from webots_mcp.store.analysis.arrays import Array, Indexes, median, np
+from webots_mcp.store.analysis.noise import noise_of
+from webots_mcp.store.analysis.summary import LARGEST
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.signals.catalogue import one_signal
 from webots_mcp.store.signals.registry import Signal, roles_of, stored_roles
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
 
 TRUE_WITHIN: Final = 0.05  # a distance that may be short by less, or by less than so many metres,
 TRUE_WITHIN_M: Final = 0.1  # is reported without a doubt
+SAMPLES: Final = 8  # parts of a run that tell how noisy it is
+SAMPLE_ROWS: Final = 1024  # of each
 IMPLAUSIBLE_M_S: Final = 50.0  # a mean speed beyond is hardly that of a robot
 
 
@@ -79,52 +83,43 @@ def find_motion(
         InvalidInputError: A name in them means several.
     """
     own = known if here is None else {name: known[name] for name in known if name in here}
-    named = _named_position(known, options.position)
-    roles = roles_of(own, (named[0].name, named[1].name)) if named else stored_roles(own)
+    position: tuple[Signal, Signal] | None = None
+    if options.position is not None:
+        x, y = (one_signal(known, each) for each in options.position)
+        position = x, y
+    names = (position[0].name, position[1].name) if position else None
+    roles = roles_of(own, names) if names else stored_roles(own)
     signals = {role: own[name] for name, role in roles.items() if name in own}
-    mode = _named(known, options.mode) or _first("mode", signals)
-    commanded = _named(known, options.commanded) or _first("commanded_speed", signals)
-    speed = None if commanded else _first("speed", signals)
-    wheels, told = (
-        tuple(own[name] for name, role in roles.items() if role == wanted)
-        for wanted in ("wheel", "commanded_wheel")
-    )
-    place = "" if named else pair_in(signals)
+
+    def first(role: str, name: str | None = None) -> Signal | None:
+        if name is not None:
+            return one_signal(known, name)
+        found = first_in(role, signals)
+        return signals[found] if found else None
+
+    def wheels(wanted: str) -> tuple[Signal, ...]:
+        named = (own[name] for name, role in roles.items() if role == wanted)
+        return tuple(wheel for wheel in named if wheel != commanded)
+
+    place = "" if position else pair_in(signals)
+    if position is None:  # it may be missing in the rows that were seen
+        ever = {role: known[name] for name, role in stored_roles(known).items()}
+        position = _pair(signals, place) or _pair(ever, pair_in(ever))
+    commanded = first("commanded_speed", options.commanded)
     return Motion(
-        # It may be missing in the rows that were seen.
-        named or _pair(signals, place) or _position_ever(known),
+        position,
         commanded,
-        speed,
-        mode,
-        heading=_first("yaw", signals),
-        wheels=tuple(wheel for wheel in wheels if wheel != commanded),
+        None if commanded else first("speed"),
+        first("mode", options.mode),
+        heading=first("yaw"),
+        wheels=wheels("wheel"),
         height=signals.get(f"z{place}"),
-        wheel_commands=tuple(wheel for wheel in told if wheel != commanded),
+        wheel_commands=wheels("commanded_wheel"),
     )
-
-
-def _position_ever(known: dict[str, Signal]) -> tuple[Signal, Signal] | None:
-    signals = {role: known[name] for name, role in stored_roles(known).items()}
-    return _pair(signals, pair_in(signals))
 
 
 def _pair(signals: dict[str, Signal], place: str | None) -> tuple[Signal, Signal] | None:
     return None if place is None else (signals[f"x{place}"], signals[f"y{place}"])
-
-
-def _first(role: str, signals: dict[str, Signal]) -> Signal | None:
-    found = first_in(role, signals)
-    return signals[found] if found else None
-
-
-def _named(known: dict[str, Signal], name: str | None) -> Signal | None:
-    return None if name is None else one_signal(known, name)
-
-
-def _named_position(
-    known: dict[str, Signal], names: tuple[str, str] | None
-) -> tuple[Signal, Signal] | None:
-    return (one_signal(known, names[0]), one_signal(known, names[1])) if names else None
 
 
 def in_metres(signal: Signal, lengths: Array) -> Array:
@@ -143,15 +138,43 @@ def doubt_of_unit(position: tuple[Signal, Signal], speed_m_s: float) -> str | No
     )
 
 
-def tracks_of_frame(
-    frame: Frame, position: tuple[Signal, Signal]
+class RunNoise:
+    """How noisy a run's signals are, by some of its rows: the same of whatever part is asked for.
+
+    Attributes:
+        position_m: Standard deviation of the noise in each of x and y.
+        interval_s: The usual one between rows.
+        rows: Of the run.
+    """
+
+    def __init__(self, run: Frame, motion: Motion) -> None:
+        starts = np.linspace(0, len(run), SAMPLES, endpoint=False) // SAMPLE_ROWS
+        rows = (np.unique(starts) * SAMPLE_ROWS).astype(np.intp).tolist()
+        self._parts = [run.rows(row, row + SAMPLE_ROWS) for row in rows]
+        self._known: dict[str, float] = {}
+        self.rows = len(run)
+        intervals = np.concatenate([np.zeros(0), *(np.diff(part.times) for part in self._parts)])
+        self.interval_s = median(intervals) if len(intervals) else 0.0
+        noises = [self.of(each.name) * metres_in(each.name) for each in motion.position or ()]
+        self.position_m = math.hypot(*noises) / math.sqrt(2)
+
+    def of(self, name: str) -> float:
+        """Standard deviation of the noise of a signal."""
+        if name not in self._known:
+            values = np.concatenate([np.zeros(0), *(part.numbers(name) for part in self._parts)])
+            self._known[name] = noise_of(values[np.abs(values) <= LARGEST])
+        return self._known[name]
+
+
+def tracks_in(
+    frame: Frame, position: tuple[Signal, Signal], noise: RunNoise
 ) -> tuple[list[Track], list[Indexes]]:
     """The way of the robot in each stretch without a gap, and the rows of the frame in it."""
     from webots_mcp.store.analysis.track import tracks_of
 
     x, y = (in_metres(each, frame.numbers(each.name)) for each in position)
     rows = np.flatnonzero(np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M)
-    tracks = tracks_of(frame.times[rows], x[rows], y[rows])
+    tracks = tracks_of(frame.times[rows], x[rows], y[rows], noise.position_m, noise.rows)
     ends = np.cumsum([len(track.times) for track in tracks])
     return tracks, np.split(rows, ends[:-1])
 
@@ -160,15 +183,12 @@ def doubt_of_length(way: PathLength) -> str | None:
     """By how much a path may be longer than reported; None where that is little."""
     if way.longer_m <= max(TRUE_WITHIN * way.length_m, TRUE_WITHIN_M):
         return None
+    # Rounded, so that similar runs share a sentence; in metres where it exceeds the distance.
+    more = f"{way.longer_m:.2g} m"
+    if way.longer_m <= way.length_m:
+        more = f"{10 * math.ceil(10 * way.longer_m / way.length_m)} %"
     noise_mm = float(f"{1000 * way.noise_m:.1g}")
     return (
-        f"the path may be up to {_more(way)} longer: position noise of about {noise_mm:g} mm hides "
-        "short moves and tight turns; more rows per second show them"
+        f"the path may be up to {more} longer: position noise of about {noise_mm:g} mm hides short "
+        "moves and tight turns; more rows per second show them"
     )
-
-
-def _more(way: PathLength) -> str:
-    """Rounded, so that similar runs share a sentence; in metres where it exceeds the distance."""
-    if way.longer_m > way.length_m:
-        return f"{way.longer_m:.2g} m"
-    return f"{10 * math.ceil(10 * way.longer_m / way.length_m)} %"

@@ -40,8 +40,6 @@ def oscillation_events(search: Search) -> Iterator[Event]:
         if not signals:
             raise NotSearchableError(why)
         search.not_searched("oscillation", why)
-    if not len(search.frame):
-        search.require_rows()
     _note_periods(search)
     for name, swing in _found(search, signals):
         details = {
@@ -52,7 +50,6 @@ def oscillation_events(search: Search) -> Iterator[Event]:
         event = search.event("oscillation", swing.start_s, swing.end_s, name, **details)
         goes_on = search.ended_s - swing.end_s < _ends_within_s(event)
         yield replace(event, ongoing=goes_on)
-    search.not_searched("oscillation", *map(str, search.frame.unread))
 
 
 def _note_periods(search: Search) -> None:

@@ -12,7 +12,6 @@ from webots_mcp.store.detection import (
     condition,
     flat,
     jump,
-    kept,
     oscillation,
     silent,
     standstill,
@@ -37,7 +36,7 @@ KINDS: Final[list[EventKind]] = [
     stored.COMMAND,
     stored.LOG,
     stored.NOTICED,
-    kept.KEPT,
+    stored.KEPT,
     stored.IMAGE,
 ]
 

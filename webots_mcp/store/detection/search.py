@@ -2,43 +2,32 @@
 
 from __future__ import annotations
 
+import copy
 import sqlite3
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any, Final
 
-from webots_mcp.naming import flatten, listed
+from webots_mcp.naming import listed
 from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.analysis.summary import LARGEST
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import EventKind, NotSearchableError
-from webots_mcp.store.detection.mode_use import ModeUses, frames_of_runs
 from webots_mcp.store.detection.motion import Motion, find_motion
 from webots_mcp.store.detection.verdict import Ledger
-from webots_mcp.store.reading.coverage import less_time, purged_until_s
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import Segment, just_after, recorded_bounds
 from webots_mcp.store.reading.wall_time import UP_TO, RunClock
 from webots_mcp.store.signals.catalogue import resolve_signals
-from webots_mcp.store.signals.flatten import parse
 from webots_mcp.store.signals.registry import Signal
 
 if TYPE_CHECKING:
     from webots_mcp.store.detection.standstill import Findings
 
-    Habits = dict[tuple[int, Motion], ModeUses]
-
 MOST_NAMED: Final = 5
-
-_ENDS: Final = (
-    "SELECT data FROM state WHERE id IN ("
-    "(SELECT id FROM state WHERE run_id = :run AND sim_time_s >= :start "
-    "ORDER BY sim_time_s, id LIMIT 1), "
-    "(SELECT id FROM state WHERE run_id = :run AND sim_time_s < :end "
-    "ORDER BY sim_time_s DESC, id DESC LIMIT 1))"
-)
+_OF_SEGMENT: Final = ("recorded", "signals", "numbers", "frame", "standstills")
 
 
 @dataclass
@@ -52,8 +41,6 @@ class Search:
             None.
         asked: The part of the segment that was asked about, where that was widened to find ends.
         ledger: What could not be looked at, and what came near to an event.
-        habits: By run and motion, in which modes the robot moves: searches of one question share
-            what they have seen of that.
     """
 
     connection: sqlite3.Connection
@@ -65,7 +52,14 @@ class Search:
     ledger: Ledger = field(default_factory=Ledger)
     only: frozenset[str] | None = None
     asked: Segment | None = None
-    habits: Habits = field(default_factory=dict[Any, Any])
+
+    def of(self, segment: Segment, **changes: Any) -> Search:
+        """The same in another segment of the run, of which it is known what is known of this."""
+        other = copy.copy(self)
+        for name in _OF_SEGMENT:
+            other.__dict__.pop(name, None)
+        other.__dict__.update(changes, segment=segment)
+        return other
 
     @cached_property
     def bounds(self) -> tuple[float, float] | None:
@@ -90,46 +84,23 @@ class Search:
     @cached_property
     def recorded(self) -> Segment | None:
         """The part of the segment that was recorded; None where nothing was."""
-        if self.bounds is None:
+        here = self.segment
+        if not self.bounds or self.ended_s < here.start_s or self.began_s >= here.end_s:
             return None
-        (first_s, newest_s), here = self.bounds, self.segment
-        if newest_s < here.start_s or first_s >= here.end_s:
-            return None
-        start_s, end_s = max(here.start_s, first_s), min(here.end_s, just_after(newest_s))
-        return replace(here, start_s=start_s, end_s=end_s)
-
-    @cached_property
-    def is_purged(self) -> bool:
-        """Whether no row of the segment is left, of which there are rollups."""
-        run_id, start_s = self.segment.run_id, self.segment.start_s
-        until_s = purged_until_s(self.connection, run_id, start_s)
-        return until_s is not None and until_s >= self.segment.end_s
-
-    @cached_property
-    def less_time(self) -> str:
-        """What shows more of the segment than its summaries do."""
-        return less_time(self.connection, self.segment)
-
-    def require_rows(self) -> None:
-        """For what shows in single rows only.
-
-        Raises:
-            NotSearchableError: They were purged.
-        """
-        if self.is_purged:
-            raise NotSearchableError("the rows of that time were purged for good")
+        ends = max(here.start_s, self.began_s), min(here.end_s, just_after(self.ended_s))
+        return replace(here, start_s=ends[0], end_s=ends[1])
 
     @cached_property
     def motion(self) -> Motion:
-        """The signals that tell how the robot moves; other runs may have had others."""
-        return find_motion(self.known, self.options, self._here)
+        """The signals that tell how the robot moves in this run; others may have had others.
 
-    @cached_property
-    def _here(self) -> set[str]:
-        """Names that the first or the newest row of the segment has."""
-        run_id, start_s, end_s = self.segment.run_id, self.segment.start_s, self.segment.end_s
-        rows = self.connection.execute(_ENDS, {"run": run_id, "start": start_s, "end": end_s})
-        return {name for (data,) in rows.fetchall() for name in flatten(parse(data))}
+        The first or the newest row has them.
+        """
+        rows = [self.whole.rows(row, row + 1) for row in {0, len(self.whole) - 1}]
+        all_count = self.options.position is not None
+        telling = [name for name, each in self.known.items() if all_count or each.role]
+        here = {name for name in telling if any(row.held(name).any() for row in rows)}
+        return find_motion(self.known, self.options, here)
 
     @cached_property
     def signals(self) -> list[Signal]:
@@ -139,9 +110,8 @@ class Search:
 
     @cached_property
     def numbers(self) -> list[Signal]:
-        """Of the signals the numeric ones, where any of the kinds looks at them."""
-        wanted = any(kind.of_numbers for kind in self.kinds)
-        return [signal for signal in self.signals if signal.is_number and wanted]
+        """Of the signals the numeric ones."""
+        return [signal for signal in self.signals if signal.is_number]
 
     def required_numbers(self) -> list[Signal]:
         """The numeric signals.
@@ -171,57 +141,34 @@ class Search:
         """The rows of the segment.
 
         Raises:
-            NotSearchableError: They were purged.
+            NotSearchableError: None of them is left, or could be read in time.
         """
         frame = read_frame(self.connection, self.segment, self.deadline)
-        self.require_read(frame)
+        if not len(frame) and frame.unread:
+            raise NotSearchableError("; ".join(map(str, frame.unread)))
         return frame
-
-    def require_read(self, frame: Frame) -> None:
-        """See that something is left of what was recorded.
-
-        Raises:
-            NotSearchableError: It was purged.
-        """
-        if not len(frame):
-            self.require_rows()
-
-    def unread(self) -> list[str]:
-        """What of the segment is not in its frame."""
-        run_id, start_s = self.segment.run_id, self.segment.start_s
-        notes = [str(each) for each in self.frame.unread]
-        until_s = purged_until_s(self.connection, run_id, start_s)
-        if until_s is not None and len(self.frame) and self.frame.times[0] >= until_s:
-            notes.append(f"not before {until_s:.3f} s, whose rows were purged")
-        return notes
 
     @cached_property
     def whole(self) -> Frame:
         """The rows of the whole run."""
         part = Segment(self.segment.run_id, self.began_s, just_after(self.ended_s))
-        if replace(self.segment, open_start=False, open_end=False) == part:
-            return self.frame
-        return read_frame(self.connection, part, self.deadline)
+        is_all = replace(self.segment, open_start=False, open_end=False) == part
+        return self.frame if is_all else read_frame(self.connection, part, self.deadline)
 
     @cached_property
     def standstills(self) -> Findings:
         """Found once for both kinds that tell of them; how the other kinds look is not imported."""
-        from webots_mcp.store.detection.standstill import judge_standstills
+        from webots_mcp.store.detection.standstill import standstills_in
 
-        asked = (self.segment.run_id, self.motion)
-        if asked not in self.habits:
-            frames = frames_of_runs(self.connection, self.segment.run_id, self.deadline)
-            self.habits[asked] = ModeUses(*asked, frames, self.options)
-        return judge_standstills(self.frame, self.motion, self.options, self.habits[asked])
+        return standstills_in(self)
 
     def event(
         self, kind: str, start_s: float, end_s: float, name: str | None, **details: Any
     ) -> Event:
         """An event of this run; what has a duration and reaches the newest row goes on."""
-        run_id = self.segment.run_id
         ongoing = end_s >= self.ended_s > start_s
-        wall_s = self.wall_time_at(start_s)
-        return Event(kind, run_id, start_s, end_s, wall_s, name, details, ongoing)
+        place = (self.segment.run_id, start_s, end_s, self.wall_time_at(start_s))
+        return Event(kind, *place, name, details, ongoing)
 
     @cached_property
     def wall_time_at(self) -> Callable[[float], float]:
@@ -234,18 +181,16 @@ class Search:
 
     def note_too_large(self, kind: str) -> None:
         """Note which signals have numbers that are too large to be judged."""
-        if self.only is None and (names := listed(self._too_large, MOST_NAMED)):
-            self.not_searched(kind, f"not in {names}: numbers beyond {LARGEST:g}")
+        large = [each.name for each in self.numbers if self.only is None and self._is_large(each)]
+        if large:
+            self.not_searched(
+                kind, f"not in {listed(large, MOST_NAMED)}: numbers beyond {LARGEST:g}"
+            )
 
-    @cached_property
-    def _too_large(self) -> list[str]:
-        """Those with such numbers."""
-        return [each.name for each in self.numbers if self._is_too_large(each.name)]
-
-    def _is_too_large(self, name: str) -> bool:
-        zones = self.frame.zones(name)
+    def _is_large(self, signal: Signal) -> bool:
+        zones = self.frame.zones(signal.name)
         spans = zones.spans(zones.value_count < zones.held_count)
-        parts = (self.frame.rows(*span).numbers(name) for span in spans)
+        parts = (self.frame.rows(*span).numbers(signal.name) for span in spans)
         return any((np.abs(part) > LARGEST).any() for part in parts)
 
     def came_near(self, kind: str, share: float, what: str) -> None:
@@ -255,8 +200,8 @@ class Search:
 
     def is_over(self, kind: str, left: Sequence[Signal]) -> bool:
         """Whether the time is over; then it is noted which signals were not searched."""
-        if not self.deadline.passed:
-            return False
-        names = ", ".join(signal.name for signal in left[:3]) + (", ..." if left[3:] else "")
-        self.not_searched(kind, f"time limit reached, {len(left)} signals left: ask for {names}")
-        return True
+        if self.deadline.passed:
+            names = listed([signal.name for signal in left], 3)
+            why = f"time limit reached, {len(left)} signals left: ask for {names}"
+            self.not_searched(kind, why)
+        return self.deadline.passed

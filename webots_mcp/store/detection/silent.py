@@ -37,16 +37,18 @@ def silent_events(search: Search) -> Iterator[Event]:
             yield search.event("silent", run.start_s, run.end_s, signal.name, **details)
         short = runs.only((runs.durations_s > 0) & (runs.durations_s < least_s))
         if len(short):
-            _note_longest(search, signal, short, least_s)
-            if least_s == search.options.silent_s:
-                array = _INDEX.sub(".*", signal.name)
-                shorter[array] = max(_count_asked(search, short), shorter[array])
-    if +shorter:
-        counts = [
-            f"{name} {count} time{'s' * (count > 1)}" for name, count in (+shorter).most_common()
-        ]
+            longest = max(short.each(), key=lambda run: run.duration_s)
+            span = f"for {longest.duration_s:.3g} s from {longest.start_s:.6g} s"
+            share = longest.duration_s / least_s
+            search.came_near("silent", share, f"{signal.name} had no value {span}")
+        if least_s == search.options.silent_s:
+            asked, array = search.asked or search.segment, _INDEX.sub(".*", signal.name)
+            inside = (short.starts_s < asked.end_s) & (short.ends_s >= asked.start_s)
+            shorter[array] = max(int(np.count_nonzero(inside)), shorter[array])
+    if counts := (+shorter).most_common():
+        times = [f"{name} {count} time{'s' * (count > 1)}" for name, count in counts]
         limit = f"for less than silent_s={search.options.silent_s:g} s"
-        note = f"without a value {limit}, so not counted as silent: {listed(counts, MOST_NAMED)}"
+        note = f"without a value {limit}, so not counted as silent: {listed(times, MOST_NAMED)}"
         search.ledger.note_of_run(search.segment.run_id, note)
 
 
@@ -54,14 +56,11 @@ def _silences(search: Search, signal: Signal) -> Runs:
     """Where neither the signal has a value nor its array in its other form, long or short."""
     frame, other = search.frame, other_form(search.known, signal)
     signals = [each for each in (signal, other) if each]
-    lacks: Flags | None = None
-    for each in signals:
-        missing = rows_without_value(frame, each.name)
-        lacks = missing if lacks is None or missing is None else lacks & missing
-        if lacks is None:
-            return runs_of(np.zeros(0, np.bool_), frame.times)
-    assert lacks is not None
-    runs = runs_of(lacks, frame.times)
+    missing = [rows_without_value(frame, each.name) for each in signals]
+    lacking = [each for each in missing if each is not None]
+    if len(lacking) < len(missing):
+        return runs_of(np.zeros(0, np.bool_), frame.times)
+    runs = runs_of(np.all(lacking, axis=0), frame.times)
     return runs.only(_have_begun(search, signals, runs) & ~_are_shorter(search, signal, runs))
 
 
@@ -109,25 +108,9 @@ def _least_silence_s(search: Search, signal: Signal, runs: Runs) -> float:
     usual_s = float(np.sort(runs.durations_s)[len(runs) // 2])
     if 3 * usual_s <= least_s:
         return least_s
-    search.ledger.notes.append(
-        f"{signal.name} is intermittent (a value about every {usual_s:.3g} s): it counts as silent "
-        f"after {3 * usual_s:.3g} s"
-    )
+    rarely = f"{signal.name} is intermittent (a value about every {usual_s:.3g} s)"
+    search.ledger.notes.append(f"{rarely}: it counts as silent after {3 * usual_s:.3g} s")
     return 3 * usual_s
-
-
-def _note_longest(search: Search, signal: Signal, short: Runs, least_s: float) -> None:
-    longest = int(short.durations_s.argmax())
-    lasts_s, start_s = float(short.durations_s[longest]), float(short.starts_s[longest])
-    what = f"{signal.name} had no value for {lasts_s:.3g} s from {start_s:.6g} s"
-    search.came_near("silent", lasts_s / least_s, what)
-
-
-def _count_asked(search: Search, short: Runs) -> int:
-    """How many of them touch what was asked for."""
-    asked = search.asked or search.segment
-    inside = (short.starts_s < asked.end_s) & (short.ends_s >= asked.start_s)
-    return int(np.count_nonzero(inside))
 
 
 SILENT: Final = EventKind(
@@ -139,5 +122,4 @@ SILENT: Final = EventKind(
     of_numbers=True,
     drawn=2,
     alike=Alike(lambda events, unit: "stretches without a value", of_arrays=True),
-    of_frame=True,
 )

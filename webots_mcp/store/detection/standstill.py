@@ -2,118 +2,173 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from webots_mcp.naming import NAME_POSITION
-from webots_mcp.store.analysis.arrays import Array, Indexes, median, np
+from webots_mcp.store.analysis.arrays import Array, Indexes, np
 from webots_mcp.store.analysis.noise import noise_of
 from webots_mcp.store.analysis.standstill import NEARLY, find_standstills, shortest_seen_s
 from webots_mcp.store.analysis.track import Track, track_of
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import Alike, EventKind, NotSearchableError
-from webots_mcp.store.detection.motion import Motion, in_metres, tracks_of_frame
-from webots_mcp.store.detection.stuck import Judged, Place, Standings, Weighing
+from webots_mcp.store.detection.mode_use import ModeUses, frames_of_runs
+from webots_mcp.store.detection.motion import Motion, RunNoise, in_metres, tracks_in
+from webots_mcp.store.detection.stuck import Judged, Place, Standings, judged
 
 if TYPE_CHECKING:
-    from webots_mcp.store.detection.mode_use import ModeUses
     from webots_mcp.store.detection.search import Search
     from webots_mcp.store.reading.frame import Frame
 
 NOISE_RANGE: Final = 6.0  # deviations of noise from the least of some hundred rows to the greatest
 SHORTEST_SHARE: Final = 4.0  # of the shortest standstill: shorter ones came nowhere near
+MARGIN_ROWS: Final = 4096  # before and after a range, and more where it takes more
+FARTHER: Final = 8
 
 
 @dataclass(frozen=True)
 class Findings:
-    """What a detector found in a frame.
+    """What was found in the rows of a run.
 
     Attributes:
         nearest: What came nearest to a standstill where there is none: its share of the shortest,
             and in words.
         unseen: What could not be looked at.
         undecided: Why one of them may be `stuck` that is told as a standstill.
+        bear: The first and the last row that bear on them; they may lie beyond the rows given.
     """
 
     events: list[Judged] = field(default_factory=list[Judged])
     nearest: tuple[float, str] | None = None
     unseen: list[str] = field(default_factory=list[str])
     undecided: list[str] = field(default_factory=list[str])
+    bear: tuple[int, int] = (0, 0)
+
+
+def standstills_in(search: Search) -> Findings:
+    """Those that touch the segment of a search, from as many rows as bear on them.
+
+    Raises:
+        NotSearchableError: No position is known, or there is none.
+    """
+    motion, run, asked = search.motion, search.frame, search.asked or search.segment
+    if search.whole.cut_at_s is None and not asked.full_rate:
+        run = search.whole
+    frames = frames_of_runs(search.connection, run, search.deadline)
+    uses = ModeUses(run.run_id, motion, frames, search.options)
+    noise = RunNoise(run, motion)
+    span = run.places([asked.start_s, asked.end_s]).tolist()
+    margin = MARGIN_ROWS
+    while True:
+        first, stop = max(0, span[0] - margin), min(len(run), span[1] + margin)
+        rows = span[0] - first, span[1] - first
+        found = judge_standstills(
+            run.rows(first, stop), motion, search.options, uses, noise=noise, asked=rows
+        )
+        is_known = (not first or found.bear[0] >= 0) and (
+            stop == len(run) or found.bear[1] < stop - first
+        )
+        if is_known or search.deadline.passed:
+            return found
+        margin *= FARTHER
 
 
 def judge_standstills(
-    frame: Frame, motion: Motion, options: EventOptions, uses: ModeUses
+    frame: Frame,
+    motion: Motion,
+    options: EventOptions,
+    uses: ModeUses,
+    *,
+    noise: RunNoise | None = None,
+    asked: tuple[int, int] | None = None,
 ) -> Findings:
     """Find where a robot stood still and where it was stuck.
+
+    Args:
+        frame: The rows.
+        motion: Which signals tell.
+        options: What counts.
+        uses: In which modes it moves.
+        noise: Of the run, where these are some of its rows.
+        asked: Rows that the standstills have to touch; None for all.
 
     Raises:
         NotSearchableError: No position is known, or the frame has none.
     """
     if motion.position is None:
         raise NotSearchableError(NAME_POSITION)
-    tracks, rows = tracks_of_frame(frame, motion.position)
+    noise = noise or RunNoise(frame, motion)
+    asked = asked or (0, len(frame))
+    tracks, rows = tracks_in(frame, motion.position, noise)
     if not tracks:
         names = " and ".join(signal.name for signal in motion.position)
         raise NotSearchableError(f"{names} have no value in that range of run {frame.run_id}")
-    noise_m = tracks[0].noise_m
-    times = np.concatenate([track.times for track in tracks])
-    interval_s = median(np.diff(times)) if len(times) > 1 else 0.0
-    seen_s = shortest_seen_s(noise_m, interval_s, options.stuck_m, options.stuck_s)
-    places = [
+    seen_s = shortest_seen_s(noise.position_m, noise.interval_s, options.stuck_m, options.stuck_s)
+    unseen = [
+        f"none under {seen_s:.2g} s: position noise of {noise.position_m:.2g} m hides slow motion"
+    ] * (seen_s > options.stuck_s / NEARLY)
+    found = (
         place
         for track, here in zip(tracks, rows, strict=True)
         for place in _places(track, here, frame, motion, options)
-    ]
-    unseen: list[str] = []
-    if seen_s > options.stuck_s / NEARLY:
-        unseen.append(
-            f"none under {seen_s:.2g} s: position noise of {noise_m:.2g} m hides slow motion"
-        )
-    seen = [each for each in places if each.lasts_s >= NEARLY * seen_s]
-    if not seen:
-        return Findings([], None if places else _nearest(tracks, options), unseen)
-    weighing = Weighing(Standings(frame, motion, options, seen), uses)
-    events = list(weighing.events())
+    )
+    places = [each for each in found if each.rows[0] < asked[1] and each.rows[-1] >= asked[0]]
+    long = [place for place in places if place.lasts_s >= NEARLY * seen_s]
+    bears = [place.bears for place in places]
+    bear = (
+        min([first for first, _ in bears], default=asked[0]),
+        max([last for _, last in bears], default=asked[1] - 1),
+    )
+    if not long:
+        there = [_part(track, here, asked) for track, here in zip(tracks, rows, strict=True)]
+        return Findings([], None if places else _nearest(there, options), unseen, bear=bear)
+    events = judged(Standings(frame, motion, options, long, noise), uses)
     cut = ["time limit reached before it was known in which modes it moves"] if uses.is_cut else []
-    return Findings(events, None, unseen, cut)
+    return Findings(events, None, unseen, cut, bear)
 
 
 def _places(
     track: Track, rows: Indexes, frame: Frame, motion: Motion, options: EventOptions
 ) -> Iterator[Place]:
     """The standstills of a track, in parts where it climbs or sinks in between."""
-    heights = None if motion.height is None else frame.numbers(motion.height.name)[rows]
     for each in find_standstills(track, options.stuck_m, options.stuck_s):
         ends = [(each.start, each.last + 1)]
-        if heights is not None and motion.height is not None:
-            here = slice(*ends[0])
-            high = in_metres(motion.height, heights[here])
-            ends = list(_at_one_height(track.times[here], high, each.start, options))
+        if motion.height is not None:
+            high = frame.numbers(motion.height.name)[rows[slice(*ends[0])]]
+            ends = list(_at_one_height(track, in_metres(motion.height, high), each.start, options))
+        before = rows[0] + each.seen_from if rows[0] == 0 else max(0, each.seen_from)
+        after = each.seen_to - len(track.times) + len(frame)
+        bears = before, after if rows[-1] == len(frame) - 1 else min(after, len(frame) - 1)
         for start, stop in ends:
-            here = slice(start, stop)
-            course = track.times[here], track.x[here], track.y[here]
-            yield Place(rows[here], *course, each.x_m, each.y_m, track.left_m)
+            part = slice(start, stop)
+            course = track.times[part], track.x[part], track.y[part]
+            yield Place(rows[part], *course, each.x_m, each.y_m, track.left_m, bears)
 
 
 def _at_one_height(
-    times: Array, heights: Array, first: int, options: EventOptions
+    track: Track, heights: Array, first: int, options: EventOptions
 ) -> Iterator[tuple[int, int]]:
     """The rows of a standstill, from `first` on, in which it neither climbs nor sinks.
 
     Noise does neither: with it, heights reach farther than the robot does.
     """
     there = np.flatnonzero(np.isfinite(heights))
-    if len(there) < 2:
-        yield first, first + len(times)
+    up = track_of(
+        track.times[first + there], heights[there], np.zeros(len(there)), noise_of(heights[there])
+    )
+    far_m = np.ptp(up.x) if len(there) > 1 else 0.0
+    if far_m <= options.stuck_m + NOISE_RANGE * up.left_m:
+        yield first, first + len(heights)
         return
-    heights = heights[there]
-    track = track_of(times[there], heights, np.zeros(len(there)), noise_of(heights))
-    if np.ptp(track.x) <= options.stuck_m + NOISE_RANGE * track.left_m:
-        yield first, first + len(times)
-        return
-    for each in find_standstills(track, options.stuck_m, options.stuck_s):
+    for each in find_standstills(up, options.stuck_m, options.stuck_s):
         yield first + int(there[each.start]), first + int(there[each.last]) + 1
+
+
+def _part(track: Track, rows: Indexes, asked: tuple[int, int]) -> Track:
+    """The part of a track in some rows."""
+    return track.part(*np.searchsorted(rows, asked).tolist())
 
 
 def _nearest(tracks: Sequence[Track], options: EventOptions) -> tuple[float, str] | None:
@@ -129,55 +184,43 @@ def _nearest(tracks: Sequence[Track], options: EventOptions) -> tuple[float, str
         climbed = ", but its height changed" if lasts_s >= least_s else ""
         stood = f"longest standstill: {lasts_s:.2g} s, from {start_s:.1f} s on{climbed}"
         return lasts_s / least_s, stood
-    ways = [way for track in tracks for way in _ways(track, least_s)]
+    ways: list[tuple[float, float]] = []
+    for track in tracks:
+        later = np.searchsorted(track.times, track.times + least_s)
+        starts = np.flatnonzero(later < len(track.times))
+        way_m = np.hypot(*(each[later[starts]] - each[starts] for each in (track.x, track.y)))
+        ways += zip(way_m.tolist(), track.times[starts].tolist(), strict=True)
     if not ways:
         return None
     way_m, start_s = min(ways)
     return 0.0, f"smallest movement in {least_s:g} s: {way_m:.2g} m, from {start_s:.1f} s on"
 
 
-def _ways(track: Track, within_s: float) -> Iterator[tuple[float, float]]:
-    """The shortest way of a track in so many seconds, and when it began."""
-    later = np.searchsorted(track.times, track.times + within_s)
-    starts = np.flatnonzero(later < len(track.times))
-    if len(starts):
-        ends = later[starts]
-        way_m = np.hypot(track.x[ends] - track.x[starts], track.y[ends] - track.y[starts])
-        least = int(way_m.argmin())
-        yield float(way_m[least]), float(track.times[starts[least]])
-
-
 def _standstills(search: Search) -> Iterator[Event]:
-    """It stayed where it was; not where it was stuck all the time, which is asked for as well."""
+    """It stayed where it was; beside `stuck`, where that is asked for as well."""
     with_stuck = any(kind.name == "stuck" for kind in search.kinds)
-    for each in _noted(search, "standstill").events:
-        if each.kind == "standstill" and not (each.covered and with_stuck):
-            yield search.event(each.kind, each.start_s, each.end_s, None, **each.details)
+    return _events(search, "standstill", "apart" if with_stuck else "standstill")
 
 
 def _stuck(search: Search) -> Iterator[Event]:
     """It should have moved and stayed where it was."""
-    found = _noted(search, "stuck")
-    search.not_searched("stuck", *found.undecided)
-    for each in found.events:
-        if each.kind == "stuck":
-            yield search.event(each.kind, each.start_s, each.end_s, None, **each.details)
+    search.not_searched("stuck", *search.standstills.undecided)
+    return _events(search, "stuck", "stuck")
 
 
-def _noted(search: Search, kind: str) -> Findings:
+def _events(search: Search, kind: str, judged_as: str) -> Iterator[Event]:
     found = search.standstills
     search.not_searched(kind, *found.unseen)
     if found.nearest is not None:
         search.came_near(kind, *found.nearest)
-    return found
+    for each in found.events:
+        if each.kind == judged_as:
+            yield search.event(kind, each.start_s, each.end_s, None, **each.details)
 
 
-def _least_s(options: EventOptions) -> float:
-    return options.stuck_s
-
-
-def _mode(event: Event) -> Hashable:
-    return event.details.get("mode")
+def _are_known(event: Event) -> float:
+    """Both ends are: it was looked for in as many rows as bear on them."""
+    return -math.inf
 
 
 STANDSTILL: Final = EventKind(
@@ -185,10 +228,10 @@ STANDSTILL: Final = EventKind(
     "stands",
     _standstills,
     lasts=True,
-    least_s=_least_s,
+    least_s=lambda options: options.stuck_s,
+    ends_within_s=_are_known,
     drawn=8,
-    alike=Alike(lambda events, unit: "standstills", sort=_mode),
-    of_frame=True,
+    alike=Alike(lambda events, unit: "standstills", sort=lambda event: event.details.get("mode")),
     effort=3,
 )
 STUCK: Final = EventKind(
@@ -196,9 +239,9 @@ STUCK: Final = EventKind(
     "stands when it should move",
     _stuck,
     lasts=True,
-    least_s=_least_s,
+    least_s=lambda options: options.stuck_s,
+    ends_within_s=_are_known,
     drawn=0,
-    alike=Alike(lambda events, unit: "times stuck", sort=_mode),
-    of_frame=True,
+    alike=Alike(lambda events, unit: "times stuck", sort=lambda event: event.details.get("mode")),
     effort=3,
 )

@@ -1,11 +1,10 @@
-"""Events that were stored when they happened: runs, commands, logs, pictures, what was noticed."""
+"""Events that were stored when they happened: runs, commands, logs, pictures, and the like."""
 
 from __future__ import annotations
 
 import json
 import math
-import sqlite3
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
@@ -17,12 +16,13 @@ from webots_mcp.store.detection.kind import (
     EventKind,
     NotSearchableError,
     but_for_numbers,
-    only_if_named,
+    told_together,
 )
 from webots_mcp.store.detection.search import Search
-from webots_mcp.store.detection.together import told_together
+from webots_mcp.store.images import count_kept_frames
 from webots_mcp.store.reading.changes import MOST_VALUES, Point, change_points, value_ended_s
 from webots_mcp.store.reading.gaps import frame_around, rhythm_in
+from webots_mcp.store.reading.kept import kept_stretches
 from webots_mcp.store.reading.ranges import Segment, just_after
 from webots_mcp.store.signals.registry import Signal
 
@@ -50,10 +50,9 @@ _RUN: Final = (
 _COMMANDS: Final = (
     "SELECT id, action, params, status, created_wall_time_s, claimed_wall_time_s, "
     "claimed_sim_time_s, finished_wall_time_s, finished_sim_time_s, result, error FROM command "
-    "WHERE robot_id = (SELECT robot_id FROM run WHERE id = :run) "
-    "AND coalesce(claimed_wall_time_s, created_wall_time_s) >= :start_wall "
-    "AND coalesce(claimed_wall_time_s, created_wall_time_s) < :end_wall "
-    "ORDER BY id DESC LIMIT :limit"
+    "WHERE robot_id = (SELECT robot_id FROM run WHERE id = ?) "
+    "AND coalesce(claimed_wall_time_s, created_wall_time_s) >= ? "
+    "AND coalesce(claimed_wall_time_s, created_wall_time_s) < ? ORDER BY id DESC LIMIT ?"
 )
 _RUN_WALLS: Final = (
     "SELECT started_wall_time_s, coalesce((SELECT min(n.started_wall_time_s) FROM run n "
@@ -67,16 +66,16 @@ _SIM_AT_WALL: Final = (
 
 def run_events(search: Search) -> Iterator[Event]:
     """Begin and end of the run, where the segment holds them."""
-    segment = search.segment
+    here, run_id = search.segment, search.segment.run_id
     start_s, start_wall_s, start, end_s, end_wall_s, end = search.connection.execute(
-        _RUN, (segment.run_id,)
+        _RUN, (run_id,)
     ).fetchone()
-    if segment.holds_from_s <= start_s and segment.wall_start_s <= start_wall_s:
+    if here.holds_from_s <= start_s and here.wall_start_s <= start_wall_s:
         details = {"what": "began", "reason": start}
-        yield Event("run", segment.run_id, start_s, start_s, start_wall_s, None, details)
-    if end_wall_s is not None and end_s < segment.holds_to_s and end_wall_s < segment.wall_end_s:
+        yield Event("run", run_id, start_s, start_s, start_wall_s, None, details)
+    if end_wall_s is not None and end_s < here.holds_to_s and end_wall_s < here.wall_end_s:
         details = {"what": "ended", "reason": end}
-        yield Event("run", segment.run_id, end_s, end_s, end_wall_s, None, details)
+        yield Event("run", run_id, end_s, end_s, end_wall_s, None, details)
 
 
 def _recorded(search: Search) -> Segment:
@@ -92,16 +91,15 @@ def gap_events(search: Search) -> Iterator[Event]:
     around = frame_around(search.connection, segment, search.deadline)
     _note_unread(search, "gap", around.cut_at_s)
     rhythm = rhythm_in(around)
-    details = {"usual_interval_s": rhythm.interval_s}
     for gap in rhythm.gaps:
         if gap.end_s > segment.start_s and gap.start_s < segment.end_s:
-            wall_s = search.wall_time_at(gap.start_s)
-            yield Event("gap", segment.run_id, gap.start_s, gap.end_s, wall_s, None, details)
+            place = (segment.run_id, gap.start_s, gap.end_s, search.wall_time_at(gap.start_s))
+            yield Event("gap", *place, None, {"usual_interval_s": rhythm.interval_s})
 
 
 def change_events(search: Search) -> Iterator[Event]:
     """Changes of text, flags and modes, each as long as the new value lasted."""
-    segment, newest_s = _recorded(search), search.ended_s
+    segment = _recorded(search)
     states = [each for each in search.signals if not each.is_number or each.is_choice]
     if not states:
         raise NotSearchableError(
@@ -111,28 +109,24 @@ def change_events(search: Search) -> Iterator[Event]:
     around = Segment(segment.run_id, segment.start_s - AROUND_S, segment.end_s + AROUND_S)
     found = change_points(search.connection, around, states, search.deadline, since=False)
     _note_unread(search, "change", found.unread_from_s)
-    for each in found.unread:
-        search.not_searched("change", str(each))
+    search.not_searched("change", *map(str, found.unread))
     for signal in states:
-        name, points = signal.name, found.points[signal.name]
-        points_left = _without_measurements(points)
-        last_s, cut_at_s = _last_ends_s(search, signal, points_left)
+        points = _without_measurements(found.points[signal.name])
+        if len(points) < len(found.points[signal.name]):
+            why = f"not between numbers of {signal.name}, a measurement"
+            search.not_searched("change", f"{why}: webots_query_history shows them")
+        last_s, cut_at_s = _last_ends_s(search, signal, points)
         if cut_at_s is not None:
-            last_s = max(cut_at_s, points_left[-1].sim_time_s)
-            why = (
-                f"the one at {points_left[-1].sim_time_s:.3f} s may last longer: time limit reached"
-            )
+            last_s = max(cut_at_s, points[-1].sim_time_s)
+            why = f"the one at {points[-1].sim_time_s:.3f} s may last longer: time limit reached"
             search.not_searched("change", why)
-        ends_s = [*(point.sim_time_s for point in points_left[2:]), last_s]
+        ends_s = [*(point.sim_time_s for point in points[2:]), last_s]
         changes = [
-            _Change(before, point, newest_s if end_s is None else end_s, end_s is None)
-            for (before, point), end_s in zip(pairwise(points_left), ends_s, strict=False)
+            _Change(before, point, search.ended_s if end_s is None else end_s, end_s is None)
+            for (before, point), end_s in zip(pairwise(points), ends_s, strict=False)
             if segment.start_s <= point.sim_time_s < segment.end_s
         ]
-        if len(points_left) < len(points):
-            why = f"not between numbers of {name}, a measurement: webots_query_history shows them"
-            search.not_searched("change", why)
-        yield from _reported(search, name, changes)
+        yield from _reported(search, signal.name, changes)
 
 
 def _note_unread(search: Search, kind: str, from_s: float | None) -> None:
@@ -153,24 +147,21 @@ class _Change(NamedTuple):
 
 def _reported(search: Search, name: str, changes: Sequence[_Change]) -> Iterator[Event]:
     """Each change; of what flickers all as one."""
+
+    def event(change: _Change, start_s: float, details: dict[str, Any]) -> Event:
+        place = (search.segment.run_id, start_s, change.end_s, search.wall_time_at(start_s))
+        return Event("change", *place, name, details, ongoing=change.ongoing)
+
     if len(changes) > MOST_CHANGES:
         starts_s = [each.point.sim_time_s for each in changes]
         lengths_s = [each.end_s - each.point.sim_time_s for each in changes]
-        to = _to(list(zip((each.point.value for each in changes), lengths_s, strict=True)))
+        to = _to([*zip((each.point.value for each in changes), lengths_s, strict=True)])
         together = to | told_together("changes", starts_s, lengths_s)
-        one = changes[-1]._replace(point=changes[0].point)
-        yield replace(_change(search, name, one, together), count=len(changes))
+        yield replace(event(changes[-1], starts_s[0], together), count=len(changes))
         return
     for each in changes:
         details = {"before": each.before.value, "after": each.point.value}
-        yield _change(search, name, each, details)
-
-
-def _change(search: Search, name: str, change: _Change, details: dict[str, Any]) -> Event:
-    run_id, start_s = search.segment.run_id, change.point.sim_time_s
-    wall_s = search.wall_time_at(start_s)
-    place = (run_id, start_s, change.end_s, wall_s)
-    return Event("change", *place, name, details, ongoing=change.ongoing)
+        yield event(each, each.point.sim_time_s, details)
 
 
 def _last_ends_s(
@@ -206,20 +197,16 @@ def _is_number(value: object) -> bool:
 
 def log_events(search: Search) -> Iterator[Event]:
     """Log lines of the level and above; where there are only lower ones, this is noted."""
-    wanted = search.options.log_level
+    wanted, run_id = search.options.log_level, search.segment.run_id
     lower, levels = LEVELS[: LEVELS.index(wanted)], LEVELS[LEVELS.index(wanted) :]
     query = f"{_LOGS} AND level IN ({', '.join('?' * len(levels))}) "
     rows = _newest(search, "log", query, *levels)
     for time_s, wall_s, level, source, message in rows:
         details = {"source": source, "message": message}
-        yield Event("log", search.segment.run_id, time_s, time_s, wall_s, level, details)
-    if rows:
-        return
-    for rank, level in reversed([*enumerate(lower, 1)]):
-        line = search.connection.execute(
-            f"{_LOGS} AND level = ? LIMIT 1", (*_bounds(search.segment), level)
-        )
-        if line.fetchone():
+        yield Event("log", run_id, time_s, time_s, wall_s, level, details)
+    for rank, level in reversed([*enumerate(lower, 1)] if not rows else []):
+        asked = (*_bounds(search.segment), level)
+        if search.connection.execute(f"{_LOGS} AND level = ? LIMIT 1", asked).fetchone():
             what = f"there are lines of level {level}, none of {wanted} or above"
             search.came_near("log", rank / len(LEVELS), what)
             return
@@ -228,9 +215,7 @@ def log_events(search: Search) -> Iterator[Event]:
 def noticed_events(search: Search) -> Iterator[Event]:
     """What the bridge noticed and stored: pause, resume, dropped rows, trouble with storage."""
     for time_s, wall_s, kind, name, data in _newest(search, "noticed", _NOTICED):
-        details: dict[str, Any] = {"what": kind}
-        if data:
-            details["data"] = json.loads(data)
+        details: dict[str, Any] = {"what": kind} | ({"data": json.loads(data)} if data else {})
         yield Event("noticed", search.segment.run_id, time_s, time_s, wall_s, name, details)
 
 
@@ -239,6 +224,18 @@ def image_events(search: Search) -> Iterator[Event]:
     for time_s, wall_s, kind, device, path, image_id in _newest(search, "image", _IMAGES):
         details = {"kind": kind, "path": path, "image_id": image_id}
         yield Event("image", search.segment.run_id, time_s, time_s, wall_s, device, details)
+
+
+def kept_events(search: Search) -> Iterator[Event]:
+    """The stretches that the segment touches; one that is not over reaches up to the newest row."""
+    segment = search.segment
+    span = (segment.holds_from_s, segment.holds_to_s)
+    for each in kept_stretches(search.connection, segment.run_id, *span):
+        end_s = max(each.start_s, min(each.end_s, search.ended_s))
+        frames = count_kept_frames(search.connection, segment.run_id, each.start_s, each.end_s)
+        details = {"reason": each.reason} | ({"frames": frames} if frames else {})  # of cameras
+        place = (segment.run_id, each.start_s, end_s, each.wall_time_s)
+        yield Event("kept", *place, None, details, ongoing=each.end_s > search.ended_s)
 
 
 def _newest(search: Search, kind: str, query: str, *values: object) -> list[Any]:
@@ -255,54 +252,37 @@ def _note_older(search: Search, kind: str, count: int) -> None:
 
 
 def command_events(search: Search) -> Iterator[Event]:
-    """Commands, from when they were claimed (or created, if never) to when they were finished."""
-    connection, segment = search.connection, search.segment
-    start_wall_s, end_wall_s = connection.execute(_RUN_WALLS, (segment.run_id,)).fetchone()
-    walls = {
-        "start_wall": max(start_wall_s, segment.wall_start_s),
-        "end_wall": min(end_wall_s, segment.wall_end_s),
-    }
-    asked = {"run": segment.run_id, "limit": MOST_OF_A_KIND, **walls}
-    rows = connection.execute(_COMMANDS, asked).fetchall()
+    """Commands, from when they were claimed (or created, if never) to when they were finished.
+
+    Not those that lie outside the segment in simulation time.
+    """
+    connection, here = search.connection, search.segment
+    start_wall_s, end_wall_s = connection.execute(_RUN_WALLS, (here.run_id,)).fetchone()
+    walls_s = max(start_wall_s, here.wall_start_s), min(end_wall_s, here.wall_end_s)
+    rows = connection.execute(_COMMANDS, (here.run_id, *walls_s, MOST_OF_A_KIND)).fetchall()
     _note_older(search, "command", len(rows))
-    for row in rows:
-        event = _command(connection, segment, row)
-        if event is not None:
-            yield event
-
-
-def _command(
-    connection: sqlite3.Connection, segment: Segment, row: tuple[Any, ...]
-) -> Event | None:
-    """None if it was outside the segment in simulation time."""
-    command_id, action, params, status, created_s, claimed_s, start_s, *finished = row
-    finished_wall_s, end_s, result, error = finished
-    wall_s = created_s if claimed_s is None else claimed_s
-    if start_s is None:
-        span = (segment.run_id, segment.holds_from_s, segment.holds_to_s, wall_s)
-        at = connection.execute(_SIM_AT_WALL, span).fetchone()
-        start_s = at[0] if at else None
-    if start_s is None or not segment.holds_from_s <= start_s < segment.holds_to_s:
-        return None
-    details: dict[str, Any] = {"id": command_id, "status": status, "params": json.loads(params)}
-    if finished_wall_s is not None:
-        details["took_wall_s"] = finished_wall_s - wall_s
-    details |= {"result": json.loads(result)} if result else {}
-    details |= {"error": error} if error else {}
-    end_s = start_s if end_s is None or end_s < start_s else end_s  # a reset finishes in a new run
-    ongoing = status in ("pending", "claimed")
-    place = (segment.run_id, start_s, end_s, wall_s)
-    return Event("command", *place, action, details, ongoing=ongoing)
+    for command_id, action, params, status, created_s, claimed_s, start_s, *finished in rows:
+        finished_wall_s, end_s, result, error = finished
+        wall_s = created_s if claimed_s is None else claimed_s
+        if start_s is None:
+            span = (here.run_id, here.holds_from_s, here.holds_to_s, wall_s)
+            (start_s,) = connection.execute(_SIM_AT_WALL, span).fetchone() or (None,)
+        if start_s is None or not here.holds_from_s <= start_s < here.holds_to_s:
+            continue
+        details: dict[str, Any] = {"id": command_id, "status": status}
+        details |= {"params": json.loads(params)}
+        details |= {} if finished_wall_s is None else {"took_wall_s": finished_wall_s - wall_s}
+        details |= {"result": json.loads(result)} if result else {}
+        details |= {"error": error} if error else {}
+        end_s = max(start_s, end_s or start_s)  # a reset finishes in a new run
+        ongoing = status in ("pending", "claimed")
+        place = (here.run_id, start_s, end_s, wall_s)
+        yield Event("command", *place, action, details, ongoing=ongoing)
 
 
 def _bounds(segment: Segment) -> tuple[float, ...]:
     walls = (segment.wall_start_s, segment.wall_end_s)
     return (segment.run_id, segment.holds_from_s, segment.holds_to_s, *walls)
-
-
-def _values(events: Sequence[Event]) -> dict[str, Any]:
-    """To which values a signal changed."""
-    return _to([(event.details["after"], event.duration_s) for event in events])
 
 
 def _to(values: Sequence[tuple[Value, float]]) -> dict[str, Any]:
@@ -311,29 +291,12 @@ def _to(values: Sequence[tuple[Value, float]]) -> dict[str, Any]:
     for value, duration_s in values:
         name = value if isinstance(value, str) else json.dumps(value)
         lasted_s.setdefault(name, []).append(duration_s)
-    often = sorted(lasted_s, key=lambda name: -len(lasted_s[name]))
+    often = sorted(lasted_s.items(), key=lambda each: -len(each[1]))
     to: dict[str, Any] = {
-        name: f"{len(lasted_s[name])} times, {sum(lasted_s[name]):.4g} s"
-        for name in often[:MOST_NAMED]
+        name: f"{len(each)} times, {sum(each):.4g} s" for name, each in often[:MOST_NAMED]
     }
     rest = len(often) - MOST_NAMED
     return {"to": to | ({"other values": rest} if rest > 0 else {})}
-
-
-def _outcome(event: Event) -> Hashable:
-    return event.details["status"], but_for_numbers(event.details.get("error"))
-
-
-def _line(event: Event) -> Hashable:
-    return event.details["source"], but_for_numbers(event.details["message"])
-
-
-def _first_line(events: Sequence[Event]) -> dict[str, Any]:
-    return {"message": events[0].details["message"]}
-
-
-def _what(event: Event) -> Hashable:
-    return event.details["what"]
 
 
 RUN: Final = EventKind("run", "began or ended", run_events, stored=True, counted=False)
@@ -346,7 +309,11 @@ CHANGE: Final = EventKind(
     change_events,
     stored=True,
     routine=True,
-    alike=Alike(lambda events, unit: "changes", adds=_values, most_single=10),
+    alike=Alike(
+        lambda events, unit: "changes",
+        adds=lambda events: _to([(e.details["after"], e.duration_s) for e in events]),
+        most_single=10,
+    ),
 )
 COMMAND: Final = EventKind(
     "command",
@@ -354,7 +321,10 @@ COMMAND: Final = EventKind(
     command_events,
     stored=True,
     drawn=5,
-    alike=Alike(lambda events, unit: "commands", sort=_outcome),
+    alike=Alike(
+        lambda events, unit: "commands",
+        sort=lambda e: (e.details["status"], but_for_numbers(e.details.get("error"))),
+    ),
 )
 LOG: Final = EventKind(
     "log",
@@ -362,7 +332,11 @@ LOG: Final = EventKind(
     log_events,
     stored=True,
     drawn=4,
-    alike=Alike(lambda events, unit: "similar lines", sort=_line, adds=_first_line),
+    alike=Alike(
+        lambda events, unit: "similar lines",
+        sort=lambda e: (e.details["source"], but_for_numbers(e.details["message"])),
+        adds=lambda events: {"message": events[0].details["message"]},
+    ),
 )
 NOTICED: Final = EventKind(
     "noticed",
@@ -370,14 +344,21 @@ NOTICED: Final = EventKind(
     noticed_events,
     stored=True,
     drawn=6,
-    alike=Alike(lambda events, unit: f"times {events[0].details['what']}", sort=_what),
+    alike=Alike(
+        lambda events, unit: f"times {events[0].details['what']}", sort=lambda e: e.details["what"]
+    ),
 )
-IMAGE: Final = EventKind(
-    "image",
-    "",
-    image_events,
+KEPT: Final = EventKind(
+    "kept",
+    "at full rate",
+    kept_events,
     stored=True,
-    usual=only_if_named,
     routine=True,
     counted=False,
+    alike=Alike(
+        lambda events, unit: "kept stretches", sort=lambda e: but_for_numbers(e.details["reason"])
+    ),
+)
+IMAGE: Final = EventKind(  # no news, and there may be thousands
+    "image", "", image_events, stored=True, usual=lambda options: False, routine=True, counted=False
 )

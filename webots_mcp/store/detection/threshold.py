@@ -95,5 +95,4 @@ THRESHOLD: Final = EventKind(
     least_s=_for_s,
     counted=False,
     alike=Alike(lambda events, unit: "stretches", sort=_limit),
-    of_frame=True,
 )

@@ -107,9 +107,8 @@ class Ledger:
     @property
     def all_notes(self) -> tuple[str, ...]:
         """The remarks, each once."""
-        of_runs = [
-            f"run {', '.join(map(str, run_ids))}: {note}" for note, run_ids in self._of_runs.items()
-        ]
+        runs = {note: ", ".join(map(str, run_ids)) for note, run_ids in self._of_runs.items()}
+        of_runs = (f"run {listed}: {note}" for note, listed in runs.items())
         return tuple(dict.fromkeys([*self.notes, *of_runs]))
 
     def came_near(self, kind: str, share: float, what: str) -> None:
@@ -118,14 +117,10 @@ class Ledger:
 
     def verdicts(self, kinds: Sequence[EventKind], events: Iterable[Event]) -> Verdicts:
         """On each of the kinds, in their order, given all that was found."""
-        counts = count_by_kind(events)
-        names = [kind.name for kind in kinds]
+        counts, names = count_by_kind(events), [kind.name for kind in kinds]
+        absent = [name for name in names if name in self.searched and not counts[name]]
         return Verdicts(
             {name: counts[name] for name in names if counts[name]},
-            {
-                name: self._nearest.get(name, (0.0, ""))[1]
-                for name in names
-                if name in self.searched and not counts[name]
-            },
+            {name: self._nearest.get(name, (0.0, ""))[1] for name in absent},
             {name: tuple(self._reasons[name]) for name in names if self._reasons.get(name)},
         )

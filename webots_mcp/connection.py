@@ -117,10 +117,9 @@ def connect(
     except sqlite3.OperationalError as error:
         raise DatabaseError(f"{database} cannot be opened: {error}; check the folder") from error
     try:
-        if create:
-            # First: another application's file stays as it is, and one of another version too.
-            if schema_version(connection) in (0, SCHEMA_VERSION):
-                _make_wal(connection)
+        # Another application's file stays as it is, and one of another version too.
+        if create and schema_version(connection) in (0, SCHEMA_VERSION):
+            _make_wal(connection)
         _prepare(connection, role)
     except Exception as error:
         connection.close()

@@ -50,7 +50,9 @@ def test_readers_see_chunks_that_the_file_has_not(recording: Recording) -> None:
     with recording.reader() as connection:
         expected = trends(connection, find_range(connection, Scope()))
     told: list[tuple[int, int]] = []
-    assert make_missing_chunks(recording, lambda *done: told.append(done), write=False) == ""
+    assert (
+        make_missing_chunks(recording, lambda done, of: told.append((done, of)), write=False) == ""
+    )
     assert told[-1] == (ROWS, ROWS)
     assert in_chunks(recording) == ROWS
     assert recording.database.read_bytes() == before
@@ -66,7 +68,9 @@ def test_they_are_made_once_and_what_broke_off_goes_on(recording: Recording) -> 
     assert make_missing_chunks(recording, write=False) == ""
     assert in_chunks(recording) == ROWS
     told: list[tuple[int, int]] = []
-    assert make_missing_chunks(recording, lambda *done: told.append(done), write=False) == ""
+    assert (
+        make_missing_chunks(recording, lambda done, of: told.append((done, of)), write=False) == ""
+    )
     assert told == []
 
 

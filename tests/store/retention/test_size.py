@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -92,7 +93,10 @@ def test_the_file_of_a_recording_that_goes_on_stays_within_a_twentieth_of_its_li
 ) -> None:
     file, noise = tmp_path / "webots.db", random.Random(5)
     sizes_of = {"state": 2_000_000, "chunk": 1_200_000, "log": 600_000}
-    limits = Retention(**{kind: Limit(size_bytes=size) for kind, size in sizes_of.items()})
+    by_kind = {kind: Limit(size_bytes=size) for kind, size in sizes_of.items()}
+    limits = replace(
+        Retention(), state=by_kind["state"], chunk=by_kind["chunk"], log=by_kind["log"]
+    )
     upkeep = Upkeep(tmp_path, lambda _: limits, interval_s=0, budget_s=60)
     sizes: list[int] = []
     with closing(connect(file, "writer", create=True)) as connection:

@@ -300,13 +300,13 @@ class ClusterSimulators:
     def _fetched(self, result: Result, recording_uuid: str, folder: Path) -> Result:
         """The result, with its runs in a recording in the folder, as if it had been returned."""
         from webots_mcp.plugins.pool.fetching import fetch
-        from webots_mcp.plugins.pool.pool_contents import Meant
+        from webots_mcp.plugins.pool.pool_contents import Meant, pooled_runs
 
         assert self._needs.ship_to is not None
         recording = Recording(folder / DATABASE_NAME, folder)
         recording.create()
         with open_pool(self._needs.ship_to) as pool, recording.writer() as connection:
-            runs = list(pool.runs(recording_uuid))
+            runs = [each for each in pooled_runs(pool) if each.recording_uuid == recording_uuid]
             ids = fetch(pool, connection, folder, Meant(runs, ())).runs
         (own,) = (ids[each.uuid] for each in runs if each.run_id == result.run_id)
         return replace(result, run_id=own)

@@ -29,7 +29,7 @@ from webots_mcp.store.reading.ranges import Scope, find_range, whole_run
 from webots_mcp.store.reading.subject import Subject, find_subject
 from webots_mcp.store.run_rows import Event, State, newest_events, runs_of
 from webots_mcp.store.signals.catalogue import resolve_signals, signals_of_frame
-from webots_mcp.store.signals.registry import cleaned
+from webots_mcp.store.signals.registry import cleaned, registered
 from webots_mcp.testing.recorded_signal import RecordedSignal
 
 COMMAND_TIME_TO_LIVE_S: Final = 60.0  # a test on a busy machine is slower than a person
@@ -100,6 +100,7 @@ class RobotRecording:
             run = f"run {subject.run_id} of robot {subject.robot!r}"
             segment = whole_run(connection, subject.run_id)
             if segment is None:
+                resolve_signals(registered(connection, subject.robot_id), [pattern])
                 raise NothingRecordedError(f"{run} has no state row: was publish() called?")
             frame = read_frame(connection, segment, Deadline(math.inf))
             meant = resolve_signals(signals_of_frame(connection, subject, frame), [pattern])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import sqlite3
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -44,15 +44,17 @@ def in_chunks(recording: Recording) -> int:
         return connection.execute("SELECT total(row_count) FROM row_group").fetchone()[0]
 
 
+def noted(told: list[tuple[int, int]]) -> Callable[[int, int], object]:
+    return lambda done, of: told.append((done, of))
+
+
 def test_readers_see_chunks_that_the_file_has_not(recording: Recording) -> None:
     assert isinstance(recording.database, Path)
     before = recording.database.read_bytes()
     with recording.reader() as connection:
         expected = trends(connection, find_range(connection, Scope()))
     told: list[tuple[int, int]] = []
-    assert (
-        make_missing_chunks(recording, lambda done, of: told.append((done, of)), write=False) == ""
-    )
+    assert make_missing_chunks(recording, noted(told), write=False) == ""
     assert told[-1] == (ROWS, ROWS)
     assert in_chunks(recording) == ROWS
     assert recording.database.read_bytes() == before
@@ -68,9 +70,7 @@ def test_they_are_made_once_and_what_broke_off_goes_on(recording: Recording) -> 
     assert make_missing_chunks(recording, write=False) == ""
     assert in_chunks(recording) == ROWS
     told: list[tuple[int, int]] = []
-    assert (
-        make_missing_chunks(recording, lambda done, of: told.append((done, of)), write=False) == ""
-    )
+    assert make_missing_chunks(recording, noted(told), write=False) == ""
     assert told == []
 
 

@@ -93,10 +93,8 @@ def test_the_file_of_a_recording_that_goes_on_stays_within_a_twentieth_of_its_li
 ) -> None:
     file, noise = tmp_path / "webots.db", random.Random(5)
     sizes_of = {"state": 2_000_000, "chunk": 1_200_000, "log": 600_000}
-    by_kind = {kind: Limit(size_bytes=size) for kind, size in sizes_of.items()}
-    limits = replace(
-        Retention(), state=by_kind["state"], chunk=by_kind["chunk"], log=by_kind["log"]
-    )
+    of_states, of_chunks, of_logs = (Limit(size_bytes=each) for each in sizes_of.values())
+    limits = replace(Retention(), state=of_states, chunk=of_chunks, log=of_logs)
     upkeep = Upkeep(tmp_path, lambda _: limits, interval_s=0, budget_s=60)
     sizes: list[int] = []
     with closing(connect(file, "writer", create=True)) as connection:

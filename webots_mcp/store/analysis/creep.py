@@ -15,7 +15,7 @@ SAME_COURSE: Final = 1.25  # times the noise: the residual of a motion that expl
 REST_SHARE: Final = 0.5  # of the speed next to it: a part that is certainly slower is a rest
 CERTAINLY_SLOWER: Final = 3.0  # standard errors: the ramps next to it are certain already
 # So many times its own length before and after a stretch is looked for the same motion.
-_AROUND: Final = ((1, 1), (0, 5), (5, 0))
+_AROUND: Final = ((1, 1), (0, 2), (2, 0), (0, 5), (5, 0))
 MOST_AROUND: Final = 5
 _MEANS: Final = 30  # of neighbouring rows, that a line is laid through
 _FINE_MEANS: Final = 120  # in which a rest is looked for
@@ -65,15 +65,19 @@ class _Lines(NamedTuple):
 def is_creep(rows: Rows, starts: Indexes, ends: Indexes, radius_m: float) -> Flags:
     """Whether stretches within a place are of a motion, be it that it only shows around them."""
     own, lengths = _lines_through(rows, starts, ends), ends - starts
-    creeps = _drifts(rows, starts, ends, radius_m)
-    for at in np.flatnonzero(creeps):
-        creeps[at] = not _only_twitches(rows, int(starts[at]), int(ends[at]))
-    for before, after in _AROUND:
-        from_row = np.maximum(0, starts - (before * lengths).astype(np.intp))
-        to_row = np.minimum(rows.count, ends + (after * lengths).astype(np.intp))
-        line = _lines_through(rows, from_row, to_row)
-        longer = to_row - from_row > lengths
-        creeps |= longer & _is_one_motion(rows, line, radius_m) & ~_is_slower(own, line)
+    creeps = np.zeros(len(starts), np.bool_)
+    for before, after in ((0, 0), *_AROUND):
+        from_row = np.maximum(0, starts - before * lengths)
+        to_row = np.minimum(rows.count, ends + after * lengths)
+        line, moves = own, _drifts(rows, starts, ends, radius_m)
+        if before or after:
+            line = _lines_through(rows, from_row, to_row)
+            moves = (to_row - from_row > lengths) & _is_one_motion(rows, line, radius_m)
+            moves &= ~_is_slower(own, line)
+        leaves = line.speed_m_s * line.lasts_s > radius_m
+        for at in np.flatnonzero(moves & ~creeps).tolist():
+            place = int(from_row[at]), int(to_row[at])
+            creeps[at] = bool(leaves[at]) or not _only_twitches(rows, *place)
     return creeps
 
 

@@ -183,16 +183,18 @@ def test_a_fetched_run_has_the_answers_of_the_recording(lab: Lab, rounds: Path, 
         fetched = answers(here, run, PART)
     assert info.purged_rows == (0 if full else info.row_count)
     assert fetched == expected
-    for name in ("trends", "trends of a part", "history"):
-        assert without_notes(fetched[name]) == without_notes(before[name])
+    for name in ("trends", "trends of a part", "events", "events of a part", "timeline", "history"):
+        assert of_values(fetched[name]) == of_values(before[name])
 
 
-def without_notes(value: Any) -> Any:
-    """Answers without what is said of rows that are here or not."""
-    if isinstance(value, dict):
-        named = cast("dict[str, Any]", value)
-        return {key: without_notes(each) for key, each in named.items() if key != "notes"}
-    return [without_notes(each) for each in value] if isinstance(value, list) else value
+def of_values(answer: Any) -> Any:
+    """An answer without what is said of rows that are here or not, and read from a single row."""
+    if isinstance(answer, dict):
+        named = cast("dict[str, Any]", answer)
+        return {k: of_values(each) for k, each in named.items() if k not in ("notes", "around")}
+    if isinstance(answer, list):
+        return [of_values(each) for each in cast("list[Any]", answer)]
+    return answer
 
 
 def test_of_a_run_whose_first_rows_were_purged_before_they_were_shipped_the_others_come(

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from webots_mcp.store.chunks.codec import (
     ABSENT,
     DamagedChunkError,
+    Encoded,
     Replaced,
     decode,
     decoded_of,
@@ -36,6 +37,21 @@ def test_what_is_decoded_is_what_was_encoded(values: list[Any]) -> None:
     assert (stored.codes is None) == (given_.codes is None)
     assert stored.codes is None or (stored.codes == given_.codes).all()  # type: ignore[operator]
     assert list(map(repr, stored.labels)) == list(map(repr, given_.labels))
+
+
+STORED_BY = {  # 0.0, 0.1, ... 1.1
+    "1.0.0": "098065d870636f21030003030401060b0000a2999999999999fb0b10000000000000000000244000e0fffffff"
+    "fffffff2f001032547698ba370f00",
+    "1.1.0": "7fed417270636f21030003030401060b00001012020066666666666656403effffffffffffff7f020000000000"
+    "0000809a9999999999b93f081e0000000000000000333333333333a33f9a9999999999e9cf999999999999e99f140000"
+    "00000080fa0300",
+}
+
+
+@pytest.mark.parametrize("version", STORED_BY)
+def test_what_a_version_of_pcodec_has_stored_every_other_one_reads(version: str) -> None:
+    stored = Encoded("pcodec/float64", bytes.fromhex(STORED_BY[version]), None, None)
+    assert decode(stored, 12).numbers.tolist() == [round(0.1 * step, 1) for step in range(12)]
 
 
 def test_a_flag_is_no_number_and_a_number_is_no_flag() -> None:

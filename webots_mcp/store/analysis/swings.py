@@ -26,17 +26,19 @@ SLOW_PERIOD_S: Final = 5.0  # beyond, bends of a way come as regularly by chance
 SLOW_HALF_SWINGS: Final = 12  # ... but hardly ever so many
 SHORTEST_PERIOD_ROWS: Final = 8.0  # fewer rows a period do not show its shape
 
-# Means a period, half a period and a lag: two for each octave.
-LEVELS: Final = ((8.0, 4, 2), (8.0 * 2**0.5, 6, 3))
-BLOCK: Final = 4  # means; half of the shortest period
+PERIODS: Final = (8.0, 8.8, 9.8, 11.0, 12.4, 14.2, 16.5)
+SHIFT: Final = 3
+BLOCK: Final = 4
+WINDOW: Final = 8  # blocks
 AT_ONCE: Final = 32_768  # means, which stay in the cache of a processor
 SURROUNDING: Final = 32  # windows, every fourth, of which the quartile is taken
 LOUD: Final = 2.0
 REGULAR: Final = 0.6  # of the means have another sign half a period later ...
 VERY_REGULAR: Final = 0.8  # ... and so many over four periods, where nothing is louder
-WINDOW: Final = 2.2  # periods
+SETTLED: Final = 2.2  # periods
 CLIPPED: Final = 1.5  # times the median magnitude: a sine has a height of 1.4 times its own
-LIKELY: Final = 0.6  # of a clipped window is explained by a sine ...
+LINKED: Final = 0.45
+LIKELY: Final = 0.58  # of a clipped window is explained by a sine ...
 MOST_LIKELY: Final = 0.7  # ... and so much somewhere in the stretch
 SEMITONES: Final = range(-5, 6)  # about the period of a level, which reaches from -3 to 3
 HIDDEN: Final = 1.0  # of a period, for which bends may hide a swing that goes on
@@ -157,22 +159,19 @@ class _Stretch:
         self.times, self.values = times, values
         self.interval_s = float(times[-1] - times[0]) / (len(times) - 1)
         self.least, self.longest_s = least, longest_s
+        self.resolution = _resolution(values)
 
     def swings(self, is_over: Callable[[], bool]) -> Iterator[Swing]:
         """Those of each octave of periods; what two of them see is found twice."""
         means, rows = self.values, 1
-        shortest = LEVELS[0][0]
-        while rows * shortest * self.interval_s < 1.2 * self.longest_s:
-            if len(means) <= 3 * shortest or is_over():
+        while rows * PERIODS[0] * self.interval_s < self.longest_s and not is_over():
+            for start, stop, period in _likely(means, self.least, self.resolution):
+                yield from self._measured(
+                    start * rows, stop * rows, period * rows, (0, len(self.values))
+                )
+            means, rows = _means(means, 2), 2 * rows
+            if len(means) <= 3 * SHORTEST_PERIOD_ROWS:
                 return
-            for period, half, lag in LEVELS:
-                for start, stop, likely in _likely(means, period, half, lag, self.least):
-                    yield from self._measured(
-                        start * rows, stop * rows, likely * rows, (0, len(self.values))
-                    )
-            even = means[: len(means) // 2 * 2]
-            means = (even[::2] + even[1::2]) / 2
-            rows *= 2
 
     def _measured(
         self, start: int, stop: int, period: float, within: tuple[int, int]
@@ -291,111 +290,88 @@ def _clipped(values: Array, limit: float | Array) -> Array:
     return np.asarray(np.minimum(np.maximum(values, -limit), limit), np.float64)
 
 
-def _likely(
-    means: Array, period: float, half: int, lag: int, least: int
-) -> Iterator[tuple[int, int, float]]:
-    """Where means [start, stop) seem to swing with about that period, and with which one."""
-    rows = round(WINDOW * period)
-    starts = _regular_windows(means, half, lag)
-    starts = starts[starts + rows + 2 * lag <= len(means)]
-    if not len(starts):
-        return
-    parts = np.lib.stride_tricks.sliding_window_view(means, rows + 2 * lag)[starts]
-    bends: Array = parts[:, 2 * lag :] - 2 * parts[:, lag:-lag] + parts[:, : -2 * lag]
-    middle = np.partition(np.abs(bends), rows // 2, axis=1)[:, rows // 2, None]
-    clipped = _clipped(bends, CLIPPED * middle)
-    squares: Array = np.einsum("ij,ij->i", clipped, clipped)
-    periods = [period * 2 ** (semitones / 12) for semitones in SEMITONES]
-    best = _explained(clipped, *periods[2::3]).max(axis=1)
-    good = np.flatnonzero((best > LIKELY * squares) & (squares > 0))
-    apart = np.flatnonzero(np.diff(starts[good]) > rows + HIDDEN * period) + 1
-    for part in np.split(good, apart) if len(good) else ():
-        first, last = int(starts[part[0]]), int(starts[part[-1]]) + rows + 2 * lag
-        if not np.any(best[part] > MOST_LIKELY * squares[part]):
-            continue
-        shares = np.mean(_explained(clipped[part], *periods) / squares[part, None], axis=0)
-        place = int(np.argmax(shares))
-        count = 2 * (last - first) / periods[place]
-        inside = period < first and last < len(means) - period
-        if count < least + (1 if inside else -1) or not 0 < place < len(periods) - 1:
-            continue  # at the end of the periods another level sees it better
-        far = round(REACH * period)
-        around = np.abs(
-            np.concatenate(
-                [
-                    _bends(means[max(0, first - far) : first], lag),
-                    _bends(means[last : last + far], lag),
-                ]
-            )
-        )
-        loudness = _loudness(float(np.median(middle[part])), around, period)
-        if evidence(LOUDER * loudness, 1.0, float(shares[place]) + 0.05, count) >= ENOUGH:
-            yield first, last, periods[place]
+def _likely(means: Array, least: int, resolution: float) -> Iterator[tuple[int, int, float]]:
+    """Where means [start, stop) seem to swing, and with about which period.
 
-
-def _regular_windows(means: Array, half: int, lag: int) -> Indexes:
-    """Starts of windows of two periods that are louder than usual, with signs as of a sine.
-
-    In single precision, which counts from a value of each part.
+    Looked at are signs, of which what is loud and short spoils few.
     """
-    found: list[Indexes] = []
-    beyond = 4 * BLOCK * half
-    for begin in range(0, max(1, len(means) - beyond), AT_ONCE):
-        part = means[begin : begin + AT_ONCE + beyond]
-        regular = _regular_blocks(_bends((part - part[0]).astype(np.float32), lag), half)
-        most = AT_ONCE // BLOCK if begin + AT_ONCE < len(means) - beyond else None
-        found.append(np.flatnonzero(regular[:most]) * BLOCK + begin)
-    return np.concatenate(found)
+    share, which, sizes = _screened(means)
+    good = np.flatnonzero(share > LINKED)
+    if not len(good):
+        return
+    windows: Array = np.lib.stride_tricks.sliding_window_view(sizes, WINDOW)
+    loud = np.partition(windows[good], 2, axis=1)[:, 2]
+    keep = loud > 0.6 * BLOCK * resolution
+    good, loud = good[keep], loud[keep]
+    apart = (np.diff(good) > WINDOW // 2) | (np.abs(np.diff(which[good])) > 1)
+    apart |= np.abs(np.diff(np.log(loud))) > math.log(LOUD)
+    edges = [0, *(np.flatnonzero(apart) + 1).tolist(), len(good)] if len(good) else [0]
+    for start, stop in itertools.pairwise(edges):
+        part = good[start:stop]
+        if share[part].max() < LIKELY:
+            continue
+        period = PERIODS[int(np.median(which[part]))]
+        first, last = int(part[0]) * BLOCK, min(len(means), (int(part[-1]) + WINDOW) * BLOCK + 2 * SHIFT)
+        yield first, last, period
 
 
-def _regular_blocks(bends: Array, half: int) -> Flags:
-    """In which blocks such windows begin."""
-    blocks, window = (len(bends) - half) // BLOCK, half  # blocks of two periods
-    if blocks < window:
-        return np.zeros(0, np.bool_)
-    whole = BLOCK * blocks
-    above = bends > 0
-    turned = np.bitwise_count((above[half : half + whole] != above[:whole]).view(np.uint32))
-    turns = sums_of(turned, window)
-    sizes = np.abs(bends[:whole:BLOCK])
-    sizes += np.abs(bends[2:whole:BLOCK])  # a quarter of a period later: of a sine never small
-    loud = sums_of((sizes > LOUD * _usual(sizes)).astype(np.uint8), window)
-    regular = (turns >= REGULAR * BLOCK * window) & (loud >= window - 1)
-    if len(turns) > window:
-        long = turns[:-window] + turns[window:] >= VERY_REGULAR * BLOCK * 2 * window
-        regular[:-window] |= long
-        regular[window:] |= long
-    else:
-        regular |= turns >= VERY_REGULAR * BLOCK * window
-    return regular
+def _screened(means: Array) -> tuple[Array, Indexes, Array]:
+    """Of each window how much of the signs a sine explains and which one; sizes of blocks."""
+    waves = _waves()
+    shares: list[Array] = []
+    whiches: list[Indexes] = []
+    sizes: list[Array] = []
+    beyond = (WINDOW - 1) * BLOCK
+    for begin in range(0, max(1, len(means) - beyond - 2 * SHIFT), AT_ONCE):
+        part = means[begin : begin + AT_ONCE + beyond + 2 * SHIFT]
+        bends = _bends((part - part[0]).astype(np.float32), SHIFT)
+        if len(bends) < WINDOW * BLOCK:
+            bends = np.pad(bends, (0, WINDOW * BLOCK - len(bends)))
+        blocks = np.reshape(bends[: len(bends) // BLOCK * BLOCK], (-1, BLOCK))
+        signs = np.sign(blocks)
+        count = len(blocks) - WINDOW + 1
+        heights = signs[:count] @ waves[0]
+        for at in range(1, WINDOW):
+            heights += signs[at : at + count] @ waves[at]
+        heights *= heights
+        squares = heights[:, : len(PERIODS)] + heights[:, len(PERIODS) :]
+        which = np.argmax(squares, axis=1)
+        shares.append(squares[np.arange(count), which] / (WINDOW * BLOCK))
+        whiches.append(which)
+        sizes.append(np.einsum("ij->i", np.abs(blocks)))
+        if begin + AT_ONCE < len(means) - beyond - 2 * SHIFT:
+            sizes[-1] = sizes[-1][:count]
+    return np.concatenate(shares), np.concatenate(whiches), np.concatenate(sizes)
 
 
-def _usual(sizes: Array) -> Array | float:
+def _usual(sizes: Array) -> Array:
     """The lower quartile about each size, the least of three such stretches."""
-    some = sizes[::4]
-    count, quarter = len(some) // SURROUNDING, SURROUNDING // 4
+    count, quarter = len(sizes) // SURROUNDING, SURROUNDING // 4
     if count < 2:
-        return float(np.partition(some, len(some) // 4)[len(some) // 4])
-    parts: Array = np.reshape(some[: count * SURROUNDING], (count, SURROUNDING))
+        return np.full(len(sizes), np.partition(sizes, len(sizes) // 4)[len(sizes) // 4])
+    parts: Array = np.reshape(sizes[: count * SURROUNDING], (count, SURROUNDING))
     padded: Array = np.pad(np.partition(parts, quarter, axis=1)[:, quarter], 1, mode="edge")
     least = np.minimum(np.minimum(padded[:-2], padded[1:-1]), padded[2:])
-    usual = np.repeat(least, 4 * SURROUNDING)[: len(sizes)]
+    usual = np.repeat(least, SURROUNDING)
     return np.pad(usual, (0, len(sizes) - len(usual)), mode="edge")
 
 
-@lru_cache(64)  # the same for all signals
-def _waves(rows: int, *periods: float) -> Array:
-    """Cosines and sines of length 1 as columns."""
-    places: Array = np.arange(rows, dtype=np.float64) - (rows - 1) / 2
-    angles: Array = 2 * np.pi * places[:, None] / np.array(periods)
+@lru_cache(1)
+def _waves() -> Array:
+    """Cosines and sines of length 1 as columns, for each block of a window."""
+    places: Array = np.arange(WINDOW * BLOCK, dtype=np.float64) - (WINDOW * BLOCK - 1) / 2
+    angles: Array = 2 * np.pi * places[:, None] / np.array(PERIODS)
     waves = np.concatenate((np.cos(angles), np.sin(angles)), axis=1)
-    return np.asarray(waves / np.sqrt(np.einsum("ij,ij->j", waves, waves)), np.float64)
+    waves /= np.sqrt(np.einsum("ij,ij->j", waves, waves))
+    return np.reshape(waves, (WINDOW, BLOCK, -1)).astype(np.float32)
 
 
-def _explained(windows: Array, *periods: float) -> Array:
-    """Of the squares in each window, what a sine of each period explains."""
-    squares = (windows @ _waves(windows.shape[1], *periods)) ** 2
-    return np.asarray(squares[:, : len(periods)] + squares[:, len(periods) :], np.float64)
+def _resolution(values: Array) -> float:
+    """The smallest step; 0 where the values are so few that something is switched."""
+    steps = np.abs(np.diff(values))
+    steps = steps[steps > SAME_NUMBER * max(float(values.max()), -float(values.min()))]
+    least = float(steps.min()) if len(steps) else 0.0
+    return least if float(np.ptp(values)) > 2.5 * least else 0.0
 
 
 @dataclass(frozen=True)
@@ -494,7 +470,7 @@ def _vertex(heights: Array, highest: int) -> float:
 def _begin(bends: Array, inside: int, period: float) -> int:
     """Where the sine begins that swings from there on: before, it explains nothing."""
     settled = inside + int(period / 2)
-    part = slice(settled, settled + round(WINDOW * period))
+    part = slice(settled, settled + round(SETTLED * period))
     angles: Array = 2 * np.pi * np.arange(len(bends), dtype=np.float64) / period
     waves: Array = np.stack((np.cos(angles), np.sin(angles)))
     squares = waves[:, part] @ np.transpose(waves[:, part])

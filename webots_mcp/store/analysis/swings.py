@@ -41,6 +41,7 @@ LINKED: Final = 0.45
 LIKELY: Final = 0.58  # of a clipped window is explained by a sine ...
 MOST_LIKELY: Final = 0.7  # ... and so much somewhere in the stretch
 SEMITONES: Final = range(-5, 6)  # about the period of a level, which reaches from -3 to 3
+BETWEEN: Final = 2.0
 HIDDEN: Final = 1.0  # of a period, for which bends may hide a swing that goes on
 
 FITTED_ROWS: Final = 24  # means a period where ends and shape are measured
@@ -67,6 +68,7 @@ OF_FIT: Final = -1.9  # ... and of all squares of clipped second differences
 OF_COUNT: Final = 4.1  # per logarithm of the half swings
 ENOUGH: Final = 26.4
 TURNS_BACK: Final = 0.08  # of the way there a value comes back that does not only go one way
+DOUBT: Final = 3.0
 STRAIGHT: Final = 0.085  # of the sine its harmonics reach where straight pieces make it
 NOISE_AMPLITUDES: Final = 3.0  # a swing is at least so many deviations of the noise high ...
 MEAN_AMPLITUDES: Final = 12.0  # ... or so many of their means over half the swing
@@ -179,7 +181,7 @@ class _Stretch:
         """The swing of about these rows and that period; two where the value rests between."""
         low, high = max(within[0], int(start - period)), min(within[1], int(stop + period))
         step = max(1, int(period / FITTED_ROWS))
-        lag = max(1, round(LAG * period / step))
+        lag = math.ceil(LAG * period / step)
         bends = _bends(_means(self.values[low:high], step), lag)
         first, last = max(0, (start - low) // step), (stop - low) // step - 2 * lag
         core = bends[first:last]
@@ -242,7 +244,7 @@ class _Stretch:
     def _loudness(self, rows: slice, period: float) -> float:
         """How much larger its second differences are than the lower quartile around it."""
         step = max(1, int(period / 16))
-        lag, far = max(1, round(LAG * period / step)), int(REACH * period)
+        lag, far = math.ceil(LAG * period / step), int(REACH * period)
         parts = slice(max(0, rows.start - far), rows.start), slice(rows.stop, rows.stop + far)
         around = [_bends(_means(self.values[part], step), lag) for part in parts]
         inside = median(np.abs(_bends(_means(self.values[rows], step), lag)))
@@ -306,13 +308,28 @@ def _likely(means: Array, least: int, resolution: float) -> Iterator[tuple[int, 
     apart = (np.diff(good) > WINDOW // 2) | (np.abs(np.diff(which[good])) > 1)
     apart |= np.abs(np.diff(np.log(loud))) > math.log(LOUD)
     edges = [0, *(np.flatnonzero(apart) + 1).tolist(), len(good)] if len(good) else [0]
+    open_groups: list[tuple[int, int, float, float]] = []
     for start, stop in itertools.pairwise(edges):
         part = good[start:stop]
         if share[part].max() < LIKELY:
             continue
         period = PERIODS[int(np.median(which[part]))]
+        size = float(np.median(loud[start:stop]))
         first, last = int(part[0]) * BLOCK, min(len(means), (int(part[-1]) + WINDOW) * BLOCK + 2 * SHIFT)
-        yield first, last, period
+        left: list[tuple[int, int, float, float]] = []
+        for each in open_groups:
+            if first - each[1] > BETWEEN * period:
+                yield each[:3]
+            elif _ratio(each[2], period) < 1.25 and _ratio(each[3], size) < 3:
+                share_of = (each[1] - each[0]) / (each[1] - each[0] + last - first)
+                period = share_of * each[2] + (1 - share_of) * period
+                size = share_of * each[3] + (1 - share_of) * size
+                first, last = each[0], max(last, each[1])
+            else:
+                left.append(each)
+        open_groups = [*left, (first, last, period, size)]
+    for each in open_groups:
+        yield each[:3]
 
 
 def _screened(means: Array) -> tuple[Array, Indexes, Array]:
@@ -525,21 +542,29 @@ def _is_straight(values: Array, period: float, noise: float) -> bool:
     third harmonic reaches a ninth of the first; of all others the second one reaches more.
     """
     step = max(1, int(period / FITTED_ROWS))
-    means = _means(values, step)
-    rows = round(2 * period / step)
-    count = len(means) // rows
-    places: Array = np.arange(rows, dtype=np.float64) - (rows - 1) / 2
-    angles: Array = 2 * np.pi * places * step / period
-    courses = [np.ones(rows), places / rows]
-    courses += [wave(order * angles) for order in (1, 2, 3) for wave in (np.cos, np.sin)]
-    pieces: Array = np.reshape(means[: count * rows], (count, rows))
-    fitted = pieces @ np.transpose(np.linalg.pinv(np.stack(courses, axis=1)))
-    first, second, third = (fitted[:, at] + 1j * fitted[:, at + 1] for at in (2, 4, 6))
+    lag = math.ceil(LAG * period / step)
+    bends = _bends(_means(values, step), lag)
+    period /= step
+    rows = math.ceil(period)
+    if len(bends) < rows:
+        return False
+    parts = np.lib.stride_tricks.sliding_window_view(bends, rows)[:: max(1, rows // 4)]
+    angles: Array = 2 * np.pi * np.arange(rows) / period
+    waves = np.stack([np.exp(-1j * k * angles) for k in (1, 2, 3)], axis=1)
+    basis = np.concatenate((waves.real, waves.imag), axis=1)
+    inverse = np.linalg.pinv(basis)
+    fitted = parts @ np.transpose(inverse)
+    gains = np.array([2 - 2 * math.cos(2 * math.pi * k * lag / period) for k in (1, 2, 3)])
+    first, second, third = np.transpose((fitted[:, :3] + 1j * fitted[:, 3:]) / gains)
     height = np.abs(first)
-    of_second = np.mean(second * np.conj(first) ** 2 / height**3)
-    of_third = np.mean(third * np.conj(first) ** 3 / height**4)
-    of_noise = 4 * noise**2 / step / (rows * count) / float(np.median(height)) ** 2
-    return float(np.abs(of_second) ** 2 + np.abs(of_third) ** 2) - of_noise > STRAIGHT**2
+    excess = 0.0
+    independent = max(1.0, len(bends) / period)
+    for each, order, at in ((second, 2, 1), (third, 3, 2)):
+        turned = each * np.conj(first) ** order / height ** (order + 1)
+        of_noise = 6 * noise**2 / step * float(np.sum(inverse[at] ** 2 + inverse[at + 3] ** 2))
+        of_noise *= 1.6 / independent / gains[at] ** 2 / float(np.median(height)) ** 2
+        excess += float(np.median(turned.real)) ** 2 + float(np.median(turned.imag)) ** 2 - DOUBT * of_noise
+    return excess > STRAIGHT**2
 
 
 def _best(found: list[Swing]) -> list[Swing]:

@@ -42,6 +42,7 @@ LIKELY: Final = 0.58  # of a clipped window is explained by a sine ...
 MOST_LIKELY: Final = 0.7  # ... and so much somewhere in the stretch
 SEMITONES: Final = range(-5, 6)  # about the period of a level, which reaches from -3 to 3
 BETWEEN: Final = 2.0
+MARGIN: Final = 2.5
 HIDDEN: Final = 1.0  # of a period, for which bends may hide a swing that goes on
 
 FITTED_ROWS: Final = 24  # means a period where ends and shape are measured
@@ -179,7 +180,7 @@ class _Stretch:
         self, start: int, stop: int, period: float, within: tuple[int, int]
     ) -> Iterator[Swing]:
         """The swing of about these rows and that period; two where the value rests between."""
-        low, high = max(within[0], int(start - period)), min(within[1], int(stop + period))
+        low, high = max(within[0], int(start - MARGIN * period)), min(within[1], int(stop + MARGIN * period))
         step = max(1, int(period / FITTED_ROWS))
         lag = math.ceil(LAG * period / step)
         bends = _bends(_means(self.values[low:high], step), lag)

@@ -67,7 +67,8 @@ OF_LOUDNESS: Final = 5.9  # per logarithm of how much louder than its surroundin
 OF_ROBUST_FIT: Final = -2.4  # per logarithm of what sines leave of the median square
 OF_FIT: Final = -1.9  # ... and of all squares of clipped second differences
 OF_COUNT: Final = 4.1  # per logarithm of the half swings
-ENOUGH: Final = 26.4
+PROMISING: Final = 90.0
+ENOUGH: Final = 1000.0
 TURNS_BACK: Final = 0.08  # of the way there a value comes back that does not only go one way
 DOUBT: Final = 3.0
 STRAIGHT: Final = 0.085  # of the sine its harmonics reach where straight pieces make it
@@ -168,7 +169,11 @@ class _Stretch:
         """Those of each octave of periods; what two of them see is found twice."""
         means, rows = self.values, 1
         while rows * PERIODS[0] * self.interval_s < self.longest_s and not is_over():
-            for start, stop, period in _likely(means, self.least, self.resolution):
+            for start, stop, period, size, usual, share in _likely(means, self.least, self.resolution):
+                ratio = min(size / max(usual, 1e-300), 1e9)
+                self.hint = (2 * (stop - start) / period, ratio, share)
+                if ratio**1.5 * self.hint[0] / (1.05 - share / 0.83) < PROMISING:
+                    continue
                 yield from self._measured(
                     start * rows, stop * rows, period * rows, (0, len(self.values))
                 )
@@ -263,12 +268,8 @@ def _loudness(inside: float, around: Array, period: float) -> float:
 
 def evidence(loudness: float, robustly: float, explained: float, count: float) -> float:
     """The weight of evidence for a swing."""
-    return (
-        OF_LOUDNESS * math.log(max(loudness, LEAST_LOUDNESS))
-        + OF_ROBUST_FIT * math.log(1.01 - max(0.0, robustly))
-        + OF_FIT * math.log(1.05 - min(explained, 1.0))
-        + OF_COUNT * math.log(count)
-    )
+    unexplained = (1.01 - max(0.0, robustly)) ** (2 / 3) * (1.05 - min(explained, 1.0)) ** (1 / 3)
+    return loudness**1.5 * count / unexplained
 
 
 def _bends(values: Array, lag: int) -> Array:
@@ -293,7 +294,7 @@ def _clipped(values: Array, limit: float | Array) -> Array:
     return np.asarray(np.minimum(np.maximum(values, -limit), limit), np.float64)
 
 
-def _likely(means: Array, least: int, resolution: float) -> Iterator[tuple[int, int, float]]:
+def _likely(means: Array, least: int, resolution: float) -> Iterator[tuple[int, int, float, float, float, float]]:
     """Where means [start, stop) seem to swing, and with about which period.
 
     Looked at are signs, of which what is loud and short spoils few.
@@ -309,7 +310,8 @@ def _likely(means: Array, least: int, resolution: float) -> Iterator[tuple[int, 
     apart = (np.diff(good) > WINDOW // 2) | (np.abs(np.diff(which[good])) > 1)
     apart |= np.abs(np.diff(np.log(loud))) > math.log(LOUD)
     edges = [0, *(np.flatnonzero(apart) + 1).tolist(), len(good)] if len(good) else [0]
-    open_groups: list[tuple[int, int, float, float]] = []
+    usual = _usual(sizes)
+    open_groups: list[tuple[int, int, float, float, float, float]] = []
     for start, stop in itertools.pairwise(edges):
         part = good[start:stop]
         if share[part].max() < LIKELY:
@@ -317,20 +319,22 @@ def _likely(means: Array, least: int, resolution: float) -> Iterator[tuple[int, 
         period = PERIODS[int(np.median(which[part]))]
         size = float(np.median(loud[start:stop]))
         first, last = int(part[0]) * BLOCK, min(len(means), (int(part[-1]) + WINDOW) * BLOCK + 2 * SHIFT)
-        left: list[tuple[int, int, float, float]] = []
+        least_usual, shown = float(usual[part].min()), float(share[part].mean())
+        left: list[tuple[int, int, float, float, float, float]] = []
         for each in open_groups:
             if first - each[1] > BETWEEN * period:
-                yield each[:3]
+                yield each
             elif _ratio(each[2], period) < 1.25 and _ratio(each[3], size) < 3:
                 share_of = (each[1] - each[0]) / (each[1] - each[0] + last - first)
                 period = share_of * each[2] + (1 - share_of) * period
                 size = share_of * each[3] + (1 - share_of) * size
+                shown = share_of * each[5] + (1 - share_of) * shown
+                least_usual = min(least_usual, each[4])
                 first, last = each[0], max(last, each[1])
             else:
                 left.append(each)
-        open_groups = [*left, (first, last, period, size)]
-    for each in open_groups:
-        yield each[:3]
+        open_groups = [*left, (first, last, period, size, least_usual, shown)]
+    yield from open_groups
 
 
 def _screened(means: Array) -> tuple[Array, Indexes, Array]:

@@ -1,11 +1,12 @@
 """Regular swings: where a value goes to and fro, how fast and how far.
 
-Looked at are second differences of means: x(t + lag) - 2 x(t) + x(t - lag) with a lag of about a
-quarter of a period. A sine stays a sine in them, a straight course is 0, and a bend of the course
-is short, so that swings are found over ramps, turns and slow drifts alike. Each octave of periods
-is searched in means of twice as many rows. Windows of two periods in which the sign changes as in
-a sine are fitted; what remains is judged by how well sines explain it, by how far it stands out of
-its surroundings, and by whether straight pieces that never turn back explain it as well.
+Looked at are second differences, x(t + lag) - 2 x(t) + x(t - lag) with a lag of about a quarter of
+a period: a sine stays a sine in them, a straight course is 0, and a bend of the course is short, so
+that swings are found over ramps, turns and slow drifts alike. Each octave of periods is searched in
+means of twice as many rows. Windows in which the signs are those of a sine are put together; few of
+these stretches stand out of their surroundings, and to those sines are fitted. What is well
+explained by them, loud and long enough is a swing, unless it never turns back and is made of
+straight pieces.
 """
 
 from __future__ import annotations
@@ -26,58 +27,48 @@ SLOW_PERIOD_S: Final = 5.0  # beyond, bends of a way come as regularly by chance
 SLOW_HALF_SWINGS: Final = 12  # ... but hardly ever so many
 SHORTEST_PERIOD_ROWS: Final = 8.0  # fewer rows a period do not show its shape
 
-PERIODS: Final = (8.0, 8.8, 9.8, 11.0, 12.4, 14.2, 16.5)
-SHIFT: Final = 3
-BLOCK: Final = 4
-WINDOW: Final = 8  # blocks
-AT_ONCE: Final = 32_768  # means, which stay in the cache of a processor
-SURROUNDING: Final = 32  # windows, every fourth, of which the quartile is taken
-LOUD: Final = 2.0
-REGULAR: Final = 0.6  # of the means have another sign half a period later ...
-VERY_REGULAR: Final = 0.8  # ... and so many over four periods, where nothing is louder
-SETTLED: Final = 2.2  # periods
-CLIPPED: Final = 1.5  # times the median magnitude: a sine has a height of 1.4 times its own
-LINKED: Final = 0.45
-LIKELY: Final = 0.58  # of a clipped window is explained by a sine ...
-MOST_LIKELY: Final = 0.7  # ... and so much somewhere in the stretch
-SEMITONES: Final = range(-5, 6)  # about the period of a level, which reaches from -3 to 3
-BETWEEN: Final = 2.0
-MARGIN: Final = 2.5
-HIDDEN: Final = 1.0  # of a period, for which bends may hide a swing that goes on
+# Of a level, in means. What the first and the last one explain best is seen by another level.
+PERIODS: Final = (7.1, 8.0, 8.8, 9.8, 11.0, 12.4, 14.2, 16.2, 18.4)
+SHIFT: Final = 3  # means: about a quarter of these periods
+BLOCK: Final = 4  # means from one window to the next
+WINDOW: Final = 8  # blocks: two to four periods
+AT_ONCE: Final = 16_384  # means, which stay in the cache of a processor
+SURROUNDING: Final = 32  # blocks of which the lower quartile is taken
+LIKELY: Final = 0.58  # of the signs a sine explains 0.81, and of white noise 0.58 once in 500
+LINKED: Final = 0.45  # of windows beside such a one
+SIGNS_OF_SINE: Final = 0.83
+SAME_PERIOD: Final = 1.25  # ratio of the periods of windows of one swing ...
+AS_LOUD: Final = 3.0  # ... and of their sizes
+HIDDEN: Final = 2.0  # periods, for which bends may hide a swing that goes on
+PROMISING: Final = 90.0  # as `ENOUGH`, by what the signs tell
 
 FITTED_ROWS: Final = 24  # means a period where ends and shape are measured
 LAG: Final = 0.25  # of the period
+CLIPPED: Final = 1.5  # times the median magnitude: a sine has a height of 1.4 times its own
+SETTLED: Final = 2.2  # periods, from which the sine is continued to find its ends
 EDGE: Final = 0.13  # of the period: a sine that begins at 0 shows so much earlier
 AT_END: Final = 0.5  # of the period: so near the end of what was recorded it reaches up to there
 PIECE: Final = 5.0  # periods of one phase: over more, a swing may change a little
-TRIED: Final = (0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08)
-OUTLYING: Final = (2.0, 2.5)  # median residuals: what is farther off is a bend
+TRIED: Final = (0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08)  # of the period
+OUTLYING: Final = 2.5  # median residuals: what is farther off is a bend
 MOST_NOISE: Final = 0.12  # of the squares of second differences, that is taken for noise
 QUIET: Final = 0.4  # of the usual magnitude for half a period: the value rests there
 REACH: Final = 30.0  # periods before and after are the surroundings
 FEW_PERIODS: Final = 1.5  # of surroundings say nothing
 LOUDEST: Final = 6.0  # times its surroundings: more is not more certain
 UNKNOWN_LOUDNESS: Final = 3.5  # where nothing surrounds it
-LEAST_LOUDNESS: Final = 0.5
-LOUDER: Final = 1.25  # times as loud a swing may be as it seems at first
 # Median magnitude of a normal variable over its lower quartile.
-_MEDIAN_TO_QUARTILE: Final = 0.6745 / 0.3186
-# Weight of evidence: a logistic regression on the labelled recordings of tests/detection.
-OF_LOUDNESS: Final = 5.9  # per logarithm of how much louder than its surroundings it is
-OF_ROBUST_FIT: Final = -2.4  # per logarithm of what sines leave of the median square
-OF_FIT: Final = -1.9  # ... and of all squares of clipped second differences
-OF_COUNT: Final = 4.1  # per logarithm of the half swings
-PROMISING: Final = 90.0
-ENOUGH: Final = 1000.0
+MEDIAN_TO_QUARTILE: Final = 0.6745 / 0.3186
+ENOUGH: Final = 1000.0  # of `evidence`: random courses reach it less than once an hour
 TURNS_BACK: Final = 0.08  # of the way there a value comes back that does not only go one way
-DOUBT: Final = 3.0
 STRAIGHT: Final = 0.085  # of the sine its harmonics reach where straight pieces make it
+DOUBT: Final = 3.0  # times the variance that noise makes of them
 NOISE_AMPLITUDES: Final = 3.0  # a swing is at least so many deviations of the noise high ...
 MEAN_AMPLITUDES: Final = 12.0  # ... or so many of their means over half the swing
 SAME_NUMBER: Final = 1e-9  # of the value: what adding up floating-point numbers makes of one
 SWITCHED_VALUES: Final = 3
 MOST_OVERLAP: Final = 0.2  # of the shorter one
-ALIKE: Final = (1.15, 1.5)  # ratio of periods and of amplitudes of parts of one swing
+ALIKE: Final = (1.15, 1.5)  # ratio of periods and of amplitudes on both sides of a gap
 
 
 @dataclass(frozen=True)
@@ -156,6 +147,15 @@ def swings_in(
     return _joined(found, rows)
 
 
+@dataclass(frozen=True)
+class _Candidate:
+    """Where rows [start, stop) seem to swing, and with about which period, in rows."""
+
+    start: int
+    stop: int
+    period: float
+
+
 class _Stretch:
     """Rows that come evenly, in which swings are looked for."""
 
@@ -163,78 +163,68 @@ class _Stretch:
         self.times, self.values = times, values
         self.interval_s = float(times[-1] - times[0]) / (len(times) - 1)
         self.least, self.longest_s = least, longest_s
-        self.resolution = _resolution(values)
 
     def swings(self, is_over: Callable[[], bool]) -> Iterator[Swing]:
         """Those of each octave of periods; what two of them see is found twice."""
-        means, rows = self.values, 1
-        while rows * PERIODS[0] * self.interval_s < self.longest_s and not is_over():
-            for start, stop, period, size, usual, share in _likely(means, self.least, self.resolution):
-                ratio = min(size / max(usual, 1e-300), 1e9)
-                self.hint = (2 * (stop - start) / period, ratio, share)
-                if ratio**1.5 * self.hint[0] / (1.05 - share / 0.83) < PROMISING:
-                    continue
-                yield from self._measured(
-                    start * rows, stop * rows, period * rows, (0, len(self.values))
-                )
+        means, rows, resolution = self.values, 1, _resolution(self.values)
+        while rows * PERIODS[1] * self.interval_s < self.longest_s and not is_over():
+            for start, stop, period in _likely(means, resolution):
+                candidate = _Candidate(start * rows, stop * rows, period * rows)
+                if self._may_last(candidate.stop - candidate.start, candidate.period):
+                    yield from self._measured(candidate)
             means, rows = _means(means, 2), 2 * rows
             if len(means) <= 3 * SHORTEST_PERIOD_ROWS:
                 return
 
-    def _measured(
-        self, start: int, stop: int, period: float, within: tuple[int, int]
-    ) -> Iterator[Swing]:
-        """The swing of about these rows and that period; two where the value rests between."""
-        low, high = max(within[0], int(start - MARGIN * period)), min(within[1], int(stop + MARGIN * period))
+    def _may_last(self, rows: float, period: float) -> bool:
+        """Whether so many rows, with what may be hidden beside them, are enough half swings."""
+        return 2 * (rows / period + 2 * HIDDEN) >= self._least(period / SAME_PERIOD)
+
+    def _least(self, period: float) -> int:
+        slow = period * self.interval_s > SLOW_PERIOD_S
+        return max(self.least, SLOW_HALF_SWINGS) if slow else self.least
+
+    def _measured(self, candidate: _Candidate) -> Iterator[Swing]:
+        """The swings of about these rows and that period: the value may rest between them."""
+        period = candidate.period
+        margin = math.ceil(HIDDEN * period)
+        low = max(0, candidate.start - margin)
         step = max(1, int(period / FITTED_ROWS))
-        lag = math.ceil(LAG * period / step)
-        bends = _bends(_means(self.values[low:high], step), lag)
-        first, last = max(0, (start - low) // step), (stop - low) // step - 2 * lag
-        core = bends[first:last]
-        if len(core) < 2 * period / step:
-            return
-        clipped = _clipped(bends, CLIPPED * median(np.abs(core)))
-        pieces = _pieces(clipped[first:last], period / step)
-        shown, _, _ = _sines(pieces, np.ones_like(pieces), period / step)
-        begin = _begin(clipped, first, shown)
-        end = len(bends) - _begin(clipped[::-1], len(bends) - last, shown)
-        quiet = _quiet(bends[begin:end], shown)
-        if quiet is not None:
-            ends = low + (begin + lag) * step, low + (end + lag) * step
-            middle = low + (begin + quiet + lag) * step
-            if min(middle - ends[0], ends[1] - middle) > period:
-                yield from self._measured(ends[0], middle, period, (low, middle))
-                yield from self._measured(middle, ends[1], period, (middle, high))
-                return
-        if end - begin < 2 * shown:
-            return
-        edge = EDGE * shown * step
-        from_row = round(low + (begin + lag) * step + edge)
-        to_row = round(low + (end + lag) * step - edge)
-        if from_row < AT_END * period:
-            from_row = 0
-        if to_row > len(self.values) - 1 - AT_END * period:
-            to_row = len(self.values) - 1
-        rows = slice(from_row, to_row + 1)
-        count = round(2 * (rows.stop - 1 - rows.start) / (shown * step))
-        if count >= self.least:
-            yield from self._judged(rows, bends[begin:end], lag, step, shown)
+        period /= step
+        lag = math.ceil(LAG * period)
+        bends = _bends(_means(self.values[low : candidate.stop + margin], step), lag)
+        first, last = (candidate.start - low) // step, (candidate.stop - low) // step - 2 * lag
+        for begin, end in _busy(np.abs(bends), first, last, round(period / 2)):
+            inside = max(first, begin) - begin, min(last, end) - begin
+            if inside[1] - inside[0] >= 1.5 * period:
+                ends = _ends(bends[begin:end], *inside, period)
+                if ends is not None and ends[1] - ends[0] >= 2 * period:
+                    ends = begin + ends[0], begin + ends[1]
+                    yield from self._judged(low + lag * step, ends, bends, lag, step, period)
 
     def _judged(
-        self, rows: slice, bends: Array, lag: int, step: int, period: float
+        self,
+        low: int,
+        ends: tuple[int, int],
+        bends: Array,
+        lag: int,
+        step: int,
+        period: float,
     ) -> Iterator[Swing]:
+        edge = EDGE * period
+        start, stop = (round(low + at * step) for at in (ends[0] + edge, ends[1] - edge))
+        last = len(self.values) - 1
+        start = 0 if start < AT_END * period * step else start
+        stop = last if stop > last - AT_END * period * step else stop
+        rows = slice(start, stop + 1)
         values = self.values[rows]
         noise = noise_of(values)
-        fit = fit_sines(bends, period, 6 * noise**2 / step)
+        fit = fit_sines(bends[slice(*ends)], period, 6 * noise**2 / step)
         period = fit.period * step
-        count = round(2 * (len(values) - 1) / period)
-        length_s = period * self.interval_s
-        if length_s > self.longest_s or count < self.least:
+        count = round(2 * (stop - start) / period)
+        if count < self._least(period) or period * self.interval_s > self.longest_s:
             return
-        if length_s > SLOW_PERIOD_S and count < SLOW_HALF_SWINGS:
-            return
-        loudness = self._loudness(rows, period)
-        if evidence(loudness, fit.robustly, fit.explained, count) < ENOUGH:
+        if evidence(self._loudness(rows, period), fit.robustly, fit.explained, count) < ENOUGH:
             return
         amplitude = fit.amplitude / (2 - 2 * math.cos(2 * math.pi * lag / fit.period))
         amplitude /= float(np.sinc(step / period)) if step > 1 else 1.0
@@ -244,30 +234,32 @@ class _Stretch:
             return
         if _turns_back(values, period) < TURNS_BACK and _is_straight(values, period, noise):
             return
-        start_s, end_s = float(self.times[rows.start]), float(self.times[rows.stop - 1])
-        yield Swing(start_s, end_s, count, length_s, amplitude, fit.explained)
+        ends_s = float(self.times[start]), float(self.times[stop])
+        yield Swing(*ends_s, count, period * self.interval_s, amplitude, fit.explained)
 
     def _loudness(self, rows: slice, period: float) -> float:
         """How much larger its second differences are than the lower quartile around it."""
         step = max(1, int(period / 16))
         lag, far = math.ceil(LAG * period / step), int(REACH * period)
         parts = slice(max(0, rows.start - far), rows.start), slice(rows.stop, rows.stop + far)
-        around = [_bends(_means(self.values[part], step), lag) for part in parts]
+        beside = [np.abs(_bends(_means(self.values[part], step), lag)) for part in parts]
+        around = np.concatenate(beside)
+        if len(around) < FEW_PERIODS * period / step:
+            return UNKNOWN_LOUDNESS
         inside = median(np.abs(_bends(_means(self.values[rows], step), lag)))
-        return _loudness(inside, np.abs(np.concatenate(around)), period / step)
-
-
-def _loudness(inside: float, around: Array, period: float) -> float:
-    """How much larger a median magnitude is than the lower quartile around it."""
-    if len(around) < FEW_PERIODS * period:
-        return UNKNOWN_LOUDNESS
-    quarter = len(around) // 4
-    usual = float(np.partition(around, quarter)[quarter]) * _MEDIAN_TO_QUARTILE
-    return inside / usual if usual * LOUDEST > inside else LOUDEST
+        usual = _quartile(around) * MEDIAN_TO_QUARTILE
+        return inside / usual if usual * LOUDEST > inside else LOUDEST
 
 
 def evidence(loudness: float, robustly: float, explained: float, count: float) -> float:
-    """The weight of evidence for a swing."""
+    """How much speaks for a swing: it grows with each of loudness, length and regularity.
+
+    Args:
+        loudness: How many times larger than its surroundings.
+        robustly: Share of the median square that sines explain; bends do not lower it.
+        explained: Share of all squares, of values clipped at what a sine reaches.
+        count: Half swings.
+    """
     unexplained = (1.01 - max(0.0, robustly)) ** (2 / 3) * (1.05 - min(explained, 1.0)) ** (1 / 3)
     return loudness**1.5 * count / unexplained
 
@@ -287,6 +279,8 @@ def _means(values: Array, step: int) -> Array:
     if step == 1:
         return values
     count = len(values) // step
+    if step == 2:
+        return (values[: 2 * count : 2] + values[1 : 2 * count : 2]) / 2
     return np.einsum("ij->i", np.reshape(values[: count * step], (count, step))) / step
 
 
@@ -294,62 +288,77 @@ def _clipped(values: Array, limit: float | Array) -> Array:
     return np.asarray(np.minimum(np.maximum(values, -limit), limit), np.float64)
 
 
-def _likely(means: Array, least: int, resolution: float) -> Iterator[tuple[int, int, float, float, float, float]]:
-    """Where means [start, stop) seem to swing, and with about which period.
+def _quartile(sizes: Array) -> float:
+    """The lower one."""
+    return float(np.partition(sizes, len(sizes) // 4)[len(sizes) // 4])
 
-    Looked at are signs, of which what is loud and short spoils few.
-    """
-    share, which, sizes = _screened(means)
-    good = np.flatnonzero(share > LINKED)
+
+def _resolution(values: Array) -> float:
+    """The smallest step of values; 0 of so few that something is switched."""
+    steps: Array = np.abs(np.diff(values))
+    low, high = float(values.min()), float(values.max())
+    least = float(steps.min(where=steps > SAME_NUMBER * max(high, -low), initial=np.inf))
+    return least if high - low >= SWITCHED_VALUES * least else 0.0
+
+
+def _likely(means: Array, resolution: float) -> Iterator[tuple[int, int, float]]:
+    """Where means [start, stop) seem to swing, and with about which period."""
+    share, which, sizes = _windows(means)
+    known = (share > LINKED) & (which > 0) & (which < len(PERIODS) - 1)
+    good = np.flatnonzero(known)
+    middle: Array = np.lib.stride_tricks.sliding_window_view(sizes, WINDOW)[good]
+    loud = np.partition(middle, WINDOW // 4, axis=1)[:, WINDOW // 4]
+    good, loud = good[loud > resolution / 2], loud[loud > resolution / 2]
     if not len(good):
         return
-    windows: Array = np.lib.stride_tricks.sliding_window_view(sizes, WINDOW)
-    loud = np.partition(windows[good], 2, axis=1)[:, 2]
-    keep = loud > 0.6 * BLOCK * resolution
-    good, loud = good[keep], loud[keep]
-    apart = (np.diff(good) > WINDOW // 2) | (np.abs(np.diff(which[good])) > 1)
-    apart |= np.abs(np.diff(np.log(loud))) > math.log(LOUD)
-    edges = [0, *(np.flatnonzero(apart) + 1).tolist(), len(good)] if len(good) else [0]
     usual = _usual(sizes)
-    open_groups: list[tuple[int, int, float, float, float, float]] = []
-    for start, stop in itertools.pairwise(edges):
-        part = good[start:stop]
-        if share[part].max() < LIKELY:
-            continue
-        period = PERIODS[int(np.median(which[part]))]
-        size = float(np.median(loud[start:stop]))
-        first, last = int(part[0]) * BLOCK, min(len(means), (int(part[-1]) + WINDOW) * BLOCK + 2 * SHIFT)
-        least_usual, shown = float(usual[part].min()), float(share[part].mean())
-        left: list[tuple[int, int, float, float, float, float]] = []
-        for each in open_groups:
-            if first - each[1] > BETWEEN * period:
-                yield each
-            elif _ratio(each[2], period) < 1.25 and _ratio(each[3], size) < 3:
-                share_of = (each[1] - each[0]) / (each[1] - each[0] + last - first)
-                period = share_of * each[2] + (1 - share_of) * period
-                size = share_of * each[3] + (1 - share_of) * size
-                shown = share_of * each[5] + (1 - share_of) * shown
-                least_usual = min(least_usual, each[4])
-                first, last = each[0], max(last, each[1])
+    for group in _groups(good, share[good], which[good], loud):
+        at = good[group]
+        period = PERIODS[int(np.median(which[at]))]
+        start, stop = int(at[0]) * BLOCK, (int(at[-1]) + WINDOW) * BLOCK + 2 * SHIFT
+        loudness = float(np.median(loud[group])) / max(float(usual[at].min()), 1e-300)
+        unexplained = 1.05 - float(np.mean(share[at])) / SIGNS_OF_SINE
+        count = 2 * (stop - start) / period
+        if min(loudness, 1e9) ** 1.5 * count / unexplained > PROMISING:
+            yield start, min(stop, len(means)), period
+
+
+def _groups(good: Indexes, share: Array, which: Indexes, loud: Array) -> Iterator[Indexes]:
+    """Places of windows that are alike, though for a while something may hide the swing."""
+    apart = (np.diff(good) > WINDOW // 2) | (np.abs(np.diff(which)) > 1)
+    apart |= np.abs(np.diff(np.log(loud))) > math.log(AS_LOUD) / 2
+    starts = np.concatenate(([0], np.flatnonzero(apart) + 1))
+    stops = np.append(starts[1:], len(good))
+    surely = np.maximum.reduceat(share, starts) > LIKELY
+    open_groups: list[tuple[float, float, Indexes]] = []
+    for start, stop in zip(starts[surely].tolist(), stops[surely].tolist(), strict=True):
+        group: Indexes = np.arange(start, stop)
+        period, size = PERIODS[int(np.median(which[group]))], median(loud[group])
+        left: list[tuple[float, float, Indexes]] = []
+        for other in open_groups:
+            between = (good[start] - good[other[2][-1]] - WINDOW) * BLOCK
+            if between > HIDDEN * period:
+                yield other[2]
+            elif _ratio(period, other[0]) < SAME_PERIOD and _ratio(size, other[1]) < AS_LOUD:
+                group = np.concatenate((other[2], group))
             else:
-                left.append(each)
-        open_groups = [*left, (first, last, period, size, least_usual, shown)]
-    yield from open_groups
+                left.append(other)
+        open_groups = [*left, (period, size, group)]
+    for _, _, group in open_groups:
+        yield group
 
 
-def _screened(means: Array) -> tuple[Array, Indexes, Array]:
-    """Of each window how much of the signs a sine explains and which one; sizes of blocks."""
+def _windows(means: Array) -> tuple[Array, Indexes, Array]:
+    """Of each window the share of signs that a sine explains, and which one; sizes of blocks."""
     waves = _waves()
-    shares: list[Array] = []
-    whiches: list[Indexes] = []
-    sizes: list[Array] = []
-    beyond = (WINDOW - 1) * BLOCK
-    for begin in range(0, max(1, len(means) - beyond - 2 * SHIFT), AT_ONCE):
-        part = means[begin : begin + AT_ONCE + beyond + 2 * SHIFT]
+    rows, beyond = WINDOW * BLOCK, (WINDOW - 1) * BLOCK + 2 * SHIFT
+    found: list[tuple[Array, Indexes, Array]] = []
+    for begin in range(0, max(1, len(means) - beyond), AT_ONCE):
+        part = means[begin : begin + AT_ONCE + beyond]
         bends = _bends((part - part[0]).astype(np.float32), SHIFT)
-        if len(bends) < WINDOW * BLOCK:
-            bends = np.pad(bends, (0, WINDOW * BLOCK - len(bends)))
-        blocks = np.reshape(bends[: len(bends) // BLOCK * BLOCK], (-1, BLOCK))
+        if len(bends) < rows:
+            bends = np.pad(bends, (0, rows - len(bends)))
+        blocks: Array = np.reshape(bends[: len(bends) // BLOCK * BLOCK], (-1, BLOCK))
         signs = np.sign(blocks)
         count = len(blocks) - WINDOW + 1
         heights = signs[:count] @ waves[0]
@@ -358,27 +367,15 @@ def _screened(means: Array) -> tuple[Array, Indexes, Array]:
         heights *= heights
         squares = heights[:, : len(PERIODS)] + heights[:, len(PERIODS) :]
         which = np.argmax(squares, axis=1)
-        shares.append(squares[np.arange(count), which] / (WINDOW * BLOCK))
-        whiches.append(which)
-        sizes.append(np.einsum("ij->i", np.abs(blocks)))
-        if begin + AT_ONCE < len(means) - beyond - 2 * SHIFT:
-            sizes[-1] = sizes[-1][:count]
-    return np.concatenate(shares), np.concatenate(whiches), np.concatenate(sizes)
+        sizes = np.einsum("ij->i", np.abs(blocks)) / BLOCK
+        found.append((squares[np.arange(count), which] / rows, which, sizes[:count]))
+    last = found[-1][2], sizes[count:]
+    found[-1] = (*found[-1][:2], np.concatenate(last))
+    share, which, sizes = (np.concatenate(each) for each in zip(*found, strict=True))
+    return share, which, sizes
 
 
-def _usual(sizes: Array) -> Array:
-    """The lower quartile about each size, the least of three such stretches."""
-    count, quarter = len(sizes) // SURROUNDING, SURROUNDING // 4
-    if count < 2:
-        return np.full(len(sizes), np.partition(sizes, len(sizes) // 4)[len(sizes) // 4])
-    parts: Array = np.reshape(sizes[: count * SURROUNDING], (count, SURROUNDING))
-    padded: Array = np.pad(np.partition(parts, quarter, axis=1)[:, quarter], 1, mode="edge")
-    least = np.minimum(np.minimum(padded[:-2], padded[1:-1]), padded[2:])
-    usual = np.repeat(least, SURROUNDING)
-    return np.pad(usual, (0, len(sizes) - len(usual)), mode="edge")
-
-
-@lru_cache(1)
+@lru_cache(1)  # the same for all
 def _waves() -> Array:
     """Cosines and sines of length 1 as columns, for each block of a window."""
     places: Array = np.arange(WINDOW * BLOCK, dtype=np.float64) - (WINDOW * BLOCK - 1) / 2
@@ -388,12 +385,49 @@ def _waves() -> Array:
     return np.reshape(waves, (WINDOW, BLOCK, -1)).astype(np.float32)
 
 
-def _resolution(values: Array) -> float:
-    """The smallest step; 0 where the values are so few that something is switched."""
-    steps = np.abs(np.diff(values))
-    steps = steps[steps > SAME_NUMBER * max(float(values.max()), -float(values.min()))]
-    least = float(steps.min()) if len(steps) else 0.0
-    return least if float(np.ptp(values)) > 2.5 * least else 0.0
+def _usual(sizes: Array) -> Array:
+    """The lower quartile about each size, the least of three such stretches."""
+    count, quarter = len(sizes) // SURROUNDING, SURROUNDING // 4
+    if count < 2:
+        return np.full(len(sizes), _quartile(sizes))
+    parts: Array = np.reshape(sizes[: count * SURROUNDING], (count, SURROUNDING))
+    padded: Array = np.pad(np.partition(parts, quarter, axis=1)[:, quarter], 1, mode="edge")
+    least = np.minimum(np.minimum(padded[:-2], padded[1:-1]), padded[2:])
+    usual = np.repeat(least, SURROUNDING)
+    return np.pad(usual, (0, len(sizes) - len(usual)), mode="edge")
+
+
+def _busy(sizes: Array, first: int, last: int, half: int) -> Iterator[tuple[int, int]]:
+    """Where [start, stop) no half period is quiet, within and around [first, last)."""
+    if last - first < half:
+        return
+    sums = sums_of(sizes, half)
+    loud = sums >= QUIET * median(sums[first : last - half + 1])
+    edges = np.flatnonzero(np.diff(loud, prepend=False, append=False)).tolist()
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        yield start, stop - 1 + half
+
+
+def _ends(bends: Array, first: int, last: int, period: float) -> tuple[int, int] | None:
+    """Where the swing that [first, last) is part of begins and ends."""
+    clipped = _clipped(bends, CLIPPED * median(np.abs(bends[first:last])))
+    pieces = _pieces(clipped[first:last], period)
+    period, _, _ = _sines(pieces, np.ones_like(pieces), period)
+    begin = _begin(clipped, first, period)
+    return begin, len(bends) - _begin(clipped[::-1], len(bends) - last, period)
+
+
+def _begin(bends: Array, inside: int, period: float) -> int:
+    """Where the sine begins that swings from there on: before, it explains nothing."""
+    settled = inside + int(period / 2)
+    part = slice(settled, settled + round(SETTLED * period))
+    angles: Array = 2 * np.pi * np.arange(part.stop, dtype=np.float64) / period
+    waves: Array = np.stack((np.cos(angles), np.sin(angles)))[:, : len(bends)]
+    squares = waves[:, part] @ np.transpose(waves[:, part])
+    end = inside + int(period)
+    swing: Array = np.linalg.solve(squares, waves[:, part] @ bends[part]) @ waves[:, :end]
+    gains = np.abs(bends[:end]) - np.abs(bends[:end] - swing)
+    return int(np.argmax(np.cumsum(gains[::-1])[::-1]))
 
 
 @dataclass(frozen=True)
@@ -425,18 +459,16 @@ def fit_sines(values: Array, period: float, noise: float) -> Fit:
     magnitudes: Array = np.abs(pieces)
     clipped = _clipped(pieces, CLIPPED * np.median(magnitudes, axis=1, keepdims=True))
     usual = float(np.median(np.abs(clipped)))
-    everything = np.ones_like(clipped)
-    period, _, model = _sines(clipped, everything, period)
+    period, _, model = _sines(clipped, np.ones_like(clipped), period)
     left = clipped - model
     squares = float(np.einsum("ij,ij->", clipped, clipped))
     explained = 1 - float(np.einsum("ij,ij->", left, left)) / squares if squares else 0.0
-    near = _near(pieces - model, OUTLYING[0], usual)
-    period, _, model = _sines(clipped, near, period)
-    rest = float(np.median(np.abs(clipped - model))) ** 2
+    sizes: Array = np.abs(pieces - model)
+    near = np.asarray(sizes <= OUTLYING * np.median(sizes) + usual / 20, np.float64)
+    period, amplitudes, model = _sines(pieces, near, period)
+    rest = float(np.median(np.abs(pieces - model))) ** 2
     rest -= min(MOST_NOISE * usual**2, 0.6745**2 * noise)
     robustly = 1 - max(0.0, rest) / usual**2 if usual else 0.0
-    near = _near(pieces - model, OUTLYING[1], usual)
-    period, amplitudes, _ = _sines(pieces, near, period)
     return Fit(period, float(np.median(amplitudes)), explained, robustly)
 
 
@@ -445,12 +477,6 @@ def _pieces(values: Array, period: float) -> Array:
     count = max(1, round(len(values) / period / PIECE))
     rows = len(values) // count
     return np.reshape(values[: count * rows], (count, rows))
-
-
-def _near(residuals: Array, times: float, usual: float) -> Array:
-    """1 where a residual is not much larger than most."""
-    sizes: Array = np.abs(residuals)
-    return np.asarray(sizes <= times * np.median(sizes) + usual / 20, np.float64)
 
 
 def _sines(pieces: Array, weights: Array, period: float) -> tuple[float, Array, Array]:
@@ -489,29 +515,6 @@ def _vertex(heights: Array, highest: int) -> float:
     )
 
 
-def _begin(bends: Array, inside: int, period: float) -> int:
-    """Where the sine begins that swings from there on: before, it explains nothing."""
-    settled = inside + int(period / 2)
-    part = slice(settled, settled + round(SETTLED * period))
-    angles: Array = 2 * np.pi * np.arange(len(bends), dtype=np.float64) / period
-    waves: Array = np.stack((np.cos(angles), np.sin(angles)))
-    squares = waves[:, part] @ np.transpose(waves[:, part])
-    end = inside + int(period)
-    swing: Array = np.linalg.solve(squares, waves[:, part] @ bends[part]) @ waves[:, :end]
-    gains = np.abs(bends[:end]) - np.abs(bends[:end] - swing)
-    return int(np.argmax(np.cumsum(gains[::-1])[::-1]))
-
-
-def _quiet(bends: Array, period: float) -> int | None:
-    """The middle of half a period in which hardly anything bends; None if there is none."""
-    half = max(1, round(period / 2))
-    if len(bends) < 2 * half:
-        return None
-    sizes = sums_of(np.abs(bends), half)
-    least = int(np.argmin(sizes))
-    return least + half // 2 if sizes[least] < QUIET * median(sizes) else None
-
-
 def _highest(values: Array, period: float) -> float:
     """Half of what the values usually reach in a period: of a clipped one the sine is higher."""
     rows = round(period)
@@ -544,32 +547,29 @@ def _is_straight(values: Array, period: float, noise: float) -> bool:
     """Whether it is a staircase of straight pieces: a sine on a ramp has no harmonics.
 
     About its slope, a staircase of ramps that last half of its period is a triangle, of which the
-    third harmonic reaches a ninth of the first; of all others the second one reaches more.
+    third harmonic reaches a ninth of the first; of all others the second one reaches more. The
+    medians over all periods are taken, since bends of the course have harmonics too.
     """
     step = max(1, int(period / FITTED_ROWS))
-    lag = math.ceil(LAG * period / step)
-    bends = _bends(_means(values, step), lag)
     period /= step
-    rows = math.ceil(period)
-    if len(bends) < rows:
-        return False
+    lag, rows = math.ceil(LAG * period), math.ceil(period)
+    bends = _bends(_means(values, step), lag)
+    orders = np.arange(1, 4)
+    gains = 2 - 2 * np.cos(2 * np.pi * orders * lag / period)
+    waves = np.exp(-2j * np.pi * np.arange(rows)[:, None] * orders / period)
+    inverse = np.linalg.pinv(np.concatenate((waves.real, waves.imag), axis=1))
     parts = np.lib.stride_tricks.sliding_window_view(bends, rows)[:: max(1, rows // 4)]
-    angles: Array = 2 * np.pi * np.arange(rows) / period
-    waves = np.stack([np.exp(-1j * k * angles) for k in (1, 2, 3)], axis=1)
-    basis = np.concatenate((waves.real, waves.imag), axis=1)
-    inverse = np.linalg.pinv(basis)
     fitted = parts @ np.transpose(inverse)
-    gains = np.array([2 - 2 * math.cos(2 * math.pi * k * lag / period) for k in (1, 2, 3)])
-    first, second, third = np.transpose((fitted[:, :3] + 1j * fitted[:, 3:]) / gains)
+    first, *harmonics = np.transpose((fitted[:, :3] + 1j * fitted[:, 3:]) / gains)
     height = np.abs(first)
-    excess = 0.0
-    independent = max(1.0, len(bends) / period)
-    for each, order, at in ((second, 2, 1), (third, 3, 2)):
-        turned = each * np.conj(first) ** order / height ** (order + 1)
-        of_noise = 6 * noise**2 / step * float(np.sum(inverse[at] ** 2 + inverse[at + 3] ** 2))
-        of_noise *= 1.6 / independent / gains[at] ** 2 / float(np.median(height)) ** 2
-        excess += float(np.median(turned.real)) ** 2 + float(np.median(turned.imag)) ** 2 - DOUBT * of_noise
-    return excess > STRAIGHT**2
+    noise_share = 6 * noise**2 / step * period / len(bends) / float(np.median(height)) ** 2
+    squares = 0.0
+    for order, harmonic in enumerate(harmonics, 2):
+        turned = harmonic * np.conj(first) ** order / height ** (order + 1)
+        squares += float(np.median(turned.real)) ** 2 + float(np.median(turned.imag)) ** 2
+        of_noise = np.sum(inverse[[order - 1, order + 2]] ** 2) / gains[order - 1] ** 2
+        squares -= DOUBT * np.pi / 2 * float(of_noise) * noise_share
+    return squares > STRAIGHT**2
 
 
 def _best(found: list[Swing]) -> list[Swing]:
@@ -587,7 +587,7 @@ def _overlap(one: Swing, other: Swing) -> float:
 
 
 def _joined(found: Sequence[Swing], rows: EvenRows) -> list[Swing]:
-    """Those that are alike and follow each other closely, or across a gap, as one."""
+    """Those that are alike and follow each other across a gap, or right away, as one."""
     joined: list[Swing] = []
     for swing in found:
         if joined and _goes_on(joined[-1], swing, rows):
@@ -604,15 +604,12 @@ def _goes_on(before: Swing, after: Swing, rows: EvenRows) -> bool:
         return False
     ended, began = np.searchsorted(rows.times, [before.end_s, after.start_s])
     recorded_s = max(0, int(began - ended)) * rows.interval_s
-    return recorded_s < HIDDEN * before.period_s * (2 if _has_gap(rows, ended, began) else 1)
-
-
-def _has_gap(rows: EvenRows, start: int, stop: int) -> bool:
-    return bool(np.any((rows.borders > start) & (rows.borders <= stop)))
+    has_gap = bool(np.any((rows.borders > ended) & (rows.borders <= began)))
+    return recorded_s < before.period_s * (2 if has_gap else 1)
 
 
 def _ratio(one: float, other: float) -> float:
-    return max(one, other) / min(one, other)
+    return max(one, other) / max(min(one, other), 1e-300)
 
 
 def _as_one(before: Swing, after: Swing) -> Swing:

@@ -52,14 +52,14 @@ PIECE: Final = 5.0  # periods of one phase: over more, a swing may change a litt
 TRIED: Final = (0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08)  # of the period
 OUTLYING: Final = 2.5  # median residuals: what is farther off is a bend
 MOST_NOISE: Final = 0.12  # of the squares of second differences, that is taken for noise
-QUIET: Final = 0.4  # of the usual magnitude for half a period: the value rests there
+QUIET: Final = 0.3  # of the usual magnitude for half a period: the value rests there
 REACH: Final = 30.0  # periods before and after are the surroundings
 FEW_PERIODS: Final = 1.5  # of surroundings say nothing
 LOUDEST: Final = 6.0  # times its surroundings: more is not more certain
 UNKNOWN_LOUDNESS: Final = 3.5  # where nothing surrounds it
 # Median magnitude of a normal variable over its lower quartile.
 MEDIAN_TO_QUARTILE: Final = 0.6745 / 0.3186
-ENOUGH: Final = 1000.0  # of `evidence`: random courses reach it less than once an hour
+ENOUGH: Final = 700.0  # of `evidence`: random courses reach it less than once an hour
 TURNS_BACK: Final = 0.08  # of the way there a value comes back that does not only go one way
 STRAIGHT: Final = 0.085  # of the sine its harmonics reach where straight pieces make it
 DOUBT: Final = 3.0  # times the variance that noise makes of them

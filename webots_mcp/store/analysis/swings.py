@@ -50,9 +50,11 @@ EDGE: Final = 0.13  # of the period: a sine that begins at 0 shows so much earli
 AT_END: Final = 0.5  # of the period: so near the end of what was recorded it reaches up to there
 PIECE: Final = 5.0  # periods of one phase: over more, a swing may change a little
 TRIED: Final = (0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08)  # of the period
+ROUNDS: Final = 2
 OUTLYING: Final = 2.5  # median residuals: what is farther off is a bend
 MOST_NOISE: Final = 0.12  # of the squares of second differences, that is taken for noise
-QUIET: Final = 0.3  # of the usual magnitude for half a period: the value rests there
+QUIET: Final = 0.3  # of the usual magnitude ...
+RESTS: Final = 0.65  # of a period long: the value rests there
 REACH: Final = 30.0  # periods before and after are the surroundings
 FEW_PERIODS: Final = 1.5  # of surroundings say nothing
 LOUDEST: Final = 6.0  # times its surroundings: more is not more certain
@@ -194,7 +196,7 @@ class _Stretch:
         lag = math.ceil(LAG * period)
         bends = _bends(_means(self.values[low : candidate.stop + margin], step), lag)
         first, last = (candidate.start - low) // step, (candidate.stop - low) // step - 2 * lag
-        for begin, end in _busy(np.abs(bends), first, last, round(period / 2)):
+        for begin, end in _busy(np.abs(bends), first, last, round(RESTS * period)):
             inside = max(first, begin) - begin, min(last, end) - begin
             if inside[1] - inside[0] >= 1.5 * period:
                 ends = _ends(bends[begin:end], *inside, period)
@@ -397,15 +399,15 @@ def _usual(sizes: Array) -> Array:
     return np.pad(usual, (0, len(sizes) - len(usual)), mode="edge")
 
 
-def _busy(sizes: Array, first: int, last: int, half: int) -> Iterator[tuple[int, int]]:
-    """Where [start, stop) no half period is quiet, within and around [first, last)."""
-    if last - first < half:
+def _busy(sizes: Array, first: int, last: int, rows: int) -> Iterator[tuple[int, int]]:
+    """Where [start, stop) no stretch of so many is quiet, within and around [first, last)."""
+    if last - first < rows:
         return
-    sums = sums_of(sizes, half)
-    loud = sums >= QUIET * median(sums[first : last - half + 1])
+    sums = sums_of(sizes, rows)
+    loud = sums >= QUIET * median(sums[first : last - rows + 1])
     edges = np.flatnonzero(np.diff(loud, prepend=False, append=False)).tolist()
     for start, stop in zip(edges[::2], edges[1::2], strict=True):
-        yield start, stop - 1 + half
+        yield start, stop - 1 + rows
 
 
 def _ends(bends: Array, first: int, last: int, period: float) -> tuple[int, int] | None:
@@ -463,10 +465,12 @@ def fit_sines(values: Array, period: float, noise: float) -> Fit:
     left = clipped - model
     squares = float(np.einsum("ij,ij->", clipped, clipped))
     explained = 1 - float(np.einsum("ij,ij->", left, left)) / squares if squares else 0.0
-    sizes: Array = np.abs(pieces - model)
-    near = np.asarray(sizes <= OUTLYING * np.median(sizes) + usual / 20, np.float64)
-    period, amplitudes, model = _sines(pieces, near, period)
-    rest = float(np.median(np.abs(pieces - model))) ** 2
+    rest, amplitudes = 0.0, np.zeros(1)
+    for _ in range(ROUNDS):
+        sizes: Array = np.abs(pieces - model)
+        near = np.asarray(sizes <= OUTLYING * np.median(sizes) + usual / 20, np.float64)
+        period, amplitudes, model = _sines(pieces, near, period)
+    rest = float(np.median(np.abs(clipped - model))) ** 2
     rest -= min(MOST_NOISE * usual**2, 0.6745**2 * noise)
     robustly = 1 - max(0.0, rest) / usual**2 if usual else 0.0
     return Fit(period, float(np.median(amplitudes)), explained, robustly)

@@ -30,10 +30,10 @@ SHORTEST_PERIOD_ROWS: Final = 8.0  # fewer rows a period do not show its shape
 # Of a level, in means. What the first and the last one explain best is seen by another level.
 PERIODS: Final = (7.1, 8.0, 8.8, 9.8, 11.0, 12.4, 14.2, 16.2, 18.4)
 SHIFT: Final = 3  # means: about a quarter of these periods
-BLOCK: Final = 4  # means from one window to the next
-WINDOW: Final = 8  # blocks: two to four periods
+BLOCK: Final = 8  # means from one window to the next
+WINDOW: Final = 4  # blocks: two to four periods
 AT_ONCE: Final = 16_384  # means, which stay in the cache of a processor
-SURROUNDING: Final = 32  # blocks of which the lower quartile is taken
+SURROUNDING: Final = 16  # blocks of which the lower quartile is taken
 LIKELY: Final = 0.58  # of the signs a sine explains 0.81, and of white noise 0.58 once in 500
 LINKED: Final = 0.45  # of windows beside such a one
 SIGNS_OF_SINE: Final = 0.83
@@ -49,7 +49,8 @@ SETTLED: Final = 2.2  # periods, from which the sine is continued to find its en
 EDGE: Final = 0.13  # of the period: a sine that begins at 0 shows so much earlier
 AT_END: Final = 0.5  # of the period: so near the end of what was recorded it reaches up to there
 PIECE: Final = 5.0  # periods of one phase: over more, a swing may change a little
-TRIED: Final = (0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08)  # of the period
+TRIED: Final = (0.92, 0.96, 1.0, 1.04, 1.08)  # of the period
+LONGER: Final = 1.1
 ROUNDS: Final = 2
 OUTLYING: Final = 2.5  # median residuals: what is farther off is a bend
 MOST_NOISE: Final = 0.12  # of the squares of second differences, that is taken for noise
@@ -219,14 +220,21 @@ class _Stretch:
         start = 0 if start < AT_END * period * step else start
         stop = last if stop > last - AT_END * period * step else stop
         rows = slice(start, stop + 1)
+        most = 2 * (stop - start) / (period * step) * LONGER
+        if most < self._least(period * step / LONGER):
+            return
+        loudness = self._loudness(rows, period * step)
+        clipped_fit = ClippedFit.of(bends[slice(*ends)], period)
+        if evidence(loudness, 1.0, clipped_fit.explained, most) < ENOUGH:
+            return
         values = self.values[rows]
         noise = noise_of(values)
-        fit = fit_sines(bends[slice(*ends)], period, 6 * noise**2 / step)
+        fit = clipped_fit.refined(6 * noise**2 / step)
         period = fit.period * step
         count = round(2 * (stop - start) / period)
         if count < self._least(period) or period * self.interval_s > self.longest_s:
             return
-        if evidence(self._loudness(rows, period), fit.robustly, fit.explained, count) < ENOUGH:
+        if evidence(loudness, fit.robustly, fit.explained, count) < ENOUGH:
             return
         amplitude = fit.amplitude / (2 - 2 * math.cos(2 * math.pi * lag / fit.period))
         amplitude /= float(np.sinc(step / period)) if step > 1 else 1.0
@@ -363,14 +371,14 @@ def _windows(means: Array) -> tuple[Array, Indexes, Array]:
         blocks: Array = np.reshape(bends[: len(bends) // BLOCK * BLOCK], (-1, BLOCK))
         signs = np.sign(blocks)
         count = len(blocks) - WINDOW + 1
-        heights = signs[:count] @ waves[0]
+        columns = np.transpose(signs)
+        heights = waves[0] @ columns[:, :count]
         for at in range(1, WINDOW):
-            heights += signs[at : at + count] @ waves[at]
+            heights += waves[at] @ columns[:, at : at + count]
         heights *= heights
-        squares = heights[:, : len(PERIODS)] + heights[:, len(PERIODS) :]
-        which = np.argmax(squares, axis=1)
+        squares = heights[: len(PERIODS)] + heights[len(PERIODS) :]
         sizes = np.einsum("ij->i", np.abs(blocks)) / BLOCK
-        found.append((squares[np.arange(count), which] / rows, which, sizes[:count]))
+        found.append((squares.max(axis=0) / rows, squares.argmax(axis=0), sizes[:count]))
     last = found[-1][2], sizes[count:]
     found[-1] = (*found[-1][:2], np.concatenate(last))
     share, which, sizes = (np.concatenate(each) for each in zip(*found, strict=True))
@@ -379,12 +387,13 @@ def _windows(means: Array) -> tuple[Array, Indexes, Array]:
 
 @lru_cache(1)  # the same for all
 def _waves() -> Array:
-    """Cosines and sines of length 1 as columns, for each block of a window."""
+    """Cosines and sines of length 1 as rows, for each block of a window."""
     places: Array = np.arange(WINDOW * BLOCK, dtype=np.float64) - (WINDOW * BLOCK - 1) / 2
     angles: Array = 2 * np.pi * places[:, None] / np.array(PERIODS)
     waves = np.concatenate((np.cos(angles), np.sin(angles)), axis=1)
     waves /= np.sqrt(np.einsum("ij,ij->j", waves, waves))
-    return np.reshape(waves, (WINDOW, BLOCK, -1)).astype(np.float32)
+    waves = np.transpose(np.reshape(waves, (WINDOW, BLOCK, -1)), (0, 2, 1))
+    return np.ascontiguousarray(waves, np.float32)
 
 
 def _usual(sizes: Array) -> Array:
@@ -449,31 +458,41 @@ class Fit:
     robustly: float
 
 
-def fit_sines(values: Array, period: float, noise: float) -> Fit:
-    """Fitted to clipped values, then to those that the first fit is near to, of all values.
+@dataclass(frozen=True)
+class ClippedFit:
+    """Sines fitted to second differences that are clipped at what a sine reaches."""
 
-    Args:
-        values: Second differences.
-        period: About which.
-        noise: Variance of the noise in them.
-    """
-    pieces = _pieces(values, period)
-    magnitudes: Array = np.abs(pieces)
-    clipped = _clipped(pieces, CLIPPED * np.median(magnitudes, axis=1, keepdims=True))
-    usual = float(np.median(np.abs(clipped)))
-    period, _, model = _sines(clipped, np.ones_like(clipped), period)
-    left = clipped - model
-    squares = float(np.einsum("ij,ij->", clipped, clipped))
-    explained = 1 - float(np.einsum("ij,ij->", left, left)) / squares if squares else 0.0
-    rest, amplitudes = 0.0, np.zeros(1)
-    for _ in range(ROUNDS):
-        sizes: Array = np.abs(pieces - model)
-        near = np.asarray(sizes <= OUTLYING * np.median(sizes) + usual / 20, np.float64)
-        period, amplitudes, model = _sines(pieces, near, period)
-    rest = float(np.median(np.abs(clipped - model))) ** 2
-    rest -= min(MOST_NOISE * usual**2, 0.6745**2 * noise)
-    robustly = 1 - max(0.0, rest) / usual**2 if usual else 0.0
-    return Fit(period, float(np.median(amplitudes)), explained, robustly)
+    pieces: Array
+    clipped: Array
+    model: Array
+    period: float
+    explained: float
+
+    @classmethod
+    def of(cls, values: Array, period: float) -> ClippedFit:
+        """Of about that period, in values."""
+        pieces = _pieces(values, period)
+        middle = pieces.shape[1] // 2
+        usual = np.partition(np.abs(pieces), middle, axis=1)[:, middle, None]
+        clipped = _clipped(pieces, CLIPPED * usual)
+        period, _, model = _sines(clipped, np.ones_like(clipped), period)
+        left = clipped - model
+        squares = float(np.einsum("ij,ij->", clipped, clipped))
+        explained = 1 - float(np.einsum("ij,ij->", left, left)) / squares if squares else 0.0
+        return cls(pieces, clipped, model, period, explained)
+
+    def refined(self, noise: float) -> Fit:
+        """Fitted to all that the fit before is near to, with that variance of the noise."""
+        usual = median(np.abs(self.clipped).ravel())
+        period, model, amplitudes = self.period, self.model, np.zeros((1, 1))
+        for _ in range(ROUNDS):
+            sizes: Array = np.abs(self.pieces - model)
+            near = sizes <= OUTLYING * median(sizes.ravel()) + usual / 20
+            period, amplitudes, model = _sines(self.pieces, near.astype(np.float64), period)
+        rest = median(np.abs(self.clipped - model).ravel()) ** 2
+        rest -= min(MOST_NOISE * usual**2, 0.6745**2 * noise)
+        robustly = 1 - max(0.0, rest) / usual**2 if usual else 0.0
+        return Fit(period, median(amplitudes[:, 0]), self.explained, robustly)
 
 
 def _pieces(values: Array, period: float) -> Array:

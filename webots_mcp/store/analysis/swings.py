@@ -32,7 +32,9 @@ PERIODS: Final = (7.1, 8.0, 8.8, 9.8, 11.0, 12.4, 14.2, 16.2, 18.4)
 SHIFT: Final = 3  # means: about a quarter of these periods
 BLOCK: Final = 8  # means from one window to the next
 WINDOW: Final = 4  # blocks: two to four periods
+SIGN_CHANGES: Final = (3, 12)  # in a window: a sine has 4 to 8, noise of the rows 16
 AT_ONCE: Final = 16_384  # means, which stay in the cache of a processor
+UNTHREADED: Final = 400  # windows in a product that BLAS does not share between threads
 SURROUNDING: Final = 16  # blocks of which the lower quartile is taken
 LIKELY: Final = 0.58  # of the signs a sine explains 0.81, and of white noise 0.58 once in 500
 LINKED: Final = 0.45  # of windows beside such a one
@@ -316,6 +318,8 @@ def _likely(means: Array, resolution: float) -> Iterator[tuple[int, int, float]]
     share, which, sizes = _windows(means)
     known = (share > LINKED) & (which > 0) & (which < len(PERIODS) - 1)
     good = np.flatnonzero(known)
+    if not len(good):
+        return
     middle: Array = np.lib.stride_tricks.sliding_window_view(sizes, WINDOW)[good]
     loud = np.partition(middle, WINDOW // 4, axis=1)[:, WINDOW // 4]
     good, loud = good[loud > resolution / 2], loud[loud > resolution / 2]
@@ -324,9 +328,9 @@ def _likely(means: Array, resolution: float) -> Iterator[tuple[int, int, float]]
     usual = _usual(sizes)
     for group in _groups(good, share[good], which[good], loud):
         at = good[group]
-        period = PERIODS[int(np.median(which[at]))]
+        period = PERIODS[int(np.argmax(np.bincount(which[at])))]
         start, stop = int(at[0]) * BLOCK, (int(at[-1]) + WINDOW) * BLOCK + 2 * SHIFT
-        loudness = float(np.median(loud[group])) / max(float(usual[at].min()), 1e-300)
+        loudness = median(loud[group]) / max(float(usual[at].min()), 1e-300)
         unexplained = 1.05 - float(np.mean(share[at])) / SIGNS_OF_SINE
         count = 2 * (stop - start) / period
         if min(loudness, 1e9) ** 1.5 * count / unexplained > PROMISING:
@@ -343,7 +347,7 @@ def _groups(good: Indexes, share: Array, which: Indexes, loud: Array) -> Iterato
     open_groups: list[tuple[float, float, Indexes]] = []
     for start, stop in zip(starts[surely].tolist(), stops[surely].tolist(), strict=True):
         group: Indexes = np.arange(start, stop)
-        period, size = PERIODS[int(np.median(which[group]))], median(loud[group])
+        period, size = PERIODS[int(np.argmax(np.bincount(which[group])))], median(loud[group])
         left: list[tuple[float, float, Indexes]] = []
         for other in open_groups:
             between = (good[start] - good[other[2][-1]] - WINDOW) * BLOCK
@@ -359,8 +363,10 @@ def _groups(good: Indexes, share: Array, which: Indexes, loud: Array) -> Iterato
 
 
 def _windows(means: Array) -> tuple[Array, Indexes, Array]:
-    """Of each window the share of signs that a sine explains, and which one; sizes of blocks."""
-    waves = _waves()
+    """Of each window the share of signs that a sine explains, and which one; sizes of blocks.
+
+    Of those windows in which the sign changes about as often as a sine's.
+    """
     rows, beyond = WINDOW * BLOCK, (WINDOW - 1) * BLOCK + 2 * SHIFT
     found: list[tuple[Array, Indexes, Array]] = []
     for begin in range(0, max(1, len(means) - beyond), AT_ONCE):
@@ -368,32 +374,35 @@ def _windows(means: Array) -> tuple[Array, Indexes, Array]:
         bends = _bends((part - part[0]).astype(np.float32), SHIFT)
         if len(bends) < rows:
             bends = np.pad(bends, (0, rows - len(bends)))
-        blocks: Array = np.reshape(bends[: len(bends) // BLOCK * BLOCK], (-1, BLOCK))
-        signs = np.sign(blocks)
-        count = len(blocks) - WINDOW + 1
-        columns = np.transpose(signs)
-        heights = waves[0] @ columns[:, :count]
-        for at in range(1, WINDOW):
-            heights += waves[at] @ columns[:, at : at + count]
-        heights *= heights
-        squares = heights[: len(PERIODS)] + heights[len(PERIODS) :]
-        sizes = np.einsum("ij->i", np.abs(blocks)) / BLOCK
-        found.append((squares.max(axis=0) / rows, squares.argmax(axis=0), sizes[:count]))
-    last = found[-1][2], sizes[count:]
-    found[-1] = (*found[-1][:2], np.concatenate(last))
-    share, which, sizes = (np.concatenate(each) for each in zip(*found, strict=True))
-    return share, which, sizes
+        bends = bends[: len(bends) // BLOCK * BLOCK]
+        above = bends > 0
+        above[1:] ^= above[:-1].copy()
+        changes = sums_of(np.bitwise_count(above.view(np.uint64)), WINDOW)
+        some = np.flatnonzero((changes >= SIGN_CHANGES[0]) & (changes <= SIGN_CHANGES[1]))
+        share, which = np.zeros(len(changes), np.float32), np.zeros(len(changes), np.intp)
+        blocks: Array = np.reshape(bends, (-1, BLOCK))
+        for at in range(0, len(some), UNTHREADED):
+            these = some[at : at + UNTHREADED]
+            signs = np.sign(blocks[these[:, None] + np.arange(WINDOW)]).reshape(-1, rows)
+            heights = _waves() @ np.transpose(signs)
+            heights *= heights
+            squares = heights[: len(PERIODS)] + heights[len(PERIODS) :]
+            share[these], which[these] = squares.max(axis=0) / rows, squares.argmax(axis=0)
+        found.append((share, which, np.einsum("ij->i", np.abs(blocks)) / BLOCK))
+    last = found[-1][2]
+    sizes = [each[2][: len(each[0])] for each in found[:-1]]
+    share, which = (np.concatenate([each[at] for each in found]) for at in (0, 1))
+    return share, which, np.concatenate([*sizes, last])
 
 
 @lru_cache(1)  # the same for all
 def _waves() -> Array:
-    """Cosines and sines of length 1 as rows, for each block of a window."""
+    """Cosines and sines of length 1 as rows."""
     places: Array = np.arange(WINDOW * BLOCK, dtype=np.float64) - (WINDOW * BLOCK - 1) / 2
     angles: Array = 2 * np.pi * places[:, None] / np.array(PERIODS)
     waves = np.concatenate((np.cos(angles), np.sin(angles)), axis=1)
     waves /= np.sqrt(np.einsum("ij,ij->j", waves, waves))
-    waves = np.transpose(np.reshape(waves, (WINDOW, BLOCK, -1)), (0, 2, 1))
-    return np.ascontiguousarray(waves, np.float32)
+    return np.ascontiguousarray(np.transpose(waves), np.float32)
 
 
 def _usual(sizes: Array) -> Array:

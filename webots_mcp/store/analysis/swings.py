@@ -44,10 +44,10 @@ AS_LOUD: Final = 3.0  # ... and of their sizes
 HIDDEN: Final = 2.0  # periods, for which bends may hide a swing that goes on
 PROMISING: Final = 90.0  # as `ENOUGH`, by what the signs tell
 
-FITTED_ROWS: Final = 24  # means a period where ends and shape are measured
+FITTED_ROWS: Final = 16  # means a period where ends and shape are measured
 LAG: Final = 0.25  # of the period
 CLIPPED: Final = 1.5  # times the median magnitude: a sine has a height of 1.4 times its own
-SETTLED: Final = 2.2  # periods, from which the sine is continued to find its ends
+SETTLED: Final = 2  # periods, from which the sine is continued to find its ends
 EDGE: Final = 0.13  # of the period: a sine that begins at 0 shows so much earlier
 AT_END: Final = 0.5  # of the period: so near the end of what was recorded it reaches up to there
 PIECE: Final = 5.0  # periods of one phase: over more, a swing may change a little
@@ -251,7 +251,7 @@ class _Stretch:
 
     def _loudness(self, rows: slice, period: float) -> float:
         """How much larger its second differences are than the lower quartile around it."""
-        step = max(1, int(period / 16))
+        step = max(1, int(period / FITTED_ROWS))
         lag, far = math.ceil(LAG * period / step), int(REACH * period)
         parts = slice(max(0, rows.start - far), rows.start), slice(rows.stop, rows.stop + far)
         beside = [np.abs(_bends(_means(self.values[part], step), lag)) for part in parts]
@@ -441,12 +441,10 @@ def _begin(bends: Array, inside: int, period: float) -> int:
     """Where the sine begins that swings from there on: before, it explains nothing."""
     settled = inside + int(period / 2)
     part = slice(settled, settled + round(SETTLED * period))
-    angles: Array = 2 * np.pi * np.arange(part.stop, dtype=np.float64) / period
-    waves: Array = np.stack((np.cos(angles), np.sin(angles)))[:, : len(bends)]
-    squares = waves[:, part] @ np.transpose(waves[:, part])
+    waves = np.exp(2j * np.pi / period * np.arange(min(part.stop, len(bends))))
+    height = 2 * np.mean(bends[part] * np.conj(waves[part]))
     end = inside + int(period)
-    swing: Array = np.linalg.solve(squares, waves[:, part] @ bends[part]) @ waves[:, :end]
-    gains = np.abs(bends[:end]) - np.abs(bends[:end] - swing)
+    gains = np.abs(bends[:end]) - np.abs(bends[:end] - (height * waves[:end]).real)
     return int(np.argmax(np.cumsum(gains[::-1])[::-1]))
 
 

@@ -64,7 +64,7 @@ LOUDEST: Final = 6.0  # times its surroundings: more is not more certain
 UNKNOWN_LOUDNESS: Final = 3.5  # where nothing surrounds it
 # Median magnitude of a normal variable over its lower quartile.
 MEDIAN_TO_QUARTILE: Final = 0.6745 / 0.3186
-ENOUGH: Final = 700.0  # of `evidence`: random courses reach it less than once an hour
+ENOUGH: Final = 850.0  # of `evidence`: random courses reach it less than once an hour
 TURNS_BACK: Final = 0.08  # of the way there a value comes back that does not only go one way
 STRAIGHT: Final = 0.085  # of the sine its harmonics reach where straight pieces make it
 DOUBT: Final = 3.0  # times the variance that noise makes of them

@@ -13,12 +13,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Final
+from typing import Final, NamedTuple, cast
 
-from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, median, np, sums_of
+from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, mean, median, np, sums_of
 from webots_mcp.store.analysis.noise import noise_of
 from webots_mcp.store.analysis.rhythm import gap_borders
 
@@ -27,18 +27,18 @@ SLOW_PERIOD_S: Final = 5.0  # beyond, bends of a way come as regularly by chance
 SLOW_HALF_SWINGS: Final = 12  # ... but hardly ever so many
 SHORTEST_PERIOD_ROWS: Final = 8.0  # fewer rows a period do not show its shape
 
-# Of a level, in means. What the first and the last one explain best is seen by another level.
+# Of a level, in means. What the first or the last one explains best is seen by another level.
 PERIODS: Final = (7.1, 8.0, 8.8, 9.8, 11.0, 12.4, 14.2, 16.2, 18.4)
 SHIFT: Final = 3  # means: about a quarter of these periods
 BLOCK: Final = 8  # means from one window to the next
 WINDOW: Final = 4  # blocks: two to four periods
 SIGN_CHANGES: Final = (3, 12)  # in a window: a sine has 4 to 8, noise of the rows 16
+LIKELY: Final = 0.58  # of the signs a sine explains 0.83, and of white noise 0.58 once in 500
+LINKED: Final = 0.45  # of windows beside such a one
+SIGNS_OF_SINE: Final = 0.83
 AT_ONCE: Final = 16_384  # means, which stay in the cache of a processor
 UNTHREADED: Final = 400  # windows in a product that BLAS does not share between threads
 SURROUNDING: Final = 16  # blocks of which the lower quartile is taken
-LIKELY: Final = 0.58  # of the signs a sine explains 0.81, and of white noise 0.58 once in 500
-LINKED: Final = 0.45  # of windows beside such a one
-SIGNS_OF_SINE: Final = 0.83
 SAME_PERIOD: Final = 1.25  # ratio of the periods of windows of one swing ...
 AS_LOUD: Final = 3.0  # ... and of their sizes
 HIDDEN: Final = 2.0  # periods, for which bends may hide a swing that goes on
@@ -47,27 +47,28 @@ PROMISING: Final = 90.0  # as `ENOUGH`, by what the signs tell
 FITTED_ROWS: Final = 16  # means a period where ends and shape are measured
 LAG: Final = 0.25  # of the period
 CLIPPED: Final = 1.5  # times the median magnitude: a sine has a height of 1.4 times its own
+RESTS: Final = 0.75  # of a period, in which the value ...
+QUIET: Final = 0.3  # ... bends by less than that share of what is usual
 SETTLED: Final = 2  # periods, from which the sine is continued to find its ends
 EDGE: Final = 0.13  # of the period: a sine that begins at 0 shows so much earlier
 AT_END: Final = 0.5  # of the period: so near the end of what was recorded it reaches up to there
 PIECE: Final = 5.0  # periods of one phase: over more, a swing may change a little
 TRIED: Final = (0.92, 0.96, 1.0, 1.04, 1.08)  # of the period
-LONGER: Final = 1.1
-ROUNDS: Final = 2
-OUTLYING: Final = 2.5  # median residuals: what is farther off is a bend
+UNSURE: Final = 1.1  # times as short the period may be as it seems before it is fitted
+ROUNDS: Final = 2  # after which what is farther off ...
+OUTLYING: Final = 2.5  # ... than so many median residuals, a bend, does not count
 MOST_NOISE: Final = 0.12  # of the squares of second differences, that is taken for noise
-QUIET: Final = 0.3  # of the usual magnitude ...
-RESTS: Final = 0.75  # of a period long: the value rests there
 REACH: Final = 30.0  # periods before and after are the surroundings
 FEW_PERIODS: Final = 1.5  # of surroundings say nothing
 LOUDEST: Final = 6.0  # times its surroundings: more is not more certain
 UNKNOWN_LOUDNESS: Final = 3.5  # where nothing surrounds it
-# Median magnitude of a normal variable over its lower quartile.
-MEDIAN_TO_QUARTILE: Final = 0.6745 / 0.3186
+# Median magnitude of a normal variable, and that over its lower quartile.
+MEDIAN: Final = 0.6745
+MEDIAN_TO_QUARTILE: Final = MEDIAN / 0.3186
 ENOUGH: Final = 850.0  # of `evidence`: random courses reach it less than once an hour
 TURNS_BACK: Final = 0.08  # of the way there a value comes back that does not only go one way
-STRAIGHT: Final = 0.085  # of the sine its harmonics reach where straight pieces make it
-DOUBT: Final = 3.0  # times the variance that noise makes of them
+STRAIGHT: Final = 0.085  # of the sine its harmonics reach where straight pieces make it ...
+DOUBT: Final = 4.7  # ... beside so many variances that noise makes of them
 NOISE_AMPLITUDES: Final = 3.0  # a swing is at least so many deviations of the noise high ...
 MEAN_AMPLITUDES: Final = 12.0  # ... or so many of their means over half the swing
 SAME_NUMBER: Final = 1e-9  # of the value: what adding up floating-point numbers makes of one
@@ -137,28 +138,15 @@ def find_swings(
 
 
 def swings_in(
-    rows: EvenRows,
-    values: Array,
-    least_half_swings: int,
-    longest_period_s: float,
-    is_over: Callable[[], bool] = lambda: False,
+    rows: EvenRows, values: Array, least_half_swings: int, longest_period_s: float
 ) -> list[Swing]:
-    """As `find_swings`, of one of several signals; less where it is over before the end."""
+    """As `find_swings`, of one of several signals."""
     found: list[Swing] = []
     for times, part in rows.stretches(values):
         if len(part) > 3 * SHORTEST_PERIOD_ROWS and part.min() < part.max():
             stretch = _Stretch(times, part, least_half_swings, longest_period_s)
-            found += _best(list(stretch.swings(is_over)))
+            found += _best(list(stretch.swings()))
     return _joined(found, rows)
-
-
-@dataclass(frozen=True)
-class _Candidate:
-    """Where rows [start, stop) seem to swing, and with about which period, in rows."""
-
-    start: int
-    stop: int
-    period: float
 
 
 class _Stretch:
@@ -169,80 +157,67 @@ class _Stretch:
         self.interval_s = float(times[-1] - times[0]) / (len(times) - 1)
         self.least, self.longest_s = least, longest_s
 
-    def swings(self, is_over: Callable[[], bool]) -> Iterator[Swing]:
+    def swings(self) -> Iterator[Swing]:
         """Those of each octave of periods; what two of them see is found twice."""
         means, rows, resolution = self.values, 1, _resolution(self.values)
-        while rows * PERIODS[1] * self.interval_s < self.longest_s and not is_over():
+        while (
+            rows * SHORTEST_PERIOD_ROWS * self.interval_s < self.longest_s
+            and len(means) > 3 * SHORTEST_PERIOD_ROWS
+        ):
             for start, stop, period in _likely(means, resolution):
-                candidate = _Candidate(start * rows, stop * rows, period * rows)
-                if self._may_last(candidate.stop - candidate.start, candidate.period):
-                    yield from self._measured(candidate)
+                most = (stop - start) / period + 2 * HIDDEN
+                if self._is_enough(2 * most, period * rows / SAME_PERIOD):
+                    yield from self._measured(start * rows, stop * rows, period * rows)
             means, rows = _means(means, 2), 2 * rows
-            if len(means) <= 3 * SHORTEST_PERIOD_ROWS:
-                return
 
-    def _may_last(self, rows: float, period: float) -> bool:
-        """Whether so many rows, with what may be hidden beside them, are enough half swings."""
-        return 2 * (rows / period + 2 * HIDDEN) >= self._least(period / SAME_PERIOD)
+    def _is_enough(self, half_swings: float, period: float) -> bool:
+        is_slow = period * self.interval_s > SLOW_PERIOD_S
+        return half_swings >= max(self.least, SLOW_HALF_SWINGS * is_slow)
 
-    def _least(self, period: float) -> int:
-        slow = period * self.interval_s > SLOW_PERIOD_S
-        return max(self.least, SLOW_HALF_SWINGS) if slow else self.least
-
-    def _measured(self, candidate: _Candidate) -> Iterator[Swing]:
+    def _measured(self, start: int, stop: int, period: float) -> Iterator[Swing]:
         """The swings of about these rows and that period: the value may rest between them."""
-        period = candidate.period
         margin = math.ceil(HIDDEN * period)
-        low = max(0, candidate.start - margin)
+        low = max(0, start - margin)
         step = max(1, int(period / FITTED_ROWS))
         period /= step
         lag = math.ceil(LAG * period)
-        bends = _bends(_means(self.values[low : candidate.stop + margin], step), lag)
-        first, last = (candidate.start - low) // step, (candidate.stop - low) // step - 2 * lag
+        bends = _bends(_means(self.values[low : stop + margin], step), lag)
+        first, last = (start - low) // step, (stop - low) // step - 2 * lag
         for begin, end in _busy(np.abs(bends), first, last, round(RESTS * period)):
-            inside = max(first, begin) - begin, min(last, end) - begin
+            part, inside = bends[begin:end], (max(first, begin) - begin, min(last, end) - begin)
             if inside[1] - inside[0] >= 1.5 * period:
-                ends = _ends(bends[begin:end], *inside, period)
-                if ends is not None and ends[1] - ends[0] >= 2 * period:
-                    ends = begin + ends[0], begin + ends[1]
-                    yield from self._judged(low + lag * step, ends, bends, lag, step, period)
+                ends = _ends(part, *inside, period)
+                offset = low + (begin + lag) * step
+                yield from self._judged(offset, part[ends], ends, _Scale(step, lag, period))
 
-    def _judged(
-        self,
-        low: int,
-        ends: tuple[int, int],
-        bends: Array,
-        lag: int,
-        step: int,
-        period: float,
-    ) -> Iterator[Swing]:
+    def _judged(self, offset: int, bends: Array, ends: slice, scale: _Scale) -> Iterator[Swing]:
+        step, lag, period = scale
         edge = EDGE * period
-        start, stop = (round(low + at * step) for at in (ends[0] + edge, ends[1] - edge))
+        start, stop = (round(offset + at * step) for at in (ends.start + edge, ends.stop - edge))
         last = len(self.values) - 1
         start = 0 if start < AT_END * period * step else start
         stop = last if stop > last - AT_END * period * step else stop
-        rows = slice(start, stop + 1)
-        most = 2 * (stop - start) / (period * step) * LONGER
-        if most < self._least(period * step / LONGER):
+        most = 2 * (stop - start) / (period * step) * UNSURE
+        if not self._is_enough(most, period * step / UNSURE):
             return
+        rows = slice(start, stop + 1)
         loudness = self._loudness(rows, period * step)
-        clipped_fit = ClippedFit.of(bends[slice(*ends)], period)
-        if evidence(loudness, 1.0, clipped_fit.explained, most) < ENOUGH:
+        fit = Fit.of(bends, period)
+        if evidence(loudness, 1.0, fit.explained, most) < ENOUGH:
             return
         values = self.values[rows]
         noise = noise_of(values)
-        fit = clipped_fit.refined(6 * noise**2 / step)
-        period = fit.period * step
+        robustly, amplitude, period = fit.refined(6 * noise**2 / step)
+        gain = 2 - 2 * math.cos(2 * math.pi * lag / period)
+        period *= step
         count = round(2 * (stop - start) / period)
-        if count < self._least(period) or period * self.interval_s > self.longest_s:
+        if not self._is_enough(count, period) or period * self.interval_s > self.longest_s:
             return
-        if evidence(loudness, fit.robustly, fit.explained, count) < ENOUGH:
+        if evidence(loudness, robustly, fit.explained, count) < ENOUGH:
             return
-        amplitude = fit.amplitude / (2 - 2 * math.cos(2 * math.pi * lag / fit.period))
-        amplitude /= float(np.sinc(step / period)) if step > 1 else 1.0
-        amplitude = min(amplitude, _highest(values, period))
+        amplitude = min(amplitude / gain / float(np.sinc(step / period)), _highest(values, period))
         least = min(NOISE_AMPLITUDES, MEAN_AMPLITUDES / (period * count / 2) ** 0.5) * noise
-        if amplitude < least or not _is_resolved(values, amplitude):
+        if amplitude < max(least, _resolution(values)):
             return
         if _turns_back(values, period) < TURNS_BACK and _is_straight(values, period, noise):
             return
@@ -253,14 +228,21 @@ class _Stretch:
         """How much larger its second differences are than the lower quartile around it."""
         step = max(1, int(period / FITTED_ROWS))
         lag, far = math.ceil(LAG * period / step), int(REACH * period)
-        parts = slice(max(0, rows.start - far), rows.start), slice(rows.stop, rows.stop + far)
-        beside = [np.abs(_bends(_means(self.values[part], step), lag)) for part in parts]
-        around = np.concatenate(beside)
+        parts = rows, slice(max(0, rows.start - far), rows.start), slice(rows.stop, rows.stop + far)
+        sizes = [np.abs(_bends(_means(self.values[part], step), lag)) for part in parts]
+        around = np.concatenate(sizes[1:])
         if len(around) < FEW_PERIODS * period / step:
             return UNKNOWN_LOUDNESS
-        inside = median(np.abs(_bends(_means(self.values[rows], step), lag)))
-        usual = _quartile(around) * MEDIAN_TO_QUARTILE
+        inside, usual = median(sizes[0]), _quartile(around) * MEDIAN_TO_QUARTILE
         return inside / usual if usual * LOUDEST > inside else LOUDEST
+
+
+class _Scale(NamedTuple):
+    """How second differences were made: of means of so many rows; lag and period in means."""
+
+    step: int
+    lag: int
+    period: float
 
 
 def evidence(loudness: float, robustly: float, explained: float, count: float) -> float:
@@ -316,83 +298,77 @@ def _resolution(values: Array) -> float:
 def _likely(means: Array, resolution: float) -> Iterator[tuple[int, int, float]]:
     """Where means [start, stop) seem to swing, and with about which period."""
     share, which, sizes = _windows(means)
-    known = (share > LINKED) & (which > 0) & (which < len(PERIODS) - 1)
-    good = np.flatnonzero(known)
+    good = np.flatnonzero((share > LINKED) & (which > 0) & (which < len(PERIODS) - 1))
     if not len(good):
         return
-    middle: Array = np.lib.stride_tricks.sliding_window_view(sizes, WINDOW)[good]
-    loud = np.partition(middle, WINDOW // 4, axis=1)[:, WINDOW // 4]
+    blocks = sizes[good[:, None] + np.arange(WINDOW)]
+    loud = np.partition(blocks, WINDOW // 4, axis=1)[:, WINDOW // 4]
     good, loud = good[loud > resolution / 2], loud[loud > resolution / 2]
-    if not len(good):
-        return
     usual = _usual(sizes)
     for group in _groups(good, share[good], which[good], loud):
         at = good[group]
-        period = PERIODS[int(np.argmax(np.bincount(which[at])))]
         start, stop = int(at[0]) * BLOCK, (int(at[-1]) + WINDOW) * BLOCK + 2 * SHIFT
-        loudness = median(loud[group]) / max(float(usual[at].min()), 1e-300)
-        unexplained = 1.05 - float(np.mean(share[at])) / SIGNS_OF_SINE
-        count = 2 * (stop - start) / period
-        if min(loudness, 1e9) ** 1.5 * count / unexplained > PROMISING:
+        period = _period(which[at])
+        loudness = median(loud[group]) / max(float(usual[at].min()), 1e-100)
+        unexplained = 1.05 - mean(share[at]) / SIGNS_OF_SINE
+        if min(loudness, 1e9) ** 1.5 * 2 * (stop - start) / period / unexplained > PROMISING:
             yield start, min(stop, len(means)), period
+
+
+def _period(which: Indexes) -> float:
+    """The most frequent one."""
+    return PERIODS[int(np.argmax(np.bincount(which)))]
 
 
 def _groups(good: Indexes, share: Array, which: Indexes, loud: Array) -> Iterator[Indexes]:
     """Places of windows that are alike, though for a while something may hide the swing."""
     apart = (np.diff(good) > WINDOW // 2) | (np.abs(np.diff(which)) > 1)
     apart |= np.abs(np.diff(np.log(loud))) > math.log(AS_LOUD) / 2
-    starts = np.concatenate(([0], np.flatnonzero(apart) + 1))
-    stops = np.append(starts[1:], len(good))
-    surely = np.maximum.reduceat(share, starts) > LIKELY
-    open_groups: list[tuple[float, float, Indexes]] = []
-    for start, stop in zip(starts[surely].tolist(), stops[surely].tolist(), strict=True):
-        group: Indexes = np.arange(start, stop)
-        period, size = PERIODS[int(np.argmax(np.bincount(which[group])))], median(loud[group])
-        left: list[tuple[float, float, Indexes]] = []
-        for other in open_groups:
-            between = (good[start] - good[other[2][-1]] - WINDOW) * BLOCK
+    waiting: list[tuple[float, float, Indexes]] = []
+    for group in np.split(np.arange(len(good)), np.flatnonzero(apart) + 1):
+        if not len(group) or share[group].max() < LIKELY:
+            continue
+        period, size = _period(which[group]), median(loud[group])
+        beside, waiting = waiting, []
+        for other in beside:
+            between = (good[group[0]] - good[other[2][-1]] - WINDOW) * BLOCK
             if between > HIDDEN * period:
                 yield other[2]
             elif _ratio(period, other[0]) < SAME_PERIOD and _ratio(size, other[1]) < AS_LOUD:
                 group = np.concatenate((other[2], group))
             else:
-                left.append(other)
-        open_groups = [*left, (period, size, group)]
-    for _, _, group in open_groups:
-        yield group
+                waiting.append(other)
+        waiting.append((period, size, group))
+    yield from (each[2] for each in waiting)
 
 
 def _windows(means: Array) -> tuple[Array, Indexes, Array]:
     """Of each window the share of signs that a sine explains, and which one; sizes of blocks.
 
-    Of those windows in which the sign changes about as often as a sine's.
+    0 of those in which the sign changes much less or more often than a sine's.
     """
     rows, beyond = WINDOW * BLOCK, (WINDOW - 1) * BLOCK + 2 * SHIFT
     found: list[tuple[Array, Indexes, Array]] = []
     for begin in range(0, max(1, len(means) - beyond), AT_ONCE):
         part = means[begin : begin + AT_ONCE + beyond]
         bends = _bends((part - part[0]).astype(np.float32), SHIFT)
-        if len(bends) < rows:
-            bends = np.pad(bends, (0, rows - len(bends)))
-        bends = bends[: len(bends) // BLOCK * BLOCK]
-        above = bends > 0
-        above[1:] ^= above[:-1].copy()
-        changes = sums_of(np.bitwise_count(above.view(np.uint64)), WINDOW)
+        bends = np.pad(bends, (0, max(0, rows - len(bends))))
+        blocks: Array = np.reshape(bends[: len(bends) // BLOCK * BLOCK], (-1, BLOCK))
+        above = np.ravel(blocks) > 0
+        changed: Flags = np.concatenate(([False], above[1:] != above[:-1]))
+        changes = sums_of(np.bitwise_count(changed.view(np.uint64)), WINDOW)
+        share, which = np.zeros(len(changes)), np.zeros(len(changes), np.intp)
         some = np.flatnonzero((changes >= SIGN_CHANGES[0]) & (changes <= SIGN_CHANGES[1]))
-        share, which = np.zeros(len(changes), np.float32), np.zeros(len(changes), np.intp)
-        blocks: Array = np.reshape(bends, (-1, BLOCK))
         for at in range(0, len(some), UNTHREADED):
             these = some[at : at + UNTHREADED]
-            signs = np.sign(blocks[these[:, None] + np.arange(WINDOW)]).reshape(-1, rows)
-            heights = _waves() @ np.transpose(signs)
-            heights *= heights
-            squares = heights[: len(PERIODS)] + heights[len(PERIODS) :]
+            signs = np.reshape(np.sign(blocks[these[:, None] + np.arange(WINDOW)]), (-1, rows))
+            squares = (_waves() @ np.transpose(signs)) ** 2
+            squares = squares[: len(PERIODS)] + squares[len(PERIODS) :]
             share[these], which[these] = squares.max(axis=0) / rows, squares.argmax(axis=0)
         found.append((share, which, np.einsum("ij->i", np.abs(blocks)) / BLOCK))
-    last = found[-1][2]
-    sizes = [each[2][: len(each[0])] for each in found[:-1]]
-    share, which = (np.concatenate([each[at] for each in found]) for at in (0, 1))
-    return share, which, np.concatenate([*sizes, last])
+    shares, periods, blocks_of = zip(*found, strict=True)
+    sizes = [each[: len(share)] for share, _, each in found[:-1]]
+    return np.concatenate(shares), np.concatenate(periods), np.concatenate([*sizes, blocks_of[-1]])
 
 
 @lru_cache(1)  # the same for all
@@ -402,7 +378,7 @@ def _waves() -> Array:
     angles: Array = 2 * np.pi * places[:, None] / np.array(PERIODS)
     waves = np.concatenate((np.cos(angles), np.sin(angles)), axis=1)
     waves /= np.sqrt(np.einsum("ij,ij->j", waves, waves))
-    return np.ascontiguousarray(np.transpose(waves), np.float32)
+    return cast("Array", np.ascontiguousarray(np.transpose(waves), np.float32))  # half as slow
 
 
 def _usual(sizes: Array) -> Array:
@@ -428,46 +404,35 @@ def _busy(sizes: Array, first: int, last: int, rows: int) -> Iterator[tuple[int,
         yield start, stop - 1 + rows
 
 
-def _ends(bends: Array, first: int, last: int, period: float) -> tuple[int, int] | None:
+def _ends(bends: Array, first: int, last: int, period: float) -> slice:
     """Where the swing that [first, last) is part of begins and ends."""
     clipped = _clipped(bends, CLIPPED * median(np.abs(bends[first:last])))
     pieces = _pieces(clipped[first:last], period)
     period, _, _ = _sines(pieces, np.ones_like(pieces), period)
     begin = _begin(clipped, first, period)
-    return begin, len(bends) - _begin(clipped[::-1], len(bends) - last, period)
+    return slice(begin, len(bends) - _begin(clipped[::-1], len(bends) - last, period))
 
 
 def _begin(bends: Array, inside: int, period: float) -> int:
     """Where the sine begins that swings from there on: before, it explains nothing."""
     settled = inside + int(period / 2)
     part = slice(settled, settled + round(SETTLED * period))
-    waves = np.exp(2j * np.pi / period * np.arange(min(part.stop, len(bends))))
-    height = 2 * np.mean(bends[part] * np.conj(waves[part]))
-    end = inside + int(period)
-    gains = np.abs(bends[:end]) - np.abs(bends[:end] - (height * waves[:end]).real)
+    angles: Array = np.arange(min(part.stop, len(bends)), dtype=np.float64) * (2 * np.pi / period)
+    waves: Array = np.stack((np.cos(angles), np.sin(angles)))
+    end, rows = inside + int(period), len(bends[part])
+    swing = (waves[:, part] @ bends[part]) @ waves[:, :end] * (2 / max(1, rows))
+    gains = np.abs(bends[:end]) - np.abs(bends[:end] - swing)
     return int(np.argmax(np.cumsum(gains[::-1])[::-1]))
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Sines of one period, in pieces that each have a phase and a height of their own.
+    """Sines of one period in second differences that are clipped at what a sine reaches.
 
     Attributes:
-        period: In values.
-        amplitude: The median of the pieces.
-        explained: Share of the squares, of values clipped at what a sine reaches.
-        robustly: Share of the squared median magnitude, without noise: bends do not lower it.
+        pieces: Of second differences, which each have a phase and a height of their own.
+        explained: Share of the squares.
     """
-
-    period: float
-    amplitude: float
-    explained: float
-    robustly: float
-
-
-@dataclass(frozen=True)
-class ClippedFit:
-    """Sines fitted to second differences that are clipped at what a sine reaches."""
 
     pieces: Array
     clipped: Array
@@ -476,30 +441,35 @@ class ClippedFit:
     explained: float
 
     @classmethod
-    def of(cls, values: Array, period: float) -> ClippedFit:
-        """Of about that period, in values."""
-        pieces = _pieces(values, period)
+    def of(cls, bends: Array, period: float) -> Fit:
+        """Of about that period."""
+        pieces = _pieces(bends, period)
         middle = pieces.shape[1] // 2
         usual = np.partition(np.abs(pieces), middle, axis=1)[:, middle, None]
         clipped = _clipped(pieces, CLIPPED * usual)
         period, _, model = _sines(clipped, np.ones_like(clipped), period)
-        left = clipped - model
-        squares = float(np.einsum("ij,ij->", clipped, clipped))
-        explained = 1 - float(np.einsum("ij,ij->", left, left)) / squares if squares else 0.0
-        return cls(pieces, clipped, model, period, explained)
+        left = float(np.square(clipped - model).sum())
+        squares = float(np.square(clipped).sum())
+        return cls(pieces, clipped, model, period, 1 - left / squares if squares else 0.0)
 
-    def refined(self, noise: float) -> Fit:
-        """Fitted to all that the fit before is near to, with that variance of the noise."""
+    def refined(self, noise: float) -> tuple[float, float, float]:
+        """What sines explain of the squared median, their median amplitude and their period.
+
+        Fitted to all to which the fit before is near, so that bends do not count.
+
+        Args:
+            noise: Variance of the noise in second differences, which nothing explains.
+        """
         usual = median(np.abs(self.clipped).ravel())
-        period, model, amplitudes = self.period, self.model, np.zeros((1, 1))
+        period, model, amplitudes = self.period, self.model, self.pieces
         for _ in range(ROUNDS):
             sizes: Array = np.abs(self.pieces - model)
             near = sizes <= OUTLYING * median(sizes.ravel()) + usual / 20
             period, amplitudes, model = _sines(self.pieces, near.astype(np.float64), period)
         rest = median(np.abs(self.clipped - model).ravel()) ** 2
-        rest -= min(MOST_NOISE * usual**2, 0.6745**2 * noise)
+        rest -= min(MOST_NOISE * usual**2, MEDIAN**2 * noise)
         robustly = 1 - max(0.0, rest) / usual**2 if usual else 0.0
-        return Fit(period, median(amplitudes[:, 0]), self.explained, robustly)
+        return robustly, median(amplitudes[:, 0]), period
 
 
 def _pieces(values: Array, period: float) -> Array:
@@ -556,16 +526,6 @@ def _highest(values: Array, period: float) -> float:
     return median(heights) / 2 / math.cos(min(math.pi / period, math.pi / 4))
 
 
-def _is_resolved(values: Array, amplitude: float) -> bool:
-    """Whether it is more than the smallest step between two values: a course that is rounded.
-
-    Up to three values are switched to and fro.
-    """
-    apart = np.diff(np.unique(values))
-    apart = apart[apart > SAME_NUMBER * float(np.abs(values).max())]
-    return len(apart) < SWITCHED_VALUES or amplitude > float(apart.min())
-
-
 def _turns_back(values: Array, period: float) -> float:
     """The share of its way there that a value comes back."""
     steps = np.diff(_means(values, max(1, int(period / 8))))
@@ -584,22 +544,21 @@ def _is_straight(values: Array, period: float, noise: float) -> bool:
     period /= step
     lag, rows = math.ceil(LAG * period), math.ceil(period)
     bends = _bends(_means(values, step), lag)
-    orders = np.arange(1, 4)
-    gains = 2 - 2 * np.cos(2 * np.pi * orders * lag / period)
-    waves = np.exp(-2j * np.pi * np.arange(rows)[:, None] * orders / period)
-    inverse = np.linalg.pinv(np.concatenate((waves.real, waves.imag), axis=1))
     parts = np.lib.stride_tricks.sliding_window_view(bends, rows)[:: max(1, rows // 4)]
-    fitted = parts @ np.transpose(inverse)
-    first, *harmonics = np.transpose((fitted[:, :3] + 1j * fitted[:, 3:]) / gains)
-    height = np.abs(first)
-    noise_share = 6 * noise**2 / step * period / len(bends) / float(np.median(height)) ** 2
-    squares = 0.0
-    for order, harmonic in enumerate(harmonics, 2):
-        turned = harmonic * np.conj(first) ** order / height ** (order + 1)
-        squares += float(np.median(turned.real)) ** 2 + float(np.median(turned.imag)) ** 2
-        of_noise = np.sum(inverse[[order - 1, order + 2]] ** 2) / gains[order - 1] ** 2
-        squares -= DOUBT * np.pi / 2 * float(of_noise) * noise_share
-    return squares > STRAIGHT**2
+    orders: Array = np.arange(1.0, 4.0)
+    angles: Array = np.arange(rows)[:, None] * orders * (2 * np.pi / period)
+    inverse = np.linalg.pinv(np.concatenate((np.cos(angles), np.sin(angles)), axis=1))
+    cosines, sines = np.split(parts @ np.transpose(inverse), 2, axis=1)
+    gains: Array = 2 - 2 * np.cos(orders * (2 * np.pi * lag / period))
+    heights: Array = np.hypot(cosines, sines) / gains
+    phases: Array = np.arctan2(sines, cosines)
+    apart = phases[:, 1:] - orders[1:] * phases[:, :1]
+    shares: Array = heights[:, 1:] / heights[:, :1]
+    turned: Array = np.concatenate((shares * np.cos(apart), shares * np.sin(apart)), axis=1)
+    squares = float(np.square(np.median(turned, axis=0)).sum())
+    of_noise = np.square(inverse).sum(axis=1).reshape(2, 3).sum(axis=0)[1:] / gains[1:] ** 2
+    of_one = 6 * noise**2 / step / median(heights[:, 0]) ** 2 * period / len(bends)
+    return squares - DOUBT * float(of_noise.sum()) * of_one > STRAIGHT**2
 
 
 def _best(found: list[Swing]) -> list[Swing]:
@@ -628,14 +587,13 @@ def _joined(found: Sequence[Swing], rows: EvenRows) -> list[Swing]:
 
 
 def _goes_on(before: Swing, after: Swing, rows: EvenRows) -> bool:
-    if _ratio(before.period_s, after.period_s) > ALIKE[0]:
-        return False
-    if _ratio(before.amplitude, after.amplitude) > ALIKE[1]:
-        return False
     ended, began = np.searchsorted(rows.times, [before.end_s, after.start_s])
-    recorded_s = max(0, int(began - ended)) * rows.interval_s
     has_gap = bool(np.any((rows.borders > ended) & (rows.borders <= began)))
-    return recorded_s < before.period_s * (2 if has_gap else 1)
+    return (
+        (began - ended) * rows.interval_s < before.period_s * (1 + has_gap)
+        and _ratio(before.period_s, after.period_s) < ALIKE[0]
+        and _ratio(before.amplitude, after.amplitude) < ALIKE[1]
+    )
 
 
 def _ratio(one: float, other: float) -> float:

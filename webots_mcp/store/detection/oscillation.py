@@ -10,12 +10,11 @@ from typing import Final
 from webots_mcp.naming import in_snake_case, listed
 from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.analysis.features import unwrap
-from webots_mcp.store.analysis.summary import LARGEST
 from webots_mcp.store.analysis.swings import SLOW_HALF_SWINGS, EvenRows, Swing, swings_in
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import Alike, EventKind, NotSearchableError
 from webots_mcp.store.detection.search import MOST_NAMED, Search
-from webots_mcp.store.reading.frame import Zones
+from webots_mcp.store.reading.frame import Frame, Zones
 from webots_mcp.store.signals.registry import Signal
 
 LONGEST_PERIOD_S: Final = 5.0  # that always counts; longer ones where enough of them fit
@@ -41,6 +40,7 @@ def oscillation_events(search: Search) -> Iterator[Event]:
             raise NotSearchableError(why)
         search.not_searched("oscillation", why)
     _note_periods(search)
+    search.note_too_large("oscillation")
     for name, swing in _found(search, signals):
         details = {
             "half_periods": swing.half_swings,
@@ -74,29 +74,23 @@ def _longest_period_s(search: Search) -> float:
 
 def _found(search: Search, signals: Sequence[Signal]) -> Iterator[tuple[str, Swing]]:
     """The swings of each signal, in the chunks in which it changes."""
-    frame, too_large = search.frame, list[str]()
-    asked = search.options.min_half_periods, _longest_period_s(search)
-    rows: dict[tuple[int, int], EvenRows] = {}  # which signals share
+    frame, least = search.frame, search.options.min_half_periods
+    asked = least, _longest_period_s(search)
+    shared: dict[tuple[int, int], tuple[Frame, EvenRows]] = {}  # by many signals
     for index, signal in enumerate(signals):
         if search.is_over("oscillation", signals[index:]):
             break
-        for span in _changing(frame.zones(signal.name), search.options.min_half_periods):
-            part = frame.rows(*span)
-            numbers = part.numbers(signal.name)
-            usable = np.abs(numbers) <= LARGEST
-            if usable.all():
-                even = rows.setdefault(span, EvenRows.of(part.times))
-            else:
-                if (np.abs(numbers) > LARGEST).any():
-                    too_large.append(signal.name)
-                even, numbers = EvenRows.of(part.times[usable]), numbers[usable]
+        for span in _changing(frame.zones(signal.name), least):
+            if span not in shared:
+                part = frame.rows(*span)
+                shared[span] = part, EvenRows.of(part.times)
+            part, rows = shared[span]
+            times, numbers = part.usable(signal.name)
+            rows = rows if len(times) == len(part) else EvenRows.of(times)
             if signal.turn:
                 numbers = unwrap(numbers, signal.turn)
-            for swing in swings_in(even, numbers, *asked, lambda: search.deadline.passed):
+            for swing in swings_in(rows, numbers, *asked):
                 yield signal.name, swing
-    if too_large and search.only is None:
-        names = listed(list(dict.fromkeys(too_large)), MOST_NAMED)
-        search.not_searched("oscillation", f"not in {names}: numbers beyond {LARGEST:g}")
 
 
 def _changing(zones: Zones, least: int) -> list[tuple[int, int]]:

@@ -53,7 +53,8 @@ SETTLED: Final = 2  # periods, from which the sine is continued to find its ends
 EDGE: Final = 0.13  # of the period: a sine that begins at 0 shows so much earlier
 AT_END: Final = 0.5  # of the period: so near the end of what was recorded it reaches up to there
 PIECE: Final = 5.0  # periods of one phase: over more, a swing may change a little
-TRIED: Final = (0.92, 0.96, 1.0, 1.04, 1.08)  # of the period
+TRIED: Final = (0.94, 1.0, 1.06)  # of the period
+FARTHEST: Final = 1.4  # times as far from the middle one the best may be
 UNSURE: Final = 1.1  # times as short the period may be as it seems before it is fitted
 ROUNDS: Final = 2  # after which what is farther off ...
 OUTLYING: Final = 2.5  # ... than so many median residuals, a bend, does not count
@@ -165,7 +166,7 @@ class _Stretch:
             and len(means) > 3 * SHORTEST_PERIOD_ROWS
         ):
             for start, stop, period in _likely(means, resolution):
-                most = (stop - start) / period + 2 * HIDDEN
+                most = (stop - start) / period + HIDDEN
                 if self._is_enough(2 * most, period * rows / SAME_PERIOD):
                     yield from self._measured(start * rows, stop * rows, period * rows)
             means, rows = _means(means, 2), 2 * rows
@@ -482,14 +483,16 @@ def _pieces(values: Array, period: float) -> Array:
 def _sines(pieces: Array, weights: Array, period: float) -> tuple[float, Array, Array]:
     """The best period about the given one, and the heights and values of its sines."""
     _, _, gains = _fits(pieces, weights, period * np.array(TRIED))
-    total: Array = gains.sum(axis=0)
-    best = int(np.argmax(total))
-    share = TRIED[best] + _vertex(total, best) * (TRIED[1] - TRIED[0])
-    sines, cosines, _ = _fits(pieces, weights, np.array([period * share]))
+    low, middle, high = gains.sum(axis=0).tolist()
+    bend = 2 * middle - low - high  # of the parabola through them: its vertex is the best
+    most = TRIED[2] - 1
+    aside = (high - low) / (2 * bend) if bend > 0 else math.copysign(1.0, high - low)
+    period *= 1 + most * max(-FARTHEST, min(FARTHEST, aside))
+    sines, cosines, _ = _fits(pieces, weights, np.array([period]))
     places: Array = np.arange(pieces.shape[1], dtype=np.float64) - (pieces.shape[1] - 1) / 2
-    angles: Array = 2 * np.pi * places / (period * share)
+    angles: Array = places * (2 * np.pi / period)
     model = sines * np.sin(angles) + cosines * np.cos(angles)
-    return period * share, np.hypot(sines, cosines), np.asarray(model, np.float64)
+    return period, np.hypot(sines, cosines), np.asarray(model, np.float64)
 
 
 def _fits(pieces: Array, weights: Array, periods: Array) -> tuple[Array, Array, Array]:
@@ -503,16 +506,6 @@ def _fits(pieces: Array, weights: Array, periods: Array) -> tuple[Array, Array, 
     determinant: Array = np.maximum(ss * cc - sc * sc, 1e-12)
     of_sine, of_cosine = (sy * cc - cy * sc) / determinant, (cy * ss - sy * sc) / determinant
     return of_sine, of_cosine, of_sine * sy + of_cosine * cy
-
-
-def _vertex(heights: Array, highest: int) -> float:
-    """How far from the highest one that of the parabola through it and its neighbours lies."""
-    if not 0 < highest < len(heights) - 1:
-        return 0.0
-    before, most, after = heights[highest - 1 : highest + 2].tolist()
-    return (
-        (after - before) / (4 * most - 2 * before - 2 * after) if 2 * most > before + after else 0.0
-    )
 
 
 def _highest(values: Array, period: float) -> float:

@@ -300,7 +300,7 @@ def _likely(means: Array, resolution: float) -> Iterator[tuple[int, int, float]]
     """Where means [start, stop) seem to swing, and with about which period."""
     share, which, sizes = _windows(means)
     good = np.flatnonzero((share > LINKED) & (which > 0) & (which < len(PERIODS) - 1))
-    if not len(good):
+    if not len(good) or share[good].max() < LIKELY:
         return
     blocks = sizes[good[:, None] + np.arange(WINDOW)]
     loud = np.partition(blocks, WINDOW // 4, axis=1)[:, WINDOW // 4]
@@ -353,7 +353,8 @@ def _windows(means: Array) -> tuple[Array, Indexes, Array]:
     for begin in range(0, max(1, len(means) - beyond), AT_ONCE):
         part = means[begin : begin + AT_ONCE + beyond]
         bends = _bends((part - part[0]).astype(np.float32), SHIFT)
-        bends = np.pad(bends, (0, max(0, rows - len(bends))))
+        if len(bends) < rows:
+            bends = np.pad(bends, (0, rows - len(bends)))
         blocks: Array = np.reshape(bends[: len(bends) // BLOCK * BLOCK], (-1, BLOCK))
         above = np.ravel(blocks) > 0
         changed: Flags = np.concatenate(([False], above[1:] != above[:-1]))
@@ -388,10 +389,10 @@ def _usual(sizes: Array) -> Array:
     if count < 2:
         return np.full(len(sizes), _quartile(sizes))
     parts: Array = np.reshape(sizes[: count * SURROUNDING], (count, SURROUNDING))
-    padded: Array = np.pad(np.partition(parts, quarter, axis=1)[:, quarter], 1, mode="edge")
-    least = np.minimum(np.minimum(padded[:-2], padded[1:-1]), padded[2:])
-    usual = np.repeat(least, SURROUNDING)
-    return np.pad(usual, (0, len(sizes) - len(usual)), mode="edge")
+    usual = np.partition(parts, quarter, axis=1)[:, quarter]
+    padded: Array = np.concatenate((usual[:1], usual, usual[-1:]))
+    least = np.minimum(np.minimum(padded[:-2], usual), padded[2:])
+    return least[np.minimum(np.arange(len(sizes)) // SURROUNDING, count - 1)]
 
 
 def _busy(sizes: Array, first: int, last: int, rows: int) -> Iterator[tuple[int, int]]:

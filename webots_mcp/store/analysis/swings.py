@@ -16,7 +16,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Final, NamedTuple, cast
+from typing import Final, cast
 
 from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, mean, median, np, sums_of
 from webots_mcp.store.analysis.noise import noise_of
@@ -189,9 +189,19 @@ class _Stretch:
             if inside[1] - inside[0] >= 1.5 * period:
                 ends = _ends(part, *inside, period)
                 offset = low + (begin + lag) * step
-                yield from self._judged(offset, part[ends], ends, _Scale(step, lag, period))
+                yield from self._judged(offset, part[ends], ends, (step, lag, period))
 
-    def _judged(self, offset: int, bends: Array, ends: slice, scale: _Scale) -> Iterator[Swing]:
+    def _judged(
+        self, offset: int, bends: Array, ends: slice, scale: tuple[int, int, float]
+    ) -> Iterator[Swing]:
+        """The swing from one place to another of second differences, if it is one.
+
+        Args:
+            offset: Row of the first of which `ends` counts from.
+            bends: Second differences between the ends.
+            ends: Their places.
+            scale: Rows of the means of which they are made; lag and period, in means.
+        """
         step, lag, period = scale
         edge = EDGE * period
         start, stop = (round(offset + at * step) for at in (ends.start + edge, ends.stop - edge))
@@ -236,14 +246,6 @@ class _Stretch:
             return UNKNOWN_LOUDNESS
         inside, usual = median(sizes[0]), _quartile(around) * MEDIAN_TO_QUARTILE
         return inside / usual if usual * LOUDEST > inside else LOUDEST
-
-
-class _Scale(NamedTuple):
-    """How second differences were made: of means of so many rows; lag and period in means."""
-
-    step: int
-    lag: int
-    period: float
 
 
 def evidence(loudness: float, robustly: float, explained: float, count: float) -> float:
@@ -357,7 +359,7 @@ def _windows(means: Array) -> tuple[Array, Indexes, Array]:
             bends = np.pad(bends, (0, rows - len(bends)))
         blocks: Array = np.reshape(bends[: len(bends) // BLOCK * BLOCK], (-1, BLOCK))
         above = np.ravel(blocks) > 0
-        changed: Flags = np.concatenate(([False], above[1:] != above[:-1]))
+        changed = above != np.append(above[:1], above[:-1])
         changes = sums_of(np.bitwise_count(changed.view(np.uint64)), WINDOW)
         share, which = np.zeros(len(changes)), np.zeros(len(changes), np.intp)
         some = np.flatnonzero((changes >= SIGN_CHANGES[0]) & (changes <= SIGN_CHANGES[1]))
@@ -597,12 +599,11 @@ def _ratio(one: float, other: float) -> float:
 def _as_one(before: Swing, after: Swing) -> Swing:
     """Period, amplitude and share are weighted by the half swings."""
     count = before.half_swings + after.half_swings
-    share = before.half_swings / count
-    return replace(
-        before,
-        end_s=after.end_s,
-        half_swings=count,
-        period_s=share * before.period_s + (1 - share) * after.period_s,
-        amplitude=share * before.amplitude + (1 - share) * after.amplitude,
-        explained=share * before.explained + (1 - share) * after.explained,
-    )
+    mixed = {
+        name: (
+            before.half_swings * getattr(before, name) + after.half_swings * getattr(after, name)
+        )
+        / count
+        for name in ("period_s", "amplitude", "explained")
+    }
+    return replace(before, end_s=after.end_s, half_swings=count, **mixed)

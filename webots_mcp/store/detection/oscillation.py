@@ -88,7 +88,7 @@ def _found(search: Search, signals: Sequence[Signal]) -> Iterator[tuple[str, Swi
             part, rows = shared[span]
             times, numbers = part.usable(signal.name)
             rows = rows if len(times) == len(part) else EvenRows.of(times)
-            if signal.turn:
+            if signal.turn and len(numbers) and np.ptp(numbers) > signal.turn / 2:
                 numbers = unwrap(numbers, signal.turn)
             for swing in swings_in(rows, numbers, *asked):
                 yield signal.name, swing

@@ -68,6 +68,7 @@ MEDIAN: Final = 0.6745
 MEDIAN_TO_QUARTILE: Final = MEDIAN / 0.3186
 ENOUGH: Final = 850.0  # of `evidence`: random courses reach it less than once an hour
 TURNS_BACK: Final = 0.08  # of the way there a value comes back that does not only go one way
+MANY_PERIODS: Final = 12  # of which some may be those of a swing within a staircase
 STRAIGHT: Final = 0.085  # of the sine its harmonics reach where straight pieces make it ...
 DOUBT: Final = 4.7  # ... beside so many variances that noise makes of them
 NOISE_AMPLITUDES: Final = 3.0  # a swing is at least so many deviations of the noise high ...
@@ -523,10 +524,13 @@ def _highest(values: Array, period: float) -> float:
 
 
 def _turns_back(values: Array, period: float) -> float:
-    """The share of its way there that a value comes back."""
-    steps = np.diff(_means(values, max(1, int(period / 8))))
-    up, down = float(steps[steps > 0].sum()), -float(steps[steps < 0].sum())
-    return min(up, down) / max(up, down) if max(up, down) > 0 else 0.0
+    """The share of its way there that a value comes back; of many periods in most of them."""
+    step = max(1, int(period / 8))
+    steps = np.diff(_means(values, step))
+    rows = round(period / step) if len(values) > MANY_PERIODS * period else len(steps)
+    parts: Array = np.reshape(steps[: len(steps) // rows * rows], (-1, rows))
+    up, down = np.maximum(parts, 0).sum(axis=1), np.maximum(-parts, 0).sum(axis=1)
+    return median(np.minimum(up, down) / np.maximum(np.maximum(up, down), 1e-300))
 
 
 def _is_straight(values: Array, period: float, noise: float) -> bool:

@@ -119,9 +119,7 @@ class EvenRows:
         return cls(times, moving, gap_borders(times, interval_s), interval_s)
 
     def stretches(self, values: Array) -> Iterator[tuple[Array, Array]]:
-        """Times and values of each stretch."""
-        if self.moving is not None:
-            values = values[self.moving]
+        """Times and values of each stretch, of values where time moved on."""
         edges = [0, *self.borders.tolist(), len(self.times)]
         for start, stop in itertools.pairwise(edges):
             yield self.times[start:stop], values[start:stop]
@@ -144,11 +142,12 @@ def swings_in(
 ) -> list[Swing]:
     """As `find_swings`, of one of several signals."""
     found: list[Swing] = []
+    values = values if rows.moving is None else values[rows.moving]
     for times, part in rows.stretches(values):
         if len(part) > 3 * SHORTEST_PERIOD_ROWS and part.min() < part.max():
             stretch = _Stretch(times, part, least_half_swings, longest_period_s)
             found += _best(list(stretch.swings()))
-    return _joined(found, rows)
+    return _joined(found, rows, values)
 
 
 class _Stretch:
@@ -575,25 +574,30 @@ def _overlap(one: Swing, other: Swing) -> float:
     return common_s / min(one.end_s - one.start_s, other.end_s - other.start_s)
 
 
-def _joined(found: Sequence[Swing], rows: EvenRows) -> list[Swing]:
-    """Those that are alike and follow each other across a gap, or right away, as one."""
+def _joined(found: Sequence[Swing], rows: EvenRows, values: Array) -> list[Swing]:
+    """Those that are alike and follow each other closely, or across a gap, as one."""
     joined: list[Swing] = []
     for swing in found:
-        if joined and _goes_on(joined[-1], swing, rows):
+        if joined and _goes_on(joined[-1], swing, rows, values):
             joined[-1] = _as_one(joined[-1], swing)
         else:
             joined.append(swing)
     return joined
 
 
-def _goes_on(before: Swing, after: Swing, rows: EvenRows) -> bool:
-    ended, began = np.searchsorted(rows.times, [before.end_s, after.start_s])
+def _goes_on(before: Swing, after: Swing, rows: EvenRows, values: Array) -> bool:
+    ratios = _ratio(before.period_s, after.period_s), _ratio(before.amplitude, after.amplitude)
+    if ratios[0] > ALIKE[0] or ratios[1] > ALIKE[1]:
+        return False
+    ended, began = np.searchsorted(rows.times, [before.end_s, after.start_s]).tolist()
+    period = before.period_s / rows.interval_s
     has_gap = bool(np.any((rows.borders > ended) & (rows.borders <= began)))
-    return (
-        (began - ended) * rows.interval_s < before.period_s * (1 + has_gap)
-        and _ratio(before.period_s, after.period_s) < ALIKE[0]
-        and _ratio(before.amplitude, after.amplitude) < ALIKE[1]
-    )
+    if began - ended < period * (1 + has_gap):
+        return True
+    lag = math.ceil(LAG * period)
+    bends = _bends(values[max(0, ended - lag) : began + lag], lag)
+    is_hidden = not has_gap and began - ended < HIDDEN * period
+    return is_hidden and median(np.abs(bends)) > QUIET * before.amplitude
 
 
 def _ratio(one: float, other: float) -> float:

@@ -232,3 +232,27 @@ def test_a_staircase_of_ramps_never_turns_back_and_does_not_swing(
     steps = whole + np.clip(part / share, 0, 1)
     noise = np.random.default_rng(8).normal(0, 0.005, len(times))
     assert swings_of(times, np.pi / 2 * (steps + noise)) == []
+
+
+def test_a_swing_within_one_that_is_much_slower_is_found_beside_it() -> None:
+    times = np.arange(0, 600, 0.05)
+    inside = (times > 200) & (times < 220)
+    fast = np.where(inside, 0.1 * np.sin(np.pi * times), 0)
+    noise = np.random.default_rng(9).normal(0, 0.01, len(times))
+    values = np.sin(2 * np.pi * times / 30) + fast + noise
+    found = find_swings(times, values, least_half_swings=6, longest_period_s=100.0)
+    assert sorted(each.period_s for each in found) == pytest.approx([2.0, 30.0], rel=0.03)
+
+
+def test_a_weave_within_a_staircase_does_not_make_all_of_it_a_swing() -> None:
+    times = np.arange(0, 400, 0.05)
+    whole, part = np.divmod(times / 14, 1)
+    stairs = np.pi / 2 * (whole + np.clip(part / 0.1, 0, 1))
+    inside = (times >= 200) & (times < 230)
+    weave = np.where(inside, 0.3 * np.sin(2 * np.pi * (times - 200) / 3), 0)
+    noise = np.random.default_rng(3).normal(0, 0.005, len(times))
+    (swing,) = find_swings(
+        times, stairs + weave + noise, least_half_swings=6, longest_period_s=60.0
+    )
+    assert swing.period_s == pytest.approx(3.0, rel=0.03)
+    assert (swing.start_s, swing.end_s) == pytest.approx((200, 230), abs=1.5)

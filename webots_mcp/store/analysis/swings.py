@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final, cast
 
-from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, mean, median, np, sums_of
+from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, median, np, sums_of
 from webots_mcp.store.analysis.noise import noise_of
 from webots_mcp.store.analysis.rhythm import gap_borders
 
@@ -75,7 +75,8 @@ NOISE_AMPLITUDES: Final = 3.0  # a swing is at least so many deviations of the n
 MEAN_AMPLITUDES: Final = 12.0  # ... or so many of their means over half the swing
 SAME_NUMBER: Final = 1e-9  # of the value: what adding up floating-point numbers makes of one
 SWITCHED_VALUES: Final = 3
-MOST_OVERLAP: Final = 0.2  # of the shorter one
+MOST_OVERLAP: Final = 0.2  # of the shorter one ...
+MUCH_SLOWER: Final = 4.0  # ... and ratio of periods, where two show one swing
 ALIKE: Final = (1.15, 1.5)  # ratio of periods and of amplitudes on both sides of a gap
 
 
@@ -313,7 +314,7 @@ def _likely(means: Array, resolution: float) -> Iterator[tuple[int, int, float]]
         start, stop = int(at[0]) * BLOCK, (int(at[-1]) + WINDOW) * BLOCK + 2 * SHIFT
         period = _period(which[at])
         loudness = median(loud[group]) / max(float(usual[at].min()), 1e-100)
-        unexplained = 1.05 - mean(share[at]) / SIGNS_OF_SINE
+        unexplained = 1.05 - float(share[at].mean()) / SIGNS_OF_SINE
         if min(loudness, 1e9) ** 1.5 * 2 * (stop - start) / period / unexplained > PROMISING:
             yield start, min(stop, len(means)), period
 
@@ -561,27 +562,33 @@ def _is_straight(values: Array, period: float, noise: float) -> bool:
 
 
 def _best(found: list[Swing]) -> list[Swing]:
-    """Of swings that overlap, the one with most half swings that are best explained."""
+    """Of swings that overlap, the one with most half swings that are best explained.
+
+    One that is much slower goes on beneath the others.
+    """
     kept: list[Swing] = []
     for swing in sorted(found, key=lambda each: -each.explained * each.half_swings):
-        if all(_overlap(swing, other) < MOST_OVERLAP for other in kept):
+        if not any(_is_same(swing, other) for other in kept):
             kept.append(swing)
     return sorted(kept, key=lambda each: each.start_s)
 
 
-def _overlap(one: Swing, other: Swing) -> float:
+def _is_same(one: Swing, other: Swing) -> bool:
     common_s = min(one.end_s, other.end_s) - max(one.start_s, other.start_s)
-    return common_s / min(one.end_s - one.start_s, other.end_s - other.start_s)
+    overlap = common_s / min(one.end_s - one.start_s, other.end_s - other.start_s)
+    return overlap > MOST_OVERLAP and _ratio(one.period_s, other.period_s) < MUCH_SLOWER
 
 
 def _joined(found: Sequence[Swing], rows: EvenRows, values: Array) -> list[Swing]:
     """Those that are alike and follow each other closely, or across a gap, as one."""
     joined: list[Swing] = []
     for swing in found:
-        if joined and _goes_on(joined[-1], swing, rows, values):
-            joined[-1] = _as_one(joined[-1], swing)
-        else:
+        newest = range(max(0, len(joined) - 3), len(joined))  # much slower ones among them
+        places = (at for at in newest if _goes_on(joined[at], swing, rows, values))
+        if (at := next(places, None)) is None:
             joined.append(swing)
+        else:
+            joined[at] = _as_one(joined[at], swing)
     return joined
 
 

@@ -30,7 +30,6 @@ _SWINGING: Final = re.compile(
 
 def oscillation_events(search: Search) -> Iterator[Event]:
     """Of heading, wheels, speed, position and the like, and of what is asked for."""
-    search.require_read(search.frame)
     signals = _swinging(search)
     if left := [each.name for each in search.required_numbers() if each not in signals]:
         why = (

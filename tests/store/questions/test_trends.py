@@ -119,7 +119,7 @@ def test_what_swung_and_rests_is_said_to_have_swung(empty: sqlite3.Connection) -
     record(empty, rows=1000, interval_s=0.1, swing=swing)
     trend = one(empty, "swing")
     assert trend.shape == "resting"
-    says = "oscillated from 70.1 to 82 s: amplitude 0.301, period 2 s; flat at 0 since 82 s"
+    says = "oscillated from 70.1 to 82 s: amplitude 0.302, period 2 s; flat at 0 since 82 s"
     assert trend.says == says
 
 

@@ -574,9 +574,12 @@ def _best(found: list[Swing]) -> list[Swing]:
 
 
 def _is_same(one: Swing, other: Swing) -> bool:
+    """Whether both show one swing: means of a fast one may seem to swing slowly, but not as far."""
     common_s = min(one.end_s, other.end_s) - max(one.start_s, other.start_s)
     overlap = common_s / min(one.end_s - one.start_s, other.end_s - other.start_s)
-    return overlap > MOST_OVERLAP and _ratio(one.period_s, other.period_s) < MUCH_SLOWER
+    fast, slow = sorted((one, other), key=lambda each: each.period_s)
+    is_beneath = slow.period_s > MUCH_SLOWER * fast.period_s and slow.amplitude > fast.amplitude
+    return overlap > MOST_OVERLAP and not is_beneath
 
 
 def _joined(found: Sequence[Swing], rows: EvenRows, values: Array) -> list[Swing]:

@@ -14,7 +14,7 @@ from tests.recordings.rows import Recorded
 from webots_mcp.contract import Database, MemoryDatabase
 from webots_mcp.store.chunks import making
 from webots_mcp.store.chunks.making import make_chunks
-from webots_mcp.store.reading import frame, frame_summary
+from webots_mcp.store.reading import frame_summary
 
 
 @pytest.fixture
@@ -56,8 +56,7 @@ CHUNK_ROWS = 100
 
 
 def _shorten_chunks(patched: pytest.MonkeyPatch) -> None:
-    for module in (making, frame):
-        patched.setattr(module, "GROUP_ROWS", CHUNK_ROWS)
+    patched.setattr(making, "GROUP_ROWS", CHUNK_ROWS)
 
 
 @pytest.fixture(params=["values", "chunks"])

@@ -298,10 +298,10 @@ def compared(frame: Frame, name: str, op: type[ast.cmpop], limit: float) -> Flag
     always, never = _verdicts(op, zones.min, zones.max, limit)
     holds = np.repeat(always & is_full, zones.row_count)
     never = never & is_full | (zones.held_count == 0)
-    for start, stop in zones.spans(~(always & is_full | never)):
-        numbers = frame.rows(start, stop).numbers(name)
+    for start, numbers in frame.opened(name, ~(always & is_full | never)):
         found = COMPARISONS[op][1](numbers, limit)
-        holds[start:stop] = found & ~np.isnan(numbers) if op is ast.NotEq else found
+        found = found & ~np.isnan(numbers) if op is ast.NotEq else found
+        holds[start : start + len(numbers)] = found
     return holds
 
 

@@ -20,7 +20,6 @@ from webots_mcp.store.chunks import making
 from webots_mcp.store.chunks.codec import decoded_of
 from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.chunks.statistics import statistics_of
-from webots_mcp.store.reading import frame as reading
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import Frame, Zones, read_frame
 from webots_mcp.store.reading.ranges import Segment, whole_run
@@ -36,8 +35,7 @@ STATES = st.lists(
 @pytest.fixture
 def short_groups(monkeypatch: pytest.MonkeyPatch) -> None:
     """Groups of eight rows, so that a short recording has several."""
-    for module in (making, reading):
-        monkeypatch.setattr(module, "GROUP_ROWS", 8)
+    monkeypatch.setattr(making, "GROUP_ROWS", 8)
     monkeypatch.setattr(making, "LEAST_AT_END", 8)
 
 

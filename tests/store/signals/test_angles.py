@@ -45,8 +45,8 @@ def test_the_third_item_of_a_planar_pose_is_an_angle(empty: sqlite3.Connection) 
 
 @given(st.lists(st.floats(-50, 50), min_size=1, max_size=50).map(np.array))
 def test_unwrapping_is_numpys(angles: Array) -> None:
-    assert unwrap(angles).tolist() == np.unwrap(angles).tolist()
-    assert unwrap(angles, 360.0).tolist() == np.unwrap(angles, period=360.0).tolist()
+    assert unwrap(angles).tolist() == pytest.approx(np.unwrap(angles).tolist())
+    assert unwrap(angles, 360.0).tolist() == pytest.approx(np.unwrap(angles, period=360.0).tolist())
 
 
 def trend_of(connection: sqlite3.Connection, name: str, course: Callable[[float], float]) -> Trend:

@@ -70,7 +70,7 @@ def find_spikes(times: Array, values: Array, turn: float | None = None) -> list[
     if len(values) < 5:
         return []
     recorded = values
-    values = values if turn is None else np.unwrap(values, period=turn)
+    values = values if turn is None else unwrap(values, turn)
     sizes = np.abs(values[1:-1] - (values[:-2] + values[2:]) / 2)
     mad = float(np.partition(sizes, len(sizes) // 2)[len(sizes) // 2])
     limit = SPIKE_SCORE * (mad / 0.6745 if mad > 0 else 1.2533 * float(sizes.mean()))
@@ -161,14 +161,16 @@ def is_monotonic(values: Array) -> bool:
 
 def leaps_in(angles: Array, turn: float) -> bool:
     """Whether it changed, the short way round, by more than a quarter turn from row to row."""
-    steps = np.remainder(np.diff(angles) + turn / 2, turn) - turn / 2
+    steps = np.diff(angles)
+    steps -= turn * np.rint(steps / turn)
     return bool(np.any(np.abs(steps) > turn / 4))
 
 
 def unwrap(angles: Array, turn: float = math.tau) -> Array:
-    """Angles without the jumps of a full turn, as if turns were counted: as numpy does it.
+    """Angles without the jumps of a full turn, as if turns were counted.
 
     Each step is taken as the shorter way round (K. Itoh, Analysis of the phase unwrapping
     algorithm, Applied Optics 21, 1982).
     """
-    return np.unwrap(angles, period=turn)
+    turns = np.rint(np.diff(angles) / turn)
+    return angles - turn * np.append(0.0, np.cumsum(turns)) if turns.any() else angles

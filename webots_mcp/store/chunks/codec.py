@@ -7,6 +7,7 @@ stand as JSON in a list of labels. Where every row holds a number there are no c
 
 from __future__ import annotations
 
+import functools
 import json
 import zlib
 from collections.abc import Sequence
@@ -204,6 +205,7 @@ def _float(value: float) -> float:
         return float("inf") if value > 0 else float("-inf")
 
 
+@functools.cache
 def _pcodec(module: str = "pcodec.standalone") -> Any:
     """The library, which has no types; imported where the first chunk is made or read."""
     return import_module(module)
@@ -232,7 +234,7 @@ def _decompress(encoded: Encoded, into: Array) -> None:
     if encoded.numbers is None:
         raise DamagedChunkError("damaged: its numbers are missing")
     checksum, packed = encoded.numbers[:_CHECKSUM_BYTES], encoded.numbers[_CHECKSUM_BYTES:]
-    if zlib.crc32(packed).to_bytes(_CHECKSUM_BYTES, "little") != checksum:
+    if zlib.crc32(packed) != int.from_bytes(checksum, "little"):
         raise DamagedChunkError("damaged: its bytes do not match their checksum")
     whole: Any = into if encoded.codec == _FLOATS else np.empty(len(into), np.int64)
     progress = _pcodec().simple_decompress_into(packed, whole)

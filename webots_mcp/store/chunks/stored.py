@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
-from collections.abc import Iterator, Sequence
-from typing import Any, Final, NamedTuple
+from collections.abc import Iterator, Mapping
+from typing import Final, NamedTuple
 
+from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.chunks.codec import DamagedChunkError, Decoded, Encoded, decode
 from webots_mcp.store.chunks.statistics import Statistics
 
@@ -32,8 +34,15 @@ IS_MARK: Final = (  # no other program's value, beyond which no row would be loo
 )
 _WATERMARK: Final = f"SELECT state_id FROM watermark WHERE name = 'chunk' AND {IS_MARK}"
 _OF_SIGNAL: Final = "FROM chunk WHERE run_id = ? AND signal_id = ? AND group_id BETWEEN ? AND ?"
+_PLACES: Final = (
+    "SELECT id, start_sim_time_s, end_sim_time_s, row_count FROM row_group WHERE run_id = ? "
+    "AND is_complete = 1 AND start_sim_time_s < ? AND end_sim_time_s >= ? ORDER BY start_sim_time_s"
+)
 _STATISTICS: Final = f"SELECT group_id, {', '.join(Statistics._fields)} {_OF_SIGNAL}"
+_LONG_STEPS: Final = f"SELECT group_id {_OF_SIGNAL} AND largest_step > ?"
 _VALUES: Final = f"SELECT group_id, codec, numbers, codes, labels {_OF_SIGNAL}"
+_FEW_VALUES: Final = f"{_VALUES} AND group_id IN (SELECT value FROM json_each(?))"
+_FEW: Final = 0.25  # of the groups between two: they are asked for one by one
 _SIGNALS_IN: Final = "SELECT DISTINCT signal_id FROM chunk WHERE run_id = ? AND signal_id > 0"
 
 WIDEN_EXTREMES: Final = (  # of the signals of a group, in the register
@@ -76,7 +85,16 @@ def groups_in(
 ) -> list[Group]:
     """The groups of a run that reach into [start_s, end_s), in order of time."""
     rows = connection.execute(_GROUPS, (run_id, end_s, start_s)).fetchall()
-    return [Group(*row) for row in rows]
+    return list(map(Group._make, rows))
+
+
+def groups_as_array(
+    connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
+) -> Array:
+    """The same as columns: id, times of the first and last row in s, and how many rows."""
+    rows = connection.execute(_PLACES, (run_id, end_s, start_s)).fetchall()
+    table: Array = np.reshape(np.array(rows, np.float64), (-1, 4))
+    return table[np.lexsort((table[:, 0], table[:, 2], table[:, 1]))]
 
 
 def reached(connection: sqlite3.Connection, run_id: int) -> Reached:
@@ -100,39 +118,45 @@ def signals_in(connection: sqlite3.Connection, run_id: int) -> set[int]:
 
 
 def statistics_in(
-    connection: sqlite3.Connection, run_id: int, signal_id: int, groups: Sequence[Group]
-) -> dict[int, Statistics]:
-    """What a signal comes to in some groups, by their ids; without those that lack it."""
-    rows = connection.execute(_STATISTICS, _between(run_id, signal_id, groups))
-    return {row[0]: Statistics(*row[1:]) for row in rows}
+    connection: sqlite3.Connection, run_id: int, signal_id: int, between: tuple[int, int]
+) -> Array:
+    """What a signal comes to in the groups between two ids: a row for each that has it.
+
+    The first column is the id of the group, the others are the fields of `Statistics`.
+    """
+    rows = connection.execute(_STATISTICS, (run_id, signal_id, *between)).fetchall()
+    return np.reshape(np.array(rows, np.float64), (-1, 1 + len(Statistics._fields)))
+
+
+def groups_with_steps(
+    connection: sqlite3.Connection, run_id: int, signal_id: int, between: tuple[int, int], by: float
+) -> list[int]:
+    """The groups between two ids in which a signal once changes by more than that."""
+    asked = (run_id, signal_id, *between, by)
+    return [group_id for (group_id,) in connection.execute(_LONG_STEPS, asked)]
 
 
 def values_in(
-    connection: sqlite3.Connection, run_id: int, signal_id: int, groups: Sequence[Group]
+    connection: sqlite3.Connection, run_id: int, signal_id: int, wanted: Mapping[int, int]
 ) -> Iterator[tuple[int, Decoded | DamagedChunkError]]:
     """The values of a signal in some groups, by their ids, in no order; none of those that lack it.
 
     Of a chunk that cannot be read comes the error that says why.
+
+    Args:
+        connection: Any.
+        run_id: Of which run.
+        signal_id: Of which signal; or times or ids.
+        wanted: How many rows each group has, by its id.
     """
-    wanted = {group.id: group.row_count for group in groups}
-    for group_id, *row in connection.execute(_VALUES, _between(run_id, signal_id, groups)):
+    query, asked = _VALUES, [run_id, signal_id, min(wanted, default=0), max(wanted, default=-1)]
+    if len(wanted) < _FEW * (asked[3] - asked[2]):
+        query, asked = _FEW_VALUES, [*asked, json.dumps([*wanted])]
+    for group_id, *encoded in connection.execute(query, asked):
         rows = wanted.get(group_id)
         if rows is None:
             continue
         try:
-            yield group_id, decode(_encoded(row), rows)
+            yield group_id, decode(Encoded(*encoded), rows)
         except DamagedChunkError as error:
             yield group_id, error
-
-
-def _encoded(row: Sequence[Any]) -> Encoded:
-    codec, numbers, codes, labels = row
-    kinds = (str, bytes | None, bytes | None, str | None)
-    if not all(isinstance(value, kind) for value, kind in zip(row, kinds, strict=True)):
-        raise DamagedChunkError("damaged: another program wrote there")
-    return Encoded(codec, numbers, codes, labels)
-
-
-def _between(run_id: int, signal_id: int, groups: Sequence[Group]) -> tuple[int, int, int, int]:
-    ids = [group.id for group in groups]
-    return run_id, signal_id, min(ids, default=0), max(ids, default=-1)

@@ -138,7 +138,8 @@ class PurgedRows:
         return np.zeros(0) if values is None else values.numbers
 
     def _values(self, signal_id: int, name: str, group: Group) -> Decoded | None:
-        for _, values in values_in(self._connection, self._segment.run_id, signal_id, [group]):
+        wanted = {group.id: group.row_count}
+        for _, values in values_in(self._connection, self._segment.run_id, signal_id, wanted):
             if isinstance(values, Decoded):
                 return values
             self.unread[Unread(group.start_s, group.end_s, f"the chunk of {name} is {values}")] = (

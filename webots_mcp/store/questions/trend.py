@@ -20,6 +20,7 @@ from webots_mcp.store.analysis.features import (
     is_monotonic,
     leaps_in,
     time_effect,
+    unwrap,
 )
 from webots_mcp.store.analysis.summary import LARGEST, Summary, summarise_numbers
 from webots_mcp.store.analysis.swings import LEAST_HALF_SWINGS, Swing, find_swings
@@ -204,6 +205,8 @@ def _digits(length_s: Any) -> float:
 def _rest_of_chunks(frame: Frame, name: str, zones: Zones, held: Indexes) -> float | None:
     """Since when all values stay within 0.5 % of their range, as `flat_since` says it."""
     low, high = float(zones.min[held].min()), float(zones.max[held].max())
+    if low == high:
+        return float(frame.rows(0, int(zones.row_count[: held[0] + 1].sum())).usable(name)[0][0])
     last = float(zones.last[held[-1]])
     farthest = np.maximum(zones.max[held] - last, last - zones.min[held])
     away = np.flatnonzero(farthest > FLAT_BAND * (high - low))
@@ -250,7 +253,7 @@ def judge(
     swings = () if fast or monotonic else _swings(times, numbers, course.resolution_s)
     mean = summary.mean if turn is None else summary.centre(turn)
     counted = None if fast else course.counted
-    deviation = summary.deviation_in(turn) if counted is None else counted.deviation
+    deviation = summary.deviation_in(turn) if counted is None else counted.deviation_in(None)
     if counted is not None:
         summary = _with_extremes_of(counted, summary)
     shape = _shape(summary, line, monotonic, swings, rest_s, float(times[-1] - times[0]))
@@ -312,7 +315,7 @@ def _swings(times: Array, course: Array, resolution_s: float | None) -> tuple[Sw
 
 def _unwrapped(angles: Array, summary: Summary, turn: float) -> Array:
     """With turns counted, beginning where the first value is."""
-    course: Array = np.unwrap(angles, period=turn)
+    course = unwrap(angles, turn)
     return course + turn * round(((summary.first or 0.0) - float(course[0])) / turn)
 
 

@@ -123,7 +123,7 @@ def _parts(frame: Frame, signal: Signal, buckets: Buckets) -> _Parts:
     """Chunks that no border of a bucket cuts are not opened, where there are many rows."""
     name = signal.name
     if reads_values(frame, signal):
-        return _of_rows(frame, name, 0, len(frame))
+        return _of_rows(0, frame.numbers(name))
     zones = frame.zones(name)
     edges = buckets.edges[buckets.edges < len(frame)]
     borders = np.searchsorted(zones.first_row, edges, "right") - 1
@@ -138,7 +138,7 @@ def _parts(frame: Frame, signal: Signal, buckets: Buckets) -> _Parts:
         zones.sum[whole],
         zones.last[whole],
     )
-    opened = [_of_rows(frame, name, start, stop) for start, stop in zones.spans(cut)]
+    opened = [_of_rows(*each) for each in frame.opened(name, cut)]
     return _in_order([chunks, *opened])
 
 
@@ -148,9 +148,8 @@ def _in_order(some: Sequence[_Parts]) -> _Parts:
     return _Parts(*(column[order] for column in joined))
 
 
-def _of_rows(frame: Frame, name: str, start: int, stop: int) -> _Parts:
+def _of_rows(start: int, numbers: Array) -> _Parts:
     """Each row that has a usable number."""
-    numbers = frame.rows(start, stop).numbers(name)
     rows = np.flatnonzero(np.abs(numbers) <= LARGEST)
     held = numbers if len(rows) == len(numbers) else numbers[rows]
     return _Parts(rows + start, np.ones(len(rows), np.intp), held, held, held, held)

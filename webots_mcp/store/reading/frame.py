@@ -10,37 +10,32 @@ from __future__ import annotations
 import math
 import sqlite3
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.naming import Value
 from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
-from webots_mcp.store.chunks.codec import (
-    IS_ABSENT,
-    IS_NUMBER,
-    Decoded,
-    Replaced,
-)
+from webots_mcp.store.analysis.summary import usable_part
+from webots_mcp.store.chunks import making
+from webots_mcp.store.chunks.codec import IS_ABSENT, IS_NUMBER, Decoded, Replaced
 from webots_mcp.store.chunks.columns import STATE_COLUMNS, StateColumns
-from webots_mcp.store.chunks.making import GROUP_ROWS
 from webots_mcp.store.chunks.statistics import Statistics, statistics_of
 from webots_mcp.store.chunks.stored import (
     SIM_TIMES,
     STATE_IDS,
     WALL_TIMES,
-    groups_in,
+    groups_as_array,
     reached,
 )
 from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.frame_source import FrameSource, Part, Unread
+from webots_mcp.store.reading.frame_source import Column, FrameSource, Unread, nothing
 from webots_mcp.store.reading.kept import MOST_ROWS, kept_parts
 from webots_mcp.store.reading.newest_rows import read_rows, rows_in_no_chunk
 from webots_mcp.store.reading.ranges import Segment
 
 _FEW: Final = 4  # times that few chunks are opened one by one; else all of them at once
-_OTHER: Final = 0  # code of null and of a key that is not there
 _FIRST_LABEL: Final = 2  # of the codes of a chunk
 
 _IN: Final = "run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
@@ -108,12 +103,7 @@ class Zones:
 
     def spans(self, wanted: Flags) -> list[tuple[int, int]]:
         """Rows [start, stop) of the chunks that are wanted; those side by side are one span."""
-        edges = np.flatnonzero(np.diff(wanted, prepend=False, append=False)).tolist()
-        stops = np.append(self.first_row, self.first_row[-1:] + self.row_count[-1:])
-        return [
-            (int(stops[start]), int(stops[stop]))
-            for start, stop in zip(edges[::2], edges[1::2], strict=True)
-        ]
+        return _spans(np.append(self.first_row, self.first_row[-1:] + self.row_count[-1:]), wanted)
 
 
 class Frame:
@@ -156,22 +146,19 @@ class Frame:
         values = {name: _plain(column) for name, column in columns.items()}
         ids = list(range(1, len(listed) + 1))
         rows = StateColumns(ids, listed, walls, [""] * len(listed), values)
-        return cls(FrameSource(None, run_id, _rows_in_parts(rows, 0), {}), 0, len(listed))
+        return cls(FrameSource(None, run_id, np.zeros((0, 4)), rows, {}), 0, len(listed))
 
     def __len__(self) -> int:
         return self._stop - self._start
 
     def __contains__(self, name: str) -> bool:
         """Whether a row may have a value of that signal."""
-        if name in self._source.ids:
-            return True
-        columns = (part.columns for part in self._source.parts)
-        return any(each is not None and name in each.values for each in columns)
+        return name in self._source.ids or name in self._source.columns.values
 
     @property
-    def new_rows(self) -> list[StateColumns]:
-        """The rows that are in no chunk yet, a part at a time."""
-        return [part.columns for part in self._source.parts if part.columns is not None]
+    def new_rows(self) -> StateColumns:
+        """The rows that are in no chunk yet."""
+        return self._source.columns
 
     @property
     def unread(self) -> tuple[Unread, ...]:
@@ -181,54 +168,38 @@ class Frame:
     @cached_property
     def times(self) -> Array:
         """Simulation time of each row, in s."""
-        return self._of_rows(SIM_TIMES, "times")
+        return self._decoded(SIM_TIMES).numbers
 
     @cached_property
     def wall_times(self) -> Array:
         """Unix time of each row, in s."""
-        return self._of_rows(WALL_TIMES, "wall_times")
+        return self._decoded(WALL_TIMES).numbers
 
     @cached_property
     def ids(self) -> Indexes:
         """The id of each state row; negative of those that only a kept stretch has."""
-        return self._of_rows(STATE_IDS, "ids").astype(np.intp)
+        return self._decoded(STATE_IDS).numbers.astype(np.intp)
 
     def numbers(self, name: str) -> Array:
         """The number of a signal in each row: NaN where it has none; flags are 0 and 1."""
-        return self._source.kept(
-            ("numbers", name, self._start, self._stop), lambda: self._numbers(name), 8 * len(self)
-        )
+        return self._decoded(name).numbers
 
     def usable(self, name: str) -> tuple[Array, Array]:
         """Times and numbers of the rows that have a usable one: not NaN, not beyond 1e100."""
-        from webots_mcp.store.analysis.summary import usable_part
-
         return usable_part(self.times, self.numbers(name))
 
     def coded(self, name: str) -> Coded:
         """The values of a signal, whatever they are, as codes."""
-        return self._source.kept(
-            ("coded", name, self._start, self._stop), lambda: self._coded(name), 8 * len(self)
-        )
+        return self._coded(name, numbers=True)
 
     def texts(self, name: str) -> Coded:
         """As `coded`, of texts alone: numbers and flags have the code of None."""
-        return self._source.kept(
-            ("texts", name, self._start, self._stop),
-            lambda: self._coded(name, numbers=False),
-            8 * len(self),
-        )
+        return self._coded(name, numbers=False)
 
     def held(self, name: str) -> Flags:
         """In which rows the state has the signal, be it null."""
-        start, stop = self._bounds()
-        whole = np.zeros(stop - start, np.bool_)
-        for part, values, inside in self._parts(name):
-            if values is not None:
-                codes = np.zeros(1) if values.codes is None else values.codes[inside]
-                first, rows = max(0, part.start - start), len(values.numbers[inside])
-                whole[first : first + rows] = codes != IS_ABSENT
-        return self._within(whole)
+        codes = self._decoded(name).codes
+        return np.ones(len(self), np.bool_) if codes is None else codes != IS_ABSENT
 
     def values(self, name: str) -> list[Value]:
         """The values as Python has them; slow, for a few rows. What was replaced is None."""
@@ -237,76 +208,47 @@ class Frame:
 
     def values_at(self, name: str, rows: Indexes) -> list[Value]:
         """The values in some rows, in order, of which each chunk is opened once."""
-        zones = self.zones(name)
-        chunks = np.searchsorted(zones.first_row, rows, "right") - 1
+        edges = self._edges
+        chunks = np.searchsorted(edges, rows, "right") - 1
         found: list[Value] = []
         for chunk in np.unique(chunks).tolist():
-            first = int(zones.first_row[chunk])
-            codes, labels = self.rows(first, first + int(zones.row_count[chunk])).coded(name)
-            found += [labels[code] for code in codes[rows[chunks == chunk] - first].tolist()]
+            codes, labels = self.rows(int(edges[chunk]), int(edges[chunk + 1])).coded(name)
+            inside = rows[chunks == chunk] - edges[chunk]
+            found += [labels[code] for code in codes[inside].tolist()]
         return found
 
     def replaced(self, name: str) -> Counter[str]:
         """How often each value that JSON cannot hold (nan, inf, ...) stood there."""
-        if self._source.order is not None:
-            return self._replaced(name)
         zones, found = self.zones(name), Counter[str]()
-        for start, stop in zones.spans(zones.held_count > zones.value_count):
-            found += self.rows(start, stop)._replaced(name)
-        return found
-
-    def _replaced(self, name: str) -> Counter[str]:
-        found = Counter[str]()
-        for _, values, inside in self._parts(name):
-            if values is None or values.codes is None:
-                continue
+        for span in zones.spans(zones.held_count > zones.value_count):
+            values = self.rows(*span)._decoded(name)
             for code, label in enumerate(values.labels, _FIRST_LABEL):
-                if isinstance(label, Replaced):
-                    found[label.why] += int(np.count_nonzero(values.codes[inside] == code))
+                if isinstance(label, Replaced) and values.codes is not None:
+                    found[label.why] += int(np.count_nonzero(values.codes == code))
         return +found
 
     def zones(self, name: str) -> Zones:
         """What the chunks of a signal come to; those that the frame cuts come to what is in it."""
-        size = 8 * len(Zones.__annotations__) * len(self._source.parts)
-        key = ("zones", name, self._start, self._stop)
-        return self._source.kept(key, lambda: self._made_zones(name), size)
+        return self._zones(name)
 
-    def _made_zones(self, name: str) -> Zones:
+    def opened(self, name: str, wanted: Flags) -> Iterator[tuple[int, Array]]:
+        """The numbers of some of its chunks, each with its first row; of those that have any."""
+        if self._source.order is None and np.count_nonzero(wanted) * _FEW < len(wanted):
+            first = self._source.parts(self._start, self._stop).start
+            parts = first + np.flatnonzero(wanted)
+            for at, values in self._source.values(name, self._start, self._stop, parts):
+                yield at, values.numbers
+            return
+        for start, stop in _spans(self._edges, wanted):
+            yield start, self.numbers(name)[start:stop]
+
+    def around_steps(self, longer_s: float) -> list[Array]:
+        """Times around all steps in time that are longer: those of whole chunks."""
         if self._source.order is not None:
-            return _zones(self._cut_zones(self._in_order(name)))
-        stored = self._source.zones(
-            self._source.ids.get(name), lambda columns: columns.values.get(name)
-        )
-        return self._zones_within(
-            stored, lambda start, stop: _slice_of(self._source, name, start, stop)
-        )
-
-    def time_zones(self) -> Zones:
-        """The same of the simulation times: the largest step shows whether rows are missing."""
-        if self._source.order is not None:
-            return _zones(self._cut_zones(Decoded(self.times, None, ())))
-        stored = self._source.zones(SIM_TIMES, lambda columns: columns.times)
-        return self._zones_within(stored, lambda start, stop: Decoded(
-            self._source.of_rows(SIM_TIMES, "times", start, stop), None, ()
-        ))  # fmt: skip
-
-    def _zones_within(
-        self,
-        stored: Sequence[tuple[Part, Statistics | None]],
-        values_in: Callable[[int, int], Decoded],
-    ) -> Zones:
-        found: list[_Zone] = []
-        for part, statistics in stored:
-            start, stop = max(part.start, self._start), min(part.start + part.rows, self._stop)
-            if start >= stop:
-                continue
-            bounds_s = part.bounds_s
-            if stop - start < part.rows:
-                statistics = statistics_of(values_in(start, stop))
-                times = self._source.of_rows(SIM_TIMES, "times", start, stop)
-                bounds_s = float(times[0]), float(times[-1])
-            found.append(_Zone(start - self._start, stop - start, statistics, *bounds_s))
-        return _zones(found)
+            return [self.times]
+        parts = self._source.parts(self._start, self._stop)
+        spans = _spans(self._edges, self._source.with_long_steps(longer_s)[parts])
+        return [self.rows(*span).times for span in spans]
 
     @property
     def bounds_s(self) -> tuple[float, float]:
@@ -318,25 +260,17 @@ class Frame:
         """The places of the first rows at or after some times; few chunks of times are opened."""
         wanted: Array = np.asarray(times_s, np.float64)
         source = self._source
-        starts_s, ends_s = source.bounds_s
-        if source.order is None and "times" not in self.__dict__ and len(starts_s):
-            parts = np.searchsorted(ends_s, wanted)
-            inside = (parts < len(starts_s)) & (
-                starts_s[np.minimum(parts, len(ends_s) - 1)] < wanted
-            )
-            opened: list[int] = np.unique(parts[inside]).tolist()
-            if len(opened) * _FEW < len(starts_s):
-                first_rows = np.array(
-                    [part.start for part in source.parts] + [source.rows], np.intp
-                )
-                found = first_rows[parts]
-                for at in opened:
-                    part = source.parts[at]
-                    times = source.of_rows(SIM_TIMES, "times", part.start, part.start + part.rows)
-                    here = inside & (parts == at)
-                    found[here] += np.searchsorted(times, wanted[here])
-                return np.maximum(0, np.minimum(found - self._start, len(self)))
-        return np.searchsorted(self.times, wanted)
+        parts = np.searchsorted(source.ends_s, wanted)
+        inside = np.append(source.starts_s, math.inf)[parts] < wanted
+        opened = np.unique(parts[inside])
+        is_known = source.order is not None or "times" in self.__dict__
+        if is_known or len(opened) * _FEW >= len(source.starts_s):
+            return np.searchsorted(self.times, wanted)
+        found = source.first_rows[parts]
+        for first, times in source.values(SIM_TIMES, 0, source.rows, opened):
+            here = inside & (source.first_rows[parts] == first)
+            found[here] += np.searchsorted(times.numbers, wanted[here])
+        return np.minimum(np.maximum(found - self._start, 0), len(self))
 
     def rows(self, start: int, stop: int) -> Frame:
         """Some of its rows by their places; only the chunks that they touch are opened."""
@@ -351,71 +285,84 @@ class Frame:
         start, stop = self.places([start_s, end_s]).tolist()
         return self.rows(start, stop)
 
-    def _cut_zones(self, values: Decoded) -> list[_Zone]:
-        """Of rows that lie among each other in several chunks, in parts of their own."""
-        found: list[_Zone] = []
-        for first in range(0, len(self), GROUP_ROWS):
-            stop = min(first + GROUP_ROWS, len(self))
-            bounds_s = float(self.times[first]), float(self.times[stop - 1])
-            statistics = statistics_of(_cut(values, first, stop))
-            found.append(_Zone(first, stop - first, statistics, *bounds_s))
-        return found
+    def _decoded(self, column: Column) -> Decoded:
+        """All values; those of several chunks share their labels."""
+        key = ("values", column, self._start, self._stop)
+        return self._source.kept(key, lambda: self._decode(column), 16 * len(self))
 
-    def _in_order(self, name: str) -> Decoded:
-        numbers, (codes, labels) = self.numbers(name), self.coded(name)
-        if not any(isinstance(label, str) for label in labels):
-            return Decoded(numbers, None, ())
-        other = np.where(codes == _OTHER, IS_ABSENT, codes + _FIRST_LABEL)
-        return Decoded(numbers, other, [None, *labels])
+    def _decode(self, column: Column) -> Decoded:
+        source, order = self._source, self._source.order
+        start, stop = (self._start, self._stop) if order is None else (0, source.rows)
+        numbers, plain = np.empty(stop - start), list[slice]()
+        coded: list[tuple[slice, Indexes]] = []
+        known: dict[object, int] = {}  # a flag equals a number, so that the type is in the key
+        labels: list[Value | Replaced] = []
+        for at, values in source.values(column, start, stop):
+            inside = slice(at, at + len(values.numbers))
+            numbers[inside] = values.numbers
+            if values.codes is None:
+                plain.append(inside)
+                continue
+            for label in values.labels:
+                if known.setdefault((type(label), label), len(labels)) == len(labels):
+                    labels.append(label)
+            shared = [known[type(each), each] + _FIRST_LABEL for each in values.labels]
+            coded.append((inside, np.array([IS_NUMBER, IS_ABSENT, *shared], np.intp)[values.codes]))
+        codes: Indexes | None = None
+        if coded or sum(each.stop - each.start for each in plain) < len(numbers):
+            codes = np.full(len(numbers), IS_ABSENT, np.intp)
+            for inside, found in [*((each, IS_NUMBER) for each in plain), *coded]:
+                codes[inside] = found
+            numbers[codes == IS_ABSENT] = np.nan
+        if order is not None:
+            rows = order[self._start : self._stop]
+            numbers, codes = numbers[rows], None if codes is None else codes[rows]
+        return Decoded(numbers, codes, labels)
 
-    def _of_rows(self, signal_id: int, attribute: str) -> Array:
-        bounds = self._bounds()
-        return self._source.kept(
-            (signal_id, self._start, self._stop),
-            lambda: self._within(self._source.of_rows(signal_id, attribute, *bounds)),
-            8 * len(self),
+    def _coded(self, name: str, *, numbers: bool) -> Coded:
+        """Codes from 1 on; numbers get labels as well, where they are wanted."""
+        key, size = ("coded", name, numbers, self._start, self._stop), 8 * len(self)
+        values = self._decoded(name)
+        return self._source.kept(key, lambda: _coded(values, numbers=numbers), size)
+
+    @property
+    def _edges(self) -> Indexes:
+        """The first row of each chunk that it touches, and behind the last; else every 1,024th."""
+        if self._source.order is not None:
+            return np.append(np.arange(0, len(self), making.GROUP_ROWS), len(self))
+        parts = self._source.parts(self._start, self._stop)
+        edges = self._source.first_rows[parts.start : parts.stop + 1]
+        return np.minimum(np.maximum(edges, self._start), self._stop) - self._start
+
+    def _zones(self, column: Column) -> Zones:
+        size = 8 * len(Zones.__annotations__) * len(self._source.starts_s)
+        key = ("zones", column, self._start, self._stop)
+        return self._source.kept(key, lambda: self._make_zones(column), size)
+
+    def _make_zones(self, column: Column) -> Zones:
+        source, edges = self._source, self._edges
+        if source.order is None:
+            parts = source.parts(self._start, self._stop)
+            table: Array = np.array(source.statistics(column)[parts])
+            starts_s: Array = np.array(source.starts_s[parts])
+            ends_s: Array = np.array(source.ends_s[parts])
+            whole = np.diff(source.first_rows[parts.start : parts.stop + 1])
+            cut = np.flatnonzero(np.diff(edges) < whole)
+        else:
+            table = nothing(len(edges) - 1)
+            starts_s, ends_s = self.times[edges[:-1]], self.times[edges[1:] - 1]
+            cut = np.arange(len(table))
+        for at in cut.tolist():
+            rows = self.rows(int(edges[at]), int(edges[at + 1]))
+            table[at] = statistics_of(rows._decoded(column))
+            starts_s[at], ends_s[at] = rows.times[0], rows.times[-1]
+        figures: dict[str, Array] = dict(zip(Statistics._fields, np.transpose(table), strict=True))
+        held: Indexes = figures.pop("row_count").astype(np.intp)
+        present: Indexes = figures.pop("value_count").astype(np.intp)
+        changed: Indexes = figures.pop("change_count").astype(np.intp)
+        return Zones(
+            edges[:-1], np.diff(edges), held, present, changed, starts_s, ends_s, **figures
         )
-
-    def _parts(self, name: str) -> list[tuple[Part, Decoded | None, slice]]:
-        """The parts that the frame touches, and which of their rows are in it."""
-        start, stop = self._bounds()
-        return [
-            (part, values, slice(max(0, start - part.start), max(0, stop - part.start)))
-            for part, values in self._source.decoded(name, start, stop)
-        ]
-
-    def _bounds(self) -> tuple[int, int]:
-        """The rows that have to be decoded; all, where they have to be put in order."""
-        if self._source.order is None:
-            return self._start, self._stop
-        return 0, self._source.rows
-
-    def _within(self, whole: Any) -> Any:
-        """The rows of the frame among those that were decoded."""
-        order = self._source.order
-        return whole if order is None else whole[order[self._start : self._stop]]
-
-    def _numbers(self, name: str) -> Array:
-        start, stop = self._bounds()
-        whole = np.full(stop - start, np.nan)
-        for part, values, inside in self._parts(name):
-            if values is not None:
-                numbers = values.numbers[inside]
-                first = max(0, part.start - start)
-                whole[first : first + len(numbers)] = numbers
-        return self._within(whole)
-
-    def _coded(self, name: str, *, numbers: bool = True) -> Coded:
-        start, stop = self._bounds()
-        whole = np.full(stop - start, _OTHER, np.intp)
-        known: dict[object, int] = {}
-        labels: list[Value] = [None]
-        for part, values, inside in self._parts(name):
-            if values is not None:
-                codes = _relabelled(values, known, labels, numbers=numbers)[inside]
-                first = max(0, part.start - start)
-                whole[first : first + len(codes)] = codes
-        return Coded(self._within(whole), labels)
 
 
 def read_frame(
@@ -436,7 +383,7 @@ def read_frame(
         every_call: Of any segment each call is a row that is in a kept stretch.
     """
     run_id, span = segment.run_id, (segment.start_s, segment.end_s)
-    parts: list[Part] = []
+    groups: Array = np.zeros((0, 4))
     if full_rate and segment.full_rate:
         columns = StateColumns()
         cut_at_s = read_rows(connection, _STATES, (run_id, *span), columns, deadline)
@@ -445,14 +392,11 @@ def read_frame(
     else:
         at = reached(connection, run_id)
         columns, cut_at_s = rows_in_no_chunk(connection, run_id, span, at, deadline)
-        for group in groups_in(connection, run_id, *span):
-            start = parts[-1].start + parts[-1].rows if parts else 0
-            parts.append(Part(start, group.row_count, group, None))
+        groups = groups_as_array(connection, run_id, *span)
         if every_call and cut_at_s is None:
             cut_at_s = read_rows(connection, _KEPT, (run_id, *span, -1), columns, deadline)
-    parts += _rows_in_parts(columns, parts[-1].start + parts[-1].rows if parts else 0)
     names = dict(connection.execute(_SIGNALS, (run_id,)).fetchall())
-    source = FrameSource(connection, run_id, parts, names)
+    source = FrameSource(connection, run_id, groups, columns, names)
     if lost := deleted_part(connection, segment):
         source.unread[lost] = None
     return _framed(source, segment, _said(source, segment, cut_at_s))
@@ -489,7 +433,7 @@ def read_kept(connection: sqlite3.Connection, segment: Segment, deadline: Deadli
         return None
     columns = StateColumns()
     cut_at_s = read_rows(connection, _KEPT, (*bounds, MOST_ROWS), columns, deadline)
-    source = FrameSource(connection, segment.run_id, _rows_in_parts(columns, 0), {})
+    source = FrameSource(connection, segment.run_id, np.zeros((0, 4)), columns, {})
     cut_at_s = _said(source, segment, cut_at_s)
     return _framed(source, segment, cut_at_s) if len(columns) else None
 
@@ -512,15 +456,10 @@ def _framed(source: FrameSource, segment: Segment, cut_at_s: float | None) -> Fr
     return Frame(source, start, stop, cut_at_s)
 
 
-def _rows_in_parts(columns: StateColumns, start: int) -> list[Part]:
-    """Rows that are in no chunk, as if they were."""
-    rows = len(columns)
-    if rows <= GROUP_ROWS:
-        return [Part(start, rows, None, columns)] if rows else []
-    return [
-        Part(start + first, min(GROUP_ROWS, rows - first), None, columns.part(first, GROUP_ROWS))
-        for first in range(0, rows, GROUP_ROWS)
-    ]
+def _spans(edges: Indexes, wanted: Flags) -> list[tuple[int, int]]:
+    """Rows [start, stop) between edges where it is wanted; those side by side are one span."""
+    ends = edges[np.flatnonzero(np.diff(wanted, prepend=False, append=False))].tolist()
+    return list(zip(ends[::2], ends[1::2], strict=True))
 
 
 def _plain(column: Sequence[Any] | Array) -> list[Any]:
@@ -528,71 +467,27 @@ def _plain(column: Sequence[Any] | Array) -> list[Any]:
     return [None if value != value else value for value in listed]
 
 
-def _cut(values: Decoded, start: int, stop: int) -> Decoded:
-    codes = None if values.codes is None else values.codes[start:stop]
-    return Decoded(values.numbers[start:stop], codes, values.labels)
-
-
-def _slice_of(source: FrameSource, name: str, start: int, stop: int) -> Decoded:
-    """The values of a signal in some rows of one part."""
-    ((part, values),) = source.decoded(name, start, stop)
-    if values is None:
-        return Decoded(np.full(stop - start, np.nan), np.full(stop - start, IS_ABSENT), ())
-    return _cut(values, start - part.start, stop - part.start)
-
-
-def _relabelled(
-    values: Decoded, known: dict[object, int], labels: list[Value], *, numbers: bool
-) -> Indexes:
-    """Codes that several chunks share; numbers get labels as well, where they are wanted."""
-
-    def code_of(value: Value) -> int:
-        key = (type(value), value)
-        if key not in known:
-            known[key] = len(labels)
-            labels.append(value)
-        return known[key]
-
-    codes = np.full(len(values.numbers), _OTHER, np.intp)
+def _coded(values: Decoded, *, numbers: bool) -> Coded:
+    labels: list[Value] = [None]
+    codes = np.zeros(len(values.numbers), np.intp)
     if numbers:
-        held = np.ones(len(codes), np.bool_) if values.codes is None else values.codes == IS_NUMBER
-        held &= ~np.isnan(values.numbers)
-        unique, places = np.unique(values.numbers[held], return_inverse=True)
-        found = [code_of(_number(each)) for each in unique.tolist()]
-        codes[held] = np.array(found, np.intp)[places] if found else _OTHER
+        held = ~np.isnan(values.numbers)
+        if values.codes is not None:
+            held &= values.codes == IS_NUMBER
+        found = values.numbers[held]
+        changes = np.append(True, found[1:] != found[:-1])[: len(found)]  # most stay as they are
+        unique, places = np.unique(found[changes], return_inverse=True)
+        codes[held] = (places + 1)[np.cumsum(changes) - 1]
+        labels += map(_number, unique.tolist())
     if values.codes is not None:
+        of_code = np.zeros(len(values.labels) + _FIRST_LABEL, np.intp)
         for code, label in enumerate(values.labels, _FIRST_LABEL):
-            wanted = numbers or isinstance(label, str)
-            if wanted and label is not None and not isinstance(label, Replaced):
-                codes[values.codes == code] = code_of(label)
-    return codes
+            if isinstance(label, str) or (numbers and isinstance(label, bool)):
+                of_code[code] = len(labels)
+                labels.append(label)
+        codes += of_code[values.codes]
+    return Coded(codes, labels)
 
 
 def _number(value: float) -> float:
     return int(value) if value.is_integer() and abs(value) < 2**53 else value
-
-
-class _Zone(NamedTuple):
-    """What rows of a frame come to that are in one chunk."""
-
-    first_row: int
-    row_count: int
-    statistics: Statistics | None
-    start_s: float
-    end_s: float
-
-
-def _zones(parts: Sequence[_Zone]) -> Zones:
-    nothing = Statistics(0, 0)
-    table: Array = np.reshape(
-        np.array([tuple(part.statistics or nothing) for part in parts], np.float64),
-        (len(parts), len(Statistics._fields)),
-    )
-    figures: dict[str, Array] = dict(zip(Statistics._fields, np.transpose(table), strict=True))
-    places: Array = np.reshape(np.array([(*part[:2], *part[3:]) for part in parts]), (-1, 4))
-    first, rows, starts_s, ends_s = np.transpose(places)
-    held: Indexes = figures.pop("row_count").astype(np.intp)
-    present: Indexes = figures.pop("value_count").astype(np.intp)
-    changed: Indexes = figures.pop("change_count").astype(np.intp)
-    where = first.astype(np.intp), rows.astype(np.intp)
-    return Zones(*where, held, present, changed, starts_s, ends_s, **figures)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import sqlite3
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
-from typing import Any, Final, NamedTuple
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple, TypeVar
 
-from webots_mcp.store.analysis.arrays import Array, Indexes, np
+from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
+from webots_mcp.store.chunks import making
 from webots_mcp.store.chunks.codec import DamagedChunkError, Decoded, decoded_of
 from webots_mcp.store.chunks.columns import STATE_COLUMNS, StateColumns
 from webots_mcp.store.chunks.statistics import Statistics, statistics_of
@@ -16,12 +16,14 @@ from webots_mcp.store.chunks.stored import (
     SIM_TIMES,
     STATE_IDS,
     WALL_TIMES,
-    Group,
+    groups_with_steps,
     statistics_in,
     values_in,
 )
 
 MOST_KEPT_BYTES: Final = 64_000_000  # of values that a frame keeps for who asks again
+Column = str | int  # the name of a signal, or what has a chunk of its own (SIM_TIMES, ...)
+T = TypeVar("T")
 
 _ROWS_OF: Final = (
     f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s <= ? "
@@ -40,148 +42,158 @@ class Unread(NamedTuple):
         return f"not read from {self.start_s:.3f} to {self.end_s:.3f} s: {self.why}"
 
 
-class Part(NamedTuple):
-    """Rows of a frame that are decoded together: a group, or rows that are in none."""
-
-    start: int  # place of the first row
-    rows: int
-    group: Group | None
-    columns: StateColumns | None
-
-    @property
-    def bounds_s(self) -> tuple[float, float]:
-        """Simulation time of its first and last row."""
-        if self.group is not None:
-            return self.group.start_s, self.group.end_s
-        assert self.columns is not None
-        return self.columns.times[0], self.columns.times[-1]
-
-
 class FrameSource:
-    """Where the values come from, before a range and an order are laid over them."""
+    """Rows of groups, then rows that are in none, before a range and an order are laid over them.
+
+    They are in parts: each group is one, and so are 1,024 of the others.
+
+    Attributes:
+        columns: The rows that are in no group.
+        first_rows: Of each part, and how many rows there are in all.
+        starts_s: Simulation time of the first row of each part; `ends_s` of the last one.
+        order: The rows in order of time; None where they are.
+        unread: What could not be read so far.
+    """
 
     def __init__(
         self,
         connection: sqlite3.Connection | None,
         run_id: int,
-        parts: Sequence[Part],
+        groups: Array,
+        columns: StateColumns,
         ids: Mapping[str, int],
     ) -> None:
         self.connection = connection
         self.run_id = run_id
-        self.parts = parts
+        self.columns = columns
         self.ids = ids
-        self.rows = parts[-1].start + parts[-1].rows if parts else 0
         self.unread: dict[Unread, None] = {}
         self.order: Indexes | None = None
-        self._groups = [part.group for part in parts if part.group is not None]
-        self._of_group = {part.group.id: part for part in parts if part.group is not None}
+        self._group_ids: Indexes = groups[:, 0].astype(np.intp)
+        new = np.arange(0, len(columns), making.GROUP_ROWS)
+        ends = np.minimum(new + making.GROUP_ROWS, len(columns))
+        rows = np.concatenate(([0.0], groups[:, 3], ends - new))
+        self.first_rows: Indexes = np.cumsum(rows.astype(np.intp))
+        times: Array = np.array(columns.times, np.float64)
+        self.starts_s: Array = np.append(groups[:, 1], times[new])
+        self.ends_s: Array = np.append(groups[:, 2], times[ends - 1])
+        self.is_in_order = bool(
+            (self.starts_s[1:] >= self.ends_s[:-1]).all() and (np.diff(times) >= 0).all()
+        )
         self._kept: OrderedDict[object, Any] = OrderedDict()
         self._kept_bytes = 0
 
-    @cached_property
-    def bounds_s(self) -> tuple[Array, Array]:
-        """Simulation times of the first rows of all parts, and of the last ones."""
-        bounds = [part.bounds_s for part in self.parts]
-        return np.array([each[0] for each in bounds]), np.array([each[1] for each in bounds])
+    @property
+    def rows(self) -> int:
+        """How many there are."""
+        return int(self.first_rows[-1])
 
-    @cached_property
-    def is_in_order(self) -> bool:
-        """Whether simulation time never falls from row to row."""
-        starts_s, ends_s = self.bounds_s
-        columns = [part.columns.times for part in self.parts if part.columns is not None]
-        return bool((starts_s[1:] >= ends_s[:-1]).all()) and all(
-            (np.diff(times) >= 0).all() for times in columns
-        )
+    def parts(self, start: int, stop: int) -> slice:
+        """The parts that have rows in [start, stop)."""
+        first = int(np.searchsorted(self.first_rows, start, "right")) - 1
+        return slice(first, int(np.searchsorted(self.first_rows, stop)) if start < stop else first)
 
-    def decoded(self, name: str, start: int, stop: int) -> list[tuple[Part, Decoded | None]]:
-        """The values of a signal in the parts that touch rows [start, stop); None: it has none."""
-        wanted = [p for p in self.parts if p.start < stop and p.start + p.rows > start]
-        stored = self._stored(self.ids.get(name), name, wanted)
-        found: list[tuple[Part, Decoded | None]] = []
-        for part in wanted:
-            if part.group is not None:
-                found.append((part, stored.get(part.group.id)))
+    def values(
+        self, column: Column, start: int, stop: int, wanted: Indexes | None = None
+    ) -> Iterator[tuple[int, Decoded]]:
+        """The values in rows [start, stop), a part at a time, each with its place from start on.
+
+        Args:
+            column: What values.
+            start: The first row.
+            stop: The row behind the last.
+            wanted: Which of the parts; None for all. Those that have no values are left out.
+        """
+        parts = self.parts(start, stop)
+        places = range(parts.start, parts.stop)
+        for place, values in self._of_parts(column, places if wanted is None else wanted.tolist()):
+            first, behind = self.first_rows[place : place + 2].tolist()
+            if start <= first and behind <= stop:
+                yield first - start, values
             else:
-                assert part.columns is not None
-                values = part.columns.values.get(name)
-                found.append((part, None if values is None else decoded_of(values)))
-        return found
+                yield max(0, first - start), _cut(values, max(0, start - first), stop - first)
 
-    def of_rows(self, signal_id: int, attribute: str, start: int, stop: int) -> Array:
-        """Times or ids of rows [start, stop)."""
-        wanted = [p for p in self.parts if p.start < stop and p.start + p.rows > start]
-        first = wanted[0].start if wanted else start
-        stored = self._stored(signal_id, attribute, wanted)
-        whole = np.full(max(stop, start) - first, np.nan)
-        for part in wanted:
-            inside = slice(part.start - first, part.start - first + part.rows)
-            if part.columns is not None:
-                values: Any = getattr(part.columns, attribute)
-            elif part.group is not None and part.group.id in stored:
-                values = stored[part.group.id].numbers
-            else:
-                continue
-            whole[inside] = values[: len(whole) - inside.start]
-        return whole[start - first :]
+    def _of_parts(self, column: Column, places: Sequence[int]) -> Iterator[tuple[int, Decoded]]:
+        groups = len(self._group_ids)
+        of_group = {int(self._group_ids[place]): place for place in places if place < groups}
+        signal_id, connection = self._signal_id(column), self.connection
+        if signal_id is not None and connection is not None and of_group:
+            sizes = np.diff(self.first_rows)
+            wanted = {group_id: int(sizes[place]) for group_id, place in of_group.items()}
+            for group_id, values in values_in(connection, self.run_id, signal_id, wanted):
+                place = of_group[group_id]
+                if isinstance(values, DamagedChunkError):
+                    values = self._from_rows(connection, place, column, values)
+                if values is not None:
+                    yield place, values
+        rows = _of_rows(self.columns, column) or ()
+        for place in (each for each in places if each >= groups and len(rows)):
+            first = (place - groups) * making.GROUP_ROWS
+            yield place, decoded_of(rows[first : first + making.GROUP_ROWS])
 
-    def _stored(
-        self, signal_id: int | None, name: str, parts: Sequence[Part]
-    ) -> dict[int, Decoded]:
-        groups = [part.group for part in parts if part.group is not None]
-        if signal_id is None or self.connection is None or not groups:
-            return {}
-        found: dict[int, Decoded] = {}
-        for group_id, values in values_in(self.connection, self.run_id, signal_id, groups):
-            if isinstance(values, DamagedChunkError):
-                again = self._from_rows(self._of_group[group_id], name, signal_id, values)
-                if again is None:
-                    continue
-                values = again
-            found[group_id] = values
-        return found
+    def _signal_id(self, column: Column) -> int | None:
+        return self.ids.get(column) if isinstance(column, str) else column
 
     def _from_rows(
-        self, part: Part, name: str, signal_id: int, error: DamagedChunkError
+        self, connection: sqlite3.Connection, place: int, column: Column, error: DamagedChunkError
     ) -> Decoded | None:
         """What the rows of a damaged chunk say, where they are all there; else it is not read."""
-        assert self.connection is not None and part.group is not None
-        group = part.group
-        columns = StateColumns()
-        asked = (self.run_id, group.start_s, group.end_s)
-        columns.add(self.connection.execute(_ROWS_OF, asked).fetchall())
-        if len(columns) == group.row_count:
-            values: Sequence[Any] | None = {
-                SIM_TIMES: columns.times, WALL_TIMES: columns.wall_times, STATE_IDS: columns.ids
-            }.get(signal_id, columns.values.get(name))  # fmt: skip
+        columns, span = StateColumns(), (float(self.starts_s[place]), float(self.ends_s[place]))
+        columns.add(connection.execute(_ROWS_OF, (self.run_id, *span)).fetchall())
+        if len(columns) == self.first_rows[place + 1] - self.first_rows[place]:
+            values = _of_rows(columns, column)
             if values is not None:
                 return decoded_of(values)
-        self.unread[Unread(group.start_s, group.end_s, f"the chunk of {name} is {error}")] = None
+        self.unread[Unread(*span, f"the chunk of {column} is {error}")] = None
         return None
 
-    def zones(
-        self, signal_id: int | None, values_of: Callable[[StateColumns], Sequence[Any] | None]
-    ) -> list[tuple[Part, Statistics | None]]:
-        """What a signal comes to in each part."""
-        stored: dict[int, Statistics] = {}
-        if signal_id is not None and self.connection is not None and self._groups:
-            stored = statistics_in(self.connection, self.run_id, signal_id, self._groups)
-        found: list[tuple[Part, Statistics | None]] = []
-        for part in self.parts:
-            if part.group is not None:
-                found.append((part, stored.get(part.group.id)))
-            else:
-                assert part.columns is not None
-                values = values_of(part.columns)
-                found.append((part, statistics_of(decoded_of(values)) if values else None))
+    def statistics(self, column: Column) -> Array:
+        """What a signal comes to: a row for each part, a column for each field of `Statistics`."""
+        size = 8 * len(Statistics._fields) * len(self.starts_s)
+        return self.kept(("statistics", column), lambda: self._statistics(column), size)
+
+    def _statistics(self, column: Column) -> Array:
+        table = nothing(len(self.starts_s))
+        signal_id, connection = self._signal_id(column), self.connection
+        if signal_id is not None and connection is not None and len(self._group_ids):
+            stored = statistics_in(connection, self.run_id, signal_id, self._between)
+            at, known = self._places_of(stored[:, 0])
+            table[at] = stored[known, 1:]
+        values = _of_rows(self.columns, column) or ()
+        for at, first in enumerate(range(0, len(values), making.GROUP_ROWS)):
+            part = decoded_of(values[first : first + making.GROUP_ROWS])
+            table[len(self._group_ids) + at] = statistics_of(part)
+        return table
+
+    def with_long_steps(self, longer_s: float) -> Flags:
+        """In which parts two rows that follow each other are further apart in simulation time."""
+        between = self.starts_s[1:] - self.ends_s[:-1] > longer_s
+        found = np.append(between, False) | np.append(False, between)
+        found[len(self._group_ids) :] = True
+        if self.connection is not None and len(self._group_ids):
+            asked = (self.run_id, SIM_TIMES, self._between, longer_s)
+            ids = groups_with_steps(self.connection, *asked)
+            found[self._places_of(np.array(ids, np.float64))[0]] = True
         return found
+
+    @property
+    def _between(self) -> tuple[int, int]:
+        return int(self._group_ids.min()), int(self._group_ids.max())
+
+    def _places_of(self, group_ids: Array) -> tuple[Indexes, Flags]:
+        """The places of groups, and which of the groups have one."""
+        order = np.argsort(self._group_ids, kind="stable")
+        ids = self._group_ids[order]
+        at = np.searchsorted(ids, group_ids)
+        known = ids[at] == group_ids
+        return order[at[known]], known
 
     def forget(self) -> None:
         """Forget what was made."""
         self._kept.clear()
         self._kept_bytes = 0
 
-    def kept(self, key: object, make: Any, size: int) -> Any:
+    def kept(self, key: object, make: Callable[[], T], size: int) -> T:
         """What was made before, or is made now; the oldest makes room for it."""
         if key in self._kept:
             self._kept.move_to_end(key)
@@ -193,3 +205,23 @@ class FrameSource:
             _, (_, freed) = self._kept.popitem(last=False)
             self._kept_bytes -= freed
         return made
+
+
+def nothing(parts: int) -> Array:
+    """The statistics of a signal that is in none of so many parts."""
+    table: Array = np.full((parts, len(Statistics._fields)), np.nan)
+    table[:] = np.array(Statistics(0, 0), np.float64)
+    return table
+
+
+def _of_rows(columns: StateColumns, column: Column) -> Sequence[Any] | None:
+    """The values of rows that are in no chunk; None where none of them has one."""
+    if isinstance(column, str):
+        return columns.values.get(column)
+    of_row = {SIM_TIMES: columns.times, WALL_TIMES: columns.wall_times, STATE_IDS: columns.ids}
+    return of_row[column] if len(columns) else None
+
+
+def _cut(values: Decoded, start: int, stop: int) -> Decoded:
+    codes = None if values.codes is None else values.codes[start:stop]
+    return Decoded(values.numbers[start:stop], codes, values.labels)

@@ -6,7 +6,6 @@ import math
 import sqlite3
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import Flags, np
 from webots_mcp.store.analysis.rhythm import (
     GAP_INTERVALS,
     Rhythm,
@@ -41,10 +40,6 @@ def rhythm_in(frame: Frame) -> Rhythm:
     interval_s = usual_interval_s(frame.rows(0, _SAMPLE_ROWS).times)
     if interval_s is None:
         return rhythm_of(frame.times)
-    zones, limit_s = frame.time_zones(), GAP_INTERVALS * interval_s
-    before_next: Flags = np.append(zones.start_s[1:] - zones.end_s[:-1], 0.0) > limit_s
-    opened = (zones.largest_step > limit_s) | before_next
-    opened[1:] |= before_next[:-1]
-    spans = [frame.rows(*span).times for span in zones.spans(opened)]
-    gaps = [gap for times in spans for gap in gaps_in(times, interval_s)]
+    around = frame.around_steps(GAP_INTERVALS * interval_s)
+    gaps = [gap for times in around for gap in gaps_in(times, interval_s)]
     return Rhythm(interval_s, interruptions(gaps))

@@ -127,7 +127,8 @@ def _any_in_chunks(
     groups = groups_in(connection, run_id, start_s, end_s) if start_s < end_s else []
     if any(group.start_s >= start_s or group.end_s < end_s for group in groups):
         return True
-    times = (values for _, values in values_in(connection, run_id, SIM_TIMES, groups))
+    wanted = {group.id: group.row_count for group in groups}
+    times = (values for _, values in values_in(connection, run_id, SIM_TIMES, wanted))
     return any(
         bool(((each.numbers >= start_s) & (each.numbers < end_s)).any())
         for each in times

@@ -291,7 +291,7 @@ def _times(
     connection: sqlite3.Connection, run_id: int, signal_id: int, group: Group
 ) -> Array | None:
     """Numbers of a chunk; None where it is missing or damaged."""
-    for _, values in values_in(connection, run_id, signal_id, [group]):
+    for _, values in values_in(connection, run_id, signal_id, {group.id: group.row_count}):
         return values.numbers if isinstance(values, Decoded) else None
     return None
 

@@ -111,9 +111,7 @@ def signals_of_frame(
 ) -> dict[str, Signal]:
     """Every signal of the subject's robot: the registered, and those in all rows of a frame."""
     known = registered(connection, subject.robot_id)
-    for rows in frame.new_rows:
-        known = seen_with(known, subject.robot_id, rows)
-    return _without_placeholders(known)
+    return _without_placeholders(seen_with(known, subject.robot_id, frame.new_rows))
 
 
 def _without_placeholders(known: dict[str, Signal]) -> dict[str, Signal]:
@@ -231,7 +229,7 @@ def list_signals(
     frame = read_frame(connection, whole, Deadline(deadline_s))
     known = signals_of_frame(connection, subject, frame)
     stored = signals_in(connection, subject.run_id)
-    here = {name for rows in frame.new_rows for name in rows.values}
+    here = frame.new_rows.values
     there = {name: each for name, each in known.items() if each.id in stored or name in here}
     matching = resolve_signals(there, [pattern]) if pattern != "*" else list(there.values())
     matching.sort(key=lambda signal: signal.name)

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.naming import Value
-from webots_mcp.store.analysis.summary import usable_numbers
+from webots_mcp.store.analysis.summary import LARGEST
 from webots_mcp.store.reading.frame import Frame
 
 _SHOWN_STATE_CHARACTERS: Final = 500
@@ -156,12 +156,10 @@ class RecordedSignal:
         what: str,
         worst_of: Callable[[list[float]], float],
     ) -> None:
-        rows, numbers = usable_numbers(range(len(self._values)), self._values)
+        numbers = self._usable
         if not numbers:
             raise AssertionError(f"{self._no_number()}, so nothing shows that it never {what}")
-        bad = {
-            int(row): number for row, number in zip(rows, numbers, strict=True) if is_bad(number)
-        }
+        bad = {row: number for row, number in numbers.items() if is_bad(number)}
         worst = worst_of(list(bad.values())) if bad else 0.0
         self._fail_at(list(bad), what, next((row for row in bad if bad[row] == worst), 0))
 
@@ -179,10 +177,19 @@ class RecordedSignal:
         raise AssertionError("\n  ".join(lines))
 
     def _numbers(self) -> Sequence[float]:
-        _, numbers = usable_numbers(self._times, self._values)
+        numbers = self._usable
         if not numbers:
             raise NothingRecordedError(self._no_number())
-        return numbers
+        return list(numbers.values())
+
+    @property
+    def _usable(self) -> dict[int, float]:
+        """The numbers by their rows, flags as 0 and 1; not NaN, nor beyond 1e100."""
+        return {
+            row: float(value)
+            for row, value in enumerate(self._values)
+            if isinstance(value, int | float) and abs(value) <= LARGEST
+        }
 
     def _no_number(self) -> str:
         return f"{self.name} holds no number in the {len(self._values)} rows of {self._run}"

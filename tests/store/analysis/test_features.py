@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from webots_mcp.naming import Value
 from webots_mcp.store.analysis.arrays import Array
 from webots_mcp.store.analysis.features import (
     find_spikes,
@@ -21,38 +20,15 @@ from webots_mcp.store.analysis.features import (
     leaps_in,
     time_effect,
 )
-from webots_mcp.store.analysis.summary import summarise_numbers, usable_numbers, usable_part
+from webots_mcp.store.analysis.summary import summarise_numbers
 
 numbers = st.lists(st.floats(-1e6, 1e6), min_size=3, max_size=50).map(np.array)
 few = st.lists(st.sampled_from([0.0, 1.0, 2.0, 7.0]), min_size=1, max_size=40).map(np.array)
-values = st.lists(
-    st.none()
-    | st.booleans()
-    | st.text(max_size=3)
-    | st.floats()
-    | st.integers(-(10**400), 10**400)
-    | st.integers(-5, 5)
-)
 hundred = np.arange(100, dtype=np.float64)
 
 
 def times_of(course: Array) -> Array:
     return 0.5 * np.arange(len(course), dtype=np.float64)
-
-
-@given(values)
-def test_arrays_hold_the_same_numbers_as_lists(held: list[Value]) -> None:
-    times = [float(index) for index in range(len(held))]
-    plain_times, plain = usable_numbers(times, held)
-    course = np.array([math.nan if number is None else number for number in map(number_of, held)])
-    moments, usable = usable_part(np.array(times), course)
-    assert (moments.tolist(), usable.tolist()) == (plain_times, plain)
-
-
-def number_of(value: Value) -> float | None:
-    if value is None or isinstance(value, str):
-        return None
-    return math.inf if abs(value) > 1e300 else float(value)
 
 
 @given(few, st.integers(0, 3), st.booleans())

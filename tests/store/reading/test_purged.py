@@ -17,8 +17,7 @@ from webots_mcp.store.questions.compare import Comparison, compare_runs
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.questions.series import RunHistory, query_history
 from webots_mcp.store.questions.trends import trends
-from webots_mcp.store.reading.coverage import less_time
-from webots_mcp.store.reading.ranges import Scope, Segment, find_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.purge import prune
 
@@ -69,18 +68,6 @@ def gaps_of(connection: sqlite3.Connection) -> Events:
     return find_events(connection, whole, EventOptions(kinds=("gap",)), limit=10, around=())
 
 
-def test_only_what_has_rows_left_is_advised_to_be_asked_for(
-    rover: sqlite3.Connection, tmp_path: Path
-) -> None:
-    segment = Segment(1, 0.0, 120.0)
-    assert less_time(rover, segment) == "ask for less time"
-    keep_rows(rover, tmp_path, 1500)
-    assert less_time(rover, segment) == (
-        "ask for less time from 55 s on: the rows before were purged"
-    )
-    assert less_time(rover, Segment(1, 0.0, 50.0)) == "its rows were purged"
-
-
 def test_a_run_without_a_row_left_still_has_an_overview(
     rover: sqlite3.Connection, tmp_path: Path
 ) -> None:
@@ -91,14 +78,11 @@ def test_a_run_without_a_row_left_still_has_an_overview(
     assert run.age_s > 0
 
 
-def test_a_range_that_begins_before_the_first_row_left_says_so(
+def test_a_range_of_which_only_chunks_are_left_has_nothing_to_say(
     rover: sqlite3.Connection, tmp_path: Path
 ) -> None:
     keep_rows(rover, tmp_path, 1500)
-    (note,) = find_range(rover, Scope(run_id=1)).notes
-    assert "rows of run 1 before 55 s were purged" in note and "read from chunks" in note
-    assert find_range(rover, Scope(run_id=1, start_s=60.0)).notes == ()
-    assert "were purged" in find_range(rover, Scope(run_id=1, start_s=10.0, end_s=20.0)).notes[0]
+    assert find_range(rover, Scope(run_id=1, start_s=10.0, end_s=20.0)).notes == ()
 
 
 def test_wall_time_reaches_into_what_was_purged(rover: sqlite3.Connection, tmp_path: Path) -> None:
@@ -109,7 +93,6 @@ def test_wall_time_reaches_into_what_was_purged(rover: sqlite3.Connection, tmp_p
     assert (segment.start_s, segment.end_s) == (
         pytest.approx(20, abs=0.2), pytest.approx(80, abs=0.2),
     )  # fmt: skip
-    assert "were purged" in found.notes[0]
     (run,) = query_history(rover, found, ["pose.0"], max_points=500).runs
     assert run.sim_time_s[0] <= 30.0
 
@@ -123,7 +106,6 @@ def test_a_run_of_which_only_chunks_are_left_is_found_by_wall_time(
     )
     assert [segment.run_id for segment in found.segments] == [1]
     assert found.segments[0].end_s == pytest.approx(60, abs=0.2)
-    assert "the rows of run 1 were purged" in found.notes[0]
     whole = find_range(rover, Scope(run_id=1, since_wall_time=WALL_START_S - 9))
     (run,) = query_history(rover, whole, ["pose.0"]).runs
     assert run.rows == 1150
@@ -132,11 +114,9 @@ def test_a_run_of_which_only_chunks_are_left_is_found_by_wall_time(
 def test_where_rows_were_purged_events_are_looked_for_in_their_chunks(
     rover: sqlite3.Connection, tmp_path: Path
 ) -> None:
+    before = find_events(rover, find_range(rover, Scope(run_id=1))).verdicts.not_searched
     keep_rows(rover, tmp_path, 1500)
-    told = find_events(rover, find_range(rover, Scope(run_id=1))).verdicts.not_searched
-    assert "purged" not in told["oscillation"]
-    kinds = {"standstill", "stuck", "jump", "silent", "flat", "threshold"}
-    assert not kinds & told.keys()
+    assert find_events(rover, find_range(rover, Scope(run_id=1))).verdicts.not_searched == before
 
 
 def distance(comparison: Comparison) -> list[Spread | None]:

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Final, NamedTuple, cast
+from typing import Final, NamedTuple
 
-from webots_mcp.naming import Value
 from webots_mcp.store.analysis.arrays import Array, inner, np
 
 LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
 NO_LENGTH: Final = 1e-9  # of a resultant vector that means no direction
-LENGTH_DUST: Final = 1e-14  # what adding unit vectors leaves; less than 1.5e-7 rad
-_NUMBERS: Final = frozenset({int, float, bool})
+_LENGTH_DUST: Final = 1e-14  # what adding unit vectors leaves; less than 1.5e-7 rad
 
 
 class Summary(NamedTuple):
@@ -82,7 +79,7 @@ class Summary(NamedTuple):
         if self.present < 2 or not length:
             return None
         return (
-            0.0 if length > 1 - LENGTH_DUST else math.sqrt(-2 * math.log(length)) * turn / math.tau
+            0.0 if length > 1 - _LENGTH_DUST else math.sqrt(-2 * math.log(length)) * turn / math.tau
         )
 
 
@@ -131,21 +128,20 @@ def with_extremes(whole: Summary, recorded: Summary) -> Summary:
         return whole
     if whole.min is None or whole.max is None:
         return recorded._replace(rows=max(whole.rows, recorded.rows))
-    if recorded.min < whole.min:
-        whole = whole._replace(min=recorded.min, min_sim_time_s=recorded.min_sim_time_s)
-    if recorded.max > cast("float", whole.max):
-        whole = whole._replace(max=recorded.max, max_sim_time_s=recorded.max_sim_time_s)
+    low = recorded if recorded.min < whole.min else whole
+    high = recorded if recorded.max > whole.max else whole
+    return with_extremes_of(with_extremes_of(whole, low, high=False), high, low=False)
+
+
+def with_extremes_of(
+    whole: Summary, other: Summary, *, low: bool = True, high: bool = True
+) -> Summary:
+    """With the least, the greatest or both values of another."""
+    if low:
+        whole = whole._replace(min=other.min, min_sim_time_s=other.min_sim_time_s)
+    if high:
+        whole = whole._replace(max=other.max, max_sim_time_s=other.max_sim_time_s)
     return whole
-
-
-def usable_numbers(times: Sequence[float], values: Sequence[Value]) -> tuple[list[float], ...]:
-    """Times and numbers of the values that are usable: not null, text, NaN or beyond 1e100."""
-    pairs = [
-        (time, float(cast("float", value)))
-        for time, value in zip(times, values, strict=True)
-        if type(value) in _NUMBERS and -LARGEST <= cast("float", value) <= LARGEST
-    ]
-    return [time for time, _ in pairs], [value for _, value in pairs]
 
 
 def usable_part(times: Array, numbers: Array) -> tuple[Array, Array]:

@@ -22,7 +22,12 @@ from webots_mcp.store.analysis.features import (
     time_effect,
     unwrap,
 )
-from webots_mcp.store.analysis.summary import LARGEST, Summary, summarise_numbers
+from webots_mcp.store.analysis.summary import (
+    LARGEST,
+    Summary,
+    summarise_numbers,
+    with_extremes_of,
+)
 from webots_mcp.store.analysis.swings import LEAST_HALF_SWINGS, Swing, find_swings
 from webots_mcp.store.reading.frame import Frame, Zones
 from webots_mcp.store.reading.moments import shown_time
@@ -151,9 +156,8 @@ def course_of_values(times: Array, recorded: Array, turn: float | None, summary:
         summary: What the values come to.
     """
     leaps = turn is not None and leaps_in(recorded, turn)
-    counts = turn is not None and not leaps
-    numbers = _unwrapped(recorded, summary, turn) if turn is not None and counts else recorded
-    counted = summarise_numbers(times, numbers) if counts else None
+    numbers = recorded if turn is None or leaps else unwrap(recorded, turn)
+    counted = None if turn is None or leaps else summarise_numbers(times, numbers)
     monotonic, rest_s = _monotonic(numbers), flat_since(times, numbers)
     return Course(times, numbers, counted or summary, counted, leaps, monotonic, rest_s)
 
@@ -216,16 +220,11 @@ def _rest_of_chunks(frame: Frame, name: str, zones: Zones, held: Indexes) -> flo
 
 
 def _monotonic_chunks(zones: Zones, held: Indexes) -> Monotonic | None:
-    first, last, low, high = (
-        each[held] for each in (zones.first, zones.last, zones.min, zones.max)
-    )
-    if first[0] == last[-1]:
-        return None
-    if (first == low).all() and (last == high).all() and (first[1:] >= last[:-1]).all():
-        return "rising"
-    if (first == high).all() and (last == low).all() and (first[1:] <= last[:-1]).all():
-        return "falling"
-    return None
+    """As far as the ends and extremes of the chunks tell, taken in the one order or the other."""
+    low, high = zones.min[held], zones.max[held]
+    orders = ((low, high), (high, low))
+    ends = [np.stack((zones.first[held], *each, zones.last[held]), 1).ravel() for each in orders]
+    return _monotonic(ends[0]) or _monotonic(ends[1])
 
 
 def judge(
@@ -255,7 +254,7 @@ def judge(
     counted = None if fast else course.counted
     deviation = summary.deviation_in(turn) if counted is None else counted.deviation_in(None)
     if counted is not None:
-        summary = _with_extremes_of(counted, summary)
+        summary = with_extremes_of(summary, counted)
     shape = _shape(summary, line, monotonic, swings, rest_s, float(times[-1] - times[0]))
     trend = Trend(
         name=signal.name,
@@ -310,22 +309,6 @@ def _swings(times: Array, course: Array, resolution_s: float | None) -> tuple[Sw
     return tuple(
         replace(swing, amplitude=swing.amplitude / float(np.sinc(resolution_s / swing.period_s)))
         for swing in found
-    )
-
-
-def _unwrapped(angles: Array, summary: Summary, turn: float) -> Array:
-    """With turns counted, beginning where the first value is."""
-    course = unwrap(angles, turn)
-    return course + turn * round(((summary.first or 0.0) - float(course[0])) / turn)
-
-
-def _with_extremes_of(course: Summary, summary: Summary) -> Summary:
-    """With the extremes of the course in which turns are counted."""
-    return summary._replace(
-        min=course.min,
-        min_sim_time_s=course.min_sim_time_s,
-        max=course.max,
-        max_sim_time_s=course.max_sim_time_s,
     )
 
 

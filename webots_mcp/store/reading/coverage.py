@@ -5,17 +5,10 @@ from __future__ import annotations
 import math
 import sqlite3
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from webots_mcp.store.reading.moments import moment_of
 
-if TYPE_CHECKING:
-    from webots_mcp.store.reading.ranges import Segment
-
-_ROWS_LEFT: Final = (
-    "SELECT (SELECT min(sim_time_s) FROM state WHERE run_id = run.id) FROM run "
-    "WHERE id = ? AND purged_rows > 0"
-)
 _ROW_IN: Final = (
     "SELECT 1 FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ? LIMIT 1"
 )
@@ -69,27 +62,6 @@ def coverage_notes(
         if end_s > math.nextafter(newest_s, math.inf):
             yield f"the recording of {run} ends at {newest_s:g} s, within the range"
         yield from _gap_notes(connection, run_id, start_s, end_s)
-
-
-def purged_until_s(connection: sqlite3.Connection, run_id: int, start_s: float) -> float | None:
-    """When the rows begin that are left of a run, where those from `start_s` on were purged.
-
-    None where they were not; infinite where none is left.
-    """
-    found = connection.execute(_ROWS_LEFT, (run_id,)).fetchone()
-    if found is None or (found[0] is not None and start_s >= found[0]):
-        return None
-    return math.inf if found[0] is None else found[0]
-
-
-def less_time(connection: sqlite3.Connection, segment: Segment) -> str:
-    """What shows more of a segment than its summaries do, if anything."""
-    until_s = purged_until_s(connection, segment.run_id, segment.start_s)
-    if until_s is None:
-        return "ask for less time"
-    if until_s >= segment.end_s:
-        return "its rows were purged"
-    return f"ask for less time from {until_s:.6g} s on: the rows before were purged"
 
 
 def _gap_notes(

@@ -232,7 +232,7 @@ def _stuck(db: sqlite3.Connection, rows: int) -> Iterable[Line]:
     """Of a long run the statistics of chunks tell where to look: nothing may be missed."""
     expected = max(0, math.ceil((end_s(rows) - 46) / CYCLE_S))  # each ends 46 s into its cycle
     stuck = find_events(db, find_range(db, Scope()), EventOptions(kinds=("stuck",)))
-    found = stuck.totals.get("stuck", 0)
+    found = stuck.verdicts.found.get("stuck", 0)
     what, beside = f"stuck places, {rows:,} rows", f"in the recording {expected:,}"
     yield Line(what, f"found {found:,}", beside, abs(expected - found), "off", Target(0))
 

@@ -97,7 +97,7 @@ def test_all_changes_of_a_flag_that_flickers_are_counted(
         empty, find_range(empty, Scope(run_id=1)), EventOptions(kinds=("change",)), group=group
     )
     (flickering,) = found.events
-    assert (flickering.count, found.totals) == (800, {"change": 800})
+    assert (flickering.count, found.verdicts.found) == (800, {"change": 800})
     assert (flickering.start_s, flickering.details["to"]) == (
         pytest.approx(0.1),
         {"true": "400 times, 40 s", "false": "400 times, 119.8 s"},

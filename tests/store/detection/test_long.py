@@ -128,7 +128,7 @@ def test_standstills_of_a_long_run_that_are_told_begin_and_end_to_the_row(
 ) -> None:
     asked, options = find_range(stopping, Scope()), EventOptions(kinds=("standstill",))
     found = find_events(stopping, asked, options, limit=3, group=False)
-    assert found.totals == {"standstill": 10}
+    assert found.verdicts.found == {"standstill": 10}
     ends = [(each.start_s, each.end_s) for each in found.events]
     expected = [(60.0 * at + 29.9, 60.0 * at + 59.9) for at in (7, 8, 9)]
     assert ends == [pytest.approx(each, abs=0.11) for each in expected]

@@ -153,8 +153,8 @@ def test_everything_at_once_is_in_order_and_counted(rover: sqlite3.Connection) -
     events = find_events(rover, found, limit=200)
     walls = [event.wall_time_s for event in events.events]
     assert walls == sorted(walls)
-    assert sum(events.totals.values()) == len(events.events)
-    assert events.totals["change"] == 5
+    assert sum(events.verdicts.found.values()) == len(events.events)
+    assert events.verdicts.found["change"] == 5
 
 
 def test_a_limit_keeps_rare_kinds_and_says_what_is_left_out(rover: sqlite3.Connection) -> None:
@@ -165,7 +165,7 @@ def test_a_limit_keeps_rare_kinds_and_says_what_is_left_out(rover: sqlite3.Conne
     assert {"stuck", "gap", "command", "run"} <= kinds
     told = Counter(event.kind for event in events.events)
     left_out = {kind: each.count for kind, each in events.left_out.items()}
-    assert left_out and told + Counter(left_out) == events.totals
+    assert left_out and told + Counter(left_out) == events.verdicts.found
 
 
 def record_a_busy_run(connection: sqlite3.Connection) -> Recorder:
@@ -216,14 +216,14 @@ def test_what_happens_all_the_time_crowds_nothing_out_and_is_named_by_time(
     told = [(event.kind, event.name) for event in events.events]
     assert told.count(("log", "warning")) == 3 and told.count(("run", None)) == 1
     changes = events.left_out["change"]
-    assert changes.count == events.totals["change"] - 2
+    assert changes.count == events.verdicts.found["change"] - 2
     assert (changes.first.start_s, changes.last.start_s) == pytest.approx((1.0, 98.0), abs=0.01)
 
 
 def test_pictures_are_told_only_where_they_are_asked_for(empty: sqlite3.Connection) -> None:
     record_a_busy_run(empty)
-    assert "image" not in find_events(empty, find_range(empty, Scope())).totals
-    assert ask(empty, "image").totals == {"image": 200}
+    assert "image" not in find_events(empty, find_range(empty, Scope())).verdicts.found
+    assert ask(empty, "image").verdicts.found == {"image": 200}
 
 
 def test_a_cursor_of_find_events_that_is_none_is_refused(rover: sqlite3.Connection) -> None:

@@ -186,4 +186,4 @@ def test_noise_is_no_motion_in_a_mode_of_which_there_are_few_rows(
     found = find_events(
         empty, find_range(empty, Scope(run_id=1)), EventOptions(kinds=("standstill", "stuck"))
     )
-    assert found.totals == {"standstill": 7}
+    assert found.verdicts.found == {"standstill": 7}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sqlite3
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import Any, Final
@@ -16,11 +16,9 @@ from webots_mcp.naming import Value, flatten
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.extent import Detection
 from webots_mcp.store.detection.grouping import grouped
-from webots_mcp.store.detection.kind import EventKind
 from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.detection.registry import asked_kinds, kind_named
 from webots_mcp.store.detection.verdict import Ledger, Verdicts, count_by_kind
-from webots_mcp.store.questions.places import Place, placed, read_place
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.snapshot import in_one_snapshot
@@ -36,6 +34,11 @@ _ROW_AT: Final = (
     "SELECT data FROM state WHERE run_id = ? AND sim_time_s <= ? "
     "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
 )
+
+
+# Of an event in the one order of all: wall time, run, simulation time, kind, and its number among
+# those of one kind and moment. Pages and cursors go on from it.
+Place = tuple[float, int, float, str, int]
 
 
 @dataclass(frozen=True)
@@ -80,11 +83,6 @@ class Events:
     left_out: dict[str, LeftOut]
     cursor: str | None
     notes: tuple[str, ...]
-
-    @property
-    def totals(self) -> dict[str, int]:
-        """How many of each kind were found."""
-        return self.verdicts.found
 
 
 @dataclass(frozen=True)
@@ -149,9 +147,7 @@ def find_events(
 ) -> Events:
     """What happened in a range: with its true begin and end, also where it reaches out of it.
 
-    Up to 30,000 rows of a run are all looked at. Of a longer range the rollups and the change
-    table tell where to look; swings and leaps are searched row by row from the newest on, as far
-    as the time allows. The verdicts say what was not searched.
+    The verdicts say what was not searched.
 
     Args:
         connection: Any.
@@ -190,59 +186,9 @@ def search_events(
 ) -> Found:
     """All that happened in a range; see `find_events` for the arguments."""
     options = options or EventOptions()
-    borders = _read_cursor(after) if after else None
-    known = known_signals(connection, time_range)
+    borders = _read_cursor(after) if after else {}
+    kinds, known = asked_kinds(options), known_signals(connection, time_range)
     context = _context(known, options, around)
-    collected = collect(connection, time_range, options, deadline_s)
-    found = grouped(collected.events, known) if group else collected.events
-    return Found(
-        time_range.robot,
-        tuple(entry for entry in placed(found) if _is_left(entry[0], borders)),
-        collected.ledger.verdicts(collected.kinds, found),
-        collected.notes,
-        tuple(context),
-        borders or {},
-    )
-
-
-def _is_left(place: Place, borders: dict[str, Place | None] | None) -> bool:
-    """Whether no earlier page has shown the event at that place."""
-    if borders is None:
-        return True
-    border = borders.get(place[3])
-    return place[3] in borders and (border is None or place < border)
-
-
-@dataclass(frozen=True)
-class Collected:
-    """All events of a range, in no order and without values around them.
-
-    Attributes:
-        kinds: Those that were asked for.
-        ledger: What could not be looked at.
-    """
-
-    events: list[Event]
-    kinds: Sequence[EventKind]
-    ledger: Ledger
-    notes: tuple[str, ...]
-
-
-@in_one_snapshot
-def collect(
-    connection: sqlite3.Connection,
-    time_range: TimeRange,
-    options: EventOptions,
-    deadline_s: float = QUESTION_DEADLINE_S,
-) -> Collected:
-    """Look for all kinds that were asked for.
-
-    Raises:
-        UnknownSignalError: A name in the options meets nothing.
-        InvalidInputError: There is no such kind.
-    """
-    kinds = asked_kinds(options)
-    known = known_signals(connection, time_range)
     import_module("numpy")  # once per process, before the time counts
     deadline, segments = Deadline(deadline_s), time_range.segments
     ledger = Ledger(notes=list(time_range.notes), of_several_runs=len(segments) > 1)
@@ -251,12 +197,39 @@ def collect(
         part = deadline.part(1 / (len(segments) - index))
         detection = Detection(connection, known, kinds, options, part, ledger)
         found += detection.events_touching(segment)
-    if not time_range.segments:
-        for kind in kinds:
-            ledger.not_searched(kind.name, "nothing was recorded in that range")
-    over = _runs_over(connection, [segment.run_id for segment in time_range.segments])
-    ended = [replace(e, ongoing=False) if e.ongoing and e.run_id in over else e for e in found]
-    return Collected(ended, kinds, ledger, ledger.all_notes)
+    for kind in kinds if not segments else ():
+        ledger.not_searched(kind.name, "nothing was recorded in that range")
+    over = _runs_over(connection, [segment.run_id for segment in segments])
+    found = [replace(e, ongoing=False) if e.ongoing and e.run_id in over else e for e in found]
+    entries = placed(grouped(found, known) if group else found)
+    return Found(
+        time_range.robot,
+        tuple(entry for entry in entries if not after or _is_left(entry[0], borders)),
+        ledger.verdicts(kinds, found),
+        ledger.all_notes,
+        tuple(context),
+        borders,
+    )
+
+
+def placed(events: Iterable[Event]) -> list[tuple[Place, Event]]:
+    """The events in order, each with its place; those of one kind and moment are numbered."""
+    seen: Counter[tuple[float, int, float, str]] = Counter()
+    entries: list[tuple[Place, Event]] = []
+    for event in sorted(events, key=lambda each: (*_moment(each), each.name or "")):
+        entries.append(((*_moment(event), seen[_moment(event)]), event))
+        seen[_moment(event)] += 1
+    return entries
+
+
+def _moment(event: Event) -> tuple[float, int, float, str]:
+    return event.wall_time_s, event.run_id, event.start_s, event.kind
+
+
+def _is_left(place: Place, borders: dict[str, Place | None]) -> bool:
+    """Whether no earlier page has shown the event at that place."""
+    border = borders.get(place[3])
+    return place[3] in borders and (border is None or place < border)
 
 
 def _runs_over(connection: sqlite3.Connection, run_ids: Sequence[int]) -> set[int]:
@@ -338,6 +311,16 @@ def _read_cursor(text: str) -> dict[str, Place | None]:
         raise InvalidInputError(
             f"cursor={text[:80]!r} is not a cursor: give the `cursor` of an answer unchanged"
         ) from error
+
+
+def read_place(value: Any) -> Place:
+    """A place as it comes out of JSON.
+
+    Raises:
+        ValueError, TypeError: It is none.
+    """
+    wall_s, run_id, start_s, kind, number = value
+    return float(wall_s), int(run_id), float(start_s), str(kind), int(number)
 
 
 def _with_values(connection: sqlite3.Connection, event: Event, context: Sequence[Signal]) -> Event:

@@ -26,7 +26,7 @@ from webots_mcp.store.detection.motion import (
     doubt_of_unit,
 )
 from webots_mcp.store.detection.registry import asked_kinds
-from webots_mcp.store.questions.events import Collected, collect
+from webots_mcp.store.questions.events import Found, search_events
 from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.questions.ways import read_way
 from webots_mcp.store.reading.changes import change_points
@@ -256,7 +256,7 @@ def _outcome(
     if not modes:
         unknown["share of each mode"] = (OUT_OF_TIME if deadline.passed else NO_MODE,)
     found = _events(connection, part, options, deadline)
-    verdicts = found.ledger.verdicts(found.kinds, found.events)
+    verdicts = found.verdicts
     if deadline.passed:
         unknown[f"events{_RATE}"] = (OUT_OF_TIME,)
     else:
@@ -284,7 +284,10 @@ def _mode_times(
 
 def _events(
     connection: sqlite3.Connection, part: RunPart, options: EventOptions, deadline: Deadline
-) -> Collected:
+) -> Found:
     kinds = tuple(kind.name for kind in asked_kinds(options) if kind.counted)
     whole = TimeRange(part.robot_id, "", (part.segment,), "simulation")
-    return collect(connection, whole, replace(options, kinds=kinds), deadline.left_s)
+    wanted = replace(options, kinds=kinds)
+    return search_events(
+        connection, whole, wanted, around=(), group=False, deadline_s=deadline.left_s
+    )

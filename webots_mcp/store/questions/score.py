@@ -14,7 +14,7 @@ from webots_mcp.naming import listed, nearest_first
 from webots_mcp.store.conditions_on_arrays import aggregated, position_in
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.registry import kind_names
-from webots_mcp.store.questions.events import collect
+from webots_mcp.store.questions.events import search_events
 from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.reading.coverage import unrecorded
 from webots_mcp.store.reading.deadline import Deadline
@@ -178,8 +178,9 @@ def _count(
         return int(connection.execute(_STORED, bounds).fetchone()[0])
     try:
         options = EventOptions(kinds=(kind,))
-        found = collect(connection, time_range, options, deadline.left_s)
+        found = search_events(
+            connection, time_range, options, around=(), group=False, deadline_s=deadline.left_s
+        )
     except NothingRecordedError as error:
         return str(error)
-    why = found.ledger.verdicts(found.kinds, found.events).not_searched.get(kind)
-    return why or len(found.events)
+    return found.verdicts.not_searched.get(kind) or len(found.events)

@@ -11,8 +11,7 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.registry import stored_kinds
 from webots_mcp.store.detection.verdict import Verdicts
-from webots_mcp.store.questions.events import collect
-from webots_mcp.store.questions.places import Place, placed, read_place
+from webots_mcp.store.questions.events import Place, read_place, search_events
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.snapshot import in_one_snapshot
@@ -63,15 +62,17 @@ def timeline(
     if not 1 <= limit <= MOST_ENTRIES:
         raise InvalidInputError(f"limit={limit} must be from 1 to {MOST_ENTRIES}")
     options = options or EventOptions(kinds=stored_kinds(), log_level="info")
-    found = collect(connection, time_range, options, deadline_s)
-    entries = placed(found.events)
-    left = [entry for entry in entries if entry[0] > _read_cursor(after)] if after else entries
+    found = search_events(
+        connection, time_range, options, around=(), group=False, deadline_s=deadline_s
+    )
+    border = _read_cursor(after) if after else None
+    left = [entry for entry in found.entries if border is None or entry[0] > border]
     page = left[:limit]
     return Timeline(
         robot=time_range.robot,
         events=tuple(event for _, event in page),
         cursor=json.dumps(page[-1][0]) if len(left) > limit else None,
-        verdicts=found.ledger.verdicts(found.kinds, found.events),
+        verdicts=found.verdicts,
         notes=found.notes,
     )
 

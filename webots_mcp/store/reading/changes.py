@@ -6,7 +6,6 @@ import math
 import sqlite3
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import pairwise
 from typing import Final, NamedTuple
 
@@ -91,13 +90,19 @@ def change_points(
             that point may be any before.
     """
     frame = frame or read_frame(connection, segment, deadline)
-    before = _Before(connection, segment, deadline)
+    before: Frame | None = None  # it is read only where it is looked at
     points: dict[str, list[Point]] = {}
     since_before = set[str]()
     for signal in signals:
         found = _points_in(frame, signal)
-        known = bool(found) and found[0].sim_time_s <= segment.start_s
-        first = before.in_force(signal, found[0] if known else None, since=since)
+        first = found[0] if found and found[0].sim_time_s <= segment.start_s else None
+        known = first is not None
+        if since or not known:
+            if before is None:
+                whole = Segment(segment.run_id, -math.inf, segment.start_s)
+                before = read_frame(connection, whole, deadline)
+            late = since and deadline.passed and len(before) > 0
+            first = None if late else _in_force(before, signal, first, since=since)
         if first is None:
             since_before.update([signal.name] * (known and since))
         else:
@@ -112,39 +117,24 @@ def change_points(
     return Changes(segment, found, frozenset(since_before), unread_s, frame.unread)
 
 
-class _Before:
-    """The rows of a run before a segment, read only where they are looked at."""
+def _in_force(
+    before: Frame, signal: Signal, at_begin: Point | None, *, since: bool
+) -> Point | None:
+    """The point of the value in force when a segment begins; None where it is not found.
 
-    def __init__(
-        self, connection: sqlite3.Connection, segment: Segment, deadline: Deadline
-    ) -> None:
-        self._connection = connection
-        self._segment = Segment(segment.run_id, -math.inf, segment.start_s)
-        self._deadline = deadline
-
-    @cached_property
-    def _frame(self) -> Frame:
-        return read_frame(self._connection, self._segment, self._deadline)
-
-    def in_force(self, signal: Signal, at_begin: Point | None, *, since: bool) -> Point | None:
-        """The point of the value in force when the segment begins; None where it is not found.
-
-        Args:
-            signal: Of which.
-            at_begin: What the row at the begin says; None without such a row.
-            since: Whether to look for the time at which that value began.
-        """
-        if at_begin is not None and not since:
-            return at_begin
-        frame = self._frame
-        if not len(frame):
-            return at_begin if frame.cut_at_s is None else None
-        if frame.cut_at_s is not None or (self._deadline.passed and since):
-            return None
-        if at_begin is None:
-            (at_begin,) = _points_in(frame.rows(len(frame) - 1, len(frame)), signal)
-        row = _first_alike(frame, signal, at_begin.value) if since else len(frame)
-        return at_begin if row == len(frame) else Point(float(frame.times[row]), at_begin.value)
+    Args:
+        before: The rows before the segment.
+        signal: Of which.
+        at_begin: What the row at the begin says; None without such a row.
+        since: Whether to look for the time at which that value began.
+    """
+    rows = len(before)
+    if before.cut_at_s is not None or not rows:
+        return at_begin if before.cut_at_s is None else None
+    if at_begin is None:
+        (at_begin,) = _points_in(before.rows(rows - 1, rows), signal)
+    row = _first_alike(before, signal, at_begin.value) if since else rows
+    return at_begin if row == rows else Point(float(before.times[row]), at_begin.value)
 
 
 def _first_alike(frame: Frame, signal: Signal, value: str | bool | None) -> int:

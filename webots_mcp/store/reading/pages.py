@@ -115,52 +115,40 @@ def _page(
     more = rows > limit or (cut and rows > 0)
     shown = [*parts[:-1], parts[-1].rows(0, len(parts[-1]) - max(0, rows - limit))] if parts else []
     ids = [row_id for part in shown for row_id in part.ids.tolist()]
-    replaced: dict[str, Counter[str]] = {}
+    states = _states_by_id(connection, ids)
+    values: dict[str, list[Value]] = {}
+    replaced: dict[str, dict[str, int]] = {}
     for signal in signals:
-        found = sum((part.replaced(signal.name) for part in shown), Counter[str]())
-        if found:
-            replaced[signal.name] = found
+        name = signal.name
+        held = [value for part in shown for value in part.values(name)]
+        exact = [  # as recorded, where the rows are there
+            states[row_id].get(name) if row_id in states else value
+            for row_id, value in zip(ids, held, strict=True)
+        ]
+        values[name] = cleaned(signal, exact)
+        if found := sum((part.replaced(name) for part in shown), Counter[str]()):
+            replaced[name] = dict(found)
     return Page(
         time_range.robot,
         [part.run_id for part in shown for _ in range(len(part))],
         ids,
         [time_s for part in shown for time_s in part.times.tolist()],
         [time_s for part in shown for time_s in part.wall_times.tolist()],
-        _values(connection, signals, shown, ids),
-        {name: dict(counts) for name, counts in replaced.items()},
+        values,
+        replaced,
         ids[-1] if more else None,
         (*time_range.notes, *(str(each) for part in shown for each in part.unread)),
         cut,
     )
 
 
-def _values(
-    connection: sqlite3.Connection,
-    signals: Sequence[Signal],
-    parts: Sequence[Frame],
-    ids: Sequence[int],
-) -> dict[str, list[Value]]:
-    """The values as they were recorded, where the rows are there; else those of their chunks."""
-    states = _states_by_id(connection, ids)
-    found: dict[str, list[Value]] = {}
-    for signal in signals:
-        name = signal.name
-        values = [value for part in parts for value in part.values(name)]
-        exact = [
-            states[row_id].get(name) if row_id in states else value
-            for row_id, value in zip(ids, values, strict=True)
-        ]
-        found[name] = cleaned(signal, exact)
-    return found
-
-
 def _states_by_id(
     connection: sqlite3.Connection, ids: Sequence[int]
 ) -> dict[int, dict[str, Value]]:
     listed = json.dumps([abs(row_id) for row_id in ids])
-    found: dict[int, dict[str, Value]] = {}
-    for query, sign in ((_STATES, 1), (_KEPT_STATES, -1)):
-        if any(row_id * sign > 0 for row_id in ids):
-            for row_id, data in connection.execute(query, (listed,)):
-                found[sign * row_id] = flatten(parse(data))
-    return found
+    return {
+        sign * row_id: flatten(parse(data))
+        for query, sign in ((_STATES, 1), (_KEPT_STATES, -1))
+        if any(row_id * sign > 0 for row_id in ids)
+        for row_id, data in connection.execute(query, (listed,))
+    }

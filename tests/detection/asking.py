@@ -11,7 +11,7 @@ from typing import Final
 
 from tests.detection.labelled import Measure
 from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.questions.compare import Comparison, compare_code, compare_runs
+from webots_mcp.store.questions.compare import Comparison, compare_runs
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading.ranges import Scope, find_range
 
@@ -192,7 +192,7 @@ def _longer_m(doubts: str, run_id: int, distance_m: float) -> float:
 
 def compared_edits(connection: sqlite3.Connection) -> Comparison:
     """The runs before the last edit and those after it."""
-    return compare_code(connection, limit=_ALL, deadline_s=UNHURRIED_S)
+    return compare_runs(connection, limit=_ALL, deadline_s=UNHURRIED_S)
 
 
 def claimed_differences(comparison: Comparison) -> Iterable[tuple[str, float]]:

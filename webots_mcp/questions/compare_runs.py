@@ -47,9 +47,7 @@ from webots_mcp.store.questions.compare import (
     Comparison,
     Difference,
     Group,
-    compare_code,
     compare_runs,
-    compare_trials,
 )
 from webots_mcp.store.questions.outcomes import Measure
 from webots_mcp.store.questions.runs import (
@@ -280,12 +278,8 @@ def _compared(
         "min_effect_sd": min_effect_sd,
     }
     asked["limit"] = limit or DEFAULT_DIFFERENCES
-    if run_ids:
-        found = compare_runs(view.connection, run_ids, **asked)
-    elif set_id:
-        found = compare_trials(view.connection, set_id, **asked)
-    else:
-        found = compare_code(view.connection, robot=view.robot.name, **asked)
+    asked |= {"set_id": set_id or None, "robot": view.robot.name}
+    found = compare_runs(view.connection, run_ids or None, **asked)
     differing = [each for each in found.differences if _differs(each)]
     groups, notes, only_in = _groups(found), notes_of(found.notes), list(found.only_in.items())
     most = len(only_in) if is_for_a_person() else _MOST_ONLY_IN

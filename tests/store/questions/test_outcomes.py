@@ -12,7 +12,7 @@ import pytest
 
 from tests.recordings.rover import Recorder
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.questions.compare import Comparison, compare_code, compare_runs
+from webots_mcp.store.questions.compare import Comparison, compare_runs
 from webots_mcp.store.questions.outcomes import Measure
 
 State = Callable[[float], dict[str, Any]]
@@ -159,7 +159,7 @@ def test_a_rare_event_that_is_gone_asks_for_more_runs(empty: sqlite3.Connection,
     for code, state in (("a", stuck_twice), ("b", driving)):
         for _ in range(runs):
             record(empty, code, state)
-    stuck = measure(compare_code(empty), "stuck per min")
+    stuck = measure(compare_runs(empty), "stuck per min")
     assert medians(stuck) == [pytest.approx(3.0, abs=0.02), 0.0]
     assert (stuck.different, stuck.runs_wanted) == ([False, None], [None, 7])
 
@@ -170,7 +170,7 @@ def test_a_rare_event_that_is_gone_from_many_runs_is_a_difference(
     for code, state in (("a", stuck_twice), ("b", driving)):
         for _ in range(7):
             record(empty, code, state)
-    stuck = measure(compare_code(empty), "stuck per min")
+    stuck = measure(compare_runs(empty), "stuck per min")
     assert (stuck.different, stuck.runs_wanted) == ([False, True], [None, None])
 
 
@@ -230,7 +230,7 @@ def test_of_what_was_not_read_in_time_no_figure_is_told(empty: sqlite3.Connectio
     """A way that a deadline cut had a length of 0.0 m, and modes took the time that was read."""
     for code in "aabb":
         record(empty, code, driving, end_s=300)
-    found = compare_code(empty, deadline_s=0.0)
+    found = compare_runs(empty, deadline_s=0.0)
     assert all(spread is None for each in found.measures for spread in each.spread)
     assert {verdict for each in found.differences for verdict in each.different} == {None}
     assert all(mean is None for each in found.differences for mean in each.mean)
@@ -245,11 +245,11 @@ def test_how_much_runs_differ_is_told_as_an_interval(empty: sqlite3.Connection) 
     for code in "ab":
         for speed_m_s in (0.30, 0.31, 0.29):
             record(empty, code, lambda time_s, v=speed_m_s: {"pose": [v * time_s, 0.0]}, end_s=10)
-    speed = measure(compare_code(empty), "mean_speed_m_s")
+    speed = measure(compare_runs(empty), "mean_speed_m_s")
     (_, interval) = speed.interval
     assert interval == pytest.approx((-0.0174, 0.0174), rel=0.02)  # 2.132 * 0.01 * (2 / 3)**0.5
     assert speed.different == [False, None]
-    speed = measure(compare_code(empty, min_effect_sd=3.0), "mean_speed_m_s")
+    speed = measure(compare_runs(empty, min_effect_sd=3.0), "mean_speed_m_s")
     assert speed.different == [False, False]
 
 
@@ -267,7 +267,7 @@ def test_what_only_adding_tells_apart_asks_for_no_more_certainty(empty: sqlite3.
     for code, factor in (("a", 1.0), ("b", 1.07)):
         for run, share in enumerate((0.98, 1.0, 1.02, 1.01)):
             record(empty, code, at(0.2 * factor * share, 0.1 * run))
-    found = compare_code(empty)
+    found = compare_runs(empty)
     shares = measure(found, "share of rest").spread
     assert all(each is not None and each.low == pytest.approx(each.high) for each in shares)
     assert measure(found, "mean_speed_m_s").different == [False, True]

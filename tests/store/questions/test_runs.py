@@ -18,7 +18,7 @@ from webots_mcp.errors import (
     UnknownRunError,
 )
 from webots_mcp.store.analysis.spread import Spread
-from webots_mcp.store.questions.compare import Comparison, compare_code, compare_runs
+from webots_mcp.store.questions.compare import Comparison, compare_runs
 from webots_mcp.store.questions.differences import Difference
 from webots_mcp.store.questions.runs import annotate_run, list_runs, run_info
 
@@ -165,7 +165,7 @@ def test_between_like_runs_no_difference_is_claimed(empty: sqlite3.Connection) -
         for code in "ab":
             record_group(recorder, robot_id, code, 3, 0.2, dice)
         empty.execute("COMMIT")
-        assert claimed(compare_code(empty, robot=f"r{pair}")) == set()
+        assert claimed(compare_runs(empty, robot=f"r{pair}")) == set()
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -177,7 +177,7 @@ def test_a_tenth_more_speed_is_found(empty: sqlite3.Connection, seed: int) -> No
     record_group(recorder, robot_id, "a", 5, 0.2, dice)
     record_group(recorder, robot_id, "b", 5, 0.22, dice)
     empty.execute("COMMIT")
-    comparison = compare_code(empty)
+    comparison = compare_runs(empty)
     assert {"distance_m", "mean_speed_m_s"} <= claimed(comparison)
     assert "noise" not in claimed(comparison)
     assert difference(comparison, "pose.0").different == [False, True]
@@ -199,7 +199,7 @@ def test_what_is_one_fact_or_the_same_in_all_runs_makes_no_other_figure_less_cer
                 mode = "scan" if 100 <= step < 130 else "explore"
                 recorder.publish(0.2 * step, {"pose": [speed * driven_s, 0.0], "mode": mode})
     empty.execute("COMMIT")
-    assert {"distance_m", "mean_speed_m_s"} <= claimed(compare_code(empty))
+    assert {"distance_m", "mean_speed_m_s"} <= claimed(compare_runs(empty))
 
 
 def test_a_run_of_one_moment_is_named_as_what_the_others_are_cut_to(
@@ -266,7 +266,7 @@ def test_what_is_left_of_adding_equal_numbers_is_no_difference(
 
 
 def test_runs_before_and_after_the_last_edit_are_compared(rover: sqlite3.Connection) -> None:
-    comparison = compare_code(rover)
+    comparison = compare_runs(rover)
     before, after = comparison.groups
     assert [run.run_id for run in before.runs] == [1, 2]
     assert [run.run_id for run in after.runs] == [3]
@@ -286,7 +286,7 @@ def test_a_signal_that_only_one_run_has_is_named(empty: sqlite3.Connection) -> N
     assert comparison.only_in == {"old": ("run 1",), "new": ("run 2",)}
     assert [each.name for each in comparison.differences] == ["x"]
     with pytest.raises(NothingRecordedError, match="no edit"):
-        compare_code(empty)
+        compare_runs(empty)
 
 
 def test_runs_of_two_robots_can_be_compared(empty: sqlite3.Connection) -> None:

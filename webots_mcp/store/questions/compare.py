@@ -6,7 +6,8 @@ import math
 import sqlite3
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import groupby
 from typing import Final
 
 from webots_mcp.conditions.signal_values import SAME_TIME_S
@@ -93,22 +94,30 @@ class Comparison:
 @in_one_snapshot
 def compare_runs(
     connection: sqlite3.Connection,
-    run_ids: Sequence[int],
+    run_ids: Sequence[int] | None = None,
     *,
+    set_id: int | None = None,
+    robot: str | None = None,
     names: Sequence[str] = ("*",),
     limit: int = 30,
     options: EventOptions | None = None,
     min_effect_sd: float = MIN_EFFECT_SD,
     deadline_s: float = COMPARE_DEADLINE_S,
 ) -> Comparison:
-    """Compare runs, aligned at their start; that of the first one is the reference.
+    """Compare runs, aligned at their start; those of the first group are the reference.
 
-    Where some of them have the same robot, code and parameters and others have not, those that
-    have are one group. For a single run it has that run's figures.
+    Of given runs where some have the same robot, code and parameters and others have not, those
+    that have are one group; for a single run it has that run's figures. Of a trial set its best
+    five sets of parameters count, the best first, of each the runs that have a score, at most 10.
+    Else it is the runs before and after the last edit of the robot's controller, which is seen by
+    the SHA-256 of its file: "after" are the newest runs that share one, "before" those just before
+    them that share another, at most the newest 10 of each.
 
     Args:
         connection: Any.
         run_ids: 1 to 10 different runs.
+        set_id: A trial set, where no runs are given.
+        robot: Whose controller was edited, where neither is given.
         names: Signals, with `*`.
         limit: The most differences to return.
         options: What counts as an event, and what the position and the mode are.
@@ -116,18 +125,52 @@ def compare_runs(
         deadline_s: After it, figures for which not all rows were read are None.
 
     Raises:
-        InvalidInputError: No run, more than 10, or one twice; nothing could matter.
-        UnknownRunError, UnknownSignalError: As they say.
-        NothingRecordedError: A run has no state row.
+        InvalidInputError: No run, more than 10, or one twice; no such set; nothing could matter.
+        UnknownRunError, UnknownRobotError, AmbiguousRobotError, UnknownSignalError: As they say.
+        NothingRecordedError: A run has no state row, all runs had the same code, or the set has no
+            run with a score.
     """
-    if not 1 <= len(run_ids) <= MOST_COMPARED or len(set(run_ids)) < len(run_ids):
-        raise InvalidInputError(f"give 1 to {MOST_COMPARED} different runs, not {list(run_ids)}")
-    asked = _Asked(names, limit, options or EventOptions(), min_effect_sd, deadline_s)
-    return _compare(connection, _repeats(connection, run_ids), asked)
+    if not 0 < min_effect_sd < math.inf:
+        raise InvalidInputError(f"min_effect_sd={min_effect_sd} must be a number above 0")
+    notes: list[str] = []
+    if run_ids is not None:
+        groups = _repeats(connection, run_ids)
+    elif set_id is not None:
+        found = scored_runs(connection, set_id)
+        groups = {name: found[name][:MOST_COMPARED] for name in list(found)[:MOST_SETS]}
+        if len(found) > len(groups):
+            notes += [f"the best {len(groups)} of {len(found)} sets of parameters"]
+    else:
+        groups = _around_last_edit(connection, robot)
+    options = options or EventOptions()
+    parts = [[_part(connection, run_id, options) for run_id in found] for found in groups.values()]
+    segments = [part.segment for found in parts for part in found]
+    durations_s = {segment.run_id: segment.end_s - segment.start_s for segment in segments}
+    compared_s = min(durations_s.values())
+    cut = [[each.cut(compared_s) for each in found] for found in parts]
+    deadline = Deadline(deadline_s)
+    differences = _differences(connection, cut, names, min_effect_sd, deadline)
+    shared = [each for each in differences if 0 not in each.count]
+    shared.sort(key=size_of, reverse=True)
+    compared = _groups(connection, groups)
+    outcomes = outcomes_of(connection, cut, options, deadline, min_effect_sd)
+    unread = any(None in each.count for each in differences)
+    return Comparison(
+        groups=compared,
+        compared_s=compared_s,
+        measures=outcomes.measures,
+        unknown=outcomes.unknown | ({"means of signals": OUT_OF_TIME} if unread else {}),
+        differences=tuple(shared[:limit]),
+        total=len(shared),
+        only_in=only_in(differences, list(groups)),
+        notes=(*notes, *_notes(compared), *_cut_notes(durations_s, compared_s)),
+    )
 
 
 def _repeats(connection: sqlite3.Connection, run_ids: Sequence[int]) -> dict[str, list[int]]:
     """Runs by robot, code and parameters, if that makes groups; by themselves where it does not."""
+    if not 1 <= len(run_ids) <= MOST_COMPARED or len(set(run_ids)) < len(run_ids):
+        raise InvalidInputError(f"give 1 to {MOST_COMPARED} different runs, not {list(run_ids)}")
     had = parameters_of(connection, run_ids)
     groups: dict[object, list[int]] = {}
     for run_id, run in zip(run_ids, run_infos(connection, run_ids), strict=True):
@@ -138,134 +181,36 @@ def _repeats(connection: sqlite3.Connection, run_ids: Sequence[int]) -> dict[str
     return {f"run{'s' * (len(each) > 1)} {', '.join(map(str, each))}": each for each in alike}
 
 
-@in_one_snapshot
-def compare_code(
-    connection: sqlite3.Connection,
-    *,
-    robot: str | None = None,
-    names: Sequence[str] = ("*",),
-    limit: int = 30,
-    options: EventOptions | None = None,
-    min_effect_sd: float = MIN_EFFECT_SD,
-    deadline_s: float = COMPARE_DEADLINE_S,
-) -> Comparison:
-    """Compare the runs before and after the last edit of the robot's controller.
-
-    An edit is seen by the SHA-256 of the controller file: "after" are the newest runs that share
-    one, "before" those just before them that share another; at most the newest 10 of each.
-
-    Raises:
-        NothingRecordedError: All runs had the same code.
-        UnknownRobotError, AmbiguousRobotError, UnknownSignalError: As they say.
-    """
+def _around_last_edit(connection: sqlite3.Connection, robot: str | None) -> dict[str, list[int]]:
     robot_id = resolve_robot(connection, robot, time.time()).id
     runs = connection.execute(_CODE_OF_RUNS, (robot_id,)).fetchall()
-    blocks: list[tuple[str | None, list[int]]] = []
-    for run_id, code in runs:
-        if not blocks or blocks[-1][0] != code:
-            if len(blocks) == 2:
-                break
-            blocks.append((code, []))
-        blocks[-1][1].append(run_id)
+    blocks = [[run_id for run_id, _ in each] for _, each in groupby(runs, lambda run: run[1])][:2]
     if len(blocks) < 2:
         raise NothingRecordedError(
             "every recorded run had the same controller file: there is no edit to compare across; "
             "give two or more run_ids (webots_list_runs has them)"
         )
-    (_, after), (_, before) = blocks
-    groups = {"before": before[:MOST_COMPARED][::-1], "after": after[:MOST_COMPARED][::-1]}
-    asked = _Asked(names, limit, options or EventOptions(), min_effect_sd, deadline_s)
-    return _compare(connection, groups, asked)
-
-
-@in_one_snapshot
-def compare_trials(
-    connection: sqlite3.Connection,
-    set_id: int,
-    *,
-    names: Sequence[str] = ("*",),
-    limit: int = 30,
-    options: EventOptions | None = None,
-    min_effect_sd: float = MIN_EFFECT_SD,
-    deadline_s: float = COMPARE_DEADLINE_S,
-) -> Comparison:
-    """Compare the runs of a trial set by their parameters; the best is the reference.
-
-    Its best five sets of parameters count, of each the runs that have a score, at most 10.
-
-    Raises:
-        InvalidInputError: There is no such set.
-        NothingRecordedError: It has no run with a score, or one has no state row.
-        UnknownSignalError: As it says.
-    """
-    found = scored_runs(connection, set_id)
-    groups = {name: found[name][:MOST_COMPARED] for name in list(found)[:MOST_SETS]}
-    asked = _Asked(names, limit, options or EventOptions(), min_effect_sd, deadline_s)
-    compared = _compare(connection, groups, asked)
-    if len(found) == len(groups):
-        return compared
-    note = f"the best {len(groups)} of {len(found)} sets of parameters"
-    return replace(compared, notes=(note, *compared.notes))
-
-
-@dataclass(frozen=True)
-class _Asked:
-    names: Sequence[str]
-    limit: int
-    options: EventOptions
-    min_effect_sd: float
-    deadline_s: float
-
-    def __post_init__(self) -> None:
-        if not 0 < self.min_effect_sd < math.inf:
-            raise InvalidInputError(f"min_effect_sd={self.min_effect_sd} must be a number above 0")
-
-
-def _compare(
-    connection: sqlite3.Connection, groups: dict[str, list[int]], asked: _Asked
-) -> Comparison:
-    options = asked.options
-    parts = [[_part(connection, run_id, options) for run_id in found] for found in groups.values()]
-    segments = [part.segment for found in parts for part in found]
-    durations_s = {segment.run_id: segment.end_s - segment.start_s for segment in segments}
-    compared_s = min(durations_s.values())
-    cut = [[each.cut(compared_s) for each in found] for found in parts]
-    deadline = Deadline(asked.deadline_s)
-    differences = _differences(connection, cut, asked, deadline)
-    shared = [each for each in differences if 0 not in each.count]
-    shared.sort(key=size_of, reverse=True)
-    compared = _groups(connection, groups)
-    outcomes = outcomes_of(connection, cut, options, deadline, asked.min_effect_sd)
-    unread = any(None in each.count for each in differences)
-    notes = _notes(compared) + _cut_notes(durations_s, compared_s)
-    return Comparison(
-        groups=compared,
-        compared_s=compared_s,
-        measures=outcomes.measures,
-        unknown=outcomes.unknown | ({"means of signals": OUT_OF_TIME} if unread else {}),
-        differences=tuple(shared[: asked.limit]),
-        total=len(shared),
-        only_in=only_in(differences, list(groups)),
-        notes=tuple(notes),
-    )
+    after, before = (each[:MOST_COMPARED][::-1] for each in blocks)
+    return {"before": before, "after": after}
 
 
 def _differences(
     connection: sqlite3.Connection,
     groups: Sequence[Sequence[RunPart]],
-    asked: _Asked,
+    names: Sequence[str],
+    min_effect_sd: float,
     deadline: Deadline,
 ) -> list[Difference]:
     """The numbers of those names, group by group; none for a single run."""
     parts = [part for group in groups for part in group]
     known = {name: signal for part in reversed(parts) for name, signal in part.known.items()}
-    found = resolve_signals(known, asked.names)
+    found = resolve_signals(known, names)
     numbers = [each for each in found if each.is_number and len(parts) > 1]
     summaries = [
         [_summarise(connection, part, numbers, deadline) for part in group] for group in groups
     ]
     tests = 2 * len(numbers)
-    return [difference_of(signal, summaries, tests, asked.min_effect_sd) for signal in numbers]
+    return [difference_of(signal, summaries, tests, min_effect_sd) for signal in numbers]
 
 
 def _notes(groups: Sequence[Group]) -> list[str]:
@@ -276,9 +221,6 @@ def _notes(groups: Sequence[Group]) -> list[str]:
     robots = list(dict.fromkeys(run.robot for run in runs))
     if len(robots) > 1:
         notes.append(f"these are runs of different robots: {', '.join(robots)}")
-    purged = [str(run.run_id) for run in runs if run.purged_rows]
-    if purged:
-        notes.append(f"rows of run {', '.join(purged)} were purged: their events are missing")
     return notes
 
 

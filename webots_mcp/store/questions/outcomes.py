@@ -27,7 +27,6 @@ from webots_mcp.store.detection.motion import (
 )
 from webots_mcp.store.detection.registry import asked_kinds
 from webots_mcp.store.questions.events import Found, search_events
-from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.questions.ways import read_way
 from webots_mcp.store.reading.changes import change_points
 from webots_mcp.store.reading.deadline import Deadline
@@ -41,10 +40,7 @@ _RATE: Final = " per min"
 NO_MODE: Final = (
     "no mode is known: publish one as a text, such as mode, or name the signal of one: mode=NAME"
 )
-OUT_OF_TIME: Final = (
-    "time limit reached before all rows were read: compare fewer runs at once, or ask again when "
-    "a server has rolled them up"
-)
+OUT_OF_TIME: Final = "time limit reached before all rows were read: compare fewer runs at once"
 _SPEED: Final = "mean_speed_m_s"
 
 
@@ -208,7 +204,7 @@ class _Outcome(NamedTuple):
         events: How many of each kind.
         unknown: What is not known of it, or not wholly, with why.
         unlooked: Kinds that were not looked for at all.
-        complete: All rows are there and were looked at.
+        complete: All rows were looked at.
     """
 
     run_id: int
@@ -234,7 +230,6 @@ def _outcome(
     connection: sqlite3.Connection, part: RunPart, options: EventOptions, deadline: Deadline
 ) -> _Outcome:
     run_id, duration_s = part.segment.run_id, part.segment.end_s - part.segment.start_s
-    purged = run_info(connection, run_id).purged_rows > 0
     figures: dict[str, float | None] = {}
     unknown: dict[str, tuple[str, ...]] = {}
     position = part.motion.position
@@ -269,7 +264,7 @@ def _outcome(
         Counter(event.kind for event in found.events),
         unknown,
         frozenset(kind for kind in verdicts.not_searched if verdicts.unlooked(kind)),
-        not purged and not deadline.passed,
+        not deadline.passed,
     )
 
 

@@ -81,9 +81,6 @@ def score_run(
     run, segment = run_info(connection, run_id), whole_run(connection, run_id)
     subject = Subject(fetch_run(connection, run_id).robot_id, run.robot, run_id)
     require_kinds(connection, score, run_id)
-    if run.purged_rows:
-        why = f"{run.purged_rows} rows of run {run_id} were purged: the rest is not the whole run"
-        return RunScore(run_id, score.text, None, why, run.duration_s, 0)
     if segment is None:
         why = f"run {run_id} has no state row: its controller published nothing"
         return RunScore(run_id, score.text, None, why, run.duration_s, 0)

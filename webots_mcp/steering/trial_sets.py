@@ -26,8 +26,8 @@ from webots_mcp.steering.target_robot import find_target
 from webots_mcp.steering.tuning import settable
 from webots_mcp.store.analysis.ranking import Ranked, Ranking
 from webots_mcp.store.parameters import Declared, declared_for
+from webots_mcp.store.questions.outcomes import way_of_run
 from webots_mcp.store.questions.score import require_kinds, unseen
-from webots_mcp.store.questions.ways import way_of_run
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.reading.subject import Subject

@@ -15,10 +15,9 @@ from webots_mcp.store.detection.motion import (
     doubt_of_unit,
     find_motion,
 )
-from webots_mcp.store.questions.ways import Way, read_way
-from webots_mcp.store.reading.coverage import row_before
+from webots_mcp.store.questions.outcomes import Way, read_way
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
-from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range
+from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range, row_before
 from webots_mcp.store.recording import View
 from webots_mcp.store.signals.catalogue import known_signals
 

@@ -22,9 +22,8 @@ from webots_mcp.plotting import plot
 from webots_mcp.questions.monitor import look_back
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.logs import LogFilter, Window, count_lines, newest_lines
-from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.questions.events import find_events, timeline
 from webots_mcp.store.questions.series import query_history
-from webots_mcp.store.questions.timeline import timeline
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.recording import Recording

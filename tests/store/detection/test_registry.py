@@ -18,8 +18,7 @@ from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import EventKind
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.questions.compare import compare_runs
-from webots_mcp.store.questions.events import find_events
-from webots_mcp.store.questions.timeline import timeline
+from webots_mcp.store.questions.events import find_events, timeline
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 

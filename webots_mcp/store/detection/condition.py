@@ -15,10 +15,9 @@ from webots_mcp.store.conditions_on_arrays import OnArrays, first_failure, posit
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import Alike, EventKind, NotSearchableError
 from webots_mcp.store.detection.search import Search
-from webots_mcp.store.reading.coverage import recorded_share
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.kept import kept_parts
-from webots_mcp.store.reading.ranges import Segment
+from webots_mcp.store.reading.ranges import Segment, recorded_share
 from webots_mcp.store.signals.catalogue import say_unknown
 
 _MOST_VALUES: Final = 8

@@ -21,7 +21,7 @@ from webots_mcp.store.detection.kind import (
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.images import count_kept_frames
 from webots_mcp.store.reading.changes import MOST_VALUES, Point, change_points, value_ended_s
-from webots_mcp.store.reading.gaps import frame_around, rhythm_in
+from webots_mcp.store.reading.frame_summary import frame_around, rhythm_in
 from webots_mcp.store.reading.kept import kept_stretches
 from webots_mcp.store.reading.ranges import Segment, just_after
 from webots_mcp.store.signals.registry import Signal

@@ -1,4 +1,4 @@
-"""`find_events`: what happened in a range, on one clock."""
+"""`find_events`: what happened in a range, on one clock; `timeline`: the same page by page."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.extent import Detection
 from webots_mcp.store.detection.grouping import grouped
 from webots_mcp.store.detection.motion import find_motion
-from webots_mcp.store.detection.registry import asked_kinds, kind_named
+from webots_mcp.store.detection.registry import asked_kinds, kind_named, stored_kinds
 from webots_mcp.store.detection.verdict import Ledger, Verdicts, count_by_kind
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import TimeRange
@@ -39,6 +39,7 @@ _ROW_AT: Final = (
 # Of an event in the one order of all: wall time, run, simulation time, kind, and its number among
 # those of one kind and moment. Pages and cursors go on from it.
 Place = tuple[float, int, float, str, int]
+MOST_ENTRIES: Final = 500
 
 
 @dataclass(frozen=True)
@@ -329,3 +330,70 @@ def _with_values(connection: sqlite3.Connection, event: Event, context: Sequence
     row = connection.execute(_ROW_AT, (event.run_id, event.start_s)).fetchone()
     leaves: dict[str, Value] = flatten(parse(row[0])) if row and context else {}
     return replace(event, around={signal.name: leaves.get(signal.name) for signal in context})
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """A page of the timeline.
+
+    Attributes:
+        cursor: Give it as `after` for the next page; None after the last event.
+        verdicts: What became of each kind in the whole range.
+    """
+
+    robot: str
+    events: tuple[Event, ...]
+    cursor: str | None
+    verdicts: Verdicts
+    notes: tuple[str, ...]
+
+
+@in_one_snapshot
+def timeline(
+    connection: sqlite3.Connection,
+    time_range: TimeRange,
+    options: EventOptions | None = None,
+    *,
+    limit: int = 50,
+    after: str | None = None,
+    deadline_s: float = QUESTION_DEADLINE_S,
+) -> Timeline:
+    """Events, commands, log lines and pictures of a range in the order in which they happened.
+
+    Args:
+        connection: Any.
+        time_range: From `find_range`.
+        options: What counts as an event; None for what was stored when it happened (runs, gaps,
+            changes, commands, logs from the level info on, notices, pictures).
+        limit: 1 to 500.
+        after: The `cursor` of the page before.
+        deadline_s: After it, what was found so far is the answer, and the notes say so.
+
+    Raises:
+        InvalidInputError: `limit` is out of bounds, or `after` is no cursor.
+    """
+    if not 1 <= limit <= MOST_ENTRIES:
+        raise InvalidInputError(f"limit={limit} must be from 1 to {MOST_ENTRIES}")
+    options = options or EventOptions(kinds=stored_kinds(), log_level="info")
+    found = search_events(
+        connection, time_range, options, around=(), group=False, deadline_s=deadline_s
+    )
+    border = _read_page_cursor(after) if after else None
+    left = [entry for entry in found.entries if border is None or entry[0] > border]
+    page = left[:limit]
+    return Timeline(
+        robot=time_range.robot,
+        events=tuple(event for _, event in page),
+        cursor=json.dumps(page[-1][0]) if len(left) > limit else None,
+        verdicts=found.verdicts,
+        notes=found.notes,
+    )
+
+
+def _read_page_cursor(text: str) -> Place:
+    try:
+        return read_place(json.loads(text))
+    except (ValueError, TypeError) as error:
+        raise InvalidInputError(
+            f"{text!r} is not a cursor: give the `cursor` of the previous page unchanged"
+        ) from error

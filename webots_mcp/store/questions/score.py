@@ -16,11 +16,10 @@ from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.registry import kind_names
 from webots_mcp.store.questions.events import search_events
 from webots_mcp.store.questions.runs import run_info
-from webots_mcp.store.reading.coverage import unrecorded
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.kept import kept_parts
-from webots_mcp.store.reading.ranges import TimeRange, whole_run
+from webots_mcp.store.reading.ranges import TimeRange, unrecorded, whole_run
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.reading.subject import Subject
 from webots_mcp.store.run_rows import fetch_run

@@ -14,12 +14,16 @@ from webots_mcp.naming import listed
 from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.rhythm import Gap
 from webots_mcp.store.analysis.summary import LARGEST, Summary, summarise_numbers, with_extremes
-from webots_mcp.store.reading.buckets import Buckets, buckets_of, cells_of
 from webots_mcp.store.reading.changes import Changes, Point, change_points
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.frame import Frame, read_frame, read_kept
-from webots_mcp.store.reading.frame_summary import summary_of
-from webots_mcp.store.reading.gaps import rhythm_in
+from webots_mcp.store.reading.frame_summary import (
+    Buckets,
+    buckets_of,
+    cells_of,
+    rhythm_in,
+    summary_of,
+)
 from webots_mcp.store.reading.ranges import Segment, TimeRange, recorded_bounds
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.signals.catalogue import signals_of

@@ -30,7 +30,7 @@ from webots_mcp.store.analysis.summary import (
 )
 from webots_mcp.store.analysis.swings import LEAST_HALF_SWINGS, Swing, find_swings
 from webots_mcp.store.reading.frame import Frame, Zones
-from webots_mcp.store.reading.moments import shown_time
+from webots_mcp.store.reading.ranges import shown_time
 from webots_mcp.store.signals.registry import Signal
 
 STRAIGHT_R2: Final = 0.8  # a line that explains less is not how a person would describe it

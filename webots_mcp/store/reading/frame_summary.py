@@ -1,16 +1,34 @@
-"""What the numbers of a signal in a frame come to; of many rows from what its chunks come to."""
+"""What the rows of a frame come to: counts, extremes, means, in all and in buckets, and gaps."""
 
 from __future__ import annotations
 
 import math
-from typing import Final
+import sqlite3
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import count
+from typing import Final, NamedTuple
 
-from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.analysis.summary import Summary, summarise_numbers
-from webots_mcp.store.reading.frame import Frame, Zones
+from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
+from webots_mcp.store.analysis.rhythm import (
+    GAP_INTERVALS,
+    Rhythm,
+    gaps_in,
+    interruptions,
+    rhythm_of,
+    usual_interval_s,
+)
+from webots_mcp.store.analysis.summary import LARGEST, NO_LENGTH, Summary, summarise_numbers
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.frame import Frame, Zones, read_frame
+from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.signals.registry import Signal
 
 FULL_ROWS: Final = 120_000  # of which every value is looked at; of more there are 100 chunks
+_SAMPLE_ROWS: Final = 2000
+_ROWS_AROUND: Final = 20  # before and after a stretch: they tell what is usual
+_NICE: Final = (1, 1.5, 2, 3, 4, 5, 6, 8)
+_DUST: Final = 1e-9  # of a bucket's length: what a float's rounding puts before a border is behind
 
 
 def reads_values(frame: Frame, signal: Signal) -> bool:
@@ -67,3 +85,205 @@ def _time_of(
     times, numbers = frame.rows(start, start + int(zones.row_count[place])).usable(name)
     rows = np.flatnonzero(numbers == value) if value is not None else np.arange(len(times))
     return float(times[rows[-1 if last else 0]])
+
+
+def frame_around(connection: sqlite3.Connection, segment: Segment, deadline: Deadline) -> Frame:
+    """A segment with some rows before and after it: a gap at its end, or all around it, shows."""
+    run = read_frame(connection, Segment(segment.run_id, -math.inf, math.inf), deadline)
+    start, stop = run.places([segment.start_s, segment.end_s]).tolist()
+    return run.rows(start - _ROWS_AROUND, stop + _ROWS_AROUND)
+
+
+def rhythm_in(frame: Frame) -> Rhythm:
+    """The rhythm of the rows of a frame; of many, only chunks that have a gap are opened.
+
+    The median is then that of the first 2,000 rows.
+    """
+    if len(frame) <= FULL_ROWS:
+        return rhythm_of(frame.times)
+    interval_s = usual_interval_s(frame.rows(0, _SAMPLE_ROWS).times)
+    if interval_s is None:
+        return rhythm_of(frame.times)
+    around = frame.around_steps(GAP_INTERVALS * interval_s)
+    gaps = [gap for times in around for gap in gaps_in(times, interval_s)]
+    return Rhythm(interval_s, interruptions(gaps))
+
+
+@dataclass(frozen=True)
+class Buckets:
+    """Buckets that begin at multiples of their length, the empty ones as well.
+
+    Attributes:
+        step_s: Length of a bucket; None where each row is one.
+        starts_s: Begin of each.
+        edges: Place of the first row of each in the frame, and after the last one how many rows
+            there are.
+    """
+
+    step_s: float | None
+    starts_s: Array
+    edges: Indexes
+
+
+class Cells(NamedTuple):
+    """What a signal comes to in each bucket; NaN where it has no usable number there.
+
+    Attributes:
+        mean: Of an angle the circular one, in its unit: below 0 only where its values are.
+    """
+
+    counts: Indexes
+    min: Array
+    max: Array
+    mean: Array
+    last: Array
+
+
+def buckets_of(frame: Frame, max_points: int, least_step_s: float = 0.0) -> Buckets:
+    """At most so many buckets for the rows of a frame; a row is one where they are as few.
+
+    Args:
+        frame: Whose rows.
+        max_points: The most buckets.
+        least_step_s: No bucket is shorter; above 0 no row is a bucket of its own.
+    """
+    rows = len(frame)
+    if not rows or (least_step_s <= 0 and rows <= max_points):
+        return Buckets(None, frame.times, np.arange(rows + 1))
+    first_s, last_s = frame.bounds_s
+    step_s = _step(first_s, last_s, max_points, least_step_s)
+    numbers: Array = np.arange(
+        _number(first_s, step_s), _number(last_s, step_s) + 2, dtype=np.float64
+    )
+    borders_s: Array = (numbers - _DUST) * step_s
+    edges = frame.places(borders_s)
+    edges[0], edges[-1] = 0, rows
+    starts_s: Array = np.round(numbers[:-1] * step_s, 9)
+    return Buckets(step_s, starts_s, edges)
+
+
+def _number(time_s: float, step_s: float) -> int:
+    """Which bucket holds a time."""
+    return math.floor(time_s / step_s + _DUST)
+
+
+def _step(first_s: float, last_s: float, max_points: int, least_s: float) -> float:
+    """The shortest round bucket length that needs no more buckets."""
+    for step_s in _round_steps(max(least_s, (last_s - first_s) / max_points / 10, 1e-9)):
+        if step_s >= least_s and _number(last_s, step_s) - _number(first_s, step_s) < max_points:
+            return step_s
+    raise AssertionError("the steps never end")
+
+
+def _round_steps(at_least_s: float) -> Iterator[float]:
+    for exponent in count(math.floor(math.log10(at_least_s))):
+        for nice in _NICE:
+            yield nice * 10**exponent if exponent >= 0 else nice / 10**-exponent
+
+
+def cells_of(frame: Frame, signal: Signal, buckets: Buckets, kept: Frame | None) -> Cells:
+    """What a signal comes to in each bucket.
+
+    Args:
+        frame: The rows.
+        signal: A numeric one.
+        buckets: From `buckets_of` of the same frame.
+        kept: Rows that only kept stretches have: they count for extremes.
+    """
+    cells = _cells(_parts(frame, signal, buckets), signal.turn, buckets.edges)
+    if kept is not None and len(buckets.starts_s):
+        times, numbers = kept.usable(signal.name)
+        places = np.searchsorted(buckets.starts_s, times + 1e-9, "right") - 1
+        np.fmin.at(cells.min, np.maximum(places, 0), numbers)
+        np.fmax.at(cells.max, np.maximum(places, 0), numbers)
+    return cells
+
+
+class _Parts(NamedTuple):
+    """Rows, and chunks that lie within one bucket, in order: what each comes to."""
+
+    first_row: Indexes
+    counts: Indexes
+    min: Array
+    max: Array
+    sum: Array
+    last: Array
+
+
+def _parts(frame: Frame, signal: Signal, buckets: Buckets) -> _Parts:
+    """Chunks that no border of a bucket cuts are not opened, where there are many rows."""
+    name = signal.name
+    if reads_values(frame, signal):
+        return _of_rows(0, frame.numbers(name))
+    zones = frame.zones(name)
+    edges = buckets.edges[buckets.edges < len(frame)]
+    borders = np.searchsorted(zones.first_row, edges, "right") - 1
+    cut: Flags = np.zeros(len(zones), np.bool_)
+    cut[borders[zones.first_row[borders] != edges]] = True
+    whole = ~cut & (zones.value_count > 0) & ~np.isnan(zones.sum)
+    chunks = _Parts(
+        zones.first_row[whole],
+        zones.value_count[whole],
+        zones.min[whole],
+        zones.max[whole],
+        zones.sum[whole],
+        zones.last[whole],
+    )
+    opened = [_of_rows(*each) for each in frame.opened(name, cut)]
+    return _in_order([chunks, *opened])
+
+
+def _in_order(some: Sequence[_Parts]) -> _Parts:
+    joined = [np.concatenate(column) for column in zip(*some, strict=True)]
+    order = np.argsort(joined[0], kind="stable")
+    return _Parts(*(column[order] for column in joined))
+
+
+def _of_rows(start: int, numbers: Array) -> _Parts:
+    """Each row that has a usable number."""
+    rows = np.flatnonzero(np.abs(numbers) <= LARGEST)
+    held = numbers if len(rows) == len(numbers) else numbers[rows]
+    return _Parts(rows + start, np.ones(len(rows), np.intp), held, held, held, held)
+
+
+def _cells(parts: _Parts, turn: float | None, edges: Indexes) -> Cells:
+    cells = len(edges) - 1
+    places = np.searchsorted(edges, parts.first_row, "right") - 1
+    starts = np.flatnonzero(np.diff(places, prepend=-1))
+    if not len(starts):
+        nothing = (np.full(cells, np.nan) for _ in range(4))
+        return Cells(np.zeros(cells, np.intp), *nothing)
+    filled = places[starts]
+
+    def spread(figures: Array) -> Array:
+        whole = np.full(cells, np.nan)
+        whole[filled] = figures
+        return whole
+
+    counts = np.add.reduceat(parts.counts, starts)
+    low = np.minimum.reduceat(parts.min, starts)
+    high = np.maximum.reduceat(parts.max, starts)
+    if turn is None:
+        mean = np.add.reduceat(parts.sum, starts) / counts
+        mean = np.minimum(np.maximum(mean, low), high)  # sums round
+    else:
+        mean = _circular_means(parts.sum, starts, counts, turn, low)
+    count_of: Indexes = np.zeros(cells, np.intp)
+    count_of[filled] = counts
+    last = parts.last[np.append(starts[1:], len(places)) - 1]
+    return Cells(count_of, spread(low), spread(high), spread(mean), spread(last))
+
+
+def _circular_means(
+    values: Array, starts: Indexes, counts: Indexes, turn: float, low: Array
+) -> Array:
+    """The direction of the resultant vector; NaN where the vectors cancel out.
+
+    K. V. Mardia, P. E. Jupp, Directional Statistics (2000), section 2.2.1.
+    """
+    angles = values * (math.tau / turn)
+    sines = np.add.reduceat(np.sin(angles), starts)
+    cosines = np.add.reduceat(np.cos(angles), starts)
+    means = np.arctan2(sines, cosines) * (turn / math.tau)
+    means[np.hypot(sines, cosines) < NO_LENGTH * counts] = np.nan
+    return np.where((means < 0) & (low >= 0), means + turn, means)

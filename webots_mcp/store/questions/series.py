@@ -13,7 +13,7 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.naming import listed
 from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.rhythm import Gap
-from webots_mcp.store.analysis.summary import LARGEST, Summary, summarise_numbers, with_extremes
+from webots_mcp.store.analysis.summary import LARGEST, Summary
 from webots_mcp.store.reading.changes import Changes, Point, change_points
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.frame import Frame, read_frame, read_kept
@@ -235,10 +235,7 @@ def signals_left(names: Sequence[str]) -> Iterator[str]:
 
 def _columns(frame: Frame, signal: Signal, buckets: Buckets, kept: Frame | None) -> NumberColumns:
     cells = cells_of(frame, signal, buckets, kept)
-    whole, too_large = summary_of(frame, signal), 0
-    if kept is not None:
-        of_kept = summarise_numbers(*kept.usable(signal.name), turn=signal.turn)
-        whole = with_extremes(whole, of_kept)
+    whole, too_large = summary_of(frame, signal, kept), 0
     if not whole.present:
         too_large = int(np.count_nonzero(np.abs(frame.numbers(signal.name)) > LARGEST))
     return NumberColumns(

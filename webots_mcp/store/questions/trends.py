@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.analysis.features import find_spikes
-from webots_mcp.store.analysis.summary import LARGEST, Summary, with_extremes
+from webots_mcp.store.analysis.features import Spike, find_spikes
+from webots_mcp.store.analysis.summary import LARGEST, with_extremes
 from webots_mcp.store.analysis.swings import SHORTEST_PERIOD_ROWS
 from webots_mcp.store.chunks import making
 from webots_mcp.store.questions.series import STATES_SHARE, signals_left
@@ -24,7 +24,7 @@ from webots_mcp.store.reading import frame_summary
 from webots_mcp.store.reading.changes import Changes, change_points
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.frame import Frame, read_frame, read_kept
-from webots_mcp.store.reading.frame_summary import reads_values, summary_of, summary_of_zones
+from webots_mcp.store.reading.frame_summary import reads_values, summary_of
 from webots_mcp.store.reading.ranges import Segment, TimeRange, recorded_bounds
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.signals.catalogue import signals_of
@@ -181,36 +181,27 @@ def _without_value(frame: Frame, found: Mapping[str, Trend | None]) -> Iterator[
 
 
 def _trend(frame: Frame, signal: Signal, kept: Frame | None) -> Trend | None:
-    """That of every value; of many rows that of means."""
-    if not reads_values(frame, signal):
-        return _trend_of_chunks(frame, signal, kept)
-    times, numbers = frame.usable(signal.name)
-    if not len(numbers):
-        return None
+    """That of every value; of many rows that of the means of chunks."""
+    name, is_long = signal.name, len(frame) > frame_summary.FULL_ROWS
     summary = summary_of(frame, signal)
-    course = course_of_values(times, numbers, signal.turn, summary)
-    is_long = len(frame) > frame_summary.FULL_ROWS
-    spikes = None if is_long else find_spikes(times, numbers, signal.turn)
-    if is_long:
-        course = in_means(course, making.GROUP_ROWS)
-    too_large = int(np.count_nonzero(np.abs(frame.numbers(signal.name)) > LARGEST))
-    return judge(signal, _with_kept(signal, summary, kept), course, spikes, too_large)
-
-
-def _trend_of_chunks(frame: Frame, signal: Signal, kept: Frame | None) -> Trend | None:
-    zones = frame.zones(signal.name)
-    summary = summary_of_zones(frame, signal.name, zones)
     if summary.sum is None:
         return None
-    course = course_of_means(frame, signal.name, zones)
-    return judge(signal, _with_kept(signal, summary, kept), course)
-
-
-def _with_kept(signal: Signal, summary: Summary, kept: Frame | None) -> Summary:
-    """With the extremes of what only kept stretches have."""
-    if kept is None or signal.name not in kept:
-        return summary
-    return with_extremes(summary, summary_of(kept, signal))
+    spikes: list[Spike] | None = None
+    too_large: int | None = None
+    if reads_values(frame, signal):
+        times, numbers = frame.usable(name)
+        course = course_of_values(times, numbers, signal.turn, summary)
+        if is_long:
+            course = in_means(course, making.GROUP_ROWS)
+        else:
+            spikes = find_spikes(times, numbers, signal.turn)
+        too_large = int(np.count_nonzero(np.abs(frame.numbers(name)) > LARGEST))
+    else:
+        course = course_of_means(frame, name, frame.zones(name))
+        course = replace(course, counted=None if signal.turn is None else summary)
+    if kept is not None and name in kept:
+        summary = with_extremes(summary, summary_of(kept, signal))
+    return judge(signal, summary, course, spikes, too_large)
 
 
 def _state_trends(

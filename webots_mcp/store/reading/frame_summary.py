@@ -18,7 +18,13 @@ from webots_mcp.store.analysis.rhythm import (
     rhythm_of,
     usual_interval_s,
 )
-from webots_mcp.store.analysis.summary import LARGEST, NO_LENGTH, Summary, summarise_numbers
+from webots_mcp.store.analysis.summary import (
+    LARGEST,
+    NO_LENGTH,
+    Summary,
+    summarise_numbers,
+    with_extremes,
+)
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import Frame, Zones, read_frame
 from webots_mcp.store.reading.ranges import Segment
@@ -32,25 +38,48 @@ _DUST: Final = 1e-9  # of a bucket's length: what a float's rounding puts before
 
 
 def reads_values(frame: Frame, signal: Signal) -> bool:
-    """Whether every value is looked at; the turns of an angle are counted from row to row."""
-    return len(frame) <= FULL_ROWS or signal.turn is not None
+    """Whether every value is looked at: of few rows, and where turns of an angle are counted."""
+    if len(frame) <= FULL_ROWS or signal.turn is None:
+        return len(frame) <= FULL_ROWS
+    zones = frame.zones(signal.name)
+    held = ~np.isnan(zones.sum)
+    if not held.any():
+        return False
+    between = np.abs(zones.first[held][1:] - zones.last[held][:-1])
+    largest_step = max(zones.largest_step[held].max(), between.max(initial=0.0))
+    span = zones.max[held].max() - zones.min[held].min()
+    return bool(span > signal.turn / 2 or largest_step > signal.turn / 4)
 
 
-def summary_of(frame: Frame, signal: Signal) -> Summary:
-    """Counts, extremes, mean and deviation of all rows; those of an angle are circular as well."""
+def summary_of(frame: Frame, signal: Signal, kept: Frame | None = None) -> Summary:
+    """Counts, extremes, mean and deviation of all rows; those of an angle are circular as well.
+
+    Args:
+        frame: The rows.
+        signal: A numeric one.
+        kept: Rows that only kept stretches have: they count for extremes.
+    """
+    if kept is not None and signal.name in kept:
+        return with_extremes(summary_of(frame, signal), summary_of(kept, signal))
     if reads_values(frame, signal):
         numbers = frame.usable(signal.name)
         return summarise_numbers(*numbers, rows=len(frame), turn=signal.turn)
-    return summary_of_zones(frame, signal.name, frame.zones(signal.name))
+    found = _summary_of_zones(frame, signal.name)
+    if signal.turn is None or not found.present:
+        return found
+    angles = frame.numbers(signal.name) * (math.tau / signal.turn)
+    angles = angles[np.abs(angles) <= LARGEST]
+    return found._replace(sines=float(np.sin(angles).sum()), cosines=float(np.cos(angles).sum()))
 
 
-def summary_of_zones(frame: Frame, name: str, zones: Zones) -> Summary:
+def _summary_of_zones(frame: Frame, name: str) -> Summary:
     """The same from chunks; only those with the ends and the extremes are opened.
 
     The squares are combined by the formula of T. F. Chan, G. H. Golub, R. J. LeVeque, "Algorithms
     for computing the sample variance", The American Statistician 37 (1983): each chunk's own plus
     count * (its mean - the mean) ** 2.
     """
+    zones = frame.zones(name)
     held = np.flatnonzero(~np.isnan(zones.sum))
     if not len(held):
         return Summary(len(frame))
@@ -213,7 +242,7 @@ class _Parts(NamedTuple):
 def _parts(frame: Frame, signal: Signal, buckets: Buckets) -> _Parts:
     """Chunks that no border of a bucket cuts are not opened, where there are many rows."""
     name = signal.name
-    if reads_values(frame, signal):
+    if len(frame) <= FULL_ROWS or signal.turn is not None:
         return _of_rows(0, frame.numbers(name))
     zones = frame.zones(name)
     edges = buckets.edges[buckets.edges < len(frame)]

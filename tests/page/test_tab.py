@@ -72,7 +72,7 @@ def test_what_no_bridge_writes_is_said_on_the_page_and_logged_once(
     assert len([each for each in caplog.records if each.exc_info]) == 1
 
 
-def test_what_no_server_rolls_up_is_rolled_up_beside_the_page(tmp_path: Path) -> None:
+def test_what_no_server_puts_into_chunks_is_beside_the_page(tmp_path: Path) -> None:
     build(tmp_path / DATABASE_NAME, 2 * LEAST_ROWS, rolled=False)
     recording = Recording(tmp_path / DATABASE_NAME, tmp_path, read_only=True)
     chunk_maker = ChunkMaker(recording)
@@ -86,7 +86,7 @@ def test_what_no_server_rolls_up_is_rolled_up_beside_the_page(tmp_path: Path) ->
         assert watermark(connection) == 2 * LEAST_ROWS
 
 
-def test_of_a_page_without_a_recording_nothing_is_rolled_up(tmp_path: Path) -> None:
+def test_of_a_page_without_a_recording_no_chunk_is_made(tmp_path: Path) -> None:
     chunk_maker = ChunkMaker(Recording(tmp_path / DATABASE_NAME, tmp_path, read_only=True))
     chunk_maker.look()
     assert (chunk_maker.rounds, chunk_maker.says) == (0, "")

@@ -154,7 +154,7 @@ async def test_the_times_in_more_values_than_are_shown_are_told_together(
     assert sum(mode["time_by_value_s"].values()) == pytest.approx(30.0)
 
 
-async def test_answers_are_the_same_before_and_after_rolling_up(
+async def test_answers_are_the_same_before_and_after_chunks_are_made(
     story: Path, tmp_path: Path
 ) -> None:
     rolled = copy_of(story, tmp_path / "webots.db")

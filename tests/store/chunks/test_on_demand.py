@@ -102,7 +102,7 @@ def test_a_database_that_another_holds_locked_is_read_as_it_is(recording: Record
     ],
     ids=lambda command: command[0],
 )
-def test_questions_of_the_command_line_roll_up_before_they_answer(
+def test_questions_of_the_command_line_make_chunks_before_they_answer(
     recording: Recording,
     command: list[str],
     tmp_path: Path,

@@ -65,16 +65,16 @@ def test_of_a_mode_that_is_a_number_the_way_to_its_changes_is_named(
     assert [round(each.start_s, 1) for each in found.events] == [3.0, 6.0]
 
 
-@pytest.mark.parametrize("rolled_up", [True, False])
+@pytest.mark.parametrize("in_chunks", [True, False])
 def test_few_whole_numbers_that_are_named_like_a_mode_are_one(
-    empty: sqlite3.Connection, *, rolled_up: bool
+    empty: sqlite3.Connection, *, in_chunks: bool
 ) -> None:
     recorder = start_run(empty)
     for step in range(90):
         phase_rad, command = step * 0.25 % 6.25, max(-1.0, min(1.0, math.sin(step) * 2))
         others = {"phase": phase_rad, "action": command, "loop_status": step}
         recorder.publish(step * 0.1, {"arm": {"driveMode": step // 30}, **others})
-    if rolled_up:
+    if in_chunks:
         make_chunks(empty, 100_000)
     found = changes(empty)
     assert [(each.name, each.details["after"]) for each in found.events] == [

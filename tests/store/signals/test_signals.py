@@ -153,7 +153,7 @@ def test_a_signal_that_changes_its_kind_is_told_the_same_before_and_after_rollin
     assert (list_signals(empty), trends(empty, find_range(empty, Scope()))) == before
 
 
-def test_rows_not_rolled_up_yet_are_in_the_list(empty: sqlite3.Connection) -> None:
+def test_rows_in_no_chunk_yet_are_in_the_list(empty: sqlite3.Connection) -> None:
     recorder = start_run(empty)
     recorder.publish(0.0, {"x": 1.0})
     make_chunks(empty)

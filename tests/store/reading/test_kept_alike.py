@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import uuid
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Any
 
@@ -37,7 +37,7 @@ _STRETCH = (
 
 
 @contextmanager
-def recorded(slope: float, kept: tuple[int, int] | None, chunks: bool) -> Iterator[Any]:
+def recorded(slope: float, kept: tuple[int, int] | None, chunks: bool) -> Generator[Any]:
     """One run, in which rows [start, stop) have the calls between them as well."""
     with memory_connection() as connection:
         recorder = start_run(connection)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sqlite3
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -12,7 +13,7 @@ from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.liveness import dead_sessions
-from webots_mcp.naming import Value, flatten
+from webots_mcp.naming import flatten
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.extent import Detection
 from webots_mcp.store.detection.grouping import grouped
@@ -20,7 +21,8 @@ from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.detection.registry import asked_kinds, kind_named, stored_kinds
 from webots_mcp.store.detection.verdict import Ledger, Verdicts, count_by_kind
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
-from webots_mcp.store.reading.ranges import TimeRange
+from webots_mcp.store.reading.frame import read_frame
+from webots_mcp.store.reading.ranges import Segment, TimeRange, just_after
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.signals.catalogue import known_signals, resolve_signals
 from webots_mcp.store.signals.flatten import parse
@@ -328,8 +330,14 @@ def _with_values(connection: sqlite3.Connection, event: Event, context: Sequence
     if event.count > 1:
         return event
     row = connection.execute(_ROW_AT, (event.run_id, event.start_s)).fetchone()
-    leaves: dict[str, Value] = flatten(parse(row[0])) if row and context else {}
-    return replace(event, around={signal.name: leaves.get(signal.name) for signal in context})
+    if row is not None:
+        leaves = flatten(parse(row[0])) if context else {}
+        return replace(event, around={signal.name: leaves.get(signal.name) for signal in context})
+    before = Segment(event.run_id, -math.inf, just_after(event.start_s))  # whose rows are deleted
+    frame = read_frame(connection, before, Deadline())
+    newest = frame.rows(len(frame) - 1, len(frame))
+    values = {signal.name: (newest.values(signal.name) or [None])[0] for signal in context}
+    return replace(event, around=values)
 
 
 @dataclass(frozen=True)

@@ -204,7 +204,8 @@ def search_events(
         ledger.not_searched(kind.name, "nothing was recorded in that range")
     over = _runs_over(connection, [segment.run_id for segment in segments])
     found = [replace(e, ongoing=False) if e.ongoing and e.run_id in over else e for e in found]
-    entries = placed(grouped(found, known) if group else found)
+    found = grouped(found, known) if group else found
+    entries = placed(found)
     return Found(
         time_range.robot,
         tuple(entry for entry in entries if not after or _is_left(entry[0], borders)),

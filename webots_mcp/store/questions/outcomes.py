@@ -306,7 +306,9 @@ def _outcome(
     if not modes:
         unknown["share of each mode"] = (OUT_OF_TIME if deadline.passed else NO_MODE,)
     found = _events(connection, part, options, deadline)
-    verdicts = found.verdicts
+    verdicts, counts = found.verdicts, Counter(event.kind for event in found.events)
+    kinds = sorted(asked_kinds(options), key=lambda kind: not kind.stored)
+    counts = {kind.name: counts[kind.name] for kind in kinds}
     if deadline.passed:
         unknown[f"events{_RATE}"] = (OUT_OF_TIME,)
     else:
@@ -316,7 +318,7 @@ def _outcome(
         duration_s,
         figures,
         bool(modes),
-        Counter(event.kind for event in found.events),
+        Counter({kind: count for kind, count in counts.items() if count}),
         unknown,
         frozenset(kind for kind in verdicts.not_searched if verdicts.unlooked(kind)),
         not deadline.passed,

@@ -70,6 +70,19 @@ def test_a_mode_of_an_earlier_run_in_which_it_moved_is_evidence(empty: sqlite3.C
     assert stuck.details["evidence_for"] == "in mode S3, in which it moved at 0.2 m/s in run 1"
 
 
+def test_an_earlier_run_without_a_position_tells_nothing_of_its_modes(
+    empty: sqlite3.Connection,
+) -> None:
+    earlier = start_run(empty)
+    for step in range(40):
+        earlier.publish(step * 1.0, {"mode": "S3"})
+    recorder = Recorder(empty, WALL_START_S + 1000)
+    recorder.run(1, 1)
+    for step in range(100):
+        recorder.publish(step * 0.1, {"mode": "S3", "gps": {"x": 1, "y": 0}})
+    assert ask(empty, "stuck", bounds={"run_id": 2}).events == ()
+
+
 def test_what_stood_is_told_also_where_nothing_shows_that_it_was_stuck(
     empty: sqlite3.Connection,
 ) -> None:

@@ -161,3 +161,16 @@ def test_rows_in_no_chunk_yet_are_in_the_list(empty: sqlite3.Connection) -> None
     x, y = list_signals(empty).signals
     assert (x.rows, x.min, x.max, x.last) == (2, 1.0, 5.0, 5.0)
     assert (y.rows, y.kind, y.missing) == (1, "null", 2)
+
+
+def test_a_name_and_a_kind_in_the_midst_of_rows_in_no_chunk_are_known(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = start_run(empty)
+    for step in range(900):
+        state: dict[str, object] = {"x": step, "front": "n/a" if step == 450 else step}
+        recorder.publish(step * 0.1, state | ({"fault": 7} if 300 <= step < 310 else {}))
+    known = catalogue(empty, find_subject(empty, None, 1))
+    assert (known["front"].kind, known["fault"].kind) == ("text", "num")
+    told = trends(empty, find_range(empty, Scope(run_id=1)))
+    assert "fault" in [trend.name for trend in told.runs[0].numbers]

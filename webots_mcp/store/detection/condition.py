@@ -18,13 +18,14 @@ from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.kept import kept_parts
 from webots_mcp.store.reading.ranges import Segment, recorded_share
+from webots_mcp.store.reading.wall_time import frame_of_purged
 from webots_mcp.store.signals.catalogue import say_unknown
 
 _MOST_VALUES: Final = 8
-_EARLIER_S: Final = 10.0  # before a range, where its earlier rows were purged
-_SOME_BEFORE: Final = (  # what was there last, for `changed` and `rate`
+_ROWS_BEFORE: Final = 20  # a range: what was there last, for `changed` and `rate`
+_SOME_BEFORE: Final = (
     "SELECT min(sim_time_s) FROM (SELECT sim_time_s FROM state WHERE run_id = ? "
-    "AND sim_time_s < ? ORDER BY sim_time_s DESC LIMIT 20)"
+    f"AND sim_time_s < ? ORDER BY sim_time_s DESC LIMIT {_ROWS_BEFORE})"
 )
 
 
@@ -60,8 +61,12 @@ def condition_events(search: Search) -> Iterator[Event]:
 def _read(search: Search, segment: Segment, condition: Condition) -> Frame:
     """The rows of a segment, and those before it as far as the condition remembers."""
     run_id, start_s = segment.run_id, segment.start_s
-    (before_s,) = search.connection.execute(_SOME_BEFORE, (run_id, start_s)).fetchone()
-    known_from_s = start_s - _EARLIER_S if before_s is None else before_s
+    (known_from_s,) = search.connection.execute(_SOME_BEFORE, (run_id, start_s)).fetchone()
+    if (run := frame_of_purged(search.connection, run_id)) is not None:
+        place = int(run.places([start_s])[0])
+        before = run.rows(place - _ROWS_BEFORE, place)
+        known_from_s = before.bounds_s[0] if len(before) else None
+    known_from_s = start_s if known_from_s is None else known_from_s
     longer = replace(segment, start_s=min(known_from_s, start_s - condition.remembers_s))
     every_call = bool(kept_parts(search.connection, run_id, longer.start_s, segment.end_s))
     frame = read_frame(search.connection, longer, search.deadline, every_call=every_call)

@@ -176,7 +176,7 @@ def tracks_in(
     rows = np.flatnonzero(np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M)
     tracks = tracks_of(frame.times[rows], x[rows], y[rows], noise.position_m, noise.rows)
     ends = np.cumsum([len(track.times) for track in tracks])
-    return tracks, np.split(rows, ends[:-1])
+    return tracks, np.split(rows, ends)[:-1]
 
 
 def doubt_of_length(way: PathLength) -> str | None:

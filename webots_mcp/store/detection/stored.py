@@ -10,6 +10,7 @@ from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.naming import Value
+from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.detection.event import LEVELS, Event
 from webots_mcp.store.detection.kind import (
     Alike,
@@ -24,6 +25,7 @@ from webots_mcp.store.reading.changes import MOST_VALUES, Point, change_points, 
 from webots_mcp.store.reading.frame_summary import frame_around, rhythm_in
 from webots_mcp.store.reading.kept import kept_stretches
 from webots_mcp.store.reading.ranges import Segment, just_after
+from webots_mcp.store.reading.wall_time import frame_of_purged
 from webots_mcp.store.signals.registry import Signal
 
 MOST_OF_A_KIND: Final = 2000  # newest rows of a table that are looked at, per run
@@ -265,8 +267,7 @@ def command_events(search: Search) -> Iterator[Event]:
         finished_wall_s, end_s, result, error = finished
         wall_s = created_s if claimed_s is None else claimed_s
         if start_s is None:
-            span = (here.run_id, here.holds_from_s, here.holds_to_s, wall_s)
-            (start_s,) = connection.execute(_SIM_AT_WALL, span).fetchone() or (None,)
+            start_s = _sim_time_at(search, wall_s)
         if start_s is None or not here.holds_from_s <= start_s < here.holds_to_s:
             continue
         details: dict[str, Any] = {"id": command_id, "status": status}
@@ -278,6 +279,19 @@ def command_events(search: Search) -> Iterator[Event]:
         ongoing = status in ("pending", "claimed")
         place = (here.run_id, start_s, end_s, wall_s)
         yield Event("command", *place, action, details, ongoing=ongoing)
+
+
+def _sim_time_at(search: Search, wall_s: float) -> float | None:
+    """Of the last row of the segment at or before a wall time; None without any."""
+    here = search.segment
+    span = (here.holds_from_s, here.holds_to_s)
+    if (run := frame_of_purged(search.connection, here.run_id)) is not None:
+        rows = run.between(*span)
+        place = int(np.searchsorted(rows.wall_times, wall_s, "right"))
+        return float(rows.times[place - 1]) if place else None
+    asked = (here.run_id, *span, wall_s)
+    (time_s,) = search.connection.execute(_SIM_AT_WALL, asked).fetchone() or (None,)
+    return time_s
 
 
 def _bounds(segment: Segment) -> tuple[float, ...]:

@@ -32,9 +32,9 @@ _ERRORS: Final = ("error", "critical")  # levels of log lines
 MOST_AROUND: Final = 6  # values that are reported with an event
 
 _IS_OPEN: Final = "SELECT id, session_id, ended_wall_time_s IS NULL FROM run WHERE id = ?"
-_ROW_AT: Final = (
-    "SELECT data FROM state WHERE run_id = ? AND sim_time_s <= ? "
-    "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+_ROW_AT: Final = (  # of a run of which the table has all rows
+    "SELECT data FROM state JOIN run r ON r.id = run_id WHERE sim_time_s <= ? AND run_id = ? "
+    "AND r.purged_rows = 0 ORDER BY sim_time_s DESC, state.id DESC LIMIT 1"
 )
 
 
@@ -330,7 +330,7 @@ def read_place(value: Any) -> Place:
 def _with_values(connection: sqlite3.Connection, event: Event, context: Sequence[Signal]) -> Event:
     if event.count > 1:
         return event
-    row = connection.execute(_ROW_AT, (event.run_id, event.start_s)).fetchone()
+    row = connection.execute(_ROW_AT, (event.start_s, event.run_id)).fetchone()
     if row is not None:
         leaves = flatten(parse(row[0])) if context else {}
         return replace(event, around={signal.name: leaves.get(signal.name) for signal in context})

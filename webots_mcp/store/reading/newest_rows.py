@@ -82,9 +82,7 @@ def rows_in_no_chunk(
     )
     if cut_s is not None or span[1] < at.end_s:
         return columns, cut_s
-    asked = (run_id, *place, MOST_ROWS_KEPT + 1)
-    is_short = connection.execute(_FEWER_THAN, asked).fetchone()[0] <= MOST_ROWS_KEPT
-    key = _key(connection, run_id) if is_short else None
+    key = _key(connection, run_id) if has_few_new_rows(connection, run_id, at) else None
     if key is None or len(columns):
         # SQLite would go through all rows from the start of the range rather than from the place.
         after = (max(span[0], at.end_s), span[1])
@@ -92,6 +90,12 @@ def rows_in_no_chunk(
         return columns, cut_s
     with _lock:
         return _kept_rows(connection, run_id, key, place, deadline)
+
+
+def has_few_new_rows(connection: sqlite3.Connection, run_id: int, at: Reached) -> bool:
+    """Whether a run has so few rows after those in chunks that they are kept between questions."""
+    asked = (run_id, at.end_s, at.last_state_id, MOST_ROWS_KEPT + 1)
+    return bool(connection.execute(_FEWER_THAN, asked).fetchone()[0] <= MOST_ROWS_KEPT)
 
 
 def _kept_rows(

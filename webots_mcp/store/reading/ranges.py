@@ -27,12 +27,9 @@ from typing import Final, Literal
 from webots_mcp.errors import InvalidRangeError, NothingRecordedError
 from webots_mcp.store.reading.kept import is_at_full_rate, kept_notes
 from webots_mcp.store.reading.subject import Subject, find_subject
-from webots_mcp.store.reading.wall_time import parse_wall_time, simulation_times
+from webots_mcp.store.reading.wall_time import frame_of_purged, parse_wall_time, simulation_times
 
 _DECIMALS: Final = 3
-_ROW_IN: Final = (
-    "SELECT 1 FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ? LIMIT 1"
-)
 _LAST_BEFORE: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s < ?"
 _FIRST_FROM: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s >= ?"
 
@@ -56,8 +53,10 @@ _RECORDED: Final = (
 )
 _MOST_HITS: Final = 1000
 _LEAST_ROWS_PER_HIT: Final = 200  # fewer than 0.5 % of the rows hardly move a mean
-_PURGED: Final = (
-    "SELECT started_sim_time_s, last_sim_time_s FROM run WHERE id = ? AND purged_rows > 0"
+_LOST: Final = (  # rows of which no chunk is left
+    "SELECT started_sim_time_s, last_sim_time_s FROM run r WHERE id = ? AND purged_rows > "
+    "coalesce((SELECT sum(row_count - stored_row_count) FROM row_group WHERE run_id = r.id "
+    "AND is_complete = 1), 0)"
 )
 _RUN_BEFORE: Final = (
     "SELECT (SELECT max(id) FROM run b WHERE b.robot_id = run.robot_id AND b.id < run.id), "
@@ -66,8 +65,7 @@ _RUN_BEFORE: Final = (
 _BOUND: Final = (
     "SELECT {0}(time_s) FROM (SELECT {0}(sim_time_s) AS time_s FROM state WHERE run_id = :run "
     "UNION ALL SELECT {0}(sim_time_s) FROM kept_state WHERE run_id = :run UNION ALL SELECT "
-    "{0}(end_sim_time_s) FROM row_group WHERE run_id = :run AND is_complete = 1 "
-    "AND stored_row_count = 0)"
+    "{0}({1}_sim_time_s) FROM row_group WHERE run_id = :run AND is_complete = 1)"
 )
 _RUNS_IN: Final = (
     "SELECT id FROM run WHERE robot_id = ? AND started_wall_time_s < ? "
@@ -80,7 +78,6 @@ _SHOWN_ALIKE: Final = "SELECT min(time_s) FROM ({})".format(
         f"SELECT min({time}) AS time_s FROM {table} WHERE {subject} "
         f"AND {time} >= :moment AND {time} < :bound"
         for table, time, subject in (
-            ("state", "sim_time_s", "run_id = :run"),
             ("log", "sim_time_s", "run_id = :run"),
             ("event", "sim_time_s", "run_id = :run"),
             ("image", "sim_time_s", "run_id = :run"),
@@ -109,8 +106,20 @@ def moment_of(time_s: float) -> float:
 
 def row_before(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> float | None:
     """The time of a run's newest row before a time; None where there is none."""
+    if (run := frame_of_purged(connection, run_id)) is not None:
+        place = int(run.places([sim_time_s])[0])
+        return float(run.rows(place - 1, place).times[0]) if place else None
     before_s: float | None = connection.execute(_LAST_BEFORE, (run_id, sim_time_s)).fetchone()[0]
     return before_s
+
+
+def _row_from(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> float | None:
+    """The time of a run's oldest row from a time on; None where there is none."""
+    if (run := frame_of_purged(connection, run_id)) is not None:
+        place = int(run.places([sim_time_s])[0])
+        return float(run.rows(place, place + 1).times[0]) if place < len(run) else None
+    from_s: float | None = connection.execute(_FIRST_FROM, (run_id, sim_time_s)).fetchone()[0]
+    return from_s
 
 
 def coverage_notes(
@@ -138,11 +147,11 @@ def _gap_notes(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
 ) -> Iterator[str]:
     """That the range lies between two rows."""
-    if connection.execute(_ROW_IN, (run_id, start_s, end_s)).fetchone():
+    after_s = _row_from(connection, run_id, start_s)
+    if after_s is None or after_s < end_s:
         return
     before_s = row_before(connection, run_id, start_s)
-    after_s = connection.execute(_FIRST_FROM, (run_id, end_s)).fetchone()[0]
-    if before_s is not None and after_s is not None:
+    if before_s is not None:
         yield f"no row: nothing was recorded between {before_s:g} and {after_s:g} s of run {run_id}"
 
 
@@ -156,6 +165,9 @@ def hit_notes(
     (hits,) = connection.execute(_HITS, values).fetchone()
     values["most"] = _LEAST_ROWS_PER_HIT * hits
     (rows,) = connection.execute(_ROWS, values).fetchone()
+    if (run := frame_of_purged(connection, run_id)) is not None:
+        first, last = run.places([start_s, end_s]).tolist()
+        rows = last - first
     if hits and rows < _LEAST_ROWS_PER_HIT * hits:
         yield (
             f"up to {hits} of {rows} rows of run {run_id} were recorded because a breakpoint was "
@@ -335,17 +347,17 @@ def recorded_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float,
     Rows that retention deleted count: their chunks are there, or a frame says what is not.
     """
     rows = _row_bounds(connection, run_id)
-    purged = connection.execute(_PURGED, (run_id,)).fetchone()
-    if purged is None:
+    lost = connection.execute(_LOST, (run_id,)).fetchone()
+    if lost is None:
         return rows
-    return purged[0], rows[1] if rows else purged[1]
+    return lost[0], rows[1] if rows else lost[1]
 
 
 def _row_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float, float] | None:
     """Simulation times of a run's first and newest row; None without any."""
     bounds = [
-        connection.execute(_BOUND.format(which), {"run": run_id}).fetchone()[0]
-        for which in ("min", "max")
+        connection.execute(_BOUND.format(*which), {"run": run_id}).fetchone()[0]
+        for which in (("min", "start"), ("max", "end"))
     ]
     return None if bounds[0] is None else (bounds[0], bounds[1])
 
@@ -427,7 +439,8 @@ def _bound(connection: sqlite3.Connection, subject: Subject, time_s: float) -> f
     names = {"run": subject.run_id, "robot": subject.robot_id}
     times = {"moment": moment_of(time_s), "bound": shown_time(time_s)}
     (before_s,) = connection.execute(_SHOWN_ALIKE, names | times).fetchone()
-    return times["bound"] if before_s is None else before_s
+    row_s = _row_from(connection, subject.run_id, times["moment"])
+    return min(each for each in (before_s, row_s, times["bound"]) if each is not None)
 
 
 def _in_wall_time(

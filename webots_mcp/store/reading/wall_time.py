@@ -6,14 +6,19 @@ import math
 import sqlite3
 from collections.abc import Callable
 from datetime import datetime
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from webots_mcp.errors import InvalidRangeError
+from webots_mcp.store.reading.deadline import Deadline
+
+if TYPE_CHECKING:
+    from webots_mcp.store.reading.frame import Frame
 
 _ENDS: Final = (
     "SELECT started_sim_time_s, started_wall_time_s, last_sim_time_s, last_wall_time_s "
     "FROM run WHERE id = ?"
 )
+_IS_PURGED: Final = "SELECT 1 FROM run WHERE id = ? AND purged_rows > 0"
 _FIRST_ROW: Final = (
     "SELECT sim_time_s, wall_time_s FROM state WHERE run_id = ? ORDER BY sim_time_s, id LIMIT 1"
 )
@@ -90,19 +95,39 @@ def simulation_times(
     return (start_s, last_s) if start_s <= last_s else None  # else between two rows
 
 
+def frame_of_purged(connection: sqlite3.Connection, run_id: int) -> Frame | None:
+    """All rows of a run that has lost some from `state`; None where that table has all of them."""
+    if not connection.execute(_IS_PURGED, (run_id,)).fetchone():
+        return None
+    from webots_mcp.store.reading.frame import read_frame  # which imports this module
+    from webots_mcp.store.reading.ranges import Segment
+
+    return read_frame(connection, Segment(run_id, -math.inf, math.inf), Deadline())
+
+
 class RunClock:
-    """The wall times of a run; of purged rows as if wall time had risen evenly."""
+    """The wall times of a run; of rows that are in no chunk either as if it had risen evenly."""
 
     def __init__(self, connection: sqlite3.Connection, run_id: int) -> None:
         self._connection = connection
         self._run_id = run_id
         *start, last_s, last_wall_s = connection.execute(_ENDS, (run_id,)).fetchone()
-        first_row = connection.execute(_FIRST_ROW, (run_id,)).fetchone()
+        self._frame = frame_of_purged(connection, run_id)
+        first_row: tuple[float, float] | None = None
+        if self._frame is None:
+            first_row = connection.execute(_FIRST_ROW, (run_id,)).fetchone()
+        elif len(self._frame):
+            first_row = self._frame.bounds_s[0], float(self._frame.rows(0, 1).wall_times[0])
         self._start_s, self._start_wall_s = start
         self._rows_from_s, self._rows_from_wall_s = first_row or (last_s, last_wall_s)
 
     def wall_s(self, query: str, time_s: float) -> float:
         """At a simulation time; before the recording that of its start."""
+        if time_s >= self._rows_from_s and self._frame is not None and len(self._frame):
+            from_s = time_s if query == _FROM else math.nextafter(time_s, math.inf)
+            place = int(self._frame.places([from_s])[0]) - (query != _FROM)
+            place = min(place, len(self._frame) - 1)
+            return float(self._frame.rows(place, place + 1).wall_times[0])
         if time_s >= self._rows_from_s:
             row = self._connection.execute(query, (self._run_id, time_s)).fetchone()
             return float(row[0]) if row else self._rows_from_wall_s

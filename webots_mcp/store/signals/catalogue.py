@@ -18,6 +18,7 @@ from webots_mcp.store.chunks.columns import STATE_COLUMNS, StateColumns
 from webots_mcp.store.chunks.stored import reached, signals_in
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.frame import Frame, read_frame
+from webots_mcp.store.reading.newest_rows import has_few_new_rows, rows_in_no_chunk
 from webots_mcp.store.reading.ranges import Segment, TimeRange
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.reading.subject import Subject, find_subject
@@ -94,8 +95,10 @@ def _signals_in(
 
 
 def _new_sample(connection: sqlite3.Connection, run_id: int) -> StateColumns:
-    """A run's rows after those in chunks; of many the oldest and the newest."""
+    """A run's rows in no chunk; of more than are kept between questions the oldest and newest."""
     at = reached(connection, run_id)
+    if has_few_new_rows(connection, run_id, at):
+        return rows_in_no_chunk(connection, run_id, (-math.inf, math.inf), at, Deadline())[0]
     asked = (run_id, at.end_s, at.last_state_id, SAMPLED_ROWS // 2)
     rows = dict[int, tuple[object, ...]]()
     for order in ("ASC", "DESC"):

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 import webots_mcp
 from webots_mcp.requirements import checkout, explain_extra, install_line, missing_requirements
@@ -65,3 +66,30 @@ def test_an_extra_is_named_by_its_packages_not_by_a_name_on_an_index() -> None:
     )
     assert missing_requirements() == []
     assert install_line(["a>=1"]).endswith("install 'a>=1'") or sys.platform == "win32"
+
+
+@pytest.mark.parametrize(
+    ("python", "newest"), [("3.10", "1.0.4"), ("3.11", "1.1.0"), ("3.13", "1.1.0")]
+)
+def test_the_newest_codec_that_a_python_may_get_has_a_wheel_for_it(
+    python: str, newest: str
+) -> None:
+    """Of 1.1 there is none for 3.10, and pip would build it, which takes a Rust compiler."""
+    lines = (PACKAGE.parent / "pyproject.toml").read_text("utf-8").splitlines()
+    wanted = [Requirement(line.split('"')[1]) for line in lines if line.startswith('    "pcodec')]
+    (ours,) = (
+        each for each in wanted if each.marker and each.marker.evaluate({"python_version": python})
+    )
+    assert list(ours.specifier.filter(["1.0.0", "1.0.4", "1.1.0"]))[-1] == newest
+
+
+def test_of_what_is_named_once_for_each_python_ours_is_needed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    new, old = "no-such-a>=2; python_version >= '3.11'", "no-such-a<2; python_version < '3.11'"
+
+    def requires(_: str) -> list[str]:
+        return [new, old]
+
+    monkeypatch.setattr("importlib.metadata.requires", requires)
+    assert missing_requirements() == [old if sys.version_info < (3, 11) else new]

@@ -22,7 +22,7 @@ from urllib.request import url2pathname
 
 _NAME: Final = re.compile(r"[\w.-]+")
 _EXTRA: Final = re.compile(r"""extra == ['"]([\w.-]+)['"]""")
-_OLD_PYTHON: Final = re.compile(r"""python_version < ['"]3\.(\d+)['"]""")
+_PYTHON: Final = re.compile(r"""python_version (<|>=) ['"]3\.(\d+)['"]""")
 
 
 def missing_requirements(extra: str | None = None) -> list[str]:
@@ -102,9 +102,10 @@ def _extra_of(requirement: str) -> str | None:
 
 
 def _is_for_us(requirement: str) -> bool:
-    """Whether this Python is old enough to need it."""
-    older_than = _OLD_PYTHON.search(requirement)
-    return older_than is None or sys.version_info < (3, int(older_than[1]))
+    """Whether this Python is as old, or as new, as those that need it."""
+    found = _PYTHON.search(requirement)
+    is_older = found is not None and sys.version_info < (3, int(found[2]))
+    return found is None or is_older == (found[1] == "<")
 
 
 def _is_installed(name: str) -> bool:

@@ -9,7 +9,7 @@ import pytest
 from mcp import Client
 
 from tests.recordings.rows import Recorded
-from tests.server.conftest import Connect
+from tests.server.conftest import Connect, ask
 from tests.store.test_status import dead_pid
 from webots_mcp.server import create_server
 from webots_mcp.store.retention.policy import Limit, Retention
@@ -64,6 +64,8 @@ async def test_a_run_whose_states_are_all_gone_is_not_said_to_have_had_none(
     robot.state(1.0, {"x": 1.0})
     prune(recorded.connection, file.parent, Retention(state=Limit(rows=0)), rest=False)
     async with connect() as client:
-        answer = await client.call_tool("webots_get_robot_state", {})
-    assert answer.structured_content is not None
-    assert "retention has deleted 1" in answer.structured_content["hint"]
+        hint = (await ask(client, "webots_get_robot_state"))["hint"]
+        (run,) = (await ask(client, "webots_query_history", signals=["x"]))["runs"]
+    assert "retention has deleted 1" in hint
+    assert "webots_query_history" in hint
+    assert run["numbers"]["x"]["value"] == [1.0]

@@ -55,7 +55,7 @@ _VALUE_NAMES: Final = {
 }  # fmt: skip
 # What a person does not give, where a model's client would soon give up waiting.
 _DEFAULTS: Final[Mapping[str, Any]] = types.MappingProxyType({"timeout_wall_s": 600.0})
-_OF_SIGNALS: Final = frozenset({"signals", "pattern"})  # of what summaries are made of
+_OF_SIGNALS: Final = frozenset({"signals", "pattern"})  # that choose among signals
 _FOLLOW: Final = Annotated[
     bool,
     Parameter(

@@ -441,13 +441,13 @@ def _print_plan(wanted: Plan, going: str) -> None:
 
 
 def _on_disk(wanted: Plan, sizes: dict[str, int]) -> dict[str, Any]:
-    """What lies on the disk, bytes: limits are about rows, not about summaries and free room."""
+    """What lies on the disk, bytes: limits are about rows, not about signals and free room."""
     held = dict(wanted.held_bytes)
     beside = {"pictures": held.pop("image"), "log": sizes["log_beside_bytes"]}
     free = sizes["free_in_file_bytes"]
     rest = max(sizes["file_bytes"] - free - sum(held.values()), 0)
     inside = {**{f"{kind}s": size for kind, size in held.items()}, "free": free}
-    inside["summaries, runs, commands"] = rest
+    inside["signals, runs, commands"] = rest
     return {"file": sizes["file_bytes"], "in_file": inside, "beside": beside}
 
 

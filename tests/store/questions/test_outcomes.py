@@ -241,6 +241,23 @@ def test_of_what_was_not_read_in_time_no_figure_is_told(empty: sqlite3.Connectio
     assert all(why.startswith("time limit reached") for why in found.unknown.values())
 
 
+def test_of_a_run_whose_first_half_was_deleted_with_its_chunks_no_figure_is_told(
+    empty: sqlite3.Connection,
+) -> None:
+    """Its way was that of the second half, over the time of both, and so were shares and means."""
+    for code in "ab":
+        record(empty, code, driving)
+    empty.execute("DELETE FROM state WHERE run_id = 1 AND sim_time_s < 20")
+    empty.execute("UPDATE run SET purged_rows = 200 WHERE id = 1")
+    found = compare_runs(empty, [1, 2])
+    for name in ("distance_m", "mean_speed_m_s", "share of drive"):
+        assert [median is None for median in medians(measure(found, name))] == [True, False], name
+    assert {each.mean[0] for each in found.differences} == {None}
+    for name in ("distance_m", "mean_speed_m_s", "share of each mode", "means of signals"):
+        (why,) = (why for names, why in found.unknown.items() if name in names.split(", "))
+        assert "run 1: not read from 0.000 to 20.000 s: deleted by retention" in why
+
+
 def test_how_much_runs_differ_is_told_as_an_interval(empty: sqlite3.Connection) -> None:
     for code in "ab":
         for speed_m_s in (0.30, 0.31, 0.29):

@@ -30,7 +30,7 @@ EXACT_INTEGERS: Final = 2**53  # beyond, a float does not hold every integer
 _FLOATS, _INTEGERS = "pcodec/float64", "pcodec/int64"
 _NOTHING: Final = "none"  # no row holds a number
 _NUMBERS: Final = frozenset({int, float})
-_HOW_TO_INSTALL: Final = "install it: pip install 'pcodec>=1.0'"
+_HOW_TO_INSTALL: Final = "install it: pip install --only-binary pcodec 'pcodec>=1.0'"
 
 
 class Absent:

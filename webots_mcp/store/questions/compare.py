@@ -149,17 +149,18 @@ def compare_runs(
     compared_s = min(durations_s.values())
     cut = [[each.cut(compared_s) for each in found] for found in parts]
     deadline = Deadline(deadline_s)
-    differences = _differences(connection, cut, names, min_effect_sd, deadline)
+    unread: dict[str, None] = {}
+    differences = _differences(connection, cut, names, min_effect_sd, deadline, unread)
     shared = [each for each in differences if 0 not in each.count]
     shared.sort(key=size_of, reverse=True)
     compared = _groups(connection, groups)
     outcomes = outcomes_of(connection, cut, options, deadline, min_effect_sd)
-    unread = any(None in each.count for each in differences)
     return Comparison(
         groups=compared,
         compared_s=compared_s,
         measures=outcomes.measures,
-        unknown=outcomes.unknown | ({"means of signals": OUT_OF_TIME} if unread else {}),
+        unknown=outcomes.unknown
+        | ({"means of signals": "; ".join(unread)} if unread and differences else {}),
         differences=tuple(shared[:limit]),
         total=len(shared),
         only_in=only_in(differences, list(groups)),
@@ -200,14 +201,16 @@ def _differences(
     names: Sequence[str],
     min_effect_sd: float,
     deadline: Deadline,
+    unread: dict[str, None],
 ) -> list[Difference]:
-    """The numbers of those names, group by group; none for a single run."""
+    """The numbers of those names, group by group; none for a single run; into `unread` why."""
     parts = [part for group in groups for part in group]
     known = {name: signal for part in reversed(parts) for name, signal in part.known.items()}
     found = resolve_signals(known, names)
     numbers = [each for each in found if each.is_number and len(parts) > 1]
     summaries = [
-        [_summarise(connection, part, numbers, deadline) for part in group] for group in groups
+        [_summarise(connection, part, numbers, deadline, unread) for part in group]
+        for group in groups
     ]
     tests = 2 * len(numbers)
     return [difference_of(signal, summaries, tests, min_effect_sd) for signal in numbers]
@@ -252,16 +255,24 @@ def _part(connection: sqlite3.Connection, run_id: int, options: EventOptions) ->
 
 
 def _summarise(
-    connection: sqlite3.Connection, part: RunPart, signals: Sequence[Signal], deadline: Deadline
+    connection: sqlite3.Connection,
+    part: RunPart,
+    signals: Sequence[Signal],
+    deadline: Deadline,
+    unread: dict[str, None],
 ) -> dict[str, Summary] | None:
     """Each signal that the run has over its compared stretch; None where not all was read."""
     frame = read_frame(connection, part.segment, deadline)
     found: dict[str, Summary] = {}
     for signal in (part.known[each.name] for each in signals if each.name in part.known):
         if deadline.passed:
-            return None
+            break
         found[signal.name] = summary_of(frame, signal)
-    return None if frame.cut_at_s is not None else found
+    if deadline.passed or frame.cut_at_s is not None:
+        unread[OUT_OF_TIME] = None
+        return None
+    unread |= dict.fromkeys(f"run {part.segment.run_id}: {each}" for each in frame.unread)
+    return None if frame.unread else found
 
 
 def _groups(connection: sqlite3.Connection, groups: dict[str, list[int]]) -> tuple[Group, ...]:

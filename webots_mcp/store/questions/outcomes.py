@@ -34,6 +34,7 @@ from webots_mcp.store.questions.events import Found, search_events
 from webots_mcp.store.reading.changes import change_points
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import read_frame
+from webots_mcp.store.reading.frame_source import Unread
 from webots_mcp.store.reading.ranges import Segment, TimeRange, whole_run
 from webots_mcp.store.reading.subject import Subject
 from webots_mcp.store.signals.catalogue import known_signals
@@ -57,13 +58,15 @@ class Way:
     Attributes:
         times: Of the rows that have a position, in s.
         x_m: In metres, as `y_m`.
-        cut_at_s: As of a frame: not all was read.
+        cut_at_s: As of a frame: where the deadline cut it.
+        unread: As of a frame: all that was not read.
     """
 
     times: Array
     x_m: Array
     y_m: Array
     cut_at_s: float | None
+    unread: tuple[Unread, ...]
 
     @property
     def length(self) -> PathLength:
@@ -81,7 +84,7 @@ def read_way(
     frame = read_frame(connection, segment, deadline)
     x, y = (in_metres(each, frame.numbers(each.name)) for each in position)
     there = np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M
-    return Way(frame.times[there], x[there], y[there], frame.cut_at_s)
+    return Way(frame.times[there], x[there], y[there], frame.cut_at_s, frame.unread)
 
 
 def way_of_run(
@@ -96,7 +99,7 @@ def way_of_run(
     if position is None:
         return None
     way = read_way(connection, whole, position, deadline)
-    return None if way.cut_at_s is not None or len(way.times) < 2 else way.length
+    return None if way.unread or len(way.times) < 2 else way.length
 
 
 @dataclass(frozen=True)
@@ -292,19 +295,19 @@ def _outcome(
         unknown["distance_m, mean_speed_m_s"] = (NAME_POSITION,)
     else:
         read = read_way(connection, part.segment, position, deadline)
-        way = None if deadline.passed or read.cut_at_s is not None else read.length
+        way = None if deadline.passed or read.unread else read.length
         speed = None if way is None else way.length_m / duration_s
         figures |= {"distance_m": way and way.length_m, _SPEED: speed}
-        doubt = doubt_of_unit(position, speed or 0.0)
-        doubt = OUT_OF_TIME if deadline.passed else doubt
+        doubt = OUT_OF_TIME if deadline.passed else "; ".join(map(str, read.unread))
+        doubt = doubt or doubt_of_unit(position, speed or 0.0)
         if doubt := doubt or (way and doubt_of_length(way)):
             unknown["distance_m, mean_speed_m_s"] = (doubt,)
-    modes = _mode_times(connection, part, deadline)
-    if deadline.passed:
+    modes, unread = _mode_times(connection, part, deadline)
+    if deadline.passed or unread:
         modes = {}
     figures |= {f"{_SHARE}{mode}": seconds / duration_s for mode, seconds in modes.items()}
     if not modes:
-        unknown["share of each mode"] = (OUT_OF_TIME if deadline.passed else NO_MODE,)
+        unknown["share of each mode"] = (OUT_OF_TIME if deadline.passed else unread or NO_MODE,)
     found = _events(connection, part, options, deadline)
     verdicts, counts = found.verdicts, Counter(event.kind for event in found.events)
     kinds = sorted(asked_kinds(options), key=lambda kind: not kind.stored)
@@ -327,11 +330,13 @@ def _outcome(
 
 def _mode_times(
     connection: sqlite3.Connection, part: RunPart, deadline: Deadline
-) -> dict[str, float]:
+) -> tuple[dict[str, float], str]:
+    """Seconds in each mode, and what was not read."""
     if part.motion.mode is None:
-        return {}
+        return {}, ""
     changes = change_points(connection, part.segment, [part.motion.mode], deadline)
-    return changes.longest_values(part.motion.mode.name, part.segment.end_s)
+    times = changes.longest_values(part.motion.mode.name, part.segment.end_s)
+    return times, "; ".join(map(str, changes.unread))
 
 
 def _events(

@@ -1,4 +1,4 @@
-"""One state of the database for a whole answer, while a robot records and the rollups advance."""
+"""One state of the database for a whole answer, while a robot records and chunks are made."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def in_one_snapshot(
 ) -> Callable[Concatenate[sqlite3.Connection, P], T]:
     """Let a question that takes several statements see one state of the database.
 
-    Without it rows could be rolled up between two of its statements, and be counted twice. It
+    Without it rows could be put into chunks between two of its statements, and be counted twice. It
     neither waits nor makes another process wait (write-ahead log); a transaction that is already
     open is used as it is.
     """

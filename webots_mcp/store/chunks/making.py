@@ -79,9 +79,9 @@ _COUNT: Final = (  # answered by the index alone
     "SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
     "AND id <= ? LIMIT ?)"
 )
-_LATE: Final = (
-    f"SELECT {STATE_COLUMNS} FROM {{state}} WHERE id > ? AND id <= ? AND +run_id = ? "
-    "AND (sim_time_s, id) <= (?, ?) ORDER BY sim_time_s, id LIMIT ?"
+_LATE: Final = (  # by their ids, by which it is known up to where they were looked at
+    f"SELECT * FROM (SELECT {STATE_COLUMNS} FROM {{state}} WHERE id > ? AND id <= ? "
+    "AND +run_id = ? AND (sim_time_s, id) <= (?, ?) ORDER BY id LIMIT ?) ORDER BY sim_time_s, id"
 )
 _TEMPORARY: Final = (
     f"CREATE TEMP TABLE IF NOT EXISTS new_chunk (number INTEGER PRIMARY KEY, {_LIST})"

@@ -107,8 +107,9 @@ _COMPLETE: Final = Step(  # unless another process has stored these rows meanwhi
     "AND is_complete = 1) <> NEW.max_state_id",
 )
 _LEFT_BEHIND: Final = "SELECT id FROM row_group WHERE is_complete = 0"
-_DELETE_CHUNKS: Final = (
-    "DELETE FROM chunk WHERE id IN (SELECT id FROM chunk WHERE group_id = ? LIMIT 20)"
+_DELETE_CHUNKS: Final = (  # unless its maker has ended in the meantime what it was at
+    "DELETE FROM chunk WHERE id IN (SELECT id FROM chunk WHERE group_id = (SELECT id "
+    "FROM row_group WHERE id = ? AND is_complete = 0) LIMIT 20)"
 )
 _DELETE_GROUP: Final = "DELETE FROM row_group WHERE id = ? AND is_complete = 0"
 

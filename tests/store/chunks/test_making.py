@@ -276,3 +276,38 @@ def test_a_group_that_is_completed_while_another_clears_up_keeps_its_chunks(
         make_chunks(one, 100_000)
         assert groups(one) == [GROUP_ROWS, GROUP_ROWS]
         assert contents(one) == before
+
+
+def test_one_whose_group_another_clears_up_goes_on_with_the_next(tmp_path: Path) -> None:
+    file = tmp_path / "webots.db"
+    with closing(sqlite3.connect(file, factory=Overtaken, isolation_level=None)) as one:
+        create_schema(one)
+        one.execute("PRAGMA foreign_keys=ON")
+        record(one, range(ROWS))
+        before = contents(one)
+        one.looks_for = making._BEGIN_GROUP  # type: ignore[attr-defined]
+        one.go_on = lambda: making._delete_left_behind(one, 0.0)  # type: ignore[attr-defined]
+        assert not make_chunks(one, 100_000).done
+        one.looks_for = ""
+        assert make_chunks(one, 100_000).done
+        assert groups(one) == [GROUP_ROWS, GROUP_ROWS]
+        assert contents(one) == before
+
+
+def test_the_range_of_a_signal_is_known_whenever_its_maker_is_stopped(
+    empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = record(empty, range(GROUP_ROWS))
+    recorder.end_run("finished")
+    complete = making._COMPLETE.run  # type: ignore[attr-defined]
+
+    def and_stop(*values: Any) -> bool:
+        complete(*values)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(making._COMPLETE, "run", and_stop)  # type: ignore[attr-defined]
+    with pytest.raises(KeyboardInterrupt):
+        make_chunks(empty, 100_000)
+    make_chunks(empty, 100_000)
+    found = empty.execute("SELECT min, max FROM signal WHERE name = 'x'").fetchone()
+    assert found == (0, (GROUP_ROWS - 1) * 0.25)

@@ -167,7 +167,7 @@ def _identity(database: Path, connection: sqlite3.Connection) -> object:
     """Of the files, and of the schema that SQLite counts the changes of; None of what is gone."""
     try:
         version = connection.execute("PRAGMA schema_version").fetchone()
-        return identify_files(database), version, is_chunked_aside(database)
+        return identify_files(database), version, is_chunked_aside(connection, database)
     except (OSError, *FAILURES):
         return None
 

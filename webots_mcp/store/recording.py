@@ -122,7 +122,7 @@ class View:
 class OpenReaders:
     """Connections that a server keeps open between its questions: as many as it asks at once.
 
-    One is used again as long as its file is the same, and so is the schema.
+    One is used again as long as its file is the one that it was opened to, and so is the schema.
     """
 
     def __init__(self) -> None:
@@ -139,20 +139,22 @@ class OpenReaders:
                 known, connection = self._idle.pop()
             except IndexError:
                 connection = open_one()
+                known = _identity(database, connection)
                 break
             if known == _identity(database, connection):
                 break
             connection.close()
         try:
             yield connection
-            known = _identity(database, connection)
         except BaseException:
             connection.close()
             raise
-        if self._is_closed or isinstance(connection, FrozenConnection):
+        if known is None or isinstance(connection, FrozenConnection):
             connection.close()
         else:
             self._idle.append((known, connection))
+        if self._is_closed:
+            self.close()
 
     def close(self) -> None:
         """Close all that are not in use, and those when they are given back."""
@@ -162,9 +164,12 @@ class OpenReaders:
 
 
 def _identity(database: Path, connection: sqlite3.Connection) -> object:
-    """Of the files, and of the schema that SQLite counts the changes of."""
-    version = connection.execute("PRAGMA schema_version").fetchone()
-    return identify_files(database), version, is_chunked_aside(database)
+    """Of the files, and of the schema that SQLite counts the changes of; None of what is gone."""
+    try:
+        version = connection.execute("PRAGMA schema_version").fetchone()
+        return identify_files(database), version, is_chunked_aside(connection, database)
+    except (OSError, *FAILURES):
+        return None
 
 
 @dataclass(frozen=True)

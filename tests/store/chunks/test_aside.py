@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import sqlite3
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -16,8 +17,12 @@ from tests.recordings.long import build
 from webots_mcp.connection import connect
 from webots_mcp.store.chunks.on_demand import LEAST_ROWS, make_missing_chunks
 from webots_mcp.store.questions.trends import trends
-from webots_mcp.store.reading.ranges import Scope, find_range
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.frame import read_frame
+from webots_mcp.store.reading.ranges import Scope, Segment, find_range
 from webots_mcp.store.recording import OpenReaders, Recording
+from webots_mcp.store.retention.policy import Limit, Retention
+from webots_mcp.store.retention.purge import prune
 
 ROWS = 3 * LEAST_ROWS
 
@@ -98,3 +103,33 @@ def test_a_question_of_the_command_line_makes_them_where_nothing_can_be_written(
         )
     assert done.returncode == 0, done.stderr
     assert "in no chunk yet" not in done.stderr
+
+
+def test_what_a_server_purges_that_begins_later_is_read_from_its_chunks(
+    recording: Recording, tmp_path: Path
+) -> None:
+    def values() -> Sequence[object]:
+        with recording.reader() as connection:
+            frame = read_frame(connection, Segment(1, -math.inf, math.inf), Deadline(60))
+            return frame.values("x")
+
+    make_missing_chunks(recording, write=False)
+    before = values()
+    with closing(connect(recording.database, "writer")) as server:
+        server.execute(
+            "INSERT INTO state (run_id, sim_time_s, wall_time_s, data) SELECT run_id, "
+            "sim_time_s + 1e6, wall_time_s, data FROM state WHERE run_id = 1"
+        )
+        prune(server, tmp_path, Retention(state=Limit(rows=10)), rest=False)
+    assert values() == [*before, *before]
+
+
+def test_chunks_of_a_recording_that_is_gone_are_not_those_of_the_next(
+    recording: Recording,
+) -> None:
+    make_missing_chunks(recording, write=False)
+    with closing(connect(recording.database, "writer")) as connection:
+        connection.execute("UPDATE recording SET uuid = 'another'")
+        connection.execute("DELETE FROM state WHERE id > 10")
+    recording.readers.close()  # type: ignore[union-attr]
+    assert in_chunks(recording) == 0

@@ -12,6 +12,7 @@ import pytest
 
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp.connection import connect
+from webots_mcp.schema import create_schema
 from webots_mcp.store.chunks import making
 from webots_mcp.store.chunks.making import GROUP_ROWS, chunk_whole_run, make_chunks
 from webots_mcp.store.reading.deadline import Deadline
@@ -163,8 +164,6 @@ def test_one_who_is_stopped_leaves_nothing_half_done(
 def test_of_two_that_make_the_same_chunk_one_stores(tmp_path: Path) -> None:
     file = tmp_path / "webots.db"
     with closing(connect(file, "writer", create=True)) as one:
-        from webots_mcp.schema import create_schema
-
         create_schema(one)
         record(one, range(ROWS))
         before = contents(one)
@@ -225,3 +224,90 @@ def test_a_signal_is_what_all_rows_tell_though_its_name_was_entered_before(
         ("pose.0", "num", "x"),
         ("pose.1", "num", "y"),
     ]
+
+
+def test_late_rows_that_come_in_several_stretches_are_all_in_chunks(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = start_run(empty)
+    late = [*range(2500, 4000), *range(1000, 2500)]
+    record_steps(empty, recorder, [step for step in range(6000) if step not in late])
+    make_chunks(empty, 100_000)
+    record_steps(empty, recorder, late)
+    before = contents(empty)
+    make_chunks(empty, 100_000)
+    assert contents(empty) == before
+    assert before["x"] == [step * 0.25 for step in range(6000)]
+
+
+class Overtaken(sqlite3.Connection):
+    """Lets another process go on right after this one has looked for a statement's rows."""
+
+    looks_for = ""
+
+    def go_on(self) -> None: ...
+
+    def execute(self, sql: str, *values: Any) -> sqlite3.Cursor:
+        cursor = super().execute(sql, *values)
+        if sql == self.looks_for:
+            self.go_on()
+        return cursor
+
+
+def test_a_group_that_is_completed_while_another_clears_up_keeps_its_chunks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "webots.db"
+    with closing(connect(file, "writer", create=True)) as one:
+        create_schema(one)
+        record(one, range(ROWS))
+        before = contents(one)
+        complete = making._COMPLETE.run  # type: ignore[attr-defined]
+
+        def beside_another(*values: Any) -> bool:
+            completed = list[bool]()
+            with closing(sqlite3.connect(file, factory=Overtaken, isolation_level=None)) as other:
+                other.looks_for = making._LEFT_BEHIND  # type: ignore[attr-defined]
+                other.go_on = lambda: completed.append(complete(*values))
+                making._delete_left_behind(other, 0.0)  # type: ignore[attr-defined]
+            return completed[0]
+
+        monkeypatch.setattr(making._COMPLETE, "run", beside_another)  # type: ignore[attr-defined]
+        make_chunks(one, 100_000)
+        assert groups(one) == [GROUP_ROWS, GROUP_ROWS]
+        assert contents(one) == before
+
+
+def test_one_whose_group_another_clears_up_goes_on_with_the_next(tmp_path: Path) -> None:
+    file = tmp_path / "webots.db"
+    with closing(sqlite3.connect(file, factory=Overtaken, isolation_level=None)) as one:
+        create_schema(one)
+        one.execute("PRAGMA foreign_keys=ON")
+        record(one, range(ROWS))
+        before = contents(one)
+        one.looks_for = making._BEGIN_GROUP  # type: ignore[attr-defined]
+        one.go_on = lambda: making._delete_left_behind(one, 0.0)  # type: ignore[attr-defined]
+        assert not make_chunks(one, 100_000).done
+        one.looks_for = ""
+        assert make_chunks(one, 100_000).done
+        assert groups(one) == [GROUP_ROWS, GROUP_ROWS]
+        assert contents(one) == before
+
+
+def test_the_range_of_a_signal_is_known_whenever_its_maker_is_stopped(
+    empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = record(empty, range(GROUP_ROWS))
+    recorder.end_run("finished")
+    complete = making._COMPLETE.run  # type: ignore[attr-defined]
+
+    def and_stop(*values: Any) -> bool:
+        complete(*values)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(making._COMPLETE, "run", and_stop)  # type: ignore[attr-defined]
+    with pytest.raises(KeyboardInterrupt):
+        make_chunks(empty, 100_000)
+    make_chunks(empty, 100_000)
+    found = empty.execute("SELECT min, max FROM signal WHERE name = 'x'").fetchone()
+    assert found == (0, (GROUP_ROWS - 1) * 0.25)

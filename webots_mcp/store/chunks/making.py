@@ -23,7 +23,6 @@ from webots_mcp.store.chunks.stored import (
     SIM_TIMES,
     STATE_IDS,
     WALL_TIMES,
-    WIDEN_EXTREMES,
     Reached,
     reached,
     watermark,
@@ -79,9 +78,9 @@ _COUNT: Final = (  # answered by the index alone
     "SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
     "AND id <= ? LIMIT ?)"
 )
-_LATE: Final = (
-    f"SELECT {STATE_COLUMNS} FROM {{state}} WHERE id > ? AND id <= ? AND +run_id = ? "
-    "AND (sim_time_s, id) <= (?, ?) ORDER BY sim_time_s, id LIMIT ?"
+_LATE: Final = (  # by their ids, by which it is known up to where they were looked at
+    f"SELECT * FROM (SELECT {STATE_COLUMNS} FROM {{state}} WHERE id > ? AND id <= ? "
+    "AND +run_id = ? AND (sim_time_s, id) <= (?, ?) ORDER BY id LIMIT ?) ORDER BY sim_time_s, id"
 )
 _TEMPORARY: Final = (
     f"CREATE TEMP TABLE IF NOT EXISTS new_chunk (number INTEGER PRIMARY KEY, {_LIST})"
@@ -92,11 +91,17 @@ _BEGIN_GROUP: Final = (
     "max_state_id, row_count, stored_row_count, lost_value_count, stored_row_bytes, chunk_bytes, "
     "is_complete) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, 0)"
 )
-_STORE: Final = Step(
+_STORE: Final = Step(  # unless another process has cleared the group up
     "store_chunks",
     ("group_id", "first", "last"),
     f"INSERT INTO chunk (group_id, {_LIST}) SELECT NEW.group_id, {_LIST} FROM new_chunk "
     "WHERE number >= NEW.first AND number <= NEW.last",
+    # The extremes of the signals in the register.
+    "UPDATE signal SET min = min(coalesce(signal.min, c.min), c.min), "
+    "max = max(coalesce(signal.max, c.max), c.max) FROM new_chunk c WHERE c.number >= NEW.first "
+    "AND c.number <= NEW.last AND signal.id = c.signal_id AND c.min IS NOT NULL "
+    "AND (signal.min IS NULL OR c.min < signal.min OR c.max > signal.max)",
+    unless="NOT EXISTS (SELECT 1 FROM row_group WHERE id = NEW.group_id)",
 )
 _COMPLETE: Final = Step(  # unless another process has stored these rows meanwhile
     "complete_group",
@@ -107,8 +112,9 @@ _COMPLETE: Final = Step(  # unless another process has stored these rows meanwhi
     "AND is_complete = 1) <> NEW.max_state_id",
 )
 _LEFT_BEHIND: Final = "SELECT id FROM row_group WHERE is_complete = 0"
-_DELETE_CHUNKS: Final = (
-    "DELETE FROM chunk WHERE id IN (SELECT id FROM chunk WHERE group_id = ? LIMIT 20)"
+_DELETE_CHUNKS: Final = (  # unless its maker has ended in the meantime what it was at
+    "DELETE FROM chunk WHERE id IN (SELECT id FROM chunk WHERE group_id = (SELECT id "
+    "FROM row_group WHERE id = ? AND is_complete = 0) LIMIT 20)"
 )
 _DELETE_GROUP: Final = "DELETE FROM row_group WHERE id = ? AND is_complete = 0"
 
@@ -254,10 +260,7 @@ class _RunChunks:
 
         in_short_steps(range(len(chunks)), store, self._pause_s)
         expected = (self._run_id, at.max_in_groups, len(chunks))
-        if not _COMPLETE.run(self._connection, group_id, *expected):
-            return False
-        self._connection.execute(WIDEN_EXTREMES, (group_id,))
-        return True
+        return _COMPLETE.run(self._connection, group_id, *expected)
 
     def _room_of(
         self, columns: StateColumns, chunks: Sequence[tuple[Any, ...]]

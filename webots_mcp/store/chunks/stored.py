@@ -45,13 +45,6 @@ _FEW_VALUES: Final = f"{_VALUES} AND group_id IN (SELECT value FROM json_each(?)
 _FEW: Final = 0.25  # of the groups between two: they are asked for one by one
 _SIGNALS_IN: Final = "SELECT DISTINCT signal_id FROM chunk WHERE run_id = ? AND signal_id > 0"
 
-WIDEN_EXTREMES: Final = (  # of the signals of a group, in the register
-    "UPDATE signal SET min = min(coalesce(signal.min, c.min), c.min), "
-    "max = max(coalesce(signal.max, c.max), c.max) FROM chunk c WHERE c.group_id = ? "
-    "AND signal.id = c.signal_id AND c.min IS NOT NULL "
-    "AND (signal.min IS NULL OR c.min < signal.min OR c.max > signal.max)"
-)
-
 
 class Group(NamedTuple):
     """Rows that follow each other, of which each signal has a chunk. Columns of `row_group`."""

@@ -9,8 +9,7 @@ from typing import Final
 from webots_mcp.conditions import Condition, parse_condition
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.naming import NO_POSITION, Value
-from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.analysis.runs import Runs, runs_of
+from webots_mcp.store.analysis.arrays import Runs, np, runs_of
 from webots_mcp.store.conditions_on_arrays import OnArrays, first_failure, position_in
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import Alike, EventKind, NotSearchableError

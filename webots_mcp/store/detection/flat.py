@@ -9,9 +9,7 @@ from itertools import pairwise
 from typing import Final, NamedTuple
 
 from webots_mcp.naming import find_targets
-from webots_mcp.store.analysis.arrays import Array, np
-from webots_mcp.store.analysis.noise import noise_of
-from webots_mcp.store.analysis.runs import MOSTLY, runs_alike
+from webots_mcp.store.analysis.arrays import MOSTLY, Array, noise_of, np, runs_alike
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import Alike, EventKind
 from webots_mcp.store.detection.search import Search

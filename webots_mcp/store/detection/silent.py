@@ -8,8 +8,7 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 from webots_mcp.naming import listed
-from webots_mcp.store.analysis.arrays import Flags, np
-from webots_mcp.store.analysis.runs import MOSTLY, Runs, runs_of
+from webots_mcp.store.analysis.arrays import MOSTLY, Flags, Runs, np, runs_of
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import Alike, EventKind
 from webots_mcp.store.detection.search import MOST_NAMED, Search

@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from webots_mcp.naming import NAME_POSITION
-from webots_mcp.store.analysis.arrays import Array, Indexes, np
-from webots_mcp.store.analysis.noise import noise_of
+from webots_mcp.store.analysis.arrays import Array, Indexes, noise_of, np
 from webots_mcp.store.analysis.standstill import NEARLY, find_standstills, shortest_seen_s
 from webots_mcp.store.analysis.track import Track, track_of
 from webots_mcp.store.detection.event import Event, EventOptions

@@ -7,8 +7,7 @@ from collections.abc import Hashable, Iterator, Sequence
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.analysis.runs import extremes_in, runs_of
+from webots_mcp.store.analysis.arrays import extremes_in, np, runs_of
 from webots_mcp.store.conditions_on_arrays import compared
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold
 from webots_mcp.store.detection.kind import Alike, EventKind, NotSearchableError

@@ -42,15 +42,12 @@ def condition_events(search: Search) -> Iterator[Event]:
     if frame.cut_at_s is not None:
         then = f"ask again with start_s={frame.cut_at_s:.3f}"
         search.not_searched("condition", f"time limit reached at {frame.cut_at_s:.3f} s: {then}")
-    if search.only is None:
-        share = recorded_share(search.connection, search.segment.run_id)
-        search.ledger.note_of_run(search.segment.run_id, share)
-        if not len(runs):
-            _require_values(condition, frame, position)
-        search.ledger.rows += len(frame) - first
-        search.ledger.came_near(
-            "condition", search.ledger.rows, f"true in none of {search.ledger.rows} rows"
-        )
+    share = recorded_share(search.connection, search.segment.run_id)
+    search.ledger.note_of_run(search.segment.run_id, share)
+    if not len(runs):
+        _require_values(condition, frame, position)
+    rows = search.ledger.rows = search.ledger.rows + len(frame) - first
+    search.ledger.came_near("condition", rows, f"true in none of {rows} rows")
     for run, values in zip(runs.each(), values_at(condition, frame, position, runs), strict=True):
         details = dict(list(values.items())[:_MOST_VALUES])
         yield search.event("condition", run.start_s, run.end_s, condition.text, **details)
@@ -123,5 +120,4 @@ CONDITION: Final = EventKind(
     lasts=True,
     counted=False,
     alike=Alike(lambda events, unit: "stretches"),
-    effort=4,
 )

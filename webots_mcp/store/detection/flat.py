@@ -58,12 +58,9 @@ def flat_events(search: Search) -> Iterator[Event]:
     """
     flat_s, signals = search.options.flat_s, search.required_quantities()
     least_s = FROZEN_SHARE * flat_s
-    search.note_too_large("flat")
     resting: dict[str, list[Rest]] = {}
     frozen: list[tuple[_Resting, Rest]] = []
-    for index, signal in enumerate(signals):
-        if search.is_over("flat", signals[index:]):
-            break
+    for signal in search.in_time("flat", signals):
         zones = (frame.zones(signal.name) for frame in (search.frame, search.whole))
         if not any(changes_in(each) >= LEAST_CHANGES for each in zones):
             continue

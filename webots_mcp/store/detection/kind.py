@@ -69,8 +69,6 @@ class EventKind:
         counted: Comparisons of runs count it.
         drawn: Its place among the rows below a plot, the least first; None if it has none there.
         alike: How similar ones are reported as one; None where each is reported by itself.
-        effort: Its rank by what it costs to look for: the least is searched first. Kinds of one
-            rank share their part of the time.
     """
 
     name: str
@@ -87,7 +85,6 @@ class EventKind:
     counted: bool = True
     drawn: int | None = None
     alike: Alike | None = None
-    effort: int = 0
 
 
 def told_together(

@@ -40,7 +40,6 @@ def oscillation_events(search: Search) -> Iterator[Event]:
             raise NotSearchableError(why)
         search.not_searched("oscillation", why)
     _note_periods(search)
-    search.note_too_large("oscillation")
     for name, swing in _found(search, signals):
         details = {
             "half_periods": swing.half_swings,
@@ -77,9 +76,7 @@ def _found(search: Search, signals: Sequence[Signal]) -> Iterator[tuple[str, Swi
     frame, least = search.frame, search.options.min_half_periods
     asked = least, _longest_period_s(search)
     shared: dict[tuple[int, int], tuple[Frame, EvenRows]] = {}  # by many signals
-    for index, signal in enumerate(signals):
-        if search.is_over("oscillation", signals[index:]):
-            break
+    for signal in search.in_time("oscillation", signals):
         for span in _changing(frame.zones(signal.name), least):
             if span not in shared:
                 part = frame.rows(*span)
@@ -129,5 +126,4 @@ OSCILLATION: Final = EventKind(
     of_numbers=True,
     drawn=3,
     alike=Alike(lambda events, unit: "oscillations"),
-    effort=1,
 )

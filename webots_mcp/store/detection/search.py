@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import sqlite3
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any, Final
@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from webots_mcp.store.detection.standstill import Findings
 
 MOST_NAMED: Final = 5
-_OF_SEGMENT: Final = ("recorded", "signals", "numbers", "frame", "standstills")
+NO_TIME: Final = "time limit reached: ask for this kind alone"
+_OF_SEGMENT: Final = ("recorded", "frame")
 
 
 @dataclass
@@ -37,8 +38,6 @@ class Search:
     Attributes:
         known: The signals of the robot.
         kinds: All that are looked for in it.
-        only: Names of the signals that matter, where it is about the ends of some events; else
-            None.
         asked: The part of the segment that was asked about, where that was widened to find ends.
         ledger: What could not be looked at, and what came near to an event.
     """
@@ -50,7 +49,6 @@ class Search:
     options: EventOptions
     deadline: Deadline
     ledger: Ledger = field(default_factory=Ledger)
-    only: frozenset[str] | None = None
     asked: Segment | None = None
 
     def of(self, segment: Segment, **changes: Any) -> Search:
@@ -105,8 +103,7 @@ class Search:
     @cached_property
     def signals(self) -> list[Signal]:
         """Those that are looked at."""
-        matching = resolve_signals(self.known, self.options.signals) if self.known else []
-        return [each for each in matching if self.only is None or each.name in self.only]
+        return resolve_signals(self.known, self.options.signals) if self.known else []
 
     @cached_property
     def numbers(self) -> list[Signal]:
@@ -179,13 +176,33 @@ class Search:
         """Note why a kind was not looked for, or where it was not."""
         self.ledger.not_searched(kind, *reasons)
 
-    def note_too_large(self, kind: str) -> None:
-        """Note which signals have numbers that are too large to be judged."""
-        large = [each.name for each in self.numbers if self.only is None and self._is_large(each)]
+    def in_time(
+        self, kind: str, signals: Sequence[Signal], *, judged: bool = True
+    ) -> Iterator[Signal]:
+        """The signals as long as there is time; which of them are not looked at is noted.
+
+        Args:
+            kind: What is looked for.
+            signals: In this order.
+            judged: Numbers that are too large cannot be.
+
+        Raises:
+            NotSearchableError: There is no time for any.
+        """
+        large: list[str] = []
+        for index, signal in enumerate(signals):
+            if self.deadline.passed:
+                if not index:
+                    raise NotSearchableError(NO_TIME)
+                names = listed([each.name for each in signals[index:]], 3)
+                why = f"time limit reached, {len(signals) - index} signals left: ask for {names}"
+                self.not_searched(kind, why)
+                break
+            large += [signal.name] if judged and self._is_large(signal) else []
+            yield signal
         if large:
-            self.not_searched(
-                kind, f"not in {listed(large, MOST_NAMED)}: numbers beyond {LARGEST:g}"
-            )
+            why = f"not in {listed(large, MOST_NAMED)}: numbers beyond {LARGEST:g}"
+            self.not_searched(kind, why)
 
     def _is_large(self, signal: Signal) -> bool:
         zones = self.frame.zones(signal.name)
@@ -197,11 +214,3 @@ class Search:
         """Note what came near to an event, as a share of what would be one."""
         where = f" (run {self.segment.run_id})" if self.ledger.of_several_runs else ""
         self.ledger.came_near(kind, share, what + where)
-
-    def is_over(self, kind: str, left: Sequence[Signal]) -> bool:
-        """Whether the time is over; then it is noted which signals were not searched."""
-        if self.deadline.passed:
-            names = listed([signal.name for signal in left], 3)
-            why = f"time limit reached, {len(left)} signals left: ask for {names}"
-            self.not_searched(kind, why)
-        return self.deadline.passed

@@ -23,9 +23,7 @@ _INDEX: Final = re.compile(r"\.\d+$")  # items that fall silent at once are repo
 def silent_events(search: Search) -> Iterator[Event]:
     """It has begun, and lasts to the signal's next value, if any."""
     shorter: Counter[str] = Counter()
-    for index, signal in enumerate(search.required_numbers()):
-        if search.is_over("silent", search.numbers[index:]):
-            break
+    for signal in search.in_time("silent", search.required_numbers(), judged=False):
         runs = _silences(search, signal)
         if not len(runs):
             continue

@@ -58,7 +58,6 @@ class Place(NamedTuple):
 
     Attributes:
         left_m: What is left of the noise in each of x and y, which are smoothed.
-        bears: The first and the last row that bear on its being a standstill.
     """
 
     rows: Indexes
@@ -68,7 +67,6 @@ class Place(NamedTuple):
     x_m: float
     y_m: float
     left_m: float
-    bears: tuple[int, int]
 
     @property
     def lasts_s(self) -> float:

@@ -44,9 +44,9 @@ def threshold_events(search: Search) -> Iterator[Event]:
     if not search.options.thresholds:
         raise NotSearchableError("no limit was given: give signals, and above or below")
     for threshold in search.options.thresholds:
-        for signal in resolve_signals(search.known, [threshold.signal]):
-            if search.only is None or signal.name in search.only:
-                yield from _beyond(search, signal, threshold)
+        signals = resolve_signals(search.known, [threshold.signal])
+        for signal in search.in_time("threshold", signals, judged=False):
+            yield from _beyond(search, signal, threshold)
 
 
 def _beyond(search: Search, signal: Signal, threshold: Threshold) -> Iterator[Event]:

@@ -23,8 +23,9 @@ def events_touching(search: Search) -> list[Event]:
         for kind in search.kinds:
             search.not_searched(kind.name, NO_TIME)
         return []
-    segment, kinds = search.recorded, [kind for kind in search.kinds if not kind.stored]
-    found = _found(search.of(search.segment, kinds=[kind for kind in search.kinds if kind.stored]))
+    segment = search.recorded
+    kinds = [kind for kind in search.kinds if kind.lasts or not kind.stored]
+    found = _found(search.of(search.segment, kinds=[e for e in search.kinds if e not in kinds]))
     if segment is None:
         for kind in kinds:
             why = f"run {search.segment.run_id} has no row in that range"

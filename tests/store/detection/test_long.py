@@ -71,8 +71,8 @@ def test_where_the_robot_stood_it_is_told_as_stuck_too_though_the_time_is_over_b
         )
         asked = find_range(empty, Scope())
         known = known_signals(empty, asked)
-        kinds, (segment,) = asked_kinds(options), asked.segments
-        search = Search(empty, segment, known, kinds, options, deadline, Ledger())
+        looked_for, (segment,) = asked_kinds(options), asked.segments
+        search = Search(empty, segment, known, looked_for, options, deadline, Ledger())
         return [each.kind for each in events_touching(search)]
 
     assert found_kinds(("standstill",), math.inf) == ["standstill"]

@@ -5,6 +5,7 @@ Neither a server's start nor a summary waits for numpy.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -71,12 +72,17 @@ def noise_of(values: Array) -> float:
 
 
 class Run(NamedTuple):
-    """One of them: rows [start, stop) of a frame, and the times of its first and last row."""
+    """One of them: rows [start, stop) of a frame, the times of its first and last row.
+
+    Attributes:
+        value: Where all of them have the same.
+    """
 
     start: int
     stop: int
     start_s: float
     end_s: float
+    value: float = math.nan
 
     @property
     def duration_s(self) -> float:

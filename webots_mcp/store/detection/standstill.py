@@ -17,7 +17,7 @@ from webots_mcp.store.detection.kind import Alike, EventKind, NotSearchableError
 from webots_mcp.store.detection.mode_use import ModeUses, frames_of_runs
 from webots_mcp.store.detection.motion import Motion, RunNoise, in_metres, tracks_in
 from webots_mcp.store.detection.search import NO_TIME
-from webots_mcp.store.detection.stuck import Judged, Place, Standings, judged
+from webots_mcp.store.detection.stuck import Judged, Place, Standings
 
 if TYPE_CHECKING:
     from webots_mcp.store.detection.search import Search
@@ -64,7 +64,7 @@ def standstills_in(search: Search) -> Findings:
     for margin in (MARGIN_ROWS, len(run)):
         rows = run.rows(before := max(0, first - margin), stop + margin)
         asked_rows = first - before, stop - before
-        found = judge_standstills(rows, motion, search.options, uses, noise=noise, asked=asked_rows)
+        found = judge_standstills(rows, motion, search.options, uses, noise, asked_rows)
         if len(rows) == len(run) or search.deadline.passed or not _may_reach_out(found, rows, run):
             break
     return found
@@ -85,9 +85,8 @@ def judge_standstills(
     motion: Motion,
     options: EventOptions,
     uses: ModeUses,
-    *,
-    noise: RunNoise | None = None,
-    asked: tuple[int, int] | None = None,
+    noise: RunNoise,
+    asked: tuple[int, int],
 ) -> Findings:
     """Find where a robot stood still and where it was stuck.
 
@@ -96,16 +95,14 @@ def judge_standstills(
         motion: Which signals tell.
         options: What counts.
         uses: In which modes it moves.
-        noise: Of the run, where these are some of its rows.
-        asked: Rows that the standstills have to touch; None for all.
+        noise: Of the run.
+        asked: Rows that the standstills have to touch.
 
     Raises:
         NotSearchableError: No position is known, or the frame has none.
     """
     if motion.position is None:
         raise NotSearchableError(NAME_POSITION)
-    noise = noise or RunNoise(frame, motion)
-    asked = asked or (0, len(frame))
     tracks, rows = tracks_in(frame, motion.position, noise)
     if not tracks:
         names = " and ".join(signal.name for signal in motion.position)
@@ -122,9 +119,10 @@ def judge_standstills(
     places = [each for each in found if each.rows[0] < asked[1] and each.rows[-1] >= asked[0]]
     long = [place for place in places if place.lasts_s >= NEARLY * seen_s]
     if not long:
-        there = [_part(track, here, asked) for track, here in zip(tracks, rows, strict=True)]
+        parts = [np.searchsorted(here, asked).tolist() for here in rows]
+        there = [track.part(*part) for track, part in zip(tracks, parts, strict=True)]
         return Findings([], None if places else _nearest(there, options), unseen)
-    events = judged(Standings(frame, motion, options, long, noise), uses)
+    events = Standings(frame, motion, options, long, noise, uses).judged()
     cut = ["time limit reached before it was known in which modes it moves"] if uses.is_cut else []
     return Findings(events, None, unseen, cut)
 
@@ -161,11 +159,6 @@ def _at_one_height(
         return
     for each in find_standstills(up, options.stuck_m, options.stuck_s):
         yield first + int(there[each.start]), first + int(there[each.last]) + 1
-
-
-def _part(track: Track, rows: Indexes, asked: tuple[int, int]) -> Track:
-    """The part of a track in some rows."""
-    return track.part(*np.searchsorted(rows, asked).tolist())
 
 
 def _nearest(tracks: Sequence[Track], options: EventOptions) -> tuple[float, str] | None:

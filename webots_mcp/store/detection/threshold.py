@@ -50,8 +50,7 @@ def threshold_events(search: Search) -> Iterator[Event]:
 
 def _beyond(search: Search, signal: Signal, threshold: Threshold) -> Iterator[Event]:
     frame, is_above = search.frame, threshold.above is not None
-    limit = threshold.above if threshold.above is not None else threshold.below
-    assert limit is not None, "a threshold has one limit"
+    (limit,) = (each for each in (threshold.above, threshold.below) if each is not None)
     holds = compared(frame, signal.name, ast.Gt if is_above else ast.Lt, limit)
     runs = runs_of(holds, frame.times)
     long = runs.only(runs.durations_s >= threshold.for_s)

@@ -11,9 +11,8 @@ import pytest
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.detection.extent import events_touching
 from webots_mcp.store.detection.registry import asked_kinds
-from webots_mcp.store.detection.search import Search
+from webots_mcp.store.detection.search import Search, events_touching
 from webots_mcp.store.detection.verdict import Ledger
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading.deadline import Deadline

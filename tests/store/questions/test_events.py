@@ -15,10 +15,9 @@ from tests.store.questions.asking import ask, spans
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold
-from webots_mcp.store.detection.extent import events_touching
 from webots_mcp.store.detection.jump import find_jumps
 from webots_mcp.store.detection.registry import asked_kinds
-from webots_mcp.store.detection.search import Search
+from webots_mcp.store.detection.search import Search, events_touching
 from webots_mcp.store.detection.verdict import Ledger
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.reading.deadline import Deadline

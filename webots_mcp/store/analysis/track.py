@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import log, sqrt
-from typing import Final, NamedTuple
+from typing import Final
 
 from webots_mcp.store.analysis.arrays import Array, Indexes, median, noise_of, np
 from webots_mcp.store.analysis.rhythm import rhythm_of
@@ -161,9 +161,9 @@ def path_length(track: Track) -> PathLength:
     if len(corners) < 2 or track.noise_m == 0:
         return PathLength(length_m, shortest_m, track.noise_m)
     ends = [*corners.tolist(), len(track.times)]
-    within = hidden_motion(track.times, track.raw_x, track.raw_y, ends)
-    counted_m = float(legs_m[within.legs].sum())
-    least_m, most_m = (max(0.0, each - counted_m) for each in (within.least_m, within.most_m))
+    slow, *hidden_m = hidden_motion(track.times, track.raw_x, track.raw_y, ends)
+    counted_m = float(legs_m[slow].sum())
+    least_m, most_m = (max(0.0, each - counted_m) for each in hidden_m)
     return PathLength(length_m + least_m, max(shortest_m, most_m - least_m), track.noise_m)
 
 
@@ -220,22 +220,13 @@ def travelled(tracks: list[Track]) -> PathLength:
     return PathLength(length_m, sum(part.longer_m for part in parts), noise_m)
 
 
-class HiddenMotion(NamedTuple):
-    """How far a robot went within legs that take long.
+def hidden_motion(
+    times: Array, x: Array, y: Array, ends: Sequence[int]
+) -> tuple[list[int], float, float]:
+    """Tell from the mean square of steps how far a robot went within legs that take long.
 
-    Attributes:
-        legs: Which of the legs take long.
-        least_m: Metres that the steps within them show; 0 where they could be noise.
-        most_m: Metres that can hardly be exceeded.
-    """
-
-    legs: list[int]
-    least_m: float
-    most_m: float
-
-
-def hidden_motion(times: Array, x: Array, y: Array, ends: Sequence[int]) -> HiddenMotion:
-    """Tell from the mean square of steps how far a robot went within slow legs.
+    Which legs these are; metres that the steps within them show, 0 where they could be noise; and
+    metres that can hardly be exceeded.
 
     Whether it stood, crept or circled there does not show in single places. But noise makes long
     steps no longer than short ones, and motion does: the difference of their mean squares is that
@@ -252,14 +243,14 @@ def hidden_motion(times: Array, x: Array, y: Array, ends: Sequence[int]) -> Hidd
     blocks = np.diff(ends) // rows
     slow: list[int] = np.flatnonzero(blocks >= _FEWEST_BLOCKS).tolist()
     if not slow:
-        return HiddenMotion([], 0.0, 0.0)
+        return [], 0.0, 0.0
     cuts = [slice(ends[leg], ends[leg] + (blocks[leg] - _BRAKING_BLOCKS) * rows) for leg in slow]
     square, error = _mean_square_step([_means(x[cut], y[cut], rows) for cut in cuts])
     took_s = sum(ends[leg + 1] - ends[leg] for leg in slow) * interval_s
     per_step = _CUT * took_s / (rows * interval_s)
     least = square - _TAKEN_OFF * error if square > _SHOWN * error else 0.0
     most = max(0.0, square + _MOST * error)
-    return HiddenMotion(slow, per_step * sqrt(least), per_step * sqrt(most))
+    return slow, per_step * sqrt(least), per_step * sqrt(most)
 
 
 def _means(x: Array, y: Array, rows: int) -> Array:

@@ -11,7 +11,7 @@ from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.naming import NO_POSITION, Value
 from webots_mcp.store.analysis.arrays import Runs, np, runs_of
 from webots_mcp.store.conditions_on_arrays import OnArrays, first_failure, position_in
-from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import Alike, EventKind, NotSearchableError
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.frame import Frame, read_frame
@@ -108,15 +108,11 @@ def _require_values(condition: Condition, frame: Frame, position: tuple[str, str
     raise NotSearchableError(f"{names} had no value in any row, so it could not be true{why}")
 
 
-def _is_given(options: EventOptions) -> bool:
-    return options.where is not None
-
-
 CONDITION: Final = EventKind(
     "condition",
     "see where",
     condition_events,
-    usual=_is_given,
+    usual=lambda options: options.where is not None,
     lasts=True,
     counted=False,
     alike=Alike(lambda events, unit: "stretches"),

@@ -71,45 +71,45 @@ class ModeUses:
     """
 
     def __init__(
-        self, run_id: int, motion: Motion, frames: Iterator[Frame | None], options: EventOptions
+        self,
+        connection: sqlite3.Connection,
+        run: Frame,
+        motion: Motion,
+        options: EventOptions,
+        deadline: Deadline,
     ) -> None:
-        self.run_id = run_id
+        self.run_id = run.run_id
         self.is_cut = False
-        self._frames = frames
         self._motion = motion
         self._options = options
+        self._frames = self._runs(connection, run, deadline)
         self._known: dict[str, ModeUse] = {}
 
     def of(self, mode: str) -> ModeUse:
         """What it did in a mode; runs are read until one of them shows that it moved."""
         while not self._known.get(mode, ModeUse()).moving:
-            try:
-                frame = next(self._frames)
-            except StopIteration:
+            if (frame := next(self._frames, None)) is None:
                 break
-            self.is_cut |= frame is None or frame.cut_at_s is not None
-            if frame is None:
-                break
+            self.is_cut |= frame.cut_at_s is not None
             for name, use in uses_in(frame, self._motion, self._options):
                 self._known[name] = self._known.get(name, ModeUse()).with_more(use)
         return self._known.get(mode, ModeUse())
 
-
-def frames_of_runs(
-    connection: sqlite3.Connection, run: Frame, deadline: Deadline
-) -> Iterator[Frame | None]:
-    """A run and a few of the same robot before it; None where there is no time for more."""
-    earlier = connection.execute(_EARLIER, (run.run_id, run.run_id, EARLIER_RUNS)).fetchall()
-    for run_id in (run.run_id, *(run_id for (run_id,) in earlier)):
-        if deadline.passed:
-            yield None
-            return
-        bounds = recorded_bounds(connection, run_id)
-        if run_id == run.run_id:
-            yield run.rows(0, MOST_ROWS)
-        elif bounds is not None:
-            whole = Segment(run_id, bounds[0], just_after(bounds[1]))
-            yield read_frame(connection, whole, deadline).rows(0, MOST_ROWS)
+    def _runs(
+        self, connection: sqlite3.Connection, run: Frame, deadline: Deadline
+    ) -> Iterator[Frame]:
+        """The run and a few of the same robot before it, as far as there is time."""
+        earlier = connection.execute(_EARLIER, (run.run_id, run.run_id, EARLIER_RUNS)).fetchall()
+        for run_id in (run.run_id, *(run_id for (run_id,) in earlier)):
+            if deadline.passed:
+                self.is_cut = True
+                return
+            bounds = recorded_bounds(connection, run_id)
+            if run_id == run.run_id:
+                yield run.rows(0, MOST_ROWS)
+            elif bounds is not None:
+                whole = Segment(run_id, bounds[0], just_after(bounds[1]))
+                yield read_frame(connection, whole, deadline).rows(0, MOST_ROWS)
 
 
 def uses_in(frame: Frame, motion: Motion, options: EventOptions) -> Iterator[tuple[str, ModeUse]]:

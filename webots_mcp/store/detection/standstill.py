@@ -14,7 +14,7 @@ from webots_mcp.store.analysis.standstill import NEARLY, find_standstills, short
 from webots_mcp.store.analysis.track import Track, track_of
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import Alike, EventKind, NotSearchableError
-from webots_mcp.store.detection.mode_use import ModeUses, frames_of_runs
+from webots_mcp.store.detection.mode_use import ModeUses
 from webots_mcp.store.detection.motion import Motion, RunNoise, in_metres, tracks_in
 from webots_mcp.store.detection.search import NO_TIME
 from webots_mcp.store.detection.stuck import Judged, Place, Standings
@@ -56,8 +56,7 @@ def standstills_in(search: Search) -> Findings:
     motion, run, asked = search.motion, search.frame, search.asked or search.segment
     if search.whole.cut_at_s is None and not asked.full_rate:
         run = search.whole
-    frames = frames_of_runs(search.connection, run, search.deadline)
-    uses = ModeUses(run.run_id, motion, frames, search.options)
+    uses = ModeUses(search.connection, run, motion, search.options, search.deadline)
     noise = RunNoise(run, motion)
     first, stop = run.places([asked.start_s, asked.end_s]).tolist()
     found = Findings()

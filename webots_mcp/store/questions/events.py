@@ -15,11 +15,10 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.liveness import dead_sessions
 from webots_mcp.naming import flatten
 from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.extent import events_touching
 from webots_mcp.store.detection.grouping import grouped
 from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.detection.registry import asked_kinds, kind_named, stored_kinds
-from webots_mcp.store.detection.search import Search
+from webots_mcp.store.detection.search import Search, events_touching
 from webots_mcp.store.detection.verdict import Ledger, Verdicts, count_by_kind
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.frame import read_frame

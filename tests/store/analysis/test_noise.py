@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from webots_mcp.store.analysis.noise import noise_of, smooth
+from webots_mcp.store.analysis.arrays import noise_of
+from webots_mcp.store.analysis.track import smooth
 
 TIMES = np.arange(0, 60, 0.032)
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from webots_mcp.store.analysis.noise import Array
+from webots_mcp.store.analysis.arrays import Array
 from webots_mcp.store.analysis.swings import Swing, find_swings
 
 START_S, PERIODS, HEIGHT = 60.0, 8, 0.2

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.store.analysis.driving import noisy_track
-from webots_mcp.store.analysis.noise import noise_of, smooth
-from webots_mcp.store.analysis.track import path_length, track_of
+from webots_mcp.store.analysis.arrays import noise_of
+from webots_mcp.store.analysis.track import path_length, smooth, track_of
 
 DRIVE = [
     phase

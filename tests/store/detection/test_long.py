@@ -11,8 +11,8 @@ import pytest
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.detection.extent import Detection
 from webots_mcp.store.detection.registry import asked_kinds
+from webots_mcp.store.detection.search import Search, events_touching
 from webots_mcp.store.detection.verdict import Ledger
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading.deadline import Deadline
@@ -70,8 +70,9 @@ def test_where_the_robot_stood_it_is_told_as_stuck_too_though_the_time_is_over_b
         )
         asked = find_range(empty, Scope())
         known = known_signals(empty, asked)
-        detection = Detection(empty, known, asked_kinds(options), options, deadline, Ledger())
-        return [each.kind for each in detection.events_touching(asked.segments[0])]
+        looked_for, (segment,) = asked_kinds(options), asked.segments
+        search = Search(empty, segment, known, looked_for, options, deadline, Ledger())
+        return [each.kind for each in events_touching(search)]
 
     assert found_kinds(("standstill",), math.inf) == ["standstill"]
     times = range(1, len(statements) + 1)

@@ -15,9 +15,9 @@ from tests.store.questions.asking import ask, spans
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold
-from webots_mcp.store.detection.extent import Detection
 from webots_mcp.store.detection.jump import find_jumps
 from webots_mcp.store.detection.registry import asked_kinds
+from webots_mcp.store.detection.search import Search, events_touching
 from webots_mcp.store.detection.verdict import Ledger
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.reading.deadline import Deadline
@@ -250,8 +250,8 @@ def test_between_two_signals_the_time_is_looked_at(
     for limit in range(4, 14):
         ticks, ledger = count(), Ledger()
         deadline = Deadline(limit, lambda ticks=ticks: next(ticks))
-        detection = Detection(rover, known, kinds, options, deadline, ledger)
-        found = detection.events_touching(time_range.segments[0])
+        search = Search(rover, time_range.segments[0], known, kinds, options, deadline, ledger)
+        found = events_touching(search)
         told += ledger.verdicts(kinds, found).not_searched.values()
     assert any(re.search(r"time limit reached, \d+ signals left: ask for", each) for each in told)
 

@@ -12,8 +12,8 @@ import pytest
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from tests.store.questions.asking import ask, spans
 from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.mode_use import ModeUses, frames_of_runs
-from webots_mcp.store.detection.motion import find_motion
+from webots_mcp.store.detection.mode_use import ModeUses
+from webots_mcp.store.detection.motion import RunNoise, find_motion
 from webots_mcp.store.detection.standstill import judge_standstills
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading.deadline import Deadline
@@ -180,8 +180,9 @@ def test_a_mode_that_was_not_looked_at_in_time_is_not_said_to_be_one_in_which_it
     asked = find_range(empty, Scope(run_id=1))
     motion = find_motion(known_signals(empty, asked), EventOptions())
     frame = read_frame(empty, asked.segments[0], Deadline(math.inf))
-    uses = ModeUses(1, motion, frames_of_runs(empty, frame, Deadline(0.0)), EventOptions())
-    standstill, _ = judge_standstills(frame, motion, EventOptions(), uses).events
+    uses = ModeUses(empty, frame, motion, EventOptions(), Deadline(0.0))
+    noise, rows = RunNoise(frame, motion), (0, len(frame))
+    standstill, _ = judge_standstills(frame, motion, EventOptions(), uses, noise, rows).events
     why = standstill.details["why_not_stuck"]
     assert why == "not checked whether it moves in mode go: time limit reached"
 

@@ -13,8 +13,8 @@ import pytest
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
 from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.extent import Detection
 from webots_mcp.store.detection.registry import asked_kinds
+from webots_mcp.store.detection.search import Search, events_touching
 from webots_mcp.store.detection.verdict import Ledger, Verdicts
 from webots_mcp.store.questions.series import RunHistory, query_history
 from webots_mcp.store.questions.trends import trends
@@ -182,5 +182,5 @@ def _look(
 ) -> list[Event]:
     known = known_signals(connection, find_range(connection, Scope()))
     kinds = asked_kinds(options)
-    detection = Detection(connection, known, kinds, options, after(looks), ledger)
-    return detection.events_touching(segment)
+    search = Search(connection, segment, known, kinds, options, after(looks), ledger)
+    return events_touching(search)

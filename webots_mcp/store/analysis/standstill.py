@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, median, np
-from webots_mcp.store.analysis.creep import MOST_AROUND, Rows, is_creep, rest_within
+from webots_mcp.store.analysis.creep import Rows, is_creep, rest_within
 from webots_mcp.store.analysis.track import Track
 
 WIDENED_BY: Final = 5.0  # a place is at least so many deviations of the smoothed position wide
@@ -34,16 +34,12 @@ class Standstill(NamedTuple):
         start: Index of the first row in which it stood; `last` of the last one.
         x_m: Where: the mean of its positions.
         y_m: As well.
-        seen_from: Index of the first row that bears on all that; `seen_to` of the last one. They
-            may lie beyond the rows that there are: then more rows might tell something else.
     """
 
     start: int
     last: int
     x_m: float
     y_m: float
-    seen_from: int
-    seen_to: int
 
 
 def find_standstills(track: Track, radius_m: float, least_s: float) -> list[Standstill]:
@@ -62,29 +58,13 @@ def find_standstills(track: Track, radius_m: float, least_s: float) -> list[Stan
     if not len(stays):
         return []
     rows = Rows(track)
-    firsts, lasts, of = _resting(track, rows, grid, stays, radius_m)
+    firsts, lasts = _resting(track, rows, grid, stays, radius_m)
     starts = _begins_of_rest(track, firsts, lasts, grid.rows)
     newest = len(track.times) - 1
     ends = newest - _begins_of_rest(track.reversed, newest - lasts, newest - firsts, grid.rows)
     long = track.times[ends] - track.times[starts] >= NEARLY * least_s
-    seen = _seen(track, grid, stays)[of[long]]
     near_m = SETTLED_SHARE * radius_m + 3 * track.left_m
-    return _joined(track, rows, starts[long], ends[long], seen, grid.rows, near_m)
-
-
-def _seen(track: Track, grid: _Grid, stays: Indexes) -> Indexes:
-    """The first and the last row that bear on each stay, which may lie beyond those of the track.
-
-    Where stays follow each other at once, each begins where the one before ended. About each it is
-    looked for a motion, in so many times its length, and for ramps.
-    """
-    follows = np.append(False, stays[1:, 0] - stays[:-1, 1] <= grid.window)
-    chain, heads = np.cumsum(~follows) - 1, np.flatnonzero(~follows)
-    ends = np.stack((stays[heads, 0], stays[np.append(heads[1:], len(stays)) - 1, 1]), axis=1)
-    rows = np.searchsorted(track.times, grid.times[np.minimum(ends, len(grid.times) - 1)])[chain]
-    around = grid.rows * np.maximum(MOST_AROUND * np.diff(stays), 2 * grid.window)
-    margins = np.maximum(around, _MOST_RAMP_ROWS) * np.array([-1, 1])
-    return np.asarray(rows + margins, np.intp)
+    return _joined(track, rows, starts[long], ends[long], grid.rows, near_m)
 
 
 def shortest_seen_s(noise_m: float, interval_s: float, radius_m: float, least_s: float) -> float:
@@ -151,11 +131,11 @@ def _stays(grid: _Grid, radius_m: float) -> Iterator[tuple[int, int]]:
 
 def _resting(
     track: Track, rows: Rows, grid: _Grid, stays: Indexes, radius_m: float
-) -> tuple[Indexes, Indexes, Indexes]:
+) -> tuple[Indexes, Indexes]:
     """About the first and the last row of the rest in each stay in which it does not only creep.
 
     It begins near the place of the first seconds and ends near that of the last: a robot that
-    twitched in between stands elsewhere. With them, of which of the stays they are.
+    twitched in between stands elsewhere.
     """
     limit_m = max(SETTLED_SHARE * radius_m, 3 * track.left_m)
     first = stays[:, 0] + _settled(grid, stays[:, :1] + np.arange(grid.window), limit_m)
@@ -177,8 +157,7 @@ def _resting(
         )
         if rest := rest_within(rows, start, end) or rest_within(rows, *edges[at].tolist()):
             firsts[at], lasts[at], creeps[at] = rest[0], rest[1] - 1, False
-    of = np.flatnonzero(~creeps)
-    return firsts[of], lasts[of], of
+    return firsts[~creeps], lasts[~creeps]
 
 
 def _pairs(ranges: Sequence[tuple[int, int]]) -> Indexes:
@@ -198,14 +177,13 @@ def _joined(
     rows: Rows,
     starts: Indexes,
     ends: Indexes,
-    seen: Indexes,
     slack: int,
     far_m: float,
 ) -> list[Standstill]:
     """Each standstill once: who creeps up to a place leaves a stay there, and stands on."""
     found: list[Standstill] = []
     _, _, x, y = (each[:, 0] for each in rows.means(starts, ends + 1, 1))
-    columns = (starts, ends, np.round(x, 6), np.round(y, 6), *np.transpose(seen))
+    columns = (starts, ends, np.round(x, 6), np.round(y, 6))
     new = sorted(map(Standstill, *(each.tolist() for each in columns)))
     for each in new:
         was = found[-1] if found else each
@@ -213,9 +191,7 @@ def _joined(
         if not found or apart_m > far_m or each.start - was.last > track.smoothed_rows + slack:
             found.append(each)
             continue
-        seen_from, seen_to = min(was.seen_from, each.seen_from), max(was.seen_to, each.seen_to)
-        last = max(each.last, was.last)
-        found[-1] = was._replace(last=last, seen_from=seen_from, seen_to=seen_to)
+        found[-1] = was._replace(last=max(each.last, was.last))
     return found
 
 

@@ -18,8 +18,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final, cast
 
-from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, median, np, sums_of
-from webots_mcp.store.analysis.noise import noise_of
+from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, median, noise_of, np, sums_of
 from webots_mcp.store.analysis.rhythm import gap_borders
 
 LEAST_HALF_SWINGS: Final = 6  # four are made by a value that fell, rested, and rose again

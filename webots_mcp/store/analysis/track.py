@@ -1,21 +1,17 @@
-"""The way of a robot: its positions without most of their noise, and how long that way is."""
+"""The way of a robot: its positions without most of their noise, and how long that way is.
+
+Bends narrower than a leg of it are hidden by the noise: how far they went shows in long steps.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import log, sqrt
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import Array, Indexes, median, np
-from webots_mcp.store.analysis.hidden import hidden_motion
-from webots_mcp.store.analysis.noise import (
-    FEWEST_SMOOTHED,
-    kept_alike,
-    noise_of,
-    smooth,
-    variance_along,
-)
+from webots_mcp.store.analysis.arrays import Array, Indexes, median, noise_of, np
 from webots_mcp.store.analysis.rhythm import rhythm_of
 
 FALSE_LEGS: Final = 0.003  # so many may noise alone make of a robot at rest, on average
@@ -25,6 +21,19 @@ SHARPEST_ARC_RAD: Final = 2.7  # from leg to leg; who turns farther went back
 LONGEST_SMOOTHING_S: Final = 1.2  # a turn of 1.5 rad/s is cut by 0.7 % then, by 5 % in 2 s
 _PLACES: Final = ("x", "y", "raw_x", "raw_y")
 _PARABOLA_GAIN: Final = 2.25  # the variance that a parabola over n rows leaves is 2.25 / n of it
+FEWEST_SMOOTHED: Final = 5  # rows: through fewer a parabola leaves the noise
+_BLOCK_S: Final = 0.5  # positions are averaged over this long
+_FAR: Final = 3  # blocks between the places of a long step
+_BRAKING_BLOCKS: Final = 2  # at the end of a leg, in which a robot that stood may have left
+_FEWEST_BLOCKS: Final = _FAR + _BRAKING_BLOCKS + 1
+# A turn of 1.5 rad/s, which steps of 0.5 to 1.5 s cut by about so much.
+_CUT: Final = 1.1
+# Standard errors of the mean square speed. It is positive without motion in one of 15 cases where
+# 1.5 are taken off; 1 of them makes up for a speed that varies, whose root mean square is more
+# than its mean. Beyond 2 it is in one of 44.
+_SHOWN: Final = 1.5
+_TAKEN_OFF: Final = 1.0
+_MOST: Final = 2.0
 
 
 @dataclass(frozen=True)
@@ -152,9 +161,9 @@ def path_length(track: Track) -> PathLength:
     if len(corners) < 2 or track.noise_m == 0:
         return PathLength(length_m, shortest_m, track.noise_m)
     ends = [*corners.tolist(), len(track.times)]
-    within = hidden_motion(track.times, track.raw_x, track.raw_y, ends)
-    counted_m = float(legs_m[within.legs].sum())
-    least_m, most_m = (max(0.0, each - counted_m) for each in (within.least_m, within.most_m))
+    slow, *hidden_m = hidden_motion(track.times, track.raw_x, track.raw_y, ends)
+    counted_m = float(legs_m[slow].sum())
+    least_m, most_m = (max(0.0, each - counted_m) for each in hidden_m)
     return PathLength(length_m + least_m, max(shortest_m, most_m - least_m), track.noise_m)
 
 
@@ -209,3 +218,105 @@ def travelled(tracks: list[Track]) -> PathLength:
     between_m = sum(way_m for way_m in across_m if way_m > GAP_NOISE * noise_m)
     length_m = between_m + sum(part.length_m for part in parts)
     return PathLength(length_m, sum(part.longer_m for part in parts), noise_m)
+
+
+def hidden_motion(
+    times: Array, x: Array, y: Array, ends: Sequence[int]
+) -> tuple[list[int], float, float]:
+    """Tell from the mean square of steps how far a robot went within legs that take long.
+
+    Which legs these are; metres that the steps within them show, 0 where they could be noise; and
+    metres that can hardly be exceeded.
+
+    Whether it stood, crept or circled there does not show in single places. But noise makes long
+    steps no longer than short ones, and motion does: the difference of their mean squares is that
+    of the speed, whatever the noise is (A. N. Kolmogorov's structure function).
+
+    Args:
+        times: Seconds, without a gap.
+        x: Metres as recorded, not smoothed; and so is `y`.
+        y: As many.
+        ends: The rows in which legs begin, and the end of the last one.
+    """
+    interval_s = median(np.diff(times))
+    rows = max(1, round(_BLOCK_S / interval_s))
+    blocks = np.diff(ends) // rows
+    slow: list[int] = np.flatnonzero(blocks >= _FEWEST_BLOCKS).tolist()
+    if not slow:
+        return [], 0.0, 0.0
+    cuts = [slice(ends[leg], ends[leg] + (blocks[leg] - _BRAKING_BLOCKS) * rows) for leg in slow]
+    square, error = _mean_square_step([_means(x[cut], y[cut], rows) for cut in cuts])
+    took_s = sum(ends[leg + 1] - ends[leg] for leg in slow) * interval_s
+    per_step = _CUT * took_s / (rows * interval_s)
+    least = square - _TAKEN_OFF * error if square > _SHOWN * error else 0.0
+    most = max(0.0, square + _MOST * error)
+    return slow, per_step * sqrt(least), per_step * sqrt(most)
+
+
+def _means(x: Array, y: Array, rows: int) -> Array:
+    """X and y, averaged over so many rows each."""
+    return np.mean(np.reshape(np.stack((x, y)), (2, -1, rows)), axis=2)
+
+
+def _mean_square_step(legs: Sequence[Array]) -> tuple[float, float]:
+    """Of a step from block to block without the noise, and its standard error.
+
+    Steps of k blocks share k of them with their neighbours.
+    """
+    near, far = (
+        np.concatenate([np.sum((leg[:, k:] - leg[:, :-k]) ** 2, axis=0) for leg in legs])
+        for k in (1, _FAR)
+    )
+    square = float(far.mean() - near.mean()) / (_FAR**2 - 1)
+    error = sqrt(_FAR * far.var() / len(far) + 2 * near.var() / len(near)) / (_FAR**2 - 1)
+    return square, error
+
+
+def smooth(values: Array, rows: int) -> tuple[Array, float]:
+    """Values without most of their noise, and the share of its standard deviation that is left.
+
+    A parabola of least squares through an odd number of rows about each (A. Savitzky, M. Golay,
+    Smoothing and differentiation of data by simplified least squares procedures, Analytical
+    Chemistry 36, 1964): a bend that is long compared to the window is kept. At the ends the
+    parabola through the first or last window is taken.
+    """
+    rows = min(rows, len(values) - 1 + len(values) % 2)
+    if rows < FEWEST_SMOOTHED:
+        return values, 1.0
+    fit, half = _parabola(rows), rows // 2
+    smoothed = np.asarray(np.convolve(values, fit[half, ::-1], "same"), np.float64)
+    smoothed[:half] = (fit @ values[:rows])[:half]
+    smoothed[-half:] = (fit @ values[-rows:])[-half:]
+    return smoothed, float(np.sqrt(fit[half] @ fit[half]))
+
+
+def variance_along(count: int, rows: int) -> Array:
+    """Of the noise in each of so many smoothed values, as a ratio to that of those in the middle.
+
+    The parabola is less certain at the ends: there it is up to four times as much.
+    """
+    variance, rows = np.ones(count), min(rows, count - 1 + count % 2)
+    if rows >= FEWEST_SMOOTHED:
+        fit, half = _parabola(rows), rows // 2
+        ratios = np.einsum("ij,ij->i", fit, fit) / (fit[half] @ fit[half])
+        variance[:half], variance[-half:] = ratios[:half], ratios[-half:]
+    return variance
+
+
+def kept_alike(rows: int) -> Array:
+    """Correlation of the noise in two smoothed values that lie 0, 1, 2, ... rows apart.
+
+    The last one, 0, holds for all that lie farther apart.
+    """
+    if rows < FEWEST_SMOOTHED:
+        return np.array([1.0, 0.0])
+    middle = _parabola(rows)[rows // 2]
+    alike = np.correlate(middle, middle, "full")[rows - 1 :]
+    return np.append(alike / alike[0], 0.0)
+
+
+def _parabola(rows: int) -> Array:
+    """The matrix that turns so many values into those of the parabola of least squares."""
+    place = np.arange(rows, dtype=np.float64) - rows // 2
+    basis: Array = np.stack((place**2, place, np.ones(rows)), axis=1)
+    return np.asarray(basis @ np.linalg.pinv(basis), np.float64)

@@ -9,10 +9,9 @@ from typing import Final
 from webots_mcp.conditions import Condition, parse_condition
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.naming import NO_POSITION, Value
-from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.analysis.runs import Runs, runs_of
+from webots_mcp.store.analysis.arrays import Runs, np, runs_of
 from webots_mcp.store.conditions_on_arrays import OnArrays, first_failure, position_in
-from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import Alike, EventKind, NotSearchableError
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.frame import Frame, read_frame
@@ -44,15 +43,12 @@ def condition_events(search: Search) -> Iterator[Event]:
     if frame.cut_at_s is not None:
         then = f"ask again with start_s={frame.cut_at_s:.3f}"
         search.not_searched("condition", f"time limit reached at {frame.cut_at_s:.3f} s: {then}")
-    if search.only is None:
-        share = recorded_share(search.connection, search.segment.run_id)
-        search.ledger.note_of_run(search.segment.run_id, share)
-        if not len(runs):
-            _require_values(condition, frame, position)
-        search.ledger.rows += len(frame) - first
-        search.ledger.came_near(
-            "condition", search.ledger.rows, f"true in none of {search.ledger.rows} rows"
-        )
+    share = recorded_share(search.connection, search.segment.run_id)
+    search.ledger.note_of_run(search.segment.run_id, share)
+    if not len(runs):
+        _require_values(condition, frame, position)
+    rows = search.ledger.rows = search.ledger.rows + len(frame) - first
+    search.ledger.came_near("condition", rows, f"true in none of {rows} rows")
     for run, values in zip(runs.each(), values_at(condition, frame, position, runs), strict=True):
         details = dict(list(values.items())[:_MOST_VALUES])
         yield search.event("condition", run.start_s, run.end_s, condition.text, **details)
@@ -117,17 +113,12 @@ def _require_values(condition: Condition, frame: Frame, position: tuple[str, str
     raise NotSearchableError(f"{names} had no value in any row, so it could not be true{why}")
 
 
-def _is_given(options: EventOptions) -> bool:
-    return options.where is not None
-
-
 CONDITION: Final = EventKind(
     "condition",
     "see where",
     condition_events,
-    usual=_is_given,
+    usual=lambda options: options.where is not None,
     lasts=True,
     counted=False,
     alike=Alike(lambda events, unit: "stretches"),
-    effort=4,
 )

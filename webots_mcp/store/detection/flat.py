@@ -6,12 +6,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Final, NamedTuple
+from typing import Final
 
 from webots_mcp.naming import find_targets
-from webots_mcp.store.analysis.arrays import Array, np
-from webots_mcp.store.analysis.noise import noise_of
-from webots_mcp.store.analysis.runs import MOSTLY, runs_alike
+from webots_mcp.store.analysis.arrays import MOSTLY, Array, Run, noise_of, np, runs_alike
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import Alike, EventKind
 from webots_mcp.store.detection.search import Search
@@ -32,26 +30,6 @@ TARGET_WENT: Final = 0.1  # of the whole range of a target: so far it goes on, t
 LONGEST_READ_S: Final = 120.0  # of a rest: longer ones show it in their first part
 
 
-class Rest(NamedTuple):
-    """Rows [start, stop) with the same value, and the times of the first and the last of them."""
-
-    start: int
-    stop: int
-    start_s: float
-    end_s: float
-    value: float
-
-    @property
-    def rows(self) -> int:
-        """How many."""
-        return self.stop - self.start
-
-    @property
-    def duration_s(self) -> float:
-        """From the first row to the last."""
-        return self.end_s - self.start_s
-
-
 def flat_events(search: Search) -> Iterator[Event]:
     """Rests of at least `flat_s` of who mostly changes otherwise.
 
@@ -60,24 +38,21 @@ def flat_events(search: Search) -> Iterator[Event]:
     """
     flat_s, signals = search.options.flat_s, search.required_quantities()
     least_s = FROZEN_SHARE * flat_s
-    search.note_too_large("flat")
-    resting: dict[str, list[Rest]] = {}
-    frozen: list[tuple[_Resting, Rest]] = []
-    for index, signal in enumerate(signals):
-        if search.is_over("flat", signals[index:]):
-            break
+    resting: dict[str, list[Run]] = {}
+    frozen: list[tuple[_Resting, Run]] = []
+    for signal in search.in_time("flat", signals):
         zones = (frame.zones(signal.name) for frame in (search.frame, search.whole))
         if not any(changes_in(each) >= LEAST_CHANGES for each in zones):
             continue
         # Rests of others count where they cover most of one that counts.
         shown = _Resting(search, signal, MOSTLY * least_s)
-        if shown.changes >= LEAST_CHANGES:
+        changes_here = shown.changes >= LEAST_CHANGES
+        if changes_here:
             resting[signal.name] = shown.rests
-        flat = [rest for rest in shown.rests if rest.duration_s >= flat_s]
-        if flat:
+        if flat := [rest for rest in shown.rests if rest.duration_s >= flat_s]:
             if shown.changes_but_for(flat) or is_lively(search.whole, signal.name):
                 yield from map(shown.event, flat)
-        elif shown.rests and shown.changes >= LEAST_CHANGES:
+        elif shown.rests and changes_here:
             soon = [rest for rest in shown.rests if rest.duration_s >= least_s]
             left = [e for e in soon if shown.target_went_on(e) and not shown.is_limit(e)]
             yield from map(shown.event, left)
@@ -100,7 +75,7 @@ def changes_in(zones: Zones) -> int:
     return int(zones.change_count.sum() + over_borders)
 
 
-def find_rests(frame: Frame, name: str, least_s: float) -> Iterator[Rest]:
+def find_rests(frame: Frame, name: str, least_s: float) -> Iterator[Run]:
     """Where a signal kept its value for so long.
 
     Opened are only the chunks with so many rows that repeat the one before, and their neighbours.
@@ -116,8 +91,8 @@ def find_rests(frame: Frame, name: str, least_s: float) -> Iterator[Rest]:
         numbers = part.numbers(name)
         runs = runs_alike(numbers, part.times)
         for run in runs.only(runs.durations_s >= least_s).each():
-            value = float(numbers[run.start])
-            yield Rest(first + run.start, first + run.stop, run.start_s, run.end_s, value)
+            rows = {"start": first + run.start, "stop": first + run.stop}
+            yield run._replace(**rows, value=float(numbers[run.start]))
 
 
 @dataclass
@@ -133,7 +108,7 @@ class _Resting:
     least_s: float
 
     @cached_property
-    def rests(self) -> list[Rest]:
+    def rests(self) -> list[Run]:
         """All of them."""
         return list(find_rests(self.search.frame, self.signal.name, self.least_s))
 
@@ -142,7 +117,7 @@ class _Resting:
         """Values unlike the one before, in all rows."""
         return changes_in(self.search.frame.zones(self.signal.name))
 
-    def changes_but_for(self, rests: Sequence[Rest]) -> bool:
+    def changes_but_for(self, rests: Sequence[Run]) -> bool:
         """Whether it changed in most of the rows outside of those rests, and in ten at least.
 
         What goes from one of them right to the next, as a counter does, has not changed otherwise.
@@ -155,7 +130,7 @@ class _Resting:
         changes = self.changes - sum(a.stop == b.start for a, b in pairwise(rests))
         return changes >= max(LEAST_CHANGES, MOSTLY * present * outside)
 
-    def event(self, rest: Rest) -> Event:
+    def event(self, rest: Run) -> Event:
         """One of its rests, and what there is to say of it, but that it is frozen."""
         value, why = f"{rest.value:.6g}", self.target_went_on(rest)
         value += f" {self.signal.unit}" if self.signal.unit else ""
@@ -169,13 +144,13 @@ class _Resting:
         details = {"value": rest.value} | ({"says": says} if says else {})
         return self.search.event("flat", rest.start_s, rest.end_s, self.signal.name, **details)
 
-    def note_near(self, rest: Rest) -> None:
+    def note_near(self, rest: Run) -> None:
         """It came near to an event."""
         lasted = f"for {rest.duration_s:.3g} s from {rest.start_s:.6g} s"
         what = f"{self.signal.name} stayed at {rest.value:.4g} {lasted}"
         self.search.came_near("flat", rest.duration_s / self.search.options.flat_s, what)
 
-    def is_limit(self, rest: Rest) -> bool:
+    def is_limit(self, rest: Run) -> bool:
         """Whether it was never beyond the value that it kept, and was there at other times too.
 
         Only then it is where a sensor ends, or what a gate lets through: what counts or creeps is
@@ -183,7 +158,7 @@ class _Resting:
         """
         return rest.value in self._extremes(self.signal) and self._rows_elsewhere(rest) > 0
 
-    def target_went_on(self, rest: Rest) -> str | None:
+    def target_went_on(self, rest: Run) -> str | None:
         """Whether its target moved, or it was commanded to move, while it stayed; None if neither.
 
         For a position in the plane `stuck` reports that.
@@ -201,10 +176,14 @@ class _Resting:
             return f"{speed.name} was {float(np.median(nonzero)):.4g}"
         return None
 
-    def _rows_elsewhere(self, rest: Rest) -> int:
+    def _rows_elsewhere(self, rest: Run) -> int:
         """How many other rows of the run have the same value."""
         first = int(np.searchsorted(self._sorted, rest.value))
-        return int(np.searchsorted(self._sorted, rest.value, "right")) - first - rest.rows
+        return (
+            int(np.searchsorted(self._sorted, rest.value, "right"))
+            - first
+            - (rest.stop - rest.start)
+        )
 
     @cached_property
     def _sorted(self) -> Array:
@@ -223,7 +202,7 @@ class _Resting:
         target, speed = find_targets(self.signal.name, numbers)
         return known.get(target or ""), known.get(speed or "")
 
-    def _values(self, signal: Signal | None, rest: Rest) -> Array:
+    def _values(self, signal: Signal | None, rest: Run) -> Array:
         """The numbers of a signal in a rest, which may be none of those that are looked at."""
         if signal is None:
             return np.zeros(0)
@@ -236,18 +215,18 @@ class _Resting:
         low, high = (each[~np.isnan(each)] for each in (zones.min, zones.max))
         return float(low.min(initial=np.inf)), float(high.max(initial=-np.inf))
 
-    def frozen(self, rests: Sequence[Rest]) -> list[Rest]:
+    def frozen(self, rests: Sequence[Run]) -> list[Run]:
         """Of some rests those that noise never makes, if it is noisy but for them."""
         motion = self.search.motion
         if self.signal in (motion.commanded, motion.speed, *motion.wheels):
             return []
-        held = [rest for rest in rests if rest.rows >= FEWEST_ROWS]
+        held = [rest for rest in rests if (rest.stop - rest.start) >= FEWEST_ROWS]
         keys = [rest.value for rest in held]
         # What it comes back to is a value by nature, and 0 is what does nothing gives.
         once = [rest for rest in held if keys.count(rest.value) == 1 and rest.value != 0]
         return [rest for rest in once if self._is_frozen(rest, held)]
 
-    def _is_frozen(self, rest: Rest, held: Sequence[Rest]) -> bool:
+    def _is_frozen(self, rest: Run, held: Sequence[Run]) -> bool:
         """Whether the rows around it are noisy, and beyond its value on both sides.
 
         The lowest or the highest of all is where a sensor ends.
@@ -287,7 +266,7 @@ def is_lively(run: Frame, name: str) -> bool:
     return False
 
 
-def _rests_with_others(signal: Signal, rest: Rest, resting: dict[str, list[Rest]]) -> bool:
+def _rests_with_others(signal: Signal, rest: Run, resting: dict[str, list[Run]]) -> bool:
     """Whether something else holds one value for most of that time: then the robot rests.
 
     What never changes is no sign of that; and the items of an array freeze together.

@@ -43,15 +43,12 @@ def jump_events(search: Search) -> Iterator[Event]:
     """Dropouts and spikes that come back, steps that stay, and leaps of the position."""
     position, frame = search.motion.position or (), search.frame
     numbers = search.numbers if position else search.required_quantities()
-    search.note_too_large("jump")
     signals = [
         each
         for each in numbers
         if each.kind != "angle" and not each.is_index and each not in position
     ]
-    for index, signal in enumerate(signals):
-        if search.is_over("jump", signals[index:]):
-            break
+    for signal in search.in_time("jump", signals):
         jumps = find_jumps(frame, signal.name, search.options.jump_min_score)
         rows = int(frame.zones(signal.name).value_count.sum())
         if len(jumps) > max(3, MOST_JUMPS_SHARE * rows):
@@ -362,5 +359,4 @@ JUMP: Final = EventKind(
     of_numbers=True,
     drawn=1,
     alike=Alike(_alike, sort=lambda event: event.end_s > event.start_s),  # who came back or stayed
-    effort=2,
 )

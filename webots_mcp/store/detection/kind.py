@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Hashable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import median
 from typing import TYPE_CHECKING, Any, Final
 
@@ -46,6 +46,18 @@ class Alike:
     most_single: int = 3
     of_arrays: bool = False
 
+    def as_one(self, alike: Sequence[Event], unit: str = "") -> Event:
+        """Several of one sort, in order; what they are, when, and what they have in common."""
+        first, last = alike[0], max(alike, key=lambda event: event.end_s)
+        times_s = [round(each.start_s, 3) for each in alike]
+        span = f"the first at {times_s[0]:.6g} s, the last at {times_s[-1]:.6g} s"
+        lasted = _lengths([each.duration_s for each in alike])
+        says = f"{len(alike)} {self.says(alike, unit)}, {span}{lasted}"
+        details = _in_common([event.details for event in alike]) | self.adds(alike)
+        details |= {"says": says, "first_times_s": times_s[:MOST_TIMES]}
+        ends = {"end_s": last.end_s, "ongoing": last.ongoing}
+        return replace(first, **ends, details=details, count=len(alike))
+
 
 @dataclass(frozen=True)
 class EventKind:
@@ -69,8 +81,6 @@ class EventKind:
         counted: Comparisons of runs count it.
         drawn: Its place among the rows below a plot, the least first; None if it has none there.
         alike: How similar ones are reported as one; None where each is reported by itself.
-        effort: Its rank by what it costs to look for: the least is searched first. Kinds of one
-            rank share their part of the time.
     """
 
     name: str
@@ -87,23 +97,6 @@ class EventKind:
     counted: bool = True
     drawn: int | None = None
     alike: Alike | None = None
-    effort: int = 0
-
-
-def told_together(
-    what: str, starts_s: Sequence[float], lengths_s: Sequence[float]
-) -> dict[str, Any]:
-    """How many there are, when, and how long they lasted, as details of an event.
-
-    Args:
-        what: What they are, in the plural.
-        starts_s: When each began, in order.
-        lengths_s: How long each lasted.
-    """
-    times_s = [round(start_s, 3) for start_s in starts_s]
-    span = f"the first at {times_s[0]:.6g} s, the last at {times_s[-1]:.6g} s"
-    says = f"{len(times_s)} {what}, {span}{_lengths(lengths_s)}"
-    return {"says": says, "first_times_s": times_s[:MOST_TIMES]}
 
 
 def _lengths(lengths_s: Sequence[float]) -> str:
@@ -115,3 +108,25 @@ def _lengths(lengths_s: Sequence[float]) -> str:
         return f", each {middle_s:.3g} s long"
     total = f"{sum(lengths_s):.4g} s in total"
     return f", {least_s:.3g} to {most_s:.3g} s long (median {middle_s:.3g} s), {total}"
+
+
+def _in_common(all_details: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """What the details of all of them are, or lie between."""
+    first, *others = all_details
+    names = [name for name in first if all(name in other for other in others)]
+    shared = {name: _shared([details[name] for details in all_details]) for name in names}
+    return {name: value for name, value in shared.items() if value is not None}
+
+
+def _shared(values: Sequence[Any]) -> Any:
+    """The one value; of numbers the least and the greatest; of texts the clauses that all have."""
+    if all(value == values[0] for value in values):
+        return values[0]
+    if all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values):
+        return f"{min(values):.4g} to {max(values):.4g}"
+    if all(isinstance(value, dict) for value in values):
+        return _in_common(values) or None
+    if all(isinstance(value, str) for value in values):
+        clauses: list[list[str]] = [value.split("; ") for value in values]
+        return "; ".join(e for e in clauses[0] if all(e in each for each in clauses)) or None
+    return None

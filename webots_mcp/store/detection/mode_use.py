@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from webots_mcp.store.analysis.arrays import Array, Indexes, median, np
-from webots_mcp.store.analysis.track import Track
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.detection.motion import Motion, RunNoise, tracks_in
+from webots_mcp.store.detection.motion import Motion, RunNoise, places_in
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import Segment, just_after, recorded_bounds
@@ -72,73 +71,68 @@ class ModeUses:
     """
 
     def __init__(
-        self, run_id: int, motion: Motion, frames: Iterator[Frame | None], options: EventOptions
+        self,
+        connection: sqlite3.Connection,
+        run: Frame,
+        motion: Motion,
+        options: EventOptions,
+        deadline: Deadline,
     ) -> None:
-        self.run_id = run_id
+        self.run_id = run.run_id
         self.is_cut = False
-        self._frames = frames
         self._motion = motion
         self._options = options
+        self._frames = self._runs(connection, run, deadline)
         self._known: dict[str, ModeUse] = {}
 
     def of(self, mode: str) -> ModeUse:
         """What it did in a mode; runs are read until one of them shows that it moved."""
         while not self._known.get(mode, ModeUse()).moving:
-            try:
-                frame = next(self._frames)
-            except StopIteration:
+            if (frame := next(self._frames, None)) is None:
                 break
-            self.is_cut |= frame is None or frame.cut_at_s is not None
-            if frame is None:
-                break
+            self.is_cut |= frame.cut_at_s is not None
             for name, use in uses_in(frame, self._motion, self._options):
                 self._known[name] = self._known.get(name, ModeUse()).with_more(use)
         return self._known.get(mode, ModeUse())
 
-
-def frames_of_runs(
-    connection: sqlite3.Connection, run: Frame, deadline: Deadline
-) -> Iterator[Frame | None]:
-    """A run and a few of the same robot before it; None where there is no time for more."""
-    earlier = connection.execute(_EARLIER, (run.run_id, run.run_id, EARLIER_RUNS)).fetchall()
-    for run_id in (run.run_id, *(run_id for (run_id,) in earlier)):
-        if deadline.passed:
-            yield None
-            return
-        bounds = recorded_bounds(connection, run_id)
-        if run_id == run.run_id:
-            yield run.rows(0, MOST_ROWS)
-        elif bounds is not None:
-            whole = Segment(run_id, bounds[0], just_after(bounds[1]))
-            yield read_frame(connection, whole, deadline).rows(0, MOST_ROWS)
+    def _runs(
+        self, connection: sqlite3.Connection, run: Frame, deadline: Deadline
+    ) -> Iterator[Frame]:
+        """The run and a few of the same robot before it, as far as there is time."""
+        earlier = connection.execute(_EARLIER, (run.run_id, run.run_id, EARLIER_RUNS)).fetchall()
+        for run_id in (run.run_id, *(run_id for (run_id,) in earlier)):
+            if deadline.passed:
+                self.is_cut = True
+                return
+            bounds = recorded_bounds(connection, run_id)
+            if run_id == run.run_id:
+                yield run.rows(0, MOST_ROWS)
+            elif bounds is not None:
+                whole = Segment(run_id, bounds[0], just_after(bounds[1]))
+                yield read_frame(connection, whole, deadline).rows(0, MOST_ROWS)
 
 
 def uses_in(frame: Frame, motion: Motion, options: EventOptions) -> Iterator[tuple[str, ModeUse]]:
-    """What a robot did in the modes of a frame, in one stretch without a gap after the other."""
+    """What a robot did in the modes of a frame, by its mean places in half a second each."""
     if motion.mode is None or motion.position is None:
         return
     codes, labels = frame.coded(motion.mode.name)
-    tracks, rows = tracks_in(frame, motion.position, RunNoise(frame, motion))
-    for track, here in zip(tracks, rows, strict=True):
-        for code, use in _uses_of(track, codes[here], frame.run_id, options):
-            if (mode := shown(labels[code])) is not None:
-                yield mode, use
-
-
-def _uses_of(
-    track: Track, codes: Indexes, run_id: int, options: EventOptions
-) -> Iterator[tuple[int, ModeUse]]:
-    interval_s = median(np.diff(track.times)) if len(track.times) > 1 else 0.0
-    each = slice(None, None, max(1, round(_SAMPLE_S / interval_s)) if interval_s else 1)
-    times, codes = track.times[each], codes[each]
+    rows, x, y = places_in(frame, motion.position)
+    if not len(rows):
+        return
+    times, codes = frame.times[rows], codes[rows]
+    same = (np.diff(times // _SAMPLE_S) == 0) & (np.diff(codes) == 0)
+    starts = np.flatnonzero(np.append(True, ~same))
+    counts = np.diff(starts, append=len(rows))
+    times, x, y = (np.add.reduceat(each, starts) / counts for each in (times, x, y))
+    left_m = RunNoise(frame, motion).position_m / median(counts) ** 0.5
+    codes: Indexes = codes[starts]
     changes = np.flatnonzero(np.diff(codes)) + 1
     visits = np.searchsorted(changes, np.arange(len(codes)), "right")
-    begins_s = np.concatenate((times[:1] - ROLLS_OUT_S, times[changes]))[visits]
+    begins_s = np.append(times[0] - ROLLS_OUT_S, times[changes])[visits]
     there = np.flatnonzero(times >= begins_s + ROLLS_OUT_S)
-    if not len(there):
-        return
-    times, codes, visits = times[there], codes[there], visits[there]
-    x, y = track.x[each][there], track.y[each][there]
+    times, x, y = times[there], x[there], y[there]
+    codes, visits = codes[there], visits[there]
     firsts = np.flatnonzero(np.diff(visits, prepend=-1))
     lengths = np.diff(firsts, append=len(visits))
     last = np.repeat(firsts + lengths - 1, lengths)
@@ -147,18 +141,20 @@ def _uses_of(
         later = np.minimum(np.searchsorted(times, times + over_s), last)
         return np.hypot(x[later] - x, y[later] - y), times[later] - times
 
-    noise_m = LEAST_NOISE * track.left_m
+    noise_m = LEAST_NOISE * left_m
     got_away = way_m(AWAY_S)[0] >= max(LEAST_MOVED_M, noise_m)
     moved = np.add.reduceat(got_away * 1.0, firsts) >= _MOVES_SHARE * np.minimum(lengths, _ENOUGH)
     slow = way_m(options.stuck_s)[0] <= max(options.stuck_m, noise_m)
     stood = np.add.reduceat(slow * 1.0, firsts) >= _STANDS_SHARE * lengths
     stood &= times[firsts + lengths - 1] - times[firsts] >= options.stuck_s
-    paced_m, took_s = way_m(pace_s := max(_PACE_S, _PACE_S_PER_M * track.left_m))
+    paced_m, took_s = way_m(pace_s := max(_PACE_S, _PACE_S_PER_M * left_m))
     speeds = paced_m / np.maximum(took_s, pace_s / 2)
     for code in np.unique(codes).tolist():
-        own = codes[firsts] == code
+        own, mode = codes[firsts] == code, shown(labels[int(code)])
         some = speeds[np.repeat(own & moved, lengths)]
         # Not beside the greatest one: where it was put elsewhere it seems to be very fast.
         fast = float(np.quantile(some, _FAST)) if len(some) else 0.0
         speed_m_s = median(some[some >= fast / 2]) if len(some) else 0.0
-        yield code, ModeUse(int((own & moved).sum()), int((own & stood).sum()), speed_m_s, run_id)
+        counted = int((own & moved).sum()), int((own & stood).sum())
+        if mode is not None:
+            yield mode, ModeUse(*counted, speed_m_s, frame.run_id)

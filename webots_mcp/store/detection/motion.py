@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from webots_mcp.naming import FARTHEST_M, metres_in, unit_in
 from webots_mcp.signal_roles import first_in, pair_in
-from webots_mcp.store.analysis.arrays import Array, Indexes, median, np
-from webots_mcp.store.analysis.noise import noise_of
+from webots_mcp.store.analysis.arrays import Array, Indexes, median, noise_of, np
 from webots_mcp.store.analysis.summary import LARGEST
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.signals.catalogue import one_signal
@@ -166,15 +165,21 @@ class RunNoise:
         return self._known[name]
 
 
+def places_in(frame: Frame, position: tuple[Signal, Signal]) -> tuple[Indexes, Array, Array]:
+    """The rows that have a position, and it in metres."""
+    x, y = (in_metres(each, frame.numbers(each.name)) for each in position)
+    rows = np.flatnonzero(np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M)
+    return rows, x[rows], y[rows]
+
+
 def tracks_in(
     frame: Frame, position: tuple[Signal, Signal], noise: RunNoise
 ) -> tuple[list[Track], list[Indexes]]:
     """The way of the robot in each stretch without a gap, and the rows of the frame in it."""
     from webots_mcp.store.analysis.track import tracks_of
 
-    x, y = (in_metres(each, frame.numbers(each.name)) for each in position)
-    rows = np.flatnonzero(np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M)
-    tracks = tracks_of(frame.times[rows], x[rows], y[rows], noise.position_m, noise.rows)
+    rows, x, y = places_in(frame, position)
+    tracks = tracks_of(frame.times[rows], x, y, noise.position_m, noise.rows)
     ends = np.cumsum([len(track.times) for track in tracks])
     return tracks, np.split(rows, ends)[:-1]
 

@@ -30,8 +30,10 @@ _SWINGING: Final = re.compile(
 
 def oscillation_events(search: Search) -> Iterator[Event]:
     """Of heading, wheels, speed, position and the like, and of what is asked for."""
-    signals = _swinging(search)
-    if left := [each.name for each in search.required_numbers() if each not in signals]:
+    signals = search.required_numbers()
+    if search.options.signals == EventOptions.signals:
+        signals = [each for each in signals if _SWINGING.search(in_snake_case(each.name))]
+    if left := [each.name for each in search.numbers if each not in signals]:
         why = (
             f"not in {len(left)} of {len(search.numbers)} signals, whose names do not suggest "
             f"motion: name them in signals ({listed(left, MOST_NAMED)})"
@@ -40,7 +42,6 @@ def oscillation_events(search: Search) -> Iterator[Event]:
             raise NotSearchableError(why)
         search.not_searched("oscillation", why)
     _note_periods(search)
-    search.note_too_large("oscillation")
     for name, swing in _found(search, signals):
         details = {
             "half_periods": swing.half_swings,
@@ -77,9 +78,7 @@ def _found(search: Search, signals: Sequence[Signal]) -> Iterator[tuple[str, Swi
     frame, least = search.frame, search.options.min_half_periods
     asked = least, _longest_period_s(search)
     shared: dict[tuple[int, int], tuple[Frame, EvenRows]] = {}  # by many signals
-    for index, signal in enumerate(signals):
-        if search.is_over("oscillation", signals[index:]):
-            break
+    for signal in search.in_time("oscillation", signals):
         for span in _changing(frame.zones(signal.name), least):
             if span not in shared:
                 part = frame.rows(*span)
@@ -101,20 +100,6 @@ def _changing(zones: Zones, least: int) -> list[tuple[int, int]]:
     return zones.spans(changes[:-2] | changes[1:-1] | changes[2:])
 
 
-def _swinging(search: Search) -> list[Signal]:
-    asked = search.options.signals != EventOptions.signals
-    return [each for each in search.numbers if asked or may_swing(each)]
-
-
-def may_swing(signal: Signal) -> bool:
-    """Whether it is named like something that a robot swings with."""
-    return signal.is_number and _SWINGING.search(in_snake_case(signal.name)) is not None
-
-
-def _around_s(options: EventOptions) -> float:
-    return options.min_half_periods * (options.oscillation_period_s or LONGEST_PERIOD_S) / 2
-
-
 def _ends_within_s(event: Event) -> float:
     return _ENDS_WITHIN * event.details["period_s"]
 
@@ -124,10 +109,11 @@ OSCILLATION: Final = EventKind(
     "of heading, wheels, ...",
     oscillation_events,
     lasts=True,
-    around_s=_around_s,
+    around_s=lambda options: (
+        options.min_half_periods * (options.oscillation_period_s or LONGEST_PERIOD_S) / 2
+    ),
     ends_within_s=_ends_within_s,
     of_numbers=True,
     drawn=3,
     alike=Alike(lambda events, unit: "oscillations"),
-    effort=1,
 )

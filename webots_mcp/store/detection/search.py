@@ -1,10 +1,10 @@
-"""One search in a stretch of a run: what a detector may read, and what it reports."""
+"""One search in a stretch of a run: what a detector may read, and events with their true ends."""
 
 from __future__ import annotations
 
 import copy
 import sqlite3
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any, Final
@@ -26,8 +26,10 @@ from webots_mcp.store.signals.registry import Signal
 if TYPE_CHECKING:
     from webots_mcp.store.detection.standstill import Findings
 
+FARTHER: Final = 8.0  # times as far is looked for the ends of what reaches out of a segment
 MOST_NAMED: Final = 5
-_OF_SEGMENT: Final = ("recorded", "signals", "numbers", "frame", "standstills")
+NO_TIME: Final = "time limit reached: ask for this kind alone"
+_OF_SEGMENT: Final = ("recorded", "frame")
 
 
 @dataclass
@@ -37,8 +39,6 @@ class Search:
     Attributes:
         known: The signals of the robot.
         kinds: All that are looked for in it.
-        only: Names of the signals that matter, where it is about the ends of some events; else
-            None.
         asked: The part of the segment that was asked about, where that was widened to find ends.
         ledger: What could not be looked at, and what came near to an event.
     """
@@ -50,7 +50,6 @@ class Search:
     options: EventOptions
     deadline: Deadline
     ledger: Ledger = field(default_factory=Ledger)
-    only: frozenset[str] | None = None
     asked: Segment | None = None
 
     def of(self, segment: Segment, **changes: Any) -> Search:
@@ -105,8 +104,7 @@ class Search:
     @cached_property
     def signals(self) -> list[Signal]:
         """Those that are looked at."""
-        matching = resolve_signals(self.known, self.options.signals) if self.known else []
-        return [each for each in matching if self.only is None or each.name in self.only]
+        return resolve_signals(self.known, self.options.signals) if self.known else []
 
     @cached_property
     def numbers(self) -> list[Signal]:
@@ -179,13 +177,33 @@ class Search:
         """Note why a kind was not looked for, or where it was not."""
         self.ledger.not_searched(kind, *reasons)
 
-    def note_too_large(self, kind: str) -> None:
-        """Note which signals have numbers that are too large to be judged."""
-        large = [each.name for each in self.numbers if self.only is None and self._is_large(each)]
+    def in_time(
+        self, kind: str, signals: Sequence[Signal], *, judged: bool = True
+    ) -> Iterator[Signal]:
+        """The signals as long as there is time; which of them are not looked at is noted.
+
+        Args:
+            kind: What is looked for.
+            signals: In this order.
+            judged: Numbers that are too large cannot be.
+
+        Raises:
+            NotSearchableError: There is no time for any.
+        """
+        large: list[str] = []
+        for index, signal in enumerate(signals):
+            if self.deadline.passed:
+                if not index:
+                    raise NotSearchableError(NO_TIME)
+                names = listed([each.name for each in signals[index:]], 3)
+                why = f"time limit reached, {len(signals) - index} signals left: ask for {names}"
+                self.not_searched(kind, why)
+                break
+            large += [signal.name] if judged and self._is_large(signal) else []
+            yield signal
         if large:
-            self.not_searched(
-                kind, f"not in {listed(large, MOST_NAMED)}: numbers beyond {LARGEST:g}"
-            )
+            why = f"not in {listed(large, MOST_NAMED)}: numbers beyond {LARGEST:g}"
+            self.not_searched(kind, why)
 
     def _is_large(self, signal: Signal) -> bool:
         zones = self.frame.zones(signal.name)
@@ -198,10 +216,83 @@ class Search:
         where = f" (run {self.segment.run_id})" if self.ledger.of_several_runs else ""
         self.ledger.came_near(kind, share, what + where)
 
-    def is_over(self, kind: str, left: Sequence[Signal]) -> bool:
-        """Whether the time is over; then it is noted which signals were not searched."""
-        if self.deadline.passed:
-            names = listed([signal.name for signal in left], 3)
-            why = f"time limit reached, {len(left)} signals left: ask for {names}"
-            self.not_searched(kind, why)
-        return self.deadline.passed
+
+def events_touching(search: Search) -> list[Event]:
+    """The events that lie in the segment of a search, or reach into it.
+
+    What has no begin or no end where was looked is followed out of it: at first as far as the
+    shortest time that counts, then each time 8 times as far.
+    """
+    if search.deadline.passed:
+        for kind in search.kinds:
+            search.not_searched(kind.name, NO_TIME)
+        return []
+    segment = search.recorded
+    kinds = [kind for kind in search.kinds if kind.lasts or not kind.stored]
+    found = _found(search.of(search.segment, kinds=[e for e in search.kinds if e not in kinds]))
+    if segment is None:
+        for kind in kinds:
+            why = f"run {search.segment.run_id} has no row in that range"
+            search.not_searched(kind.name, why)
+        return found
+    reaches_s = ((each.least_s, each.around_s) for each in kinds)
+    reach_s = max((of(search.options) for both in reaches_s for of in both), default=0.0)
+    looked, cut, waiting = search.of(segment, asked=segment), list[Event](), list[Event]()
+    while kinds and not (cut and search.deadline.passed):
+        looked = looked.of(_around(search, segment, reach_s), kinds=kinds)
+        touching = (e for e in _found(looked) if e.start_s < segment.end_s)
+        events = [each for each in touching if each.end_s >= segment.start_s]
+        if cut and search.deadline.passed:
+            break  # some may be lacking
+        by_name = {kind.name: kind for kind in kinds}
+        cut = [each for each in events if _is_cut(each, by_name[each.kind], looked)]
+        names = {each.kind for each in cut}
+        kinds = [kind for kind in kinds if kind.name in names]
+        found += [each for each in events if each.kind not in names]
+        waiting = [each for each in events if each.kind in names]
+        reach_s = FARTHER * max(reach_s, 1.0)
+        looked.ledger = Ledger()  # what the longer one lacks is known
+    for each in cut:
+        why = f"the one at {each.start_s:.3f} s may last longer: time limit reached"
+        search.not_searched(each.kind, why)
+    return found + waiting
+
+
+def _found(search: Search) -> list[Event]:
+    """The events in the segment of a search, cut off at its ends."""
+    return [event for kind in search.kinds for event in _found_of(kind, search)]
+
+
+def _found_of(kind: EventKind, search: Search) -> list[Event]:
+    try:
+        found = list(kind.find(search))
+    except NotSearchableError as error:
+        search.not_searched(kind.name, str(error))
+        return []
+    if not found and kind.lasts and search.length_s < (least_s := kind.least_s(search.options)):
+        run = f"run {search.segment.run_id} lasted only {search.length_s:.3g} s"
+        search.not_searched(kind.name, f"{run}; this kind needs at least {least_s:g} s")
+        return []
+    search.ledger.searched.add(kind.name)
+    if not kind.stored:
+        search.not_searched(kind.name, *map(str, search.frame.unread))
+    return found
+
+
+def _is_cut(event: Event, kind: EventKind, looked: Search) -> bool:
+    """Whether it reaches the first or last row that was looked at, and others follow there."""
+    if not kind.lasts:
+        return False
+    segment = looked.segment
+    within_s, (first_s, last_s) = kind.ends_within_s(event), looked.frame.bounds_s
+    at_begin = segment.start_s > looked.began_s and event.start_s - within_s <= first_s
+    return at_begin or (segment.end_s <= looked.ended_s and event.end_s + within_s >= last_s)
+
+
+def _around(search: Search, segment: Segment, reach_s: float) -> Segment:
+    """The segment with so much before and after it, as far as there is something."""
+    start_s = max(search.began_s, segment.start_s - reach_s)
+    end_s = min(just_after(search.ended_s), segment.end_s + reach_s)
+    if (start_s, end_s) == (segment.start_s, segment.end_s):
+        return segment
+    return Segment(segment.run_id, start_s, end_s)

@@ -8,8 +8,7 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 from webots_mcp.naming import listed
-from webots_mcp.store.analysis.arrays import Flags, np
-from webots_mcp.store.analysis.runs import MOSTLY, Runs, runs_of
+from webots_mcp.store.analysis.arrays import MOSTLY, Flags, Runs, np, runs_of
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import Alike, EventKind
 from webots_mcp.store.detection.search import MOST_NAMED, Search
@@ -24,9 +23,7 @@ _INDEX: Final = re.compile(r"\.\d+$")  # items that fall silent at once are repo
 def silent_events(search: Search) -> Iterator[Event]:
     """It has begun, and lasts to the signal's next value, if any."""
     shorter: Counter[str] = Counter()
-    for index, signal in enumerate(search.required_numbers()):
-        if search.is_over("silent", search.numbers[index:]):
-            break
+    for signal in search.in_time("silent", search.required_numbers(), judged=False):
         runs = _silences(search, signal)
         if not len(runs):
             continue

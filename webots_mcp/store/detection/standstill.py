@@ -8,15 +8,16 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from webots_mcp.naming import NAME_POSITION
-from webots_mcp.store.analysis.arrays import Array, Indexes, np
-from webots_mcp.store.analysis.noise import noise_of
+from webots_mcp.store.analysis.arrays import Array, Indexes, noise_of, np
+from webots_mcp.store.analysis.creep import MOST_AROUND
 from webots_mcp.store.analysis.standstill import NEARLY, find_standstills, shortest_seen_s
 from webots_mcp.store.analysis.track import Track, track_of
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import Alike, EventKind, NotSearchableError
-from webots_mcp.store.detection.mode_use import ModeUses, frames_of_runs
+from webots_mcp.store.detection.mode_use import ModeUses
 from webots_mcp.store.detection.motion import Motion, RunNoise, in_metres, tracks_in
-from webots_mcp.store.detection.stuck import Judged, Place, Standings, judged
+from webots_mcp.store.detection.search import NO_TIME
+from webots_mcp.store.detection.stuck import Judged, Place, Standings
 
 if TYPE_CHECKING:
     from webots_mcp.store.detection.search import Search
@@ -24,8 +25,7 @@ if TYPE_CHECKING:
 
 NOISE_RANGE: Final = 6.0  # deviations of noise from the least of some hundred rows to the greatest
 SHORTEST_SHARE: Final = 4.0  # of the shortest standstill: shorter ones came nowhere near
-MARGIN_ROWS: Final = 4096  # before and after a range, and more where it takes more
-FARTHER: Final = 8
+MARGIN_ROWS: Final = 50_000  # before and after a range; all where a standstill takes more
 
 
 @dataclass(frozen=True)
@@ -37,42 +37,46 @@ class Findings:
             and in words.
         unseen: What could not be looked at.
         undecided: Why one of them may be `stuck` that is told as a standstill.
-        bear: The first and the last row that bear on them; they may lie beyond the rows given.
     """
 
     events: list[Judged] = field(default_factory=list[Judged])
     nearest: tuple[float, str] | None = None
     unseen: list[str] = field(default_factory=list[str])
     undecided: list[str] = field(default_factory=list[str])
-    bear: tuple[int, int] = (0, 0)
 
 
 def standstills_in(search: Search) -> Findings:
     """Those that touch the segment of a search, from as many rows as bear on them.
 
     Raises:
-        NotSearchableError: No position is known, or there is none.
+        NotSearchableError: No position is known, or there is none, or no time.
     """
+    if search.deadline.passed:
+        raise NotSearchableError(NO_TIME)
     motion, run, asked = search.motion, search.frame, search.asked or search.segment
     if search.whole.cut_at_s is None and not asked.full_rate:
         run = search.whole
-    frames = frames_of_runs(search.connection, run, search.deadline)
-    uses = ModeUses(run.run_id, motion, frames, search.options)
+    uses = ModeUses(search.connection, run, motion, search.options, search.deadline)
     noise = RunNoise(run, motion)
-    span = run.places([asked.start_s, asked.end_s]).tolist()
-    margin = MARGIN_ROWS
-    while True:
-        first, stop = max(0, span[0] - margin), min(len(run), span[1] + margin)
-        rows = span[0] - first, span[1] - first
-        found = judge_standstills(
-            run.rows(first, stop), motion, search.options, uses, noise=noise, asked=rows
-        )
-        is_known = (not first or found.bear[0] >= 0) and (
-            stop == len(run) or found.bear[1] < stop - first
-        )
-        if is_known or search.deadline.passed:
-            return found
-        margin *= FARTHER
+    first, stop = run.places([asked.start_s, asked.end_s]).tolist()
+    found = Findings()
+    for margin in (MARGIN_ROWS, len(run)):
+        rows = run.rows(before := max(0, first - margin), stop + margin)
+        asked_rows = first - before, stop - before
+        found = judge_standstills(rows, motion, search.options, uses, noise, asked_rows)
+        if len(rows) == len(run) or search.deadline.passed or not _may_reach_out(found, rows, run):
+            break
+    return found
+
+
+def _may_reach_out(found: Findings, rows: Frame, run: Frame) -> bool:
+    """Whether rows beyond bear on a standstill: a creep shows in so many times its length."""
+    lasts_s = max((each.end_s - each.start_s for each in found.events), default=0.0)
+    first_s = min((each.start_s for each in found.events), default=math.inf)
+    last_s = max((each.end_s for each in found.events), default=-math.inf)
+    reach_s, (begin_s, end_s) = MOST_AROUND * lasts_s, rows.bounds_s
+    began_s, ended_s = run.bounds_s
+    return (began_s < begin_s > first_s - reach_s) or (ended_s > end_s < last_s + reach_s)
 
 
 def judge_standstills(
@@ -80,9 +84,8 @@ def judge_standstills(
     motion: Motion,
     options: EventOptions,
     uses: ModeUses,
-    *,
-    noise: RunNoise | None = None,
-    asked: tuple[int, int] | None = None,
+    noise: RunNoise,
+    asked: tuple[int, int],
 ) -> Findings:
     """Find where a robot stood still and where it was stuck.
 
@@ -91,16 +94,14 @@ def judge_standstills(
         motion: Which signals tell.
         options: What counts.
         uses: In which modes it moves.
-        noise: Of the run, where these are some of its rows.
-        asked: Rows that the standstills have to touch; None for all.
+        noise: Of the run.
+        asked: Rows that the standstills have to touch.
 
     Raises:
         NotSearchableError: No position is known, or the frame has none.
     """
     if motion.position is None:
         raise NotSearchableError(NAME_POSITION)
-    noise = noise or RunNoise(frame, motion)
-    asked = asked or (0, len(frame))
     tracks, rows = tracks_in(frame, motion.position, noise)
     if not tracks:
         names = " and ".join(signal.name for signal in motion.position)
@@ -116,17 +117,13 @@ def judge_standstills(
     )
     places = [each for each in found if each.rows[0] < asked[1] and each.rows[-1] >= asked[0]]
     long = [place for place in places if place.lasts_s >= NEARLY * seen_s]
-    bears = [place.bears for place in places]
-    bear = (
-        min([first for first, _ in bears], default=asked[0]),
-        max([last for _, last in bears], default=asked[1] - 1),
-    )
     if not long:
-        there = [_part(track, here, asked) for track, here in zip(tracks, rows, strict=True)]
-        return Findings([], None if places else _nearest(there, options), unseen, bear=bear)
-    events = judged(Standings(frame, motion, options, long, noise), uses)
+        parts = [np.searchsorted(here, asked).tolist() for here in rows]
+        there = [track.part(*part) for track, part in zip(tracks, parts, strict=True)]
+        return Findings([], None if places else _nearest(there, options), unseen)
+    events = Standings(frame, motion, options, long, noise, uses).judged()
     cut = ["time limit reached before it was known in which modes it moves"] if uses.is_cut else []
-    return Findings(events, None, unseen, cut, bear)
+    return Findings(events, None, unseen, cut)
 
 
 def _places(
@@ -138,13 +135,10 @@ def _places(
         if motion.height is not None:
             high = frame.numbers(motion.height.name)[rows[slice(*ends[0])]]
             ends = list(_at_one_height(track, in_metres(motion.height, high), each.start, options))
-        before = rows[0] + each.seen_from if rows[0] == 0 else max(0, each.seen_from)
-        after = each.seen_to - len(track.times) + len(frame)
-        bears = before, after if rows[-1] == len(frame) - 1 else min(after, len(frame) - 1)
         for start, stop in ends:
             part = slice(start, stop)
             course = track.times[part], track.x[part], track.y[part]
-            yield Place(rows[part], *course, each.x_m, each.y_m, track.left_m, bears)
+            yield Place(rows[part], *course, each.x_m, each.y_m, track.left_m)
 
 
 def _at_one_height(
@@ -164,11 +158,6 @@ def _at_one_height(
         return
     for each in find_standstills(up, options.stuck_m, options.stuck_s):
         yield first + int(there[each.start]), first + int(there[each.last]) + 1
-
-
-def _part(track: Track, rows: Indexes, asked: tuple[int, int]) -> Track:
-    """The part of a track in some rows."""
-    return track.part(*np.searchsorted(rows, asked).tolist())
 
 
 def _nearest(tracks: Sequence[Track], options: EventOptions) -> tuple[float, str] | None:
@@ -218,21 +207,14 @@ def _events(search: Search, kind: str, judged_as: str) -> Iterator[Event]:
             yield search.event(kind, each.start_s, each.end_s, None, **each.details)
 
 
-def _are_known(event: Event) -> float:
-    """Both ends are: it was looked for in as many rows as bear on them."""
-    return -math.inf
-
-
 STANDSTILL: Final = EventKind(
     "standstill",
     "stands",
     _standstills,
     lasts=True,
     least_s=lambda options: options.stuck_s,
-    ends_within_s=_are_known,
     drawn=8,
     alike=Alike(lambda events, unit: "standstills", sort=lambda event: event.details.get("mode")),
-    effort=3,
 )
 STUCK: Final = EventKind(
     "stuck",
@@ -240,8 +222,6 @@ STUCK: Final = EventKind(
     _stuck,
     lasts=True,
     least_s=lambda options: options.stuck_s,
-    ends_within_s=_are_known,
     drawn=0,
     alike=Alike(lambda events, unit: "times stuck", sort=lambda event: event.details.get("mode")),
-    effort=3,
 )

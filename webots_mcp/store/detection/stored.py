@@ -7,9 +7,8 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
-from webots_mcp.naming import Value
 from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.detection.event import LEVELS, Event
 from webots_mcp.store.detection.kind import (
@@ -17,16 +16,14 @@ from webots_mcp.store.detection.kind import (
     EventKind,
     NotSearchableError,
     but_for_numbers,
-    told_together,
 )
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.images import count_kept_frames
-from webots_mcp.store.reading.changes import MOST_VALUES, Point, change_points, value_ended_s
+from webots_mcp.store.reading.changes import MOST_VALUES, Point, change_points
 from webots_mcp.store.reading.frame_summary import frame_around, rhythm_in
 from webots_mcp.store.reading.kept import kept_stretches
-from webots_mcp.store.reading.ranges import Segment, just_after
+from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.reading.wall_time import frame_of_purged
-from webots_mcp.store.signals.registry import Signal
 
 MOST_OF_A_KIND: Final = 2000  # newest rows of a table that are looked at, per run
 AROUND_S: Final = 10.0  # before and after: what changes all the time there, measures
@@ -101,34 +98,39 @@ def gap_events(search: Search) -> Iterator[Event]:
 
 def change_events(search: Search) -> Iterator[Event]:
     """Changes of text, flags and modes, each as long as the new value lasted."""
-    segment = _recorded(search)
     states = [each for each in search.signals if not each.is_number or each.is_choice]
     if not states:
         raise NotSearchableError(
             "no text, flag or mode was published, or none with these names; for another number "
             "ask with where='changed(NAME)'"
         )
-    around = Segment(segment.run_id, segment.start_s - AROUND_S, segment.end_s + AROUND_S)
-    found = change_points(search.connection, around, states, search.deadline, since=False)
+    here, asked, frame = search.segment, search.asked or search.segment, search.frame
+    found = change_points(
+        search.connection, here, states, search.deadline, frame=frame, since=False
+    )
     _note_unread(search, "change", found.unread_from_s)
     search.not_searched("change", *map(str, found.unread))
+    goes_on = found.unread_from_s is None and here.end_s > search.ended_s
+    last_s = frame.bounds_s[1] if len(frame) else here.start_s
     for signal in states:
         points = _without_measurements(found.points[signal.name])
         if len(points) < len(found.points[signal.name]):
             why = f"not between numbers of {signal.name}, a measurement"
             search.not_searched("change", f"{why}: webots_query_history shows them")
-        last_s, cut_at_s = _last_ends_s(search, signal, points)
-        if cut_at_s is not None:
-            last_s = max(cut_at_s, points[-1].sim_time_s)
-            why = f"the one at {points[-1].sim_time_s:.3f} s may last longer: time limit reached"
-            search.not_searched("change", why)
-        ends_s = [*(point.sim_time_s for point in points[2:]), last_s]
         changes = [
-            _Change(before, point, search.ended_s if end_s is None else end_s, end_s is None)
-            for (before, point), end_s in zip(pairwise(points), ends_s, strict=False)
-            if segment.start_s <= point.sim_time_s < segment.end_s
-        ]
-        yield from _reported(search, signal.name, changes)
+            Event(
+                "change", here.run_id, point.sim_time_s,
+                max(last_s, point.sim_time_s) if after is None else after.sim_time_s, 0.0,
+                signal.name, {"before": before.value, "after": point.value},
+                ongoing=after is None and goes_on,
+            )
+            for before, point, after in zip(points, points[1:], [*points[2:], None], strict=False)
+            if asked.start_s <= point.sim_time_s < asked.end_s
+        ]  # fmt: skip
+        if len(changes) > MOST_CHANGES:
+            changes = [CHANGES.as_one(changes)]
+        for each in changes:
+            yield replace(each, wall_time_s=search.wall_time_at(each.start_s))
 
 
 def _note_unread(search: Search, kind: str, from_s: float | None) -> None:
@@ -136,45 +138,6 @@ def _note_unread(search: Search, kind: str, from_s: float | None) -> None:
         from_s = max(from_s, search.segment.start_s)
         why = f"not after {from_s:.3f} s: time limit reached, ask start_s={from_s:.3f}"
         search.not_searched(kind, why)
-
-
-class _Change(NamedTuple):
-    """From one value to another, which lasted until `end_s`, or goes on."""
-
-    before: Point
-    point: Point
-    end_s: float
-    ongoing: bool
-
-
-def _reported(search: Search, name: str, changes: Sequence[_Change]) -> Iterator[Event]:
-    """Each change; of what flickers all as one."""
-
-    def event(change: _Change, start_s: float, details: dict[str, Any]) -> Event:
-        place = (search.segment.run_id, start_s, change.end_s, search.wall_time_at(start_s))
-        return Event("change", *place, name, details, ongoing=change.ongoing)
-
-    if len(changes) > MOST_CHANGES:
-        starts_s = [each.point.sim_time_s for each in changes]
-        lengths_s = [each.end_s - each.point.sim_time_s for each in changes]
-        to = _to([*zip((each.point.value for each in changes), lengths_s, strict=True)])
-        together = to | told_together("changes", starts_s, lengths_s)
-        yield replace(event(changes[-1], starts_s[0], together), count=len(changes))
-        return
-    for each in changes:
-        details = {"before": each.before.value, "after": each.point.value}
-        yield event(each, each.point.sim_time_s, details)
-
-
-def _last_ends_s(
-    search: Search, signal: Signal, points_left: Sequence[Point]
-) -> tuple[float | None, float | None]:
-    """As `value_ended_s` of the newest of some values; None where it began elsewhere."""
-    begin_s = points_left[-1].sim_time_s if points_left else math.inf
-    if not search.segment.start_s <= begin_s < search.segment.end_s:
-        return None, None
-    after = Segment(search.segment.run_id, begin_s, just_after(search.ended_s))
-    return value_ended_s(search.connection, after, signal, search.deadline)
 
 
 def _without_measurements(points: Sequence[Point]) -> Sequence[Point]:
@@ -299,20 +262,20 @@ def _bounds(segment: Segment) -> tuple[float, ...]:
     return (segment.run_id, segment.holds_from_s, segment.holds_to_s, *walls)
 
 
-def _to(values: Sequence[tuple[Value, float]]) -> dict[str, Any]:
+def _to(changes: Sequence[Event]) -> dict[str, Any]:
     """The most frequent values first, and for how long each was there in all."""
     lasted_s: dict[str, list[float]] = {}
-    for value, duration_s in values:
+    for each in changes:
+        value = each.details["after"]
         name = value if isinstance(value, str) else json.dumps(value)
-        lasted_s.setdefault(name, []).append(duration_s)
+        lasted_s.setdefault(name, []).append(each.duration_s)
     often = sorted(lasted_s.items(), key=lambda each: -len(each[1]))
-    to: dict[str, Any] = {
-        name: f"{len(each)} times, {sum(each):.4g} s" for name, each in often[:MOST_NAMED]
-    }
+    to = {name: f"{len(each)} times, {sum(each):.4g} s" for name, each in often[:MOST_NAMED]}
     rest = len(often) - MOST_NAMED
     return {"to": to | ({"other values": rest} if rest > 0 else {})}
 
 
+CHANGES: Final = Alike(lambda events, unit: "changes", adds=_to, most_single=10)
 RUN: Final = EventKind("run", "began or ended", run_events, stored=True, counted=False)
 GAP: Final = EventKind(
     "gap", "no rows", gap_events, stored=True, alike=Alike(lambda events, unit: "gaps")
@@ -322,12 +285,10 @@ CHANGE: Final = EventKind(
     "of a text or flag",
     change_events,
     stored=True,
+    lasts=True,
+    around_s=lambda options: AROUND_S,
     routine=True,
-    alike=Alike(
-        lambda events, unit: "changes",
-        adds=lambda events: _to([(e.details["after"], e.duration_s) for e in events]),
-        most_single=10,
-    ),
+    alike=CHANGES,
 )
 COMMAND: Final = EventKind(
     "command",

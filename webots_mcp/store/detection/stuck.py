@@ -58,7 +58,6 @@ class Place(NamedTuple):
 
     Attributes:
         left_m: What is left of the noise in each of x and y, which are smoothed.
-        bears: The first and the last row that bear on its being a standstill.
     """
 
     rows: Indexes
@@ -68,7 +67,6 @@ class Place(NamedTuple):
     x_m: float
     y_m: float
     left_m: float
-    bears: tuple[int, int]
 
     @property
     def lasts_s(self) -> float:
@@ -86,6 +84,7 @@ class Standings:
         told: It was commanded to move; `stops`: to stand.
         wheel_drives: 1 where its wheels drive it ahead, -1 back; `resting`: none of them turns.
         turns: It turned in place; `sways`: it went to and fro.
+        in_moving_mode: It was in a mode in which it moves.
     """
 
     def __init__(
@@ -95,8 +94,10 @@ class Standings:
         options: EventOptions,
         places: Sequence[Place],
         noise: RunNoise,
+        uses: ModeUses,
     ) -> None:
         self.motion, self.options, self.places, self.noise = motion, options, places, noise
+        self._uses = uses
         rows = np.concatenate([place.rows for place in places])
         self.times, self._x, self._y = (
             np.concatenate([getattr(place, name) for place in places])
@@ -140,6 +141,9 @@ class Standings:
         coded = None if motion.mode is None else frame.coded(motion.mode.name)
         self.modes = np.zeros(len(rows), np.intp) if coded is None else coded.codes[rows]
         self.labels = [None] if coded is None else coded.labels
+        self._by_mode = {code: self._moves_in(code) for code in self.codes(slice(None))}
+        moves = [bool(self._by_mode.get(code, (None,))[0]) for code in range(len(self.labels))]
+        self.in_moving_mode = np.array(moves)[self.modes]
 
     @cached_property
     def _cells(self) -> tuple[Indexes, Indexes, Flags]:
@@ -194,17 +198,13 @@ class Standings:
         """Rows [start, stop) of one standstill in which flags hold for the shortest time that
         counts, but for moments.
         """
-        new = np.diff(self.owner, prepend=-1) != 0
-        starts = np.flatnonzero(flags & (~np.append(False, flags[:-1]) | new))
-        stops = (
-            np.flatnonzero(flags & (~np.append(flags[1:], False) | np.append(new[1:], True))) + 1
-        )
-        apart_s = self.times[starts[1:]] - self.times[stops[:-1] - 1]
-        apart = (self.owner[starts[1:]] != self.owner[starts[:-1]]) | (apart_s > bridged_s)
-        starts, stops = (
-            starts[np.append(True, apart)[: len(starts)]],
-            stops[np.append(apart, True)[: len(stops)]],
-        )
+        rows = np.flatnonzero(flags)
+        apart = (np.diff(rows) > 1) & (np.diff(self.times[rows]) > bridged_s)
+        edges = np.flatnonzero(apart | (np.diff(self.owner[rows]) != 0)) + 1
+        firsts, ends = np.append(0, edges), np.append(edges, len(rows))
+        if not len(rows):
+            return []
+        starts, stops = rows[firsts], rows[ends - 1] + 1
         long = self.times[stops - 1] - self.times[starts] >= NEARLY * self.options.stuck_s
         return list(zip(starts[long].tolist(), stops[long].tolist(), strict=True))
 
@@ -225,75 +225,58 @@ class Standings:
                 facts["turned_rad"] = round(median(course[-few:]) - median(course[:few]), 3)
         return facts
 
+    def judged(self) -> list[Judged]:
+        """Each standstill, what of it the robot was stuck for, and what that leaves of it."""
+        events = list[Judged]()
+        hindered = np.zeros(len(self.times), np.bool_)  # it moved in its place for long enough
+        for start, stop in self.spans(self.turns | self.sways, 0.0):
+            hindered[start:stop] = True
+        drives = self.told | (self.wheel_drives != 0) | self.in_moving_mode
+        spans: dict[int, list[tuple[int, int]]] = {}
+        for span in self.spans(drives & ~self.stops & ~hindered, BRIDGED_S):
+            spans.setdefault(int(self.owner[span[0]]), []).append(span)
+        for at, place in enumerate(self.places):
+            whole = slice(int(self.starts[at]), int(self.starts[at + 1]))
+            against, stuck = self._against(at, whole), list[tuple[int, int]]()
+            for start, stop in spans.get(at, []):
+                if stop - start >= NEARLY * (whole.stop - whole.start):
+                    start, stop = whole.start, whole.stop
+                reasons, doubt = self._shown(slice(start, stop))
+                if doubt is not None:
+                    against.append(doubt)
+                    continue
+                stuck.append((start, stop))
+                speeds = self.speeds[start:stop][np.isfinite(self.speeds[start:stop])]
+                details = self.facts(place, slice(start, stop))
+                details |= {"commanded": round(median(speeds), 9)} if len(speeds) else {}
+                details["evidence_for"] = "; ".join(reasons)
+                details |= {"evidence_against": "; ".join(against)} if against else {}
+                events.append(self._event("stuck", start, stop, details))
+            details = self.facts(place, whole)
+            if not stuck:
+                modeless = "" if self.motion.mode else "; if one holds the mode, give mode=NAME"
+                nothing = f"no published signal shows that it should have moved{modeless}"
+                details["why_not_stuck"] = "; ".join(against) or nothing
+            events.append(self._event("standstill", whole.start, whole.stop, details))
+            edges = [whole.start, *(edge for span in stuck for edge in span), whole.stop]
+            for start, stop in zip(edges[::2], edges[1::2], strict=True):
+                # It ends in the row in which it begins to be stuck, and begins in their last one.
+                first, last = start - (start > whole.start), min(stop, whole.stop - 1)
+                part = self._event("apart", first, last + 1, details)
+                if part.end_s - part.start_s >= NEARLY * self.options.stuck_s or not stuck:
+                    own = self.facts(place, slice(first, last + 1)) if stuck else details
+                    events.append(part._replace(details=own))
+        return events
 
-def judged(found: Standings, uses: ModeUses) -> list[Judged]:
-    """Each standstill, what of it the robot was stuck for, and what that leaves of it."""
-    weighing, events = _Weighing(found, uses), list[Judged]()
-    hindered = np.zeros(len(found.times), np.bool_)  # it moved in its place for long enough
-    for start, stop in found.spans(found.turns | found.sways, 0.0):
-        hindered[start:stop] = True
-    drives = found.told | (found.wheel_drives != 0) | weighing.in_moving_mode
-    spans: dict[int, list[tuple[int, int]]] = {}
-    for span in found.spans(drives & ~found.stops & ~hindered, BRIDGED_S):
-        spans.setdefault(int(found.owner[span[0]]), []).append(span)
-    for at, place in enumerate(found.places):
-        whole = slice(int(found.starts[at]), int(found.starts[at + 1]))
-        against, stuck = weighing.against(at, whole), list[tuple[int, int]]()
-        for start, stop in spans.get(at, []):
-            if stop - start >= NEARLY * (whole.stop - whole.start):
-                start, stop = whole.start, whole.stop
-            reasons, doubt = weighing.shown(slice(start, stop))
-            if doubt is not None:
-                against.append(doubt)
-                continue
-            stuck.append((start, stop))
-            speeds = found.speeds[start:stop][np.isfinite(found.speeds[start:stop])]
-            details = found.facts(place, slice(start, stop))
-            details |= {"commanded": round(median(speeds), 9)} if len(speeds) else {}
-            details["evidence_for"] = "; ".join(reasons)
-            details |= {"evidence_against": "; ".join(against)} if against else {}
-            events.append(_event("stuck", found, start, stop, details))
-        details = found.facts(place, whole)
-        if not stuck:
-            modeless = "" if found.motion.mode else "; if one holds the mode, give mode=NAME"
-            nothing = f"no published signal shows that it should have moved{modeless}"
-            details["why_not_stuck"] = "; ".join(against) or nothing
-        events.append(_event("standstill", found, whole.start, whole.stop, details))
-        edges = [whole.start, *(edge for span in stuck for edge in span), whole.stop]
-        for start, stop in zip(edges[::2], edges[1::2], strict=True):
-            # It ends in the row in which it begins to be stuck, and begins in the last of those.
-            first, last = start - (start > whole.start), min(stop, whole.stop - 1)
-            part = _event("apart", found, first, last + 1, details)
-            if part.end_s - part.start_s >= NEARLY * found.options.stuck_s or not stuck:
-                own = found.facts(place, slice(first, last + 1)) if stuck else details
-                events.append(part._replace(details=own))
-    return events
-
-
-def _event(kind: str, found: Standings, start: int, stop: int, details: dict[str, Any]) -> Judged:
-    return Judged(kind, float(found.times[start]), float(found.times[stop - 1]), details)
-
-
-class _Weighing:
-    """Weighs what shows that the robot should have moved.
-
-    Attributes:
-        in_moving_mode: It was in a mode in which it moves.
-    """
-
-    def __init__(self, found: Standings, uses: ModeUses) -> None:
-        self._found = found
-        self._uses = uses
-        self._by_mode = {code: self._moves_in(code) for code in found.codes(slice(None))}
-        moves = [bool(self._by_mode.get(code, (None,))[0]) for code in range(len(found.labels))]
-        self.in_moving_mode = np.array(moves)[found.modes]
+    def _event(self, kind: str, start: int, stop: int, details: dict[str, Any]) -> Judged:
+        return Judged(kind, float(self.times[start]), float(self.times[stop - 1]), details)
 
     def _moves_in(self, code: int) -> tuple[str | None, str | None]:
         """Why a robot in that mode should move, and what speaks against it."""
-        mode = shown(self._found.labels[code])
+        mode = shown(self.labels[code])
         if mode is None:
             return None, None
-        if (moving := self._found.options.moving_modes) is not None:
+        if (moving := self.options.moving_modes) is not None:
             return (f"mode {mode} is one of moving_modes" if mode in moving else None), None
         use = self._uses.of(mode)
         if use.moving and not use.usually_stands:
@@ -305,21 +288,21 @@ class _Weighing:
             return None, f"not checked whether it moves in mode {mode}: time limit reached"
         return None, f"not seen moving in mode {mode}"
 
-    def shown(self, rows: slice) -> tuple[list[str], str | None]:
+    def _shown(self, rows: slice) -> tuple[list[str], str | None]:
         """What shows that it should have moved in these rows; or why that is in doubt."""
-        found, codes = self._found, self._found.codes(rows)
+        codes = self.codes(rows)
         said = [why for code in codes for why in self._by_mode[code][:1] if why]
-        told, wheels = found.told[rows], found.wheel_drives[rows] != 0
-        speeds, is_measured = np.zeros(0), found.motion.commanded is None
-        if found.speed is not None and told.sum() > TOLD_SHARE * len(told):
-            speeds = found.speeds[rows][told]
-            said.append(f"{found.speed.name} {median(speeds):.3g}")
+        told, wheels = self.told[rows], self.wheel_drives[rows] != 0
+        speeds, is_measured = np.zeros(0), self.motion.commanded is None
+        if self.speed is not None and told.sum() > TOLD_SHARE * len(told):
+            speeds = self.speeds[rows][told]
+            said.append(f"{self.speed.name} {median(speeds):.3g}")
         if wheels.any():
-            unit = " rad/s" if all(wheel.unit == "rad/s" for wheel in found.wheels) else ""
-            turning = (found.wheel_drives * found.fastest)[rows][wheels]
+            unit = " rad/s" if all(wheel.unit == "rad/s" for wheel in self.wheels) else ""
+            turning = (self.wheel_drives * self.fastest)[rows][wheels]
             said.append(f"wheels at {median(abs(turning)):.3g}{unit}")
             if wheels.sum() > told.sum():
-                speeds, is_measured = turning, not found.motion.wheel_commands
+                speeds, is_measured = turning, not self.motion.wheel_commands
         if self.in_moving_mode[rows].mean() >= MOSTLY or not len(speeds):
             return said, None
         # Speeds that are hardly beyond their noise, or go to and fro, are no command.
@@ -333,29 +316,29 @@ class _Weighing:
         return said, f"commanded or measured speeds of {middle:.2g} are hardly beyond their noise"
 
     def _use(self, code: int) -> ModeUse:
-        mode = shown(self._found.labels[code])
+        mode = shown(self.labels[code])
         return ModeUse() if mode is None else self._uses.of(mode)
 
-    def against(self, at: int, rows: slice) -> list[str]:
+    def _against(self, at: int, rows: slice) -> list[str]:
         """What speaks against that it should have moved in a standstill."""
-        found, said = self._found, list[str]()
+        said = list[str]()
 
         def mostly(flags: Flags) -> bool:
             return np.count_nonzero(flags[rows]) > MOSTLY * (rows.stop - rows.start)
 
-        if found.motion.commanded and mostly(found.stops):
-            stopped = median(found.speeds[rows][found.stops[rows]])
-            said.append(f"{found.motion.commanded.name} {stopped:.3g}")
-        if mostly(found.resting):
+        if self.motion.commanded and mostly(self.stops):
+            stopped = median(self.speeds[rows][self.stops[rows]])
+            said.append(f"{self.motion.commanded.name} {stopped:.3g}")
+        if mostly(self.resting):
             said.append("wheels at rest")
-        said += [why for code in found.codes(rows) for why in self._by_mode[code][1:] if why]
-        if mostly(found.turns):
+        said += [why for code in self.codes(rows) for why in self._by_mode[code][1:] if why]
+        if mostly(self.turns):
             opposite = "its wheels turned in opposite directions, as for a turn in place"
             # What only the wheels tell, a quadcopter's do as well.
-            seen = found.motion.heading is not None
+            seen = self.motion.heading is not None
             said.append("it turned in place" if seen else f"{opposite}; no heading recorded")
-        if mostly(found.sways):
-            place = found.places[at]
+        if mostly(self.sways):
+            place = self.places[at]
             reach_m = math.hypot(np.ptp(place.x), np.ptp(place.y))
             said.append(f"it moved back and forth within {reach_m:.2g} m")
         return said

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.analysis.runs import extremes_in, runs_of
+from webots_mcp.store.analysis.arrays import extremes_in, np, runs_of
 from webots_mcp.store.conditions_on_arrays import compared
-from webots_mcp.store.detection.event import Event, EventOptions, Threshold
+from webots_mcp.store.detection.event import Event, Threshold
 from webots_mcp.store.detection.kind import Alike, EventKind, NotSearchableError
 from webots_mcp.store.detection.search import Search
-from webots_mcp.store.reading.frame import Zones
 from webots_mcp.store.signals.catalogue import resolve_signals
 from webots_mcp.store.signals.registry import Signal
 
@@ -45,45 +43,32 @@ def threshold_events(search: Search) -> Iterator[Event]:
     if not search.options.thresholds:
         raise NotSearchableError("no limit was given: give signals, and above or below")
     for threshold in search.options.thresholds:
-        for signal in resolve_signals(search.known, [threshold.signal]):
-            if search.only is None or signal.name in search.only:
-                yield from _beyond(search, signal, threshold)
+        signals = resolve_signals(search.known, [threshold.signal])
+        for signal in search.in_time("threshold", signals, judged=False):
+            yield from _beyond(search, signal, threshold)
 
 
 def _beyond(search: Search, signal: Signal, threshold: Threshold) -> Iterator[Event]:
-    limit = {"above": threshold.above, "below": threshold.below}
-    given = {name: value for name, value in limit.items() if value is not None}
-    frame = search.frame
-    (limit_at,) = given.values()
-    op = ast.Gt if threshold.above is not None else ast.Lt
-    runs = runs_of(compared(frame, signal.name, op, limit_at), frame.times)
+    frame, is_above = search.frame, threshold.above is not None
+    (limit,) = (each for each in (threshold.above, threshold.below) if each is not None)
+    holds = compared(frame, signal.name, ast.Gt if is_above else ast.Lt, limit)
+    runs = runs_of(holds, frame.times)
     long = runs.only(runs.durations_s >= threshold.for_s)
     numbers = frame.numbers(signal.name) if len(long) else np.zeros(0)
     for run, low, high in zip(long.each(), *extremes_in(long, numbers), strict=True):
-        details = {**given, "min": float(low), "max": float(high)}
+        details = {"above" if is_above else "below": limit, "min": float(low), "max": float(high)}
         yield search.event("threshold", run.start_s, run.end_s, signal.name, **details)
+    zones = frame.zones(signal.name)
+    extremes = (zones.max if is_above else zones.min)[
+        (zones.value_count > 0) & ~np.isnan(zones.min)
+    ]
     if len(runs) > len(long):
         longest_s = float(runs.durations_s[runs.durations_s < threshold.for_s].max())
         what = f"{signal.name} was beyond the limit for at most {longest_s:.3g} s"
         search.came_near("threshold", longest_s / threshold.for_s, what)
-    elif not len(runs) and (extreme := _extreme(frame.zones(signal.name), op)) is not None:
+    elif not len(runs) and len(extremes):
+        extreme = extremes.max() if is_above else extremes.min()
         search.came_near("threshold", 0.0, f"{signal.name} reached {extreme:.4g}")
-
-
-def _extreme(zones: Zones, op: type[ast.cmpop]) -> float | None:
-    there = zones.value_count > 0
-    values = (zones.max if op is ast.Gt else zones.min)[there & ~np.isnan(zones.min)]
-    if not len(values):
-        return None
-    return float(values.max() if op is ast.Gt else values.min())
-
-
-def _limit(event: Event) -> Hashable:
-    return event.details.get("above"), event.details.get("below")
-
-
-def _for_s(options: EventOptions) -> float:
-    return max((threshold.for_s for threshold in options.thresholds), default=0.0)
 
 
 THRESHOLD: Final = EventKind(
@@ -92,7 +77,10 @@ THRESHOLD: Final = EventKind(
     threshold_events,
     usual=lambda options: bool(options.thresholds),
     lasts=True,
-    least_s=_for_s,
+    least_s=lambda options: max((each.for_s for each in options.thresholds), default=0.0),
     counted=False,
-    alike=Alike(lambda events, unit: "stretches", sort=_limit),
+    alike=Alike(
+        lambda events, unit: "stretches",
+        sort=lambda e: (e.details.get("above"), e.details.get("below")),
+    ),
 )

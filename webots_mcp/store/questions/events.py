@@ -15,10 +15,10 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.liveness import dead_sessions
 from webots_mcp.naming import flatten
 from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.extent import Detection
 from webots_mcp.store.detection.grouping import grouped
 from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.detection.registry import asked_kinds, kind_named, stored_kinds
+from webots_mcp.store.detection.search import Search, events_touching
 from webots_mcp.store.detection.verdict import Ledger, Verdicts, count_by_kind
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.frame import read_frame
@@ -198,8 +198,8 @@ def search_events(
     found: list[Event] = []
     for index, segment in enumerate(segments):  # each run gets its share of the time
         part = deadline.part(1 / (len(segments) - index))
-        detection = Detection(connection, known, kinds, options, part, ledger)
-        found += detection.events_touching(segment)
+        search = Search(connection, segment, known, kinds, options, part, ledger)
+        found += events_touching(search)
     for kind in kinds if not segments else ():
         ledger.not_searched(kind.name, "nothing was recorded in that range")
     over = _runs_over(connection, [segment.run_id for segment in segments])

@@ -93,6 +93,9 @@ def test_a_damaged_byte_is_noticed(at: int) -> None:
         (["a", "b"], {"codes": b"no zlib"}, "damaged"),
         (["a", "b"], {"labels": None}, "codes"),
         (["a", "b"], {"labels": "["}, "damaged"),
+        (["a", "b"], {"labels": '"ab"'}, "no list"),
+        (["a", "b"], {"labels": '[{"a": 1}, {}]'}, "not those of values"),
+        (["a", "b"], {"labels": "[1, 2]"}, "not those of values"),
     ],
 )
 def test_what_another_version_or_program_wrote_is_said(

@@ -12,7 +12,7 @@ import json
 import zlib
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias, cast
 
 from webots_mcp.errors import DatabaseError
 from webots_mcp.naming import Value
@@ -160,8 +160,20 @@ def _decode_coded(encoded: Encoded, rows: int) -> Decoded:
 
 
 def _labels(text: str | None) -> list[Value | Replaced]:
-    listed: list[Any] = json.loads(text or "[]")
-    return [Replaced(each[0]) if isinstance(each, list) else each for each in listed]
+    listed: Any = json.loads(text or "[]")
+    if not isinstance(listed, list):
+        raise DamagedChunkError("damaged: its labels are no list")
+    return [_label(each) for each in cast("list[Any]", listed)]
+
+
+def _label(label: Any) -> Value | Replaced:
+    if label is None or isinstance(label, str | bool):
+        return label
+    match label:
+        case [str(why)]:
+            return Replaced(why)
+        case _:
+            raise DamagedChunkError("damaged: its labels are not those of values")
 
 
 def _fill_flags(numbers: Array, codes: Indexes, labels: Sequence[Value | Replaced]) -> None:

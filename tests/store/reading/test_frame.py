@@ -137,6 +137,45 @@ def test_a_damaged_chunk_is_read_from_its_rows_where_they_are_there(
     assert "the chunk of a is damaged" in frame.unread[0].why
 
 
+@pytest.mark.parametrize("loss", ["DELETE FROM chunk", "UPDATE chunk SET numbers = x'00'"])
+def test_rows_whose_times_are_lost_stay_in_order_and_it_is_said(
+    short_groups: None, empty: sqlite3.Connection, loss: str
+) -> None:
+    recorded(empty, [{"a": 0.5 * step} for step in range(24)])
+    make_chunks(empty, 1000)
+    before = framed(empty)
+    times, walls = before.times.tolist(), before.wall_times.tolist()
+    empty.execute(f"{loss} WHERE signal_id <= 0 AND group_id = 2")
+    frame = framed(empty)
+    assert (frame.times.tolist(), frame.wall_times.tolist()) == (times, walls)
+    assert frame.ids.tolist() == list(range(1, 25)) and frame.unread == ()
+
+    segment = whole_run(empty, 1)
+    assert segment is not None
+    empty.execute("DELETE FROM state")
+    frame = read_frame(empty, segment, Deadline(60))
+    assert frame.times.tolist() == pytest.approx(times)
+    assert frame.wall_times.tolist() == pytest.approx(walls)
+    assert frame.ids[8:16].tolist() == [0] * 8
+    assert {(part.start_s, part.end_s) for part in frame.unread} == {(0.8, 1.5)}
+    said = " ".join(part.why for part in frame.unread)
+    assert all(f"chunk of {what} is" in said for what in ("simulation times", "wall times"))
+
+
+@pytest.mark.parametrize("rows", [10**12, 0, -5])
+def test_a_group_with_a_count_of_rows_that_cannot_be_is_not_read_and_it_is_said(
+    short_groups: None, empty: sqlite3.Connection, rows: int
+) -> None:
+    recorded(empty, [{"a": step} for step in range(24)])
+    make_chunks(empty, 1000)
+    empty.execute("UPDATE row_group SET row_count = ? WHERE id = 2", (rows,))
+    frame = framed(empty)
+    assert frame.values("a") == [*range(8), *range(16, 24)]
+    assert [str(part) for part in frame.unread] == [
+        "not read from 0.800 to 1.500 s: its row group is damaged"
+    ]
+
+
 def test_a_range_in_wall_time_holds_only_its_rows(empty: sqlite3.Connection) -> None:
     recorder = start_run(empty)
     for step in range(6):  # simulation time stands still

@@ -165,6 +165,14 @@ class Frame:
         """What is not in it, as far as its values were asked for."""
         return tuple(self._source.unread)
 
+    @property
+    def was_read(self) -> Flags:
+        """Which rows lie in no part that could not be read, of the values asked for so far."""
+        read = np.ones(len(self), np.bool_)
+        for part in self.unread:
+            read[slice(*self.places([part.start_s, math.nextafter(part.end_s, math.inf)]))] = False
+        return read
+
     @cached_property
     def times(self) -> Array:
         """Simulation time of each row, in s."""

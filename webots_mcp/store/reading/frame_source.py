@@ -21,10 +21,16 @@ from webots_mcp.store.chunks.stored import (
     values_in,
 )
 
+_MOST_ROWS: Final = 2**20  # of a group: no maker puts more than 1,024 into one
 MOST_KEPT_BYTES: Final = 64_000_000  # of values that a frame keeps for who asks again
 Column = str | int  # the name of a signal, or what has a chunk of its own (SIM_TIMES, ...)
 T = TypeVar("T")
 
+_NAMES: Final[dict[Column, str]] = {
+    SIM_TIMES: "simulation times",
+    WALL_TIMES: "wall times",
+    STATE_IDS: "row ids",
+}
 _ROWS_OF: Final = (
     f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s <= ? "
     "ORDER BY sim_time_s, id"
@@ -69,6 +75,10 @@ class FrameSource:
         self.ids = ids
         self.unread: dict[Unread, None] = {}
         self.order: Indexes | None = None
+        sound = (groups[:, 3] >= 1) & (groups[:, 3] <= _MOST_ROWS) & (groups[:, 1] <= groups[:, 2])
+        for _, start_s, end_s, _ in groups[~sound].tolist():
+            self.unread[Unread(start_s, end_s, "its row group is damaged")] = None
+        groups = groups[sound]
         self._group_ids: Indexes = groups[:, 0].astype(np.intp)
         new = np.arange(0, len(columns), making.GROUP_ROWS)
         ends = np.minimum(new + making.GROUP_ROWS, len(columns))
@@ -120,7 +130,10 @@ class FrameSource:
         if signal_id is not None and connection is not None and of_group:
             sizes = np.diff(self.first_rows)
             wanted = {group_id: int(sizes[place]) for group_id, place in of_group.items()}
-            for group_id, values in values_in(connection, self.run_id, signal_id, wanted):
+            found = values_in(connection, self.run_id, signal_id, wanted)
+            if signal_id <= SIM_TIMES:  # each group has times and ids
+                found = _with_missing(found, wanted)
+            for group_id, values in found:
                 place = of_group[group_id]
                 if isinstance(values, DamagedChunkError):
                     values = self._from_rows(connection, place, column, values)
@@ -140,12 +153,30 @@ class FrameSource:
         """What the rows of a damaged chunk say, where they are all there; else it is not read."""
         columns, span = StateColumns(), (float(self.starts_s[place]), float(self.ends_s[place]))
         columns.add(connection.execute(_ROWS_OF, (self.run_id, *span)).fetchall())
-        if len(columns) == self.first_rows[place + 1] - self.first_rows[place]:
+        rows = int(self.first_rows[place + 1] - self.first_rows[place])
+        if len(columns) == rows:
             values = _of_rows(columns, column)
             if values is not None:
                 return decoded_of(values)
-        self.unread[Unread(*span, f"the chunk of {column} is {error}")] = None
-        return None
+        said = _NAMES.get(column, column)
+        self.unread[Unread(*span, f"the chunk of {said} is {error}")] = None
+        evenly: Array = np.linspace(*span, rows)
+        if column == SIM_TIMES:  # so they keep the rows in order
+            return Decoded(evenly, None, ())
+        if column == WALL_TIMES:
+            return Decoded(np.interp(evenly, *self._known_walls()), None, ())
+        return Decoded(np.zeros(rows), None, ()) if column == STATE_IDS else None
+
+    def _known_walls(self) -> tuple[Array, Array]:
+        """Simulation and wall times of the first and last rows of parts, by their statistics."""
+        table = self.statistics(WALL_TIMES)
+        first, last = (Statistics._fields.index(end) for end in ("first", "last"))
+        walls: Array = np.append(table[:, first], table[:, last])
+        times: Array = np.append(self.starts_s, self.ends_s)
+        order = np.argsort(times[~np.isnan(walls)], kind="stable")
+        if not len(order):
+            return np.zeros(1), np.zeros(1)
+        return times[~np.isnan(walls)][order], walls[~np.isnan(walls)][order]
 
     def statistics(self, column: Column) -> Array:
         """What a signal comes to: a row for each part, a column for each field of `Statistics`."""
@@ -212,6 +243,18 @@ def nothing(parts: int) -> Array:
     table: Array = np.full((parts, len(Statistics._fields)), np.nan)
     table[:] = np.array(Statistics(0, 0), np.float64)
     return table
+
+
+def _with_missing(
+    found: Iterator[tuple[int, Decoded | DamagedChunkError]], wanted: Mapping[int, int]
+) -> Iterator[tuple[int, Decoded | DamagedChunkError]]:
+    """What was found in some groups, and an error of each in which nothing was."""
+    missing = dict.fromkeys(wanted)
+    for group_id, values in found:
+        missing.pop(group_id, None)
+        yield group_id, values
+    for group_id in missing:
+        yield group_id, DamagedChunkError("missing")
 
 
 def _of_rows(columns: StateColumns, column: Column) -> Sequence[Any] | None:

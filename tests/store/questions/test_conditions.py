@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp.errors import InvalidConditionError, InvalidInputError, UnknownSignalError
+from webots_mcp.store.chunks import making
+from webots_mcp.store.chunks.making import chunk_whole_run
 from webots_mcp.store.detection.event import EventOptions, Threshold
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.reading.ranges import Scope, find_range
@@ -198,3 +200,24 @@ def test_thresholds_are_a_short_form_of_a_condition(
     assert [(event.start_s, event.end_s) for event in held.events] == [
         (pytest.approx(start_s), end_s) for start_s, end_s in told
     ]
+
+
+def test_where_a_condition_could_not_be_asked_of_a_damaged_chunk_is_said(
+    counting: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(making, "GROUP_ROWS", 100)
+    connection = counting.connection
+    for step in range(400):
+        counting.publish(step * 0.1, {"n": step, "m": step})
+    assert chunk_whole_run(connection, 1)
+    connection.execute("DELETE FROM state")
+    of_m = "signal_id = (SELECT id FROM signal WHERE name = 'm')"
+    connection.execute(f"UPDATE chunk SET numbers = x'00' WHERE group_id = 2 AND {of_m}")
+
+    assert spans(ask(connection, "n < m + 1")) == [(0.0, 9.9), (20.0, 39.9)]
+    never = ask(connection, "missing(m)").verdicts
+    assert never.absent["condition"] == "true in none of 300 rows"
+    assert "from 10.000 to 19.900 s: the chunk of m is damaged" in never.not_searched["condition"]
+
+    connection.execute(f"UPDATE chunk SET numbers = x'00' WHERE {of_m}")
+    assert "condition" not in ask(connection, "missing(m)").verdicts.absent

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import start_run
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
 from webots_mcp.store.questions.trend import Trend
 from webots_mcp.store.questions.trends import RunTrends, trends
 from webots_mcp.store.reading.ranges import Scope, find_range
@@ -370,3 +370,17 @@ def test_the_extremes_of_an_angle_are_its_own_and_not_those_of_means(
     summary, values = one(empty, "yaw").summary, [yaw(step * 0.1) for step in range(6000)]
     assert (summary.min, summary.max) == pytest.approx((min(values), max(values)))
     assert yaw(summary.max_sim_time_s or 0.0) == pytest.approx(max(values))
+
+
+def test_a_signal_whose_chunk_is_damaged_is_not_said_to_have_no_value(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = start_run(empty)
+    for step in range(300):
+        recorder.publish(step * 0.1, {"x": step})
+    assert chunk_whole_run(empty, 1)
+    empty.execute("DELETE FROM state")
+    empty.execute("UPDATE chunk SET numbers = x'00' WHERE signal_id > 0")
+    told = ask(empty)
+    assert (told.numbers, told.silent) == ((), ())
+    assert "the chunk of x is damaged" in told.unread[0]

@@ -40,6 +40,10 @@ def condition_events(search: Search) -> Iterator[Event]:
     position = position_in(frame, search.known) if condition.asks_position else None
     first = int(np.searchsorted(frame.times, search.recorded.start_s))
     runs = where_held(condition, frame, position, first)
+    read = frame.was_read[first:]
+    search.not_searched("condition", *map(str, frame.unread))
+    if frame.unread and not read.any():
+        raise NotSearchableError("; ".join(map(str, frame.unread)))
     if frame.cut_at_s is not None:
         then = f"ask again with start_s={frame.cut_at_s:.3f}"
         search.not_searched("condition", f"time limit reached at {frame.cut_at_s:.3f} s: {then}")
@@ -47,7 +51,7 @@ def condition_events(search: Search) -> Iterator[Event]:
     search.ledger.note_of_run(search.segment.run_id, share)
     if not len(runs):
         _require_values(condition, frame, position)
-    rows = search.ledger.rows = search.ledger.rows + len(frame) - first
+    rows = search.ledger.rows = search.ledger.rows + int(np.count_nonzero(read))
     search.ledger.came_near("condition", rows, f"true in none of {rows} rows")
     for run, values in zip(runs.each(), values_at(condition, frame, position, runs), strict=True):
         details = dict(list(values.items())[:_MOST_VALUES])
@@ -83,7 +87,7 @@ def where_held(
     if failed := first_failure(failures):
         place = f"in run {frame.run_id}, at {frame.times[failed.row]:.3f} s"
         raise InvalidInputError(f"{failed.why} ({place})")
-    return runs_of(holds & (np.arange(len(frame)) >= first), frame.times)
+    return runs_of(holds & frame.was_read & (np.arange(len(frame)) >= first), frame.times)
 
 
 def values_at(

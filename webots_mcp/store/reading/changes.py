@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import Final, NamedTuple
 
 from webots_mcp.naming import Value
-from webots_mcp.store.analysis.arrays import Array, Indexes, np
+from webots_mcp.store.analysis.arrays import Indexes, np
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import Frame, Unread, read_frame
 from webots_mcp.store.reading.kept import kept_parts
@@ -153,10 +153,8 @@ def _first_alike(frame: Frame, signal: Signal, value: str | bool | None) -> int:
 def _points_in(frame: Frame, signal: Signal) -> list[Point]:
     """The first value of a frame, and each that is unlike the one before."""
     values, codes = _valued(frame, signal)
-    times: Array = frame.times
-    for each in frame.unread:
-        read = (times < each.start_s) | (times > each.end_s)
-        times, codes = times[read], codes[read]
+    read = frame.was_read
+    times, codes = frame.times[read], codes[read]
     rows = np.flatnonzero(np.diff(codes, prepend=-1))
     at = zip(times[rows].tolist(), codes[rows].tolist(), strict=True)
     return [Point(time_s, values[code]) for time_s, code in at]

@@ -31,7 +31,7 @@ _LOG: Final = (
 
 
 def record(file: Path, rows: int) -> None:
-    """One run of that many rows, rolled up, with a log line a second; every 97th tells of slip.
+    """One run of that many rows, in chunks, with a log line a second; every 97th tells of slip.
 
     Only the first 50,000 rows are made one by one. The others repeat their texts.
     """

@@ -297,10 +297,8 @@ def test_a_pool_that_is_away_is_tried_again_and_then_gets_everything(shipped: Sh
     assert pooled(away, shipped.uuid) == shipped.rows()
 
 
-@pytest.mark.skipif(not unprivileged.POSSIBLE, reason="root may write everywhere")
-def test_a_recording_that_nobody_can_write_is_shipped(shipped: Shipped) -> None:
-    shipped.add_run()
-    uuid, rows = shipped.uuid, shipped.rows()
+def ship_unwritable(shipped: Shipped, *, full: bool) -> str:
+    """Ship a recording that nobody can write; what was noted."""
     shipped.connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     shipped.connection.close()
     code = (
@@ -309,14 +307,31 @@ def test_a_recording_that_nobody_can_write_is_shipped(shipped: Shipped) -> None:
         "from webots_mcp.plugins.pool.report import Report; "
         "from webots_mcp.plugins.pool.shipping import Order, ship; "
         "from webots_mcp.store.recording import Recording; folder, pool = map(Path, sys.argv[1:]); "
-        "recording = Recording(folder / 'webots.db', folder, read_only=True); "
-        "ship(Order(recording, functools.partial(SQLiteTarget, pool), full=True), Report())"
+        "recording = Recording(folder / 'webots.db', folder, read_only=True); report = Report(); "
+        f"ship(Order(recording, functools.partial(SQLiteTarget, pool), full={full}), report); "
+        "print(*report.notes)"
     )
     with unprivileged.unwritable(shipped.folder):
         line = unprivileged.line("-c", code, str(shipped.folder), str(shipped.pool))
-        subprocess.run(line, check=True)
+        return subprocess.run(line, check=True, stdout=subprocess.PIPE, text=True).stdout
+
+
+@pytest.mark.skipif(not unprivileged.POSSIBLE, reason="root may write everywhere")
+def test_a_recording_that_nobody_can_write_is_shipped(shipped: Shipped) -> None:
+    shipped.add_run()
+    uuid, rows = shipped.uuid, shipped.rows()
+    assert not ship_unwritable(shipped, full=True).strip()
     assert pooled(shipped.pool, uuid) == rows
     assert not list(shipped.folder.glob("*shipped.json"))
+
+
+@pytest.mark.skipif(not unprivileged.POSSIBLE, reason="root may write everywhere")
+def test_of_a_recording_that_nobody_can_write_a_copy_is_asked_for(shipped: Shipped) -> None:
+    """It was to be shipped again when its run has ended, which it had."""
+    shipped.recorded.add_run(300)
+    told = ship_unwritable(shipped, full=False)
+    assert "300 states are in no chunk yet" in told
+    assert "ship a copy, or with --full" in told
 
 
 def test_rows_of_other_programs_that_hold_no_text_and_no_times_are_shipped_as_what_is_near(

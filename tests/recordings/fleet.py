@@ -26,7 +26,7 @@ _INSERT: Final = "INSERT INTO state (run_id, sim_time_s, wall_time_s, data) VALU
 
 
 def build_fleet(file: Path, robots: int, seconds: float, interval_s: float) -> None:
-    """Record so many robots (`rover0`, ...) for so long each, all of it rolled up."""
+    """Record so many robots (`rover0`, ...) for so long each, all of it in chunks."""
     recorded = Recorded(file)
     with closing(recorded.connection) as connection:
         connection.execute("BEGIN IMMEDIATE")

@@ -12,12 +12,12 @@ from webots_mcp.contract import new_uuid
 from webots_mcp.schema import create_schema
 from webots_mcp.store.chunks.making import make_chunks
 
-ROWS: Final = 5200  # 1040 s: two coarse buckets and some
-PART: Final = (480.0, 720.0)  # within it, over the border of coarse buckets
+ROWS: Final = 5200  # 1040 s: five groups of rows and some
+PART: Final = (480.0, 720.0)  # within it, over the borders of groups
 
 
 def record_rounds(file: Path, rows: int = ROWS) -> None:
-    """Write run 1, rolled up, and run 2 of another robot, whose rows lie between its ids."""
+    """Write run 1, in chunks, and run 2 of another robot, whose rows lie between its ids."""
     with closing(connect(file, "writer", create=True)) as connection:
         create_schema(connection)
         recorder = start_run(connection)

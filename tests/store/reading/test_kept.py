@@ -56,7 +56,7 @@ def recorded() -> Iterator[MemoryDatabase]:
     database.close()
 
 
-@pytest.fixture(params=[False, True], ids=["rows", "rolled up"])
+@pytest.fixture(params=[False, True], ids=["rows", "chunks"])
 def connection(
     recorded: MemoryDatabase, request: pytest.FixtureRequest
 ) -> Iterator[sqlite3.Connection]:

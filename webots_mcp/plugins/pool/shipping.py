@@ -165,9 +165,13 @@ class Shipper:
             self._knows_owners(source)
             behind = source.in_no_chunk(self._progress.get("state", 0))  # at full rate
         if behind:
+            mend = "ship again when their run has ended, or with --full"
+            if isinstance(connection, FrozenConnection):
+                mend = (
+                    "none can be made where the file cannot be written: ship a copy, or with --full"
+                )
             self._report.note(
-                f"{behind} states are in no chunk yet, and so not in the pool: ship again when "
-                "their run has ended, or with --full"
+                f"{behind} states are in no chunk yet, and so not in the pool: {mend}"
             )
 
     def _end_what_was_killed(self, connection: sqlite3.Connection) -> None:

@@ -52,6 +52,7 @@ GETTING_STARTED: Final = (
     "elsewhere, start the server with --data-dir or --database."
 )
 
+_MOST_IDLE: Final = 8  # connections: each may hold 2 MB of pages
 _NO_DATABASE: Final = "file is not a database"  # SQLite's words
 _FROZEN: Final = "the file cannot be written from here: read as it is on the disk"
 _NOT_IN: Final = (
@@ -120,7 +121,7 @@ class View:
 
 
 class OpenReaders:
-    """Connections that a server keeps open between its questions: as many as it asks at once.
+    """Connections that a server keeps open between its questions: a few, each with its cache.
 
     One is used again as long as its file is the one that it was opened to, and so is the schema.
     """
@@ -149,7 +150,8 @@ class OpenReaders:
         except BaseException:
             connection.close()
             raise
-        if known is None or isinstance(connection, FrozenConnection):
+        is_enough = len(self._idle) >= _MOST_IDLE
+        if known is None or is_enough or isinstance(connection, FrozenConnection):
             connection.close()
         else:
             self._idle.append((known, connection))

@@ -12,7 +12,7 @@ from __future__ import annotations
 import sqlite3
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple
 
 from webots_mcp.errors import warn
 from webots_mcp.store.chunks.codec import ABSENT, EXACT_INTEGERS, decoded_of, pack
@@ -36,13 +36,12 @@ from webots_mcp.transactions import LONGEST_WRITE_S, Step
 GROUP_ROWS: Final = 1024
 LEAST_AT_END: Final = 256  # fewer rows, with which a run ended, are read as they are
 _IDS_AT_ONCE: Final = 20_000
-_FIRST_AT_ONCE: Final = 20
+_FIRST_AT_ONCE: Final = 100_000  # bytes
+_STEP_BYTES: Final = 5_000  # a chunk takes as long as so many bytes, and its own besides
 _NO_LIMIT: Final = 2**62
 _STATE_BYTES: Final = 25  # of a record beside its text: run, two times, lengths
 _STATISTICS_BYTES: Final = 115  # of a chunk beside what is compressed
 _CHUNK_INDEX_BYTES: Final = 110  # in both indexes, measured
-
-Item = TypeVar("Item")
 
 _COLUMNS: Final = (
     "run_id",
@@ -255,10 +254,10 @@ class _RunChunks:
         values = (*group, max(columns.ids), rows, rows, lost, *self._room_of(columns, chunks))
         group_id = self._connection.execute(_BEGIN_GROUP, values).lastrowid
 
-        def store(some: Sequence[int]) -> bool:
-            return _STORE.run(self._connection, group_id, some[0], some[-1])
+        def store(first: int, last: int) -> bool:
+            return _STORE.run(self._connection, group_id, first, last)
 
-        in_short_steps(range(len(chunks)), store, self._pause_s)
+        _in_short_steps(list(map(_packed_bytes, chunks)), store, self._pause_s)
         expected = (self._run_id, at.max_in_groups, len(chunks))
         return _COMPLETE.run(self._connection, group_id, *expected)
 
@@ -268,10 +267,7 @@ class _RunChunks:
         """Bytes on the disk, with indexes: of a state row on average, and of all chunks."""
         page_bytes = self._connection.execute("PRAGMA page_size").fetchone()[0]
         texts = (len(text.encode()) + _STATE_BYTES for text in columns.texts)
-        packed = (
-            sum(len(each) for each in chunk[-3:] if each is not None) + _STATISTICS_BYTES
-            for chunk in chunks
-        )
+        packed = (_packed_bytes(chunk) + _STATISTICS_BYTES for chunk in chunks)
         row_bytes = disk_bytes(texts, page_bytes) / len(columns) + INDEX_BYTES
         return row_bytes, round(disk_bytes(packed, page_bytes) + _CHUNK_INDEX_BYTES * len(chunks))
 
@@ -346,18 +342,25 @@ def _chunks_of(
         yield (run_id, signal_id, *statistics_of(held), *pack(held))
 
 
-def in_short_steps(
-    items: Sequence[Item], store: Callable[[Sequence[Item]], bool], pause_s: float
+def _packed_bytes(chunk: tuple[Any, ...]) -> int:
+    return sum(len(each) for each in chunk[-3:] if each is not None)
+
+
+def _in_short_steps(
+    sizes: Sequence[int], store: Callable[[int, int], object], pause_s: float
 ) -> None:
-    """Store items in order, as many at a time as half a millisecond takes."""
+    """Store the items from one to another, as many at a time as half a millisecond takes."""
     most, done = _FIRST_AT_ONCE, 0
-    while done < len(items):
-        some = items[done : done + most]
+    while done < len(sizes):
+        last, size = done, sizes[done] + _STEP_BYTES
+        while last + 1 < len(sizes) and size + sizes[last + 1] + _STEP_BYTES <= most:
+            last += 1
+            size += sizes[last] + _STEP_BYTES
         started_s = time.perf_counter()
-        store(some)
+        store(done, last)
         took_s = time.perf_counter() - started_s
-        done += len(some)
-        most = max(1, round(len(some) * min(2.0, LONGEST_WRITE_S / 2 / took_s)))
+        done = last + 1
+        most = round(size * min(2.0, LONGEST_WRITE_S / 2 / took_s))
         time.sleep(pause_s)
 
 

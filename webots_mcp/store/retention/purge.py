@@ -37,7 +37,6 @@ _FREE_RUN: Final = f"NOT EXISTS (SELECT 1 FROM run WHERE id = :run_id AND {KEPT}
 _OLD_COMMANDS: Final = f"SELECT id {OLD_COMMANDS} ORDER BY id LIMIT :limit"
 _DELETE: Final = {
     "command": "DELETE FROM command WHERE id = :id",
-    "chunk": "DELETE FROM chunk WHERE id = :id",
     "image": f"DELETE FROM image WHERE id = :id AND {_FREE_RUN}",
     "run": f"DELETE FROM run WHERE id = :id AND {_FREE_RUN}",
 }
@@ -98,7 +97,7 @@ _STEPS: Final = {
         *_BEFORE_DELETION.get(table, ()),
         _DELETE_GOING.format(table=table),
     )
-    for table in ("state", "kept_state", "log", "event")
+    for table in ("state", "chunk", "kept_state", "log", "event")
 }
 # Frames whose kept stretch is gone.
 _LEFT_FRAMES: Final = (
@@ -216,14 +215,14 @@ def purge(
 
 
 class _Pace:
-    """How many to take at once, so that they take about the time that the lock may be held."""
+    """How many to take at once, so that they take about half the time that the lock may be held."""
 
     def __init__(self) -> None:
         self.count = 8
 
     def measure(self, count: int, held_s: float) -> None:
         """Go on from what these have taken; twice as many at most."""
-        fitting = count * LONGEST_WRITE_S / max(held_s, 1e-6)
+        fitting = count * LONGEST_WRITE_S / 2 / max(held_s, 1e-6)  # some take twice as long
         self.count = max(1, min(int(fitting), 2 * self.count, BATCH_ROWS))
 
 
@@ -306,7 +305,7 @@ class _Purge:
         if not self._unless_locked(lambda: self._connection.execute(_HIDE_GROUP, group).rowcount):
             return
         found = self._connection.execute(_CHUNKS, (group["id"],)).fetchall()
-        keys = [{"id": chunk_id} for (chunk_id,) in found]
+        keys = [{"id": chunk_id, "run_id": 0} for (chunk_id,) in found]  # whatever was marked since
         while keys:
             keys = keys[self._delete_some("chunk", keys) :]
             yield self.purged
@@ -351,7 +350,7 @@ class _Purge:
 
         done = self._unless_locked(lambda: self._writes.write(keys, delete))
         if done:
-            self.purged.rows[table] += deleted if table != "chunk" else 0
+            self.purged.rows[table] += deleted
             self._note(self._writes.held_s)
         return done
 
@@ -365,7 +364,8 @@ class _Purge:
         _STEPS[table].run(self._connection, group_id)
         held_s = time.perf_counter() - started_s
         pace.measure(len(some), held_s)
-        self.purged.rows[table] += self._first("SELECT count(*) FROM going")
+        if table != "chunk":  # of which states are counted
+            self.purged.rows[table] += self._first("SELECT count(*) FROM going")
         self._note(held_s)
         return len(some)
 

@@ -79,7 +79,7 @@ def test_events_tell_since_when_it_was_stuck(say: Say) -> None:
     assert beyond.count("  threshold  ") == 2
     held = say("events", "--run", "1", "--where", "pose.0 > 7.9 and displacement(3) < 0.01")
     assert line_with(held, "condition", "43", "9.1")
-    assert "came_near: stuck smallest movement" in say("events", "--kind", "stuck")
+    assert "nearest: stuck smallest movement" in say("events", "--kind", "stuck")
 
 
 def test_compare_says_what_differs(say: Say) -> None:

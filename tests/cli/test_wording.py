@@ -80,7 +80,7 @@ def test_a_flag_that_is_to_be_turned_off_is_named_by_the_option_that_does(
     for row in range(1200):
         rover.state(row * 0.1, {"front_m": None if row % 40 > 19 else 1.0})
     recording.close()
-    assert main(["events", "--kind", "silent", "--data-dir", str(tmp_path)]) == 0
+    assert main(["events", "--kind", "missing", "--data-dir", str(tmp_path)]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "--one-by-one tells alike events one by one" in said
 

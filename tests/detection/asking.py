@@ -23,7 +23,7 @@ _ALL: Final = 1_000_000
 _KINDS: Final[dict[Measure, tuple[str, ...]]] = {
     "standstill": ("standstill", "stuck"),
     "stuck": ("stuck",),
-    "silent": ("silent",),
+    "missing": ("missing",),
     "flat": ("flat",),
     "dropout": ("jump",),
     "leap": ("jump",),

@@ -16,7 +16,7 @@ MOST_VALUES: Final = 400_000  # rows times signals that are added to a run
 WIDE: Final = 300
 _RESET_SHARE: Final = 0.25
 _MOTION: Final[tuple[Measure, ...]] = ("standstill", "stuck")
-_SENSORS: Final[tuple[Measure, ...]] = ("silent", "flat", "dropout", "swing")
+_SENSORS: Final[tuple[Measure, ...]] = ("missing", "flat", "dropout", "swing")
 
 
 def with_others(rng: np.random.Generator, run: LabelledRun, count: int) -> LabelledRun:
@@ -50,12 +50,12 @@ KINDS: Final[dict[str, Kind]] = {
     "gaps": Kind(sensing.draw_gaps, ("gap", *_SENSORS)),
     "leaps": Kind(sensing.draw_leaps, ("leap",)),
     "healthy": Kind(
-        sensing.draw_healthy, ("standstill", "stuck", "silent", "flat", "dropout", "leap", "gap")
+        sensing.draw_healthy, ("standstill", "stuck", "missing", "flat", "dropout", "leap", "gap")
     ),
     **{name: Kind(draw, ("swing",)) for name, draw in swinging.DRAWN.items()},
     "swing_gap": Kind(swinging.draw_with_gap, ("swing", "dropout", "gap")),
     "renamed": Kind(driving.draw_held, _MOTION, anew=True),
-    "wide": Kind(sensing.draw_short_silence, ("silent",), others=WIDE),
+    "wide": Kind(sensing.draw_short_silence, ("missing",), others=WIDE),
 }
 
 

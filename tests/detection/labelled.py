@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-Measure = Literal["standstill", "stuck", "silent", "flat", "dropout", "leap", "swing", "gap"]
+Measure = Literal["standstill", "stuck", "missing", "flat", "dropout", "leap", "swing", "gap"]
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,7 @@ def _stretches(
 
 def silenced(run: LabelledRun, name: str, rows: Flags, nothing: float | None) -> LabelledRun:
     """The run with a sensor that gives nothing in the rows that are marked."""
-    truth = Incident("silent", *_ends_of(run, rows), name)
+    truth = Incident("missing", *_ends_of(run, rows), name)
     return with_incidents(with_values(run, name, rows, nothing), truth)
 
 
@@ -103,7 +103,7 @@ def draw_late(rng: np.random.Generator) -> LabelledRun:
     name = str(rng.choice(["lidar", "front"]))
     rows = run.times < rng.uniform(0.2, 10)
     run = with_values(run, name, rows, None)
-    return with_incidents(run, Incident("silent", *_ends_of(run, rows), name, optional=True))
+    return with_incidents(run, Incident("missing", *_ends_of(run, rows), name, optional=True))
 
 
 def draw_dead(rng: np.random.Generator) -> LabelledRun:
@@ -194,7 +194,7 @@ def draw_healthy(rng: np.random.Generator) -> LabelledRun:
 
 
 DRAWN: Final[dict[str, Callable[[np.random.Generator], LabelledRun]]] = {
-    "silent": draw_silent,
+    "missing": draw_silent,
     "late": draw_late,
     "dead": draw_dead,
     "frozen": draw_frozen,

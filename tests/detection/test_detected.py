@@ -27,7 +27,7 @@ _REPEATABLE = settings.default is not None and settings.default.derandomize
 EXAMPLES = 4 if _REPEATABLE else 100
 MOST_VALUES = 10_000  # that are added to a run: enough to be searched, and read in no time
 LOOKED_FOR: tuple[Measure, ...] = (
-    "standstill", "silent", "flat", "dropout", "leap", "swing", "gap",
+    "standstill", "missing", "flat", "dropout", "leap", "swing", "gap",
 )  # fmt: skip
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -96,8 +96,8 @@ def test_every_gap_is_told_and_nothing_else_is_a_gap(kind: str, seed: int) -> No
         assert not verdict.missed and not verdict.false
 
 
-@pytest.mark.parametrize("kind", ["silent", "late", "wide"])
+@pytest.mark.parametrize("kind", ["missing", "late", "wide"])
 def test_silence_that_lasts_less_than_half_of_a_run_is_told_exactly(kind: str) -> None:
     report = measure([kind], 1, 1)
-    tally = report.tallies[kind, "silent", ""]
+    tally = report.tallies[kind, "missing", ""]
     assert (tally.recall or 1.0, tally.false, report.wrong) == (1.0, 0, [])

@@ -90,7 +90,7 @@ def test_noise_is_as_strong_as_it_is_said_to_be() -> None:
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_sensor_has_no_value_exactly_while_it_is_silent(seed: int) -> None:
     for run in (drawn(draw_silent, seed), drawn(draw_dead, seed)):
-        silent = of(run, "silent")
+        silent = of(run, "missing")
         for name in {each.name for each in silent}:
             for time_s, value in zip(run.times.tolist(), run.columns[str(name)], strict=True):
                 missing = value is None or (isinstance(value, float) and math.isnan(value))

@@ -96,10 +96,10 @@ def test_a_swing_that_a_gap_cuts_in_two_may_be_told_twice() -> None:
 
 def test_what_several_items_of_an_array_tell_at_once_is_one_claim() -> None:
     events = [
-        Event("silent", 1, 3.0, 9.0, 0.0, name) for name in ("lidar.min", "lidar.max", "front")
+        Event("missing", 1, 3.0, 9.0, 0.0, name) for name in ("lidar.min", "lidar.max", "front")
     ]
-    events.append(Event("silent", 1, 20.0, 22.0, 0.0, "lidar.min"))
-    claims = claims_of(events, "silent")
+    events.append(Event("missing", 1, 20.0, 22.0, 0.0, "lidar.min"))
+    claims = claims_of(events, "missing")
     assert [(each.name, each.start_s) for each in claims] == [
         ("lidar", 3.0), ("front", 3.0), ("lidar", 20.0),
     ]  # fmt: skip

@@ -73,7 +73,7 @@ TOOLS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
             "gap",
             "jump",
             "flat",
-            "silent",
+            "missing",
             "oscillation",
             "change",
         )

@@ -170,7 +170,7 @@ def test_what_the_values_show_can_be_asked_for(
     (stuck,) = webots_recording.find_events("stuck", stuck_s=4.0)
     assert (stuck.start_s, stuck.end_s) == pytest.approx((61 * 0.096, 120 * 0.096), abs=0.1)
     assert stuck.ongoing
-    assert webots_recording.find_events("jump", "silent") == []
+    assert webots_recording.find_events("jump", "missing") == []
     with pytest.raises(InvalidInputError, match="unknown kind 'stucked'"):
         webots_recording.find_events("stucked")
 

@@ -60,11 +60,11 @@ class Rover:
         """Close the gripper."""
         raise RuntimeError("the gripper is not mounted")
 
-    def drive(self, until_s: float, commands: dict[float, Any], silent_s: tuple[float, float]):
+    def drive(self, until_s: float, commands: dict[float, Any], missing_s: tuple[float, float]):
         while self.robot.step(STEP_MS) != -1 and self.robot.getTime() < until_s:
             time_s = round(self.robot.getTime(), 3)
             self.act(time_s)
-            if not silent_s[0] <= time_s < silent_s[1]:
+            if not missing_s[0] <= time_s < missing_s[1]:
                 self.bridge.publish(self.state(time_s))
             self.answer(commands, time_s)
             if time_s % 4 < STEP_MS / 1000:

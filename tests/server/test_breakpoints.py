@@ -43,7 +43,7 @@ async def test_a_breakpoint_pauses_at_the_step_and_is_listed_and_removed(
         assert row["id"] == answer["breakpoint_id"]
         assert (row["hit_count"], row["newest_hit_s"]) == (1, state["sim_time_s"])
 
-        events = await ask(client, "webots_find_events", kinds=["noticed"])
+        events = await ask(client, "webots_find_events", kinds=["bridge_event"])
         assert f"steps == {at}" in json.dumps(events["events"])
 
         removed = await ask(

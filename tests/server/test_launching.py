@@ -76,7 +76,7 @@ async def test_a_world_is_started_changed_and_ended(begin: Begin, project: Path)
     async with begin() as client:
         answer = await ask(client, "webots_launch_world", world="worlds/arena.wbt", mode="fast")
         assert (answer["outcome"], answer["route"]) == ("done", "process")
-        assert answer["proof"] == f"rover records: run {answer['run_id']}"
+        assert answer["evidence"] == f"rover records: run {answer['run_id']}"
         assert answer["result"]["world"] == str(project / "worlds" / "arena.wbt")
         family = _family(answer)
         text = await fail(client, "webots_launch_world", world="field.wbt")
@@ -85,7 +85,7 @@ async def test_a_world_is_started_changed_and_ended(begin: Begin, project: Path)
         loaded = await ask(client, "webots_load_world", world="field.wbt", timeout_wall_s=60)
         assert (loaded["outcome"], loaded["route"]) == ("done", "bridge")
         assert loaded["run_id"] > answer["run_id"]
-        assert loaded["proof"] == (
+        assert loaded["evidence"] == (
             f"its controller has ended; run {loaded['run_id']} of rover began in field.wbt"
         )
         world = await ask(client, "webots_get_world_info")
@@ -93,7 +93,7 @@ async def test_a_world_is_started_changed_and_ended(begin: Begin, project: Path)
 
         ended = await ask(client, "webots_quit")
         assert (ended["outcome"], ended["route"]) == ("done", "process")
-        assert ended["proof"] == "its processes have ended, exit code 0"
+        assert ended["evidence"] == "its processes have ended, exit code 0"
         await _ends(family)
         assert "rover" in await fail(client, "webots_quit")
 
@@ -186,8 +186,8 @@ async def test_a_robot_that_is_no_supervisor_has_another_world_by_webots_itself(
         first = await ask(client, "webots_launch_world", world="arena.wbt", stream=True)
         loaded = await ask(client, "webots_load_world", world="field.wbt", timeout_wall_s=60)
         assert loaded["route"] == "websocket"
-        assert loaded["proof"].startswith("Webots replied 'delete world'; run ")
-        assert loaded["proof"].endswith(" of rover began in field.wbt")
+        assert loaded["evidence"].startswith("Webots replied 'delete world'; run ")
+        assert loaded["evidence"].endswith(" of rover began in field.wbt")
         assert loaded["run_id"] > first["run_id"]
 
 
@@ -230,7 +230,7 @@ async def test_an_observer_opens_another_world_for_a_robot_that_is_no_supervisor
             client, "webots_load_world", world="field.wbt", robot="rover", timeout_wall_s=60
         )
         assert (loaded["route"], loaded["outcome"]) == ("observer", "done")
-        assert "its controller has ended; run " in loaded["proof"]
+        assert "its controller has ended; run " in loaded["evidence"]
 
 
 @pytest.mark.parametrize("controller", [CONTROLLER, PLAIN])
@@ -253,5 +253,5 @@ async def test_a_webots_that_somebody_else_started_is_ended_by_a_supervisor_alon
             return
         answer = await ask(client, "webots_quit", timeout_wall_s=60)
         assert (answer["outcome"], answer["route"]) == ("done", "bridge")
-        assert answer["proof"] == f"no Webots listens at port {port} any more"
+        assert answer["evidence"] == f"no Webots listens at port {port} any more"
     assert process.wait(30) == 0

@@ -115,8 +115,8 @@ async def test_a_robot_that_is_no_supervisor_is_steered_by_the_observer(begin: A
             )
         told = {name: (answer["outcome"], answer["route"]) for name, answer in answers.items()}
         assert set(told.values()) == {("done", "observer")}
-        assert answers["resume"]["proof"].startswith("simulation time advanced to ")
-        assert answers["reload"]["proof"].endswith("began")
+        assert answers["resume"]["evidence"].startswith("simulation time advanced to ")
+        assert answers["reload"]["evidence"].endswith("began")
 
 
 async def test_steps_by_the_observer_are_counted_by_the_time_that_passed(begin: Any) -> None:
@@ -165,4 +165,4 @@ async def test_a_pause_by_hand_is_taken_back_by_the_observer(begin: Any) -> None
         assert simulation["fix"].startswith("webots_simulation_control('resume')")
         answer = await ask(client, "webots_simulation_control", command="resume")
         assert (answer["outcome"], answer["route"]) == ("done", "observer")
-        assert answer["proof"].startswith("simulation time advanced to ")
+        assert answer["evidence"].startswith("simulation time advanced to ")

@@ -157,7 +157,9 @@ async def test_a_kept_stretch_says_that_it_has_camera_frames(
         robot.image(second, f"{second}.png", kind="kept")
     robot.kept(2.0, 6.0, "a look")
     async with connect() as client:
-        (event,) = (await ask(client, "webots_find_events", kinds=["kept"]))["events"]["rows"]
+        (event,) = (await ask(client, "webots_find_events", kinds=["kept_stretch"]))["events"][
+            "rows"
+        ]
     assert "'frames': 5" in str(event)
 
 

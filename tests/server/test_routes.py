@@ -70,16 +70,16 @@ async def test_a_robot_that_is_no_supervisor_is_steered_by_webots_itself(in_proj
     async with client:
         paused = await control(client, "pause")
         assert (paused["outcome"], paused["route"]) == ("done", "websocket")
-        assert paused["proof"] == "Webots replied 'paused by client'"
+        assert paused["evidence"] == "Webots replied 'paused by client'"
         assert wait_for_line(process, "pause") == "pause\n"
         stepped = await control(client, "step", steps=3, timeout_wall_s=30)
-        assert stepped["proof"].startswith("Webots made 3 of 3 basic time steps; ")
+        assert stepped["evidence"].startswith("Webots made 3 of 3 basic time steps; ")
         resumed = await control(client, "resume", timeout_wall_s=30)
-        assert resumed["proof"].startswith(
+        assert resumed["evidence"].startswith(
             "Webots replied 'real-time'; simulation time advanced to "
         )
         fast = await control(client, "fast", timeout_wall_s=30)
-        assert fast["proof"].startswith("Webots replied 'fast'; simulation time advanced")
+        assert fast["evidence"].startswith("Webots replied 'fast'; simulation time advanced")
 
 
 async def test_a_controller_that_hangs_is_freed_by_a_reload_of_webots(in_project: Any) -> None:
@@ -89,11 +89,11 @@ async def test_a_controller_that_hangs_is_freed_by_a_reload_of_webots(in_project
         await _until_its_loop_is_silent(client)
         answer = await control(client, "reload", timeout_wall_s=60)
         assert (answer["outcome"], answer["route"]) == ("done", "websocket")
-        assert answer["proof"].endswith(f"run {answer['run_id']} began")
+        assert answer["evidence"].endswith(f"run {answer['run_id']} began")
         assert answer["run_id"] > state["run_id"]
         await _until_its_loop_is_silent(client)
         again = await ask(client, "webots_world_reset", timeout_wall_s=60)
-        assert again["proof"].endswith(f"run {again['run_id']} began")
+        assert again["evidence"].endswith(f"run {again['run_id']} began")
         assert again["run_id"] > answer["run_id"]
 
 
@@ -204,7 +204,7 @@ async def test_a_reset_that_webots_says_nothing_of_is_proven_by_the_run_that_beg
         )
         async with connect() as client:
             answer = await ask(client, "webots_world_reset", timeout_wall_s=20)
-    assert (answer["route"], answer["proof"]) == ("websocket", "run 2 began")
+    assert (answer["route"], answer["evidence"]) == ("websocket", "run 2 began")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="each system has its own keys")

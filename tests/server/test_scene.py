@@ -92,7 +92,7 @@ async def test_a_robot_is_moved_and_its_event_says_by_whom(
         assert driver.robot.simulation.robot("rover").position == pytest.approx((0.0, 1.0, 0.04))
         told = (await ask(client, "webots_get_field", path="ROVER.translation"))["result"]
         assert told["value"] == pytest.approx(value)
-        events = await ask(client, "webots_find_events", kinds=["noticed"])
+        events = await ask(client, "webots_find_events", kinds=["bridge_event"])
         assert "set_field" in json.dumps(events)
         assert "ROVER.translation" in json.dumps(events)
         await ask(client, "webots_world_reset")

@@ -140,7 +140,7 @@ async def test_watching_reports_what_was_recorded_meanwhile(
     changes = json.dumps([event["details"] for event in events if event["name"] == "mode"])
     assert '"turn"' in changes  # each change by itself, or all together where a fast machine
     assert '"cruise"' in changes  # has made many
-    noticed = [event["details"]["what"] for event in events if event["kind"] == "noticed"]
+    noticed = [event["details"]["what"] for event in events if event["kind"] == "bridge_event"]
     assert noticed == ["pause", "resume"]
     assert [e["name"] for e in events if e["kind"] == "command"] == ["pause", "resume"]
     logs = [event["details"]["message"] for event in events if event["kind"] == "log"]

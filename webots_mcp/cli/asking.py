@@ -244,8 +244,8 @@ def _not_done(question: Question, answer: Mapping[str, Any], where: Where) -> st
     """What became of a command, and what to do next."""
     is_under_way = answer["outcome"] == "claimed" and "command_id" in answer
     hint = _under_way(answer, where) if is_under_way else answer.get("hint")
-    tried = (f"{route}: {reason}" for route, reason in answer.get("tried", {}).items())
-    why = "; ".join(filter(None, (answer.get("error"), hint, *tried))) or "no answer in time"
+    failed = (f"{route}: {reason}" for route, reason in answer.get("failed_routes", {}).items())
+    why = "; ".join(filter(None, (answer.get("error"), hint, *failed))) or "no answer in time"
     return f"{answer.get('action') or question.name} is not done ({answer['outcome']}): {why}"
 
 

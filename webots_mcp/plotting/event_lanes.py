@@ -67,7 +67,7 @@ def _lane(kind: str, found: Events, part: Part) -> Lane:
 
 def _interval(event: Event, part: Part) -> Interval:
     """Named by what it is about: the signal, the action, the level, or what the bridge noticed."""
-    what = event.details.get("what") if event.kind == "noticed" else event.name
+    what = event.details.get("what") if event.kind == "bridge_event" else event.name
     return _within(Interval(str(what or ""), event.start_s, event.end_s), part)
 
 

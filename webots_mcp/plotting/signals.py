@@ -178,9 +178,11 @@ def _notes(parts: Sequence[Part], curves: Sequence[Curve]) -> list[str]:
         left = [c for c in part.run.numbers if (part.run.run_id, c.name) not in drawn]
         if too_large := [columns.name for columns in left if columns.too_large]:
             notes.append(f"beyond 1e100 in {part.name}: {listed(too_large)}")
-        silent = [each.name for each in left if not each.whole.present and not each.too_large]
-        if silent and part.unread is None:
-            notes.append(f"without a value in {part.name}: {listed(silent)}")
+        without_value = [
+            each.name for each in left if not each.whole.present and not each.too_large
+        ]
+        if without_value and part.unread is None:
+            notes.append(f"without a value in {part.name}: {listed(without_value)}")
         notes += [
             f"{columns.name} in {part.name} was {_counted(columns.replaced)}: not drawn"
             for columns in part.run.numbers

@@ -182,8 +182,10 @@ class CommandAnswer(Answer):
     route: str | None = Field(
         default=None, description="What steered: bridge, websocket (of Webots), keyboard, process."
     )
-    proof: str | None = Field(default=None, description="What shows that it happened.")
-    tried: dict[str, str] | None = Field(default=None, description="Why other routes did not work.")
+    evidence: str | None = Field(default=None, description="What shows that it happened.")
+    failed_routes: dict[str, str] | None = Field(
+        default=None, description="Why other routes did not work."
+    )
 
 
 class ParametersAnswer(Answer):

@@ -73,7 +73,7 @@ _GROUP_BUDGET_TOKENS: Final = 200
     "Find events",
     READS,
     command="events",
-    options={"group": "--one-by-one", "cursor": "--after", "silent_s": "--silent"},
+    options={"group": "--one-by-one", "cursor": "--after", "missing_s": "--missing"},
     core=True,
     example="--where 'front_m < 0.1 for 0.5' --last 60",
 )
@@ -100,9 +100,9 @@ def webots_find_events(
     stuck_m: Annotated[
         float, Field(gt=0, description="... within this many metres.")
     ] = EventOptions.stuck_m,
-    silent_s: Annotated[
+    missing_s: Annotated[
         float, Field(gt=0, description="Silent: no value for so long.")
-    ] = EventOptions.silent_s,
+    ] = EventOptions.missing_s,
     position: Position = None,
     mode: Mode = None,
     log_level: LogLevel = "warning",
@@ -112,7 +112,7 @@ def webots_find_events(
 ) -> EventsAnswer:
     """What went wrong, since when, how often: searches the values, by default of the whole run.
 
-    verdicts: what was found, what is absent, what was not looked for and why. What is not shown is
+    verdicts: what was found, what was not, what was not looked for and why. What is not shown is
     counted; the next are seen with cursor.
     """
     thresholds = thresholds_on(signals or (), above, below, for_s)
@@ -123,7 +123,7 @@ def webots_find_events(
         thresholds=thresholds,
         stuck_s=stuck_s,
         stuck_m=stuck_m,
-        silent_s=silent_s,
+        missing_s=missing_s,
         position=both_of(position),
         mode=mode,
         log_level=log_level,
@@ -196,8 +196,8 @@ def verdicts_of(verdicts: Verdicts) -> KindVerdicts:
     """What became of each kind, as it is shown."""
     return KindVerdicts(
         found=verdicts.found or None,
-        absent=", ".join(verdicts.far) or None,
-        came_near=verdicts.came_near or None,
+        not_found=", ".join(verdicts.far) or None,
+        nearest=verdicts.nearest or None,
         not_searched=verdicts.gaps or None,
     )
 

@@ -87,8 +87,8 @@ def trend_tables(run: RunTrends, limit: int, budget_tokens: int) -> RunTrendTabl
     changed = [state for state in run.states if state.changes]
     states = fitting([_state_row(state) for state in changed], int(budget_tokens * _STATES_SHARE))
     moving = _moving(run)
-    constant, silent = some(_constants(run), _SHOWN_CONSTANTS), some(run.silent)
-    left_tokens = budget_tokens - tokens_of([states, constant, silent])
+    constant, without_value = some(_constants(run), _SHOWN_CONSTANTS), some(run.without_value)
+    left_tokens = budget_tokens - tokens_of([states, constant, without_value])
     rows = fitting([_trend_row(trend) for trend in moving[:limit]], left_tokens)
     return RunTrendTables(
         run_id=run.run_id,
@@ -99,7 +99,7 @@ def trend_tables(run: RunTrends, limit: int, budget_tokens: int) -> RunTrendTabl
         numbers=table(TREND_COLUMNS, rows),
         states=table(STATE_COLUMNS, states),
         constant=constant or None,
-        silent=silent or None,
+        without_value=without_value or None,
         not_shown=_not_shown(run, len(rows), len(states)),
         rows_missing_from_s=seconds(run.cut_at_s),
     )

@@ -45,7 +45,7 @@ class NumberSeries(Part):
         default=None, description="Values per bucket, where they are not those of the run."
     )
     whole: dict[str, float | None] | None = Field(default=None, description="Over the range.")
-    silent: bool | None = Field(default=None, description="True: no value in the range.")
+    without_value: bool | None = Field(default=None, description="True: no value in the range.")
     replaced: dict[str, int] | None = Field(
         default=None, description="How often nan, inf, ... or too large a number stood there."
     )
@@ -119,7 +119,9 @@ class RunTrendTables(Part):
     numbers: Table | None = Field(default=None, description="What changed most is first.")
     states: Table | None = Field(default=None, description="Text and flags that changed.")
     constant: str | None = Field(default=None, description="What never changed, with its value.")
-    silent: str | None = Field(default=None, description="Signals without a value in the range.")
+    without_value: str | None = Field(
+        default=None, description="Signals without a value in the range."
+    )
     not_shown: str | None = Field(default=None, description="Of those that changed.")
     rows_missing_from_s: float | None = Field(
         default=None, description="Reading took too long: from here on rows are missing."
@@ -138,8 +140,8 @@ class KindVerdicts(Part):
     found: dict[str, int] | None = Field(
         default=None, description="How many there are in the range, shown or not."
     )
-    absent: str | None = Field(default=None, description="Searched for and not found.")
-    came_near: dict[str, str] | None = Field(
+    not_found: str | None = Field(default=None, description="Searched for and not found.")
+    nearest: dict[str, str] | None = Field(
         default=None, description="Not found either; what came nearest."
     )
     not_searched: dict[str, str] | None = Field(

@@ -127,7 +127,7 @@ def _answer(
         waited_s=round(time.monotonic() - started_s, 3),
         result=_described(launched),
         route="process",
-        proof=f"{first.robot} records: run {first.run_id}" if first else None,
+        evidence=f"{first.robot} records: run {first.run_id}" if first else None,
         hint=None if first else f"Webots runs, but {launched.silence()}{_then(launched)}",
     )
 

@@ -217,7 +217,7 @@ EVENTS: Final = merged(
     text="""\
 What went wrong, since when, how often: searches the values, by default of the whole run.
 
-verdicts: what was found, what is absent, what was not looked for and why. cursor shows more.""",
+verdicts: what was found, what was not, what was not looked for and why. cursor shows more.""",
 )
 RUNS: Final = merged(
     webots_list_runs,

@@ -35,7 +35,7 @@ _SHOWN_EVENTS: Final = 30
 _ROWS_TOKENS: Final = 1_300
 _EVENTS_SHARE: Final = 0.45  # of them
 _TOLD_RUNS: Final = 2  # whose trends are told: that before a reset, and that after it
-_ROWLESS: Final = EventOptions(kinds=("run", "command", "log", "noticed"))  # without any row
+_ROWLESS: Final = EventOptions(kinds=("run", "command", "log", "bridge_event"))  # without any row
 
 _WatchS = Annotated[float, Field(ge=1, le=MAX_WAIT_S)] | None
 

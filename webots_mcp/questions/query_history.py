@@ -177,7 +177,7 @@ def _number_series(
     if columns.too_large:
         return NumberSeries(replaced={**(replaced or {}), "beyond 1e100": columns.too_large})
     if not whole.present:
-        return NumberSeries(silent=run.cut_at_s is None or None, replaced=replaced)
+        return NumberSeries(without_value=run.cut_at_s is None or None, replaced=replaced)
     if run.step_s is None:
         return NumberSeries(unit=columns.unit, value=figures(columns.last), replaced=replaced)
     if whole.min == whole.max and columns.count == counts:

@@ -24,14 +24,14 @@ class Request:
     Attributes:
         robot: The robot whose simulation to steer; None where there is only one.
         timeout_s: The wall time for all routes together, in seconds.
-        tried: Why each route did not work, by its name.
+        failed_routes: Why each route did not work, by its name.
     """
 
     recording: Recording
     dispatcher: Dispatcher
     robot: str | None
     timeout_s: float
-    tried: dict[str, str] = field(default_factory=dict[str, str], init=False)
+    failed_routes: dict[str, str] = field(default_factory=dict[str, str], init=False)
     started_s: float = field(default_factory=time.monotonic, init=False)
 
     async def _sent(
@@ -49,7 +49,7 @@ class Request:
             return view.header()
 
     def _failed_routes(self) -> str:
-        return "; ".join(f"{route}: {why}" for route, why in self.tried.items())
+        return "; ".join(f"{route}: {why}" for route, why in self.failed_routes.items())
 
     @property
     def _waited_s(self) -> float:

@@ -43,7 +43,7 @@ from webots_mcp.webots.stream import (
 )
 
 _POLL_S: Final = 0.05
-_PROOF_S: Final = 3.0  # a heartbeat shows within half a second that simulation time advances
+_EVIDENCE_S: Final = 3.0  # a heartbeat shows within half a second that simulation time advances
 _RESTART_S: Final = 5.0  # until a controller that Webots restarts has recorded
 _NOTHING_SEEN: Final = (
     "the recording does not show it yet: simulation time also stands still while a controller "
@@ -112,7 +112,7 @@ class Attempt(Request):
             situation = await self._assess()
         if situation.silent is None:
             return await self._by_bridge(situation)
-        self.tried["bridge"] = situation.silent
+        self.failed_routes["bridge"] = situation.silent
         for route in (self._by_observer, self._by_websocket, self._by_keyboard):
             answer = await route(situation)
             if answer is not None:
@@ -140,9 +140,9 @@ class Attempt(Request):
         if situation.robot is not None and situation.robot == situation.observer:
             return await self._done_by_observer(situation, answer)
         answer.route = "bridge" if answer.outcome == "done" else None
-        others = {name: why for name, why in self.tried.items() if name != "bridge"}
+        others = {name: why for name, why in self.failed_routes.items() if name != "bridge"}
         if answer.outcome != "done" and others:
-            answer.tried = others
+            answer.failed_routes = others
         return answer
 
     async def _by_observer(self, situation: Situation) -> CommandAnswer | None:
@@ -153,10 +153,12 @@ class Attempt(Request):
         try:
             answer = await self._sent(observer, self.order, self.params, CLAIMING_S)
         except CommandRefusedError as error:
-            self.tried["observer"] = str(error)
+            self.failed_routes["observer"] = str(error)
             return None
         if answer.outcome in UNCLAIMED:
-            self.tried["observer"] = f"robot {observer!r} did not take the command: {answer.why}"
+            self.failed_routes["observer"] = (
+                f"robot {observer!r} did not take the command: {answer.why}"
+            )
             return None
         return await self._done_by_observer(situation, answer)
 
@@ -166,8 +168,8 @@ class Attempt(Request):
             return answer
         answer.route = "observer"
         if self.order not in ("pause", "step"):
-            answer.proof = await self._shown(situation, _PROOF_S)
-            answer.hint = answer.hint if answer.proof else _NOTHING_SEEN
+            answer.evidence = await self._shown(situation, _EVIDENCE_S)
+            answer.hint = answer.hint if answer.evidence else _NOTHING_SEEN
         return answer
 
     async def _by_websocket(self, situation: Situation) -> CommandAnswer | None:
@@ -175,7 +177,7 @@ class Attempt(Request):
             address = await to_thread.run_sync(find_webots, self.recording, situation)
             reply, made = await self._give(address)
         except CommandRefusedError as error:
-            self.tried["websocket"] = str(error)
+            self.failed_routes["websocket"] = str(error)
             return None
         if made:
             return await self._obeyed(situation, reply, made)
@@ -183,7 +185,7 @@ class Attempt(Request):
         if self.order in RESTARTING:  # Webots need not reply to these
             seen = await self._shown(situation, _RESTART_S)
         if seen is None:
-            self.tried["websocket"] = await to_thread.run_sync(why_no_reply, address, reply)
+            self.failed_routes["websocket"] = await to_thread.run_sync(why_no_reply, address, reply)
             return None
         return await self._answered(situation, "websocket", seen)
 
@@ -207,10 +209,10 @@ class Attempt(Request):
         replied = f"Webots replied {reply.text!r}" if reply.text else "Webots obeyed"
         if self._wanted > 1:
             replied = f"Webots made {made} of {self._wanted} basic time steps"
-        wait_s = self._left_s if self.order in RESTARTING else _PROOF_S
+        wait_s = self._left_s if self.order in RESTARTING else _EVIDENCE_S
         seen = None if self.order == "pause" else await self._shown(situation, wait_s)
-        proof = f"{replied}; {seen}" if seen else replied
-        answer = await self._answered(situation, "websocket", proof)
+        evidence = f"{replied}; {seen}" if seen else replied
+        answer = await self._answered(situation, "websocket", evidence)
         if made < self._wanted:
             answer.outcome = "failed"
         elif seen is None and self.order != "pause" and situation.robot is not None:
@@ -219,18 +221,18 @@ class Attempt(Request):
 
     async def _by_keyboard(self, situation: Situation) -> CommandAnswer | None:
         if not self.force:
-            self.tried["keyboard"] = _NO_FORCE
+            self.failed_routes["keyboard"] = _NO_FORCE
             return None
         try:
             pid = await to_thread.run_sync(_window_owner, self.recording, situation)
             await to_thread.run_sync(press, self.order, pid)
         except CommandRefusedError as error:
-            self.tried["keyboard"] = str(error)
+            self.failed_routes["keyboard"] = str(error)
             return None
         seen = await self._shown(situation, self.timeout_s)
         if seen is not None:
             return await self._answered(situation, "keyboard", seen)
-        self.tried["keyboard"] = (
+        self.failed_routes["keyboard"] = (
             f"{KEYS[self.order].spoken} was pressed, but the recording does not show that Webots "
             "obeyed: check its window"
         )
@@ -251,7 +253,7 @@ class Attempt(Request):
         with self.recording.view(situation.robot) as view:
             return _SIGNS[self.order](situation.before, view)
 
-    async def _answered(self, situation: Situation, route: str, proof: str) -> CommandAnswer:
+    async def _answered(self, situation: Situation, route: str, evidence: str) -> CommandAnswer:
         header: dict[str, Any] = {}
         if situation.robot is not None:
             header = await to_thread.run_sync(self._header, situation.robot)
@@ -261,7 +263,7 @@ class Attempt(Request):
             outcome="done",
             waited_s=self._waited_s,
             route=route,
-            proof=proof,
+            evidence=evidence,
         )
 
 

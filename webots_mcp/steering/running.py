@@ -310,7 +310,7 @@ def _is_own(event: Event, command: Command) -> bool:
     if event.kind == "command":
         return event.details.get("id") == command.id
     data: dict[str, Any] = event.details.get("data") or {}
-    return event.kind == "noticed" and data.get("command_id") == command.id
+    return event.kind == "bridge_event" and data.get("command_id") == command.id
 
 
 def _last_rows(view: View, command: Command, progress: Progress, end_s: float) -> Any:

@@ -66,8 +66,8 @@ class WorldRequest(Request):
         ours = self.launcher.running
         if ours is not None and await self._is_meant(ours):
             await to_thread.run_sync(self.launcher.stop)
-            proof = f"its processes have ended, exit code {ours.webots.exit_code}"
-            return self._answer("quit", "process", proof)
+            evidence = f"its processes have ended, exit code {ours.webots.exit_code}"
+            return self._answer("quit", "process", evidence)
         situation = await self._assess("quit")
         answer = await self._by_controller(situation, "quit", {})
         if answer is None:
@@ -76,7 +76,7 @@ class WorldRequest(Request):
                 f"end another. {self._failed_routes()}. Close its window (Ctrl+Q)"
             )
         if answer.outcome == "done":
-            answer.proof = await self._gone(situation.address)
+            answer.evidence = await self._gone(situation.address)
         return answer
 
     async def _is_meant(self, ours: Launch) -> bool:
@@ -99,7 +99,7 @@ class WorldRequest(Request):
             if answer is not None:
                 return answer
         else:
-            self.tried["bridge"] = situation.silent
+            self.failed_routes["bridge"] = situation.silent
         if situation.observer in (None, situation.robot):
             return None
         return await self._taken("observer", situation.observer, action, params)
@@ -109,7 +109,7 @@ class WorldRequest(Request):
     ) -> CommandAnswer | None:
         answer = await self._sent(robot, action, params, CLAIMING_S)
         if answer.outcome in UNCLAIMED:
-            self.tried[route] = answer.hint or answer.error or "it did not take the command"
+            self.failed_routes[route] = answer.hint or answer.error or "it did not take the command"
             return None
         answer.route = route if answer.outcome == "done" else None
         return answer
@@ -127,7 +127,7 @@ class WorldRequest(Request):
             if reply.text is None:
                 raise CommandRefusedError(await to_thread.run_sync(why_no_reply, address, reply))
         except CommandRefusedError as error:
-            self.tried["websocket"] = str(error)
+            self.failed_routes["websocket"] = str(error)
             raise CommandRefusedError(
                 f"no route to open {world.name} works. {self._failed_routes()}. Open it in Webots "
                 "(File, Open World), or end Webots and start it with that world "
@@ -176,10 +176,12 @@ class WorldRequest(Request):
         """The answer with the run that began in the world, or with a hint why none has."""
         begun = await self._wait(lambda: self._begun_in(situation, world, before))
         if begun is None:
-            answer.proof, answer.hint = evidence, _NOT_RECORDED_YET
+            answer.evidence, answer.hint = evidence, _NOT_RECORDED_YET
         else:
             answer = answer.model_copy(update=await to_thread.run_sync(self._header, begun.robot))
-            answer.proof = f"{evidence}; run {begun.run_id} of {begun.robot} began in {world.name}"
+            answer.evidence = (
+                f"{evidence}; run {begun.run_id} of {begun.robot} began in {world.name}"
+            )
         if self.launcher.running is not None:
             self.launcher.running.world = world
         answer.waited_s = self._waited_s
@@ -210,8 +212,8 @@ class WorldRequest(Request):
             await anyio.sleep(_POLL_S)
         return f"no Webots listens at port {address.port} any more"
 
-    def _answer(self, action: str, route: str, proof: str) -> CommandAnswer:
+    def _answer(self, action: str, route: str, evidence: str) -> CommandAnswer:
         waited_s = self._waited_s
         return CommandAnswer(
-            action=action, outcome="done", waited_s=waited_s, route=route, proof=proof
+            action=action, outcome="done", waited_s=waited_s, route=route, evidence=evidence
         )

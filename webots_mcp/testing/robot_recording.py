@@ -133,7 +133,7 @@ class RobotRecording:
         """What the values of the run show: when it was stuck, where a signal jumped, and the like.
 
         Args:
-            kinds: `standstill`, `stuck`, `jump`, `oscillation`, `silent`, `gap`, ...; none for all
+            kinds: `standstill`, `stuck`, `jump`, `oscillation`, `missing`, `gap`, ...; none for all
                 but pictures.
             options: More fields of `webots_mcp.store.detection.event.EventOptions`.
 

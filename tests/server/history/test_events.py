@@ -57,7 +57,7 @@ async def test_events_tell_what_nobody_noted(story: Path) -> None:
     answer = await tell(story, "webots_find_events", run_id=STORY)
     events = rows_of(answer["events"])
     found = {(event["kind"], event["name"]): event for event in events}
-    assert found["silent", "sensors.front"]["start_s"] == NAN_S[0]
+    assert found["missing", "sensors.front"]["start_s"] == NAN_S[0]
     assert found["gap", None]["start_s"] == pytest.approx(GAP_S[0], abs=0.2)
     assert found["oscillation", "heading"]["details"]["period_s"] == pytest.approx(2.0, rel=0.05)
     assert found["jump", "ir"]["start_s"] == 70.0
@@ -83,7 +83,7 @@ async def test_a_threshold_holds_for_at_least_so_long(story: Path) -> None:
     both = await tell(story, "webots_find_events", **asked, for_s=2)
     assert [row["start_s"] for row in rows_of(both["events"])] == [39.6, 95.6]
     none = await tell(story, "webots_find_events", **asked, for_s=60)
-    assert "pose.0 was beyond the limit for at most" in none["verdicts"]["came_near"]["threshold"]
+    assert "pose.0 was beyond the limit for at most" in none["verdicts"]["nearest"]["threshold"]
     assert "need signals" in await refuse(story, "webots_find_events", above=1)
 
 
@@ -101,8 +101,8 @@ async def test_lines_below_the_level_that_was_asked_for_are_not_absent(
         none = await ask(client, "webots_find_events", **asked, log_level="info", end_s=0.5)
         found = await ask(client, "webots_find_events", **asked, log_level="info")
     said = "there are lines of level info, none of warning or above"
-    assert below["verdicts"] == {"came_near": {"log": said}}
-    assert none["verdicts"] == {"absent": "log"}
+    assert below["verdicts"] == {"nearest": {"log": said}}
+    assert none["verdicts"] == {"not_found": "log"}
     assert found["verdicts"] == {"found": {"log": 1}}
 
 
@@ -146,9 +146,9 @@ async def test_looking_back_over_a_reset_tells_of_both_runs_and_no_way_between(
 async def test_of_each_kind_it_is_told_whether_it_was_found_is_absent_or_was_not_searched(
     story: Path,
 ) -> None:
-    for kinds in (["stuck", "gap"], ["jump", "silent", "flat", "oscillation"], None):
+    for kinds in (["stuck", "gap"], ["jump", "missing", "flat", "oscillation"], None):
         told = (await tell(story, "webots_find_events", kinds=kinds))["verdicts"]
-        absent = [*told.get("came_near", ()), *told.get("absent", "").split(", ")]
+        absent = [*told.get("nearest", ()), *told.get("not_found", "").split(", ")]
         unsearched = [kind for each in told.get("not_searched", ()) for kind in each.split(", ")]
         lacking = [kind for kind in (*absent, *unsearched) if kind]
         assert len(lacking) == len(set(lacking))
@@ -156,11 +156,11 @@ async def test_of_each_kind_it_is_told_whether_it_was_found_is_absent_or_was_not
         assert {*told.get("found", ()), *lacking} == asked
     (answer,) = [await tell(story, "webots_find_events", kinds=["standstill"], signals=["mode"])]
     assert (
-        "standstill" in answer["verdicts"]["came_near"] or answer["verdicts"]["found"]["standstill"]
+        "standstill" in answer["verdicts"]["nearest"] or answer["verdicts"]["found"]["standstill"]
     )
-    blind = await tell(story, "webots_find_events", kinds=["silent"], signals=["mode"])
+    blind = await tell(story, "webots_find_events", kinds=["missing"], signals=["mode"])
     assert blind["verdicts"] == {
-        "not_searched": {"silent": "no number was published, or none with these names"}
+        "not_searched": {"missing": "no number was published, or none with these names"}
     }
 
 

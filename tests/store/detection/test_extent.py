@@ -57,13 +57,13 @@ def _stand(connection: sqlite3.Connection) -> None:
 
 def told(connection: sqlite3.Connection, kind: str, **bounds: Any) -> list[Event]:
     low = (Threshold("battery_v", below=5.0, for_s=2.0),)
-    names = {"silent": "front_m", "flat": "heading_deg", "change": "mode"}
+    names = {"missing": "front_m", "flat": "heading_deg", "change": "mode"}
     name = (names | {"oscillation": "steering_rad"}).get(kind, "*")
     options = EventOptions(kinds=(kind,), signals=(name,), thresholds=low)
     return list(find_events(connection, find_range(connection, Scope(**bounds)), options).events)
 
 
-@pytest.mark.parametrize("kind", ["stuck", "threshold", "silent", "flat", "oscillation"])
+@pytest.mark.parametrize("kind", ["stuck", "threshold", "missing", "flat", "oscillation"])
 @pytest.mark.parametrize(
     ("start_s", "end_s"), [(250.0, 255.0), (250.0, 250.5), (150.0, 250.0), (295.0, 350.0)]
 )
@@ -77,7 +77,7 @@ def test_a_range_that_holds_a_part_tells_the_true_begin_and_end(
     assert not event.ongoing
 
 
-@pytest.mark.parametrize("kind", ["stuck", "threshold", "silent", "flat"])
+@pytest.mark.parametrize("kind", ["stuck", "threshold", "missing", "flat"])
 def test_what_was_over_before_the_range_is_not_in_it(
     standing: sqlite3.Connection, kind: str
 ) -> None:
@@ -112,7 +112,7 @@ def test_a_signal_that_few_rows_of_the_run_hold_is_not_silent_in_the_others(
     recorder.end_run("finished")
     make_chunks(empty, 100_000)
     asked = find_range(empty, Scope(start_s=70.0, end_s=80.0))
-    assert find_events(empty, asked, EventOptions(kinds=("silent",))).events == ()
+    assert find_events(empty, asked, EventOptions(kinds=("missing",))).events == ()
 
 
 def test_what_a_short_stretch_costs_does_not_grow_with_the_run(empty: sqlite3.Connection) -> None:

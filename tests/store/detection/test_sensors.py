@@ -54,8 +54,8 @@ def test_what_was_null_before_its_first_value_has_not_been_silent(
     empty: sqlite3.Connection,
 ) -> None:
     record(empty, lambda t: {"front": None if t < 30 else range_m(t), "x": t})
-    assert told(ask(empty, "silent")) == []
-    assert told(ask(empty, "silent", start_s=10.0, end_s=20.0)) == []
+    assert told(ask(empty, "missing")) == []
+    assert told(ask(empty, "missing", start_s=10.0, end_s=20.0)) == []
 
 
 def test_a_scalar_null_is_the_missing_value_of_what_comes_below_it(
@@ -67,14 +67,14 @@ def test_a_scalar_null_is_the_missing_value_of_what_comes_below_it(
         "lidar.count", "lidar.min", "lidar.max", "lidar.mean", "lidar.argmin",
     }  # fmt: skip
     assert "lidar" not in [signal.name for signal in list_signals(empty).signals]
-    assert told(ask(empty, "silent")) == []
-    assert trends(empty, find_range(empty, Scope())).runs[0].silent == ()
+    assert told(ask(empty, "missing")) == []
+    assert trends(empty, find_range(empty, Scope())).runs[0].without_value == ()
 
 
 def test_a_lidar_that_dies_is_silent_once(empty: sqlite3.Connection) -> None:
     record(empty, lambda t: waking(t) if t < 60 else {"lidar": None, "x": t})
-    assert told(ask(empty, "silent")) == [("lidar.*", 60.0, 119.9)]
-    (event,) = ask(empty, "silent", start_s=80.0, end_s=90.0).events
+    assert told(ask(empty, "missing")) == [("lidar.*", 60.0, 119.9)]
+    (event,) = ask(empty, "missing", start_s=80.0, end_s=90.0).events
     assert (event.start_s, event.end_s) == (60.0, pytest.approx(119.9))
 
 
@@ -82,7 +82,7 @@ def test_a_silence_that_is_exactly_as_long_as_asked_for_is_told(
     empty: sqlite3.Connection,
 ) -> None:
     record(empty, lambda t: {"front": None if 20 <= t <= 20.5 else range_m(t), "x": t})
-    options = EventOptions(kinds=("silent",), silent_s=0.5)
+    options = EventOptions(kinds=("missing",), missing_s=0.5)
     for scope in (Scope(), Scope(start_s=20.5, end_s=40.0)):  # its end is the range's first row
         found = find_events(empty, find_range(empty, scope), options)
         assert told(found) == [("front", 20.0, 20.5)]
@@ -90,7 +90,7 @@ def test_a_silence_that_is_exactly_as_long_as_asked_for_is_told(
 
 def test_an_array_that_crosses_16_items_is_not_silent(empty: sqlite3.Connection) -> None:
     record(empty, lambda t: {"hit_count": [range_m(t)] * (14 if t % 40 < 20 else 20)})
-    assert told(ask(empty, "silent")) == []
+    assert told(ask(empty, "missing")) == []
 
 
 def test_a_list_that_is_shorter_at_times_is_not_silent_and_a_dead_item_is(
@@ -101,22 +101,22 @@ def test_a_list_that_is_shorter_at_times_is_not_silent_and_a_dead_item_is(
         return {"seen": seen, "near": [1.0, None if time_s > 60 else range_m(time_s)]}
 
     record(empty, state)
-    assert told(ask(empty, "silent")) == [("near.1", 60.1, 119.9)]
+    assert told(ask(empty, "missing")) == [("near.1", 60.1, 119.9)]
 
 
 def test_a_sensor_that_is_dead_for_most_of_the_run_is_silent(
     empty: sqlite3.Connection,
 ) -> None:
     record(empty, lambda t: {"front": range_m(t) if t < 20 else None, "x": t})
-    assert told(ask(empty, "silent")) == [("front", 20.0, 119.9)]
+    assert told(ask(empty, "missing")) == [("front", 20.0, 119.9)]
 
 
 def test_a_signal_that_never_had_a_value_is_not_said_to_be_silent_for_good(
     empty: sqlite3.Connection,
 ) -> None:
     record(empty, lambda t: {"front": None, "x": t})
-    assert told(ask(empty, "silent")) == []
-    assert trends(empty, find_range(empty, Scope())).runs[0].silent == ("front",)
+    assert told(ask(empty, "missing")) == []
+    assert trends(empty, find_range(empty, Scope())).runs[0].without_value == ("front",)
     with pytest.raises(UnknownSignalError):
         resolve_signals(known_signals(empty, find_range(empty, Scope())), ["frount"])
 
@@ -140,14 +140,14 @@ def test_a_lidar_that_sees_nothing_at_all_has_no_value(
         blind = 200 <= step < 250
         scan = [None if blind else 2.0 + 0.1 * math.sin(step + item) for item in range(items)]
         recorder.publish(step * 0.1, {"lidar": scan}, replaced if blind else None)
-    (silent,) = ask(empty, "silent").events
+    (silent,) = ask(empty, "missing").events
     assert (silent.start_s, silent.end_s) == pytest.approx((20.0, 24.9))
     assert silent.details["value"] == "inf"
 
 
 def test_many_silences_are_one_event_but_for_one_that_goes_on(empty: sqlite3.Connection) -> None:
     record(empty, lambda t: {"front": range_m(t) if t % 10 < 8 else None})
-    event, newest = ask(empty, "silent").events
+    event, newest = ask(empty, "missing").events
     assert (event.count, newest.count) == (11, 1)
     assert event.details["says"] == (
         "11 stretches without a value, the first at 8 s, the last at 108 s, each 1.9 s long"
@@ -175,16 +175,16 @@ def test_losses_shorter_than_what_counts_are_counted_beside(
     empty: sqlite3.Connection, bounds: dict[str, float], found: int, note: str
 ) -> None:
     record(empty, losing_the_line)
-    answer = ask(empty, "silent", **bounds)
+    answer = ask(empty, "missing", **bounds)
     assert len(answer.events) == found
     (said,) = answer.notes
-    too_short = "without a value for less than silent_s=1 s, so not counted as silent"
+    too_short = "without a value for less than missing_s=1 s, so not counted as silent"
     assert said == f"run 1: {too_short}: {note}"
 
 
 def test_how_long_a_silence_counts_is_the_askers_to_say(empty: sqlite3.Connection) -> None:
     record(empty, losing_the_line)
-    options = EventOptions(kinds=("silent",), silent_s=0.15)
+    options = EventOptions(kinds=("missing",), missing_s=0.15)
     answer = find_events(empty, find_range(empty, Scope()), options, group=False)
     assert {round(event.start_s, 1) for event in answer.events} == {start for start, _ in LOST_S}
     assert answer.notes == ()
@@ -194,7 +194,7 @@ def test_what_comes_now_and_then_is_not_silent_meanwhile_and_the_answer_says_so(
     empty: sqlite3.Connection,
 ) -> None:
     record(empty, lambda t: {"gps": t if round(t * 10) % 20 == 0 else None})
-    answer = ask(empty, "silent")
+    answer = ask(empty, "missing")
     assert answer.events == ()
     assert "gps is intermittent (a value about every 1.8 s)" in answer.notes[0]
 
@@ -254,7 +254,7 @@ def test_a_freeze_that_is_too_short_to_count_is_told_as_what_came_nearest(
     empty: sqlite3.Connection,
 ) -> None:
     record(empty, lambda t: {"front": range_m(min(t, 45)), "gear": int(t / 15)}, until_s=60.0)
-    nearest = ask(empty, "flat").verdicts.absent["flat"]
+    nearest = ask(empty, "flat").verdicts.not_found["flat"]
     assert nearest.startswith("front stayed at ")
     assert nearest.endswith(" for 14.9 s from 45 s")
 
@@ -353,7 +353,7 @@ def test_what_a_device_gave_that_is_no_number_is_told_of_its_silence(
         free = 100 <= step < 200
         replaced = {"front": "inf"} if free else None
         recorder.publish(step / 10, {"front": None if free else range_m(step / 10)}, replaced)
-    (silent,) = ask(empty, "silent").events
+    (silent,) = ask(empty, "missing").events
     assert silent.details == {"value": "inf"}
 
 

@@ -28,7 +28,7 @@ KINDS = {
     "stuck": 1,
     "threshold": 1,
     "condition": 1,
-    "silent": 1,
+    "missing": 1,
     "flat": 3,
     "jump": 3,
     "oscillation": 1,

@@ -25,10 +25,10 @@ def ask(connection: sqlite3.Connection, rows: int, *kinds: str) -> Verdicts:
 
 
 def test_what_no_run_so_short_can_hold_was_not_searched(empty: sqlite3.Connection) -> None:
-    told = ask(empty, 21, "stuck", "standstill", "flat", "silent")
+    told = ask(empty, 21, "stuck", "standstill", "flat", "missing")
     run = "run 1 lasted only 2 s; this kind needs at least"
     assert told.gaps == {"standstill, stuck": f"{run} 3 s", "flat": f"{run} 20 s"}
-    assert told.far == ["silent"]
+    assert told.far == ["missing"]
 
 
 def test_what_was_searched_in_some_signals_is_named_once_with_the_others(
@@ -38,7 +38,7 @@ def test_what_was_searched_in_some_signals_is_named_once_with_the_others(
     (why,) = told.gaps.values()
     assert why.startswith("not in 1 of 4 signals")
     assert "(temp_c)" in why and why.endswith("; none in the searched part")
-    assert (told.far, told.came_near) == (["gap"], {})
+    assert (told.far, told.nearest) == (["gap"], {})
 
 
 def test_of_a_short_run_it_is_said_which_swings_do_not_fit_in(empty: sqlite3.Connection) -> None:

@@ -58,7 +58,7 @@ def test_a_gap_is_an_event(rover: sqlite3.Connection, looked_at: str) -> None:
 
 
 def test_a_silent_sensor_is_found(rover: sqlite3.Connection, looked_at: str) -> None:
-    events = ask(rover, "silent")
+    events = ask(rover, "missing")
     assert [event.name for event in events.events] == ["sensors.front"]
     assert spans(events) == [(100.0, 103.9)]
 
@@ -89,7 +89,7 @@ def test_numbers_too_large_to_reckon_with_cross_a_threshold_and_are_not_silent(
     make_chunks(empty)
     high = Threshold("big", above=5.0)
     assert spans(ask(empty, "threshold", thresholds=(high,))) == [(10.0, 19.9)]
-    assert ask(empty, "silent").events == ()
+    assert ask(empty, "missing").events == ()
 
 
 def test_a_jump_of_the_position_is_found(rover: sqlite3.Connection) -> None:
@@ -122,7 +122,7 @@ def test_commands_logs_and_notices_are_on_the_same_clock(rover: sqlite3.Connecti
     assert command.details["status"] == "done" and command.details["result"] == 0.2
     logs = ask(rover, "log").events
     assert [(log.start_s, log.name) for log in logs] == [(45.0, "warning"), (104.0, "error")]
-    (noticed,) = ask(rover, "noticed").events
+    (noticed,) = ask(rover, "bridge_event").events
     assert (noticed.start_s, noticed.details) == (61.0, {"what": "dropped", "data": {"rows": 3}})
     (image,) = ask(rover, "image").events
     assert image.details["path"] == "camera/1.png"
@@ -225,7 +225,7 @@ def test_a_cursor_of_find_events_that_is_none_is_refused(rover: sqlite3.Connecti
 def test_what_there_was_no_time_for_is_named(rover: sqlite3.Connection, looked_at: str) -> None:
     found = find_range(rover, Scope(run_id=1))
     told = find_events(rover, found, deadline_s=0.0)
-    assert not told.events and not told.verdicts.absent and not told.verdicts.found
+    assert not told.events and not told.verdicts.not_found and not told.verdicts.found
     for kind in asked_kinds(EventOptions()):
         assert "ask for this kind alone" in told.verdicts.not_searched[kind.name]
 

@@ -141,7 +141,7 @@ def test_where_nothing_stood_the_answer_says_what_came_nearest(empty: sqlite3.Co
     recorder = start_run(empty)
     for step in range(300):
         recorder.publish(step * 0.1, {"gps": {"x": step * 0.03, "y": 0}})
-    assert "in 3 s: 0.9 m" in ask(empty, "stuck").verdicts.absent["stuck"]
+    assert "in 3 s: 0.9 m" in ask(empty, "stuck").verdicts.not_found["stuck"]
 
 
 def test_a_recording_gap_ends_a_standstill(empty: sqlite3.Connection) -> None:
@@ -157,7 +157,7 @@ def test_without_a_position_stuck_cannot_be_searched_and_the_answer_says_so(
     recorder = start_run(empty)
     recorder.publish(0.0, {"mode": "drive", "range": 1.0})
     told = ask(empty, "stuck", bounds={"run_id": 1}).verdicts
-    assert "no position is known" in told.not_searched["stuck"] and not told.absent
+    assert "no position is known" in told.not_searched["stuck"] and not told.not_found
 
 
 def test_a_short_command_within_a_long_standstill_is_told_as_evidence(

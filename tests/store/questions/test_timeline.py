@@ -18,7 +18,7 @@ def test_the_timeline_merges_all_sources_in_order(rover: sqlite3.Connection) -> 
     told = [(event.kind, round(event.start_s, 1)) for event in answer.events]
     assert told == [
         ("run", 0.0), ("log", 10.0), ("command", 20.0), ("image", 30.0), ("change", 40.0),
-        ("log", 45.0), ("change", 52.0), ("change", 52.0), ("change", 60.0), ("noticed", 61.0),
+        ("log", 45.0), ("change", 52.0), ("change", 52.0), ("change", 60.0), ("bridge_event", 61.0),
         ("gap", 89.9), ("change", 95.0), ("log", 104.0), ("run", 119.9),
     ]  # fmt: skip
     assert answer.cursor is None

@@ -233,7 +233,7 @@ def test_a_mode_alone_is_told_with_the_rows_that_it_is_of(
 
 def test_a_signal_without_a_value_in_the_range_is_named(rover: sqlite3.Connection) -> None:
     run = ask(rover, "sensors.front", start_s=101.0, end_s=103.0)
-    assert run.numbers == () and run.silent == ("sensors.front",)
+    assert run.numbers == () and run.without_value == ("sensors.front",)
 
 
 def test_an_empty_range_has_empty_trends(rover: sqlite3.Connection) -> None:
@@ -323,7 +323,7 @@ def test_numbers_too_large_to_reckon_with_are_not_called_missing(
 ) -> None:
     record(empty, rows=300, interval_s=0.1, big=lambda _: 1e308, x=lambda time_s: time_s)
     make_chunks(empty)
-    assert ask(empty).silent == ("big (its numbers are beyond 1e100)",)
+    assert ask(empty).without_value == ("big (its numbers are beyond 1e100)",)
 
 
 def test_whole_numbers_that_name_a_mode_have_times_and_no_slope(
@@ -382,5 +382,5 @@ def test_a_signal_whose_chunk_is_damaged_is_not_said_to_have_no_value(
     empty.execute("DELETE FROM state")
     empty.execute("UPDATE chunk SET numbers = x'00' WHERE signal_id > 0")
     told = ask(empty)
-    assert (told.numbers, told.silent) == ((), ())
+    assert (told.numbers, told.without_value) == ((), ())
     assert "the chunk of x is damaged" in told.unread[0]

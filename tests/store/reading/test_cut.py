@@ -113,7 +113,7 @@ def test_who_had_no_time_at_all_says_so_of_text_as_of_numbers(
         (trend,) = trends(unsummed, found, names, deadline_s=0.0).runs
         assert (history.cut_at_s, trend.cut_at_s) == (100.0, 100.0)
         assert (history.rows, trend.rows) == (0, 0)
-        assert trend.silent == (), "nobody has looked"
+        assert trend.without_value == (), "nobody has looked"
         assert not any(each.time_by_value_s for each in history.changes)
 
 
@@ -148,7 +148,7 @@ def test_a_kind_is_absent_only_where_all_of_it_was_looked_at(unsummed: sqlite3.C
     whole = _verdicts(unsummed, ENOUGH)
     assert (whole.found["change"], whole.far) == (3, ["gap"])
     told = [_verdicts(unsummed, looks) for looks in SOME]
-    assert not any("change" in {*each.far, *each.came_near} for each in told)
+    assert not any("change" in {*each.far, *each.nearest} for each in told)
     cut = [each for each in told if "change" in each.reasons]
     assert any("change" in each.found for each in cut), "some of them were read"
     assert all("time limit reached" in each.not_searched["change"] for each in cut)

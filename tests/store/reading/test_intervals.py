@@ -55,7 +55,7 @@ def test_a_sensor_that_is_slower_than_the_rows_is_not_silent(
 ) -> None:
     slow = [{"front_m": 1.0 + step / 999} if step % 2 else {} for step in range(2000)]
     record(empty, slow, 0.02)
-    assert spans(empty, kinds=("silent",), silent_s=0.03) == []
+    assert spans(empty, kinds=("missing",), missing_s=0.03) == []
 
 
 def test_a_signal_that_is_not_published_any_more_is_silent(
@@ -63,7 +63,7 @@ def test_a_signal_that_is_not_published_any_more_is_silent(
 ) -> None:
     stops = [{"lidar_m": 1.0 + step % 5} if step < 250 else {} for step in range(400)]
     record(empty, stops, 0.1)
-    ((name, start_s, end_s),) = spans(empty, kinds=("silent",))
+    ((name, start_s, end_s),) = spans(empty, kinds=("missing",))
     assert (name, start_s) == ("lidar_m", 25.0)
     assert end_s == pytest.approx(39.9, abs=0.1)
 

@@ -276,7 +276,7 @@ def test_the_newest_state_and_the_end_of_a_crashed_run_are_those_of_its_last_cal
 
 
 def test_stretches_are_events_with_their_reason(connection: sqlite3.Connection) -> None:
-    options = EventOptions(kinds=("kept",))
+    options = EventOptions(kinds=("kept_stretch",))
     first, last = find_events(connection, ranges(connection)[0], options, limit=10).events
     assert (first.start_s, first.end_s) == stretch(connection)
     assert "gear is gone" in last.details["reason"]

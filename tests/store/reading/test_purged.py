@@ -161,7 +161,7 @@ def test_a_mode_that_is_a_number_changed_when_its_rows_said_before_they_were_pur
 def test_a_silence_of_which_no_row_is_left_has_its_begin_and_end(
     patrol: sqlite3.Connection,
 ) -> None:
-    (silent,) = events_of(patrol, "silent", end_s=300.0).events
+    (silent,) = events_of(patrol, "missing", end_s=300.0).events
     assert (silent.start_s, silent.end_s) == pytest.approx((123.5, 199.9))
 
 

@@ -99,7 +99,7 @@ class Chapter:
         range: The whole run; None where it has no state row.
         numbers: How many numeric signals have values.
         changed_most: Those that changed, what changed most first.
-        findings: What was found, and what is absent.
+        findings: What was found, and what was not.
         unsearched: What was not looked for, or not everywhere, and why.
     """
 
@@ -287,10 +287,8 @@ def _findings(verdicts: Verdicts) -> list[str]:
     """What there is of each kind that was looked for, and what there is none of."""
     found = [f"{kind} ({count})" for kind, count in verdicts.found.items()]
     said = [f"Found: {', '.join(found)}."] if found else []
-    said += [f"Looked for and absent: {', '.join(verdicts.far)}."] if verdicts.far else []
-    said += [
-        f"Absent, but came near: {kind} ({what})." for kind, what in verdicts.came_near.items()
-    ]
+    said += [f"Looked for and not found: {', '.join(verdicts.far)}."] if verdicts.far else []
+    said += [f"Not found; nearest was: {kind} ({what})." for kind, what in verdicts.nearest.items()]
     return said
 
 
@@ -312,7 +310,7 @@ def _events(connection: sqlite3.Connection, found: Found) -> Grid:
 
 def _outstanding(connection: sqlite3.Connection, found: Found) -> list[Event]:
     """The few whose surroundings are shown: what was found in the values, else in the log."""
-    matter = [each for each in found.events if each.kind not in ("kept", "command", "log")]
+    matter = [each for each in found.events if each.kind not in ("kept_stretch", "command", "log")]
     matter = [each for each in matter if each.details.get("what") not in _ORDINARY]
     failed = [each for each in found.events if _mark(each)]
     chosen = choose(matter, MOST_MOMENTS) or choose(failed, MOST_MOMENTS)
@@ -392,7 +390,7 @@ def _trends(run: RunTrends) -> Grid:
         Row([trend.name, trend.unit or "", trend.says, *_figures(trend)]) for trend in run.numbers
     ]
     rows += [Row([state.name, "", _course(state), "", "", "", ""]) for state in run.states]
-    notes = [f"Without a value: {', '.join(run.silent[:50])}."] if run.silent else []
+    notes = [f"Without a value: {', '.join(run.without_value[:50])}."] if run.without_value else []
     columns = ("signal", "unit", "what it did", "mean", "deviation", "least", "greatest")
     return Grid(columns, rows, notes, left_out=run.total - len(run.numbers))
 

@@ -186,7 +186,7 @@ _WORDS: Final[Mapping[str, Callable[[Event], str]]] = {
     "log": _of_log,
     "command": _of_command,
     "run": _of_run,
-    "noticed": _of_noticed,
+    "bridge_event": _of_noticed,
     "image": _of_image,
     "gap": _of_gap,
 }

@@ -52,7 +52,7 @@ def condition_events(search: Search) -> Iterator[Event]:
     if not len(runs):
         _require_values(condition, frame, position)
     rows = search.ledger.rows = search.ledger.rows + int(np.count_nonzero(read))
-    search.ledger.came_near("condition", rows, f"true in none of {rows} rows")
+    search.ledger.note_nearest("condition", rows, f"true in none of {rows} rows")
     for run, values in zip(runs.each(), values_at(condition, frame, position, runs), strict=True):
         details = dict(list(values.items())[:_MOST_VALUES])
         yield search.event("condition", run.start_s, run.end_s, condition.text, **details)

@@ -96,7 +96,7 @@ class EventOptions:
         stuck_s: ... for so long.
         thresholds: For the kind "threshold".
         where: For the kind "condition"; see docs/conditions.md.
-        silent_s: Without a value for so long, though it mostly has one.
+        missing_s: Without a value for so long, though it mostly has one.
         flat_s: Exactly the same number for so long, though it mostly changes; for a signal that
             is noisy otherwise 0.15 of that are enough.
         jump_min_score: How many times larger than the usual step (modified z-score) a jump is.
@@ -118,7 +118,7 @@ class EventOptions:
     stuck_s: float = 3.0
     thresholds: tuple[Threshold, ...] = ()
     where: str | None = None
-    silent_s: float = 1.0
+    missing_s: float = 1.0
     flat_s: float = 20.0
     jump_min_score: float = 12.0
     jump_m: float = 0.3
@@ -131,7 +131,7 @@ class EventOptions:
             raise InvalidInputError(
                 f"unknown log level {self.log_level!r}; there is {', '.join(LEVELS)}"
             )
-        for name in ("stuck_m", "stuck_s", "silent_s", "flat_s", "jump_min_score", "jump_m"):
+        for name in ("stuck_m", "stuck_s", "missing_s", "flat_s", "jump_min_score", "jump_m"):
             value = getattr(self, name)
             if not 0 < value < math.inf:
                 raise InvalidInputError(f"{name}={value} must be a number above 0")

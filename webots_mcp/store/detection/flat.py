@@ -148,7 +148,7 @@ class _Resting:
         """It came near to an event."""
         lasted = f"for {rest.duration_s:.3g} s from {rest.start_s:.6g} s"
         what = f"{self.signal.name} stayed at {rest.value:.4g} {lasted}"
-        self.search.came_near("flat", rest.duration_s / self.search.options.flat_s, what)
+        self.search.note_nearest("flat", rest.duration_s / self.search.options.flat_s, what)
 
     def is_limit(self, rest: Run) -> bool:
         """Whether it was never beyond the value that it kept, and was there at other times too.

@@ -67,8 +67,8 @@ class EventKind:
         name: Its name in questions and answers.
         means: What the name leaves open, in a few words; empty where it leaves nothing open.
         find: Finds the events in the segment of a search. It reports to the search what it could
-            not search (`not_searched`) and what came nearest to an event (`came_near`), and raises
-            `NotSearchableError` where it cannot search at all.
+            not search (`not_searched`) and what came nearest to an event (`note_nearest`), and
+            raises `NotSearchableError` where it cannot search at all.
         stored: It was stored when it happened: nothing is judged, and a timeline shows it.
         usual: Whether it is looked for where no kinds are named.
         lasts: It has a begin and an end, which are followed out of the range.

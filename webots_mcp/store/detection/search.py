@@ -211,10 +211,10 @@ class Search:
         parts = (self.frame.rows(*span).numbers(signal.name) for span in spans)
         return any((np.abs(part) > LARGEST).any() for part in parts)
 
-    def came_near(self, kind: str, share: float, what: str) -> None:
+    def note_nearest(self, kind: str, share: float, what: str) -> None:
         """Note what came near to an event, as a share of what would be one."""
         where = f" (run {self.segment.run_id})" if self.ledger.of_several_runs else ""
-        self.ledger.came_near(kind, share, what + where)
+        self.ledger.note_nearest(kind, share, what + where)
 
 
 def events_touching(search: Search) -> list[Event]:

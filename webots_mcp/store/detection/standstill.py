@@ -201,7 +201,7 @@ def _events(search: Search, kind: str, judged_as: str) -> Iterator[Event]:
     found = search.standstills
     search.not_searched(kind, *found.unseen)
     if found.nearest is not None:
-        search.came_near(kind, *found.nearest)
+        search.note_nearest(kind, *found.nearest)
     for each in found.events:
         if each.kind == judged_as:
             yield search.event(kind, each.start_s, each.end_s, None, **each.details)

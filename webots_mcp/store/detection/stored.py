@@ -173,15 +173,15 @@ def log_events(search: Search) -> Iterator[Event]:
         asked = (*_bounds(search.segment), level)
         if search.connection.execute(f"{_LOGS} AND level = ? LIMIT 1", asked).fetchone():
             what = f"there are lines of level {level}, none of {wanted} or above"
-            search.came_near("log", rank / len(LEVELS), what)
+            search.note_nearest("log", rank / len(LEVELS), what)
             return
 
 
 def noticed_events(search: Search) -> Iterator[Event]:
     """What the bridge noticed and stored: pause, resume, dropped rows, trouble with storage."""
-    for time_s, wall_s, kind, name, data in _newest(search, "noticed", _NOTICED):
+    for time_s, wall_s, kind, name, data in _newest(search, "bridge_event", _NOTICED):
         details: dict[str, Any] = {"what": kind} | ({"data": json.loads(data)} if data else {})
-        yield Event("noticed", search.segment.run_id, time_s, time_s, wall_s, name, details)
+        yield Event("bridge_event", search.segment.run_id, time_s, time_s, wall_s, name, details)
 
 
 def image_events(search: Search) -> Iterator[Event]:
@@ -200,7 +200,7 @@ def kept_events(search: Search) -> Iterator[Event]:
         frames = count_kept_frames(search.connection, segment.run_id, each.start_s, each.end_s)
         details = {"reason": each.reason} | ({"frames": frames} if frames else {})  # of cameras
         place = (segment.run_id, each.start_s, end_s, each.wall_time_s)
-        yield Event("kept", *place, None, details, ongoing=each.end_s > search.ended_s)
+        yield Event("kept_stretch", *place, None, details, ongoing=each.end_s > search.ended_s)
 
 
 def _newest(search: Search, kind: str, query: str, *values: object) -> list[Any]:
@@ -314,7 +314,7 @@ LOG: Final = EventKind(
     ),
 )
 NOTICED: Final = EventKind(
-    "noticed",
+    "bridge_event",
     "by the bridge",
     noticed_events,
     stored=True,
@@ -324,7 +324,7 @@ NOTICED: Final = EventKind(
     ),
 )
 KEPT: Final = EventKind(
-    "kept",
+    "kept_stretch",
     "at full rate",
     kept_events,
     stored=True,

@@ -65,10 +65,10 @@ def _beyond(search: Search, signal: Signal, threshold: Threshold) -> Iterator[Ev
     if len(runs) > len(long):
         longest_s = float(runs.durations_s[runs.durations_s < threshold.for_s].max())
         what = f"{signal.name} was beyond the limit for at most {longest_s:.3g} s"
-        search.came_near("threshold", longest_s / threshold.for_s, what)
+        search.note_nearest("threshold", longest_s / threshold.for_s, what)
     elif not len(runs) and len(extremes):
         extreme = extremes.max() if is_above else extremes.min()
-        search.came_near("threshold", 0.0, f"{signal.name} reached {extreme:.4g}")
+        search.note_nearest("threshold", 0.0, f"{signal.name} reached {extreme:.4g}")
 
 
 THRESHOLD: Final = EventKind(

@@ -1,4 +1,4 @@
-"""What became of each kind that was asked for: found, absent, or not looked for and why."""
+"""What became of each kind that was asked for: found, not found, or not looked for and why."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ class Verdicts:
 
     Attributes:
         found: How many there are.
-        absent: Kinds that were looked for, be it in a part, and of which there is none, each with
-            what came nearest, or with an empty text.
+        not_found: Kinds that were looked for, be it in a part, and of which there is none, each
+            with what came nearest, or with an empty text.
         reasons: Why kinds were not looked for, or not everywhere, and what to ask to have them
-            looked for. One that is also found or absent is so in what was.
+            looked for. A kind that stands here and above is found, or not, in what was.
 
     Shown are the properties, which name each kind that was not found once.
     """
 
     found: dict[str, int] = field(default_factory=dict[str, int])
-    absent: dict[str, str] = field(default_factory=dict[str, str])
+    not_found: dict[str, str] = field(default_factory=dict[str, str])
     reasons: dict[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
 
     @property
@@ -43,13 +43,13 @@ class Verdicts:
 
     @property
     def far(self) -> list[str]:
-        """Kinds that are absent everywhere, and to which nothing came near."""
-        return [kind for kind in self._nowhere if not self.absent[kind]]
+        """Kinds that were found nowhere, and to which nothing came near."""
+        return [kind for kind in self._nowhere if not self.not_found[kind]]
 
     @property
-    def came_near(self) -> dict[str, str]:
-        """Kinds that are absent everywhere, with what came nearest."""
-        return {kind: self.absent[kind] for kind in self._nowhere if self.absent[kind]}
+    def nearest(self) -> dict[str, str]:
+        """Kinds that were found nowhere, with what came nearest."""
+        return {kind: self.not_found[kind] for kind in self._nowhere if self.not_found[kind]}
 
     @property
     def gaps(self) -> dict[str, str]:
@@ -65,15 +65,15 @@ class Verdicts:
 
     @property
     def _nowhere(self) -> list[str]:
-        return [kind for kind in self.absent if kind not in self.reasons]
+        return [kind for kind in self.not_found if kind not in self.reasons]
 
     def _in_what_was_searched(self, kind: str) -> list[str]:
-        near = self.absent.get(kind)
+        near = self.not_found.get(kind)
         return [] if near is None else [f"none in the searched part{near and f' ({near})'}"]
 
     def unlooked(self, kind: str) -> str | None:
         """Why a kind was not looked for anywhere; None if it was, at least in a part."""
-        looked = kind in self.found or kind in self.absent
+        looked = kind in self.found or kind in self.not_found
         return None if looked else self.not_searched.get(kind)
 
 
@@ -111,16 +111,16 @@ class Ledger:
         of_runs = (f"run {listed}: {note}" for note, listed in runs.items())
         return tuple(dict.fromkeys([*self.notes, *of_runs]))
 
-    def came_near(self, kind: str, share: float, what: str) -> None:
+    def note_nearest(self, kind: str, share: float, what: str) -> None:
         """Note what came near to an event, as a share of what would be one; the most counts."""
         self._nearest[kind] = max(self._nearest.get(kind, (0.0, "")), (share, what))
 
     def verdicts(self, kinds: Sequence[EventKind], events: Iterable[Event]) -> Verdicts:
         """On each of the kinds, in their order, given all that was found."""
         counts, names = count_by_kind(events), [kind.name for kind in kinds]
-        absent = [name for name in names if name in self.searched and not counts[name]]
+        not_found = [name for name in names if name in self.searched and not counts[name]]
         return Verdicts(
             {name: counts[name] for name in names if counts[name]},
-            {name: self._nearest.get(name, (0.0, ""))[1] for name in absent},
+            {name: self._nearest.get(name, (0.0, ""))[1] for name in not_found},
             {name: tuple(self._reasons[name]) for name in names if self._reasons.get(name)},
         )

@@ -74,7 +74,7 @@ class Events:
 
     Attributes:
         events: In the order of wall time; at most `limit` of all that were found.
-        verdicts: What became of each kind: found, absent, or not looked for and why.
+        verdicts: What became of each kind: found, not found, or not looked for and why.
         left_out: Events that are reported neither here nor on the pages before.
         cursor: Give it as `after` for those that are left out; None where none are.
         notes: Where the range leaves the recording, and the like.

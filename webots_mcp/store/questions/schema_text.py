@@ -37,8 +37,8 @@ _RULES: Final = (
     "Times are seconds: sim_time_s of the simulation, wall_time_s Unix. state.data is JSON: "
     "json_extract(data, '$.pose[0]'); signal.path has the path of each name. A range of a run is "
     "fast by run_id and sim_time_s; for a long one use robot_statistics (min, max, mean of about "
-    "1,024 rows each, also of purged ones; not of rows in no chunk: the newest of a run that goes on, "
-    "up to 1,023, and the last of an ended one where they are fewer than 256)."
+    "1,024 rows each, also of purged ones; not of rows in no chunk: the newest of a run that goes "
+    "on, up to 1,023, and the last of an ended one where they are fewer than 256)."
 )
 
 

@@ -59,7 +59,7 @@ class RunTrends:
         resolution_s: None if every row was looked at; else the length of the chunks from whose
             means shape, slope and swings come (counts, extremes, mean and deviation stay exact).
         numbers: What changed most comes first, clocks come last; at most `limit` of `total`.
-        silent: Names that have no value in the range, or none that can be reckoned with.
+        without_value: Names that have no value in the range, or none that can be reckoned with.
         rows: Rows of the range, as far as it was read.
         cut_at_s: The deadline passed; from there on something is missing in the answer.
         unread: What else was not read, and why.
@@ -72,7 +72,7 @@ class RunTrends:
     rows: int
     numbers: tuple[Trend, ...]
     states: tuple[StateTrend, ...]
-    silent: tuple[str, ...]
+    without_value: tuple[str, ...]
     total: int
     cut_at_s: float | None
     unread: tuple[str, ...] = ()
@@ -164,7 +164,7 @@ def _run_trends(
         rows=len(frame),
         numbers=tuple(held[:limit]),
         states=_state_trends(connection, changes, states),
-        silent=tuple(_without_value(frame, found)),
+        without_value=tuple(_without_value(frame, found)),
         total=len(held),
         cut_at_s=min(cuts_s, default=None),
         unread=(*map(str, frame.unread), *signals_left([e.name for e in numbers[len(found) :]])),

@@ -1,4 +1,4 @@
-"""`silent`: a signal that had a value has none."""
+"""`missing`: a signal that had a value has none."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from webots_mcp.store.signals.catalogue import other_form
 from webots_mcp.store.signals.registry import Signal
 
 MANY_SILENCES: Final = 10  # of a signal that mostly has no value: it comes so by nature
-_INDEX: Final = re.compile(r"\.\d+$")  # items that fall silent at once are reported as the array
+_INDEX: Final = re.compile(r"\.\d+$")  # items that go missing at once are reported as the array
 
 
-def silent_events(search: Search) -> Iterator[Event]:
+def missing_events(search: Search) -> Iterator[Event]:
     """It has begun, and lasts to the signal's next value, if any."""
     shorter: Counter[str] = Counter()
-    for signal in search.in_time("silent", search.required_numbers(), judged=False):
+    for signal in search.in_time("missing", search.required_numbers(), judged=False):
         runs = _silences(search, signal)
         if not len(runs):
             continue
@@ -31,21 +31,21 @@ def silent_events(search: Search) -> Iterator[Event]:
         for run in runs.only(runs.durations_s >= least_s).each():
             replaced = search.frame.rows(run.start, run.start + 1).replaced(signal.name)
             details = {"value": next(iter(replaced))} if replaced else {}
-            yield search.event("silent", run.start_s, run.end_s, signal.name, **details)
+            yield search.event("missing", run.start_s, run.end_s, signal.name, **details)
         short = runs.only((runs.durations_s > 0) & (runs.durations_s < least_s))
         if len(short):
             longest = max(short.each(), key=lambda run: run.duration_s)
             span = f"for {longest.duration_s:.3g} s from {longest.start_s:.6g} s"
             share = longest.duration_s / least_s
-            search.came_near("silent", share, f"{signal.name} had no value {span}")
-        if least_s == search.options.silent_s:
+            search.note_nearest("missing", share, f"{signal.name} had no value {span}")
+        if least_s == search.options.missing_s:
             asked, array = search.asked or search.segment, _INDEX.sub(".*", signal.name)
             inside = (short.starts_s < asked.end_s) & (short.ends_s >= asked.start_s)
             shorter[array] = max(int(np.count_nonzero(inside)), shorter[array])
     if counts := (+shorter).most_common():
         times = [f"{name} {count} time{'s' * (count > 1)}" for name, count in counts]
-        limit = f"for less than silent_s={search.options.silent_s:g} s"
-        note = f"without a value {limit}, so not counted as silent: {listed(times, MOST_NAMED)}"
+        limit = f"for less than missing_s={search.options.missing_s:g} s"
+        note = f"without a value {limit}, so not counted as missing: {listed(times, MOST_NAMED)}"
         search.ledger.note_of_run(search.segment.run_id, note)
 
 
@@ -97,7 +97,7 @@ def _are_shorter(search: Search, signal: Signal, runs: Runs) -> Flags:
 
 def _least_silence_s(search: Search, signal: Signal, runs: Runs) -> float:
     """Longer for an intermittent signal: three times its usual interval between values."""
-    least_s = search.options.silent_s
+    least_s = search.options.missing_s
     zones = search.frame.zones(signal.name)
     is_usual = zones.value_count.sum() >= MOSTLY * zones.row_count.sum()
     if is_usual or len(runs) < MANY_SILENCES:
@@ -106,16 +106,16 @@ def _least_silence_s(search: Search, signal: Signal, runs: Runs) -> float:
     if 3 * usual_s <= least_s:
         return least_s
     rarely = f"{signal.name} is intermittent (a value about every {usual_s:.3g} s)"
-    search.ledger.notes.append(f"{rarely}: it counts as silent after {3 * usual_s:.3g} s")
+    search.ledger.notes.append(f"{rarely}: it counts as missing after {3 * usual_s:.3g} s")
     return 3 * usual_s
 
 
-SILENT: Final = EventKind(
-    "silent",
+MISSING: Final = EventKind(
+    "missing",
     "no value",
-    silent_events,
+    missing_events,
     lasts=True,
-    least_s=lambda options: options.silent_s,
+    least_s=lambda options: options.missing_s,
     of_numbers=True,
     drawn=2,
     alike=Alike(lambda events, unit: "stretches without a value", of_arrays=True),

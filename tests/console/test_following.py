@@ -146,6 +146,7 @@ def test_two_who_follow_write_each_line_once_and_one_takes_over_from_the_other(
                 server.log("stdout", "once\n")
                 until(lambda: "once" in messages(recorded))
                 first.stop()
+                until(lambda: not server.is_listened_to or second.problem is None)
                 server.log("stdout", "then\n")
                 until(lambda: "then" in messages(recorded))
         assert [each for each in messages(recorded) if each[0] != "("] == ["once", "then"]

@@ -88,6 +88,11 @@ class WebotsServer:
             self._console.append(f"{stream}:{text}")
             self._tell_console()
 
+    @property
+    def is_listened_to(self) -> bool:
+        """Whether a line of the console would reach somebody, who may have just hung up."""
+        return bool(self._listeners)
+
     def send_raw(self, data: bytes) -> None:
         """Send bytes to all who listen to the console, whatever they mean."""
         for listener in self._listeners:

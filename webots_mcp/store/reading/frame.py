@@ -296,7 +296,7 @@ class Frame:
     def _decoded(self, column: Column) -> Decoded:
         """All values; those of several chunks share their labels."""
         key = ("values", column, self._start, self._stop)
-        return self._source.kept(key, lambda: self._decode(column), 16 * len(self))
+        return self._source.kept(key, lambda: self._decode(column))
 
     def _decode(self, column: Column) -> Decoded:
         source, order = self._source, self._source.order
@@ -329,9 +329,9 @@ class Frame:
 
     def _coded(self, name: str, *, numbers: bool) -> Coded:
         """Codes from 1 on; numbers get labels as well, where they are wanted."""
-        key, size = ("coded", name, numbers, self._start, self._stop), 8 * len(self)
+        key = ("coded", name, numbers, self._start, self._stop)
         values = self._decoded(name)
-        return self._source.kept(key, lambda: _coded(values, numbers=numbers), size)
+        return self._source.kept(key, lambda: _coded(values, numbers=numbers))
 
     @property
     def _edges(self) -> Indexes:
@@ -343,9 +343,8 @@ class Frame:
         return np.minimum(np.maximum(edges, self._start), self._stop) - self._start
 
     def _zones(self, column: Column) -> Zones:
-        size = 8 * len(Zones.__annotations__) * len(self._source.starts_s)
         key = ("zones", column, self._start, self._stop)
-        return self._source.kept(key, lambda: self._make_zones(column), size)
+        return self._source.kept(key, lambda: self._make_zones(column))
 
     def _make_zones(self, column: Column) -> Zones:
         source, edges = self._source, self._edges

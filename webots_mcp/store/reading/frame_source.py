@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlite3
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar, cast
 
 from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
 from webots_mcp.store.chunks import making
@@ -22,7 +22,7 @@ from webots_mcp.store.chunks.stored import (
 )
 
 _MOST_ROWS: Final = 2**20  # of a group: no maker puts more than 1,024 into one
-MOST_KEPT_BYTES: Final = 64_000_000  # of values that a frame keeps for who asks again
+MOST_KEPT_BYTES: Final = 100_000_000  # of values that a frame keeps for who asks again
 Column = str | int  # the name of a signal, or what has a chunk of its own (SIM_TIMES, ...)
 T = TypeVar("T")
 
@@ -180,8 +180,7 @@ class FrameSource:
 
     def statistics(self, column: Column) -> Array:
         """What a signal comes to: a row for each part, a column for each field of `Statistics`."""
-        size = 8 * len(Statistics._fields) * len(self.starts_s)
-        return self.kept(("statistics", column), lambda: self._statistics(column), size)
+        return self.kept(("statistics", column), lambda: self._statistics(column))
 
     def _statistics(self, column: Column) -> Array:
         table = nothing(len(self.starts_s))
@@ -224,18 +223,26 @@ class FrameSource:
         self._kept.clear()
         self._kept_bytes = 0
 
-    def kept(self, key: object, make: Callable[[], T], size: int) -> T:
-        """What was made before, or is made now; the oldest makes room for it."""
+    def kept(self, key: object, make: Callable[[], T]) -> T:
+        """What was made before, or is made now; what was used longest ago makes room for it."""
         if key in self._kept:
             self._kept.move_to_end(key)
             return self._kept[key][0]
         made = make()
-        self._kept[key] = (made, size)
+        self._kept[key] = made, (size := _bytes_of(made))
         self._kept_bytes += size
         while self._kept_bytes > MOST_KEPT_BYTES and len(self._kept) > 1:
             _, (_, freed) = self._kept.popitem(last=False)
             self._kept_bytes -= freed
         return made
+
+
+def _bytes_of(made: object) -> int:
+    """Of an array, or of those that make it up."""
+    if isinstance(made, np.ndarray):
+        return int(made.nbytes)
+    parts = cast("Sequence[object]", made) if isinstance(made, tuple) else vars(made).values()
+    return sum(int(getattr(part, "nbytes", 0)) for part in parts)
 
 
 def nothing(parts: int) -> Array:

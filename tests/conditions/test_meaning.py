@@ -219,4 +219,4 @@ def test_the_values_of_a_state_are_those_that_the_condition_reads() -> None:
 
     values = evaluator.values({"x": 0.5, "y": 2, "lidar": [3.0] * 20})
 
-    assert values == {"x": 0.5, "not_found": None, "lidar.min": 3.0}
+    assert values == {"x": 0.5, "absent": None, "lidar.min": 3.0}

@@ -44,6 +44,13 @@ def test_eight_periods_within_two_minutes_are_found(
     assert swing.end_s == pytest.approx(START_S + PERIODS * period_s, abs=period_s)
 
 
+@pytest.mark.parametrize("unit", [1e-60, 1e60])
+def test_a_swing_is_found_whatever_its_unit_is(unit: float) -> None:
+    times = np.arange(0, 120, 0.032)
+    (swing,) = swings_of(times, unit * swinging(times, "turns", 2.0))
+    assert swing.amplitude == pytest.approx(unit * HEIGHT, rel=0.1)
+
+
 @pytest.mark.parametrize("course", ["constant", "ramp", "turns"])
 def test_more_time_never_finds_less(course: str) -> None:
     times = np.arange(0, 600, 0.032)

@@ -60,8 +60,8 @@ def test_a_kind_that_is_entered_once_is_found_compared_told_and_drawn(
 
 
 def test_nothing_but_its_own_file_and_the_registry_names_a_kind() -> None:
-    """`log`, `run` and the like are words of other things too."""
-    names = {"oscillation", "missing", "jump", "threshold", "flat"}
+    """`log`, `run`, `missing` and the like are words of other things too."""
+    names = {"oscillation", "jump", "threshold", "flat"}
     folder = Path(webots_mcp.__file__).parent
     own = {f"{name}.py" for name in names}
     naming = {

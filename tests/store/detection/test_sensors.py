@@ -178,7 +178,7 @@ def test_losses_shorter_than_what_counts_are_counted_beside(
     answer = ask(empty, "missing", **bounds)
     assert len(answer.events) == found
     (said,) = answer.notes
-    too_short = "without a value for less than missing_s=1 s, so not counted as silent"
+    too_short = "without a value for less than missing_s=1 s, so not counted as missing"
     assert said == f"run 1: {too_short}: {note}"
 
 

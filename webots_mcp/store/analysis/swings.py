@@ -351,10 +351,11 @@ def _windows(means: Array) -> tuple[Array, Indexes, Array]:
     0 of those in which the sign changes much less or more often than a sine's.
     """
     rows, beyond = WINDOW * BLOCK, (WINDOW - 1) * BLOCK + 2 * SHIFT
+    span = float(np.ptp(means)) or 1.0  # to which short floats are reduced, which reach 1e38
     found: list[tuple[Array, Indexes, Array]] = []
     for begin in range(0, max(1, len(means) - beyond), AT_ONCE):
         part = means[begin : begin + AT_ONCE + beyond]
-        bends = _bends((part - part[0]).astype(np.float32), SHIFT)
+        bends = _bends(((part - part[0]) / span).astype(np.float32), SHIFT)
         if len(bends) < rows:
             bends = np.pad(bends, (0, rows - len(bends)))
         blocks: Array = np.reshape(bends[: len(bends) // BLOCK * BLOCK], (-1, BLOCK))
@@ -372,7 +373,8 @@ def _windows(means: Array) -> tuple[Array, Indexes, Array]:
         found.append((share, which, np.einsum("ij->i", np.abs(blocks)) / BLOCK))
     shares, periods, blocks_of = zip(*found, strict=True)
     sizes = [each[: len(share)] for share, _, each in found[:-1]]
-    return np.concatenate(shares), np.concatenate(periods), np.concatenate([*sizes, blocks_of[-1]])
+    of_blocks = np.concatenate([*sizes, blocks_of[-1]]).astype(np.float64) * span
+    return np.concatenate(shares), np.concatenate(periods), of_blocks
 
 
 @lru_cache(1)  # the same for all

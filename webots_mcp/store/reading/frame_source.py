@@ -22,7 +22,7 @@ from webots_mcp.store.chunks.stored import (
 )
 
 _MOST_ROWS: Final = 2**20  # of a group: no maker puts more than 1,024 into one
-MOST_KEPT_BYTES: Final = 100_000_000  # of values that a frame keeps for who asks again
+MOST_KEPT_BYTES: Final = 32_000_000  # of values that a frame keeps for who asks again
 Column = str | int  # the name of a signal, or what has a chunk of its own (SIM_TIMES, ...)
 T = TypeVar("T")
 

@@ -171,3 +171,18 @@ def test_a_kept_stretch_comes_once() -> None:
     assert [line["n"] for line in after] == [line["n"] for line in before]
     assert len(after) > 600
     database.close()
+
+
+def test_a_row_that_a_stretch_of_a_single_moment_keeps_is_exported_once(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = start_run(empty)
+    for step in range(50):
+        recorder.publish(step * 0.1, {"x": step})
+    recorder.end_run("finished")
+    empty.execute(
+        "INSERT INTO kept_stretch (run_id, uuid, start_sim_time_s, end_sim_time_s, reason, "
+        "wall_time_s) SELECT 1, 'u', sim_time_s, sim_time_s, 'bumped', 0 FROM state WHERE id = 21"
+    )
+    purged(empty)
+    assert [line["x"] for line in lines(empty)] == list(range(50))

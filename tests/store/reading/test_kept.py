@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.recordings.rover import start_run
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
@@ -22,8 +23,10 @@ from webots_mcp.store.export.export_rows import Source
 from webots_mcp.store.questions.events import EventOptions, find_events
 from webots_mcp.store.questions.series import query_history
 from webots_mcp.store.questions.trends import trends
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.pages import query_rows
-from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
+from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range
 from webots_mcp.store.run_rows import newest_state
 
 STEP_MS = 16
@@ -317,3 +320,13 @@ def test_a_mean_that_leans_towards_the_hits_of_a_breakpoint_is_told(
     rows = len({n for n in range(2000) if (n + 1) % interval == 0 or n % every == 0})
     text = f"up to 286 of {rows} rows of run 1 were recorded because a breakpoint was hit"
     assert [text in note for note in whole.notes] == [True] * leans
+
+
+def test_a_kept_call_before_the_row_of_the_same_step_comes_first(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = start_run(empty)
+    recorder.publish(1.0, {"x": 2})
+    recorder.insert("kept_state", **recorder.at(1.0) | {"wall_time_s": 0.0}, data='{"x": 1}')
+    frame = read_frame(empty, Segment(1, 0.0, 2.0, full_rate=True), Deadline(60))
+    assert frame.values("x") == [1, 2]

@@ -87,8 +87,10 @@ class FrameSource:
         times: Array = np.array(columns.times, np.float64)
         self.starts_s: Array = np.append(groups[:, 1], times[new])
         self.ends_s: Array = np.append(groups[:, 2], times[ends - 1])
+        steps = np.diff(times)
+        rising = (steps == 0) & (np.diff(np.array(columns.ids)) > 0)  # those of kept rows fall
         self.is_in_order = bool(
-            (self.starts_s[1:] >= self.ends_s[:-1]).all() and (np.diff(times) >= 0).all()
+            (self.starts_s[1:] >= self.ends_s[:-1]).all() and ((steps > 0) | rising).all()
         )
         self._kept: OrderedDict[object, Any] = OrderedDict()
         self._kept_bytes = 0

@@ -79,7 +79,8 @@ def kept_parts(
 ) -> list[KeptStretch]:
     """Of those the ones that have rows of their own."""
     found = kept_stretches(connection, run_id, start_s, end_s)
-    return [each for each in found if _any(connection, "kept_state", run_id, *each[:2])]
+    spans = [(each, each.start_s, _after(each.end_s)) for each in found]  # the last row is in it
+    return [each for each, *span in spans if _any(connection, "kept_state", run_id, *span)]
 
 
 def is_at_full_rate(

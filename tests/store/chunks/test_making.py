@@ -311,3 +311,17 @@ def test_the_range_of_a_signal_is_known_whenever_its_maker_is_stopped(
     make_chunks(empty, 100_000)
     found = empty.execute("SELECT min, max FROM signal WHERE name = 'x'").fetchone()
     assert found == (0, (GROUP_ROWS - 1) * 0.25)
+
+
+def test_a_late_row_at_the_time_between_two_groups_stays_behind_those_before_it(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = start_run(empty)
+    for step in range(2 * GROUP_ROWS):
+        recorder.publish((step + 1) // 2 * 0.1, {"x": step})
+    make_chunks(empty, 10_000)
+    recorder.publish(GROUP_ROWS // 2 * 0.1, {"x": -1})
+    before = framed(empty).values("x")
+    chunk_whole_run(empty, 1)
+    assert before[GROUP_ROWS : GROUP_ROWS + 2] == [GROUP_ROWS, -1]
+    assert framed(empty).values("x") == before

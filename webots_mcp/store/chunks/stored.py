@@ -35,8 +35,9 @@ IS_MARK: Final = (  # no other program's value, beyond which no row would be loo
 _WATERMARK: Final = f"SELECT state_id FROM watermark WHERE name = 'chunk' AND {IS_MARK}"
 _OF_SIGNAL: Final = "FROM chunk WHERE run_id = ? AND signal_id = ? AND group_id BETWEEN ? AND ?"
 _PLACES: Final = (
-    "SELECT id, start_sim_time_s, end_sim_time_s, row_count FROM row_group WHERE run_id = ? "
-    "AND is_complete = 1 AND start_sim_time_s < ? AND end_sim_time_s >= ? ORDER BY start_sim_time_s"
+    "SELECT id, start_sim_time_s, end_sim_time_s, row_count, max_state_id FROM row_group "
+    "WHERE run_id = ? AND is_complete = 1 AND start_sim_time_s < ? AND end_sim_time_s >= ? "
+    "ORDER BY start_sim_time_s"
 )
 _STATISTICS: Final = f"SELECT group_id, {', '.join(Statistics._fields)} {_OF_SIGNAL}"
 _LONG_STEPS: Final = f"SELECT group_id {_OF_SIGNAL} AND largest_step > ?"
@@ -84,9 +85,9 @@ def groups_in(
 def groups_as_array(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
 ) -> Array:
-    """The same as columns: id, times of the first and last row in s, and how many rows."""
+    """The same as columns: id, times of the first and last row in s, how many rows, greatest id."""
     rows = connection.execute(_PLACES, (run_id, end_s, start_s)).fetchall()
-    table: Array = np.reshape(np.array(rows, np.float64), (-1, 4))
+    table: Array = np.reshape(np.array(rows, np.float64), (-1, 5))
     return table[np.lexsort((table[:, 0], table[:, 2], table[:, 1]))]
 
 

@@ -146,7 +146,7 @@ class Frame:
         values = {name: _plain(column) for name, column in columns.items()}
         ids = list(range(1, len(listed) + 1))
         rows = StateColumns(ids, listed, walls, [""] * len(listed), values)
-        return cls(FrameSource(None, run_id, np.zeros((0, 4)), rows, {}), 0, len(listed))
+        return cls(FrameSource(None, run_id, np.zeros((0, 5)), rows, {}), 0, len(listed))
 
     def __len__(self) -> int:
         return self._stop - self._start
@@ -390,7 +390,7 @@ def read_frame(
         every_call: Of any segment each call is a row that is in a kept stretch.
     """
     run_id, span = segment.run_id, (segment.start_s, segment.end_s)
-    groups: Array = np.zeros((0, 4))
+    groups: Array = np.zeros((0, 5))
     if full_rate and segment.full_rate:
         columns = StateColumns()
         cut_at_s = read_rows(connection, _STATES, (run_id, *span), columns, deadline)
@@ -440,7 +440,7 @@ def read_kept(connection: sqlite3.Connection, segment: Segment, deadline: Deadli
         return None
     columns = StateColumns()
     cut_at_s = read_rows(connection, _KEPT, (*bounds, MOST_ROWS), columns, deadline)
-    source = FrameSource(connection, segment.run_id, np.zeros((0, 4)), columns, {})
+    source = FrameSource(connection, segment.run_id, np.zeros((0, 5)), columns, {})
     cut_at_s = _said(source, segment, cut_at_s)
     return _framed(source, segment, cut_at_s) if len(columns) else None
 

@@ -76,7 +76,7 @@ class FrameSource:
         self.unread: dict[Unread, None] = {}
         self.order: Indexes | None = None
         sound = (groups[:, 3] >= 1) & (groups[:, 3] <= _MOST_ROWS) & (groups[:, 1] <= groups[:, 2])
-        for _, start_s, end_s, _ in groups[~sound].tolist():
+        for _, start_s, end_s, *_ in groups[~sound].tolist():
             self.unread[Unread(start_s, end_s, "its row group is damaged")] = None
         groups = groups[sound]
         self._group_ids: Indexes = groups[:, 0].astype(np.intp)
@@ -90,7 +90,11 @@ class FrameSource:
         steps = np.diff(times)
         rising = (steps == 0) & (np.diff(np.array(columns.ids)) > 0)  # those of kept rows fall
         self.is_in_order = bool(
-            (self.starts_s[1:] >= self.ends_s[:-1]).all() and ((steps > 0) | rising).all()
+            (self.starts_s[1:] >= self.ends_s[:-1]).all()
+            and ((steps > 0) | rising).all()
+            and not (  # what came late has greater ids than what stood there before
+                (groups[1:, 1] == groups[:-1, 2]) & (groups[1:, 4] < groups[:-1, 4])
+            ).any()
         )
         self._kept: OrderedDict[object, Any] = OrderedDict()
         self._kept_bytes = 0

@@ -275,6 +275,19 @@ def test_a_noisy_sensor_that_freezes_is_flat_long_before_one_that_rests_by_natur
     assert flat.details["value"] == 3.3
 
 
+def test_a_sensor_that_freezes_is_flat_though_another_is_at_its_limit_meanwhile(
+    empty: sqlite3.Connection,
+) -> None:
+    force, side = noisy(1), noisy(2)
+
+    def state(time_s: float) -> dict[str, Any]:
+        limited = 4.0 if time_s % 60 > 35 else side(time_s)
+        return {"force": 3.3 if 100 <= time_s < 112 else force(time_s), "side": limited}
+
+    record(empty, state)
+    assert told(ask(empty, "flat"))[-1] == ("force", 100.0, 111.9)
+
+
 def held(time_s: float, measured: float, value: float) -> float:
     """What is measured, but for ten seconds in which it is that value."""
     return measured if not 50 < time_s < 60 else value

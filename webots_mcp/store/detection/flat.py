@@ -38,7 +38,7 @@ def flat_events(search: Search) -> Iterator[Event]:
     """
     flat_s, signals = search.options.flat_s, search.required_quantities()
     least_s = FROZEN_SHARE * flat_s
-    resting: dict[str, list[Run]] = {}
+    resting: dict[str, _Resting] = {}
     frozen: list[tuple[_Resting, Run]] = []
     for signal in search.in_time("flat", signals):
         zones = (frame.zones(signal.name) for frame in (search.frame, search.whole))
@@ -48,7 +48,7 @@ def flat_events(search: Search) -> Iterator[Event]:
         shown = _Resting(search, signal, MOSTLY * least_s)
         changes_here = shown.changes >= LEAST_CHANGES
         if changes_here:
-            resting[signal.name] = shown.rests
+            resting[signal.name] = shown
         if flat := [rest for rest in shown.rests if rest.duration_s >= flat_s]:
             if shown.changes_but_for(flat) or is_lively(search.whole, signal.name):
                 yield from map(shown.event, flat)
@@ -266,17 +266,19 @@ def is_lively(run: Frame, name: str) -> bool:
     return False
 
 
-def _rests_with_others(signal: Signal, rest: Run, resting: dict[str, list[Run]]) -> bool:
+def _rests_with_others(signal: Signal, rest: Run, resting: dict[str, _Resting]) -> bool:
     """Whether something else holds one value for most of that time: then the robot rests.
 
-    What never changes is no sign of that; and the items of an array freeze together.
+    What never changes, or is at its limit, is no sign of that; and the items of an array freeze
+    together.
     """
     branch = signal.name.partition(".")[0]
     return any(
         min(rest.end_s, other.end_s) - max(rest.start_s, other.start_s) > MOSTLY * rest.duration_s
-        for name, others in resting.items()
+        and not shown.is_limit(other)
+        for name, shown in resting.items()
         if name.partition(".")[0] != branch
-        for other in others
+        for other in shown.rests
     )
 
 

@@ -37,8 +37,11 @@ from webots_mcp.signal_kinds import Kind, ends_pose, is_reachable, turn_of
 
 PLACES: Final = ("", *(str(place) for place in range(2, 10)))  # in line for a role
 
-_TAIL: Final = r"([._](x|vx|linear|speed|velocity|m_s|mps))*$"
-_COMMANDED: Final = re.compile(rf"(^|[._])(commanded|command|cmd|cmd_vel|target_speed){_TAIL}")
+_TAIL: Final = r"([._](x|vx|linear|speed|velocity|m_s|mps)|\.v)*$"  # `_v` is in volts
+_COMMANDED: Final = re.compile(
+    r"(^|[._])(commanded|command|cmd|cmd_vel(\.linear)?(\.0)?|target_speed"
+    rf"|(speed|velocity)[._](setpoint|target|ref)){_TAIL}"
+)
 _SPEED: Final = re.compile(rf"(^|[._])(speed|velocity|linear){_TAIL}")
 _WHEEL: Final = re.compile(
     r"(^|[._])(wheels?|(left|right)_motors?|motors?[._]?(left|right|\d)?)([._]|$)"

@@ -106,10 +106,18 @@ def test_a_slow_drift_in_much_noise_is_not_called_a_standstill(empty: sqlite3.Co
     assert "hides slow motion" in found.verdicts.not_searched["standstill"]
 
 
-@pytest.mark.parametrize("name", ["targetSpeed", "cmdVel", "commandedSpeed"])
-def test_a_command_is_found_in_camel_case(empty: sqlite3.Connection, name: str) -> None:
+@pytest.mark.parametrize(
+    "command",
+    [
+        {"targetSpeed": 0.2}, {"cmdVel": 0.2}, {"commandedSpeed": 0.2}, {"speedSetpoint": 0.2},
+        {"cmd": {"v": 0.2, "w": 0.0}}, {"cmd_vel": [0.2, 0.0]}, {"cmdVel": {"linear": [0.2, 0, 0]}},
+    ],
+)  # fmt: skip
+def test_a_command_is_found_in_camel_case_and_as_a_pair(
+    empty: sqlite3.Connection, command: dict[str, Any]
+) -> None:
     def pushes(time_s: float) -> dict[str, Any]:
-        return {"pose": [0.2 * min(30.0, time_s), 0.0], name: 0.2}
+        return {"pose": [0.2 * min(30.0, time_s), 0.0]} | command
 
     (stuck,) = ask(empty, pushes).events
     assert (stuck.kind, stuck.details["commanded"]) == ("stuck", 0.2)

@@ -10,7 +10,8 @@ from tests.recordings.rover import start_run
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.naming import flatten
 from webots_mcp.signal_kinds import Place, places
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.signal_register import MAX_SIGNALS
+from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.pages import query_rows
 from webots_mcp.store.reading.ranges import Scope, find_range
@@ -174,3 +175,14 @@ def test_a_name_and_a_kind_in_the_midst_of_rows_in_no_chunk_are_known(
     assert (known["front"].kind, known["fault"].kind) == ("text", "num")
     told = trends(empty, find_range(empty, Scope(run_id=1)))
     assert "fault" in [trend.name for trend in told.runs[0].numbers]
+
+
+def test_who_asks_for_a_name_beyond_the_limit_is_told_of_the_limit(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = start_run(empty)
+    recorder.publish(0.0, {f"s{number}": number for number in range(MAX_SIGNALS + 1)})
+    recorder.end_run("finished")
+    chunk_whole_run(empty, 1)
+    with pytest.raises(UnknownSignalError, match=f"only the first {MAX_SIGNALS} names of a robot"):
+        trends(empty, find_range(empty, Scope(run_id=1)), [f"s{MAX_SIGNALS}"])

@@ -26,6 +26,7 @@ from webots_mcp.store.signals.registry import Signal, cleaned, registered, seen_
 
 SAMPLED_ROWS: Final = 200  # in no chunk yet, that are searched for new names and kinds
 _MOST_OFFERED: Final = 5
+_ONLY_FIRST: Final = f"only the first {MAX_SIGNALS} names of a robot are kept"
 
 _NEW_ROWS: Final = (
     f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
@@ -200,7 +201,8 @@ def say_unknown(known: dict[str, Signal], name: str) -> str:
     if not known:
         return f"no signal {name!r}: no state row with values has been recorded yet"
     offer = ", ".join(nearest_first(name.replace("*", ""), known)[:_MOST_OFFERED])
-    return f"no signal {name!r} is recorded; there is {offer} (the nearest of {len(known)})"
+    said = f"no signal {name!r} is recorded; there is {offer} (the nearest of {len(known)})"
+    return f"{said}, and {_ONLY_FIRST}" if len(known) >= MAX_SIGNALS else said
 
 
 @in_one_snapshot
@@ -239,7 +241,7 @@ def list_signals(
     infos = tuple(_info(frame, signal) for signal in matching[:limit])
     notes = [str(each) for each in frame.unread]
     if len(known) >= MAX_SIGNALS:
-        notes.append(f"only the first {MAX_SIGNALS} names of a robot are kept")
+        notes.append(_ONLY_FIRST)
     return SignalList(subject.robot, subject.run_id, len(frame), infos, len(matching), tuple(notes))
 
 

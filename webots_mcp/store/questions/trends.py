@@ -176,7 +176,7 @@ def _without_value(frame: Frame, found: Mapping[str, Trend | None]) -> Iterator[
     for name in (name for name, trend in found.items() if trend is None):
         if (np.abs(frame.numbers(name)) > LARGEST).any():
             yield f"{name} ({TOO_LARGE})"
-        elif frame.cut_at_s is None and frame.was_read.any():
+        elif frame.cut_at_s is None and frame.was_read(name).any():
             yield name
 
 

@@ -165,11 +165,16 @@ class Frame:
         """What is not in it, as far as its values were asked for."""
         return tuple(self._source.unread)
 
-    @property
-    def was_read(self) -> Flags:
-        """Which rows lie in no part that could not be read, of the values asked for so far."""
+    def was_read(self, name: str | None = None) -> Flags:
+        """Which rows lie in no part that could not be read, of the values asked for so far.
+
+        Args:
+            name: Of which signal, where the damage of others does not matter.
+        """
         read = np.ones(len(self), np.bool_)
-        for part in self.unread:
+        for part, column in self._source.unread.items():
+            if isinstance(column, str) and name not in (None, column):
+                continue
             read[slice(*self.places([part.start_s, math.nextafter(part.end_s, math.inf)]))] = False
         return read
 

@@ -23,6 +23,7 @@ from webots_mcp.plotting.path import Path, Place, headings, thinned
 from webots_mcp.plotting.signal_axes import SignalAxes
 from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
+from webots_mcp.store.chunks.making import chunk_whole_run
 
 
 def signals_of_run(connection: sqlite3.Connection, *names: str, **limits: Any) -> SignalAxes:
@@ -274,6 +275,20 @@ def test_where_nothing_was_read_in_time_nobody_says_that_nothing_was_recorded(
     names = [["x"]] if compose is compose_signals else []
     with pytest.raises(NothingRecordedError, match="read in time"):
         compose(connection, [whole(connection)], *names, deadline_s=0.0)
+
+
+@pytest.mark.parametrize("compose", [compose_signals, compose_trajectory])
+def test_where_retention_has_deleted_the_values_nobody_says_that_none_were_recorded(
+    record: Record, compose: Any
+) -> None:
+    connection = record(moded, 200)
+    assert chunk_whole_run(connection, 1)
+    for table in ("state", "chunk", "row_group"):
+        connection.execute(f"DELETE FROM {table}")
+    connection.execute("UPDATE run SET purged_rows = row_count")
+    names = [["x"]] if compose is compose_signals else []
+    with pytest.raises(NothingRecordedError, match="deleted by retention"):
+        compose(connection, [whole(connection)], *names)
 
 
 def test_what_is_too_far_to_tell_a_distance_to_is_no_place(record: Record) -> None:

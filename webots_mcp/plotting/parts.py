@@ -104,8 +104,8 @@ def parts_of(
             alone = replace(each, segments=(segment,))
             parts.append(_part(connection, alone, run, count > 1))
     if not any(part.has_rows for part in parts):
-        notes = [note for each in ranges for note in each.notes]
-        raise NothingRecordedError("; ".join(["nothing was recorded in the range", *notes]))
+        notes = [note for history in histories for note in history.notes]
+        raise NothingRecordedError("; ".join(["there are no values in the range", *notes]))
     return _named_by_parameters(connection, [part for part in parts if part.has_rows])
 
 

@@ -285,7 +285,7 @@ def test_where_retention_has_deleted_the_values_nobody_says_that_none_were_recor
     assert chunk_whole_run(connection, 1)
     for table in ("state", "chunk", "row_group"):
         connection.execute(f"DELETE FROM {table}")
-    connection.execute("UPDATE run SET purged_rows = row_count")
+    connection.execute("UPDATE run SET row_count = 200, purged_rows = 200, last_sim_time_s = 19.9")
     names = [["x"]] if compose is compose_signals else []
     with pytest.raises(NothingRecordedError, match="deleted by retention"):
         compose(connection, [whole(connection)], *names)

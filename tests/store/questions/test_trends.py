@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import random
 import re
@@ -405,3 +406,21 @@ def test_a_damaged_chunk_costs_its_own_signal_alone(
     assert {state.name: state.changes for state in told.states} == {"mode": 0, "left": 1}
     assert {state.name: state.since_s for state in later.states} == {"mode": None, "left": 5.0}
     assert [trend.summary.rows - trend.summary.present for trend in told.numbers] == [0, 0]
+
+
+@pytest.mark.parametrize("name", ["x", "yaw"])
+def test_nothing_rests_before_a_number_elsewhere_in_a_kept_stretch(
+    empty: sqlite3.Connection, name: str
+) -> None:
+    recorder = start_run(empty)
+    for step in range(240):
+        recorder.publish(step * 0.1, {name: 3.14159})
+    recorder.insert(
+        "kept_stretch", run_id=1, uuid="k", wall_time_s=0.0, reason="hit",
+        start_sim_time_s=10.0, end_sim_time_s=11.0,
+    )  # fmt: skip
+    last = -3.14159 if name == "yaw" else 1.0  # which is the same angle, and another number
+    for time_s, value in ((10.05, 1.0), (10.15, 1.0), (10.25, last)):
+        recorder.insert("kept_state", **recorder.at(time_s), data=json.dumps({name: value}))
+    at_rest_s = one(empty, name).flat_since_s
+    assert at_rest_s == pytest.approx(10.2 if name == "yaw" else 10.3)

@@ -291,6 +291,17 @@ def test_where_retention_has_deleted_the_values_nobody_says_that_none_were_recor
         compose(connection, [whole(connection)], *names)
 
 
+def test_what_of_a_picture_could_not_be_read_is_said(record: Record) -> None:
+    connection = record(lambda time_s: {"n": time_s, "m": time_s}, 200)
+    assert chunk_whole_run(connection, 1)
+    connection.execute("DELETE FROM state")
+    of_n = "signal_id = (SELECT id FROM signal WHERE name = 'n')"
+    connection.execute(f"UPDATE chunk SET numbers = x'00' WHERE {of_n}")
+    _, notes = compose_signals(connection, [whole(connection)], ["n", "m"], events=False)
+    (note,) = notes
+    assert note.startswith("run 1: not read from 0.000 to 19.900 s: the chunk of n is damaged")
+
+
 def test_what_is_too_far_to_tell_a_distance_to_is_no_place(record: Record) -> None:
     far = record(lambda time_s: {"x": 1.7e308 if 4 <= time_s < 5 else time_s, "y": 0.0})
     axes, _ = compose_trajectory(far, [whole(far)])

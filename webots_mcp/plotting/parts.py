@@ -66,8 +66,9 @@ class Part:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Where the range reaches outside the recording."""
-        return self.range.notes
+        """Where the range reaches outside the recording, and what of it could not be read."""
+        unread = (f"run {self.run.run_id}: {each}" for each in self.run.unread)
+        return (*self.range.notes, *unread)
 
 
 def parts_of(

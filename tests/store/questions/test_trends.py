@@ -422,5 +422,6 @@ def test_nothing_rests_before_a_number_elsewhere_in_a_kept_stretch(
     last = -3.14159 if name == "yaw" else 1.0  # which is the same angle, and another number
     for time_s, value in ((10.05, 1.0), (10.15, 1.0), (10.25, last)):
         recorder.insert("kept_state", **recorder.at(time_s), data=json.dumps({name: value}))
-    at_rest_s = one(empty, name).flat_since_s
-    assert at_rest_s == pytest.approx(10.2 if name == "yaw" else 10.3)
+    trend = one(empty, name)
+    assert trend.flat_since_s == pytest.approx(10.2 if name == "yaw" else 10.3)
+    assert trend.says.startswith("between 1 (at 10.05 s) and 3.142")

@@ -40,7 +40,7 @@ def database(subject: Examined) -> Finding:
     if subject.file is None:
         return Finding("ok", "in memory")
     with closing(connect(subject.file, "reader")) as connection:
-        # Without a log beside it a file that cannot be written is read as if it had none.
+        # A file that cannot be written is read as if it had no write-ahead log.
         mode = "wal" if isinstance(connection, FrozenConnection) else journal_mode(connection)
     size = subject.file.stat().st_size
     seen = f"{subject.file}, {size / 1e6:.1f} MB"

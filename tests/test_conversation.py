@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import pytest
 
+from webots_mcp.store.detection.registry import kind_names
+
 EXAMPLES = Path(__file__).parent.parent / "examples"
 CONVERSATIONS = sorted(path.parent.name for path in EXAMPLES.glob("*/conversation.toml"))
 TURN = re.compile(r"```\n(.*?)\n```\n\n```\n(.*?)\n```\n\n\*\*Assistant:\*\* (.*?)\n\n", re.S)
@@ -35,6 +37,15 @@ def without_numbers(text: str) -> str:
 
 def test_there_are_conversations_to_have() -> None:
     assert {"conversation", "e_puck", "tag"} <= set(CONVERSATIONS)
+
+
+@pytest.mark.parametrize(
+    "page", sorted(EXAMPLES.glob("*/README.md")), ids=lambda page: page.parent.name
+)
+def test_a_page_shows_kinds_and_counts_by_the_names_that_they_have(page: Path) -> None:
+    shown = page.read_text("utf-8")
+    assert set(re.findall(r'"(\w+) per min"', shown)) <= set(kind_names())
+    assert re.search(r'"rows": \d', shown) is None
 
 
 @pytest.mark.parametrize("name", CONVERSATIONS)

@@ -21,6 +21,7 @@ from webots_mcp.questions.argument_types import MAX_WAIT_S
 from webots_mcp.questions.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS
 from webots_mcp.schema import SCHEMA_FILE
 from webots_mcp.server import create_server
+from webots_mcp.store.detection.registry import kind_names
 
 CHECKOUT = Path(__file__).parents[1]
 DOCS = CHECKOUT / "docs"
@@ -98,6 +99,15 @@ def test_the_page_of_the_database_names_tables_and_views_that_there_are() -> Non
     named = set(re.findall(r"`([a-z]+_?[a-z]+)`", part))
     made = set(re.findall(r"(?m)^CREATE (?:TABLE|VIEW) (\w+)", SCHEMA_FILE.read_text()))
     assert named == made - {"alembic_version"}
+
+
+def test_the_pages_name_only_kinds_of_events_that_there_are() -> None:
+    found = [
+        re.findall(r"events of the kind `(\w+)`", page(file.name)) for file in DOCS.glob("*.md")
+    ]
+    named = [kind for kinds in found for kind in kinds]
+    assert named
+    assert set(named) <= set(kind_names())
 
 
 def test_the_first_page_leads_to_each_other_once() -> None:

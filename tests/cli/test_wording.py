@@ -143,6 +143,11 @@ def test_help_loses_no_word_of_a_description(capsys: pytest.CaptureFixture[str])
     assert "'*' is any text. (*)" in capsys.readouterr().out
 
 
+def test_help_shows_a_default_of_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["events", "--help"]) == 0
+    assert "no value for so long. (1)" in capsys.readouterr().out
+
+
 def test_each_command_that_stands_for_a_tool_exists() -> None:
     assert {command.partition(" ")[0] for command in BY_TOOL.values()} <= {*names()}
 

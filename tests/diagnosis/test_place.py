@@ -41,6 +41,7 @@ def test_a_folder_that_cannot_be_written_is_wrong(bridge_recording: Path, tmp_pa
     assert checks["Data folder"]["verdict"] == "wrong"
     assert "cannot be written" in checks["Data folder"]["seen"]
     assert checks["Rows"]["verdict"] == "ok"  # it is read nevertheless
+    assert checks["Database"]["verdict"] == "ok"  # it has a write-ahead log where it can be written
 
 
 @pytest.mark.parametrize(

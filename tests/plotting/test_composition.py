@@ -23,6 +23,7 @@ from webots_mcp.plotting.path import Path, Place, headings, thinned
 from webots_mcp.plotting.signal_axes import SignalAxes
 from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
+from webots_mcp.store.chunks.making import chunk_whole_run
 
 
 def signals_of_run(connection: sqlite3.Connection, *names: str, **limits: Any) -> SignalAxes:
@@ -274,6 +275,31 @@ def test_where_nothing_was_read_in_time_nobody_says_that_nothing_was_recorded(
     names = [["x"]] if compose is compose_signals else []
     with pytest.raises(NothingRecordedError, match="read in time"):
         compose(connection, [whole(connection)], *names, deadline_s=0.0)
+
+
+@pytest.mark.parametrize("compose", [compose_signals, compose_trajectory])
+def test_where_retention_has_deleted_the_values_nobody_says_that_none_were_recorded(
+    record: Record, compose: Any
+) -> None:
+    connection = record(moded, 200)
+    assert chunk_whole_run(connection, 1)
+    for table in ("state", "chunk", "row_group"):
+        connection.execute(f"DELETE FROM {table}")
+    connection.execute("UPDATE run SET row_count = 200, purged_rows = 200, last_sim_time_s = 19.9")
+    names = [["x"]] if compose is compose_signals else []
+    with pytest.raises(NothingRecordedError, match="deleted by retention"):
+        compose(connection, [whole(connection)], *names)
+
+
+def test_what_of_a_picture_could_not_be_read_is_said(record: Record) -> None:
+    connection = record(lambda time_s: {"n": time_s, "m": time_s}, 200)
+    assert chunk_whole_run(connection, 1)
+    connection.execute("DELETE FROM state")
+    of_n = "signal_id = (SELECT id FROM signal WHERE name = 'n')"
+    connection.execute(f"UPDATE chunk SET numbers = x'00' WHERE {of_n}")
+    _, notes = compose_signals(connection, [whole(connection)], ["n", "m"], events=False)
+    (note,) = notes
+    assert note.startswith("run 1: not read from 0.000 to 19.900 s: the chunk of n is damaged")
 
 
 def test_what_is_too_far_to_tell_a_distance_to_is_no_place(record: Record) -> None:

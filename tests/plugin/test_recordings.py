@@ -15,6 +15,7 @@ from webots_mcp.errors import (
     UnknownSignalError,
 )
 from webots_mcp.standin import InProcessSupervisor
+from webots_mcp.store.chunks.making import chunk_whole_run
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.purge import prune
 from webots_mcp.testing import RobotRecording
@@ -183,3 +184,15 @@ def test_what_could_not_be_looked_for_is_not_told_to_be_absent(
         webots_bridge.publish({"mode": "cruise", "step": step})
     with pytest.raises(NothingRecordedError, match="stuck could not be looked for: no position"):
         webots_recording.find_events("stuck")
+
+
+def test_what_could_not_be_read_shows_nothing(story: RobotRecording) -> None:
+    with closing(story._connect("writer")) as connection:  # pyright: ignore[reportPrivateUsage]
+        assert chunk_whole_run(connection, 1)
+        connection.execute("DELETE FROM state")
+        connection.execute("UPDATE row_group SET stored_row_count = 0")
+        damage = "UPDATE chunk SET numbers = x'00', codes = x'00' WHERE signal_id IN "
+        connection.execute(damage + "(SELECT id FROM signal WHERE name = 'mode')")
+    with pytest.raises(AssertionError, match=r"the chunk of mode is damaged.*nothing shows"):
+        story.signal("mode").assert_never("backwards")
+    story.signal("sensors.front_m").assert_never_below(0.0)

@@ -195,6 +195,18 @@ async def test_a_database_in_memory_is_asked_in_the_same_way() -> None:
     database.close()
 
 
+async def test_it_is_said_that_states_were_deleted_where_a_statement_asks_of_states(
+    recorded: Recorded, connect: Connect
+) -> None:
+    recorded.robot().state(1.5, {"x": 1})
+    recorded.connection.execute("UPDATE run SET purged_rows = 7")
+    async with connect() as client:
+        of_states = await ask(client, "webots_query_sql", sql="SELECT count(*) FROM State")
+        of_runs = await ask(client, "webots_query_sql", sql="SELECT count(*) FROM run")
+    assert "retention has deleted 7 states" in of_states["hint"]
+    assert "hint" not in of_runs
+
+
 async def test_bytes_that_are_no_text_are_shown_as_such(file: Path, connect: Connect) -> None:
     recorded = Recorded(file)
     robot = recorded.robot()

@@ -12,6 +12,7 @@ from tests.server.conftest import DATA_TOOLS, Connect, ask, fail
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.questions.sensing import unnamed_devices
 from webots_mcp.questions.shortening import tokens_of
+from webots_mcp.store.chunks.making import chunk_whole_run
 
 pytestmark = pytest.mark.anyio
 TOKENS = 2_000
@@ -259,3 +260,20 @@ async def test_log_lines_come_from_before_a_reset_too_each_with_its_run(
         assert [row[2] for row in earlier["lines"]["rows"]] == ["before the reset"]
         grave = await ask(client, "webots_get_logs", robot="rover", level="critical")
         assert [row[1] for row in grave["lines"]["rows"]] == ["critical"]
+
+
+async def test_a_signal_that_could_not_be_read_is_not_said_to_have_no_value(
+    recorded: Recorded, connect: Connect
+) -> None:
+    rover = recorded.robot()
+    for step in range(30):
+        rover.state(step * 0.1, {"n": step, "m": step})
+    assert chunk_whole_run(recorded.connection, 1)
+    recorded.connection.execute("DELETE FROM state")
+    of_n = "signal_id = (SELECT id FROM signal WHERE name = 'n')"
+    recorded.connection.execute(f"UPDATE chunk SET numbers = x'00' WHERE {of_n}")
+    async with connect() as client:
+        answer = await ask(client, "webots_query_history", signals=["n", "m"])
+    (run,) = answer["runs"]
+    assert run["numbers"]["n"] == {}
+    assert "the chunk of n is damaged" in answer["notes"][0]

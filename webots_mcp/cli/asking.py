@@ -333,7 +333,7 @@ def _parameter(question: Question, declared: inspect.Parameter) -> inspect.Param
     default = declared.default if isinstance(declared.default, bool) else None
     if declared.default is inspect.Parameter.empty:
         default = inspect.Parameter.empty
-    elif (usual := _DEFAULTS.get(name, declared.default)) not in (None, "", False, True):
+    elif not isinstance(usual := _DEFAULTS.get(name, declared.default), bool) and usual:
         text = f"{text} ({usual:g})" if isinstance(usual, float) else f"{text} ({usual})"
     text = text.replace("*", r"\*")  # help is Markdown, where two of them would be emphasis
     if default is None and type(None) not in get_args(kind):

@@ -18,6 +18,7 @@ from webots_mcp.plugins import export_formats
 if TYPE_CHECKING:
     import sqlite3
 
+    from webots_mcp.store.reading.ranges import TimeRange
     from webots_mcp.store.recording import Recording
     from webots_mcp.store.retention.planning import Plan
     from webots_mcp.store.retention.policy import Retention
@@ -143,9 +144,10 @@ def _export_table(
     with recorded.reader() as connection, shown_progress("exporting") as progress:
         if trial_set is not None:
             wanted = TrialTable.of(connection, trial_set)
+            notes = list(wanted.notes)
         else:
             wanted = part.in_recording(connection)
-        notes = list(wanted.notes)
+            notes = _notes_of(wanted)
         how: dict[str, Any] = {"safe_cells": safe_cells, "notes": notes}
         if file is None:
             write(connection, wanted, form, binary_stdout(), progress, **how)
@@ -167,7 +169,14 @@ def _export_for_viewers(recorded: Where, part: Range, file: Path, form: str) -> 
     data: dict[str, Any] = {"counts": by_kind}
     if written.beside:
         text, data["beside"] = f"{text}; {written.beside}", written.beside
-    return _Written(file, text, data, tuple(wanted.notes))
+    return _Written(file, text, data, (*_notes_of(wanted), *written.notes))
+
+
+def _notes_of(wanted: TimeRange) -> list[str]:
+    """Each call in a kept stretch is a row of an export, whatever else was asked for."""
+    from webots_mcp.store.reading.ranges import USE_EVERY_ROW
+
+    return [note.removesuffix(USE_EVERY_ROW) for note in wanted.notes]
 
 
 def _export_bundle(recorded: Where, part: Range, file: Path) -> _Written:

@@ -6,7 +6,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from webots_mcp.connection import connect, is_there, journal_mode
+from webots_mcp.connection import FrozenConnection, connect, is_there, journal_mode
 from webots_mcp.contract import HEARTBEAT_LATE_S, SCHEMA_VERSION
 from webots_mcp.diagnosis.doctor import Examined, Finding, ago, check, last_seen_s, worst
 from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
@@ -40,7 +40,8 @@ def database(subject: Examined) -> Finding:
     if subject.file is None:
         return Finding("ok", "in memory")
     with closing(connect(subject.file, "reader")) as connection:
-        mode = journal_mode(connection)
+        # A file that cannot be written is read as if it had no write-ahead log.
+        mode = "wal" if isinstance(connection, FrozenConnection) else journal_mode(connection)
     size = subject.file.stat().st_size
     seen = f"{subject.file}, {size / 1e6:.1f} MB"
     if mode != "wal":

@@ -66,8 +66,9 @@ class Part:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Where the range reaches outside the recording."""
-        return self.range.notes
+        """Where the range reaches outside the recording, and what of it could not be read."""
+        unread = (f"run {self.run.run_id}: {each}" for each in self.run.unread)
+        return (*self.range.notes, *unread)
 
 
 def parts_of(
@@ -104,8 +105,8 @@ def parts_of(
             alone = replace(each, segments=(segment,))
             parts.append(_part(connection, alone, run, count > 1))
     if not any(part.has_rows for part in parts):
-        notes = [note for each in ranges for note in each.notes]
-        raise NothingRecordedError("; ".join(["nothing was recorded in the range", *notes]))
+        notes = [note for history in histories for note in history.notes]
+        raise NothingRecordedError("; ".join(["there are no values in the range", *notes]))
     return _named_by_parameters(connection, [part for part in parts if part.has_rows])
 
 

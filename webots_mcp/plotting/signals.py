@@ -179,7 +179,9 @@ def _notes(parts: Sequence[Part], curves: Sequence[Curve]) -> list[str]:
         if too_large := [columns.name for columns in left if columns.too_large]:
             notes.append(f"beyond 1e100 in {part.name}: {listed(too_large)}")
         without_value = [
-            each.name for each in left if not each.whole.present and not each.too_large
+            each.name
+            for each in left
+            if not each.whole.present and not each.too_large and each.whole.rows
         ]
         if without_value and part.unread is None:
             notes.append(f"without a value in {part.name}: {listed(without_value)}")

@@ -100,7 +100,10 @@ def compose_trajectory(
             raise NothingRecordedError(
                 f"no position was read in time in {title_of(parts)}: ask for less time"
             )
-        raise NothingRecordedError(f"{x.name} and {y.name} have no values in {title_of(parts)}")
+        none = f"{x.name} and {y.name} have no values in {title_of(parts)}"
+        raise NothingRecordedError(
+            "; ".join([none, *(note for part in parts for note in part.notes)])
+        )
     metres = None if position else "m"
     labels = (_label(x, metres), _label(y, metres))
     axes = TrajectoryAxes(title_of(parts), *labels, tracks, mode)

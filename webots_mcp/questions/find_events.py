@@ -101,7 +101,7 @@ def webots_find_events(
         float, Field(gt=0, description="... within this many metres.")
     ] = EventOptions.stuck_m,
     missing_s: Annotated[
-        float, Field(gt=0, description="Silent: no value for so long.")
+        float, Field(gt=0, description="Missing: no value for so long.")
     ] = EventOptions.missing_s,
     position: Position = None,
     mode: Mode = None,

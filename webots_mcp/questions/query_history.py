@@ -177,7 +177,8 @@ def _number_series(
     if columns.too_large:
         return NumberSeries(replaced={**(replaced or {}), "beyond 1e100": columns.too_large})
     if not whole.present:
-        return NumberSeries(without_value=run.cut_at_s is None or None, replaced=replaced)
+        was_read = run.cut_at_s is None and whole.rows > 0
+        return NumberSeries(without_value=was_read or None, replaced=replaced)
     if run.step_s is None:
         return NumberSeries(unit=columns.unit, value=figures(columns.last), replaced=replaced)
     if whole.min == whole.max and columns.count == counts:

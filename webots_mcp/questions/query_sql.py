@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
@@ -38,6 +39,12 @@ _MOST_COLUMNS: Final = 60
 _AT_ONCE: Final = 2
 _LONGEST_WAIT_S: Final = 30.0
 _PROCESS_TIMEOUT_S: Final = 20.0  # its own deadline counts from when it has started
+_OF_STATES: Final = re.compile(r"\b(state|all_state|robot_now|robot_trajectory)\b", re.IGNORECASE)
+_DELETED: Final = "SELECT coalesce(sum(max(0, purged_rows)), 0) FROM run"
+_LESS: Final = (
+    "retention has deleted {} states (run.purged_rows), which no table or view of states has: "
+    "robot_statistics, webots_query_history and webots_get_trends have what chunks hold of them"
+)
 _turns: Final[RunVar[anyio.Semaphore]] = RunVar("statements that may run at once")
 
 
@@ -68,7 +75,7 @@ async def webots_query_sql(
     if is_for_a_person():
         max_bytes, most_columns = _BYTES_FOR_A_PERSON, sys.maxsize
     require_select(sql)
-    header = await to_thread.run_sync(_header, recording)
+    header, deleted = await to_thread.run_sync(_header, recording)
     found = await _run(recording, sql, limit or DEFAULT_ROWS, max_bytes)
     columns = [cut_for_a_model(name, LONGEST_NAME) for name in found.columns[:most_columns]]
     rows = [list(row[:most_columns]) for row in found.rows]
@@ -79,17 +86,21 @@ async def webots_query_sql(
         longest = budget_tokens // len(columns)  # a character has at most a token
         rows = [[_cut(each, longest) for each in rows[0]]]
     more = len(found.columns) > most_columns
+    wide = f"only the first {_MOST_COLUMNS} columns are shown" if more else None
+    less = _LESS.format(deleted) if deleted and _OF_STATES.search(sql) else None
     return SqlAnswer(
         **header,
         result=Table(columns=columns, rows=rows),
         truncated=_truncated(found, len(rows), longest),
-        hint=f"only the first {_MOST_COLUMNS} columns are shown" if more else _none(rows),
+        hint="; ".join(filter(None, (less, wide or _none(rows)))) or None,
     )
 
 
-def _header(recording: Recording) -> dict[str, Any]:
+def _header(recording: Recording) -> tuple[dict[str, Any], int]:
+    """And how many states retention has deleted."""
     with recording.reader() as connection:
-        return header_of_only(connection)
+        (deleted,) = connection.execute(_DELETED).fetchone()
+        return header_of_only(connection), deleted
 
 
 async def _run(recording: Recording, sql: str, max_rows: int, max_bytes: int) -> Result:

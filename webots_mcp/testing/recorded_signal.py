@@ -41,6 +41,7 @@ class RecordedSignal:
         """
         self.name = name
         self._run = run
+        self._unread = "; ".join(map(str, frame.unread_of(name)))
         self._times: list[float] = frame.times.tolist()
         self._ids: list[int] = frame.ids.tolist()
         self._values = values
@@ -164,6 +165,10 @@ class RecordedSignal:
         self._fail_at(list(bad), what, next((row for row in bad if bad[row] == worst), 0))
 
     def _fail_at(self, bad: Sequence[int], what: str, worst: int) -> None:
+        if not bad and self._unread:
+            raise AssertionError(
+                f"{self.name} of {self._run} was {self._unread}: nothing shows that it never {what}"
+            )
         if not bad:
             return
         times, values, first = self._times, self._values, bad[0]
@@ -192,7 +197,9 @@ class RecordedSignal:
         }
 
     def _no_number(self) -> str:
-        return f"{self.name} holds no number in the {len(self._values)} rows of {self._run}"
+        why = f" ({self._unread})" if self._unread else ""
+        rows = f"the {len(self._values)} rows of {self._run}"
+        return f"{self.name} holds no number in {rows}{why}"
 
 
 def _shown(value: Value) -> str:

@@ -21,7 +21,7 @@ from webots_mcp.bridge.encoding import encode
 from webots_mcp.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.chunks.making import GROUP_ROWS, make_chunks
-from webots_mcp.store.export import export
+from webots_mcp.store.export import FOR_VIEWERS, export, export_for_viewers
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.purge import prune
@@ -139,6 +139,28 @@ def test_a_damaged_chunk_is_said_and_costs_its_signal_alone() -> None:
         assert [json.loads(line)["y"] for line in found.splitlines()] == list(range(300))
         (note,) = notes
         assert "the chunk of x is damaged" in note
+
+
+@pytest.mark.parametrize("form", FOR_VIEWERS)
+def test_a_file_for_viewers_says_as_well_what_could_not_be_given_back(
+    form: str, tmp_path: Path
+) -> None:
+    pytest.importorskip({"rrd": "rerun"}.get(form, form), reason="its extra is not installed")
+    with memory_connection() as connection:
+        recorder = start_run(connection)
+        for step in range(3):
+            recorder.publish(step * 1.0, {"scan": [0.5] * 20, "x": step})
+        recorder.end_run("finished")
+        purged(connection)
+        connection.execute(
+            "UPDATE chunk SET numbers = x'00112233445566' WHERE signal_id = "
+            "(SELECT id FROM signal WHERE name = 'x')"
+        )
+        wanted = find_range(connection, Scope(run_id=1))
+        file = tmp_path / f"run.{form}"
+        lost, damaged = export_for_viewers(connection, tmp_path, wanted, form, file).notes
+    assert lost.startswith("3 values of run 1 are incomplete: their rows were deleted")
+    assert "the chunk of x is damaged" in damaged
 
 
 def test_of_chunks_that_are_deleted_too_the_time_is_said() -> None:

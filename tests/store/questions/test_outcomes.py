@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import Recorder
+from webots_mcp.store.chunks.making import chunk_whole_run
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.questions.compare import Comparison, compare_runs
 from webots_mcp.store.questions.outcomes import Measure
@@ -64,6 +65,21 @@ def test_what_was_not_looked_for_in_a_run_is_not_known_of_it(empty: sqlite3.Conn
     assert medians(stuck) == [pytest.approx(3.0, abs=0.02), None]
     (why,) = (why for names, why in found.unknown.items() if "stuck per min" in names)
     assert why.startswith("run 2: no position is known")
+
+
+@pytest.mark.parametrize("chunked", [False, True])
+def test_each_run_went_as_far_as_its_own_position_says(
+    empty: sqlite3.Connection, chunked: bool
+) -> None:
+    record(empty, "a", driving)
+    record(empty, "b", lambda time_s: {"pose": {"x": 0.6 * time_s, "y": 0.0}, "mode": "drive"})
+    record(empty, "c", without_position)
+    if chunked:
+        assert all(chunk_whole_run(empty, run_id) for run_id in (1, 2, 3))
+        empty.execute("DELETE FROM state")
+    found = compare_runs(empty, [1, 2, 3])
+    one, two, none = medians(measure(found, "distance_m"))
+    assert (one, two, none) == (pytest.approx(11.97), pytest.approx(23.94), None)
 
 
 def test_what_no_run_has_is_told_as_not_known(empty: sqlite3.Connection) -> None:

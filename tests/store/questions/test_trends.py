@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import random
 import re
@@ -13,6 +14,7 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import start_run
+from webots_mcp.store.chunks import making
 from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
 from webots_mcp.store.questions.trend import Trend
 from webots_mcp.store.questions.trends import RunTrends, trends
@@ -384,3 +386,42 @@ def test_a_signal_whose_chunk_is_damaged_is_not_said_to_have_no_value(
     told = ask(empty)
     assert (told.numbers, told.without_value) == ((), ())
     assert "the chunk of x is damaged" in told.unread[0]
+
+
+def test_a_damaged_chunk_costs_its_own_signal_alone(
+    empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(making, "GROUP_ROWS", 100)
+    recorder = start_run(empty)
+    for step in range(300):
+        mode = "a" if step < 50 else "b"
+        recorder.publish(step * 0.1, {"x": step, "mode": mode, "left": mode, "y": step})
+    assert chunk_whole_run(empty, 1)
+    empty.execute("DELETE FROM state")
+    empty.execute(
+        "UPDATE chunk SET numbers = x'00', codes = x'00' WHERE group_id = 1 AND signal_id IN "
+        "(SELECT id FROM signal WHERE name IN ('mode', 'x'))"
+    )
+    told, later = ask(empty), ask(empty, start_s=10.0, end_s=20.0)
+    assert {state.name: state.changes for state in told.states} == {"mode": 0, "left": 1}
+    assert {state.name: state.since_s for state in later.states} == {"mode": None, "left": 5.0}
+    assert [trend.summary.rows - trend.summary.present for trend in told.numbers] == [0, 0]
+
+
+@pytest.mark.parametrize("name", ["x", "yaw"])
+def test_nothing_rests_before_a_number_elsewhere_in_a_kept_stretch(
+    empty: sqlite3.Connection, name: str
+) -> None:
+    recorder = start_run(empty)
+    for step in range(240):
+        recorder.publish(step * 0.1, {name: 3.14159})
+    recorder.insert(
+        "kept_stretch", run_id=1, uuid="k", wall_time_s=0.0, reason="hit",
+        start_sim_time_s=10.0, end_sim_time_s=11.0,
+    )  # fmt: skip
+    last = -3.14159 if name == "yaw" else 1.0  # which is the same angle, and another number
+    for time_s, value in ((10.05, 1.0), (10.15, 1.0), (10.25, last)):
+        recorder.insert("kept_state", **recorder.at(time_s), data=json.dumps({name: value}))
+    trend = one(empty, name)
+    assert trend.flat_since_s == pytest.approx(10.2 if name == "yaw" else 10.3)
+    assert trend.says.startswith("between 1 (at 10.05 s) and 3.142")

@@ -44,7 +44,8 @@ def export_mcap(
         counts = write_mcap(contents, sink)
     with placed(layout_file(file)) as aside:
         aside.write_text(json.dumps(layout(contents), indent=2), "utf-8")
-    return Exported(counts, f"layout for Foxglove and Lichtblick: {layout_file(file)}")
+    beside = f"layout for Foxglove and Lichtblick: {layout_file(file)}"
+    return Exported(counts, beside, contents.source.notes)
 
 
 def layout_file(file: Path) -> Path:

@@ -51,7 +51,7 @@ def export_rrd(
     """As `export_for_viewers`."""
     with placed(file) as aside:
         contents = Contents.of(connection, data_dir, wanted, 1, progress)
-        return Exported(write_rrd(contents, aside))
+        return Exported(write_rrd(contents, aside), notes=contents.source.notes)
 
 
 def write_rrd(contents: Contents, file: Path) -> Counter[str]:

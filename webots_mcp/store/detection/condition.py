@@ -40,7 +40,7 @@ def condition_events(search: Search) -> Iterator[Event]:
     position = position_in(frame, search.known) if condition.asks_position else None
     first = int(np.searchsorted(frame.times, search.recorded.start_s))
     runs = where_held(condition, frame, position, first)
-    read = frame.was_read[first:]
+    read = frame.was_read()[first:]
     search.not_searched("condition", *map(str, frame.unread))
     if frame.unread and not read.any():
         raise NotSearchableError("; ".join(map(str, frame.unread)))
@@ -87,7 +87,7 @@ def where_held(
     if failed := first_failure(failures):
         place = f"in run {frame.run_id}, at {frame.times[failed.row]:.3f} s"
         raise InvalidInputError(f"{failed.why} ({place})")
-    return runs_of(holds & frame.was_read & (np.arange(len(frame)) >= first), frame.times)
+    return runs_of(holds & frame.was_read() & (np.arange(len(frame)) >= first), frame.times)
 
 
 def values_at(

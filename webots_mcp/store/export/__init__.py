@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections import Counter
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
@@ -24,10 +24,12 @@ class Exported(NamedTuple):
     Attributes:
         counts: How many there are of each kind: states, log lines, events, commands, pictures.
         beside: Which other file was written, and what for; empty where none was.
+        notes: What could not be given back of deleted rows.
     """
 
     counts: Counter[str]
     beside: str = ""
+    notes: Sequence[str] = ()
 
 
 _OWN: Final = (

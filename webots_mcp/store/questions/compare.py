@@ -143,12 +143,15 @@ def compare_runs(
     else:
         groups = _around_last_edit(connection, robot)
     options = options or EventOptions()
-    parts = [[_part(connection, run_id, options) for run_id in found] for found in groups.values()]
+    deadline = Deadline(deadline_s)
+    parts = [
+        [_part(connection, run_id, options, deadline) for run_id in found]
+        for found in groups.values()
+    ]
     segments = [part.segment for found in parts for part in found]
     durations_s = {segment.run_id: segment.end_s - segment.start_s for segment in segments}
     compared_s = min(durations_s.values())
     cut = [[each.cut(compared_s) for each in found] for found in parts]
-    deadline = Deadline(deadline_s)
     unread: dict[str, None] = {}
     differences = _differences(connection, cut, names, min_effect_sd, deadline, unread)
     shared = [each for each in differences if 0 not in each.count]
@@ -245,13 +248,18 @@ def _cut_notes(durations_s: dict[int, float], compared_s: float) -> list[str]:
     ]
 
 
-def _part(connection: sqlite3.Connection, run_id: int, options: EventOptions) -> RunPart:
+def _part(
+    connection: sqlite3.Connection, run_id: int, options: EventOptions, deadline: Deadline
+) -> RunPart:
     robot_id = fetch_run(connection, run_id).robot_id
     segment = whole_run(connection, run_id)
     if segment is None:
         raise NothingRecordedError(f"run {run_id} has no state row: there is nothing to compare")
     known = catalogue(connection, Subject(robot_id, "", run_id))
-    return RunPart(robot_id, segment, known, find_motion(known, options))
+    frame = read_frame(connection, segment, deadline)
+    telling = (name for name, each in known.items() if options.position or each.role)
+    here = {name for name in telling if frame.zones(name).value_count.any()}
+    return RunPart(robot_id, segment, known, find_motion(known, options, here))
 
 
 def _summarise(

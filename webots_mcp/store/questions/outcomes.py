@@ -47,6 +47,7 @@ _RATE: Final = " per min"
 NO_MODE: Final = (
     "no mode is known: publish one as a text, such as mode, or name the signal of one: mode=NAME"
 )
+NO_WAY: Final = "fewer than two rows have a position"
 OUT_OF_TIME: Final = "time limit reached before all rows were read: compare fewer runs at once"
 _SPEED: Final = "mean_speed_m_s"
 
@@ -295,11 +296,12 @@ def _outcome(
         unknown["distance_m, mean_speed_m_s"] = (NAME_POSITION,)
     else:
         read = read_way(connection, part.segment, position, deadline)
-        way = None if deadline.passed or read.unread else read.length
+        is_known = len(read.times) > 1 and not (deadline.passed or read.unread)
+        way = read.length if is_known else None
         speed = None if way is None else way.length_m / duration_s
         figures |= {"distance_m": way and way.length_m, _SPEED: speed}
         doubt = OUT_OF_TIME if deadline.passed else "; ".join(map(str, read.unread))
-        doubt = doubt or doubt_of_unit(position, speed or 0.0)
+        doubt = doubt or (NO_WAY if way is None else doubt_of_unit(position, speed or 0.0))
         if doubt := doubt or (way and doubt_of_length(way)):
             unknown["distance_m, mean_speed_m_s"] = (doubt,)
     modes, unread = _mode_times(connection, part, deadline)

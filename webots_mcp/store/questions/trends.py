@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.analysis.features import Spike, find_spikes
-from webots_mcp.store.analysis.summary import LARGEST, with_extremes
+from webots_mcp.store.analysis.arrays import Array, np
+from webots_mcp.store.analysis.features import FLAT_BAND, Spike, find_spikes
+from webots_mcp.store.analysis.summary import LARGEST, Summary, summarise_numbers, with_extremes
 from webots_mcp.store.analysis.swings import SHORTEST_PERIOD_ROWS
 from webots_mcp.store.chunks import making
 from webots_mcp.store.questions.series import STATES_SHARE, signals_left
 from webots_mcp.store.questions.trend import (
+    Course,
     Trend,
     course_of_means,
     course_of_values,
@@ -176,7 +178,7 @@ def _without_value(frame: Frame, found: Mapping[str, Trend | None]) -> Iterator[
     for name in (name for name, trend in found.items() if trend is None):
         if (np.abs(frame.numbers(name)) > LARGEST).any():
             yield f"{name} ({TOO_LARGE})"
-        elif frame.cut_at_s is None and frame.was_read.any():
+        elif frame.cut_at_s is None and frame.was_read(name).any():
             yield name
 
 
@@ -201,7 +203,30 @@ def _trend(frame: Frame, signal: Signal, kept: Frame | None) -> Trend | None:
         course = replace(course, counted=None if signal.turn is None else summary)
     if kept is not None and name in kept:
         summary = with_extremes(summary, summary_of(kept, signal))
+        course = _with_kept(course, summary, signal.turn, *kept.usable(name))
     return judge(signal, summary, course, spikes, too_large)
+
+
+def _with_kept(
+    course: Course, summary: Summary, turn: float | None, times: Array, numbers: Array
+) -> Course:
+    """A course with the numbers of kept stretches: extremes of an angle, and when it rests.
+
+    It rests no earlier than the last of them that lies elsewhere.
+    """
+    if course.counted is not None and turn is not None:
+        near = np.interp(times, course.times, course.numbers)
+        numbers = numbers + turn * np.round((near - numbers) / turn)
+        summary = with_extremes(course.counted, summarise_numbers(times, numbers))
+        course = replace(course, counted=summary)
+    if course.rest_s is None or summary.last is None:
+        return course
+    band = FLAT_BAND * ((summary.max or 0.0) - (summary.min or 0.0))
+    away = times[np.abs(numbers - summary.last) > band]
+    later = course.times[course.times > away.max(initial=-math.inf)]
+    least_s = 0.1 * (course.times[-1] - course.times[0])
+    rest_s = max(course.rest_s, float(later[0])) if len(later) else math.inf
+    return replace(course, rest_s=rest_s if course.times[-1] - rest_s >= least_s else None)
 
 
 def _state_trends(

@@ -103,6 +103,8 @@ def change_points(
                 before = read_frame(connection, whole, deadline)
             late = since and deadline.passed and len(before) > 0
             first = None if late else _in_force(before, signal, first, since=since)
+            if first is not None and since and _is_hidden(before, signal, first.sim_time_s):
+                since_before.add(signal.name)
         if first is None:
             since_before.update([signal.name] * (known and since))
         else:
@@ -132,9 +134,17 @@ def _in_force(
     if before.cut_at_s is not None or not rows:
         return at_begin if before.cut_at_s is None else None
     if at_begin is None:
-        (at_begin,) = _points_in(before.rows(rows - 1, rows), signal)
+        at_begin = next(iter(_points_in(before.rows(rows - 1, rows), signal)), None)
+    if at_begin is None:
+        return None
     row = _first_alike(before, signal, at_begin.value) if since else rows
     return at_begin if row == rows else Point(float(before.times[row]), at_begin.value)
+
+
+def _is_hidden(before: Frame, signal: Signal, time_s: float) -> bool:
+    """Whether the row before a time is one whose value could not be read."""
+    row = int(before.places([time_s])[0])
+    return row > 0 and not before.rows(row - 1, row).was_read(signal.name).all()
 
 
 def _first_alike(frame: Frame, signal: Signal, value: str | bool | None) -> int:
@@ -153,7 +163,7 @@ def _first_alike(frame: Frame, signal: Signal, value: str | bool | None) -> int:
 def _points_in(frame: Frame, signal: Signal) -> list[Point]:
     """The first value of a frame, and each that is unlike the one before."""
     values, codes = _valued(frame, signal)
-    read = frame.was_read
+    read = frame.was_read(signal.name)
     times, codes = frame.times[read], codes[read]
     rows = np.flatnonzero(np.diff(codes, prepend=-1))
     at = zip(times[rows].tolist(), codes[rows].tolist(), strict=True)

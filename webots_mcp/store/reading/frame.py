@@ -165,11 +165,19 @@ class Frame:
         """What is not in it, as far as its values were asked for."""
         return tuple(self._source.unread)
 
-    @property
-    def was_read(self) -> Flags:
-        """Which rows lie in no part that could not be read, of the values asked for so far."""
+    def unread_of(self, name: str) -> tuple[Unread, ...]:
+        """The same, without what concerns other signals alone."""
+        found = self._source.unread.items()
+        return tuple(part for part, of in found if of == name or not isinstance(of, str))
+
+    def was_read(self, name: str | None = None) -> Flags:
+        """Which rows lie in no part that could not be read, of the values asked for so far.
+
+        Args:
+            name: Of which signal, where the damage of others does not matter.
+        """
         read = np.ones(len(self), np.bool_)
-        for part in self.unread:
+        for part in self.unread if name is None else self.unread_of(name):
             read[slice(*self.places([part.start_s, math.nextafter(part.end_s, math.inf)]))] = False
         return read
 

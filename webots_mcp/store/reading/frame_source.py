@@ -58,7 +58,7 @@ class FrameSource:
         first_rows: Of each part, and how many rows there are in all.
         starts_s: Simulation time of the first row of each part; `ends_s` of the last one.
         order: The rows in order of time; None where they are.
-        unread: What could not be read so far.
+        unread: What could not be read so far, each of which column: None of all.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class FrameSource:
         self.run_id = run_id
         self.columns = columns
         self.ids = ids
-        self.unread: dict[Unread, None] = {}
+        self.unread: dict[Unread, Column | None] = {}
         self.order: Indexes | None = None
         sound = (groups[:, 3] >= 1) & (groups[:, 3] <= _MOST_ROWS) & (groups[:, 1] <= groups[:, 2])
         for _, start_s, end_s, *_ in groups[~sound].tolist():
@@ -165,7 +165,7 @@ class FrameSource:
             if values is not None:
                 return decoded_of(values)
         said = _NAMES.get(column, column)
-        self.unread[Unread(*span, f"the chunk of {said} is {error}")] = None
+        self.unread[Unread(*span, f"the chunk of {said} is {error}")] = column
         evenly: Array = np.linspace(*span, rows)
         if column == SIM_TIMES:  # so they keep the rows in order
             return Decoded(evenly, None, ())

@@ -63,7 +63,8 @@ def summary_of(frame: Frame, signal: Signal, kept: Frame | None = None) -> Summa
         return with_extremes(summary_of(frame, signal), summary_of(kept, signal))
     if reads_values(frame, signal):
         numbers = frame.usable(signal.name)
-        return summarise_numbers(*numbers, rows=len(frame), turn=signal.turn)
+        rows = int(np.count_nonzero(frame.was_read(signal.name)))
+        return summarise_numbers(*numbers, rows=rows, turn=signal.turn)
     found = _summary_of_zones(frame, signal.name)
     if signal.turn is None or not found.present:
         return found

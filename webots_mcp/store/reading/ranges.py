@@ -85,6 +85,7 @@ _SHOWN_ALIKE: Final = "SELECT min(time_s) FROM ({})".format(
         )
     )
 )
+USE_EVERY_ROW: Final = "; ask for such a stretch alone to use every row"
 MOST_RUNS: Final = 50  # that one range in wall time may hold
 
 
@@ -419,7 +420,7 @@ def _rate_notes(connection: sqlite3.Connection, segment: Segment) -> list[str]:
     kept = kept_notes(connection, *span)
     if segment.full_rate:
         return kept
-    inside = [f"{each}; ask for such a stretch alone to use every row" for each in kept]
+    inside = [f"{each}{USE_EVERY_ROW}" for each in kept]
     return [*inside, *hit_notes(connection, *span)]
 
 

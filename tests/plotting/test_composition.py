@@ -216,6 +216,13 @@ def test_a_path_is_broken_at_a_gap_and_at_a_leap(rover: sqlite3.Connection) -> N
     assert [round(path.places[index].time_s) for index in sorted(path.breaks)] == [95, 110]
 
 
+def test_the_path_of_a_run_is_that_of_its_own_position(record: Record) -> None:
+    published = iter([{"pose": [1, 2]}] * 100)
+    connection = record(lambda t: next(published, {"gps": {"x": t, "y": 0}}), 100, 100)
+    axes, _ = compose_trajectory(connection, [whole(connection, 2)])
+    assert axes.tracks[0].path.places[-1] == Place(9.9, 9.9, 0)
+
+
 def test_trouble_is_marked_where_it_was(rover: sqlite3.Connection) -> None:
     axes, _ = compose_trajectory(rover, [whole(rover)])
     (track,) = axes.tracks

@@ -132,6 +132,19 @@ async def test_over_a_reset_the_movement_is_told_run_by_run(
     assert second["run_id"] == first["run_id"] + 1
 
 
+async def test_each_run_moved_by_its_own_position(connect: Connect, rover: RecordedRobot) -> None:
+    drive(rover, [0, 0], [3, 4])
+    rover.end_run("reset")
+    rover.begin_run("reset")
+    for step in range(3):
+        rover.state(step * 0.5, {"gps": {"x": step, "y": 0}}, at=rover.now + step * 0.5)
+    async with connect() as client:
+        answer = await ask(client, "webots_monitor", lookback_wall_s=60)
+    first, second = answer["movement"]["runs"]
+    assert (first["position"], first["distance_m"]) == (["pose.0", "pose.1"], 5.0)
+    assert (second["position"], second["distance_m"]) == (["gps.x", "gps.y"], 2.0)
+
+
 def test_a_movement_says_from_when_on_rows_were_not_read(
     recorded: Recorded, rover: RecordedRobot, tmp_path: Path
 ) -> None:

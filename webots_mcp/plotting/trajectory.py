@@ -24,8 +24,9 @@ from webots_mcp.plotting.path import read_path
 from webots_mcp.plotting.plotted_intervals import Lane, lane_of, merged_notes
 from webots_mcp.plotting.trajectory_axes import Track, TrajectoryAxes, paint_trajectory
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.detection.motion import find_motion
-from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
+from webots_mcp.store.detection.motion import motion_in
+from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
+from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.signals.catalogue import one_signal
 from webots_mcp.store.signals.registry import Signal
@@ -79,7 +80,7 @@ def compose_trajectory(
     `deadline_s` is for each thing that is read; where a way was cut by it, it has no end.
     """
     known = known_signals(connection, ranges)
-    x, y = _position(known, position)
+    x, y = position_of(connection, known, ranges[-1], position)
     mode = mode_signal(known, bands)
     flags = _flags(known) if events else []
     names = [x.name, y.name, *([mode] if mode else []), *flags]
@@ -110,10 +111,22 @@ def compose_trajectory(
     return axes, tuple(dict.fromkeys((*_notes(parts, tracks), *unlooked)))
 
 
-def _position(known: Known, named: tuple[str, str] | None) -> tuple[Signal, Signal]:
+def position_of(
+    connection: sqlite3.Connection,
+    known: Known,
+    newest: TimeRange,
+    named: tuple[str, str] | None = None,
+) -> tuple[Signal, Signal]:
+    """The position that is drawn: the one named, else the one of the newest run.
+
+    Raises:
+        UnknownSignalError: No signal has such a name.
+        InvalidInputError: A name holds no numbers; none is named, and there is no position.
+    """
     if named is not None:
         return _number(known, named[0]), _number(known, named[1])
-    position = find_motion(known, EventOptions()).position
+    frame = read_frame(connection, newest.segments[-1], Deadline())
+    position = motion_in(frame, known, EventOptions()).position
     if position is None:
         numbers = [name for name, signal in known.items() if signal.is_number]
         raise InvalidInputError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sqlite3
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Final
 
 from webots_mcp.questions.bounds import newest_runs
 from webots_mcp.questions.budget import figure, seconds
@@ -13,13 +13,16 @@ from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import (
     doubt_of_length,
     doubt_of_unit,
-    find_motion,
+    motion_in,
 )
-from webots_mcp.store.questions.outcomes import Way, read_way
+from webots_mcp.store.questions.outcomes import Way, way_in
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
+from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range, row_before
 from webots_mcp.store.recording import View
 from webots_mcp.store.signals.catalogue import known_signals
+
+_NAMING: Final = ("position", "unit")  # said once where it is the same of all runs
 
 
 @dataclass(frozen=True)
@@ -65,32 +68,43 @@ def movement(
 ) -> dict[str, Any] | None:
     """Distance along the path and displacement, in metres; None without a position.
 
+    Each run has its own position: its controller may have had other names for it.
+
     Several runs are reported one by one: the jump to the start at a reset was not travelled. Where
     reading took longer than the deadline, the answer has the time since which rows are missing.
     """
     known = known_signals(view.connection, found)
-    position = find_motion(known, EventOptions()).position
-    if position is None:
-        return None
     deadline = Deadline(deadline_s)
-    names: dict[str, Any] = {"position": [signal.name for signal in position]}
     ways: dict[int, dict[str, Any]] = {}
-    speeds_m_s: list[float] = []
     for segment in found.segments:
-        way = read_way(view.connection, segment, position, deadline)
-        missing = {}
+        frame = read_frame(view.connection, segment, deadline)
+        position = motion_in(frame, known, EventOptions()).position
+        if position is None:
+            continue
+        way = way_in(frame, position)
+        facts = _distances(way) or {}
         if way.cut_at_s is not None:
-            missing = {"rows_missing_from_s": seconds(max(way.cut_at_s, segment.start_s))}
-        if facts := (_distances(way) or {}) | missing:
-            ways[segment.run_id] = facts
-            took_s = float(way.times[-1] - way.times[0]) if len(way.times) else 0.0
-            travelled_m: float = facts.get("distance_m") or 0.0
-            speeds_m_s.append(travelled_m / took_s if took_s else 0.0)
-    if doubt := doubt_of_unit(position, max(speeds_m_s, default=0.0)):
-        names |= {"unit": doubt}
-    if len(ways) > 1:
-        return names | {"runs": [{"run_id": run_id, **way} for run_id, way in ways.items()]}
-    return next((names | way for way in ways.values()), None)
+            facts["rows_missing_from_s"] = seconds(max(way.cut_at_s, segment.start_s))
+        if not facts:
+            continue
+        took_s = float(way.times[-1] - way.times[0]) if len(way.times) else 0.0
+        speed_m_s = (facts.get("distance_m") or 0.0) / took_s if took_s else 0.0
+        names: dict[str, Any] = {"position": [signal.name for signal in position]}
+        if doubt := doubt_of_unit(position, speed_m_s):
+            names["unit"] = doubt
+        ways[segment.run_id] = names | facts
+    if len(ways) < 2:
+        return next(iter(ways.values()), None)
+    shared = {
+        key: value
+        for key, value in next(iter(ways.values())).items()
+        if key in _NAMING and all(way.get(key) == value for way in ways.values())
+    }
+    own = {
+        run_id: {key: value for key, value in way.items() if key not in shared}
+        for run_id, way in ways.items()
+    }
+    return shared | {"runs": [{"run_id": run_id, **way} for run_id, way in own.items()]}
 
 
 def _distances(way: Way) -> dict[str, Any] | None:

@@ -20,13 +20,11 @@ from webots_mcp.naming import Value, spelled_out
 from webots_mcp.plotting.question import changed_most
 from webots_mcp.plotting.signal_axes import SignalAxes
 from webots_mcp.plotting.signals import compose_signals
-from webots_mcp.plotting.trajectory import compose_trajectory
+from webots_mcp.plotting.trajectory import compose_trajectory, position_of
 from webots_mcp.plotting.trajectory_axes import TrajectoryAxes
 from webots_mcp.plugins.page.choice import Choice
 from webots_mcp.plugins.report.charts.obstacles import Obstacle, obstacles_of
 from webots_mcp.plugins.report.charts.signal_panels import ROOM
-from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.images import StoredImage, newest_image
 from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines
 from webots_mcp.store.parameters import described
@@ -186,7 +184,7 @@ def gather(recording: Recording, shown: Look, choice: Choice) -> Drawing:
         names = names or tuple(changed_most(connection, ranges[0]))
         signals, notes = _composed(lambda: compose_signals(connection, ranges, names, room=ROOM))
         way, of_way = _composed(lambda: compose_trajectory(connection, ranges))
-        position = find_motion(known, EventOptions()).position if way else None
+        position = position_of(connection, known, ranges[-1]) if way else None
         return Drawing(
             names=names,
             read=_read(known, signals, way, position),

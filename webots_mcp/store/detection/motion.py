@@ -126,6 +126,20 @@ def in_metres(signal: Signal, lengths: Array) -> Array:
     return lengths * metres_in(signal.name)
 
 
+def motion_in(frame: Frame, known: dict[str, Signal], options: EventOptions) -> Motion:
+    """As `find_motion`, of what is published in a run: others of the robot may have other names.
+
+    Args:
+        frame: Of the run: its first or newest row has them.
+        known: All signals of the robot.
+        options: As for `find_motion`.
+    """
+    rows = [frame.rows(row, row + 1) for row in {0, len(frame) - 1}]
+    telling = [name for name, each in known.items() if options.position or each.role]
+    here = {name for name in telling if any(row.held(name).any() for row in rows)}
+    return find_motion(known, options, here)
+
+
 def doubt_of_unit(position: tuple[Signal, Signal], speed_m_s: float) -> str | None:
     """That a position without a unit in its names is hardly in metres; None where it may be."""
     name = position[0].name

@@ -14,7 +14,7 @@ from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.analysis.summary import LARGEST
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import EventKind, NotSearchableError
-from webots_mcp.store.detection.motion import Motion, find_motion
+from webots_mcp.store.detection.motion import Motion, motion_in
 from webots_mcp.store.detection.verdict import Ledger
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import Frame, read_frame
@@ -91,15 +91,8 @@ class Search:
 
     @cached_property
     def motion(self) -> Motion:
-        """The signals that tell how the robot moves in this run; others may have had others.
-
-        The first or the newest row has them.
-        """
-        rows = [self.whole.rows(row, row + 1) for row in {0, len(self.whole) - 1}]
-        all_count = self.options.position is not None
-        telling = [name for name, each in self.known.items() if all_count or each.role]
-        here = {name for name in telling if any(row.held(name).any() for row in rows)}
-        return find_motion(self.known, self.options, here)
+        """The signals that tell how the robot moves in this run."""
+        return motion_in(self.whole, self.known, self.options)
 
     @cached_property
     def signals(self) -> list[Signal]:

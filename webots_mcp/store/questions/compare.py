@@ -16,7 +16,7 @@ from webots_mcp.parameter import Value
 from webots_mcp.store.analysis.spread import MIN_EFFECT_SD
 from webots_mcp.store.analysis.summary import Summary
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.detection.motion import find_motion
+from webots_mcp.store.detection.motion import motion_in
 from webots_mcp.store.parameters import differing, parameters_of
 from webots_mcp.store.questions.differences import Difference, difference_of, only_in, size_of
 from webots_mcp.store.questions.outcomes import (
@@ -257,9 +257,7 @@ def _part(
         raise NothingRecordedError(f"run {run_id} has no state row: there is nothing to compare")
     known = catalogue(connection, Subject(robot_id, "", run_id))
     frame = read_frame(connection, segment, deadline)
-    telling = (name for name, each in known.items() if options.position or each.role)
-    here = {name for name in telling if frame.zones(name).value_count.any()}
-    return RunPart(robot_id, segment, known, find_motion(known, options, here))
+    return RunPart(robot_id, segment, known, motion_in(frame, known, options))
 
 
 def _summarise(

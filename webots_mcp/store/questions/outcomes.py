@@ -26,14 +26,14 @@ from webots_mcp.store.detection.motion import (
     Motion,
     doubt_of_length,
     doubt_of_unit,
-    find_motion,
     in_metres,
+    motion_in,
 )
 from webots_mcp.store.detection.registry import asked_kinds
 from webots_mcp.store.questions.events import Found, search_events
 from webots_mcp.store.reading.changes import change_points
 from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.frame import read_frame
+from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.frame_source import Unread
 from webots_mcp.store.reading.ranges import Segment, TimeRange, whole_run
 from webots_mcp.store.reading.subject import Subject
@@ -75,14 +75,8 @@ class Way:
         return travelled(tracks_of(self.times, self.x_m, self.y_m))
 
 
-def read_way(
-    connection: sqlite3.Connection,
-    segment: Segment,
-    position: tuple[Signal, Signal],
-    deadline: Deadline,
-) -> Way:
-    """The way of a robot in a segment, as far as it is read before the deadline."""
-    frame = read_frame(connection, segment, deadline)
+def way_in(frame: Frame, position: tuple[Signal, Signal]) -> Way:
+    """The way of a robot in a frame, as far as it is read before the deadline."""
     x, y = (in_metres(each, frame.numbers(each.name)) for each in position)
     there = np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M
     return Way(frame.times[there], x[there], y[there], frame.cut_at_s, frame.unread)
@@ -96,10 +90,11 @@ def way_of_run(
     if whole is None:
         return None
     asked = TimeRange(subject.robot_id, subject.robot, (whole,), "simulation")
-    position = find_motion(known_signals(connection, asked), EventOptions()).position
+    frame = read_frame(connection, whole, deadline)
+    position = motion_in(frame, known_signals(connection, asked), EventOptions()).position
     if position is None:
         return None
-    way = read_way(connection, whole, position, deadline)
+    way = way_in(frame, position)
     return None if way.unread or len(way.times) < 2 else way.length
 
 
@@ -295,7 +290,7 @@ def _outcome(
     if position is None:
         unknown["distance_m, mean_speed_m_s"] = (NAME_POSITION,)
     else:
-        read = read_way(connection, part.segment, position, deadline)
+        read = way_in(read_frame(connection, part.segment, deadline), position)
         is_known = len(read.times) > 1 and not (deadline.passed or read.unread)
         way = read.length if is_known else None
         speed = None if way is None else way.length_m / duration_s

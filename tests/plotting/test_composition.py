@@ -219,6 +219,7 @@ def test_a_path_is_broken_at_a_gap_and_at_a_leap(rover: sqlite3.Connection) -> N
 def test_the_path_of_a_run_is_that_of_its_own_position(record: Record) -> None:
     published = iter([{"pose": [1, 2]}] * 100)
     connection = record(lambda t: next(published, {"gps": {"x": t, "y": 0}}), 100, 100)
+    assert all(chunk_whole_run(connection, run_id) for run_id in (1, 2))
     axes, _ = compose_trajectory(connection, [whole(connection, 2)])
     assert axes.tracks[0].path.places[-1] == Place(9.9, 9.9, 0)
 

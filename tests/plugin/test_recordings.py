@@ -152,6 +152,28 @@ def test_states_and_signals_are_the_same_once_their_rows_are_deleted(
         story.signal("sensors.front_m").assert_never_below(0.65)
 
 
+@pytest.mark.parametrize("loss", ["UPDATE chunk SET numbers = x'00'", "DELETE FROM row_group"])
+def test_what_was_lost_of_a_run_fails_a_test_that_asks_for_it(
+    story: RobotRecording, tmp_path: Path, loss: str
+) -> None:
+    """Limits held, conditions never did, and minima were those of what was left."""
+    with closing(connect(story.database, "writer")) as connection:
+        prune(connection, tmp_path, Retention(state=Limit(rows=0)), rest=False)
+        connection.execute(loss)
+        connection.execute(
+            "INSERT INTO state (run_id, sim_time_s, wall_time_s, data) "
+            """SELECT id, 9.0, 2e9, '{"sensors": {"front_m": 1.0}, "mode": "turn"}' FROM run"""
+        )
+    for ask in (
+        lambda: story.signal("sensors.front_m").assert_never_below(0.65),
+        lambda: story.held("sensors.front_m < 0.65"),
+        lambda: story.find_events("jump"),
+        story.states,
+    ):
+        with pytest.raises(NothingRecordedError, match=r"not read from .* (damaged|deleted)"):
+            ask()
+
+
 def test_events_and_logs_come_in_order_and_by_kind(story: RobotRecording) -> None:
     assert [event.kind for event in story.events()] == ["start"] + ["change"] * 4
     changed = [event.details()["to"] for event in story.events("change") if event.name == "mode"]

@@ -6,7 +6,7 @@ import json
 import math
 import sqlite3
 import sys
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from functools import partial
 from typing import Any, Final, Literal
@@ -94,7 +94,8 @@ class RobotRecording:
 
         Raises:
             UnknownSignalError: None matches.
-            NoDatabaseError, NothingRecordedError: Nothing has been recorded yet.
+            NoDatabaseError, NothingRecordedError: Nothing has been recorded yet, or not all of it
+                is there any more: what was not read could break any limit.
         """
         with self._subject() as (connection, subject):
             run = f"run {subject.run_id} of robot {subject.robot!r}"
@@ -105,21 +106,29 @@ class RobotRecording:
             frame = read_frame(connection, segment, Deadline(math.inf))
             meant = resolve_signals(signals_of_frame(connection, subject, frame), [pattern])
             state_of = partial(self._state, subject.run_id)
-            return [
+            found = [
                 RecordedSignal(
                     each.name, run, frame, cleaned(each, frame.values(each.name)), state_of
                 )
                 for each in meant
             ]
+            _require_all(run, frame.unread)
+        return found
 
     def states(self) -> list[dict[str, Any]]:
         """What was published, row by row; "nan", "inf" and the like where JSON holds null.
 
         Rows that retention has deleted come from their chunks, without long arrays and texts.
+
+        Raises:
+            NothingRecordedError: Not all of them are there any more.
         """
         with self._subject() as (connection, subject):
-            rows = _rows(connection, subject.run_id)
-            return [row.value() for row in rows if row.id > 0]
+            source = _source(connection, subject.run_id)
+            states = [row.value() for row in _rows(source) if row.id > 0]
+            run = f"run {subject.run_id} of robot {subject.robot!r}"
+            _require_all(run, [unread for each in source.purged for unread in each.unread])
+        return states
 
     # -- what happened -------------------------------------------------------------------------
 
@@ -140,7 +149,8 @@ class RobotRecording:
         Raises:
             InvalidInputError: There is no such kind.
             NothingRecordedError: A named kind could not be looked for: without a position, say,
-                nobody knows whether the robot was stuck, and an empty list would claim to.
+                nobody knows whether the robot was stuck, and an empty list would claim to. Or not
+                all of the run could be read.
         """
         wanted = EventOptions(kinds=kinds, **options)
         with self._subject() as (connection, subject):
@@ -151,6 +161,8 @@ class RobotRecording:
         for kind in kinds:
             if (why := found.verdicts.unlooked(kind)) is not None:
                 raise NothingRecordedError(f"{kind} could not be looked for: {why}")
+        unread = [each for kind in found.verdicts.reasons for each in found.verdicts.unread(kind)]
+        _require_all(f"run {subject.run_id} of robot {subject.robot!r}", unread)
         return list(found.events)
 
     def held(self, condition: str) -> list[FoundEvent]:
@@ -248,14 +260,22 @@ class RobotRecording:
 
     def _state(self, run_id: int, state_id: int) -> str:
         with closing(self._connect("reader")) as connection:
-            rows = _rows(connection, run_id)
+            rows = _rows(_source(connection, run_id))
             return next((row.data for row in rows if row.id == state_id), "deleted since")
 
 
-def _rows(connection: sqlite3.Connection, run_id: int) -> Iterator[State]:
-    """The rows of a run, in order; those that were deleted come from their chunks."""
+def _require_all(run: str, unread: Iterable[object]) -> None:
+    if missing := "; ".join(dict.fromkeys(map(str, unread))):
+        raise NothingRecordedError(f"of {run} not all is there: {missing}")
+
+
+def _source(connection: sqlite3.Connection, run_id: int) -> Source:
     segment = whole_run(connection, run_id)
-    source = Source.of(connection, [segment] if segment else [], 1, None)
+    return Source.of(connection, [segment] if segment else [], 1, None)
+
+
+def _rows(source: Source) -> Iterator[State]:
+    """The rows of a run, in order; those that were deleted come from their chunks."""
     return (State(row.state_id, row.run_id, *row[2:]) for row in source.recorded())
 
 

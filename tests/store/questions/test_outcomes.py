@@ -260,16 +260,25 @@ def test_of_what_was_not_read_in_time_no_figure_is_told(empty: sqlite3.Connectio
 def test_of_a_run_whose_first_half_was_deleted_with_its_chunks_no_figure_is_told(
     empty: sqlite3.Connection,
 ) -> None:
-    """Its way was that of the second half, over the time of both, and so were shares and means."""
-    for code in "ab":
-        record(empty, code, driving)
+    """Its way was that of the second half, over the time of both, and so were shares and means.
+
+    So were events per minute; and extremes of a group were those of its other runs.
+    """
+
+    def with_spikes(time_s: float) -> dict[str, Any]:
+        return driving(time_s) | {"front_m": 1.0 if round(time_s * 10) % 50 else 9.0}
+
+    for code in "aab":
+        record(empty, code, with_spikes)
     empty.execute("DELETE FROM state WHERE run_id = 1 AND sim_time_s < 20")
     empty.execute("UPDATE run SET purged_rows = 200 WHERE id = 1")
-    found = compare_runs(empty, [1, 2])
-    for name in ("distance_m", "mean_speed_m_s", "share of drive"):
+    found = compare_runs(empty, [1, 2, 3])
+    assert [len(group.runs) for group in found.groups] == [2, 1]
+    for name in ("distance_m", "mean_speed_m_s", "share of drive", "jump per min"):
         assert [median is None for median in medians(measure(found, name))] == [True, False], name
-    assert {each.mean[0] for each in found.differences} == {None}
-    for name in ("distance_m", "mean_speed_m_s", "share of each mode", "means of signals"):
+    assert {e for each in found.differences for e in (each.mean[0], each.max[0])} == {None}
+    told = ("distance_m", "mean_speed_m_s", "share of each mode", "means of signals", "gap per min")
+    for name in told:
         (why,) = (why for names, why in found.unknown.items() if name in names.split(", "))
         assert "run 1: not read from 0.000 to 20.000 s: deleted by retention" in why
 

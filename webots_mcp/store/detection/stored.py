@@ -89,6 +89,9 @@ def gap_events(search: Search) -> Iterator[Event]:
     segment = _recorded(search)
     around = frame_around(search.connection, segment, search.deadline)
     _note_unread(search, "gap", around.cut_at_s)
+    asked = search.segment
+    left = (e for e in around.unread if e.end_s > asked.start_s and e.start_s < asked.end_s)
+    search.not_searched("gap", *map(str, left))
     rhythm = rhythm_in(around)
     for gap in rhythm.gaps:
         if gap.end_s > segment.start_s and gap.start_s < segment.end_s:

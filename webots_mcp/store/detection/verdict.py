@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import EventKind
+from webots_mcp.store.reading.frame_source import NOT_READ
 
 
 def count_by_kind(events: Iterable[Event]) -> Counter[str]:
@@ -75,6 +76,10 @@ class Verdicts:
         """Why a kind was not looked for anywhere; None if it was, at least in a part."""
         looked = kind in self.found or kind in self.not_found
         return None if looked else self.not_searched.get(kind)
+
+    def unread(self, kind: str) -> list[str]:
+        """What of the range could not be read for a kind: its count is that of the rest."""
+        return [each for each in self.reasons.get(kind, ()) if each.startswith(NOT_READ)]
 
 
 @dataclass

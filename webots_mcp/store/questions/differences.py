@@ -65,6 +65,7 @@ def difference_of(
     is_whole = [len(a) == len(b) for a, b in zip(whole, groups, strict=True)]
     runs = [[run.get(signal.name, Summary()) for run in group] for group in whole]
     runs = [[each for each in group if each.sum is not None] for group in runs]
+    read = [group if all_read else [] for group, all_read in zip(runs, is_whole, strict=True)]
     known = all(each.sines is not None for group in runs for each in group)
     turn = signal.turn if known else None
     means, deviations = (
@@ -83,11 +84,11 @@ def difference_of(
         deviation=deviation,
         min=[
             min((each.min for each in group if each.min is not None), default=None)
-            for group in runs
+            for group in read
         ],
         max=[
             max((each.max for each in group if each.max is not None), default=None)
-            for group in runs
+            for group in read
         ],
         count=[
             sum(each.present for each in group) if all_read else None

@@ -257,7 +257,7 @@ class _Outcome(NamedTuple):
         has_mode: Its mode is known: one in which it never was took no time.
         events: How many of each kind.
         unknown: What is not known of it, or not wholly, with why.
-        unlooked: Kinds that were not looked for at all.
+        unlooked: Kinds that were not looked for at all, or not in rows that could not be read.
         complete: All rows were looked at.
     """
 
@@ -320,7 +320,7 @@ def _outcome(
         bool(modes),
         Counter({kind: count for kind, count in counts.items() if count}),
         unknown,
-        frozenset(kind for kind in verdicts.not_searched if verdicts.unlooked(kind)),
+        frozenset(e for e in verdicts.reasons if verdicts.unlooked(e) or verdicts.unread(e)),
         not deadline.passed,
     )
 

@@ -22,6 +22,7 @@ from webots_mcp.store.chunks.stored import (
 )
 
 _MOST_ROWS: Final = 2**20  # of a group: no maker puts more than 1,024 into one
+NOT_READ: Final = "not read from"  # how what says that a part is not in a frame begins
 MOST_KEPT_BYTES: Final = 32_000_000  # of values that a frame keeps for who asks again
 Column = str | int  # the name of a signal, or what has a chunk of its own (SIM_TIMES, ...)
 T = TypeVar("T")
@@ -45,7 +46,7 @@ class Unread(NamedTuple):
     why: str
 
     def __str__(self) -> str:
-        return f"not read from {self.start_s:.3f} to {self.end_s:.3f} s: {self.why}"
+        return f"{NOT_READ} {self.start_s:.3f} to {self.end_s:.3f} s: {self.why}"
 
 
 class FrameSource:

@@ -27,7 +27,12 @@ from typing import Final, Literal
 from webots_mcp.errors import InvalidRangeError, NothingRecordedError
 from webots_mcp.store.reading.kept import is_at_full_rate, kept_notes
 from webots_mcp.store.reading.subject import Subject, find_subject
-from webots_mcp.store.reading.wall_time import frame_of_purged, parse_wall_time, simulation_times
+from webots_mcp.store.reading.wall_time import (
+    frame_of_purged,
+    parse_wall_time,
+    rising_parts,
+    simulation_times,
+)
 
 _DECIMALS: Final = 3
 _LAST_BEFORE: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s < ?"
@@ -453,9 +458,11 @@ def _in_wall_time(
 ) -> TimeRange:
     wanted = (subject.robot_id, wall_end_s, wall_start_s, run_id, run_id, MOST_RUNS + 1)
     runs = [run for (run,) in connection.execute(_RUNS_IN, wanted).fetchall()]
-    cuts = (_cut(connection, run, wall_start_s, wall_end_s) for run in reversed(runs[:MOST_RUNS]))
+    notes: list[str] = []
+    walls = (wall_start_s, wall_end_s)
+    cuts = (_cut(connection, run, *walls, notes) for run in reversed(runs[:MOST_RUNS]))
     segments = tuple(segment for segment in cuts if segment is not None)
-    notes = [] if segments else [f"no row of robot {subject.robot!r} in that wall time"]
+    notes += [] if segments else [f"no row of robot {subject.robot!r} in that wall time"]
     for segment in segments:
         notes += _rate_notes(connection, segment)
     if len(runs) > MOST_RUNS:
@@ -464,12 +471,23 @@ def _in_wall_time(
 
 
 def _cut(
-    connection: sqlite3.Connection, run_id: int, wall_start_s: float, wall_end_s: float
+    connection: sqlite3.Connection,
+    run_id: int,
+    wall_start_s: float,
+    wall_end_s: float,
+    notes: list[str],
 ) -> Segment | None:
-    """The part of a run in [wall_start_s, wall_end_s)."""
+    """The part of a run in [wall_start_s, wall_end_s); of several, the newest."""
     recorded = recorded_bounds(connection, run_id)
     walls = (wall_start_s, wall_end_s)
-    found = simulation_times(connection, run_id, recorded, walls) if recorded else None
+    parts = rising_parts(connection, run_id, recorded) if recorded else []
+    if back := ", ".join(_told(start_s) for start_s, _ in parts[-2::-1]):
+        notes.append(
+            f"run {run_id}: its clock was set back at {back} s: of the parts in between, the "
+            "newest with such wall times is meant"
+        )
+    founds = (simulation_times(connection, run_id, part, walls) for part in parts)
+    found = next((each for each in founds if each), None)
     if found is None:
         return None
     start_s, last_s = found

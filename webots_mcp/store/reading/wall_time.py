@@ -9,6 +9,7 @@ from datetime import datetime
 from typing import TYPE_CHECKING, Final
 
 from webots_mcp.errors import InvalidRangeError
+from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.reading.deadline import Deadline
 
 if TYPE_CHECKING:
@@ -29,6 +30,19 @@ UP_TO: Final = (  # of the last row at or before a simulation time
 _FROM: Final = (  # of the first row at or after a simulation time
     "SELECT wall_time_s FROM state WHERE run_id = ? AND sim_time_s >= ? "
     "ORDER BY sim_time_s, id LIMIT 1"
+)
+_SET_BACK_S: Final = 1.0  # less is what keeps a clock right
+# Whether wall time falls with simulation time: by what chunks come to, and by rows in none.
+_FALLS: Final = (
+    "SELECT 1 FROM (SELECT min, max, first, last, lag(last) OVER (ORDER BY at_s, id) AS before "
+    "FROM (SELECT g.start_sim_time_s AS at_s, 0 AS id, min, max, first, last FROM chunk c "
+    "JOIN row_group g ON g.id = c.group_id "
+    "WHERE c.run_id = :run AND c.signal_id = -1 AND g.is_complete = 1 UNION ALL "
+    "SELECT sim_time_s, id, wall_time_s, wall_time_s, wall_time_s, wall_time_s FROM state "
+    "WHERE run_id = :run AND sim_time_s > coalesce((SELECT max(end_sim_time_s) FROM row_group "
+    "WHERE run_id = :run AND is_complete = 1), -9e999))) "
+    f"WHERE first < before - {_SET_BACK_S} OR min < first - {_SET_BACK_S} "
+    f"OR max > last + {_SET_BACK_S} LIMIT 1"
 )
 _BISECTIONS: Final = 60
 _LONGEST_SHOWN: Final = 80
@@ -63,6 +77,24 @@ def _iso_seconds(text: str) -> float:
         ) from error
 
 
+def rising_parts(
+    connection: sqlite3.Connection, run_id: int, recorded: tuple[float, float]
+) -> list[tuple[float, float]]:
+    """Simulation times between which the wall clock of a run was not set back, the newest first.
+
+    Args:
+        connection: Any.
+        run_id: Which.
+        recorded: Simulation times of its first and newest row.
+    """
+    if not connection.execute(_FALLS, {"run": run_id}).fetchone():
+        return [recorded]
+    frame = _all_rows(connection, run_id)
+    after = np.flatnonzero(np.diff(frame.wall_times) < -_SET_BACK_S) + 1
+    starts = [recorded[0], *frame.times[after].tolist()]
+    return list(zip(starts, [*frame.times[after - 1].tolist(), recorded[1]], strict=True))[::-1]
+
+
 def simulation_times(
     connection: sqlite3.Connection,
     run_id: int,
@@ -71,12 +103,12 @@ def simulation_times(
 ) -> tuple[float, float] | None:
     """First and last simulation time of a run in [start, end) of wall time; None without any.
 
-    Wall time rises with simulation time, so both are found by bisection.
+    Wall time rises with simulation time there, so both are found by bisection.
 
     Args:
         connection: Any.
         run_id: Which.
-        recorded: Simulation times of its first and newest row, purged ones too.
+        recorded: Simulation times between which to look; see `rising_parts`.
         walls: Unix times.
     """
     clock = RunClock(connection, run_id)
@@ -99,6 +131,10 @@ def frame_of_purged(connection: sqlite3.Connection, run_id: int) -> Frame | None
     """All rows of a run that has lost some from `state`; None where that table has all of them."""
     if not connection.execute(_IS_PURGED, (run_id,)).fetchone():
         return None
+    return _all_rows(connection, run_id)
+
+
+def _all_rows(connection: sqlite3.Connection, run_id: int) -> Frame:
     from webots_mcp.store.reading.frame import read_frame  # which imports this module
     from webots_mcp.store.reading.ranges import Segment
 

@@ -12,6 +12,7 @@ import pytest
 from tests.recordings.rows import Recorded, RecordedRobot, insert
 from webots_mcp.contract import ISSUED_TIME_TO_LIVE_S
 from webots_mcp.liveness import process_identity, reap
+from webots_mcp.store.recording import look
 from webots_mcp.waiting_file import FORMAT, adopt
 
 STATUS = "SELECT status FROM command"
@@ -74,6 +75,21 @@ def test_rows_that_are_adopted_after_a_crash_are_counted(recorded: Recorded) -> 
     leave_waiting(recorded.database, [1, "state", "r", [2.0, time.time(), "{}", None]])
     assert adopt(recorded.connection, recorded.database) == 1
     assert recorded.connection.execute("SELECT row_count FROM run").fetchone() == (2,)
+
+
+def test_rows_that_a_dead_controller_left_beside_the_database_are_told_until_they_are_adopted(
+    recorded: Recorded,
+) -> None:
+    """A server that may not write answered as if the recording ended before them."""
+    assert isinstance(recorded.database, Path)
+    robot = recorded.robot(uuid="u", pid=NOBODY)
+    robot.state(1.0, {"n": 1})
+    recorded.connection.execute("UPDATE run SET uuid = 'r'")
+    leave_waiting(recorded.database, [1, "state", "r", [2.0, time.time(), "{}", None]])
+    why = look(recorded.connection, None).status.why
+    assert "killed or crashed); its last rows wait in webots.db-waiting-u.jsonl" in (why or "")
+    adopt(recorded.connection, recorded.database)
+    assert "wait in" not in (look(recorded.connection, None).status.why or "")
 
 
 @pytest.mark.skipif(process_identity(os.getpid()) is None, reason="needs the system's word")

@@ -77,6 +77,10 @@ _WAITING: Final = (
     "the database takes no rows: those of its controller wait in {0} next to it, for {1:.0f} s now "
     "(is the disk full, or does another program hold a lock?); what is shown here is older"
 )
+_LEFT_WAITING: Final = (
+    "its last rows wait in {} next to the database, until a server that may write there (not "
+    "--read-only) takes them in: what is shown here is older"
+)
 _STARTED: Final = "its controller has just started; simulation time has not moved yet"
 _NOT_STARTED: Final = (
     "its controller has started, but simulation time has not moved since: the simulation may be "
@@ -119,7 +123,11 @@ def judge(
         return Status(NEVER_SEEN)
     moved_s = _moved_wall_time_s(connection, session, run)
     if not session.is_alive(now_s):
-        return _stopped(session, moved_s, now_s, _why_ended(connection, session))
+        why = _why_ended(connection, session)
+        if (backlog := find_backlog(connection, session)) is not None:
+            moved_s = max(moved_s or 0.0, backlog.newest_wall_time_s)
+            why = "; ".join(filter(None, (why, _LEFT_WAITING.format(backlog.file_name))))
+        return _stopped(session, moved_s, now_s, why)
     if holder := find_holder(connection, session, now_s):
         if holder is session:
             return Status(PAUSED, breakpoint_at(connection, session.id))

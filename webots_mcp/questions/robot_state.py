@@ -145,8 +145,8 @@ def _nothing_yet(view: View) -> str:
     (purged_rows,) = view.connection.execute(_PURGED, (run_id,)).fetchone() or (0,)
     if purged_rows:
         return (
-            f"all states of this run are gone: retention has deleted {purged_rows}; for their "
-            "values, as far as chunks hold them, ask webots_get_trends or webots_query_history"
+            f"the newest states of this run are gone: retention has deleted {purged_rows}; for "
+            "their values, as far as chunks hold them, webots_get_trends or webots_query_history"
         )
     earlier = view.connection.execute(_EARLIER, (view.robot.id, run_id)).fetchone()[0]
     if earlier is None:

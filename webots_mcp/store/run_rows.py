@@ -94,6 +94,9 @@ _NEWEST_STATE: Final = (
     "AND sim_time_s <= :until ORDER BY sim_time_s DESC, id DESC LIMIT 1)) "
     "ORDER BY sim_time_s DESC, wall_time_s DESC LIMIT 1"
 ).format(columns=_STATE_COLUMNS, kept=_STATE_COLUMNS.partition(", ")[2])
+_CHUNKS_END: Final = (
+    "SELECT max(end_sim_time_s) FROM row_group WHERE run_id = ? AND is_complete = 1"
+)
 _RECENT_TIMES: Final = (
     "SELECT sim_time_s, wall_time_s FROM state WHERE run_id = ? "
     "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
@@ -153,8 +156,12 @@ def _no_such_run(connection: sqlite3.Connection, run_id: int, robot_id: int | No
 
 
 def newest_state(connection: sqlite3.Connection, run_id: int) -> State | None:
-    """The latest row of a run."""
-    return _state_up_to(connection, run_id, _LATER_THAN_ANY)
+    """The latest row of a run; None where retention has deleted it."""
+    state = _state_up_to(connection, run_id, _LATER_THAN_ANY)
+    if state is None or state.id > 0:
+        return state
+    (ended_s,) = connection.execute(_CHUNKS_END, (run_id,)).fetchone()
+    return None if ended_s is not None and ended_s > state.sim_time_s else state
 
 
 def state_at(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> State | None:

@@ -14,9 +14,11 @@ from webots_mcp.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.questions.series import query_history
 from webots_mcp.store.reading.ranges import Scope, find_range
+from webots_mcp.store.recording import look
 from webots_mcp.store.retention.planning import plan
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.purge import prune
+from webots_mcp.store.run_rows import newest_state
 
 NONE = Limit(rows=0)
 ALL = Limit()
@@ -64,6 +66,17 @@ def test_they_stay_whole_where_all_states_go(
     (run,) = query_history(connection, asked, ["n"], max_points=500).runs
     assert run.rows == 438
     assert run.numbers[0].last == [float(n) for n in before[0]]
+
+
+def test_they_are_not_told_as_the_newest_state_of_a_run_whose_later_rows_are_deleted(
+    connection: sqlite3.Connection, tmp_path: Path
+) -> None:
+    """The robot was said to be where it was in the stretch, at that time and so long ago."""
+    newest = newest_state(connection, 1)
+    assert newest is not None
+    prune(connection, tmp_path, Retention(state=NONE, kept_state=ALL), rest=False)
+    assert newest_state(connection, 1) is None
+    assert look(connection, None).header()["sim_time_s"] == pytest.approx(newest.sim_time_s, abs=1)
 
 
 def test_their_own_limit_takes_the_oldest_and_what_loses_a_row_is_no_stretch_any_more(

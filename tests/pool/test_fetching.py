@@ -32,6 +32,8 @@ from webots_mcp.plugins.pool.pool_contents import pooled_runs
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.questions.runs import run_info
+from webots_mcp.store.questions.trends import trends
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.retention.policy import Limit, Retention
 from webots_mcp.store.retention.purge import prune
 from webots_mcp.store.trials import (
@@ -46,6 +48,7 @@ LOCAL = {"id", "run_id", "session_id", "robot_id", "command_id", "trial_set_id",
 
 STATES = ("state", "kept_state")
 IN_EACH_POOL = pytest.mark.parametrize("lab", ["parquet", "postgres"], indirect=True)
+TIMES = "SELECT id FROM chunk WHERE run_id = 1 AND signal_id = 0 ORDER BY group_id LIMIT 1 OFFSET 1"
 KEPT = "SELECT sim_time_s, data, replaced FROM {} WHERE run_id = ? ORDER BY sim_time_s"
 
 
@@ -212,6 +215,19 @@ def test_of_a_run_whose_first_rows_were_purged_before_they_were_shipped_the_othe
     with closing(connect(rounds, "reader")) as there, lab.opened() as here:
         assert answers(here, found.runs[uuid], PART) == answers(there, 1, PART)
         assert everything(here, lab.here, found.runs[uuid]) == everything(there, rounds.parent, 1)
+
+
+@pytest.mark.parametrize("lab", ["parquet"], indirect=True)
+def test_of_a_run_with_damaged_times_the_rest_is_fetched(lab: Lab, rounds: Path) -> None:
+    """It was refused, and free space and permissions were blamed."""
+    with closing(connect(rounds, "writer")) as there:
+        there.execute(f"UPDATE chunk SET numbers = x'00' WHERE id = ({TIMES})")
+    lab.ship(rounds)
+    uuid = uuid_of(rounds, 1)
+    run_id = lab.fetch(run_uuid=uuid).runs[uuid]
+    with lab.opened() as here:
+        found = trends(here, find_range(here, Scope(run_id=run_id)), ["mode"])
+    assert [each for each in found.notes if "simulation times is missing" in each]
 
 
 @IN_EACH_POOL

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from contextlib import closing
 from importlib import import_module
 from pathlib import Path
@@ -117,7 +118,7 @@ def test_a_chunk_that_is_damaged_is_counted_and_the_others_are_shipped(
     sqlite3 = import_module("sqlite3")
     with closing(sqlite3.connect(database)) as connection, connection:
         connection.execute("UPDATE chunk SET numbers = x'00' WHERE signal_id = 1")
-    assert shipped(database, tmp_path / "pool").replaced == {"chunk.numbers": 1}
+    assert shipped(database, tmp_path / "pool").replaced == {"damaged chunk": 1}
     (row, *_) = globbed(tmp_path / "pool", "value")
     assert (row["mode"], row["run (4)"]) == ("go", 5.0)
-    assert "x" not in row
+    assert (row["x"], json.loads(row["others"])["x"]) == (None, ["damaged"])

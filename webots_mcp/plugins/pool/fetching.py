@@ -72,9 +72,10 @@ _LEFT: Final = (
 )
 _COUNT_ROOM: Final = (
     f"UPDATE row_group SET stored_row_count = (SELECT count(*) {_LEFT}), stored_row_bytes = "
-    f"coalesce((SELECT avg(length(CAST(s.data AS BLOB))) {_LEFT}), 0), chunk_bytes = (SELECT "
-    "sum(coalesce(length(numbers), 0) + coalesce(length(codes), 0) + coalesce(length(labels), 0)) "
-    "FROM chunk WHERE group_id = row_group.id)"
+    f"coalesce((SELECT avg(length(CAST(s.data AS BLOB))) {_LEFT}), 0), chunk_bytes = coalesce(("
+    "SELECT sum(coalesce(length(numbers), 0) + coalesce(length(codes), 0) "
+    "+ coalesce(length(labels), 0)) "
+    "FROM chunk WHERE group_id = row_group.id), 0)"  # none came of one whose times are damaged
 )
 _IN_CHUNKS: Final = "SELECT coalesce(sum(row_count), 0) FROM row_group WHERE run_id = ?"
 

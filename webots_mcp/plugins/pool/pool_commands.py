@@ -101,8 +101,9 @@ def _print_fetched(found: Fetched, address: str) -> None:
         )
     if found.unchunked:
         print(
-            f"of run {listed(found.unchunked)} not all rows are in chunks: the recording could not "
-            "be written where it was shipped ('webots-mcp ship --full' ships them)"
+            f"of run {listed(found.unchunked)} not all rows are in chunks: retention had deleted "
+            "those, or the recording could not be written where it was shipped ('webots-mcp ship "
+            "--full' ships rows that are still there)"
         )
     if found.nameless:
         print(f"not taken: {found.nameless} runs without a UUID, which every bridge of today gives")

@@ -54,7 +54,7 @@ def columns_of(
     Args:
         chunks: Rows of the table `chunk`: of each group all.
         signals: Their names and kinds by their ids.
-        altered: Counts chunks that cannot be read, whose values are left out.
+        altered: Counts chunks that cannot be read.
         held: Columns that these are put behind, with the types that they have there.
     """
     arrow = package("pyarrow")
@@ -74,15 +74,18 @@ def columns_of(
 
 
 def _decoded(chunks: Mapping[int, Mapping[str, Any]], altered: Counter[str]) -> dict[int, Decoded]:
-    """The values of a group by signals, without those that cannot be read."""
+    """The values of a group by signals; those that cannot be read are told as replaced."""
     rows = int(chunks[SIM_TIMES]["row_count"]) if SIM_TIMES in chunks else 0
 
     def values_of(chunk: Mapping[str, Any]) -> Decoded | None:
         try:
             return decode(Encoded(*(chunk[name] for name in Encoded._fields)), rows)
         except DamagedChunkError:
-            altered["chunk.numbers"] += 1
+            altered["damaged chunk"] += 1
+        if chunk["signal_id"] <= SIM_TIMES:
             return None
+        codes = np.full(rows, _FIRST_LABEL, np.intp)
+        return Decoded(np.full(rows, np.nan), codes, [Replaced("damaged")])
 
     found = {signal_id: values_of(chunk) for signal_id, chunk in chunks.items()}
     return {signal_id: values for signal_id, values in found.items() if values is not None}

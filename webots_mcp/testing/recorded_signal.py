@@ -77,7 +77,7 @@ class RecordedSignal:
         """The smallest number.
 
         Raises:
-            NothingRecordedError: No row holds a number.
+            NothingRecordedError: No row holds a number, or not all rows could be read.
         """
         return min(self._numbers())
 
@@ -85,7 +85,7 @@ class RecordedSignal:
         """The largest number.
 
         Raises:
-            NothingRecordedError: No row holds a number.
+            NothingRecordedError: No row holds a number, or not all rows could be read.
         """
         return max(self._numbers())
 
@@ -183,8 +183,9 @@ class RecordedSignal:
 
     def _numbers(self) -> Sequence[float]:
         numbers = self._usable
-        if not numbers:
-            raise NothingRecordedError(self._no_number())
+        if not numbers or self._unread:
+            why = f"{self.name} of {self._run} was {self._unread}" if numbers else self._no_number()
+            raise NothingRecordedError(why)
         return list(numbers.values())
 
     @property

@@ -94,8 +94,7 @@ class RobotRecording:
 
         Raises:
             UnknownSignalError: None matches.
-            NoDatabaseError, NothingRecordedError: Nothing has been recorded yet, or not all of it
-                is there any more: what was not read could break any limit.
+            NoDatabaseError, NothingRecordedError: Nothing has been recorded yet.
         """
         with self._subject() as (connection, subject):
             run = f"run {subject.run_id} of robot {subject.robot!r}"
@@ -106,14 +105,12 @@ class RobotRecording:
             frame = read_frame(connection, segment, Deadline(math.inf))
             meant = resolve_signals(signals_of_frame(connection, subject, frame), [pattern])
             state_of = partial(self._state, subject.run_id)
-            found = [
+            return [
                 RecordedSignal(
                     each.name, run, frame, cleaned(each, frame.values(each.name)), state_of
                 )
                 for each in meant
             ]
-            _require_all(run, frame.unread)
-        return found
 
     def states(self) -> list[dict[str, Any]]:
         """What was published, row by row; "nan", "inf" and the like where JSON holds null.

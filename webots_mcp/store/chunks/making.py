@@ -230,8 +230,8 @@ class _RunChunks:
     def _has_tail(self, at: Reached, last_id: int, least_rows: int) -> bool:
         """Whether there are so many rows after those that are in chunks."""
         place = (at.end_s, at.last_state_id)
-        asked = (self._run_id, *place, last_id, max(1, least_rows))
-        return bool(self._connection.execute(_COUNT, asked).fetchone()[0] >= max(1, least_rows))
+        asked = (self._run_id, *place, last_id, least_rows)
+        return bool(self._connection.execute(_COUNT, asked).fetchone()[0] >= least_rows)
 
     def _tail(self, at: Reached, last_id: int) -> StateColumns:
         """The first rows after those that are in chunks."""

@@ -21,8 +21,6 @@ from webots_mcp.store.signals.registry import Signal
 MOST_VALUES: Final = 20
 _FIRST_ROWS_BACK: Final = 1024  # that are looked at before a row, then each time more before those
 _MORE_BACK: Final = 4
-_FIRST_AHEAD_S: Final = 60.0  # in which the end of a value is looked for, then each time further
-_FURTHER: Final = 8
 
 
 class Point(NamedTuple):
@@ -211,25 +209,6 @@ def _splice_kept(
             points[signal.name] = [
                 point for point, same in zip(whole, alike, strict=True) if not same
             ]
-
-
-def value_ended_s(
-    connection: sqlite3.Connection, segment: Segment, signal: Signal, deadline: Deadline
-) -> tuple[float | None, float | None]:
-    """When the value in force at the begin of a segment ended in it; None where it did not.
-
-    And from where on the rows were not read, where it did not end before; None where all were.
-    """
-    ahead_s = _FIRST_AHEAD_S
-    while True:
-        part = segment.until(min(segment.start_s + ahead_s, segment.end_s))
-        changes = change_points(connection, part, [signal], deadline, since=False)
-        points = changes.points[signal.name]
-        if len(points) > 1:
-            return points[1].sim_time_s, None
-        if changes.unread_from_s is not None or part.end_s >= segment.end_s:
-            return None, changes.unread_from_s
-        ahead_s *= _FURTHER
 
 
 def _until(points: list[Point], end_s: float) -> list[Point]:

@@ -129,24 +129,18 @@ class Frame:
         cls,
         times: Sequence[float] | Array,
         columns: Mapping[str, Sequence[Any] | Array],
-        *,
-        wall_times: Sequence[float] | Array | None = None,
-        run_id: int = 0,
     ) -> Frame:
-        """A frame of values that are in no recording.
+        """A frame of values that are in no recording; wall times are as simulation times.
 
         Args:
             times: Simulation time of each row in s, never falling.
             columns: Of each signal one value for each row; None or NaN where it has none.
-            wall_times: Unix time of each row in s; None for the simulation times.
-            run_id: Of which run it says to be.
         """
         listed = [float(each) for each in times]
-        walls = listed if wall_times is None else [float(each) for each in wall_times]
         values = {name: _plain(column) for name, column in columns.items()}
         ids = list(range(1, len(listed) + 1))
-        rows = StateColumns(ids, listed, walls, [""] * len(listed), values)
-        return cls(FrameSource(None, run_id, np.zeros((0, 5)), rows, {}), 0, len(listed))
+        rows = StateColumns(ids, listed, listed, [""] * len(listed), values)
+        return cls(FrameSource(None, 0, np.zeros((0, 5)), rows, {}), 0, len(listed))
 
     def __len__(self) -> int:
         return self._stop - self._start

@@ -13,7 +13,6 @@ from webots_mcp.signal_kinds import (
     Kind,
     Place,
     ends_pose,
-    is_reachable,
     kind_of,
     places,
     turn_of,
@@ -41,15 +40,13 @@ _TYPES: Final[dict[Kind, frozenset[type]]] = {  # of values that leave a kind as
 
 @dataclass(frozen=True)
 class Signal:
-    """A signal of a robot, and how its value is read from a state row.
+    """A signal of a robot, and where its value stands in a state row.
 
     Attributes:
         id: In the register; None for one that was seen only in rows after the watermark.
         path: For `json_extract(state.data, path)`.
         reduction: None, or how the long array at `path` becomes one number.
         role: What it tells of the robot's motion, as `signal_roles` decides; None of most.
-        decoded: Rows must be decoded to read it: its array was at times long enough to be
-            reduced, or its name holds what the paths of SQLite before 3.45 do not reach.
         is_choice: Its whole numbers, of which there are few, name what a robot does.
     """
 
@@ -61,13 +58,7 @@ class Signal:
     path: str
     reduction: str | None
     role: str | None = None
-    decoded: bool = False
     is_choice: bool = False
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether `json_extract` alone gives the same as `flatten`."""
-        return self.reduction is None and not self.decoded
 
     @property
     def turn(self) -> float | None:
@@ -88,7 +79,8 @@ class Signal:
 def registered(connection: sqlite3.Connection, robot_id: int) -> dict[str, Signal]:
     """The signals of a robot in the register, by name."""
     rows = connection.execute(_OF_ROBOT, (robot_id,)).fetchall()
-    return by_name([_registered(Signal(*row)) for row in rows])
+    signals = (_registered(Signal(*row)) for row in rows)
+    return {signal.name: signal for signal in signals}
 
 
 def _registered(signal: Signal) -> Signal:
@@ -114,17 +106,6 @@ def with_roles(known: dict[str, Signal]) -> dict[str, Signal]:
     return {
         name: signal if signal.role == roles.get(name) else replace(signal, role=roles.get(name))
         for name, signal in known.items()
-    }
-
-
-def by_name(signals: Sequence[Signal]) -> dict[str, Signal]:
-    """The signals by name, with what they tell about each other."""
-    arrays = tuple({f"{signal.path}[" for signal in signals if signal.reduction})
-    return {
-        signal.name: replace(signal, decoded=True)
-        if signal.path.startswith(arrays) or not is_reachable(signal.name)
-        else signal
-        for signal in signals
     }
 
 
@@ -198,7 +179,7 @@ def seen_with(known: dict[str, Signal], robot_id: int, columns: StateColumns) ->
             unit = unit_of(name, kind)
             found[name] = replace(before, kind=kind, unit=unit, is_choice=is_choice)
     changed = any(signal is not known.get(name) for name, signal in found.items())
-    return with_roles(by_name([*found.values()])) if changed else found
+    return with_roles(found) if changed else found
 
 
 def cleaned(signal: Signal, values: Sequence[Any]) -> list[Value]:

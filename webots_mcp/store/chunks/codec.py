@@ -19,9 +19,9 @@ from webots_mcp.naming import Value
 from webots_mcp.store.analysis.arrays import Array, Indexes, np
 from webots_mcp.store.signals.flatten import MAX_TEXT
 
-IS_NUMBER: Final = 0  # codes; a higher one than these is the place of a label, counted from 2 on
+IS_NUMBER: Final = 0  # codes
 IS_ABSENT: Final = 1
-_FIRST_LABEL: Final = 2
+FIRST_LABEL: Final = 2  # and those above: the place of a label, counted from it on
 
 _LEVEL: Final = 4  # of pcodec: a quarter of the time of its default, for 2 % more bytes
 _CODES_LEVEL: Final = 1
@@ -111,7 +111,7 @@ def pack(values: Decoded) -> Encoded:
     if values.codes is None:
         return Encoded(*_compressed(values.numbers, values.is_whole), None, None)
     listed = [[label.why] if isinstance(label, Replaced) else label for label in values.labels]
-    width = np.uint8 if len(listed) + _FIRST_LABEL < 2**8 else np.uint16
+    width = np.uint8 if len(listed) + FIRST_LABEL < 2**8 else np.uint16
     return Encoded(
         *_compressed(values.numbers[values.codes == IS_NUMBER], values.is_whole),
         zlib.compress(values.codes.astype(width).tobytes(), _CODES_LEVEL),
@@ -147,7 +147,7 @@ def _decode_coded(encoded: Encoded, rows: int) -> Decoded:
     width: Any = np.uint8 if len(raw) == rows else np.uint16
     codes = np.frombuffer(raw, width).astype(np.intp)
     labels = _labels(encoded.labels)
-    if len(codes) != rows or codes.max(initial=0) >= len(labels) + _FIRST_LABEL:
+    if len(codes) != rows or codes.max(initial=0) >= len(labels) + FIRST_LABEL:
         raise DamagedChunkError("damaged: its codes are not those of its rows")
     numbers = np.full(rows, np.nan)
     held = codes == IS_NUMBER
@@ -177,7 +177,7 @@ def _label(label: Any) -> Value | Replaced:
 
 
 def _fill_flags(numbers: Array, codes: Indexes, labels: Sequence[Value | Replaced]) -> None:
-    for code, label in enumerate(labels, _FIRST_LABEL):
+    for code, label in enumerate(labels, FIRST_LABEL):
         if isinstance(label, bool):
             numbers[codes == code] = label
 
@@ -196,7 +196,7 @@ def _coded(values: Sequence[Recorded]) -> tuple[Indexes, list[Value | Replaced]]
             code = known.get(value)
             if code is None:
                 label = value[:MAX_TEXT] if isinstance(value, str) else value
-                code = known[value] = len(labels) + _FIRST_LABEL
+                code = known[value] = len(labels) + FIRST_LABEL
                 labels.append(label)  # pyright: ignore[reportArgumentType]
             codes[row] = code
     return codes, labels

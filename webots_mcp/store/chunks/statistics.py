@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 from webots_mcp.store.analysis.arrays import inner, np
-from webots_mcp.store.chunks.codec import IS_ABSENT, Decoded
+from webots_mcp.store.chunks.codec import FIRST_LABEL, IS_ABSENT, Decoded
 
 LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
 
@@ -63,6 +63,8 @@ def _without_numbers(values: Decoded, rows: int) -> Statistics:
     """Of texts: how many there are, and how often they change."""
     if values.codes is None:
         return Statistics(rows, 0)
-    texts = [code for code, label in enumerate(values.labels, 2) if isinstance(label, str)]
+    texts = [
+        code for code, label in enumerate(values.labels, FIRST_LABEL) if isinstance(label, str)
+    ]
     codes = values.codes[np.isin(values.codes, texts)]
     return Statistics(rows, len(codes), int(np.count_nonzero(np.diff(codes))))

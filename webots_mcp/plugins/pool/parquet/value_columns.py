@@ -20,6 +20,7 @@ from webots_mcp.plugins.pool.row_batch import Row
 from webots_mcp.plugins.pool.shipped_tables import table
 from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.chunks.codec import (
+    FIRST_LABEL,
     IS_ABSENT,
     IS_NUMBER,
     DamagedChunkError,
@@ -35,7 +36,6 @@ from webots_mcp.store.chunks.stored import SIM_TIMES, STATE_IDS, WALL_TIMES
 _PLACES: Final = {"state_id": STATE_IDS, "sim_time_s": SIM_TIMES, "wall_time_s": WALL_TIMES}
 _FIXED: Final = frozenset({"group_id", "others", *_PLACES, "recording", "recording_uuid", "run",
                            "run_id", "table"})  # fmt: skip
-_FIRST_LABEL: Final = 2
 _TYPES: Final = {"bool": "bool", "text": "string"}  # of kinds of signals; the others are doubles
 _HELD: Final[Mapping[str, type]] = {"bool": bool, "string": str}
 
@@ -84,7 +84,7 @@ def _decoded(chunks: Mapping[int, Mapping[str, Any]], altered: Counter[str]) -> 
             altered["damaged chunk"] += 1
         if chunk["signal_id"] <= SIM_TIMES:
             return None
-        codes = np.full(rows, _FIRST_LABEL, np.intp)
+        codes = np.full(rows, FIRST_LABEL, np.intp)
         return Decoded(np.full(rows, np.nan), codes, [Replaced("damaged")])
 
     found = {signal_id: values_of(chunk) for signal_id, chunk in chunks.items()}
@@ -122,9 +122,9 @@ def _group(
 def _type_of(values: Decoded, kind: str) -> Any:
     """The type that most values have; where there is none, the one of the signal's kind."""
     codes = np.zeros(len(values.numbers), np.intp) if values.codes is None else values.codes
-    counts = np.bincount(codes, minlength=len(values.labels) + _FIRST_LABEL).tolist()
+    counts = np.bincount(codes, minlength=len(values.labels) + FIRST_LABEL).tolist()
     found = Counter({"double": counts[IS_NUMBER]})
-    for label, count in zip(values.labels, counts[_FIRST_LABEL:], strict=True):
+    for label, count in zip(values.labels, counts[FIRST_LABEL:], strict=True):
         found.update({name: count for name, held in _HELD.items() if isinstance(label, held)})
     ((most, count),) = found.most_common(1)
     return package("pyarrow").type_for_alias(most if count else _TYPES.get(kind, "double"))
@@ -136,7 +136,7 @@ def _array(values: Decoded, name: str, kind: Any, others: dict[int, dict[str, An
     held = _HELD.get(str(kind))
     codes = np.zeros(len(values.numbers), np.intp) if values.codes is None else values.codes
     fitting: list[Any] = [None, None]
-    for code, label in enumerate(values.labels, _FIRST_LABEL):
+    for code, label in enumerate(values.labels, FIRST_LABEL):
         fits = held is not None and isinstance(label, held)
         fitting.append(label if fits else None)
         for row in () if fits else np.flatnonzero(codes == code).tolist():
@@ -180,7 +180,7 @@ def _values(column: Any, name: str, others: Mapping[int, Mapping[str, Any]]) -> 
     known: dict[tuple[type, Value | Replaced], int] = {}
 
     def code_of(label: Value | Replaced) -> int:
-        return known.setdefault((type(label), label), len(known) + _FIRST_LABEL)
+        return known.setdefault((type(label), label), len(known) + FIRST_LABEL)
 
     if str(column.type) in _HELD:
         listed = column.combine_chunks().dictionary_encode()

@@ -19,7 +19,14 @@ from webots_mcp.naming import Value
 from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
 from webots_mcp.store.analysis.summary import usable_part
 from webots_mcp.store.chunks import making
-from webots_mcp.store.chunks.codec import IS_ABSENT, IS_NUMBER, Decoded, Replaced
+from webots_mcp.store.chunks.codec import (
+    EXACT_INTEGERS,
+    FIRST_LABEL,
+    IS_ABSENT,
+    IS_NUMBER,
+    Decoded,
+    Replaced,
+)
 from webots_mcp.store.chunks.columns import STATE_COLUMNS, StateColumns
 from webots_mcp.store.chunks.statistics import Statistics, statistics_of
 from webots_mcp.store.chunks.stored import (
@@ -33,10 +40,9 @@ from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame_source import Column, FrameSource, Unread, nothing
 from webots_mcp.store.reading.kept import MOST_ROWS, kept_parts
 from webots_mcp.store.reading.newest_rows import read_rows, rows_in_no_chunk
-from webots_mcp.store.reading.ranges import Segment
+from webots_mcp.store.reading.ranges import HAS_LOST_ROWS, Segment
 
 _FEW: Final = 4  # times that few chunks are opened one by one; else all of them at once
-_FIRST_LABEL: Final = 2  # of the codes of a chunk
 
 _IN: Final = "run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
 _STATES: Final = f"SELECT {STATE_COLUMNS} FROM state WHERE {_IN} ORDER BY sim_time_s, id"
@@ -44,12 +50,11 @@ _KEPT: Final = (
     "SELECT -id, sim_time_s, wall_time_s, data, replaced FROM kept_state "
     f"WHERE {_IN} ORDER BY sim_time_s, id LIMIT ?"
 )
-# Rows that were deleted, and of which no chunk is left. What is oldest goes first.
+# Where a run begins, and where what is left of it does: what is oldest goes first.
 _LOST: Final = (
     "SELECT started_sim_time_s, (SELECT min(start_sim_time_s) FROM row_group WHERE run_id = r.id "
     "AND is_complete = 1), (SELECT min(sim_time_s) FROM state WHERE run_id = r.id) FROM run r "
-    "WHERE id = ? AND purged_rows > coalesce((SELECT sum(row_count - stored_row_count) "
-    "FROM row_group WHERE run_id = r.id AND is_complete = 1), 0)"
+    f"WHERE id = ? AND {HAS_LOST_ROWS}"
 )
 _SIGNALS: Final = (
     "SELECT s.name, s.id FROM run r JOIN signal s ON s.robot_id = r.robot_id WHERE r.id = ? "
@@ -232,7 +237,7 @@ class Frame:
         zones, found = self.zones(name), Counter[str]()
         for span in zones.spans(zones.held_count > zones.value_count):
             values = self.rows(*span)._decoded(name)
-            for code, label in enumerate(values.labels, _FIRST_LABEL):
+            for code, label in enumerate(values.labels, FIRST_LABEL):
                 if isinstance(label, Replaced) and values.codes is not None:
                     found[label.why] += int(np.count_nonzero(values.codes == code))
         return +found
@@ -316,7 +321,7 @@ class Frame:
             for label in values.labels:
                 if known.setdefault((type(label), label), len(labels)) == len(labels):
                     labels.append(label)
-            shared = [known[type(each), each] + _FIRST_LABEL for each in values.labels]
+            shared = [known[type(each), each] + FIRST_LABEL for each in values.labels]
             coded.append((inside, np.array([IS_NUMBER, IS_ABSENT, *shared], np.intp)[values.codes]))
         codes: Indexes | None = None
         if coded or sum(each.stop - each.start for each in plain) < len(numbers):
@@ -489,8 +494,8 @@ def _coded(values: Decoded, *, numbers: bool) -> Coded:
         codes[held] = (places + 1)[np.cumsum(changes) - 1]
         labels += map(_number, unique.tolist())
     if values.codes is not None:
-        of_code = np.zeros(len(values.labels) + _FIRST_LABEL, np.intp)
-        for code, label in enumerate(values.labels, _FIRST_LABEL):
+        of_code = np.zeros(len(values.labels) + FIRST_LABEL, np.intp)
+        for code, label in enumerate(values.labels, FIRST_LABEL):
             if isinstance(label, str) or (numbers and isinstance(label, bool)):
                 of_code[code] = len(labels)
                 labels.append(label)
@@ -499,4 +504,4 @@ def _coded(values: Decoded, *, numbers: bool) -> Coded:
 
 
 def _number(value: float) -> float:
-    return int(value) if value.is_integer() and abs(value) < 2**53 else value
+    return int(value) if value.is_integer() and abs(value) < EXACT_INTEGERS else value

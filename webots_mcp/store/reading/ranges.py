@@ -58,10 +58,12 @@ _RECORDED: Final = (
 )
 _MOST_HITS: Final = 1000
 _LEAST_ROWS_PER_HIT: Final = 200  # fewer than 0.5 % of the rows hardly move a mean
-_LOST: Final = (  # rows of which no chunk is left
-    "SELECT started_sim_time_s, last_sim_time_s FROM run r WHERE id = ? AND purged_rows > "
-    "coalesce((SELECT sum(row_count - stored_row_count) FROM row_group WHERE run_id = r.id "
-    "AND is_complete = 1), 0)"
+HAS_LOST_ROWS: Final = (  # of a run `r`: some were deleted of which no chunk is left
+    "r.purged_rows > coalesce((SELECT sum(row_count - stored_row_count) FROM row_group "
+    "WHERE run_id = r.id AND is_complete = 1), 0)"
+)
+_LOST: Final = (
+    f"SELECT started_sim_time_s, last_sim_time_s FROM run r WHERE id = ? AND {HAS_LOST_ROWS}"
 )
 _RUN_BEFORE: Final = (
     "SELECT (SELECT max(id) FROM run b WHERE b.robot_id = run.robot_id AND b.id < run.id), "

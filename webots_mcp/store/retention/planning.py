@@ -27,7 +27,7 @@ _COMMAND_BYTES: Final = 400
 
 
 @dataclass(frozen=True)
-class Step:
+class Going:
     """The oldest rows of a portion go; or a run, or commands of a robot.
 
     Attributes:
@@ -84,7 +84,7 @@ class Plan:
         unshipped: Of what goes, what no pool holds, because more waits than is kept until then.
     """
 
-    steps: tuple[Step, ...]
+    steps: tuple[Going, ...]
     held_bytes: dict[str, int]
     spared: tuple[Spared, ...]
     kept_run_ids: tuple[int, ...]
@@ -150,14 +150,14 @@ class _Planner:
         self._forgotten = self._find_forgotten() if retention.outlive else set[int]()
 
     def plan(self) -> Plan:
-        steps: list[Step] = []
+        steps: list[Going] = []
         for table in TABLES:
             gone = [each.portion for each in steps if each.portion and each.is_whole]
             whole_groups = {portion.group_id for portion in gone if portion.table == "state"}
             steps += reversed(list(self._beyond(table, whole_groups)))
         for run_id in self._runs:
             if run_id in self._forgotten:
-                steps.append(Step("run", run_id, 1, 0, self._runs[run_id].last_wall_time_s))
+                steps.append(Going("run", run_id, 1, 0, self._runs[run_id].last_wall_time_s))
         for robot_id in {run.robot_id: None for run in self._runs.values()}:
             steps += self._commands(robot_id)
         if limit_bytes := self._retention.unshipped.size_bytes:
@@ -195,7 +195,7 @@ class _Planner:
             after += run.recorded_rows
         return forgotten
 
-    def _beyond(self, table: str, whole_groups: set[int]) -> Iterator[Step]:
+    def _beyond(self, table: str, whole_groups: set[int]) -> Iterator[Going]:
         """What goes of a table, the newest first; all of runs that are forgotten."""
         limit: Limit = getattr(self._retention, table)
         free = self._kept(table, is_kept=False)
@@ -263,17 +263,17 @@ class _Planner:
             self._rows[portion] = rows_of(self._connection, portion)
         return self._rows[portion]
 
-    def _step(self, portion: Portion, rows: int) -> Step:
+    def _step(self, portion: Portion, rows: int) -> Going:
         bound = portion.last_id
         if rows < portion.rows:
             ids = self._rows_of(portion)[0]
             bound = int(ids[min(rows, len(ids)) - 1]) if len(ids) else 0
         size_bytes = round(rows * portion.size_bytes / portion.rows)
-        return Step(
+        return Going(
             portion.table, portion.run_id, rows, size_bytes, portion.newest_s, portion, bound
         )
 
-    def _commands(self, robot_id: int) -> Iterator[Step]:
+    def _commands(self, robot_id: int) -> Iterator[Going]:
         """Finished commands from before all runs of the robot that stay, or older than events."""
         runs = [run for run in self._runs.values() if run.robot_id == robot_id]
         staying = [run.started_wall_time_s for run in runs if run.id not in self._forgotten]
@@ -283,12 +283,12 @@ class _Planner:
         values = {"robot_id": robot_id, "before_s": before_s}
         query = f"SELECT count(*) {OLD_COMMANDS}"
         if rows := int(self._connection.execute(query, values).fetchone()[0]):
-            yield Step("command", robot_id, rows, rows * _COMMAND_BYTES, before_s)
+            yield Going("command", robot_id, rows, rows * _COMMAND_BYTES, before_s)
 
-    def _after_shipping(self, steps: Sequence[Step], left_bytes: float) -> list[Step]:
+    def _after_shipping(self, steps: Sequence[Going], left_bytes: float) -> list[Going]:
         """Without what waits to be shipped: the newest of it stays, up to that size."""
         pools = shipped_of(self._connection)
-        going = list[Step]()
+        going = list[Going]()
         runs = set[int]()  # that have to wait for their rows
         for step in sorted(steps, key=lambda each: (each.table == "run", -each.newest_s)):
             waiting = self._waiting(step, pools)
@@ -309,7 +309,7 @@ class _Planner:
         return [step for table in dict.fromkeys(s.table for s in steps)
                 for step in reversed(going) if step.table == table]  # fmt: skip
 
-    def _waiting(self, step: Step, pools: Sequence[Shipped]) -> int:
+    def _waiting(self, step: Going, pools: Sequence[Shipped]) -> int:
         """How many of a step's rows are not in all pools."""
         if step.portion is None:
             return step.rows if step.newest_s > complete_until_s(pools) else 0
@@ -318,7 +318,7 @@ class _Planner:
 
 
 def _add(
-    found: dict[tuple[str, str], list[float]], of: Portion | Step, rows: int, why: str
+    found: dict[tuple[str, str], list[float]], of: Portion | Going, rows: int, why: str
 ) -> None:
     """Note so many rows, by table and reason."""
     if rows > 0:

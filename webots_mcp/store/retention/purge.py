@@ -21,8 +21,7 @@ from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.errors import DatabaseError, InvalidInputError, NothingRecordedError
 from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
 from webots_mcp.store.images import inside
-from webots_mcp.store.retention.planning import OLD_COMMANDS, Plan, plan
-from webots_mcp.store.retention.planning import Step as Going
+from webots_mcp.store.retention.planning import OLD_COMMANDS, Going, Plan, plan
 from webots_mcp.store.retention.policy import DEFAULT, KEPT, Retention
 from webots_mcp.store.retention.usage import Holdings, Portion, rows_of
 from webots_mcp.transactions import LONGEST_WRITE_S, ShortWrites, Step, is_busy

@@ -20,7 +20,7 @@ from webots_mcp.contract import make_folder, whole_file
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.liveness import reap
 from webots_mcp.schema import require_shipped
-from webots_mcp.store.chunks.taking_in import take_in_chunks
+from webots_mcp.store.chunks.merged_run import take_in_chunks
 from webots_mcp.store.images import PICTURES, inside
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.trials import fetch_trial_set, is_at_work

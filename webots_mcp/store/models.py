@@ -519,7 +519,11 @@ class RetentionLimit(SQLModel, table=True):
 
     __tablename__: ClassVar[Any] = "retention_limit"
     kind: str = Field(
-        sa_column=Column(Text, primary_key=True, comment="state, chunk, log, event, image or run")
+        sa_column=Column(
+            Text,
+            primary_key=True,
+            comment="state, kept_state, chunk, log, event, image, run or unshipped",
+        )
     )
     size_bytes: int | None = _column(BigInteger, "on the disk; of pictures their files")
     row_count: int | None = _column(BigInteger)

@@ -28,7 +28,7 @@ from webots_mcp.store.chunks.stored import (
     watermark,
 )
 from webots_mcp.store.invalid_rows import is_over_a_value, valid_rows
-from webots_mcp.store.retention.pages import INDEX_BYTES, disk_bytes
+from webots_mcp.store.retention.disk_size import INDEX_BYTES, disk_bytes
 from webots_mcp.store.signals.flatten import MAX_TEXT
 from webots_mcp.store.signals.registry import Signal, enter_signals, registered, seen_in, tell_more
 from webots_mcp.transactions import LONGEST_WRITE_S, Step

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from webots_mcp.errors import InvalidRangeError
 from webots_mcp.store.analysis.arrays import np
+from webots_mcp.store.chunks.stored import WALL_TIMES
 from webots_mcp.store.reading.deadline import Deadline
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ _FALLS: Final = (
     "SELECT 1 FROM (SELECT min, max, first, last, lag(last) OVER (ORDER BY at_s, id) AS before "
     "FROM (SELECT g.start_sim_time_s AS at_s, 0 AS id, min, max, first, last FROM chunk c "
     "JOIN row_group g ON g.id = c.group_id "
-    "WHERE c.run_id = :run AND c.signal_id = -1 AND g.is_complete = 1 UNION ALL "
+    f"WHERE c.run_id = :run AND c.signal_id = {WALL_TIMES} AND g.is_complete = 1 UNION ALL "
     "SELECT sim_time_s, id, wall_time_s, wall_time_s, wall_time_s, wall_time_s FROM state "
     "WHERE run_id = :run AND sim_time_s > coalesce((SELECT max(end_sim_time_s) FROM row_group "
     "WHERE run_id = :run AND is_complete = 1), -9e999))) "

@@ -17,7 +17,7 @@ from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.chunks.codec import Decoded
 from webots_mcp.store.chunks.stored import STATE_IDS, WALL_TIMES, Group, values_in
-from webots_mcp.store.retention.pages import INDEX_BYTES, disk_bytes
+from webots_mcp.store.retention.disk_size import INDEX_BYTES, disk_bytes
 from webots_mcp.store.retention.policy import KEPT
 
 TABLES: Final = ("state", "chunk", "kept_state", "log", "event", "image")
@@ -34,9 +34,10 @@ _STORED: Final = "SELECT id, stored_row_count FROM row_group WHERE is_complete =
 _GROUPS: Final = (
     "SELECT g.id, g.run_id, g.max_state_id, g.row_count, g.stored_row_bytes, g.chunk_bytes, "
     "coalesce(i.min, 0), w.min, w.max FROM row_group g "
-    "LEFT JOIN chunk i ON i.run_id = g.run_id AND i.signal_id = -2 AND i.group_id = g.id "
-    "LEFT JOIN chunk w ON w.run_id = g.run_id AND w.signal_id = -1 AND w.group_id = g.id "
-    "WHERE g.is_complete = 1 AND g.id > ?"
+    "LEFT JOIN chunk i ON i.run_id = g.run_id AND i.group_id = g.id "
+    f"AND i.signal_id = {STATE_IDS} "
+    "LEFT JOIN chunk w ON w.run_id = g.run_id AND w.group_id = g.id "
+    f"AND w.signal_id = {WALL_TIMES} WHERE g.is_complete = 1 AND g.id > ?"
 )
 _PLACE: Final = (
     "SELECT id, start_sim_time_s, end_sim_time_s, last_state_id, max_state_id, row_count "

@@ -1,4 +1,4 @@
-"""The chunks of a run of another recording, whose rows are not all there to make them anew.
+"""The chunks of a merged run: of one of another recording, whose rows are not all there any more.
 
 The other recording is attached as `source`. Its signals are found here by their names, or entered.
 Row groups name state rows by ids, also those that are gone: so all ids of the run rise alike here,

@@ -244,7 +244,8 @@ class Frame:
 
     def zones(self, name: str) -> Zones:
         """What the chunks of a signal come to; those that the frame cuts come to what is in it."""
-        return self._zones(name)
+        key = ("zones", name, self._start, self._stop)
+        return self._source.cached(key, lambda: self._make_zones(name))
 
     def opened(self, name: str, wanted: Flags) -> Iterator[tuple[int, Array]]:
         """The numbers of some of its chunks, each with its first row; of those that have any."""
@@ -303,7 +304,7 @@ class Frame:
     def _decoded(self, column: Column) -> Decoded:
         """All values; those of several chunks share their labels."""
         key = ("values", column, self._start, self._stop)
-        return self._source.kept(key, lambda: self._decode(column))
+        return self._source.cached(key, lambda: self._decode(column))
 
     def _decode(self, column: Column) -> Decoded:
         source, order = self._source, self._source.order
@@ -338,7 +339,7 @@ class Frame:
         """Codes from 1 on; numbers get labels as well, where they are wanted."""
         key = ("coded", name, numbers, self._start, self._stop)
         values = self._decoded(name)
-        return self._source.kept(key, lambda: _coded(values, numbers=numbers))
+        return self._source.cached(key, lambda: _coded(values, numbers=numbers))
 
     @property
     def _edges(self) -> Indexes:
@@ -349,15 +350,11 @@ class Frame:
         edges = self._source.first_rows[parts.start : parts.stop + 1]
         return np.minimum(np.maximum(edges, self._start), self._stop) - self._start
 
-    def _zones(self, column: Column) -> Zones:
-        key = ("zones", column, self._start, self._stop)
-        return self._source.kept(key, lambda: self._make_zones(column))
-
-    def _make_zones(self, column: Column) -> Zones:
+    def _make_zones(self, name: str) -> Zones:
         source, edges = self._source, self._edges
         if source.order is None:
             parts = source.parts(self._start, self._stop)
-            table: Array = np.array(source.statistics(column)[parts])
+            table: Array = np.array(source.statistics(name)[parts])
             starts_s: Array = np.array(source.starts_s[parts])
             ends_s: Array = np.array(source.ends_s[parts])
             whole = np.diff(source.first_rows[parts.start : parts.stop + 1])
@@ -368,7 +365,7 @@ class Frame:
             cut = np.arange(len(table))
         for at in cut.tolist():
             rows = self.rows(int(edges[at]), int(edges[at + 1]))
-            table[at] = statistics_of(rows._decoded(column))
+            table[at] = statistics_of(rows._decoded(name))
             starts_s[at], ends_s[at] = rows.times[0], rows.times[-1]
         figures: dict[str, Array] = dict(zip(Statistics._fields, np.transpose(table), strict=True))
         held: Indexes = figures.pop("row_count").astype(np.intp)
@@ -413,11 +410,11 @@ def read_frame(
     source = FrameSource(connection, run_id, groups, columns, names)
     if lost := deleted_part(connection, segment):
         source.unread[lost] = None
-    return _framed(source, segment, _said(source, segment, cut_at_s))
+    return _framed(source, segment, _note_cut(source, segment, cut_at_s))
 
 
-def _said(source: FrameSource, segment: Segment, cut_at_s: float | None) -> float | None:
-    """Where the deadline cut a segment, if it did; the frame names what is not in it."""
+def _note_cut(source: FrameSource, segment: Segment, cut_at_s: float | None) -> float | None:
+    """Where the deadline cut a segment, if it did; what is behind it is noted as unread."""
     if cut_at_s is None or cut_at_s >= segment.end_s:
         return None
     reached_s = max(cut_at_s, segment.start_s)
@@ -448,7 +445,7 @@ def read_kept(connection: sqlite3.Connection, segment: Segment, deadline: Deadli
     columns = StateColumns()
     cut_at_s = read_rows(connection, _KEPT, (*bounds, MOST_ROWS), columns, deadline)
     source = FrameSource(connection, segment.run_id, np.zeros((0, 5)), columns, {})
-    cut_at_s = _said(source, segment, cut_at_s)
+    cut_at_s = _note_cut(source, segment, cut_at_s)
     return _framed(source, segment, cut_at_s) if len(columns) else None
 
 

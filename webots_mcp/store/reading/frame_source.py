@@ -23,7 +23,7 @@ from webots_mcp.store.chunks.stored import (
 
 _MOST_ROWS: Final = 2**20  # of a group: no maker puts more than 1,024 into one
 NOT_READ: Final = "not read from"  # how what says that a part is not in a frame begins
-MOST_KEPT_BYTES: Final = 32_000_000  # of values that a frame keeps for who asks again
+MOST_CACHED_BYTES: Final = 32_000_000  # of values that a frame caches
 Column = str | int  # the name of a signal, or what has a chunk of its own (SIM_TIMES, ...)
 T = TypeVar("T")
 
@@ -97,8 +97,8 @@ class FrameSource:
                 (groups[1:, 1] == groups[:-1, 2]) & (groups[1:, 4] < groups[:-1, 4])
             ).any()
         )
-        self._kept: OrderedDict[object, Any] = OrderedDict()
-        self._kept_bytes = 0
+        self._cache: OrderedDict[object, Any] = OrderedDict()
+        self._cached_bytes = 0
 
     @property
     def rows(self) -> int:
@@ -187,7 +187,7 @@ class FrameSource:
 
     def statistics(self, column: Column) -> Array:
         """What a signal comes to: a row for each part, a column for each field of `Statistics`."""
-        return self.kept(("statistics", column), lambda: self._statistics(column))
+        return self.cached(("statistics", column), lambda: self._statistics(column))
 
     def _statistics(self, column: Column) -> Array:
         table = nothing(len(self.starts_s))
@@ -227,20 +227,20 @@ class FrameSource:
 
     def forget(self) -> None:
         """Forget what was made."""
-        self._kept.clear()
-        self._kept_bytes = 0
+        self._cache.clear()
+        self._cached_bytes = 0
 
-    def kept(self, key: object, make: Callable[[], T]) -> T:
+    def cached(self, key: object, make: Callable[[], T]) -> T:
         """What was made before, or is made now; what was used longest ago makes room for it."""
-        if key in self._kept:
-            self._kept.move_to_end(key)
-            return self._kept[key][0]
+        if key in self._cache:
+            self._cache.move_to_end(key)
+            return self._cache[key][0]
         made = make()
-        self._kept[key] = made, (size := _bytes_of(made))
-        self._kept_bytes += size
-        while self._kept_bytes > MOST_KEPT_BYTES and len(self._kept) > 1:
-            _, (_, freed) = self._kept.popitem(last=False)
-            self._kept_bytes -= freed
+        self._cache[key] = made, (size := _bytes_of(made))
+        self._cached_bytes += size
+        while self._cached_bytes > MOST_CACHED_BYTES and len(self._cache) > 1:
+            _, (_, freed) = self._cache.popitem(last=False)
+            self._cached_bytes -= freed
         return made
 
 

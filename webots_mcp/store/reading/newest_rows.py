@@ -1,6 +1,6 @@
 """The rows of a run that are in no chunk: the newest ones, and those that came late.
 
-Parsing them is what a question about a running robot costs, so that the newest are kept between
+Parsing them is what a question about a running robot costs, so that the newest are cached between
 questions, and only what has come since is read.
 """
 
@@ -16,8 +16,8 @@ from webots_mcp.store.chunks.stored import Reached
 from webots_mcp.store.reading.deadline import Deadline
 
 ROWS_AT_ONCE: Final = 1024  # between two looks at the deadline
-MOST_ROWS_KEPT: Final = 4096  # of one run; more are there only where nobody makes chunks
-MOST_RUNS_KEPT: Final = 16
+MOST_ROWS_CACHED: Final = 4096  # of one run; more are there only where nobody makes chunks
+MOST_RUNS_CACHED: Final = 16
 
 _IN: Final = "sim_time_s >= ? AND sim_time_s < ?"
 _NEWEST: Final = (
@@ -47,12 +47,12 @@ _SHADOWED: Final = "SELECT EXISTS (SELECT 1 FROM temp.sqlite_master WHERE name =
 Read = tuple[StateColumns, "float | None"]
 
 
-class _Kept(NamedTuple):
+class _Cached(NamedTuple):
     place: tuple[float, int]  # after which the rows begin
     columns: StateColumns
 
 
-_kept: OrderedDict[tuple[str, str], _Kept] = OrderedDict()
+_cache: OrderedDict[tuple[str, str], _Cached] = OrderedDict()
 _lock = threading.Lock()
 
 
@@ -89,16 +89,16 @@ def rows_in_no_chunk(
         cut_s = read_rows(connection, _NEWEST_IN, (run_id, *after, *place), columns, deadline)
         return columns, cut_s
     with _lock:
-        return _kept_rows(connection, run_id, key, place, deadline)
+        return _cached_rows(connection, run_id, key, place, deadline)
 
 
 def has_few_new_rows(connection: sqlite3.Connection, run_id: int, at: Reached) -> bool:
-    """Whether a run has so few rows after those in chunks that they are kept between questions."""
-    asked = (run_id, at.end_s, at.last_state_id, MOST_ROWS_KEPT + 1)
-    return bool(connection.execute(_FEWER_THAN, asked).fetchone()[0] <= MOST_ROWS_KEPT)
+    """Whether a run has so few rows after those in chunks that they are cached."""
+    asked = (run_id, at.end_s, at.last_state_id, MOST_ROWS_CACHED + 1)
+    return bool(connection.execute(_FEWER_THAN, asked).fetchone()[0] <= MOST_ROWS_CACHED)
 
 
-def _kept_rows(
+def _cached_rows(
     connection: sqlite3.Connection,
     run_id: int,
     key: tuple[str, str],
@@ -106,18 +106,18 @@ def _kept_rows(
     deadline: Deadline,
 ) -> Read:
     """The newest rows: those that were parsed before, and those that have come since."""
-    kept = _kept.pop(key, None)
+    cached = _cache.pop(key, None)
     columns = StateColumns()
-    if kept is not None and kept.place == place and len(kept.columns):
-        last = (kept.columns.times[-1], kept.columns.ids[-1])
-        asked = (run_id, *place, *last, max(kept.columns.ids))
+    if cached is not None and cached.place == place and len(cached.columns):
+        last = (cached.columns.times[-1], cached.columns.ids[-1])
+        asked = (run_id, *place, *last, max(cached.columns.ids))
         if not connection.execute(_ONE_BETWEEN, asked).fetchone()[0]:
-            columns = kept.columns
+            columns = cached.columns
     after = (columns.times[-1], columns.ids[-1]) if len(columns) else place
     cut_s = read_rows(connection, _NEWEST, (run_id, *after), columns, deadline)
-    _kept[key] = _Kept(place, columns)
-    while len(_kept) > MOST_RUNS_KEPT:
-        _kept.popitem(last=False)
+    _cache[key] = _Cached(place, columns)
+    while len(_cache) > MOST_RUNS_CACHED:
+        _cache.popitem(last=False)
     return columns.part(0, len(columns)), cut_s
 
 

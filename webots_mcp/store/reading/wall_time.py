@@ -123,8 +123,8 @@ def simulation_times(
     first_s, newest_s = recorded
     if not begun(newest_s) or over(first_s):
         return None
-    start_s = first_s if begun(first_s) else _turn(first_s, newest_s, begun)[1]
-    last_s = _turn(first_s, newest_s, over)[0] if over(newest_s) else newest_s
+    start_s = first_s if begun(first_s) else _turning_point(first_s, newest_s, begun)[1]
+    last_s = _turning_point(first_s, newest_s, over)[0] if over(newest_s) else newest_s
     return (start_s, last_s) if start_s <= last_s else None  # else between two rows
 
 
@@ -174,7 +174,7 @@ class RunClock:
         return self._start_wall_s + share * (self._rows_from_wall_s - self._start_wall_s)
 
 
-def _turn(
+def _turning_point(
     before_s: float, after_s: float, has_turned: Callable[[float], bool]
 ) -> tuple[float, float]:
     """The last time before and the first after something turned from false to true."""

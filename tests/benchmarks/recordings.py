@@ -35,7 +35,7 @@ def record(file: Path, rows: int) -> None:
 
     Only the first 50,000 rows are made one by one. The others repeat their texts.
     """
-    build(file, min(rows, _PART_ROWS), rolled=False)
+    build(file, min(rows, _PART_ROWS), chunked=False)
     with closing(connect(file, "writer")) as connection:
         connection.execute("BEGIN IMMEDIATE")
         _lengthen(connection, rows)

@@ -73,7 +73,7 @@ def test_what_no_bridge_writes_is_said_on_the_page_and_logged_once(
 
 
 def test_what_no_server_puts_into_chunks_is_beside_the_page(tmp_path: Path) -> None:
-    build(tmp_path / DATABASE_NAME, 2 * LEAST_ROWS, rolled=False)
+    build(tmp_path / DATABASE_NAME, 2 * LEAST_ROWS, chunked=False)
     recording = Recording(tmp_path / DATABASE_NAME, tmp_path, read_only=True)
     chunk_maker = ChunkMaker(recording)
     chunk_maker.start()

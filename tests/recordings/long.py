@@ -20,7 +20,7 @@ CYCLE_S: Final = 100.0  # 70 s cruise, 6 s stuck within it, 10 s back up, 20 s t
 _INSERT: Final = "INSERT INTO state (run_id, sim_time_s, wall_time_s, data) VALUES (?, ?, ?, ?)"
 
 
-def build(file: Path, rows: int, *, rolled: bool = True) -> None:
+def build(file: Path, rows: int, *, chunked: bool = True) -> None:
     """Make the file: one robot, one run of that many rows."""
     with closing(connect(file, "writer", create=True)) as connection:
         create_schema(connection)
@@ -30,7 +30,7 @@ def build(file: Path, rows: int, *, rolled: bool = True) -> None:
         recorder.wall_s = WALL_START_S + rows * INTERVAL_S
         recorder.end_run("finished")
         connection.execute("COMMIT")
-        while rolled and not make_chunks(connection, 100_000).done:
+        while chunked and not make_chunks(connection, 100_000).done:
             pass
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
 

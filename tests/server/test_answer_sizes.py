@@ -63,7 +63,7 @@ DEFAULTS: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
 def big(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Long names, 69 signals, many log lines and events, two long runs and many short ones."""
     file = tmp_path_factory.mktemp("big") / "webots.db"
-    build(file, ROWS, rolled=False)
+    build(file, ROWS, chunked=False)
     more = {f"manipulator_joint_{i}_torque_estimate_nm": 0.5 for i in range(MORE_SIGNALS)}
     with connect(file, "writer") as connection:
         connection.execute("BEGIN IMMEDIATE")

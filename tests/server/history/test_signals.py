@@ -157,8 +157,8 @@ async def test_the_times_in_more_values_than_are_shown_are_told_together(
 async def test_answers_are_the_same_before_and_after_chunks_are_made(
     story: Path, tmp_path: Path
 ) -> None:
-    rolled = copy_of(story, tmp_path / "webots.db")
-    with connect(rolled, "writer") as connection:
+    chunked = copy_of(story, tmp_path / "webots.db")
+    with connect(chunked, "writer") as connection:
         assert make_chunks(connection, 100_000).done
     connection.close()
     for tool, arguments in (
@@ -167,7 +167,7 @@ async def test_answers_are_the_same_before_and_after_chunks_are_made(
         ("webots_get_trends", {"run_id": STORY}),
         ("webots_find_events", {"run_id": STORY}),
     ):
-        before, after = [await tell(file, tool, **arguments) for file in (story, rolled)]
+        before, after = [await tell(file, tool, **arguments) for file in (story, chunked)]
         changing = ("age_s", "status")
         assert {k: v for k, v in before.items() if k not in changing} == {
             k: v for k, v in after.items() if k not in changing

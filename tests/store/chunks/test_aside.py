@@ -30,7 +30,7 @@ ROWS = 3 * LEAST_ROWS
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("long") / "webots.db"
-    build(file, ROWS, rolled=False)
+    build(file, ROWS, chunked=False)
     with closing(connect(file, "writer")) as connection:
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     return file

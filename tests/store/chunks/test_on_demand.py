@@ -22,7 +22,7 @@ ROWS = 4 * LEAST_ROWS
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     file = tmp_path_factory.mktemp("long") / "webots.db"
-    build(file, ROWS, rolled=False)
+    build(file, ROWS, chunked=False)
     return file
 
 

@@ -34,7 +34,7 @@ def clock_times() -> list[float]:
 TIMES = clock_times()
 
 
-@pytest.fixture(scope="module", params=["raw", "rolled"])
+@pytest.fixture(scope="module", params=["raw", "chunked"])
 def clock(request: pytest.FixtureRequest) -> Iterator[sqlite3.Connection]:
     """A mode that changes in every 7th row, and a log line in every 5th."""
     with memory_connection() as connection:
@@ -44,7 +44,7 @@ def clock(request: pytest.FixtureRequest) -> Iterator[sqlite3.Connection]:
             if row % 5 == 0:
                 line = {"level": "warning", "source": "controller", "message": str(row)}
                 recorder.insert("log", **recorder.at(time_s), **line)
-        if request.param == "rolled":
+        if request.param == "chunked":
             assert make_chunks(connection, 100_000).done
         yield connection
 

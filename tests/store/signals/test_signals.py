@@ -78,13 +78,13 @@ STRANGE = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("rolled", [False, True])
-def test_whatever_a_key_is_called_it_is_a_signal(empty: sqlite3.Connection, rolled: bool) -> None:
+@pytest.mark.parametrize("chunked", [False, True])
+def test_whatever_a_key_is_called_it_is_a_signal(empty: sqlite3.Connection, chunked: bool) -> None:
     recorder = start_run(empty)
     for step in range(30):
         flat = {name: step + index for index, name in enumerate(STRANGE)}
         recorder.publish(float(step), {**flat, "deep": flat})
-    if rolled:
+    if chunked:
         make_chunks(empty)
     names = {*STRANGE, *(f"deep.{name}" for name in STRANGE)}
     assert {signal.name for signal in list_signals(empty).signals} == names
@@ -121,19 +121,19 @@ def test_rows_that_do_not_hold_a_signal_have_no_value_of_it(empty: sqlite3.Conne
         if step in (4, 25):
             missing = {signal.name: signal.missing for signal in list_signals(empty).signals}
             make_chunks(empty)
-            rolled = {signal.name: signal.missing for signal in list_signals(empty).signals}
-            assert missing == rolled == {"lidar": max(0, step + 1 - 10), "x": 0}
+            chunked = {signal.name: signal.missing for signal in list_signals(empty).signals}
+            assert missing == chunked == {"lidar": max(0, step + 1 - 10), "x": 0}
     assert list_signals(empty).signals[0].missing == 30
 
 
-@pytest.mark.parametrize("rolled", [False, True])
+@pytest.mark.parametrize("chunked", [False, True])
 def test_numbers_too_large_to_reckon_with_are_values(
-    empty: sqlite3.Connection, rolled: bool
+    empty: sqlite3.Connection, chunked: bool
 ) -> None:
     recorder = start_run(empty)
     for step in range(40):
         recorder.publish(float(step), {"big": 1e301})
-    if rolled:
+    if chunked:
         make_chunks(empty)
     (big,) = list_signals(empty).signals
     assert (big.missing, big.first_s, big.last_s, big.last) == (0, 0.0, 39.0, 1e301)

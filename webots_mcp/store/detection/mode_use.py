@@ -120,7 +120,8 @@ def uses_in(frame: Frame, motion: Motion, options: EventOptions) -> Iterator[tup
     rows, x, y = places_in(frame, motion.position)
     if not len(rows):
         return
-    times, codes = frame.times[rows], codes[rows]
+    is_all = len(rows) == len(frame)
+    times, codes = (frame.times, codes) if is_all else (frame.times[rows], codes[rows])
     same = (np.diff(times // _SAMPLE_S) == 0) & (np.diff(codes) == 0)
     starts = np.flatnonzero(np.append(True, ~same))
     counts = np.diff(starts, append=len(rows))

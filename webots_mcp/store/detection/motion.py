@@ -123,7 +123,8 @@ def _pair(signals: dict[str, Signal], place: str | None) -> tuple[Signal, Signal
 
 def in_metres(signal: Signal, lengths: Array) -> Array:
     """Lengths that a signal holds, in metres; they are metres where its name has no unit."""
-    return lengths * metres_in(signal.name)
+    factor = metres_in(signal.name)
+    return lengths if factor == 1 else lengths * factor
 
 
 def motion_in(frame: Frame, known: dict[str, Signal], options: EventOptions) -> Motion:
@@ -183,7 +184,7 @@ def places_in(frame: Frame, position: tuple[Signal, Signal]) -> tuple[Indexes, A
     """The rows that have a position, and it in metres."""
     x, y = (in_metres(each, frame.numbers(each.name)) for each in position)
     rows = np.flatnonzero(np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M)
-    return rows, x[rows], y[rows]
+    return (rows, x, y) if len(rows) == len(frame) else (rows, x[rows], y[rows])
 
 
 def tracks_in(
@@ -193,7 +194,8 @@ def tracks_in(
     from webots_mcp.store.analysis.track import tracks_of
 
     rows, x, y = places_in(frame, position)
-    tracks = tracks_of(frame.times[rows], x, y, noise.position_m, noise.rows)
+    times = frame.times if len(rows) == len(frame) else frame.times[rows]
+    tracks = tracks_of(times, x, y, noise.position_m, noise.rows)
     ends = np.cumsum([len(track.times) for track in tracks])
     return tracks, np.split(rows, ends)[:-1]
 

@@ -333,6 +333,7 @@ class Frame:
         if order is not None:
             rows = order[self._start : self._stop]
             numbers, codes = numbers[rows], None if codes is None else codes[rows]
+        numbers.flags.writeable = False  # others may hold the same
         return Decoded(numbers, codes, labels)
 
     def _coded(self, name: str, *, numbers: bool) -> Coded:

@@ -23,7 +23,7 @@ from webots_mcp.store.chunks.stored import (
 
 _MOST_ROWS: Final = 2**20  # of a group: no maker puts more than 1,024 into one
 NOT_READ: Final = "not read from"  # how what says that a part is not in a frame begins
-MOST_CACHED_BYTES: Final = 32_000_000  # of values that a frame caches
+MOST_CACHED_BYTES: Final = 80_000_000  # of values that a frame caches
 Column = str | int  # the name of a signal, or what has a chunk of its own (SIM_TIMES, ...)
 T = TypeVar("T")
 

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from webots_mcp import MCPBridge, MemoryDatabase
-from webots_mcp.bridge import encoding, recovery
+from webots_mcp.bridge import encoding, recorder
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, Database
 from webots_mcp.standin import InProcessSupervisor
@@ -103,7 +103,7 @@ def filed(file: Path) -> Recording:
 @pytest.fixture
 def retry_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """No waiting between tries, so that the tests need no sleep."""
-    monkeypatch.setattr(recovery, "_RETRY_INTERVAL_S", 0.0)
+    monkeypatch.setattr(recorder, "_RETRY_INTERVAL_S", 0.0)
 
 
 @pytest.fixture

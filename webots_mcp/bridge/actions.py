@@ -1,8 +1,9 @@
-"""The built-in actions: for each in `contract.BUILT_IN_ACTIONS` the function of its name.
+"""Serving the command queue, with the built-in actions.
 
-Each returns a generator, which yields until its outcome is known (once per round of the user's
-loop, or of the pause), returns the command's result, or raises the command's error. A command that
-is refused before its generator exists does not interrupt another one.
+For each action in `contract.BUILT_IN_ACTIONS` there is the function of its name. It returns a
+generator, which yields until its outcome is known (once per round of the user's loop, or of the
+pause), returns the command's result, or raises the command's error. A command that is refused
+before its generator exists does not interrupt another one.
 """
 
 from __future__ import annotations
@@ -10,17 +11,23 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final, NamedTuple, cast
 
-from webots_mcp.bridge.command_queue import ClaimedCommand, Progress
-from webots_mcp.bridge.context import Context
-from webots_mcp.bridge.declared_parameters import SETTERS, Setter
-from webots_mcp.bridge.goal import Goal, read_goal
-from webots_mcp.bridge.picture_files import complete_png_size
-from webots_mcp.bridge.picturing import find_pictured, take_picture
-from webots_mcp.bridge.text import describe
+from webots_mcp.bridge.breakpoints import Breakpoints, Goal, Watch, read_goal
+from webots_mcp.bridge.commands import ClaimedCommand, ClaimedCommands, Handlers, Progress, Reloads
+from webots_mcp.bridge.error_report import describe
+from webots_mcp.bridge.journal import Heartbeat, Journal
+from webots_mcp.bridge.keeping import Keeper, Throttle
+from webots_mcp.bridge.parameters import SETTERS, Parameters, Setter
+from webots_mcp.bridge.pause import PUMP_INTERVAL_S, Pause
+from webots_mcp.bridge.pictures import Album, complete_png_size, find_pictured, take_picture
+from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.scene_changes import SceneEdits
+from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.contract import (
     BUILT_IN_ACTIONS,
+    ENDING,
+    LOOPING,
     MAX_STEPS,
     SCREENSHOT_FOLDER,
     Then,
@@ -33,7 +40,29 @@ from webots_mcp.errors import (
     InterruptedCommandError,
     InvalidInputError,
 )
+from webots_mcp.liveness import EXTERN
 from webots_mcp.pauses import Cause
+
+
+class Context(NamedTuple):
+    """The parts that serving commands and each built-in action work with."""
+
+    simulation: Simulation
+    clock: Clock
+    recorder: Recorder
+    journal: Journal
+    album: Album
+    heartbeat: Heartbeat
+    throttle: Throttle
+    reloads: Reloads
+    queue: ClaimedCommands
+    pause: Pause
+    parameters: Parameters
+    breakpoints: Breakpoints
+    watch: Watch
+    keeper: Keeper
+    scene: SceneEdits
+
 
 Action = Callable[[Context, ClaimedCommand], Progress]
 
@@ -60,14 +89,14 @@ def begin(context: Context, command: ClaimedCommand) -> Progress:
 def action_of(name: str) -> Action:
     """The function of a built-in action."""
     if name not in _known:  # the scene's: seldom used, and not worth their import at every start
-        from webots_mcp.bridge import scene_changing, scene_looking
+        from webots_mcp.bridge import scene, scene_changes
 
         _known.update(
-            get_scene=scene_looking.get_scene,
-            get_field=scene_looking.get_field,
-            set_field=scene_changing.set_field,
-            add_node=scene_changing.add_node,
-            remove_node=scene_changing.remove_node,
+            get_scene=scene.get_scene,
+            get_field=scene.get_field,
+            set_field=scene_changes.set_field,
+            add_node=scene_changes.add_node,
+            remove_node=scene_changes.remove_node,
         )
     return _known[name]
 
@@ -95,7 +124,7 @@ def pause(context: Context, command: ClaimedCommand) -> Progress:
 def resume(context: Context, command: ClaimedCommand) -> Progress:
     """Continue in real time, whatever the mode was before."""
     before = context.pause.running_mode
-    context.pause.end(command, "real_time")
+    context.pause.end(command.id, "real_time")
     why = "resume means real time"
     if before == "fast":
         why += "; it ran fast before: the command fast continues in that mode"
@@ -106,7 +135,7 @@ def resume(context: Context, command: ClaimedCommand) -> Progress:
 @_built_in
 def fast(context: Context, command: ClaimedCommand) -> Progress:
     """Continue as fast as the computer can."""
-    context.pause.end(command, "fast")
+    context.pause.end(command.id, "fast")
     return _mode(context)
     yield
 
@@ -126,7 +155,7 @@ def _step(context: Context, command: ClaimedCommand, steps: int) -> Progress:
     clock, watch = context.clock, context.watch
     from_s, from_step = clock.sim_time_s, clock.steps_seen
     mode = None if context.simulation.waits_for_robot else "real_time"
-    context.pause.change_mode_temporarily(command, mode, stepping=True)
+    context.pause.change_mode_temporarily(command.id, mode, stepping=True)
     watch.stepping = command.id
     try:
         while (made := clock.steps_seen - from_step) < steps and not context.pause.active:
@@ -165,7 +194,7 @@ def reset(context: Context, command: ClaimedCommand) -> Progress:
     """Ask for the reset; done when simulation time has gone back, which takes a physics step."""
     was_paused = context.pause.active
     context.queue.issue(command)
-    context.pause.end(command)  # first: a paused simulation makes no physics step
+    context.pause.end(command.id)  # first: a paused simulation makes no physics step
     yield from _reset(context)
     why = "a reset takes a step, which ended the pause" if was_paused else "a reset keeps the mode"
     return {"run_id": context.clock.run.id, **_mode(context), "why": f"{why}; the simulation runs"}
@@ -192,7 +221,7 @@ def reload(context: Context, command: ClaimedCommand) -> Progress:
     """Ask for the reload; this process ends, and the next session confirms the command."""
     context.queue.issue(command)
     context.reloads.requested_by = command
-    context.pause.end(command)  # first: after worldReload() Webots answers nothing but quit
+    context.pause.end(command.id)  # first: after worldReload() Webots answers nothing but quit
     context.simulation.robot.worldReload()
     deadline_s = time.monotonic() + _RELOAD_TIMEOUT_S
     while time.monotonic() < deadline_s:
@@ -211,7 +240,7 @@ def load_world(context: Context, command: ClaimedCommand) -> Progress:
 
 
 def _load(context: Context, command: ClaimedCommand, world: Path) -> Progress:
-    context.pause.end(command)  # first: a paused simulation makes no physics step
+    context.pause.end(command.id)  # first: a paused simulation makes no physics step
     context.simulation.robot.worldLoad(str(world))
     return (yield from _until_ended("worldLoad"))
 
@@ -242,7 +271,7 @@ def quit(context: Context, command: ClaimedCommand) -> Progress:  # noqa: A001  
 
 
 def _quit(context: Context, command: ClaimedCommand, status: int) -> Progress:
-    context.pause.end(command)
+    context.pause.end(command.id)
     context.simulation.robot.simulationQuit(status)
     return (yield from _until_ended("simulationQuit"))
 
@@ -354,7 +383,7 @@ def _run_until(context: Context, command: ClaimedCommand, goal: Goal) -> Progres
     watch.begin(command.id, goal, finish)
     pause.ask_before_steps(watch.before_step)
     try:
-        pause.change_mode_temporarily(command, goal.pace)
+        pause.change_mode_temporarily(command.id, goal.pace)
         if goal.reset:
             yield from _reset(context)
         while not watch.over():
@@ -429,3 +458,148 @@ def _whole_number(
             f"{name} must be a whole number from {least} to {most}, not {value!r}"
         )
     return value
+
+
+# -- serving the queue -----------------------------------------------------------------------------
+
+
+POLL_INTERVAL_S: Final = 0.005
+
+
+class Control:
+    """Claims commands, runs them, and keeps the loop while the simulation is paused.
+
+    Attributes:
+        handlers: The controller's own actions.
+        why_ended: The error of commands that are still running when the process ends.
+    """
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self.handlers = Handlers(context.recorder, context.journal, context.pause)
+        self.why_ended = "the controller ended"
+        self._running: dict[ClaimedCommand, Progress] = {}
+        self._reported = False
+        self._next_poll_s = 0.0
+        context.pause.serve = self._serve_pause
+
+    def report_end(self, *, extern: bool) -> None:
+        """The process is about to end: answer the commands that no successor will answer."""
+        for running in [c for c in self._running if c.action in (*LOOPING, *ENDING)]:
+            self._end(running, ControllerEndedError(self.why_ended))
+        command = self._context.reloads.requested_by
+        if command is not None and extern and not self._reported:
+            self._reported = True
+            self._running.pop(command, None)
+            self._succeed(command, {"controller": f"it has ended; {EXTERN}"})
+
+    def serve(self) -> ClaimedCommand | None:
+        """One round: advance running actions, begin one new command, and stay in a pause.
+
+        Returns:
+            The command that was handled last in this call, if any.
+        """
+        now, handled = time.monotonic(), None
+        due = now >= self._next_poll_s
+        if not (due or self._running or self._context.pause.active):
+            return None
+        self._advance_all()
+        if due:
+            handled = self._serve_one()
+            # Commands often come in groups: after one, the next round looks for another.
+            self._next_poll_s = now + POLL_INTERVAL_S if handled is None else now
+        return self._serve_pause() or handled
+
+    def _serve_pause(self) -> ClaimedCommand | None:
+        """Serve commands for as long as the pause lasts."""
+        handled, pause = None, self._context.pause
+        while pause.active:
+            self._context.heartbeat.poll()
+            pause.pump()
+            self._advance_all()
+            handled = self._serve_one() or handled
+            time.sleep(PUMP_INTERVAL_S if pause.active else 0)
+        return handled
+
+    def _serve_one(self) -> ClaimedCommand | None:
+        if self._context.simulation.over:
+            return None
+        command = self._context.queue.claim(self._context.clock.sim_time_s)
+        if command is not None:
+            self._start(command)
+        return command
+
+    def _start(self, command: ClaimedCommand) -> None:
+        built_in = BUILT_IN_ACTIONS.get(command.action)
+        try:
+            self._context.queue.begin(command)
+            if built_in is None or self.handlers.knows(command.action):
+                self._succeed(command, self.handlers.run(command))
+            else:
+                progress = begin(self._context, command)
+                if built_in.ends_steps:
+                    self._interrupt(f"interrupted by command {command.id} ({command.action})")
+                self._running[command] = progress
+        except BaseException as error:
+            self._fail(command, error)  # whatever a handler raises is the answer
+            if not isinstance(error, Exception):
+                raise  # Ctrl-C and SystemExit still end the loop, but the command is answered first
+        self._advance(command)
+
+    def _advance_all(self) -> None:
+        for command in tuple(self._running):  # a copy: an advanced action leaves or changes it
+            if self._context.simulation.over:
+                self._abandon(command)
+            else:
+                self._advance(command)
+
+    def _abandon(self, command: ClaimedCommand) -> None:
+        """Drop an action after Webots said quit; a reload is left for the successor to confirm."""
+        if command.action == "reload":
+            del self._running[command]
+        else:
+            self._end(command, ControllerEndedError("Webots ended the controller"))
+
+    def _advance(self, command: ClaimedCommand) -> None:
+        """Advance a built-in action by one round.
+
+        It is taken out meanwhile: a callback of the user may call `get_command()` and so come back
+        to here, and a generator cannot be entered twice.
+        """
+        progress = self._running.pop(command, None)
+        if progress is None:
+            return
+        try:
+            next(progress)
+            self._running[command] = progress
+        except StopIteration as end:
+            self._succeed(command, end.value)
+        except BaseException as error:
+            self._fail(command, error)  # whatever the action raises is the answer
+            if not isinstance(error, Exception):
+                raise
+
+    def _interrupt(self, why: str) -> None:
+        """Another command controls the loop from now on: end the ones that let it run."""
+        for command in [c for c in self._running if c.action in LOOPING]:
+            self._end(command, InterruptedCommandError(why))
+
+    def _end(self, command: ClaimedCommand, interruption: InterruptedCommandError) -> None:
+        """End a running built-in action, which may answer how far it got."""
+        progress = self._running.pop(command)
+        try:
+            progress.throw(interruption)
+        except StopIteration as end:
+            self._succeed(command, end.value)
+        except CommandRefusedError as reason:
+            self._fail(command, reason)
+
+    def _succeed(self, command: ClaimedCommand, result: object) -> None:
+        context = self._context
+        replaced = context.queue.succeed(command, result, context.clock.sim_time_s)
+        if replaced is not None:
+            text = f"command {command.id} ({command.action}): {replaced}"
+            context.journal.log("warning", "bridge", text)
+
+    def _fail(self, command: ClaimedCommand, error: BaseException) -> None:
+        self._context.queue.fail(command, describe(error), self._context.clock.sim_time_s)

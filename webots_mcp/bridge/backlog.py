@@ -6,8 +6,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Final
 
-from webots_mcp.bridge.row_counts import RowCounts
-from webots_mcp.bridge.run import Run
+from webots_mcp.bridge.error_report import RowCounts
+from webots_mcp.bridge.simulation import Run
 from webots_mcp.entries import Entry, Kind, Values
 from webots_mcp.waiting_file import ENTRIES_AT_ONCE, WaitingFile
 

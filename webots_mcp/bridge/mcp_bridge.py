@@ -7,23 +7,16 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from webots_mcp.bridge import open_bridges
-from webots_mcp.bridge.attachment import Attachment
-from webots_mcp.bridge.capture import Capture
-from webots_mcp.bridge.command_queue import ClaimedCommand
-from webots_mcp.bridge.controller_session import Session
-from webots_mcp.bridge.declared_parameters import Parameter, V
+from webots_mcp.bridge.commands import ClaimedCommand, Handler
 from webots_mcp.bridge.encoding import text_of
-from webots_mcp.bridge.error_report import ErrorReport
-from webots_mcp.bridge.handlers import Handler
-from webots_mcp.bridge.open_bridges import OpenBridge
-from webots_mcp.bridge.picture_files import MOST_FRAMES
-from webots_mcp.bridge.stats import BridgeStats
-from webots_mcp.bridge.text import describe
-from webots_mcp.bridge.throttle import Throttle
-from webots_mcp.bridge.webots_api import Simulation
+from webots_mcp.bridge.error_report import ErrorReport, describe
+from webots_mcp.bridge.keeping import Throttle
+from webots_mcp.bridge.parameters import Parameter, V
+from webots_mcp.bridge.pictures import MOST_FRAMES
+from webots_mcp.bridge.session import Attachment, Session
+from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.contract import (
     ENDED_BY,
     KEEP_LAST_S,
@@ -42,6 +35,8 @@ from webots_mcp.parameter import declare
 
 if TYPE_CHECKING:
     import logging
+
+    from webots_mcp.bridge.capture import Capture
 
 _FALSE: Final = ("", "0", "false", "no", "off")
 _MOST_KEEP_LAST_S: Final = 3600.0
@@ -115,18 +110,16 @@ class MCPBridge:
         simulation = Simulation(robot)
         # After the check of the robot, before the new session: a refused construction leaves the
         # former bridge as it is, and two sessions of one robot never overlap.
-        open_bridges.close_former(robot)
+        close_former(robot)
         where = (self.database, self.data_dir)
         self._session = Session(
             simulation, *where, throttle, keep_last_s, self._errors, kind=self._kind
         )
         self._publisher = self._session.publisher
         self._session.begin()
-        self._capture = Capture(self._record_output)
-        if capture_output:
-            self._capture.begin()
+        self._capture = self._capture_output() if capture_output else None
         self._attachment: Attachment | None = None
-        open_bridges.enter(robot, OpenBridge(self, self.close, self._leave_to_parent))
+        enter(robot, OpenBridge(self, self.close, self._leave_to_parent))
         atexit.register(self._close_at_exit)
 
     # -- attaching -----------------------------------------------------------------------------
@@ -161,7 +154,7 @@ class MCPBridge:
         Raises:
             ValueError: Options are given and the robot has a bridge already.
         """
-        bridge = open_bridges.find(robot)
+        bridge = find(robot)
         if not isinstance(bridge, MCPBridge):
             bridge = cls(robot, **options)
         elif options:
@@ -316,7 +309,7 @@ class MCPBridge:
         Args:
             level: The handler records this level and those above it.
         """
-        from webots_mcp.bridge.log_handler import LogHandler  # `logging` costs a tenth of a start
+        from webots_mcp.bridge.capture import LogHandler  # `logging` costs a tenth of a start
 
         return LogHandler(self._log, level)
 
@@ -511,8 +504,9 @@ class MCPBridge:
             self._session.let_go()
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("close", error)
-        open_bridges.leave(self.robot)
-        self._capture.close()
+        leave(self.robot)
+        if self._capture is not None:
+            self._capture.close()
         self._session.close(reason)
         self._closed = True  # last: an interrupted call is repeated by `_close_at_exit`
         atexit.unregister(self._close_at_exit)
@@ -546,6 +540,13 @@ class MCPBridge:
         if isinstance(error, Exception):
             self.log(why, "error")
 
+    def _capture_output(self) -> Capture:
+        from webots_mcp.bridge.capture import Capture  # only here: seldom needed
+
+        capture = Capture(self._record_output)
+        capture.begin()
+        return capture
+
     def _record_output(self, stream: str, lines: Sequence[str]) -> None:
         try:
             self._session.context.journal.output(stream, lines)
@@ -556,7 +557,8 @@ class MCPBridge:
         """In a forked child: leave the session to the parent; the child records nothing."""
         self._closed = True
         self.detach()
-        self._capture.abandon()
+        if self._capture is not None:
+            self._capture.abandon()
         self._session.context.recorder.abandon()
         self._session.context.keeper.abandon()
 
@@ -574,3 +576,90 @@ def _seconds(given: float | str) -> float:
     if not 0 <= seconds <= _MOST_KEEP_LAST_S:
         raise ValueError(f"keep_last_s must be from 0 to {_MOST_KEEP_LAST_S:g}, got {given!r}")
     return seconds
+
+
+# -- the open bridges of this process --------------------------------------------------------------
+# One per robot: a second one closes the first. Those of a parent that forked the process are
+# dropped.
+
+
+class OpenBridge(NamedTuple):
+    """A bridge, and how to close it.
+
+    Attributes:
+        bridge: The bridge itself.
+        close: Ends its session, for a reason.
+        abandon: In a forked child: leaves the session to the parent.
+    """
+
+    bridge: object
+    close: Callable[[str], object]
+    abandon: Callable[[], object]
+
+
+_bridges: dict[int, OpenBridge] = {}
+
+
+def enter(robot: object, bridge: OpenBridge) -> None:
+    """Register a robot's bridge."""
+    _bridges[id(robot)] = bridge
+
+
+def find(robot: object) -> object | None:
+    """The open bridge of a robot, or None."""
+    open_bridge = _bridges.get(id(robot))
+    return None if open_bridge is None else open_bridge.bridge
+
+
+def leave(robot: object) -> None:
+    """Remove a robot's closed bridge."""
+    _bridges.pop(id(robot), None)
+
+
+def close_former(robot: object) -> None:
+    """Close the robot's previous bridge, if it has one."""
+    former = _bridges.get(id(robot))
+    if former is not None:
+        former.close("superseded")
+
+
+def _leave_to_parent() -> None:
+    for bridge in _bridges.values():
+        bridge.abandon()
+    _bridges.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_leave_to_parent)
+
+
+class BridgeStats(NamedTuple):
+    """What a bridge recorded so far, and what it could not record.
+
+    Attributes:
+        rows_written: Rows that the database has taken.
+        rows_waiting: Rows that it could not take yet: in the file next to it, else in memory.
+        rows_dropped: Rows that will never be in it.
+        publish_calls: Calls of `publish` and `auto_publish` in the session.
+        publish_throttled: Calls that the throttle did not record.
+        values_replaced: Values that JSON cannot hold; `replaced` of their row names them.
+        publish_mean_us: The mean duration of a recorded call, in microseconds.
+        publish_max_us: The longest duration of a recorded call, in microseconds.
+        ring_interval: One call of `auto_publish` in this many is held in the ring buffer.
+        frames_missed: Camera frames that could not be taken or written.
+        failures: Calls of the bridge's methods that failed.
+        last_error: The newest error, with its reason; None if there was none.
+    """
+
+    rows_written: int
+    rows_waiting: int
+    rows_dropped: int
+    publish_calls: int
+    publish_throttled: int
+    values_replaced: int
+    publish_mean_us: float
+    publish_max_us: float
+    ring_interval: int
+    frames_missed: int
+    failures: int
+    last_error: str | None

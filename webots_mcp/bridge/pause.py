@@ -6,11 +6,8 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import Final, Protocol
 
-from webots_mcp.bridge.command_queue import ClaimedCommand
-from webots_mcp.bridge.gate import QUIT, Step
-from webots_mcp.bridge.heartbeat import Heartbeat
-from webots_mcp.bridge.journal import Journal
-from webots_mcp.bridge.webots_api import Simulation
+from webots_mcp.bridge.journal import Heartbeat, Journal
+from webots_mcp.bridge.simulation import QUIT, Simulation, Step
 from webots_mcp.pauses import (
     BRIDGE_CLOSED,
     IN_WEBOTS,
@@ -95,23 +92,21 @@ class Pause:
         self._journal.event(PAUSE, cause.data)
         self._heartbeat.change_loop(PAUSED, self._mode_before)
 
-    def end(
-        self, command: ClaimedCommand, mode: str | None = None, *, stepping: bool = False
-    ) -> None:
+    def end(self, command_id: int, mode: str | None = None, *, stepping: bool = False) -> None:
         """Let the loop continue, in `mode` or in the mode before the pause."""
         before, was_active = self.running_mode, self.active
         self._simulation.set_mode(mode or _running(before))
         self._deactivate()
         if was_active:
-            self._journal.event(RESUME, Cause(command.id).data)
+            self._journal.event(RESUME, Cause(command_id).data)
         self._heartbeat.change_loop(STEPPING if stepping else None)
 
     def change_mode_temporarily(
-        self, command: ClaimedCommand, mode: str | None, *, stepping: bool = False
+        self, command_id: int, mode: str | None, *, stepping: bool = False
     ) -> None:
         """Let the loop continue as `end` does, but remember the mode to return to."""
         before = self.running_mode
-        self.end(command, mode, stepping=stepping)
+        self.end(command_id, mode, stepping=stepping)
         self._mode_before = before
 
     def restore_mode(self) -> None:

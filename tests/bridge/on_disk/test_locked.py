@@ -21,7 +21,7 @@ from tests.bridge.conftest import (
 )
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import actions, backlog
-from webots_mcp.bridge.command_queue import ClaimedCommand
+from webots_mcp.bridge.commands import ClaimedCommand
 from webots_mcp.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 

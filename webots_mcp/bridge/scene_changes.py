@@ -10,26 +10,34 @@ import itertools
 import json
 import re
 import time
-from collections.abc import Generator
-from dataclasses import replace
-from typing import Any, Final
+from collections.abc import Callable, Generator
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from webots_mcp.bridge.command_queue import ClaimedCommand, Progress
-from webots_mcp.bridge.context import Context
-from webots_mcp.bridge.scene_edits import MOST_EDITS
-from webots_mcp.bridge.scene_path import Place, children, find, find_node, label
-from webots_mcp.bridge.scene_restoring import FieldEdit, Removal, find_again, import_node, spot_of
-from webots_mcp.bridge.scene_values import (
+from webots_mcp.bridge.commands import ClaimedCommand, Progress
+from webots_mcp.bridge.error_report import cut
+from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.scene import (
     MOST_ENTRIES,
+    Pace,
+    Place,
     checked,
+    children,
+    entries,
+    fields_of,
+    find,
+    find_node,
     is_nearer,
     is_same,
+    label,
     read,
     require_no_path,
     write,
 )
-from webots_mcp.bridge.text import cut
+from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
+
+if TYPE_CHECKING:
+    from webots_mcp.bridge.actions import Context
 
 _LONGEST_NODE: Final = 50_000  # characters of a node that is added
 _LONGEST_SHOWN: Final = 1_000  # characters of a value in an answer
@@ -48,9 +56,9 @@ def set_field(context: Context, command: ClaimedCommand) -> Progress:
     _require_settable(robot, place)
     value = checked(place.path, place.type_name, params.get("value"))
     require_no_path(str(place.webots_field.getName()), value)
-    before = read(place.field, place.index)
+    before = read(place.field, place.entry)
     is_remembered = context.scene.remember_field(_edit(place, before, value))
-    write(place.field, value, place.index)
+    write(place.field, value, place.entry)
     if params.get("stop") is True:
         place.node.resetPhysics()
     facts: dict[str, Any] = {"path": place.path, "type": place.type_name}
@@ -82,7 +90,7 @@ def _shown(value: Any) -> Any:
 def _edit(place: Place, before: Any, value: Any) -> FieldEdit:
     name = str(place.webots_field.getName())
     node_id = int(place.node.getId())
-    return FieldEdit(place.path, node_id, name, place.index, place.type_name, before, value)
+    return FieldEdit(place.path, node_id, name, place.entry, place.type_name, before, value)
 
 
 def _require_settable(robot: Any, place: Place) -> None:
@@ -96,7 +104,7 @@ def _require_settable(robot: Any, place: Place) -> None:
             f"{place.path} is inside a PROTO, where nothing can be set: set a field of the PROTO "
             "node itself"
         )
-    if place.index is None and place.field.getCount() > MOST_ENTRIES:
+    if place.entry is None and place.field.getCount() > MOST_ENTRIES:
         raise InvalidInputError(
             f"{place.path} has {place.field.getCount()} entries: set one, such as {place.path}[0]"
         )
@@ -114,7 +122,7 @@ def _read_again(robot: Any, place: Place) -> Any:
         raise CommandRefusedError(
             f"{place.path} does not exist any more after it was set: look with webots_get_scene"
         )
-    return read(field, place.index)
+    return read(field, place.entry)
 
 
 def _until_stepped(context: Context) -> Generator[None, None, bool]:
@@ -208,7 +216,7 @@ def _find_room(robot: Any, path: object) -> Generator[None, None, Place]:
             raise InvalidInputError(
                 f"{place.path} ({label(place.node)}) has no field children: name a field of nodes"
             )
-        place = replace(place, path=f"{place.path}.children", field=room)
+        place = place._replace(path=f"{place.path}.children", field=room)
     room = place.webots_field
     if place.type_name == "SFNode" and room.getSFNode() is not None:
         holds = label(room.getSFNode())
@@ -290,3 +298,274 @@ def _removal(robot: Any, place: Place, node_id: int) -> Generator[None, None, Re
     if found is None or export is None:
         return None
     return Removal(place.path, node_id, *found, str(export() or ""))
+
+
+# Physics has changed these since a command set them, and Webots' own reset restores them.
+_MOVED_BY_PHYSICS: Final = ("translation", "rotation", "battery")
+
+_MOST_EXPORTED_CHARACTERS: Final = 200_000  # of a removed node
+
+_Spot = tuple[int | None, str, int | None]
+
+
+class FieldEdit(NamedTuple):
+    """A field, or an entry of one, that was set.
+
+    Attributes:
+        path: The path of the command.
+        node_id: The number of its node.
+        name: The name of the field.
+        entry: The index of the entry; None for the whole field.
+        type_name: The type of the value.
+        before: The value before it was set for the first time in this run.
+        value: The newest value that it was set to.
+    """
+
+    path: str
+    node_id: int
+    name: str
+    entry: int | None
+    type_name: str
+    before: Any
+    value: Any
+
+
+class Removal(NamedTuple):
+    """A node that was removed, as text, and its former position.
+
+    Attributes:
+        path: The path of the command.
+        node_id: The number of the node, or of the one that replaced it at the last reset.
+        parent_id: The number of its parent; None for the top of the tree.
+        field: The name of the field that contained it.
+        entry: Its index in the field; None in a field for a single node.
+        text: Its text as in a world file.
+    """
+
+    path: str
+    node_id: int
+    parent_id: int | None
+    field: str
+    entry: int | None
+    text: str
+
+    @property
+    def is_written_out(self) -> bool:
+        """Whether Webots exported its text, and it is short enough to be remembered."""
+        return 0 < len(self.text) <= _MOST_EXPORTED_CHARACTERS
+
+
+class Restoration:
+    """Undoes the changes of one run, after its reset.
+
+    Args:
+        robot: The Supervisor.
+        failed: Receives each error of a call to Webots.
+    """
+
+    def __init__(self, robot: Any, failed: Callable[[str, Exception], None]) -> None:
+        self._robot = robot
+        self._failed = failed
+        self._set: list[FieldEdit] = []
+        self._outcomes: dict[str, list[str]] = {"by_webots": [], "by_bridge": [], "not": []}
+
+    def put_back(
+        self, fields: list[FieldEdit], added: dict[int, str], removed: list[Removal]
+    ) -> list[Removal]:
+        """Restore fields, remove added nodes, and add removed nodes again.
+
+        Returns:
+            The removed nodes with their new numbers. They have to be remembered: to Webots they
+            are added nodes, so the next reset will remove them again.
+        """
+        for edit in reversed(fields):
+            self._try(edit.path, self._set_back, edit)
+        for node_id, path in added.items():
+            self._try(path, self._take_away, node_id, path)
+        in_order = sorted(removed, key=lambda each: each.entry or 0)
+        return [self._try(each.path, self._bring_back, each) or each for each in in_order]
+
+    def outcome(self) -> dict[str, object]:
+        """What was put back by Webots, what by the bridge, and what was not; a step later."""
+        for edit in self._set:
+            self._try(edit.path, self._check_set, edit)
+        return {how: paths for how, paths in self._outcomes.items() if paths}
+
+    def _try(self, path: str, restore: Callable[..., Any], *arguments: Any) -> Any:
+        try:
+            return restore(*arguments)
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            self._failed(f"putting {path} back", error)
+            self._outcomes["not"].append(path)
+            return None
+
+    def _set_back(self, edit: FieldEdit) -> None:
+        field = find_again(self._robot, edit.node_id, edit.name)
+        if field is None:
+            self._outcomes["not"].append(f"{edit.path}: its node does not exist any more")
+        elif edit.name in _MOVED_BY_PHYSICS or not self._holds(edit, edit.value):
+            self._outcomes["by_webots"].append(edit.path)
+        else:
+            write(field, edit.before, edit.entry)
+            self._set.append(edit)
+
+    def _check_set(self, edit: FieldEdit) -> None:
+        self._note(edit.path, done=self._holds(edit, edit.before))
+
+    def _holds(self, edit: FieldEdit, value: Any) -> bool:
+        field = find_again(self._robot, edit.node_id, edit.name)
+        return field is not None and is_same(edit.type_name, read(field, edit.entry), value)
+
+    def _take_away(self, node_id: int, path: str) -> None:
+        node = self._robot.getFromId(node_id)
+        if node is None:
+            self._outcomes["by_webots"].append(f"{path} (added)")
+            return
+        node.remove()
+        self._note(f"{path} (added)", done=self._robot.getFromId(node_id) is None)
+
+    def _bring_back(self, removal: Removal) -> Removal:
+        if self._robot.getFromId(removal.node_id) is not None:
+            return removal
+        parent = self._robot.getRoot()
+        if removal.parent_id is not None:
+            parent = self._robot.getFromId(removal.parent_id)
+        field = None if parent is None else parent.getField(removal.field)
+        node = None if field is None else import_node(field, removal.text, removal.entry)
+        self._note(f"{removal.path} (removed)", done=node is not None)
+        return removal if node is None else removal._replace(node_id=int(node.getId()))
+
+    def _note(self, path: str, *, done: bool) -> None:
+        self._outcomes["by_bridge" if done else "not"].append(path)
+
+
+def find_again(robot: Any, node_id: int, name: str) -> Any | None:
+    """The field of that name, of a node that may not exist any more."""
+    node = robot.getFromId(node_id)
+    return None if node is None else node.getField(name)
+
+
+def import_node(field: Any, text: str, index: int | None = None) -> Any | None:
+    """Add a node to a field of nodes, by default at its end.
+
+    Webots reports errors in its console only, and the package raises nothing, so the field is
+    compared with before.
+
+    Returns:
+        The new node; None if none was added.
+    """
+    if field.getTypeName() == "SFNode":
+        field.importSFNodeFromString(text)
+        return field.getSFNode()
+    before = field.getCount()
+    place = before if index is None else min(index, before)
+    field.importMFNodeFromString(place, text)
+    return field.getMFNode(place) if field.getCount() > before else None
+
+
+def spot_of(robot: Any, node: Any) -> Generator[None, None, _Spot | None]:
+    """The position of a node: the number of its parent (None: the top), the field, and the index.
+
+    Returns:
+        None where it is not found.
+    """
+    parent, root, wanted, pace = node.getParentNode(), robot.getRoot(), node.getId(), Pace()
+    parent_id, fields = None, iter((children(root),))
+    if parent is not None and parent.getId() != root.getId():
+        parent_id, fields = int(parent.getId()), fields_of(parent)
+    for field in fields:
+        if field.getTypeName() not in ("SFNode", "MFNode"):
+            continue
+        for index, each in entries(field):
+            if each.getId() == wanted:
+                return parent_id, str(field.getName()), index
+            yield from pace.rest()
+    return None
+
+
+# -- what a reset has to undo ----------------------------------------------------------------------
+# A reset by Webots restores poses and removes added nodes. It does not restore other fields or
+# removed nodes: that is done here, as long as the controller's process lives.
+
+
+MOST_EDITS: Final = 200  # that are put back
+
+
+class SceneEdits:
+    """Remembers changes of the scene, and undoes them after a reset.
+
+    Args:
+        simulation: Has the scene.
+        clock: Counts the steps: Webots sets fields with the next one.
+        journal: Receives an event with what was put back.
+        failed: Receives each error of a call to Webots.
+
+    Attributes:
+        fields: The fields that were set in this run, in that order.
+        added: The paths of the nodes that were added in this run, by their numbers.
+        removed: The nodes that were removed in this run or an earlier one.
+    """
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        clock: Clock,
+        journal: Journal,
+        failed: Callable[[str, Exception], None],
+    ) -> None:
+        self._simulation = simulation
+        self._clock = clock
+        self._journal = journal
+        self._failed = failed
+        self._restoration: Restoration | None = None
+        self._restored_at_step = 0
+        self.fields: dict[tuple[int, str, int | None], FieldEdit] = {}
+        self.added: dict[int, str] = {}
+        self.removed: list[Removal] = []
+
+    def remember_field(self, edit: FieldEdit) -> bool:
+        """Remember that a field is about to be set; False if that will not be undone."""
+        key = (edit.node_id, edit.name, edit.entry)
+        known = self.fields.get(key)
+        if known is None and self._is_full:
+            return False
+        self.fields[key] = edit if known is None else known._replace(value=edit.value)
+        return True
+
+    def remember_added(self, path: str, node_id: int) -> bool:
+        """Remember an added node; False if that will not be undone."""
+        if self._is_full:
+            return False
+        self.added[node_id] = path
+        return True
+
+    def remember_removed(self, removal: Removal) -> bool:
+        """Remember a removed node; False if it will not be restored."""
+        if self.added.pop(removal.node_id, None) is not None:
+            return True  # it did not exist when the run began
+        if self._is_full or not removal.is_written_out:
+            return False
+        self.removed.append(removal)
+        return True
+
+    @property
+    def _is_full(self) -> bool:
+        return len(self.fields) + len(self.added) + len(self.removed) >= MOST_EDITS
+
+    def begin_run(self) -> None:
+        """The world was reset: undo the changes that Webots has not undone."""
+        if not (self.fields or self.added or self.removed):
+            return
+
+        self._restoration = Restoration(self._simulation.robot, self._failed)
+        self._restored_at_step = self._clock.steps_seen
+        fields, self.fields = [*self.fields.values()], {}
+        added, self.added = self.added, {}
+        self.removed = self._restoration.put_back(fields, added, self.removed)
+
+    def look(self) -> None:
+        """Record what was put back, after the step with which Webots sets the fields."""
+        restoration = self._restoration
+        if restoration is not None and self._clock.steps_seen != self._restored_at_step:
+            self._restoration = None
+            self._journal.event("put_back", restoration.outcome())

@@ -142,7 +142,7 @@ def numbers(recording: Recording) -> list[int]:
 def waiting_file(bridge: MCPBridge) -> Path:
     """Where the rows of the bridge wait while its database takes none."""
     assert isinstance(bridge.database, Path)
-    return waiting_path(bridge.database, bridge._session.context.recorder.session.uuid)  # pyright: ignore[reportPrivateUsage]
+    return waiting_path(bridge.database, bridge._session.context.recorder.uuid)  # pyright: ignore[reportPrivateUsage]
 
 
 def keep_in_memory(bridge: MCPBridge) -> None:

@@ -26,9 +26,8 @@ PACKAGE = str(Path(webots_mcp.__file__).parent)
 WRITING = {
     f"{name}.py"
     for name in (
-        *("recorder", "row_writer", "recovery", "session_connection", "connection_lock"),
-        *("row_counts", "backlog", "journal", "heartbeat", "heartbeat_rows", "run"),
-        *("mcp_bridge", "publisher", "waiting_file", "transactions", "connection"),
+        *("recorder", "backlog", "journal", "session", "simulation", "mcp_bridge"),
+        *("waiting_file", "transactions", "connection"),
     )
 }
 Place = tuple[str, int, int]  # file, line, and the instruction in it or -1
@@ -180,7 +179,7 @@ def _is_held(bridge: MCPBridge) -> bool:
     recorder = bridge._session.context.recorder  # pyright: ignore[reportPrivateUsage]
     recorder.flush()
     held = bool(recorder._lock._held)  # pyright: ignore[reportPrivateUsage]
-    connection = recorder.session.connection
+    connection = recorder.connection
     return held or (connection is not None and connection.in_transaction)
 
 

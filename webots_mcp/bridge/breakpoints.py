@@ -110,7 +110,7 @@ class Breakpoints:
         self._registration: Registration | None = None  # in the database that was read last
         self._off: dict[int, str] = {}
         self.armed: list[Breakpoint] = []
-        recorder.session.new_database_entries.append(self._read_later)
+        recorder.new_database_entries.append(self._read_later)
 
     # -- setting -------------------------------------------------------------------------------
 
@@ -130,7 +130,7 @@ class Breakpoints:
             self._begun = run
             for each in self.armed:
                 each.begin_run()
-        registration = self._recorder.session.registration
+        registration = self._recorder.registration
         if registration is None:
             return False
         ids = {"robot": registration.robot_id, "session": registration.session_id}
@@ -204,7 +204,7 @@ class Breakpoints:
         return number
 
     def _store(self, text: str, action: str, after_hits: int) -> int | None:
-        registration = self._recorder.session.registration
+        registration = self._recorder.registration
         if registration is None:
             return None
         ids = (registration.robot_id, registration.session_id)

@@ -67,7 +67,7 @@ class ClaimedCommands:
         Call `begin` with it. Where an interrupt prevents that, the next call writes it as failed.
         """
         recorder, now = self._recorder, time.time()
-        registration = recorder.session.registration
+        registration = recorder.registration
         if registration is not None and self._claiming:
             self._fail_interrupted(registration.session_id, sim_time_s)
         if registration is None or not recorder.fetch(PEEK, (registration.robot_id, now)):
@@ -228,7 +228,7 @@ class Handlers:
             why = "this function is called instead of the callbacks of on_reload()"
             self._journal.log("info", "bridge", f"the controller has registered {action!r}: {why}")
         self._handlers[action] = handler
-        self._recorder.session.actions[action] = storable(cut(doc, _MOST_DOC_CHARACTERS))
+        self._recorder.actions[action] = storable(cut(doc, _MOST_DOC_CHARACTERS))
         self._recorder.update_actions()
 
     def knows(self, action: str) -> bool:

@@ -1,8 +1,7 @@
-"""What a bridge reports of its errors and of dropped rows, and texts for the database."""
+"""What a bridge reports of its errors, and texts for the database."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Final
 
@@ -79,43 +78,3 @@ def _text_of(error: BaseException) -> str:
         return cut(str(error), _LONGEST_TEXT)
     except Exception as failure:  # noqa: BLE001  (an exception of the user's own kind)
         return f"(no text: its str() raised {type(failure).__name__})"
-
-
-class RowCounts:
-    """Counts written and dropped rows; drops are warned of and recorded as an event.
-
-    Attributes:
-        written: Rows that the database took.
-        dropped: Rows that will never be in it.
-        unreported: Dropped rows that no event in the database reports yet.
-    """
-
-    def __init__(self, errors: ErrorReport) -> None:
-        self._errors = errors
-        self._why = ""
-        self._confirmed = 0
-        self.written = 0
-        self.dropped = 0
-        self.unreported = 0
-
-    def drop(self, rows: int, why: str) -> None:
-        """Count rows as dropped, and warn; raises in strict mode."""
-        self.dropped += rows
-        self.unreported += rows
-        self._why = why
-        self._errors.warn(f"dropped: {why}", f"rows are being dropped: {why}")
-
-    def confirm(self) -> None:
-        """The files still exist, so what was written to them so far is stored."""
-        self._confirmed = self.written
-
-    def drop_unconfirmed(self, why: str) -> None:
-        """The files are lost: count the rows written since the last `confirm` as dropped."""
-        rows, self.written = self.written - self._confirmed, self._confirmed
-        if rows:
-            self.drop(rows, why)
-
-    def report(self) -> str:
-        """The data of the event that reports the unreported drops; none are left afterwards."""
-        rows, self.unreported = self.unreported, 0
-        return json.dumps({"row_count": rows, "why": self._why})

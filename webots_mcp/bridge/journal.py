@@ -152,7 +152,7 @@ class SignalNames:
         self._rows = 0
         self._known: dict[str, tuple[Kind, bool]] = {}  # kind, and whether numbers are whole
         self._waiting: dict[str, Seen] = {}
-        recorder.session.new_database_entries.append(self._begin_anew)
+        recorder.new_database_entries.append(self._begin_anew)
 
     def look(self, state: Mapping[Any, Any], text: str) -> None:
         """Enter the names that are new, some of many.

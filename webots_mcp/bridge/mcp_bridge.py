@@ -466,9 +466,9 @@ class MCPBridge:
         """Counts of what was recorded so far and what was not, and the time that it took."""
         recorder, throttle = self._session.context.recorder, self._session.context.throttle
         return BridgeStats(
-            rows_written=recorder.counts.written,
+            rows_written=recorder.rows_written,
             rows_waiting=recorder.rows_waiting,
-            rows_dropped=recorder.counts.dropped,
+            rows_dropped=recorder.rows_dropped,
             publish_calls=throttle.calls,
             publish_throttled=throttle.skipped,
             values_replaced=self._session.context.journal.values_replaced,

@@ -122,7 +122,7 @@ class Parameters:
         self._wanted: dict[str, Value] = {}
         self._from_reset: dict[str, tuple[Value, Setter]] = {}
         self._changes = 0
-        recorder.session.new_database_entries.append(self._entries_for_new_database)
+        recorder.new_database_entries.append(self._entries_for_new_database)
 
     def declare(self, declaration: Declaration) -> Parameter[Any]:
         """The parameter of that name, created or updated to this declaration.

@@ -95,7 +95,7 @@ class Album:
 
     def _name_of(self, device: str) -> str:
         """The beginning of a camera's file names."""
-        registration = self._recorder.session.registration
+        registration = self._recorder.registration
         robot = registration.robot_name if registration else "robot"
         return f"{_file_name(robot)}.{_file_name(device)}"
 

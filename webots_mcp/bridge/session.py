@@ -100,12 +100,12 @@ class Session:
     @property
     def robot_name(self) -> str:
         """The name under which the robot is recorded."""
-        registration = self.context.recorder.session.registration
+        registration = self.context.recorder.registration
         return registration.robot_name if registration else self._identity.robot_name
 
     def begin(self) -> None:
         """Begin the first run, and continue the previous session's reload or pause."""
-        registration = self.context.recorder.session.registration
+        registration = self.context.recorder.registration
         self.runs.begin_first(reloaded=registration is not None and registration.reloaded)
         if registration is not None:
             self._succeed_to(registration)
@@ -265,7 +265,7 @@ class Runs:
     def begin(self) -> None:
         """Simulation time went back: end the old run at its newest known time, begin a new one."""
         self._recorder.end_run("reset", self._clock.ended_sim_time_s)
-        self._recorder.session.run = self._clock.run
+        self._recorder.run = self._clock.run
         self._throttle.begin_run()
         self._reloads.happened()
         self._journal.event("reset")

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.bridge.registration import Identity
 from webots_mcp.contract import new_uuid
 from webots_mcp.errors import CommandRefusedError
 
@@ -343,14 +342,3 @@ class Run:
         self.id = None
         self.uuid = new_uuid()
         self.rows = 0
-
-    def describe(self, identity: Identity) -> dict[str, Any]:
-        """The values of its own row."""
-        return {
-            "uuid": self.uuid,
-            "world": identity.world,
-            "step_ms": identity.basic_time_step_ms,
-            "reason": self.start_reason,
-            "wall_time": self.started_wall_time_s,
-            "sim_time": self.started_sim_time_s,
-        }

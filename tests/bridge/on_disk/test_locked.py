@@ -29,7 +29,7 @@ from webots_mcp.standin import InProcessSupervisor
 def test_a_row_is_there_for_others_when_publish_returns_and_no_disk_is_waited_for(
     bridge: MCPBridge, filed: Recording
 ) -> None:
-    connection = bridge._session.context.recorder.session.connection  # pyright: ignore[reportPrivateUsage]
+    connection = bridge._session.context.recorder.connection  # pyright: ignore[reportPrivateUsage]
     assert connection is not None
     modes = [
         connection.execute(f"PRAGMA {name}").fetchone() for name in ("journal_mode", "synchronous")

@@ -38,7 +38,7 @@ NOT_ROOT = pytest.mark.skipif(
 def test_a_full_disk_makes_rows_wait_until_there_is_room(
     bridge: MCPBridge, filed: Recording, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    connection = bridge._session.context.recorder.session.connection  # pyright: ignore[reportPrivateUsage]
+    connection = bridge._session.context.recorder.connection  # pyright: ignore[reportPrivateUsage]
     assert connection is not None
     bridge.publish({"n": 0})
     (pages,) = connection.execute("PRAGMA page_count").fetchone()
@@ -286,7 +286,7 @@ def test_a_read_only_folder_costs_rows_only(robot: InProcessSupervisor, tmp_path
 def test_a_database_that_turns_read_only_costs_rows_only(
     bridge: MCPBridge, filed: Recording, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    connection = bridge._session.context.recorder.session.connection  # pyright: ignore[reportPrivateUsage]
+    connection = bridge._session.context.recorder.connection  # pyright: ignore[reportPrivateUsage]
     assert connection is not None
     connection.execute("PRAGMA query_only=ON")
     bridge.publish({"n": 0})

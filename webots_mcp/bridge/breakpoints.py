@@ -9,12 +9,8 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast, get_args
 
 from webots_mcp.bridge.encoding import plain
 from webots_mcp.bridge.error_report import cut, describe, storable
-from webots_mcp.bridge.journal import Journal
-from webots_mcp.bridge.keeping import Keeper
-from webots_mcp.bridge.pause import Pause
-from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
-from webots_mcp.bridge.simulation import Clock, Run, Simulation
+from webots_mcp.bridge.simulation import Clock, Run
 from webots_mcp.contract import BREAKPOINT_ACTIONS, MAX_BREAKPOINTS, MAX_RUN_S, Pace, RunEnd, Then
 from webots_mcp.errors import (
     CommandRefusedError,
@@ -26,6 +22,7 @@ from webots_mcp.pauses import Cause
 from webots_mcp.stored_breakpoints import ARMED, OF_CONTROLLER, SET
 
 if TYPE_CHECKING:
+    from webots_mcp.bridge.session import Session
     from webots_mcp.conditions import Condition, Evaluator
     from webots_mcp.naming import Value
 
@@ -90,27 +87,19 @@ class Breakpoint:
 class Breakpoints:
     """This robot's armed breakpoints: the stored ones, and those of the controller's code."""
 
-    def __init__(
-        self,
-        simulation: Simulation,
-        clock: Clock,
-        recorder: Recorder,
-        journal: Journal,
-        pause: Pause,
-        keeper: Keeper,
-    ) -> None:
-        self._simulation = simulation
-        self._clock = clock
-        self._recorder = recorder
-        self._journal = journal
-        self._pause = pause
-        self._keeper = keeper
+    def __init__(self, session: Session) -> None:
+        self._simulation = session.simulation
+        self._clock = session.clock
+        self._recorder = session.recorder
+        self._journal = session.journal
+        self._pause = session.pause
+        self._keeper = session.keeper
         self.run: Run | None = None  # in which the stored ones were read; None: to be read again
-        self._begun = clock.run
+        self._begun = session.clock.run
         self._registration: Registration | None = None  # in the database that was read last
         self._off: dict[int, str] = {}
         self.armed: list[Breakpoint] = []
-        recorder.new_database_entries.append(self._read_later)
+        session.recorder.new_database_entries.append(self._read_later)
 
     # -- setting -------------------------------------------------------------------------------
 

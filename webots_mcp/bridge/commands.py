@@ -8,18 +8,20 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Generator, Mapping
-from typing import Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.error_report import cut, storable
-from webots_mcp.bridge.journal import Journal
-from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
 from webots_mcp.contract import BUILT_IN_ACTIONS
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.naming import nearest_first, same_in_meaning
 from webots_mcp.queue import CLAIM, CLAIMED_SINCE, PEEK, SUCCESSOR_PID
+
+if TYPE_CHECKING:
+    from webots_mcp.bridge.session import Session
+
 
 Progress = Generator[None, None, object]
 """A running built-in action: it yields until its outcome is known, and returns the result."""
@@ -194,10 +196,10 @@ class Handlers:
         loop_polls: The loop itself calls `get_command()`, and may handle the command it returns.
     """
 
-    def __init__(self, recorder: Recorder, journal: Journal, pause: Pause) -> None:
-        self._recorder = recorder
-        self._journal = journal
-        self._pause = pause
+    def __init__(self, session: Session) -> None:
+        self._recorder = session.recorder
+        self._journal = session.journal
+        self._pause = session.pause
         self._handlers: dict[str, Handler] = {}
         self._refused: set[str] = set()
         self.running = False

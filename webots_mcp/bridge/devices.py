@@ -14,11 +14,11 @@ from collections import deque
 from collections.abc import Callable
 from itertools import pairwise
 from operator import methodcaller
-from typing import Any, Final, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
-from webots_mcp.bridge.error_report import ErrorReport
-from webots_mcp.bridge.journal import Journal
-from webots_mcp.bridge.simulation import Simulation
+if TYPE_CHECKING:
+    from webots_mcp.bridge.session import Session
+
 
 SECTORS: Final = 8
 MOST_OBJECTS: Final = 8  # of a camera or a radar that are published, the nearest first
@@ -264,10 +264,10 @@ class DeviceReader:
         why: The reason for an interval above 1; empty while the interval is 1.
     """
 
-    def __init__(self, simulation: Simulation, journal: Journal, errors: ErrorReport) -> None:
-        self._simulation = simulation
-        self._journal = journal
-        self._errors = errors
+    def __init__(self, session: Session) -> None:
+        self._simulation = session.simulation
+        self._journal = session.journal
+        self._errors = session.errors
         self._durations_us: deque[float] = deque(maxlen=_READINGS)
         self._reported_interval = 1
         self.ring_interval = 1
@@ -314,43 +314,30 @@ def _why(interval: int, usual_us: float) -> str:
 # used here.
 
 
-class Motors:
-    """Repeats `setPosition(inf)` and the velocity of motors after a reset.
+def restart_motors(session: Session) -> None:
+    """After a reset: restart the motors in velocity control, at their last velocity."""
+    devices: dict[str, Any] = getattr(session.simulation.robot, "devices", None) or {}
+    motors = [each for each in devices.items() if type(each[1]).__name__ == "Motor"]
+    restarted = [
+        text for name, motor in motors if (text := _restart(name, motor, session.errors.failed))
+    ]
+    if restarted:
+        what = "the reset stopped these motors; the bridge called setPosition(inf) again"
+        listed = ", ".join(restarted)
+        session.journal.log("info", "bridge", f"{what}, with their last velocity: {listed}")
 
-    Args:
-        simulation: Has the robot.
-        journal: Receives a log line that names the restarted motors.
-        failed: Receives name and error of each motor that could not be restarted.
-    """
 
-    def __init__(
-        self, simulation: Simulation, journal: Journal, failed: Callable[[str, Exception], object]
-    ) -> None:
-        self._simulation = simulation
-        self._journal = journal
-        self._failed = failed
-
-    def begin_run(self) -> None:
-        """The world was reset: restart the motors in velocity control, at their last velocity."""
-        devices: dict[str, Any] = getattr(self._simulation.robot, "devices", None) or {}
-        motors = [each for each in devices.items() if type(each[1]).__name__ == "Motor"]
-        restarted = [text for name, motor in motors if (text := self._restart(name, motor))]
-        if restarted:
-            what = "the reset stopped these motors; the bridge called setPosition(inf) again"
-            listed = ", ".join(restarted)
-            self._journal.log("info", "bridge", f"{what}, with their last velocity: {listed}")
-
-    def _restart(self, name: str, motor: Any) -> str | None:
-        """Restart a motor; returns its name and velocity, or None where it was not in that mode."""
-        try:
-            target, velocity = motor.getTargetPosition(), motor.getVelocity()
-            if not math.isinf(target):
-                return None
-            if name.count("::") == 1 and motor.getMultiplier() != 1:
-                return None  # coupled (`name::part`): the motor of multiplier 1 drives it too
-            motor.setPosition(target)
-            motor.setVelocity(velocity)  # else it would turn at its maximum velocity
-        except Exception as error:  # noqa: BLE001  (the other motors are still restarted)
-            self._failed(f"setPosition(inf) after the reset, of the motor {name!r},", error)
+def _restart(name: str, motor: Any, failed: Failed) -> str | None:
+    """Restart a motor; returns its name and velocity, or None where it was not in that mode."""
+    try:
+        target, velocity = motor.getTargetPosition(), motor.getVelocity()
+        if not math.isinf(target):
             return None
-        return f"{name} ({velocity:g})"
+        if name.count("::") == 1 and motor.getMultiplier() != 1:
+            return None  # coupled (`name::part`): the motor of multiplier 1 drives it too
+        motor.setPosition(target)
+        motor.setVelocity(velocity)  # else it would turn at its maximum velocity
+    except Exception as error:  # noqa: BLE001  (the other motors are still restarted)
+        failed(f"setPosition(inf) after the reset, of the motor {name!r},", error)
+        return None
+    return f"{name} ({velocity:g})"

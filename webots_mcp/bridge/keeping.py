@@ -15,15 +15,18 @@ import threading
 import time
 from collections import deque
 from itertools import islice
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from webots_mcp.bridge.encoding import copy_or_encode, encode_copy
 from webots_mcp.bridge.error_report import cut, describe, storable
 from webots_mcp.bridge.journal import Journal
-from webots_mcp.bridge.pictures import Album, image_of
-from webots_mcp.bridge.recorder import Recorder
-from webots_mcp.bridge.simulation import Clock, Run
+from webots_mcp.bridge.pictures import image_of
+from webots_mcp.bridge.simulation import Run
 from webots_mcp.contract import KEEP_AFTER_S, new_uuid
+
+if TYPE_CHECKING:
+    from webots_mcp.bridge.session import Session
+
 
 MOST_KEPT_S: Final = 600.0  # of one run; a condition that flickers would keep all of it
 _MOST_REASONS: Final = 10  # of one stretch that are stored
@@ -77,24 +80,16 @@ class Keeper:
         enabled: Whether anything is held at all.
     """
 
-    def __init__(
-        self,
-        clock: Clock,
-        recorder: Recorder,
-        journal: Journal,
-        album: Album,
-        throttle: Throttle,
-        last_s: float,
-    ) -> None:
-        self._clock = clock
-        self._recorder = recorder
-        self._journal = journal
-        self._album = album
-        self._throttle = throttle
+    def __init__(self, session: Session, last_s: float) -> None:
+        self._clock = session.clock
+        self._recorder = session.recorder
+        self._journal = session.journal
+        self._album = session.album
+        self._throttle = session.throttle
         self._last_s = last_s
         self._ring = Ring(last_s)
-        self._run = clock.run
-        self._ring.begin(clock.sim_time_s)
+        self._run = session.clock.run
+        self._ring.begin(session.clock.sim_time_s)
         self._kept_s = 0.0
         self._left_out: tuple[float, str] | None = None  # this run's last call that was not held
         self._stretch: Stretch | None = None
@@ -103,9 +98,9 @@ class Keeper:
         self._unwritten: deque[tuple[Run, RingRow]] = deque()
         self._unwritten_frames: deque[tuple[Stretch, Frame]] = deque()
         self._lock = threading.RLock()  # of all that is held: any thread may publish
-        self.frames = CameraFrames(journal, last_s)
+        self.frames = CameraFrames(session.journal, last_s)
         self.enabled = last_s > 0
-        self.fills = self.enabled and throttle.interval > 1
+        self.fills = self.enabled and session.throttle.interval > 1
         self.busy = False
 
     # -- the loop ------------------------------------------------------------------------------

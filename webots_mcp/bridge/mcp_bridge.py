@@ -163,7 +163,7 @@ class MCPBridge:
                 "that bridge first, or call attach(robot) without options"
             )
         if bridge._attachment is None:
-            bridge._attachment = Attachment(bridge._session, bridge._serve, bridge._errors)
+            bridge._attachment = Attachment(bridge._session, bridge._serve)
             bridge._attachment.begin()
         return bridge
 
@@ -238,7 +238,7 @@ class MCPBridge:
             state = self._publisher.publish_devices(extra, include_time)
             if state is None:
                 state = self._publisher.unread(extra, include_time)
-            times = {"sim_time": self._session.context.clock.sim_time_s} if include_time else {}
+            times = {"sim_time": self._session.clock.sim_time_s} if include_time else {}
             return times | state
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("auto_publish", error)
@@ -257,7 +257,7 @@ class MCPBridge:
             reason: Why they are kept; it is stored with the stretch.
         """
         try:
-            self._session.context.keeper.keep(text_of(reason))
+            self._session.keeper.keep(text_of(reason))
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("keep", error)
 
@@ -279,7 +279,7 @@ class MCPBridge:
                 the camera's sampling period allows. A later call for the same camera changes it.
         """
         try:
-            keeper = self._session.context.keeper
+            keeper = self._session.keeper
             if not keeper.enabled:
                 raise CommandRefusedError(keeper.why_not)
             keeper.frames.watch(camera, frames_per_s)
@@ -320,9 +320,9 @@ class MCPBridge:
                 names = ", ".join(LOG_LEVELS)
                 self._errors.warn("level", f"log level {level!r:.80} is not one of {names}")
             text = text_of(message)
-            self._session.context.journal.log(known or "info", "controller", text, logger)
+            self._session.journal.log(known or "info", "controller", text, logger)
             if known in _KEEPING:
-                self._session.context.keeper.ask(f"{known}: {text}")
+                self._session.keeper.ask(f"{known}: {text}")
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("log", error)
 
@@ -337,7 +337,7 @@ class MCPBridge:
             The file's path relative to the data folder; None where there is no image yet.
         """
         try:
-            return self._session.context.album.save_frame(camera, max_frames)
+            return self._session.album.save_frame(camera, max_frames)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("save_camera_frame", error)
             return None
@@ -403,7 +403,7 @@ class MCPBridge:
         declaration = declare(
             name, default, low=low, high=high, choices=choices, doc=doc, unit=unit
         )
-        return self._session.context.parameters.declare(declaration)
+        return self._session.parameters.declare(declaration)
 
     def breakpoint(
         self, condition: str, action: BreakpointAction = "pause", after_hits: int = 1
@@ -430,7 +430,7 @@ class MCPBridge:
             InvalidInputError: The condition or the action is invalid, or there are 32 breakpoints
                 already.
         """
-        return self._session.context.breakpoints.set(condition, action, after_hits)
+        return self._session.breakpoints.set(condition, action, after_hits)
 
     def on_reload(self, callback: Callable[[], object]) -> None:
         """Call `callback` once for each reload or reset of the world, and on `reset_state`.
@@ -438,13 +438,13 @@ class MCPBridge:
         A Supervisor's reset happens inside the same process (simulation time goes back); a reload
         starts a new process, which recognises its predecessor in the database.
         """
-        self._session.context.reloads.add(callback)
+        self._session.reloads.add(callback)
 
     def detect_reload(self) -> bool:
         """Whether the world was reloaded or reset since the last call; true once for each."""
-        reloads = self._session.context.reloads
+        reloads = self._session.reloads
         try:
-            self._session.runs.look()
+            self._session.look()
             reloads.fire()
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("detect_reload", error)
@@ -460,22 +460,23 @@ class MCPBridge:
     @property
     def run_id(self) -> int | None:
         """Id of the current run; None while nothing has been written yet."""
-        return self._session.context.clock.run.id
+        return self._session.clock.run.id
 
     def stats(self) -> BridgeStats:
         """Counts of what was recorded so far and what was not, and the time that it took."""
-        recorder, throttle = self._session.context.recorder, self._session.context.throttle
+        recorder, throttle = self._session.recorder, self._session.throttle
+        publisher = self._publisher
         return BridgeStats(
             rows_written=recorder.rows_written,
             rows_waiting=recorder.rows_waiting,
             rows_dropped=recorder.rows_dropped,
             publish_calls=throttle.calls,
             publish_throttled=throttle.skipped,
-            values_replaced=self._session.context.journal.values_replaced,
-            publish_mean_us=self._publisher.cost.mean_us,
-            publish_max_us=self._publisher.cost.max_us,
-            ring_interval=self._publisher.devices.ring_interval,
-            frames_missed=self._session.context.keeper.frames.missed,
+            values_replaced=self._session.journal.values_replaced,
+            publish_mean_us=1e6 * publisher.total_s / max(1, publisher.recorded),
+            publish_max_us=1e6 * publisher.longest_s,
+            ring_interval=publisher.devices.ring_interval,
+            frames_missed=self._session.keeper.frames.missed,
             failures=self._errors.failures,
             last_error=self._errors.last_error,
         )
@@ -498,8 +499,8 @@ class MCPBridge:
             if self._attachment is not None:
                 self._attachment.publish_missing()
                 self._attachment.look_for_unseen()
-            elif self._session.context.clock.moved_s is None:
-                self._session.look_for_unseen(self._session.context.clock.sim_time_s)
+            elif self._session.clock.moved_s is None:
+                self._session.look_for_unseen(self._session.clock.sim_time_s)
             self.detach()
             self._session.let_go()
         except Exception as error:  # noqa: BLE001  (the robot comes first)
@@ -549,7 +550,7 @@ class MCPBridge:
 
     def _record_output(self, stream: str, lines: Sequence[str]) -> None:
         try:
-            self._session.context.journal.output(stream, lines)
+            self._session.journal.output(stream, lines)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("capture_output", error)
 
@@ -559,8 +560,8 @@ class MCPBridge:
         self.detach()
         if self._capture is not None:
             self._capture.abandon()
-        self._session.context.recorder.abandon()
-        self._session.context.keeper.abandon()
+        self._session.recorder.abandon()
+        self._session.keeper.abandon()
 
     def _close_at_exit(self) -> None:
         """Close when the interpreter ends, and find out whether an exception ended it."""

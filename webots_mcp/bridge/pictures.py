@@ -13,13 +13,13 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from webots_mcp.bridge.recorder import Recorder
-from webots_mcp.bridge.simulation import Clock, Run
+from webots_mcp.bridge.simulation import Run
 from webots_mcp.contract import CAMERA_FOLDER, KEPT_FRAME, make_folder, whole_file
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
 if TYPE_CHECKING:
     from webots_mcp.bridge.keeping import Frame
+    from webots_mcp.bridge.session import Session
 
 MOST_FRAMES: Final = 50  # of a camera that are kept
 
@@ -31,9 +31,9 @@ _PNG_TAIL: Final = b"IEND\xaeB`\x82"
 class Album:
     """The newest camera frames of each device; older ones are deleted, with their rows."""
 
-    def __init__(self, recorder: Recorder, clock: Clock, data_dir: Path) -> None:
-        self._recorder = recorder
-        self._clock = clock
+    def __init__(self, session: Session, data_dir: Path) -> None:
+        self._recorder = session.recorder
+        self._clock = session.clock
         self._data_dir = data_dir
         self._kept: dict[str, deque[str]] = {}
 

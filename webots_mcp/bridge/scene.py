@@ -21,7 +21,7 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.naming import nearest_first
 
 if TYPE_CHECKING:
-    from webots_mcp.bridge.actions import Context
+    from webots_mcp.bridge.session import Session
 
 MOST_NODES: Final = 5000  # that one walk yields
 DEEPEST: Final = 24  # levels below the root
@@ -543,9 +543,9 @@ _MOST_PATTERNS: Final = 20
 _MOST_NEAR: Final = 10  # types or names that are listed where none matches
 
 
-def get_scene(context: Context, command: ClaimedCommand) -> Progress:
+def get_scene(session: Session, command: ClaimedCommand) -> Progress:
     """The nodes of the tree, or below a `path`, that match `types` and `names`."""
-    params, robot = command.params, context.simulation.robot
+    params, robot = command.params, session.simulation.robot
     types, names = _patterns(params, "types"), _patterns(params, "names")
     seen: dict[str, None] = {}
     wanted = [each for each in _patterns(params, "fields") if each != "name"]  # shown anyway
@@ -640,9 +640,9 @@ def _any_match(texts: Iterable[str], patterns: list[str]) -> bool:
     return any(fnmatchcase(text.lower(), each.lower()) for text in texts for each in patterns)
 
 
-def get_field(context: Context, command: ClaimedCommand) -> Progress:
+def get_field(session: Session, command: ClaimedCommand) -> Progress:
     """The value of the field, or all fields of the node, at a `path`."""
-    place = yield from find(context.simulation.robot, command.params.get("path"))
+    place = yield from find(session.simulation.robot, command.params.get("path"))
     start = _whole(command.params, "start", 0, 0, 10**9)
     facts: dict[str, Any] = {"path": place.path}
     if place.is_hidden:

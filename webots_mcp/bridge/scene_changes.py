@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from webots_mcp.bridge.commands import ClaimedCommand, Progress
 from webots_mcp.bridge.error_report import cut
-from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.scene import (
     MOST_ENTRIES,
     Pace,
@@ -33,11 +32,10 @@ from webots_mcp.bridge.scene import (
     require_no_path,
     write,
 )
-from webots_mcp.bridge.simulation import Clock, Simulation
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
 if TYPE_CHECKING:
-    from webots_mcp.bridge.actions import Context
+    from webots_mcp.bridge.session import Session
 
 _LONGEST_NODE: Final = 50_000  # characters of a node that is added
 _LONGEST_SHOWN: Final = 1_000  # characters of a value in an answer
@@ -49,21 +47,21 @@ _ADDED_BEFORE: Final = "does not bring it back: it was added in this run"
 _SAYS: Final = "Webots' console has the reason (see webots_get_logs, if it is recorded)"
 
 
-def set_field(context: Context, command: ClaimedCommand) -> Progress:
+def set_field(session: Session, command: ClaimedCommand) -> Progress:
     """Set the field, or the entry of a field, at a `path` to a `value`."""
-    robot, params = context.simulation.robot, command.params
+    robot, params = session.simulation.robot, command.params
     place = yield from find(robot, params.get("path"))
     _require_settable(robot, place)
     value = checked(place.path, place.type_name, params.get("value"))
     require_no_path(str(place.webots_field.getName()), value)
     before = read(place.field, place.entry)
-    is_remembered = context.scene.remember_field(_edit(place, before, value))
+    is_remembered = session.scene.remember_field(_edit(place, before, value))
     write(place.field, value, place.entry)
     if params.get("stop") is True:
         place.node.resetPhysics()
     facts: dict[str, Any] = {"path": place.path, "type": place.type_name}
     facts |= {"from": _shown(before), "to": _shown(value)}
-    is_stepped = yield from _until_stepped(context)
+    is_stepped = yield from _until_stepped(session)
     now = _read_again(robot, place)
     if not is_stepped and not is_same(place.type_name, now, value):
         facts["now"] = _shown(now)
@@ -77,8 +75,8 @@ def set_field(context: Context, command: ClaimedCommand) -> Progress:
         )
     elif not is_same(place.type_name, now, value):
         facts["now"] = _shown(now)  # the simulation has changed it since
-    context.journal.event("set_field", facts | _asked_by(command), place.path)
-    return facts | {"sim_time_s": context.clock.sim_time_s} | _effect_of_reset(is_remembered)
+    session.journal.event("set_field", facts | _asked_by(command), place.path)
+    return facts | {"sim_time_s": session.clock.sim_time_s} | _effect_of_reset(is_remembered)
 
 
 def _shown(value: Any) -> Any:
@@ -125,13 +123,13 @@ def _read_again(robot: Any, place: Place) -> Any:
     return read(field, place.entry)
 
 
-def _until_stepped(context: Context) -> Generator[None, None, bool]:
+def _until_stepped(session: Session) -> Generator[None, None, bool]:
     """Wait for a step of the simulation; False where simulation time stands still."""
-    clock, from_step = context.clock, context.clock.steps_seen
+    clock, from_step = session.clock, session.clock.steps_seen
     until_s = time.monotonic() + _LONGEST_STEP_S
     while clock.steps_seen == from_step:
         yield
-        stands = context.simulation.paused or time.monotonic() > until_s
+        stands = session.simulation.paused or time.monotonic() > until_s
         if stands and clock.steps_seen == from_step:
             return False
     return True
@@ -147,15 +145,15 @@ def _effect_of_reset(is_remembered: bool) -> dict[str, Any]:
     return {"a_reset": f"does not undo it: at most {MOST_EDITS} changes are remembered"}
 
 
-def add_node(context: Context, command: ClaimedCommand) -> Progress:
+def add_node(session: Session, command: ClaimedCommand) -> Progress:
     """Add the node of the text `vrml` to the children of the node, or to the field, at a `path`."""
-    robot, params = context.simulation.robot, command.params
+    robot, params = session.simulation.robot, command.params
     text = _require_one_node(params.get("vrml"))
     place = yield from _find_room(robot, params.get("path") or "root")
     before = _count(place)
     node = import_node(place.field, text)
     if node is None:
-        yield from _until_stepped(context)
+        yield from _until_stepped(session)
         node = _newest(robot, place, before)
     if node is None:
         raise CommandRefusedError(
@@ -163,12 +161,12 @@ def add_node(context: Context, command: ClaimedCommand) -> Progress:
             "world file first: IMPORTABLE EXTERNPROTO"
         )
     path = _path_of(robot, node)
-    is_remembered = context.scene.remember_added(path, int(node.getId()))
+    is_remembered = session.scene.remember_added(path, int(node.getId()))
     facts: dict[str, Any] = {"path": path, "type": str(node.getTypeName()), "parent": place.path}
-    yield from _until_stepped(context)
-    context.journal.event("add_node", facts | {"vrml": cut(text, 2000)} | _asked_by(command), path)
+    yield from _until_stepped(session)
+    session.journal.event("add_node", facts | {"vrml": cut(text, 2000)} | _asked_by(command), path)
     reset = {"a_reset": "removes it"} if is_remembered else _effect_of_reset(is_remembered)
-    return facts | {"node": label(node), "sim_time_s": context.clock.sim_time_s} | reset
+    return facts | {"node": label(node), "sim_time_s": session.clock.sim_time_s} | reset
 
 
 def _count(place: Place) -> int:
@@ -238,9 +236,9 @@ def _path_of(robot: Any, node: Any) -> str:
     return definition if is_first else f"#{node.getId()}"
 
 
-def remove_node(context: Context, command: ClaimedCommand) -> Progress:
+def remove_node(session: Session, command: ClaimedCommand) -> Progress:
     """Remove the node at a `path`, with everything in it."""
-    robot = context.simulation.robot
+    robot = session.simulation.robot
     place = yield from find_node(robot, command.params.get("path"))
     _require_removable(robot, place)
     node, node_id = place.node, int(place.node.getId())
@@ -250,16 +248,16 @@ def remove_node(context: Context, command: ClaimedCommand) -> Progress:
         "node": label(node),
     }
     removal = yield from _removal(robot, place, node_id)
-    was_added = node_id in context.scene.added
+    was_added = node_id in session.scene.added
     node.remove()
     if robot.getFromId(node_id) is not None:
-        yield from _until_stepped(context)
+        yield from _until_stepped(session)
     if robot.getFromId(node_id) is not None:
         raise CommandRefusedError(f"Webots did not remove {place.path}; {_SAYS}")
-    is_remembered = removal is not None and context.scene.remember_removed(removal)
-    context.journal.event("remove_node", facts | _asked_by(command), place.path)
+    is_remembered = removal is not None and session.scene.remember_removed(removal)
+    session.journal.event("remove_node", facts | _asked_by(command), place.path)
     reset = _ADDED_BEFORE if was_added else _brought_back(removal, is_remembered)
-    return facts | {"sim_time_s": context.clock.sim_time_s, "a_reset": reset}
+    return facts | {"sim_time_s": session.clock.sim_time_s, "a_reset": reset}
 
 
 def _brought_back(removal: Removal | None, is_remembered: bool) -> str:
@@ -494,29 +492,14 @@ MOST_EDITS: Final = 200  # that are put back
 class SceneEdits:
     """Remembers changes of the scene, and undoes them after a reset.
 
-    Args:
-        simulation: Has the scene.
-        clock: Counts the steps: Webots sets fields with the next one.
-        journal: Receives an event with what was put back.
-        failed: Receives each error of a call to Webots.
-
     Attributes:
         fields: The fields that were set in this run, in that order.
         added: The paths of the nodes that were added in this run, by their numbers.
         removed: The nodes that were removed in this run or an earlier one.
     """
 
-    def __init__(
-        self,
-        simulation: Simulation,
-        clock: Clock,
-        journal: Journal,
-        failed: Callable[[str, Exception], None],
-    ) -> None:
-        self._simulation = simulation
-        self._clock = clock
-        self._journal = journal
-        self._failed = failed
+    def __init__(self, session: Session) -> None:
+        self._session = session
         self._restoration: Restoration | None = None
         self._restored_at_step = 0
         self.fields: dict[tuple[int, str, int | None], FieldEdit] = {}
@@ -557,8 +540,8 @@ class SceneEdits:
         if not (self.fields or self.added or self.removed):
             return
 
-        self._restoration = Restoration(self._simulation.robot, self._failed)
-        self._restored_at_step = self._clock.steps_seen
+        self._restoration = Restoration(self._session.simulation.robot, self._session.errors.failed)
+        self._restored_at_step = self._session.clock.steps_seen
         fields, self.fields = [*self.fields.values()], {}
         added, self.added = self.added, {}
         self.removed = self._restoration.put_back(fields, added, self.removed)
@@ -566,6 +549,6 @@ class SceneEdits:
     def look(self) -> None:
         """Record what was put back, after the step with which Webots sets the fields."""
         restoration = self._restoration
-        if restoration is not None and self._clock.steps_seen != self._restored_at_step:
+        if restoration is not None and self._session.clock.steps_seen != self._restored_at_step:
             self._restoration = None
-            self._journal.event("put_back", restoration.outcome())
+            self._session.journal.event("put_back", restoration.outcome())

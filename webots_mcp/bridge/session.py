@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final, cast
 
-from webots_mcp.bridge.actions import Context, Control
+from webots_mcp.bridge.actions import Control
 from webots_mcp.bridge.breakpoints import Breakpoints, Watch
 from webots_mcp.bridge.commands import ClaimedCommand, ClaimedCommands, Reloads
-from webots_mcp.bridge.devices import DeviceReader, Motors
+from webots_mcp.bridge.devices import DeviceReader, restart_motors
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.journal import Changes, Heartbeat, Journal, SignalNames
 from webots_mcp.bridge.keeping import Keeper, Throttle
-from webots_mcp.bridge.parameters import CODE, Parameters, StartValues
+from webots_mcp.bridge.parameters import Parameters
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.pictures import Album
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration, identify
 from webots_mcp.bridge.scene_changes import SceneEdits
 from webots_mcp.bridge.simulation import QUIT, Clock, Simulation, Step
-from webots_mcp.contract import PARAMETERS_VARIABLE, UNMOVED, UNSEEN, Database, MemoryDatabase
-from webots_mcp.errors import WebotsMCPError
+from webots_mcp.contract import UNMOVED, UNSEEN, Database, MemoryDatabase
 from webots_mcp.maintenance import Maintainer
 
 _IDLE_S: Final = 0.5  # a loop that recorded nothing for so long is blocked or waiting
@@ -34,14 +32,7 @@ _UNMOVED_S: Final = 10.0  # of wall time
 
 
 class Session:
-    """All parts of a bridge, from its construction to its end.
-
-    Attributes:
-        context: The parts that commands work with.
-        control: Serves commands.
-        publisher: Handles published states.
-        runs: Detects resets.
-    """
+    """All parts of a bridge, from its construction to its end, and the runs in it."""
 
     def __init__(
         self,
@@ -55,44 +46,26 @@ class Session:
     ) -> None:
         from webots_mcp import __version__
 
-        self._identity = identify(
-            simulation.robot, simulation.supervisor, __version__, throttle.interval, kind
-        )
-        clock = Clock(simulation)
-        recorder = Recorder(database, self._identity, clock, errors)
-        journal, heartbeat = Journal(recorder, clock), Heartbeat(recorder, clock)
-        reloads = Reloads(errors.failed)
-        given = os.environ.get(PARAMETERS_VARIABLE)
-        start_values = StartValues(given, self._identity.robot_name, errors)
-        parameters = Parameters(clock, recorder, journal, start_values, self._set_parameter)
-        scene = SceneEdits(simulation, clock, journal, errors.failed)
-        motors = Motors(simulation, journal, errors.failed)
-        self.runs = Runs(
-            clock, recorder, journal, heartbeat, reloads, parameters, throttle, scene, motors
-        )
-        album = Album(recorder, clock, data_dir)
-        keeper = Keeper(clock, recorder, journal, album, throttle, keep_last_s)
-        look = self.runs.look_after_step
-        pause = Pause(simulation, journal, heartbeat, look, keeper.write_all)
-        self.context = Context(
-            simulation=simulation,
-            clock=clock,
-            recorder=recorder,
-            journal=journal,
-            album=album,
-            heartbeat=heartbeat,
-            throttle=throttle,
-            reloads=reloads,
-            queue=ClaimedCommands(recorder),
-            pause=pause,
-            parameters=parameters,
-            breakpoints=Breakpoints(simulation, clock, recorder, journal, pause, keeper),
-            watch=Watch(clock, simulation.basic_time_step_s / 100),
-            keeper=keeper,
-            scene=scene,
-        )
-        self.control = Control(self.context)
-        self.publisher = Publisher(self.context, self.runs)
+        robot = (simulation.robot, simulation.supervisor)
+        self._identity = identify(*robot, __version__, throttle.interval, kind)
+        self.errors = errors
+        self.simulation = simulation
+        self.throttle = throttle
+        self.clock = Clock(simulation)
+        self.recorder = Recorder(database, self._identity, self.clock, errors)
+        self.journal = Journal(self.recorder, self.clock)
+        self.heartbeat = Heartbeat(self.recorder, self.clock)
+        self.reloads = Reloads(errors.failed)
+        self.parameters = Parameters(self, self._identity.robot_name)
+        self.scene = SceneEdits(self)
+        self.album = Album(self, data_dir)
+        self.keeper = Keeper(self, keep_last_s)
+        self.pause = Pause(self)
+        self.queue = ClaimedCommands(self.recorder)
+        self.breakpoints = Breakpoints(self)
+        self.watch = Watch(self.clock, simulation.basic_time_step_s / 100)
+        self.control = Control(self)
+        self.publisher = Publisher(self)
         self._unseen_reported = False
         self._began_s: float | None = time.monotonic()  # None once `_look_after` has judged it
         self._maintainer = _start_maintainer(database, self._look_after)
@@ -100,60 +73,72 @@ class Session:
     @property
     def robot_name(self) -> str:
         """The name under which the robot is recorded."""
-        registration = self.context.recorder.registration
+        registration = self.recorder.registration
         return registration.robot_name if registration else self._identity.robot_name
 
     def begin(self) -> None:
         """Begin the first run, and continue the previous session's reload or pause."""
-        registration = self.context.recorder.registration
-        self.runs.begin_first(reloaded=registration is not None and registration.reloaded)
+        registration = self.recorder.registration
+        run, reloaded = self.clock.run, registration is not None and registration.reloaded
+        run.start_reason = "reload" if reloaded else "start"
+        self.journal.event(run.start_reason)
+        if reloaded:
+            self.reloads.happened()
         if registration is not None:
             self._succeed_to(registration)
-        self.context.breakpoints.begin()
+        self.breakpoints.begin()
 
     def _succeed_to(self, registration: Registration) -> None:
-        simulation, clock = self.context.simulation, self.context.clock
+        simulation, clock = self.simulation, self.clock
         mode = simulation.mode_name if simulation.supervisor else None
         values = {"now": time.time(), "sim_time": clock.sim_time_s, "mode": mode}
-        self.context.recorder.record("reload confirmed", clock.run, values)
+        self.recorder.record("reload confirmed", clock.run, values)
         if registration.paused_mode is not None:
-            self.context.pause.take_over(registration.paused_mode)
+            self.pause.take_over(registration.paused_mode)
 
     def serve(self) -> ClaimedCommand | None:
         """One round of the loop: the pending commands, and the heartbeat."""
-        simulation = self.context.simulation
-        self.runs.look()
+        simulation = self.simulation
+        self.look()
         if simulation.over:
             return None
-        self._take_wanted_parameters()
-        if self.context.keeper.busy:
-            self.context.keeper.go_on()
-        self.context.scene.look()
+        self.parameters.take_wanted()
+        if self.keeper.busy:
+            self.keeper.go_on()
+        self.scene.look()
         command = self.control.serve()
-        self.context.heartbeat.poll()
+        self.heartbeat.poll()
         if simulation.over:
             self.end()
         return command
 
-    def _take_wanted_parameters(self) -> None:
-        try:
-            self.context.parameters.take_wanted()
-        except WebotsMCPError as error:
-            self.context.recorder.errors.failed("Parameter.set", error)
+    def look(self, *, after_step: bool = False) -> None:
+        """Begin a run if simulation time went back since the last call.
 
-    def _set_parameter(self, name: str, value: object) -> None:
-        """Set a parameter from the controller's code: at once in a handler, else at the next call.
-
-        Within a round of the loop values must not change, so it waits for `get_command()` there.
+        Args:
+            after_step: A step has just ended.
         """
-        parameters = self.context.parameters
-        if self.control.handlers.running:
-            parameters.set_now({name: value}, CODE)
-            return
-        try:
-            parameters.want(name, value)
-        except Exception as error:  # noqa: BLE001  (the robot comes first)
-            self.context.recorder.errors.failed("Parameter.set", error)
+        if self.clock.look(after_step=after_step):
+            self.begin_run()
+
+    def look_after_step(self) -> None:
+        """Look right after a step, before the loop's own code runs."""
+        self.look(after_step=True)
+        self.heartbeat.beat_if_due()
+
+    def begin_run(self) -> None:
+        """Simulation time went back: end the old run at its newest known time, begin a new one."""
+        self.recorder.end_run("reset", self.clock.ended_sim_time_s)
+        self.recorder.run = self.clock.run
+        self.throttle.begin_run()
+        self.reloads.happened()
+        self.journal.event("reset")
+        # Before the callbacks, which may read values that waited for the reset, and set others.
+        self.parameters.begin_run()
+        self.scene.begin_run()
+        restart_motors(self)
+        self.reloads.fire()
+        self.heartbeat.beat()
 
     def look_for_unseen(self, seen_s: float) -> None:
         """Warn once that the loop makes steps that the bridge does not see.
@@ -161,7 +146,7 @@ class Session:
         Args:
             seen_s: The newest simulation time at which the bridge saw the loop.
         """
-        simulation = self.context.simulation
+        simulation = self.simulation
         if self._unseen_reported or simulation.over:
             return
         unseen_s = simulation.time_s - seen_s
@@ -169,25 +154,25 @@ class Session:
             return
         self._unseen_reported = True
         text = f"{UNSEEN}; so far it has missed {unseen_s:.1f} s of simulation time"
-        self.context.journal.log("warning", "bridge", text)
-        self.context.recorder.errors.warn("unseen", text)
+        self.journal.log("warning", "bridge", text)
+        self.errors.warn("unseen", text)
 
     def close(self, reason: str | None) -> None:
         """Write the waiting rows and end, for the given or the known reason."""
         if self._maintainer is not None:
             self._maintainer.stop()  # first: its thread uses the recorder too
-        self.context.keeper.close()
+        self.keeper.close()
         reason = reason or self._end_reason
-        self.context.recorder.close(reason, self.context.clock.sim_time_s)
+        self.recorder.close(reason, self.clock.sim_time_s)
 
     def let_go(self) -> None:
         """Resume a paused simulation, which no command could resume later, and answer commands."""
-        self.context.pause.close()
+        self.pause.close()
         self.control.report_end(extern=self._identity.extern)
 
     @property
     def _end_reason(self) -> str:
-        return "reload" if self.context.reloads.requested_by else "finished"
+        return "reload" if self.reloads.requested_by else "finished"
 
     def end(self) -> None:
         """Write everything when Webots says quit: it may kill the process from here on.
@@ -195,8 +180,8 @@ class Session:
         The session stays usable, since the loop may also continue for a last few statements.
         """
         self.control.report_end(extern=self._identity.extern)
-        self.context.keeper.write_all()
-        self.context.recorder.end(self._end_reason, self.context.clock.sim_time_s)
+        self.keeper.write_all()
+        self.recorder.end(self._end_reason, self.clock.sim_time_s)
 
     def _look_after(self) -> None:
         """Called in the maintainer's thread, for a loop that is blocked or never calls the bridge.
@@ -204,14 +189,14 @@ class Session:
         Waiting rows are written. Webots' API must not be called in this thread, so it is not known
         here whether simulation time advances without the bridge.
         """
-        recorder, began_s = self.context.recorder, self._began_s
+        recorder, began_s = self.recorder, self._began_s
         if recorder.rows_waiting and time.monotonic() - recorder.last_use_s > _IDLE_S:
             recorder.flush()
         if began_s is None or time.monotonic() - began_s < _UNMOVED_S:
             return
         self._began_s = None
-        if self.context.clock.moved_s is None and not self.context.heartbeat.polled:
-            self.context.journal.log("warning", "bridge", UNMOVED)
+        if self.clock.moved_s is None and not self.heartbeat.polled:
+            self.journal.log("warning", "bridge", UNMOVED)
 
 
 def _start_maintainer(database: Database, on_tick: Callable[[], Any]) -> Maintainer | None:
@@ -223,95 +208,35 @@ def _start_maintainer(database: Database, on_tick: Callable[[], Any]) -> Maintai
     return maintainer
 
 
-class Runs:
-    """Begins each run, and calls the controller's callbacks."""
-
-    def __init__(
-        self,
-        clock: Clock,
-        recorder: Recorder,
-        journal: Journal,
-        heartbeat: Heartbeat,
-        reloads: Reloads,
-        parameters: Parameters,
-        throttle: Throttle,
-        scene: SceneEdits,
-        motors: Motors,
-    ) -> None:
-        self._clock = clock
-        self._recorder = recorder
-        self._journal = journal
-        self._heartbeat = heartbeat
-        self._reloads = reloads
-        self._parameters = parameters
-        self._throttle = throttle
-        self._scene = scene
-        self._motors = motors
-
-    def look(self, *, after_step: bool = False) -> None:
-        """Begin a run if simulation time went back since the last call.
-
-        Args:
-            after_step: A step has just ended.
-        """
-        if self._clock.look(after_step=after_step):
-            self.begin()
-
-    def look_after_step(self) -> None:
-        """Look right after a step, before the loop's own code runs."""
-        self.look(after_step=True)
-        self._heartbeat.beat_if_due()
-
-    def begin(self) -> None:
-        """Simulation time went back: end the old run at its newest known time, begin a new one."""
-        self._recorder.end_run("reset", self._clock.ended_sim_time_s)
-        self._recorder.run = self._clock.run
-        self._throttle.begin_run()
-        self._reloads.happened()
-        self._journal.event("reset")
-        # Before the callbacks, which may read values that waited for the reset, and set others.
-        self._parameters.begin_run()
-        self._scene.begin_run()
-        self._motors.begin_run()
-        self._reloads.fire()
-        self._heartbeat.beat()
-
-    def begin_first(self, *, reloaded: bool) -> None:
-        """Begin the session's first run, after a reload or a start."""
-        run = self._clock.run
-        run.start_reason = "reload" if reloaded else "start"
-        self._journal.event(run.start_reason)
-        if reloaded:
-            self._reloads.happened()
-
-
 class Publisher:
     """Handles each call of `publish` and `auto_publish`.
 
     Attributes:
-        cost: How long the recorded calls took.
+        recorded: Recorded calls.
+        total_s: The time that they took.
+        longest_s: The longest of them.
         devices: Reads the devices for `auto_publish`.
     """
 
-    def __init__(self, context: Context, runs: Runs) -> None:
-        self._context = context
-        self._clock = context.clock
-        self._heartbeat = context.heartbeat
-        self._throttle = context.throttle
-        self._breakpoints = context.breakpoints
-        self._watch = context.watch
-        self._keeper = context.keeper
-        self._runs = runs
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._clock = session.clock
+        self._heartbeat = session.heartbeat
+        self._throttle = session.throttle
+        self._breakpoints = session.breakpoints
+        self._watch = session.watch
+        self._keeper = session.keeper
         self._changes = Changes()
-        self._names = SignalNames(context.recorder)
-        self.devices = DeviceReader(context.simulation, context.journal, context.recorder.errors)
-        self._run = context.clock.run
-        self.cost = PublishCost()
+        self._names = SignalNames(session.recorder)
+        self.devices = DeviceReader(session)
+        self._run = session.clock.run
+        self.recorded = 0
+        self.total_s = self.longest_s = 0.0
 
     def publish(self, state: Mapping[Any, Any], force: bool) -> None:
         """Record the state if this call is due, a breakpoint is hit or a goal is reached."""
         if self._clock.look():
-            self._runs.begin()
+            self._session.begin_run()
         wanted, hit, keeper, breakpoints = force, None, self._keeper, self._breakpoints
         # Tested here, since even an empty call would slow down every `publish`.
         if breakpoints.armed or breakpoints.run is not self._clock.run:
@@ -342,7 +267,7 @@ class Publisher:
         """
         state = None
         if self._clock.look():
-            self._runs.begin()
+            self._session.begin_run()
         keeper, throttle = self._keeper, self._throttle
         due = keeper.fills and (throttle.calls + 1) % self.devices.ring_interval == 0
         if due or self._breakpoints.ask_states() or self._watch.asks_states:
@@ -375,23 +300,29 @@ class Publisher:
 
     def _record(self, state: Mapping[Any, Any]) -> None:
         started_s = time.perf_counter()
-        self._context.reloads.fire()
+        self._session.reloads.fire()
         encoded = encode(state)
         if not encoded.text.startswith("{"):
             raise TypeError(f"publish() takes a dict, got {type(state).__name__}")
-        self._context.journal.state(encoded)
+        self._session.journal.state(encoded)
         if isinstance(state, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
             self._record_changes(state)
         self._names.look(state, encoded.text)
         self._heartbeat.beat_if_due()
-        self.cost.add(time.perf_counter() - started_s)
+        self._count(time.perf_counter() - started_s)
+
+    def _count(self, duration_s: float) -> None:
+        self.recorded += 1
+        self.total_s += duration_s
+        if duration_s > self.longest_s:
+            self.longest_s = duration_s
 
     def _record_changes(self, state: Mapping[Any, Any]) -> None:
         if self._clock.run is not self._run:
             self._run = self._clock.run
             self._changes.forget()
         for name, before, after in self._changes.look(state):
-            self._context.journal.event("change", {"from": before, "to": after}, name)
+            self._session.journal.event("change", {"from": before, "to": after}, name)
 
 
 def _finite(extra: Mapping[Any, Any]) -> dict[Any, Any]:
@@ -422,18 +353,15 @@ class Attachment:
     Args:
         session: Publishes states.
         serve: Serves the pending commands, as `get_command()` does.
-        errors: Receives each failure.
     """
 
-    def __init__(
-        self, session: Session, serve: Callable[[], ClaimedCommand | None], errors: ErrorReport
-    ) -> None:
+    def __init__(self, session: Session, serve: Callable[[], ClaimedCommand | None]) -> None:
         self._session = session
         self._serve = serve
-        self._errors = errors
-        self._throttle = session.context.throttle
-        self._pause = session.context.pause
-        self._clock = session.context.clock
+        self._errors = session.errors
+        self._throttle = session.throttle
+        self._pause = session.pause
+        self._clock = session.clock
         self._calls = self._throttle.calls  # of publish, up to the end of the last step
         self._left_to_controller = False  # the controller published in the last round
         self._last_served: ClaimedCommand | None = None
@@ -441,7 +369,7 @@ class Attachment:
     def begin(self) -> None:
         """Listen to each step from now on."""
         self._session.control.handlers.loop_polls = False
-        self._clock.stepped_s = self._session.context.simulation.time_s
+        self._clock.stepped_s = self._session.simulation.time_s
         self._pause.listen_to_steps(self)
 
     def end(self) -> None:
@@ -483,7 +411,7 @@ class Attachment:
 
     def publish_missing(self) -> None:
         """Publish the devices where the controller published a round ago, but not in this one."""
-        over = self._session.context.simulation.over
+        over = self._session.simulation.over
         if self._left_to_controller and self._throttle.calls == self._calls and not over:
             self._publish()
 
@@ -499,29 +427,3 @@ class Attachment:
             self._session.publisher.publish_devices({}, include_time=True)
         finally:
             self._calls = self._throttle.calls
-
-
-class PublishCost:
-    """How long the recorded calls of `publish` took."""
-
-    def __init__(self) -> None:
-        self._calls = 0
-        self._total_s = 0.0
-        self._max_s = 0.0
-
-    def add(self, duration_s: float) -> None:
-        """Count one call."""
-        self._calls += 1
-        self._total_s += duration_s
-        if duration_s > self._max_s:
-            self._max_s = duration_s
-
-    @property
-    def mean_us(self) -> float:
-        """The mean so far; 0 before the first."""
-        return 1e6 * self._total_s / max(1, self._calls)
-
-    @property
-    def max_us(self) -> float:
-        """The longest so far."""
-        return 1e6 * self._max_s

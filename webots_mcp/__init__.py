@@ -11,8 +11,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from webots_mcp.bridge.mcp_bridge import MCPBridge
-    from webots_mcp.bridge.stats import BridgeStats
+    from webots_mcp.bridge.mcp_bridge import BridgeStats, MCPBridge
     from webots_mcp.contract import MemoryDatabase
 
 __version__ = "0.1.0"
@@ -21,7 +20,7 @@ __all__ = ["BridgeStats", "MCPBridge", "MemoryDatabase", "__version__"]
 
 _HOMES = {
     "MCPBridge": "webots_mcp.bridge.mcp_bridge",
-    "BridgeStats": "webots_mcp.bridge.stats",
+    "BridgeStats": "webots_mcp.bridge.mcp_bridge",
     "MemoryDatabase": "webots_mcp.contract",
 }
 

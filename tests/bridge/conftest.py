@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from webots_mcp import MCPBridge, MemoryDatabase
-from webots_mcp.bridge import encoding, recovery
+from webots_mcp.bridge import encoding, recorder
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, Database
 from webots_mcp.standin import InProcessSupervisor
@@ -103,7 +103,7 @@ def filed(file: Path) -> Recording:
 @pytest.fixture
 def retry_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """No waiting between tries, so that the tests need no sleep."""
-    monkeypatch.setattr(recovery, "_RETRY_INTERVAL_S", 0.0)
+    monkeypatch.setattr(recorder, "_RETRY_INTERVAL_S", 0.0)
 
 
 @pytest.fixture
@@ -142,7 +142,7 @@ def numbers(recording: Recording) -> list[int]:
 def waiting_file(bridge: MCPBridge) -> Path:
     """Where the rows of the bridge wait while its database takes none."""
     assert isinstance(bridge.database, Path)
-    return waiting_path(bridge.database, bridge._session.context.recorder.session.uuid)  # pyright: ignore[reportPrivateUsage]
+    return waiting_path(bridge.database, bridge._session.recorder.uuid)  # pyright: ignore[reportPrivateUsage]
 
 
 def keep_in_memory(bridge: MCPBridge) -> None:
@@ -153,14 +153,14 @@ def keep_in_memory(bridge: MCPBridge) -> None:
 def catch_up(bridge: MCPBridge) -> None:
     """Write all that waits, whatever the maintainer is doing at this moment."""
     deadline_s = time.monotonic() + 10
-    while not bridge._session.context.recorder.flush():  # pyright: ignore[reportPrivateUsage]
+    while not bridge._session.recorder.flush():  # pyright: ignore[reportPrivateUsage]
         assert time.monotonic() < deadline_s
     assert bridge.stats().rows_waiting == 0
 
 
 def heartbeat_now(bridge: MCPBridge) -> None:
     """The next call looks after the file, as it would half a second later."""
-    bridge._session.context.heartbeat._next_s = 0.0  # pyright: ignore[reportPrivateUsage]
+    bridge._session.heartbeat._next_s = 0.0  # pyright: ignore[reportPrivateUsage]
     bridge.get_command()
 
 

@@ -26,9 +26,8 @@ PACKAGE = str(Path(webots_mcp.__file__).parent)
 WRITING = {
     f"{name}.py"
     for name in (
-        *("recorder", "row_writer", "recovery", "session_connection", "connection_lock"),
-        *("row_counts", "backlog", "journal", "heartbeat", "heartbeat_rows", "run"),
-        *("mcp_bridge", "publisher", "waiting_file", "transactions", "connection"),
+        *("recorder", "backlog", "journal", "session", "simulation", "mcp_bridge"),
+        *("waiting_file", "transactions", "connection"),
     )
 }
 Place = tuple[str, int, int]  # file, line, and the instruction in it or -1
@@ -156,7 +155,7 @@ def drive(folder: Path, interrupter: Interrupter) -> Outcome:
             publish(n)
             interrupter.run(bridge.get_command)
             if n in (5, 7):
-                interrupter.run(lambda: bridge._session.context.heartbeat.beat())  # pyright: ignore[reportPrivateUsage]
+                interrupter.run(lambda: bridge._session.heartbeat.beat())  # pyright: ignore[reportPrivateUsage]
             if interrupter.done and not before and not other.in_transaction:
                 blocked = not _can_write(other)
     interrupter.run(bridge.close)
@@ -177,10 +176,10 @@ def _can_write(other: sqlite3.Connection) -> bool:
 
 def _is_held(bridge: MCPBridge) -> bool:
     """Whether the recorder stays taken, or a transaction open, after one more call."""
-    recorder = bridge._session.context.recorder  # pyright: ignore[reportPrivateUsage]
+    recorder = bridge._session.recorder  # pyright: ignore[reportPrivateUsage]
     recorder.flush()
     held = bool(recorder._lock._held)  # pyright: ignore[reportPrivateUsage]
-    connection = recorder.session.connection
+    connection = recorder.connection
     return held or (connection is not None and connection.in_transaction)
 
 

@@ -32,9 +32,9 @@ from tests.bridge.monsters import (
 )
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import cleaning, encoding
-from webots_mcp.bridge.change_detector import Changes
 from webots_mcp.bridge.cleaning import MAX_NAMED
 from webots_mcp.bridge.encoding import MAX_ROW_BYTES, Encoded
+from webots_mcp.bridge.journal import Changes
 
 POSE = [1.5, 2.5, 0.25]
 MOST_LOOKED_AT = 20_000

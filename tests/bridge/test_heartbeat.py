@@ -13,7 +13,7 @@ from webots_mcp import MCPBridge
 
 def age(bridge: MCPBridge) -> None:
     """As if the simulation had stood still for a minute."""
-    bridge._session.context.clock.moved_s = time.monotonic() - 60  # pyright: ignore[reportPrivateUsage]
+    bridge._session.clock.moved_s = time.monotonic() - 60  # pyright: ignore[reportPrivateUsage]
 
 
 def standing_for_s(recording: Recording) -> float:
@@ -54,7 +54,7 @@ def test_a_handler_that_steps_by_itself_shows_its_robot_as_moving(
     def go(_: dict[str, object]) -> None:
         for _number in range(3):
             bridge.robot.step(16)
-        bridge._session.context.heartbeat._next_s = 0.0  # pyright: ignore[reportPrivateUsage]
+        bridge._session.heartbeat._next_s = 0.0  # pyright: ignore[reportPrivateUsage]
         bridge.robot.step(16)
         seen.extend(recording.rows("SELECT sim_time_s FROM session"))
 

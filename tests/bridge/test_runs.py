@@ -10,7 +10,7 @@ import pytest
 
 from tests.bridge.conftest import STEP_MS, Recording
 from webots_mcp import MCPBridge, MemoryDatabase
-from webots_mcp.bridge import identity
+from webots_mcp.bridge import registration
 from webots_mcp.standin import InProcessRobot, InProcessSimulation, InProcessSupervisor
 
 
@@ -275,7 +275,7 @@ def test_an_object_that_passes_on_to_the_robot_is_refused_with_the_way_to_its_ro
 def test_a_git_head_that_is_no_text_costs_the_commit_only(tmp_path: Path) -> None:
     (tmp_path / ".git").mkdir()
     (tmp_path / ".git" / "HEAD").write_bytes(b"\xff\xfe")
-    assert identity._git_commit(tmp_path) is None  # pyright: ignore[reportPrivateUsage]
+    assert registration._git_commit(tmp_path) is None  # pyright: ignore[reportPrivateUsage]
 
 
 def test_a_path_whose_bytes_are_no_text_is_recorded_readably(
@@ -284,7 +284,7 @@ def test_a_path_whose_bytes_are_no_text_is_recorded_readably(
     recording: Recording,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(identity, "controller_file", lambda: Path("/robots/\udcff/rover.py"))
+    monkeypatch.setattr(registration, "controller_file", lambda: Path("/robots/\udcff/rover.py"))
     with MCPBridge(robot, database=database):
         pass
     assert recording.rows("SELECT controller FROM session") == [str(Path("/robots/?/rover.py"))]

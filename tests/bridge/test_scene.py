@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from webots_mcp.bridge.scene_tree import SceneNode, find_field, find_inner_field, read_value, walk
+from webots_mcp.bridge.scene import SceneNode, find_field, find_inner_field, read_value, walk
 from webots_mcp.standin import InProcessSupervisor
 
 CROWD = Path(__file__).parent / "worlds" / "crowd.wbt"
@@ -38,8 +38,8 @@ def test_robots_are_found_in_groups_on_other_robots_and_in_the_slots_of_proto_no
 def test_each_node_says_where_it_stands(referee: InProcessSupervisor) -> None:
     by_name = {node.name: node for node in walk(referee.getRoot())}
     platform, sensor = by_name["platform"], by_name["turned"]
-    assert (platform.field, platform.index, platform.depth) == ("endPoint", None, 3)
-    assert (sensor.field, sensor.index, sensor.base_type) == ("device", 1, "PositionSensor")
+    assert (platform.field, platform.entry, platform.depth) == ("endPoint", None, 3)
+    assert (sensor.field, sensor.entry, sensor.base_type) == ("device", 1, "PositionSensor")
     assert (platform.is_solid, sensor.is_solid) == (True, False)
 
 

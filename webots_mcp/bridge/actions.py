@@ -1,8 +1,9 @@
-"""The built-in actions: for each in `contract.BUILT_IN_ACTIONS` the function of its name.
+"""Serving the command queue, with the built-in actions.
 
-Each returns a generator, which yields until its outcome is known (once per round of the user's
-loop, or of the pause), returns the command's result, or raises the command's error. A command that
-is refused before its generator exists does not interrupt another one.
+For each action in `contract.BUILT_IN_ACTIONS` there is the function of its name. It returns a
+generator, which yields until its outcome is known (once per round of the user's loop, or of the
+pause), returns the command's result, or raises the command's error. A command that is refused
+before its generator exists does not interrupt another one.
 """
 
 from __future__ import annotations
@@ -10,17 +11,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
-from webots_mcp.bridge.command_queue import ClaimedCommand, Progress
-from webots_mcp.bridge.context import Context
-from webots_mcp.bridge.declared_parameters import SETTERS, Setter
-from webots_mcp.bridge.goal import Goal, read_goal
-from webots_mcp.bridge.picture_files import complete_png_size
-from webots_mcp.bridge.picturing import find_pictured, take_picture
-from webots_mcp.bridge.text import describe
+from webots_mcp.bridge.breakpoints import Goal, read_goal
+from webots_mcp.bridge.commands import ClaimedCommand, Handlers, Progress
+from webots_mcp.bridge.error_report import describe
+from webots_mcp.bridge.parameters import SETTERS, Setter
+from webots_mcp.bridge.pause import PUMP_INTERVAL_S
+from webots_mcp.bridge.pictures import complete_png_size, find_pictured, take_picture
 from webots_mcp.contract import (
     BUILT_IN_ACTIONS,
+    ENDING,
+    LOOPING,
     MAX_STEPS,
     SCREENSHOT_FOLDER,
     Then,
@@ -33,9 +35,14 @@ from webots_mcp.errors import (
     InterruptedCommandError,
     InvalidInputError,
 )
+from webots_mcp.liveness import EXTERN
 from webots_mcp.pauses import Cause
 
-Action = Callable[[Context, ClaimedCommand], Progress]
+if TYPE_CHECKING:
+    from webots_mcp.bridge.session import Session
+
+
+Action = Callable[["Session", ClaimedCommand], Progress]
 
 _SCREENSHOT_TIMEOUT_S: Final = 10.0
 _RESET_TIMEOUT_S: Final = 10.0
@@ -46,28 +53,28 @@ _HIGHEST_STATUS: Final = 255
 _known: Final[dict[str, Action]] = {}
 
 
-def begin(context: Context, command: ClaimedCommand) -> Progress:
+def begin(session: Session, command: ClaimedCommand) -> Progress:
     """The generator of a built-in action.
 
     Raises:
         CommandRefusedError: It needs a Supervisor and this robot is not one.
     """
     if BUILT_IN_ACTIONS[command.action].needs_supervisor:
-        context.simulation.require_supervisor(command.action)
-    return action_of(command.action)(context, command)
+        session.simulation.require_supervisor(command.action)
+    return action_of(command.action)(session, command)
 
 
 def action_of(name: str) -> Action:
     """The function of a built-in action."""
     if name not in _known:  # the scene's: seldom used, and not worth their import at every start
-        from webots_mcp.bridge import scene_changing, scene_looking
+        from webots_mcp.bridge import scene, scene_changes
 
         _known.update(
-            get_scene=scene_looking.get_scene,
-            get_field=scene_looking.get_field,
-            set_field=scene_changing.set_field,
-            add_node=scene_changing.add_node,
-            remove_node=scene_changing.remove_node,
+            get_scene=scene.get_scene,
+            get_field=scene.get_field,
+            set_field=scene_changes.set_field,
+            add_node=scene_changes.add_node,
+            remove_node=scene_changes.remove_node,
         )
     return _known[name]
 
@@ -79,57 +86,57 @@ def _built_in(action: Action) -> Action:
 
 
 @_built_in
-def pause(context: Context, command: ClaimedCommand) -> Progress:
+def pause(session: Session, command: ClaimedCommand) -> Progress:
     """Pause at once, or after one more round where the state of this round was throttled.
 
     A person looks at the newest recorded state of a paused robot, so it must be the current one.
     """
-    if context.throttle.stale and not context.pause.active:
-        context.throttle.want()
+    if session.throttle.stale and not session.pause.active:
+        session.throttle.want()
         yield
-    context.pause.begin(Cause(command.id))
-    return _mode(context)
+    session.pause.begin(Cause(command.id))
+    return _mode(session)
 
 
 @_built_in
-def resume(context: Context, command: ClaimedCommand) -> Progress:
+def resume(session: Session, command: ClaimedCommand) -> Progress:
     """Continue in real time, whatever the mode was before."""
-    before = context.pause.running_mode
-    context.pause.end(command, "real_time")
+    before = session.pause.running_mode
+    session.pause.end(command.id, "real_time")
     why = "resume means real time"
     if before == "fast":
         why += "; it ran fast before: the command fast continues in that mode"
-    return {**_mode(context), "why": why}
+    return {**_mode(session), "why": why}
     yield
 
 
 @_built_in
-def fast(context: Context, command: ClaimedCommand) -> Progress:
+def fast(session: Session, command: ClaimedCommand) -> Progress:
     """Continue as fast as the computer can."""
-    context.pause.end(command, "fast")
-    return _mode(context)
+    session.pause.end(command.id, "fast")
+    return _mode(session)
     yield
 
 
 @_built_in
-def step(context: Context, command: ClaimedCommand) -> Progress:
+def step(session: Session, command: ClaimedCommand) -> Progress:
     """Let the user's loop run `steps` rounds, each with its own step, then pause.
 
     A loop that does not ask for commands in every round makes more steps; the answer has the number
     made. A world that does not wait for the robot (`synchronization` FALSE) runs in real time
     meanwhile, so that it can be stopped in time.
     """
-    return _step(context, command, _whole_number(command.params, "steps", 1, MAX_STEPS))
+    return _step(session, command, _whole_number(command.params, "steps", 1, MAX_STEPS))
 
 
-def _step(context: Context, command: ClaimedCommand, steps: int) -> Progress:
-    clock, watch = context.clock, context.watch
+def _step(session: Session, command: ClaimedCommand, steps: int) -> Progress:
+    clock, watch = session.clock, session.watch
     from_s, from_step = clock.sim_time_s, clock.steps_seen
-    mode = None if context.simulation.waits_for_robot else "real_time"
-    context.pause.change_mode_temporarily(command, mode, stepping=True)
+    mode = None if session.simulation.waits_for_robot else "real_time"
+    session.pause.change_mode_temporarily(command.id, mode, stepping=True)
     watch.stepping = command.id
     try:
-        while (made := clock.steps_seen - from_step) < steps and not context.pause.active:
+        while (made := clock.steps_seen - from_step) < steps and not session.pause.active:
             if watch.stepping != command.id:
                 break
             yield
@@ -140,43 +147,43 @@ def _step(context: Context, command: ClaimedCommand, steps: int) -> Progress:
     ended_by = "it was cancelled" if watch.stepping != command.id else "a breakpoint paused it"
     why = {"why": f"{ended_by} before the last step"} if made < steps else {}
     watch.stepping = None
-    context.pause.begin(Cause(command.id))
+    session.pause.begin(Cause(command.id))
     advanced_s = round(clock.sim_time_s - from_s, 6)
-    return {"steps": made, "advanced_s": advanced_s, **_mode(context), **why}
+    return {"steps": made, "advanced_s": advanced_s, **_mode(session), **why}
 
 
 @_built_in
-def run(context: Context, command: ClaimedCommand) -> Progress:
+def run(session: Session, command: ClaimedCommand) -> Progress:
     """Let the loop run until a condition holds or a time has passed; then act on `then`."""
     goal = read_goal(command.params)
-    context.watch.require_free()
-    return _run_until(context, command, goal)
+    session.watch.require_free()
+    return _run_until(session, command, goal)
 
 
 @_built_in
-def cancel_run(context: Context, command: ClaimedCommand) -> Progress:
+def cancel_run(session: Session, command: ClaimedCommand) -> Progress:
     """End the `run` command of that id, as its `then` says, or the `step`: its caller left."""
-    return {"was_under_way": context.watch.cancel(command.params.get("command_id"))}
+    return {"was_under_way": session.watch.cancel(command.params.get("command_id"))}
     yield
 
 
 @_built_in
-def reset(context: Context, command: ClaimedCommand) -> Progress:
+def reset(session: Session, command: ClaimedCommand) -> Progress:
     """Ask for the reset; done when simulation time has gone back, which takes a physics step."""
-    was_paused = context.pause.active
-    context.queue.issue(command)
-    context.pause.end(command)  # first: a paused simulation makes no physics step
-    yield from _reset(context)
+    was_paused = session.pause.active
+    session.queue.issue(command)
+    session.pause.end(command.id)  # first: a paused simulation makes no physics step
+    yield from _reset(session)
     why = "a reset takes a step, which ended the pause" if was_paused else "a reset keeps the mode"
-    return {"run_id": context.clock.run.id, **_mode(context), "why": f"{why}; the simulation runs"}
+    return {"run_id": session.clock.run.id, **_mode(session), "why": f"{why}; the simulation runs"}
 
 
-def _reset(context: Context) -> Generator[None]:
-    clock, run = context.clock, context.clock.run
+def _reset(session: Session) -> Generator[None]:
+    clock, run = session.clock, session.clock.run
     clock.await_reset()
-    context.simulation.robot.simulationReset()
+    session.simulation.robot.simulationReset()
     deadline_s = time.monotonic() + _RESET_TIMEOUT_S
-    with context.pause.awaiting_step():  # the state published in the first step is of the new run
+    with session.pause.awaiting_step():  # the state published in the first step is of the new run
         while clock.run is run:
             if time.monotonic() > deadline_s:
                 clock.forget_reset()
@@ -188,16 +195,16 @@ def _reset(context: Context) -> Generator[None]:
 
 
 @_built_in
-def reload(context: Context, command: ClaimedCommand) -> Progress:
+def reload(session: Session, command: ClaimedCommand) -> Progress:
     """Ask for the reload; this process ends, and the next session confirms the command."""
-    context.queue.issue(command)
-    context.reloads.requested_by = command
-    context.pause.end(command)  # first: after worldReload() Webots answers nothing but quit
-    context.simulation.robot.worldReload()
+    session.queue.issue(command)
+    session.reloads.requested_by = command
+    session.pause.end(command.id)  # first: after worldReload() Webots answers nothing but quit
+    session.simulation.robot.worldReload()
     deadline_s = time.monotonic() + _RELOAD_TIMEOUT_S
     while time.monotonic() < deadline_s:
         yield
-    context.reloads.requested_by = None
+    session.reloads.requested_by = None
     raise CommandRefusedError(
         f"worldReload() was called, but Webots has not ended the controller after "
         f"{_RELOAD_TIMEOUT_S:.0f} s; {_DIALOG}"
@@ -205,18 +212,18 @@ def reload(context: Context, command: ClaimedCommand) -> Progress:
 
 
 @_built_in
-def load_world(context: Context, command: ClaimedCommand) -> Progress:
+def load_world(session: Session, command: ClaimedCommand) -> Progress:
     """Ask for another world of the project; this process ends, as all controllers do."""
-    return _load(context, command, _world_of_project(context, command.params.get("world")))
+    return _load(session, command, _world_of_project(session, command.params.get("world")))
 
 
-def _load(context: Context, command: ClaimedCommand, world: Path) -> Progress:
-    context.pause.end(command)  # first: a paused simulation makes no physics step
-    context.simulation.robot.worldLoad(str(world))
+def _load(session: Session, command: ClaimedCommand, world: Path) -> Progress:
+    session.pause.end(command.id)  # first: a paused simulation makes no physics step
+    session.simulation.robot.worldLoad(str(world))
     return (yield from _until_ended("worldLoad"))
 
 
-def _world_of_project(context: Context, world: object) -> Path:
+def _world_of_project(session: Session, world: object) -> Path:
     """A world of the current one's project.
 
     This is checked here, so that every client is bound by it: loading a world starts its
@@ -229,21 +236,21 @@ def _world_of_project(context: Context, world: object) -> Path:
         file, is_file = Path(), False
     if not is_file:
         raise InvalidInputError(f"world must be the full path of a world file, not {world!r:.200}")
-    present = full_path(context.simulation.robot.getWorldPath())
+    present = full_path(session.simulation.robot.getWorldPath())
     require_world_of(require_world_of(None, present), file)
     return file
 
 
 @_built_in
-def quit(context: Context, command: ClaimedCommand) -> Progress:  # noqa: A001  (the action's name)
+def quit(session: Session, command: ClaimedCommand) -> Progress:  # noqa: A001  (the action's name)
     """Ask Webots to end; this process ends with it."""
     status = _whole_number(command.params, "status", 0, _HIGHEST_STATUS, default=0)
-    return _quit(context, command, status)
+    return _quit(session, command, status)
 
 
-def _quit(context: Context, command: ClaimedCommand, status: int) -> Progress:
-    context.pause.end(command)
-    context.simulation.robot.simulationQuit(status)
+def _quit(session: Session, command: ClaimedCommand, status: int) -> Progress:
+    session.pause.end(command.id)
+    session.simulation.robot.simulationQuit(status)
     return (yield from _until_ended("simulationQuit"))
 
 
@@ -262,36 +269,36 @@ def _until_ended(asked: str) -> Progress:
 
 
 @_built_in
-def screenshot(context: Context, command: ClaimedCommand) -> Progress:
+def screenshot(session: Session, command: ClaimedCommand) -> Progress:
     """Ask for the picture; Webots writes the file some time later, or never."""
     quality = _whole_number(command.params, "quality", 1, 100, default=100)
     path = f"{SCREENSHOT_FOLDER}/command-{command.id:06d}.png"
-    file = context.album.make_room(path)
-    context.simulation.robot.exportImage(str(file), quality)
+    file = session.album.make_room(path)
+    session.simulation.robot.exportImage(str(file), quality)
     size = yield from _wait_for_picture(file)
-    return context.album.add_screenshot(path, *size)
+    return session.album.add_screenshot(path, *size)
 
 
 @_built_in
-def take_frame(context: Context, command: ClaimedCommand) -> Progress:
+def take_frame(session: Session, command: ClaimedCommand) -> Progress:
     """Take a picture of the newest measurement of a camera, a range finder or a lidar."""
     name = command.params.get("camera") or ""
-    device = find_pictured(context.simulation.robot, str(name))
+    device = find_pictured(session.simulation.robot, str(name))
     picture, camera = take_picture(device), str(device.getName())
-    saved = context.album.add_frame(camera, picture.bgra, picture.width, picture.height)
-    when = {"sim_time_s": context.clock.sim_time_s}
+    saved = session.album.add_frame(camera, picture.bgra, picture.width, picture.height)
+    when = {"sim_time_s": session.clock.sim_time_s}
     return {"camera": camera, **saved, **when, "scale": picture.scale}
     yield
 
 
 @_built_in
-def reset_state(context: Context, command: ClaimedCommand) -> Progress:
+def reset_state(session: Session, command: ClaimedCommand) -> Progress:
     """Run the callbacks of `on_reload`; not called where the controller registered its own action.
 
     See `Control._start`, where a registered function comes first.
     """
-    with context.pause.user_code():
-        outcomes = context.reloads.call_back()
+    with session.pause.user_code():
+        outcomes = session.reloads.call_back()
     if not outcomes:
         raise CommandRefusedError(
             "nothing was reset: this controller registered no callback with bridge.on_reload() and "
@@ -307,9 +314,9 @@ def reset_state(context: Context, command: ClaimedCommand) -> Progress:
 
 
 @_built_in
-def set_parameters(context: Context, command: ClaimedCommand) -> Progress:
+def set_parameters(session: Session, command: ClaimedCommand) -> Progress:
     """Set all given parameters or none: `when` "now", or "reset" for the next reset."""
-    params, clock, parameters = command.params, context.clock, context.parameters
+    params, clock, parameters = command.params, session.clock, session.parameters
     values, when = params.get("values"), params.get("when", "now")
     if not isinstance(values, dict) or not values or when not in ("now", "reset"):
         raise InvalidInputError(
@@ -328,41 +335,41 @@ def set_parameters(context: Context, command: ClaimedCommand) -> Progress:
 
 
 @_built_in
-def arm_breakpoints(context: Context, command: ClaimedCommand) -> Progress:
+def arm_breakpoints(session: Session, command: ClaimedCommand) -> Progress:
     """Read the stored breakpoints again, since some were set or removed."""
-    while not context.breakpoints.load():
+    while not session.breakpoints.load():
         yield
-    return context.breakpoints.describe()
+    return session.breakpoints.describe()
 
 
 @_built_in
-def keep(context: Context, command: ClaimedCommand) -> Progress:
+def keep(session: Session, command: ClaimedCommand) -> Progress:
     """Keep the last seconds and the next ones at full rate, for a `reason`."""
-    reason, sim_time_s = command.params.get("reason"), context.clock.sim_time_s
+    reason, sim_time_s = command.params.get("reason"), session.clock.sim_time_s
     if not isinstance(reason, str) or not reason.strip():
         raise InvalidInputError(f"reason must be a text that is not empty, not {reason!r:.80}")
-    if not context.keeper.keep(reason):
-        raise CommandRefusedError(context.keeper.why_not)
-    return {"run_id": context.clock.run.id, "kept_around_s": sim_time_s}
+    if not session.keeper.keep(reason):
+        raise CommandRefusedError(session.keeper.why_not)
+    return {"run_id": session.clock.run.id, "kept_around_s": sim_time_s}
     yield
 
 
-def _run_until(context: Context, command: ClaimedCommand, goal: Goal) -> Progress:
+def _run_until(session: Session, command: ClaimedCommand, goal: Goal) -> Progress:
     """Apply the goal's parameters, run until the goal is reached, and report how far it got."""
-    watch, pause, finish = context.watch, context.pause, _finish_of(context, command, goal.then)
-    _set_before_run(context, command, goal)
+    watch, pause, finish = session.watch, session.pause, _finish_of(session, command, goal.then)
+    _set_before_run(session, command, goal)
     watch.begin(command.id, goal, finish)
     pause.ask_before_steps(watch.before_step)
     try:
-        pause.change_mode_temporarily(command, goal.pace)
+        pause.change_mode_temporarily(command.id, goal.pace)
         if goal.reset:
-            yield from _reset(context)
+            yield from _reset(session)
         while not watch.over():
             if pause.active:
                 why = f"the simulation was paused meanwhile: {pause.cause}"
                 watch.interrupt("interrupted", why)
             yield
-        return watch.describe() | {"mode": context.simulation.mode_name}
+        return watch.describe() | {"mode": session.simulation.mode_name}
     except ControllerEndedError as ending:
         watch.interrupt("run ended", str(ending))
         return watch.describe()
@@ -377,10 +384,10 @@ def _run_until(context: Context, command: ClaimedCommand, goal: Goal) -> Progres
         watch.end()
 
 
-def _set_before_run(context: Context, command: ClaimedCommand, goal: Goal) -> None:
+def _set_before_run(session: Session, command: ClaimedCommand, goal: Goal) -> None:
     """Set the parameters of a goal, all or none."""
     if goal.parameters:
-        parameters, setter = context.parameters, _setter(command)
+        parameters, setter = session.parameters, _setter(command)
         (parameters.set_from_reset if goal.reset else parameters.set_now)(goal.parameters, setter)
 
 
@@ -390,9 +397,9 @@ def _setter(command: ClaimedCommand) -> Setter:
     return Setter(by if by in SETTERS else "command", command.id)
 
 
-def _finish_of(context: Context, command: ClaimedCommand, then: Then) -> Callable[[], None]:
+def _finish_of(session: Session, command: ClaimedCommand, then: Then) -> Callable[[], None]:
     """The function that is called at the step that ends a run."""
-    pause = context.pause
+    pause = session.pause
     was_paused = pause.active
 
     def finish() -> None:
@@ -404,8 +411,8 @@ def _finish_of(context: Context, command: ClaimedCommand, then: Then) -> Callabl
     return finish
 
 
-def _mode(context: Context) -> dict[str, object]:
-    return {"mode": context.simulation.mode_name, "sim_time_s": context.clock.sim_time_s}
+def _mode(session: Session) -> dict[str, object]:
+    return {"mode": session.simulation.mode_name, "sim_time_s": session.clock.sim_time_s}
 
 
 def _wait_for_picture(file: Path) -> Generator[None, None, tuple[int, int, int]]:
@@ -429,3 +436,148 @@ def _whole_number(
             f"{name} must be a whole number from {least} to {most}, not {value!r}"
         )
     return value
+
+
+# -- serving the queue -----------------------------------------------------------------------------
+
+
+POLL_INTERVAL_S: Final = 0.005
+
+
+class Control:
+    """Claims commands, runs them, and keeps the loop while the simulation is paused.
+
+    Attributes:
+        handlers: The controller's own actions.
+        why_ended: The error of commands that are still running when the process ends.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self.handlers = Handlers(session)
+        self.why_ended = "the controller ended"
+        self._running: dict[ClaimedCommand, Progress] = {}
+        self._reported = False
+        self._next_poll_s = 0.0
+        session.pause.serve = self._serve_pause
+
+    def report_end(self, *, extern: bool) -> None:
+        """The process is about to end: answer the commands that no successor will answer."""
+        for running in [c for c in self._running if c.action in (*LOOPING, *ENDING)]:
+            self._end(running, ControllerEndedError(self.why_ended))
+        command = self._session.reloads.requested_by
+        if command is not None and extern and not self._reported:
+            self._reported = True
+            self._running.pop(command, None)
+            self._succeed(command, {"controller": f"it has ended; {EXTERN}"})
+
+    def serve(self) -> ClaimedCommand | None:
+        """One round: advance running actions, begin one new command, and stay in a pause.
+
+        Returns:
+            The command that was handled last in this call, if any.
+        """
+        now, handled = time.monotonic(), None
+        due = now >= self._next_poll_s
+        if not (due or self._running or self._session.pause.active):
+            return None
+        self._advance_all()
+        if due:
+            handled = self._serve_one()
+            # Commands often come in groups: after one, the next round looks for another.
+            self._next_poll_s = now + POLL_INTERVAL_S if handled is None else now
+        return self._serve_pause() or handled
+
+    def _serve_pause(self) -> ClaimedCommand | None:
+        """Serve commands for as long as the pause lasts."""
+        handled, pause = None, self._session.pause
+        while pause.active:
+            self._session.heartbeat.poll()
+            pause.pump()
+            self._advance_all()
+            handled = self._serve_one() or handled
+            time.sleep(PUMP_INTERVAL_S if pause.active else 0)
+        return handled
+
+    def _serve_one(self) -> ClaimedCommand | None:
+        if self._session.simulation.over:
+            return None
+        command = self._session.queue.claim(self._session.clock.sim_time_s)
+        if command is not None:
+            self._start(command)
+        return command
+
+    def _start(self, command: ClaimedCommand) -> None:
+        built_in = BUILT_IN_ACTIONS.get(command.action)
+        try:
+            self._session.queue.begin(command)
+            if built_in is None or self.handlers.knows(command.action):
+                self._succeed(command, self.handlers.run(command))
+            else:
+                progress = begin(self._session, command)
+                if built_in.ends_steps:
+                    self._interrupt(f"interrupted by command {command.id} ({command.action})")
+                self._running[command] = progress
+        except BaseException as error:
+            self._fail(command, error)  # whatever a handler raises is the answer
+            if not isinstance(error, Exception):
+                raise  # Ctrl-C and SystemExit still end the loop, but the command is answered first
+        self._advance(command)
+
+    def _advance_all(self) -> None:
+        for command in tuple(self._running):  # a copy: an advanced action leaves or changes it
+            if self._session.simulation.over:
+                self._abandon(command)
+            else:
+                self._advance(command)
+
+    def _abandon(self, command: ClaimedCommand) -> None:
+        """Drop an action after Webots said quit; a reload is left for the successor to confirm."""
+        if command.action == "reload":
+            del self._running[command]
+        else:
+            self._end(command, ControllerEndedError("Webots ended the controller"))
+
+    def _advance(self, command: ClaimedCommand) -> None:
+        """Advance a built-in action by one round.
+
+        It is taken out meanwhile: a callback of the user may call `get_command()` and so come back
+        to here, and a generator cannot be entered twice.
+        """
+        progress = self._running.pop(command, None)
+        if progress is None:
+            return
+        try:
+            next(progress)
+            self._running[command] = progress
+        except StopIteration as end:
+            self._succeed(command, end.value)
+        except BaseException as error:
+            self._fail(command, error)  # whatever the action raises is the answer
+            if not isinstance(error, Exception):
+                raise
+
+    def _interrupt(self, why: str) -> None:
+        """Another command controls the loop from now on: end the ones that let it run."""
+        for command in [c for c in self._running if c.action in LOOPING]:
+            self._end(command, InterruptedCommandError(why))
+
+    def _end(self, command: ClaimedCommand, interruption: InterruptedCommandError) -> None:
+        """End a running built-in action, which may answer how far it got."""
+        progress = self._running.pop(command)
+        try:
+            progress.throw(interruption)
+        except StopIteration as end:
+            self._succeed(command, end.value)
+        except CommandRefusedError as reason:
+            self._fail(command, reason)
+
+    def _succeed(self, command: ClaimedCommand, result: object) -> None:
+        session = self._session
+        replaced = session.queue.succeed(command, result, session.clock.sim_time_s)
+        if replaced is not None:
+            text = f"command {command.id} ({command.action}): {replaced}"
+            session.journal.log("warning", "bridge", text)
+
+    def _fail(self, command: ClaimedCommand, error: BaseException) -> None:
+        self._session.queue.fail(command, describe(error), self._session.clock.sim_time_s)

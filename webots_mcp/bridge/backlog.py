@@ -6,8 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Final
 
-from webots_mcp.bridge.row_counts import RowCounts
-from webots_mcp.bridge.run import Run
+from webots_mcp.bridge.simulation import Run
 from webots_mcp.entries import Entry, Kind, Values
 from webots_mcp.waiting_file import ENTRIES_AT_ONCE, WaitingFile
 
@@ -38,7 +37,7 @@ class Backlog:
     Args:
         file: Where rows survive the process; None for memory alone.
         describe_run: Returns the values of a run's own entry.
-        counts: Counts dropped rows.
+        drop: Counts dropped rows, and says why.
 
     Attributes:
         why: The reason why rows wait.
@@ -48,11 +47,11 @@ class Backlog:
         self,
         file: WaitingFile | None,
         describe_run: Callable[[Run], dict[str, Any]],
-        counts: RowCounts,
+        drop: Callable[[int, str], None],
     ) -> None:
         self._file = file
         self._describe_run = describe_run
-        self._counts = counts
+        self._drop = drop
         self._rows: deque[Row] = deque()
         self._bytes = 0
         self._last_number = 0
@@ -89,7 +88,7 @@ class Backlog:
         self.save()
         while len(self._rows) > MAX_WAITING_ROWS or self._bytes > MAX_WAITING_BYTES:
             self._remove_oldest()
-            self._counts.drop(1, self.why)
+            self._drop(1, self.why)
 
     def save(self) -> None:
         """Move the rows in memory to the file, as far as it takes them."""
@@ -142,7 +141,7 @@ class Backlog:
         """Drop the rows in memory, which nothing will write any more."""
         while self._rows:
             self._remove_oldest()
-            self._counts.drop(1, why)
+            self._drop(1, why)
 
     def close(self) -> str | None:
         """Close the file; one that still has entries is not deleted, and its path is returned."""

@@ -13,14 +13,15 @@ within milliseconds also while the database is locked.
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final
 
-from webots_mcp.bridge.printed_lines import PrintedLines
 from webots_mcp.errors import warn
 
 _DESCRIPTORS: Final = {"stdout": 1, "stderr": 2}
@@ -308,3 +309,108 @@ def _enlarge(pipe: int) -> None:
             fcntl.fcntl(pipe, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
         except OSError:  # the user's limit for pipes is reached: the default size remains
             return
+
+
+# -- printed lines: up to 500 a second -------------------------------------------------------------
+
+
+MOST_LINES_PER_S: Final = 500  # of wall time
+_MOST_LINE_BYTES: Final = 40_000  # a log row has the first 10,000 characters
+
+
+class PrintedLines:
+    """Splits a stream of bytes into whole lines, without the empty ones.
+
+    Attributes:
+        waiting: Lines that have not been removed yet: those of some seconds at most.
+    """
+
+    def __init__(self) -> None:
+        self.waiting: deque[str] = deque()
+        self._unfinished = bytearray()
+        self._second = 0
+        self._lines_in_second = 0
+        self._left_out = 0
+
+    def take(self, data: bytes) -> None:
+        """Add printed bytes."""
+        *lines, rest = data.split(b"\n")
+        for line in lines:
+            self._add(bytes(self._unfinished) + line)
+            self._unfinished.clear()
+        self._unfinished += rest[: _MOST_LINE_BYTES - len(self._unfinished)]
+
+    def end(self) -> None:
+        """Finish: the rest without a newline is a line too."""
+        self.take(b"\n")
+        self._note_left_out()
+
+    def remove(self) -> list[str]:
+        """Remove and return the waiting lines."""
+        return [self.waiting.popleft() for _ in range(len(self.waiting))]
+
+    def add_note(self, text: str) -> None:
+        """Add a note of the bridge, in parentheses."""
+        self.waiting.append(f"({text})")
+
+    def _add(self, line: bytes) -> None:
+        second = int(time.monotonic())
+        if second != self._second:
+            self._note_left_out()
+            self._second, self._lines_in_second = second, 0
+        # The text after the last carriage return: what a terminal shows of a progress bar.
+        text = line.rstrip(b"\r").rpartition(b"\r")[2].decode("utf-8", "replace")
+        if not text.strip():
+            return
+        self._lines_in_second += 1
+        if self._lines_in_second > MOST_LINES_PER_S:
+            self._left_out += 1
+        else:
+            self.waiting.append(text)
+
+    def _note_left_out(self) -> None:
+        if self._left_out:
+            self.add_note(
+                f"{self._left_out} lines were not recorded: more than {MOST_LINES_PER_S} were "
+                "printed in a second"
+            )
+            self._left_out = 0
+
+
+# -- Python's logging ------------------------------------------------------------------------------
+
+
+class LogHandler(logging.Handler):
+    """Records each line with its level and the name of its logger.
+
+    Args:
+        record: Receives the text, the level's number and the logger's name; called in any thread.
+        level: Lines of this level and those above it are recorded.
+    """
+
+    def __init__(
+        self, record: Callable[[object, object, str | None], None], level: int | str
+    ) -> None:
+        super().__init__(level.upper() if isinstance(level, str) else level)
+        self._record = record
+        self._inside = threading.local()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Record a line; one that is logged by the recording itself is ignored."""
+        if getattr(self._inside, "busy", False):
+            return
+        self._inside.busy = True
+        try:
+            self._record(self._text_of(record), record.levelno, record.name)
+        finally:
+            self._inside.busy = False
+
+    def _text_of(self, record: logging.LogRecord) -> str:
+        try:
+            return self.format(record)
+        except Exception as error:  # noqa: BLE001  (a message's arguments may raise anything)
+            return f"{_as_given(record.msg)} (not formatted: {type(error).__name__})"
+
+
+def _as_given(message: object) -> str:
+    return message if isinstance(message, str) else f"a {type(message).__name__} without text"

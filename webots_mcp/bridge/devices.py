@@ -8,10 +8,17 @@ such reading.
 from __future__ import annotations
 
 import math
+import statistics
+import time
+from collections import deque
 from collections.abc import Callable
 from itertools import pairwise
 from operator import methodcaller
-from typing import Any, Final, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
+
+if TYPE_CHECKING:
+    from webots_mcp.bridge.session import Session
+
 
 SECTORS: Final = 8
 MOST_OBJECTS: Final = 8  # of a camera or a radar that are published, the nearest first
@@ -239,3 +246,98 @@ RULES: Final[dict[str, Rule]] = {
     "TouchSensor": _sensor(_read_touch),
     "VacuumGripper": _actuator("actuators", _read_vacuum_gripper),
 }
+
+
+# -- how often devices are read --------------------------------------------------------------------
+
+
+MOST_READING_US: Final = 100.0  # per call, on average, for rows that go to the ring buffer only
+_READINGS: Final = 9  # their median counts, so that a single interrupted reading does not
+
+
+class DeviceReader:
+    """Reads a robot's devices, and measures how long that takes.
+
+    Attributes:
+        ring_interval: One call of `auto_publish` in this many reads the devices for the ring
+            buffer alone, which limits the mean time of all calls to 100 us.
+        why: The reason for an interval above 1; empty while the interval is 1.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._simulation = session.simulation
+        self._journal = session.journal
+        self._errors = session.errors
+        self._durations_us: deque[float] = deque(maxlen=_READINGS)
+        self._reported_interval = 1
+        self.ring_interval = 1
+        self.why = ""
+
+    def read(self) -> dict[str, object]:
+        """The devices' values, without those that cannot be read; these are counted as failures."""
+        if self._simulation.over:
+            return {}
+        started_s = time.perf_counter()
+        try:
+            return read_devices(self._simulation.robot, self._failed)
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            self._errors.failed("auto_publish", error)
+            return {}
+        finally:
+            self._count(1e6 * (time.perf_counter() - started_s))
+
+    def _failed(self, name: str, error: Exception) -> None:
+        self._errors.failed(f"auto_publish of the device {name!r}", error)
+
+    def _count(self, duration_us: float) -> None:
+        """Set the interval by the median of the last durations; log it when it has doubled."""
+        self._durations_us.append(duration_us)
+        usual_us = statistics.median(self._durations_us)
+        interval = max(1, math.ceil(usual_us / MOST_READING_US))
+        if interval != self.ring_interval:
+            self.ring_interval = interval
+            self.why = _why(interval, usual_us) if interval > 1 else ""
+        if self.ring_interval > self._reported_interval and len(self._durations_us) == _READINGS:
+            self._reported_interval = 2 * self.ring_interval
+            self._journal.log("info", "bridge", f"ring buffer: {self.why}")
+
+
+def _why(interval: int, usual_us: float) -> str:
+    share = f"one call of auto_publish() in {interval}"
+    return f"{share}, because reading the devices takes {usual_us:.0f} us"
+
+
+# -- motors after a reset --------------------------------------------------------------------------
+# A reset stops each motor at its position. A controller that calls `setPosition(inf)` once, before
+# its loop, does not notice the reset, and its robot would stand still from then on. Webots'
+# library does not notice it either: `getTargetPosition` still returns the last command, which is
+# used here.
+
+
+def restart_motors(session: Session) -> None:
+    """After a reset: restart the motors in velocity control, at their last velocity."""
+    devices: dict[str, Any] = getattr(session.simulation.robot, "devices", None) or {}
+    motors = [each for each in devices.items() if type(each[1]).__name__ == "Motor"]
+    restarted = [
+        text for name, motor in motors if (text := _restart(name, motor, session.errors.failed))
+    ]
+    if restarted:
+        what = "the reset stopped these motors; the bridge called setPosition(inf) again"
+        listed = ", ".join(restarted)
+        session.journal.log("info", "bridge", f"{what}, with their last velocity: {listed}")
+
+
+def _restart(name: str, motor: Any, failed: Failed) -> str | None:
+    """Restart a motor; returns its name and velocity, or None where it was not in that mode."""
+    try:
+        target, velocity = motor.getTargetPosition(), motor.getVelocity()
+        if not math.isinf(target):
+            return None
+        if name.count("::") == 1 and motor.getMultiplier() != 1:
+            return None  # coupled (`name::part`): the motor of multiplier 1 drives it too
+        motor.setPosition(target)
+        motor.setVelocity(velocity)  # else it would turn at its maximum velocity
+    except Exception as error:  # noqa: BLE001  (the other motors are still restarted)
+        failed(f"setPosition(inf) after the reset, of the motor {name!r},", error)
+        return None
+    return f"{name} ({velocity:g})"

@@ -59,9 +59,11 @@ from webots_mcp.bridge.cleaning import (
     MAX_ROOM,
     ROOM_OF_A_VALUE,
     Cleaner,
+    convert,
     failure,
+    is_number_array,
+    item_count,
 )
-from webots_mcp.bridge.conversions import convert, is_number_array, item_count
 
 # Numpy's type codes. Half and single floats are not here: orjson writes them with fewer digits.
 _ORDINARY_NUMBERS: Final = frozenset("?bBhHiIlLqQd")

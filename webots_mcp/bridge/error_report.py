@@ -1,11 +1,13 @@
-"""The errors of a bridge: the newest is kept, and each kind is printed once."""
+"""What a bridge reports of its errors, and texts for the database."""
 
 from __future__ import annotations
 
-from webots_mcp.bridge.text import describe
-from webots_mcp.errors import DatabaseError, warn
+from pathlib import Path
+from typing import Final
 
-_MOST_CHARACTERS = 2000
+from webots_mcp.errors import DatabaseError, WebotsMCPError, warn
+
+_LONGEST_WARNING = 2000
 
 
 class ErrorReport:
@@ -26,7 +28,7 @@ class ErrorReport:
 
     def warn(self, kind: str, text: str) -> None:
         """Keep an error as the newest one; print the first of its kind; raise in strict mode."""
-        text = text[:_MOST_CHARACTERS].encode("utf-8", "replace").decode()
+        text = text[:_LONGEST_WARNING].encode("utf-8", "replace").decode()
         self.last_error = text
         if kind not in self._warned:
             self._warned.add(kind)
@@ -40,3 +42,39 @@ class ErrorReport:
         if self._strict:
             raise error
         self.warn(f"{method} {type(error).__name__}", f"{method} failed: {describe(error)}")
+
+
+_LONGEST_TEXT: Final = 2000  # of what an error says
+
+
+def cut(text: str, most_characters: int) -> str:
+    """The text, or its beginning with the original length."""
+    if len(text) <= most_characters:
+        return text
+    return f"{text[:most_characters]}... (cut: it had {len(text)} characters)"
+
+
+def storable(text: str) -> str:
+    """A text without surrogates, which UTF-8 lacks, and NULs, at which SQLite's shell ends it."""
+    return text.encode("utf-8", "replace").decode().replace("\0", "\\0")
+
+
+def describe(error: BaseException) -> str:
+    """The text of an error; for one of the user's code also its type, file and line."""
+    text = _text_of(error)
+    if isinstance(error, WebotsMCPError):
+        return text
+    frame = error.__traceback__
+    while frame is not None and frame.tb_next is not None:
+        frame = frame.tb_next
+    if frame is None:
+        return f"{type(error).__name__}: {text}"
+    place = Path(frame.tb_frame.f_code.co_filename).name
+    return f"{type(error).__name__}: {text} ({place}, line {frame.tb_lineno})"
+
+
+def _text_of(error: BaseException) -> str:
+    try:
+        return cut(str(error), _LONGEST_TEXT)
+    except Exception as failure:  # noqa: BLE001  (an exception of the user's own kind)
+        return f"(no text: its str() raised {type(failure).__name__})"

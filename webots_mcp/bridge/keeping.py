@@ -10,23 +10,23 @@ one file with each call.
 from __future__ import annotations
 
 import math
+import sys
 import threading
 import time
 from collections import deque
 from itertools import islice
-from typing import Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from webots_mcp.bridge.clock import Clock
-from webots_mcp.bridge.encoding import copy_or_encode
-from webots_mcp.bridge.frames import MOST_FRAMES, CameraFrames, Frame
+from webots_mcp.bridge.encoding import copy_or_encode, encode_copy
+from webots_mcp.bridge.error_report import cut, describe, storable
 from webots_mcp.bridge.journal import Journal
-from webots_mcp.bridge.picture_files import Album
-from webots_mcp.bridge.recorder import Recorder
-from webots_mcp.bridge.ring import Ring, RingRow
-from webots_mcp.bridge.run import Run
-from webots_mcp.bridge.text import cut, storable
-from webots_mcp.bridge.throttle import Throttle
+from webots_mcp.bridge.pictures import image_of
+from webots_mcp.bridge.simulation import Run
 from webots_mcp.contract import KEEP_AFTER_S, new_uuid
+
+if TYPE_CHECKING:
+    from webots_mcp.bridge.session import Session
+
 
 MOST_KEPT_S: Final = 600.0  # of one run; a condition that flickers would keep all of it
 _MOST_REASONS: Final = 10  # of one stretch that are stored
@@ -80,24 +80,16 @@ class Keeper:
         enabled: Whether anything is held at all.
     """
 
-    def __init__(
-        self,
-        clock: Clock,
-        recorder: Recorder,
-        journal: Journal,
-        album: Album,
-        throttle: Throttle,
-        last_s: float,
-    ) -> None:
-        self._clock = clock
-        self._recorder = recorder
-        self._journal = journal
-        self._album = album
-        self._throttle = throttle
+    def __init__(self, session: Session, last_s: float) -> None:
+        self._clock = session.clock
+        self._recorder = session.recorder
+        self._journal = session.journal
+        self._album = session.album
+        self._throttle = session.throttle
         self._last_s = last_s
         self._ring = Ring(last_s)
-        self._run = clock.run
-        self._ring.begin(clock.sim_time_s)
+        self._run = session.clock.run
+        self._ring.begin(session.clock.sim_time_s)
         self._kept_s = 0.0
         self._left_out: tuple[float, str] | None = None  # this run's last call that was not held
         self._stretch: Stretch | None = None
@@ -106,9 +98,9 @@ class Keeper:
         self._unwritten: deque[tuple[Run, RingRow]] = deque()
         self._unwritten_frames: deque[tuple[Stretch, Frame]] = deque()
         self._lock = threading.RLock()  # of all that is held: any thread may publish
-        self.frames = CameraFrames(journal, last_s)
+        self.frames = CameraFrames(session.journal, last_s)
         self.enabled = last_s > 0
-        self.fills = self.enabled and throttle.interval > 1
+        self.fills = self.enabled and session.throttle.interval > 1
         self.busy = False
 
     # -- the loop ------------------------------------------------------------------------------
@@ -310,3 +302,266 @@ class Keeper:
             self._recorder.record_together("kept state", self._unwritten[0][0], rows)
         for _ in rows:
             self._unwritten.popleft()
+
+
+MAX_RING_BYTES: Final = 8_000_000
+_ROW_BYTES: Final = 400  # of a row in addition to its state: a tuple, three numbers, its place
+
+
+class RingRow(NamedTuple):
+    """A call of `publish` that may be kept.
+
+    Attributes:
+        call: Its number in the session.
+        data: The text that would have been recorded, or a copy of the state to encode later.
+        replaced: The value of the column `replaced`, where `data` is a text.
+    """
+
+    call: int
+    sim_time_s: float
+    wall_time_s: float
+    data: str | bytes
+    replaced: str | None
+
+    @property
+    def size_bytes(self) -> int:
+        """The approximate memory that it takes."""
+        replaced_bytes = sys.getsizeof(self.replaced) if self.replaced else 0
+        return _ROW_BYTES + sys.getsizeof(self.data) + replaced_bytes
+
+    def encode(self) -> RingRow:
+        """The row as it would have been recorded."""
+        if isinstance(self.data, str):
+            return self
+        encoded = encode_copy(self.data)
+        return RingRow(*self[:3], encoded.text, encoded.replaced_text)
+
+
+class Ring:
+    """Rows of one run, oldest first; the oldest are forgotten where they are too old or too many.
+
+    Args:
+        last_s: Seconds of simulation time that are held.
+        most_bytes: The limit of memory in bytes; a single larger row is not held.
+
+    Attributes:
+        size_bytes: The memory that the rows take.
+        starts_s: The simulation time since which no row is missing.
+    """
+
+    def __init__(self, last_s: float, most_bytes: int = MAX_RING_BYTES) -> None:
+        self._last_s = last_s
+        self._most_bytes = most_bytes
+        self._rows: deque[tuple[int, RingRow]] = deque()
+        self.size_bytes = 0
+        self.starts_s = 0.0
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def add(self, row: RingRow) -> None:
+        """Add the newest row."""
+        size_bytes = row.size_bytes
+        self._rows.append((size_bytes, row))
+        self.size_bytes += size_bytes
+        oldest_s = row.sim_time_s - self._last_s
+        while self._rows and (
+            self.size_bytes > self._most_bytes or self._rows[0][1].sim_time_s < oldest_s
+        ):
+            self._forget_oldest()
+
+    def take(self) -> list[RingRow]:
+        """Remove and return all rows."""
+        rows = [row for _, row in self._rows]
+        self._rows.clear()
+        self.size_bytes = 0
+        return rows
+
+    def begin(self, starts_s: float) -> None:
+        """Empty the ring; rows are complete from that simulation time on."""
+        self._rows.clear()
+        self.size_bytes, self.starts_s = 0, starts_s
+
+    def _forget_oldest(self) -> None:
+        size_bytes, row = self._rows.popleft()
+        self.size_bytes -= size_bytes
+        self.starts_s = self._rows[0][1].sim_time_s if self._rows else row.sim_time_s
+
+
+LONGEST_SIDE_PX: Final = 160
+MOST_FRAMES: Final = 78  # of all cameras together: 8 MB, were they square
+_MOST_FRAMES_PER_S: Final = 100.0
+_EARLY_S: Final = 1e-9  # tolerance: summed floating-point steps may fall a little short
+_METHODS: Final = ("getName", "getSamplingPeriod", "getWidth", "getHeight", "getImage")
+
+
+class Frame(NamedTuple):
+    """A camera's newest image at some moment, scaled down.
+
+    Attributes:
+        bgra: Four bytes a pixel, rows from the top left.
+    """
+
+    device: str
+    sim_time_s: float
+    wall_time_s: float
+    width: int
+    height: int
+    bgra: bytes
+
+
+class _Camera:
+    """A camera of which frames are taken.
+
+    Attributes:
+        due_s: Simulation time of its next frame.
+        missed: Frames that could not be taken.
+    """
+
+    def __init__(self, device: Any, interval_s: float) -> None:
+        self.device = device
+        self.name = str(device.getName())
+        self.interval_s = interval_s
+        self.due_s = self.taken_s = -math.inf
+        self.missed = 0
+
+    def frame(self, now_s: float) -> Frame:
+        """Its newest image, scaled down; the next frame is due no sooner than its next image."""
+        self.taken_s = now_s
+        period_s = self.device.getSamplingPeriod() / 1000
+        self.due_s = now_s + max(self.interval_s, period_s) - _EARLY_S
+        scaled = scale_down(*image_of(self.device))
+        return Frame(self.name, now_s, time.time(), *scaled)
+
+
+class CameraFrames:
+    """Takes frames of cameras, and holds those of the last seconds of a run.
+
+    Args:
+        last_s: Seconds of simulation time that are held, in 78 frames at most.
+
+    Attributes:
+        cameras: The cameras of which frames are taken, by name.
+        missed: Frames that could not be taken or written.
+    """
+
+    def __init__(self, journal: Journal, last_s: float) -> None:
+        self._journal = journal
+        self._last_s = last_s
+        self._held: deque[Frame] = deque(maxlen=MOST_FRAMES)
+        self._looked_s = self._due_s = -math.inf
+        self.cameras: dict[str, _Camera] = {}
+        self.missed = 0
+
+    def watch(self, device: Any, frames_per_s: float) -> None:
+        """Take this many frames of a camera per second of simulation time.
+
+        Raises:
+            TypeError: It is not a camera.
+            ValueError: The number is out of bounds.
+        """
+        lacking = [name for name in _METHODS if not callable(getattr(device, name, None))]
+        if lacking:
+            kind = type(device).__name__
+            raise TypeError(f"a Camera is needed, and {kind} has no {', '.join(lacking)}")
+        if not 0 < frames_per_s <= _MOST_FRAMES_PER_S:
+            most = f"{_MOST_FRAMES_PER_S:g}"
+            raise ValueError(f"frames_per_s must be above 0 and at most {most}: {frames_per_s!r}")
+        camera = _Camera(device, 1 / frames_per_s)
+        self.cameras[camera.name] = camera
+        self._due_s = -math.inf
+
+    def is_due(self, now_s: float) -> bool:
+        """Whether a frame is due, or simulation time has gone back."""
+        return not self._looked_s <= now_s < self._due_s
+
+    def look(self, now_s: float, *, at_once: bool) -> list[Frame]:
+        """The frames that are due; `at_once` one of each camera."""
+        again = now_s < self._looked_s  # a new run
+        due = [
+            each
+            for each in self.cameras.values()
+            if again or now_s >= each.due_s or (at_once and now_s > each.taken_s)
+        ]
+        frames = [frame for each in due if (frame := self._frame_of(each, now_s)) is not None]
+        self._looked_s = now_s
+        self._due_s = min((each.due_s for each in self.cameras.values()), default=math.inf)
+        return frames
+
+    def add(self, frame: Frame) -> None:
+        """Hold the newest frame, and forget those that are too old."""
+        while self._held and self._held[0].sim_time_s < frame.sim_time_s - self._last_s:
+            self._held.popleft()
+        self._held.append(frame)
+
+    def take(self, start_s: float) -> list[Frame]:
+        """The frames taken since a simulation time; all held frames are forgotten."""
+        frames = [frame for frame in self._held if frame.sim_time_s >= start_s]
+        self._held.clear()
+        return frames
+
+    def _frame_of(self, camera: _Camera, now_s: float) -> Frame | None:
+        """A frame of a camera, or None where it has none; its second failure is logged."""
+        try:
+            return camera.frame(now_s)
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            camera.missed += 1
+            self.missed += 1
+            if camera.missed == 2:  # the first one may come before the camera's first image
+                self._journal.log("warning", "bridge", f"keep_camera: {describe(error)}")
+            return None
+
+
+def scale_down(bgra: bytes, width: int, height: int) -> tuple[int, int, bytes]:
+    """Width, height and pixels of an image reduced to 160 pixels per side, by each n-th pixel.
+
+    Raises:
+        ValueError: The image does not have 4 * width * height bytes.
+    """
+    if len(bgra) != 4 * width * height:
+        raise ValueError(f"{len(bgra)} bytes are not an image of {width} x {height} pixels")
+    step = math.ceil(max(width, height) / LONGEST_SIDE_PX)
+    if step <= 1:
+        return width, height, bgra
+    pixels = memoryview(bgra).cast("I")
+    rows = [pixels[i : i + width : step].tobytes() for i in range(0, len(pixels), width * step)]
+    return math.ceil(width / step), len(rows), b"".join(rows)
+
+
+class Throttle:
+    """Admits one call in `interval`, and each call that is wanted for another reason.
+
+    Attributes:
+        interval: One call in this many is recorded.
+
+    Raises:
+        ValueError: The interval is less than 1.
+    """
+
+    def __init__(self, interval: int) -> None:
+        if interval < 1:
+            raise ValueError(f"throttle_interval must be 1 or more, got {interval!r}")
+        self.interval = interval
+        self._wanted = False
+        self._calls_before_run = 0
+        self.calls = 0
+        self.skipped = 0
+        self.stale = False  # the newest published state is not the newest recorded one
+
+    def begin_run(self) -> None:
+        """Count from here, so that equal runs are recorded at equal times."""
+        self._calls_before_run = self.calls
+
+    def want(self) -> None:
+        """Admit the next call, whatever its number."""
+        self._wanted = True
+
+    def admits(self, force: object) -> bool:
+        """Count a call; True if it is to be recorded, which any true value of `force` demands."""
+        self.calls += 1
+        if (self.calls - self._calls_before_run) % self.interval and not (force or self._wanted):
+            self.skipped += 1
+            self.stale = True
+            return False
+        self._wanted = self.stale = False
+        return True

@@ -7,23 +7,16 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from webots_mcp.bridge import open_bridges
-from webots_mcp.bridge.attachment import Attachment
-from webots_mcp.bridge.capture import Capture
-from webots_mcp.bridge.command_queue import ClaimedCommand
-from webots_mcp.bridge.controller_session import Session
-from webots_mcp.bridge.declared_parameters import Parameter, V
+from webots_mcp.bridge.commands import ClaimedCommand, Handler
 from webots_mcp.bridge.encoding import text_of
-from webots_mcp.bridge.error_report import ErrorReport
-from webots_mcp.bridge.handlers import Handler
-from webots_mcp.bridge.open_bridges import OpenBridge
-from webots_mcp.bridge.picture_files import MOST_FRAMES
-from webots_mcp.bridge.stats import BridgeStats
-from webots_mcp.bridge.text import describe
-from webots_mcp.bridge.throttle import Throttle
-from webots_mcp.bridge.webots_api import Simulation
+from webots_mcp.bridge.error_report import ErrorReport, describe
+from webots_mcp.bridge.keeping import Throttle
+from webots_mcp.bridge.parameters import Parameter, V
+from webots_mcp.bridge.pictures import MOST_FRAMES
+from webots_mcp.bridge.session import Attachment, Session
+from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.contract import (
     ENDED_BY,
     KEEP_LAST_S,
@@ -42,6 +35,8 @@ from webots_mcp.parameter import declare
 
 if TYPE_CHECKING:
     import logging
+
+    from webots_mcp.bridge.capture import Capture
 
 _FALSE: Final = ("", "0", "false", "no", "off")
 _MOST_KEEP_LAST_S: Final = 3600.0
@@ -115,18 +110,16 @@ class MCPBridge:
         simulation = Simulation(robot)
         # After the check of the robot, before the new session: a refused construction leaves the
         # former bridge as it is, and two sessions of one robot never overlap.
-        open_bridges.close_former(robot)
+        close_former(robot)
         where = (self.database, self.data_dir)
         self._session = Session(
             simulation, *where, throttle, keep_last_s, self._errors, kind=self._kind
         )
         self._publisher = self._session.publisher
         self._session.begin()
-        self._capture = Capture(self._record_output)
-        if capture_output:
-            self._capture.begin()
+        self._capture = self._capture_output() if capture_output else None
         self._attachment: Attachment | None = None
-        open_bridges.enter(robot, OpenBridge(self, self.close, self._leave_to_parent))
+        enter(robot, OpenBridge(self, self.close, self._leave_to_parent))
         atexit.register(self._close_at_exit)
 
     # -- attaching -----------------------------------------------------------------------------
@@ -161,7 +154,7 @@ class MCPBridge:
         Raises:
             ValueError: Options are given and the robot has a bridge already.
         """
-        bridge = open_bridges.find(robot)
+        bridge = find(robot)
         if not isinstance(bridge, MCPBridge):
             bridge = cls(robot, **options)
         elif options:
@@ -170,7 +163,7 @@ class MCPBridge:
                 "that bridge first, or call attach(robot) without options"
             )
         if bridge._attachment is None:
-            bridge._attachment = Attachment(bridge._session, bridge._serve, bridge._errors)
+            bridge._attachment = Attachment(bridge._session, bridge._serve)
             bridge._attachment.begin()
         return bridge
 
@@ -245,7 +238,7 @@ class MCPBridge:
             state = self._publisher.publish_devices(extra, include_time)
             if state is None:
                 state = self._publisher.unread(extra, include_time)
-            times = {"sim_time": self._session.context.clock.sim_time_s} if include_time else {}
+            times = {"sim_time": self._session.clock.sim_time_s} if include_time else {}
             return times | state
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("auto_publish", error)
@@ -264,7 +257,7 @@ class MCPBridge:
             reason: Why they are kept; it is stored with the stretch.
         """
         try:
-            self._session.context.keeper.keep(text_of(reason))
+            self._session.keeper.keep(text_of(reason))
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("keep", error)
 
@@ -286,7 +279,7 @@ class MCPBridge:
                 the camera's sampling period allows. A later call for the same camera changes it.
         """
         try:
-            keeper = self._session.context.keeper
+            keeper = self._session.keeper
             if not keeper.enabled:
                 raise CommandRefusedError(keeper.why_not)
             keeper.frames.watch(camera, frames_per_s)
@@ -316,7 +309,7 @@ class MCPBridge:
         Args:
             level: The handler records this level and those above it.
         """
-        from webots_mcp.bridge.log_handler import LogHandler  # `logging` costs a tenth of a start
+        from webots_mcp.bridge.capture import LogHandler  # `logging` costs a tenth of a start
 
         return LogHandler(self._log, level)
 
@@ -327,9 +320,9 @@ class MCPBridge:
                 names = ", ".join(LOG_LEVELS)
                 self._errors.warn("level", f"log level {level!r:.80} is not one of {names}")
             text = text_of(message)
-            self._session.context.journal.log(known or "info", "controller", text, logger)
+            self._session.journal.log(known or "info", "controller", text, logger)
             if known in _KEEPING:
-                self._session.context.keeper.ask(f"{known}: {text}")
+                self._session.keeper.ask(f"{known}: {text}")
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("log", error)
 
@@ -344,7 +337,7 @@ class MCPBridge:
             The file's path relative to the data folder; None where there is no image yet.
         """
         try:
-            return self._session.context.album.save_frame(camera, max_frames)
+            return self._session.album.save_frame(camera, max_frames)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("save_camera_frame", error)
             return None
@@ -410,7 +403,7 @@ class MCPBridge:
         declaration = declare(
             name, default, low=low, high=high, choices=choices, doc=doc, unit=unit
         )
-        return self._session.context.parameters.declare(declaration)
+        return self._session.parameters.declare(declaration)
 
     def breakpoint(
         self, condition: str, action: BreakpointAction = "pause", after_hits: int = 1
@@ -437,7 +430,7 @@ class MCPBridge:
             InvalidInputError: The condition or the action is invalid, or there are 32 breakpoints
                 already.
         """
-        return self._session.context.breakpoints.set(condition, action, after_hits)
+        return self._session.breakpoints.set(condition, action, after_hits)
 
     def on_reload(self, callback: Callable[[], object]) -> None:
         """Call `callback` once for each reload or reset of the world, and on `reset_state`.
@@ -445,13 +438,13 @@ class MCPBridge:
         A Supervisor's reset happens inside the same process (simulation time goes back); a reload
         starts a new process, which recognises its predecessor in the database.
         """
-        self._session.context.reloads.add(callback)
+        self._session.reloads.add(callback)
 
     def detect_reload(self) -> bool:
         """Whether the world was reloaded or reset since the last call; true once for each."""
-        reloads = self._session.context.reloads
+        reloads = self._session.reloads
         try:
-            self._session.runs.look()
+            self._session.look()
             reloads.fire()
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("detect_reload", error)
@@ -467,22 +460,23 @@ class MCPBridge:
     @property
     def run_id(self) -> int | None:
         """Id of the current run; None while nothing has been written yet."""
-        return self._session.context.clock.run.id
+        return self._session.clock.run.id
 
     def stats(self) -> BridgeStats:
         """Counts of what was recorded so far and what was not, and the time that it took."""
-        recorder, throttle = self._session.context.recorder, self._session.context.throttle
+        recorder, throttle = self._session.recorder, self._session.throttle
+        publisher = self._publisher
         return BridgeStats(
-            rows_written=recorder.counts.written,
+            rows_written=recorder.rows_written,
             rows_waiting=recorder.rows_waiting,
-            rows_dropped=recorder.counts.dropped,
+            rows_dropped=recorder.rows_dropped,
             publish_calls=throttle.calls,
             publish_throttled=throttle.skipped,
-            values_replaced=self._session.context.journal.values_replaced,
-            publish_mean_us=self._publisher.cost.mean_us,
-            publish_max_us=self._publisher.cost.max_us,
-            ring_interval=self._publisher.devices.ring_interval,
-            frames_missed=self._session.context.keeper.frames.missed,
+            values_replaced=self._session.journal.values_replaced,
+            publish_mean_us=1e6 * publisher.total_s / max(1, publisher.recorded),
+            publish_max_us=1e6 * publisher.longest_s,
+            ring_interval=publisher.devices.ring_interval,
+            frames_missed=self._session.keeper.frames.missed,
             failures=self._errors.failures,
             last_error=self._errors.last_error,
         )
@@ -505,14 +499,15 @@ class MCPBridge:
             if self._attachment is not None:
                 self._attachment.publish_missing()
                 self._attachment.look_for_unseen()
-            elif self._session.context.clock.moved_s is None:
-                self._session.look_for_unseen(self._session.context.clock.sim_time_s)
+            elif self._session.clock.moved_s is None:
+                self._session.look_for_unseen(self._session.clock.sim_time_s)
             self.detach()
             self._session.let_go()
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("close", error)
-        open_bridges.leave(self.robot)
-        self._capture.close()
+        leave(self.robot)
+        if self._capture is not None:
+            self._capture.close()
         self._session.close(reason)
         self._closed = True  # last: an interrupted call is repeated by `_close_at_exit`
         atexit.unregister(self._close_at_exit)
@@ -546,9 +541,16 @@ class MCPBridge:
         if isinstance(error, Exception):
             self.log(why, "error")
 
+    def _capture_output(self) -> Capture:
+        from webots_mcp.bridge.capture import Capture  # only here: seldom needed
+
+        capture = Capture(self._record_output)
+        capture.begin()
+        return capture
+
     def _record_output(self, stream: str, lines: Sequence[str]) -> None:
         try:
-            self._session.context.journal.output(stream, lines)
+            self._session.journal.output(stream, lines)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("capture_output", error)
 
@@ -556,9 +558,10 @@ class MCPBridge:
         """In a forked child: leave the session to the parent; the child records nothing."""
         self._closed = True
         self.detach()
-        self._capture.abandon()
-        self._session.context.recorder.abandon()
-        self._session.context.keeper.abandon()
+        if self._capture is not None:
+            self._capture.abandon()
+        self._session.recorder.abandon()
+        self._session.keeper.abandon()
 
     def _close_at_exit(self) -> None:
         """Close when the interpreter ends, and find out whether an exception ended it."""
@@ -574,3 +577,90 @@ def _seconds(given: float | str) -> float:
     if not 0 <= seconds <= _MOST_KEEP_LAST_S:
         raise ValueError(f"keep_last_s must be from 0 to {_MOST_KEEP_LAST_S:g}, got {given!r}")
     return seconds
+
+
+# -- the open bridges of this process --------------------------------------------------------------
+# One per robot: a second one closes the first. Those of a parent that forked the process are
+# dropped.
+
+
+class OpenBridge(NamedTuple):
+    """A bridge, and how to close it.
+
+    Attributes:
+        bridge: The bridge itself.
+        close: Ends its session, for a reason.
+        abandon: In a forked child: leaves the session to the parent.
+    """
+
+    bridge: object
+    close: Callable[[str], object]
+    abandon: Callable[[], object]
+
+
+_bridges: dict[int, OpenBridge] = {}
+
+
+def enter(robot: object, bridge: OpenBridge) -> None:
+    """Register a robot's bridge."""
+    _bridges[id(robot)] = bridge
+
+
+def find(robot: object) -> object | None:
+    """The open bridge of a robot, or None."""
+    open_bridge = _bridges.get(id(robot))
+    return None if open_bridge is None else open_bridge.bridge
+
+
+def leave(robot: object) -> None:
+    """Remove a robot's closed bridge."""
+    _bridges.pop(id(robot), None)
+
+
+def close_former(robot: object) -> None:
+    """Close the robot's previous bridge, if it has one."""
+    former = _bridges.get(id(robot))
+    if former is not None:
+        former.close("superseded")
+
+
+def _leave_to_parent() -> None:
+    for bridge in _bridges.values():
+        bridge.abandon()
+    _bridges.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_leave_to_parent)
+
+
+class BridgeStats(NamedTuple):
+    """What a bridge recorded so far, and what it could not record.
+
+    Attributes:
+        rows_written: Rows that the database has taken.
+        rows_waiting: Rows that it could not take yet: in the file next to it, else in memory.
+        rows_dropped: Rows that will never be in it.
+        publish_calls: Calls of `publish` and `auto_publish` in the session.
+        publish_throttled: Calls that the throttle did not record.
+        values_replaced: Values that JSON cannot hold; `replaced` of their row names them.
+        publish_mean_us: The mean duration of a recorded call, in microseconds.
+        publish_max_us: The longest duration of a recorded call, in microseconds.
+        ring_interval: One call of `auto_publish` in this many is held in the ring buffer.
+        frames_missed: Camera frames that could not be taken or written.
+        failures: Calls of the bridge's methods that failed.
+        last_error: The newest error, with its reason; None if there was none.
+    """
+
+    rows_written: int
+    rows_waiting: int
+    rows_dropped: int
+    publish_calls: int
+    publish_throttled: int
+    values_replaced: int
+    publish_mean_us: float
+    publish_max_us: float
+    ring_interval: int
+    frames_missed: int
+    failures: int
+    last_error: str | None

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
-from webots_mcp.bridge.command_queue import ClaimedCommand
-from webots_mcp.bridge.gate import QUIT, Step
-from webots_mcp.bridge.heartbeat import Heartbeat
-from webots_mcp.bridge.journal import Journal
-from webots_mcp.bridge.webots_api import Simulation
+from webots_mcp.bridge.simulation import QUIT, Step
 from webots_mcp.pauses import (
     BRIDGE_CLOSED,
     IN_WEBOTS,
@@ -21,6 +17,10 @@ from webots_mcp.pauses import (
     STEPPING,
     Cause,
 )
+
+if TYPE_CHECKING:
+    from webots_mcp.bridge.session import Session
+
 
 PUMP_INTERVAL_S: Final = 0.01
 
@@ -44,32 +44,17 @@ class Pause:
     `get_command()`, calls `step(0)` repeatedly, and serves commands there. Code of the user that
     runs there (a handler, a callback) may step nevertheless: time advances for just that step.
 
-    Args:
-        simulation: The simulation to pause.
-        journal: Receives an event when the pause begins and ends.
-        heartbeat: Publishes the pause to other processes.
-        stepped: Called after each guarded step.
-        begins: Called before the loop is stopped.
-
     Attributes:
         active: The loop is paused.
         cause: Why the newest pause was begun.
         serve: Serves commands until the pause has ended: for a loop that steps during it.
     """
 
-    def __init__(
-        self,
-        simulation: Simulation,
-        journal: Journal,
-        heartbeat: Heartbeat,
-        stepped: Callable[[], object],
-        begins: Callable[[], object],
-    ) -> None:
-        self._simulation = simulation
-        self._journal = journal
-        self._heartbeat = heartbeat
-        self._stepped = stepped
-        self._begins = begins
+    def __init__(self, session: Session) -> None:
+        self._simulation = session.simulation
+        self._journal = session.journal
+        self._heartbeat = session.heartbeat
+        self._session = session
         self._mode_before: str | None = None  # a pause, a run's pace or steps; None where none is
         self._user_code_depth = 0  # a count: a handler may call get_command(), which runs another
         self._awaiting_step = False
@@ -89,29 +74,27 @@ class Pause:
         if self.active:
             return
         self.cause = cause
-        self._begins()  # first: no call of the loop follows that could write what is left
+        self._session.keeper.write_all()  # first: no call of the loop follows that could
         self._activate(self.running_mode)
         self._simulation.set_mode("pause")
         self._journal.event(PAUSE, cause.data)
         self._heartbeat.change_loop(PAUSED, self._mode_before)
 
-    def end(
-        self, command: ClaimedCommand, mode: str | None = None, *, stepping: bool = False
-    ) -> None:
+    def end(self, command_id: int, mode: str | None = None, *, stepping: bool = False) -> None:
         """Let the loop continue, in `mode` or in the mode before the pause."""
         before, was_active = self.running_mode, self.active
         self._simulation.set_mode(mode or _running(before))
         self._deactivate()
         if was_active:
-            self._journal.event(RESUME, Cause(command.id).data)
+            self._journal.event(RESUME, Cause(command_id).data)
         self._heartbeat.change_loop(STEPPING if stepping else None)
 
     def change_mode_temporarily(
-        self, command: ClaimedCommand, mode: str | None, *, stepping: bool = False
+        self, command_id: int, mode: str | None, *, stepping: bool = False
     ) -> None:
         """Let the loop continue as `end` does, but remember the mode to return to."""
         before = self.running_mode
-        self.end(command, mode, stepping=stepping)
+        self.end(command_id, mode, stepping=stepping)
         self._mode_before = before
 
     def restore_mode(self) -> None:
@@ -234,7 +217,7 @@ class Pause:
             self._simulation.end()
             self.active = False
         elif step.ends:
-            self._stepped()
+            self._session.look_after_step()
         return answer
 
     def _leave_for(self, step: Step) -> int:

@@ -4,10 +4,10 @@ One recorded row is one statement and so one short transaction into the write-ah
 controller that is killed the next instant loses nothing. The control loop hardly waits: where
 another writer holds the lock for longer than a millisecond, the disk is full, or the database is
 read-only or missing, the row goes into a file of the session next to the database, and into memory
-only where that fails too. Waiting rows are written, in order, with the next call, or by the next
-process that opens the database. Beyond the limits of the backlog the oldest rows in memory are
-dropped, and so is a row that the database will never accept; dropped rows are counted, and reported
-as an event as soon as one can be written.
+only where that fails too (`backlog`). Waiting rows are written, in order, with the next call, or by
+the next process that opens the database. Beyond the limits of the backlog the oldest rows in memory
+are dropped, and so is a row that the database will never accept; dropped rows are counted, and
+reported as an event as soon as one can be written.
 
 A KeyboardInterrupt may come between any two lines, and nothing here relies on the lines after it: a
 statement is either written or not, the next call rolls back an open transaction, waiting rows are
@@ -16,31 +16,71 @@ recognised by their number, and the connection lock is free when the call that t
 
 from __future__ import annotations
 
+import json
+import sqlite3
+import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from threading import get_ident
+from types import FrameType
 from typing import Any, Final, TypeVar
 
 from webots_mcp.bridge.backlog import Backlog, Row
-from webots_mcp.bridge.clock import Clock
-from webots_mcp.bridge.connection_lock import ConnectionLock, this_call
 from webots_mcp.bridge.error_report import ErrorReport
-from webots_mcp.bridge.identity import Identity
-from webots_mcp.bridge.recovery import Recovery
-from webots_mcp.bridge.row_counts import RowCounts
-from webots_mcp.bridge.row_writer import RowWriter
-from webots_mcp.bridge.run import Run
-from webots_mcp.bridge.session_connection import SessionConnection, patiently
-from webots_mcp.contract import Database
-from webots_mcp.entries import Kind, Values
+from webots_mcp.bridge.registration import (
+    Identity,
+    Registration,
+    deregister,
+    describe_robot,
+    describe_session,
+    register,
+)
+from webots_mcp.bridge.simulation import Clock, Run
+from webots_mcp.connection import connect, identify_files, journal_mode
+from webots_mcp.contract import DATABASE_NAME, Database, new_uuid
+from webots_mcp.entries import STATEMENTS, Kind, Values, bind
+from webots_mcp.errors import (
+    ForeignDatabaseError,
+    ForkedProcessError,
+    SchemaTooNewError,
+    SchemaTooOldError,
+    SessionGoneError,
+)
 from webots_mcp.liveness import LoopStatus, RecordingStatus, write_heartbeat
-from webots_mcp.signal_register import Seen
-from webots_mcp.transactions import in_transaction
-from webots_mcp.waiting_file import WaitingFile, waiting_path
+from webots_mcp.schema import create_schema, require_current, schema_version
+from webots_mcp.signal_register import Seen, find_changes, write_changes
+from webots_mcp.transactions import (
+    FAILURES,
+    in_transaction,
+    is_busy,
+    is_damage,
+    never_wait,
+    roll_back,
+    text_of,
+)
+from webots_mcp.waiting_file import WaitingFile, adopt, is_unfit, take_in, waiting_path
 
 _LOCK_PATIENCE_S: Final = 0.001  # how long to wait for another thread of this process
+_WRITER_PATIENCE_S: Final = 0.001  # and for another writer, whose commit takes 50 us
+# Windows may sleep for 15 ms where less was asked for.
+_BETWEEN_TRIES_S: Final = 0.0 if sys.platform == "win32" else 0.0001
+_CATCH_UP_S: Final = 0.002  # per call: writing waiting rows must not stall the loop
+_RETRY_INTERVAL_S: Final = 1.0
+_RUN_ID: Final = "SELECT id FROM run WHERE uuid = ?"
+_GO_ON: Final = "UPDATE run SET end_reason = NULL, ended_wall_time_s = NULL WHERE id = ?"
+
+# Errors that no later attempt can resolve.
+_FOR_GOOD: Final = (
+    ForeignDatabaseError, ForkedProcessError, SchemaTooNewError, SchemaTooOldError,
+)  # fmt: skip
+
+_LOST: Final = ("no such table", "FOREIGN KEY")  # in SQLite's error where a table or a row is gone
 
 Result = TypeVar("Result")
+
+_of_parents: list[sqlite3.Connection | None] = []
 
 
 class Recorder:
@@ -50,24 +90,44 @@ class Recorder:
     time.
 
     Attributes:
-        session: The connection, the session and the current run.
-        counts: Rows that were written and dropped.
         errors: Receives each failure.
+        uuid: Of the session.
+        run: The run that is being recorded.
+        actions: Docstrings of the registered custom actions, by name.
+        new_database_entries: Called when a new database is begun. Each returns the entries that
+            it needs to know the session: kind, whether it belongs to the run, and values.
+        connection: None while the database is not open.
+        registration: The ids to record under; None while the database is not open.
+        off: Why recording has ended for good; None while it has not.
+        rows_written: Rows that the database took.
+        rows_dropped: Rows that will never be in it.
     """
 
     def __init__(
         self, database: Database, identity: Identity, clock: Clock, errors: ErrorReport
     ) -> None:
+        self.database = database
         self.errors = errors
-        self.counts = RowCounts(errors)
-        self.session = SessionConnection(database, identity, clock.run, errors)
+        self.uuid = new_uuid()
+        self.run = clock.run
+        self.actions: dict[str, str] = {}
+        self.new_database_entries: list[Callable[[], Iterable[tuple[Kind, bool, Values]]]] = []
+        self.connection: sqlite3.Connection | None = None
+        self.registration: Registration | None = None
+        self.off: str | None = None
+        self.rows_written = self.rows_dropped = 0
         self.last_use_s = time.monotonic()
+        self._identity = identity
+        self._clock = clock
         self._lock = ConnectionLock()
-        self._backlog = Backlog(self._waiting_file(), self.session.describe_run, self.counts)
-        parts = (self.session, self._backlog)
-        self._recovery = Recovery(*parts, self.counts, self.errors, clock)
-        self._writer = RowWriter(*parts, self._recovery, self.counts, clock)
-        self._recovery.open(patient=True)
+        self._backlog = Backlog(self._waiting_file(), self.describe_run, self._drop)
+        self._files: tuple[int, ...] = ()
+        self._log = _Log(f"{database}-wal")
+        self._retry_at_s = 0.0
+        self._confirmed = 0  # rows that were written when the files were looked after
+        self._unreported = 0  # dropped rows that no event in the database reports yet
+        self._why_dropped = ""
+        self._open(patient=True)
 
     @property
     def rows_waiting(self) -> int:
@@ -97,7 +157,7 @@ class Recorder:
             self._backlog.put(Row(kind, run, values))
             return None
         try:
-            return self._writer.write(kind, run, values)
+            return self._write(kind, run, values)
         except BaseException:
             if run is not None:
                 run.counted = False  # an interrupt may have come between the row and its count
@@ -113,25 +173,27 @@ class Recorder:
                 self._backlog.put(Row(kind, run, values))
             return
         try:
-            self._writer.write_together(kind, run, rows)
+            if not self._write_together(kind, run, rows):
+                for values in rows:
+                    self._write(kind, run, values)
         finally:
             self._lock.release()
 
     def fetch(self, statement: str, values: Values) -> Sequence[Any] | None:
         """The rows that a statement reads or returns; None while that is not possible."""
-        if self.session.connection is None:
+        if self.connection is None:
             return None
-        return self._locked(lambda: self._writer.fetch(statement, values))
+        return self._locked(lambda: self._fetch(statement, values))
 
     def enter_signals(self, seen: Mapping[str, Seen]) -> bool:
         """Enter names into the register of signals; False where that has to wait."""
-        if self._backlog.waits or self.session.connection is None:
+        if self._backlog.waits or self.connection is None:
             return False
-        return self._locked(lambda: self._writer.enter_signals(seen)) is True
+        return self._locked(lambda: self._enter_signals(seen)) is True
 
     def flush(self) -> bool:
         """Write waiting rows, for as long as one call may; True if none are left."""
-        return self._locked(lambda: self._writer.catch_up(None)) is True
+        return self._locked(lambda: self._catch_up(None)) is True
 
     def _locked(self, act: Callable[[], Result]) -> Result | None:
         """Call `act` with the connection lock; None where another thread has it, or it fails."""
@@ -140,7 +202,7 @@ class Recorder:
         try:
             return act()
         except Exception as error:  # noqa: BLE001  (see `is_busy`)
-            self._recovery.put_off(error)
+            self._put_off(error)
             return None
         finally:
             self._lock.release()
@@ -151,28 +213,14 @@ class Recorder:
         """Write a heartbeat. Skipped while rows wait: a late heartbeat would be misleading."""
         self._locked(lambda: self._beat(loop))
 
-    def _beat(self, loop: LoopStatus) -> None:
-        self._recovery.look_after_files()
-        run = self.session.run
-        if not self._writer.is_ready(run):
-            return
-        connection, registration = self.session.opened
-        status = RecordingStatus(self.rows_waiting, self.counts.dropped, self.errors.last_error)
-        ids = (registration.session_id, run.id, run.rows)
-        patiently(
-            lambda: in_transaction(
-                connection, lambda: write_heartbeat(connection, loop, status, *ids)
-            )
-        )
-
     def update_actions(self) -> None:
         """Store the names and docstrings of the registered custom actions."""
-        if self.session.registration is not None:
-            self.record("actions", None, {"actions": self.session.actions_text()})
+        if self.registration is not None:
+            self.record("actions", None, {"actions": self._actions_text()})
 
     def end_run(self, reason: str, sim_time_s: float) -> None:
         """End the current run, at the simulation time that was seen last."""
-        run = self.session.run
+        run = self.run
         # The count is given only where it is certain; else the statement counts the rows itself.
         rows = run.rows if run.counted and not self._backlog.waits else None
         values = {"reason": reason, "now": time.time(), "sim_time": sim_time_s, "rows": rows}
@@ -182,39 +230,196 @@ class Recorder:
         """End run and session; what is recorded until `close` still belongs to them."""
         self.end_run(reason, sim_time_s)
         times = {"now": time.time(), "monotonic": time.monotonic()}
-        status = {"dropped": self.counts.dropped, "error": self.errors.last_error}
+        status = {"dropped": self.rows_dropped, "error": self.errors.last_error}
         self.record("session end", None, {"reason": reason, **times, **status})
 
     def close(self, reason: str, sim_time_s: float) -> None:
         """End run and session, write the waiting rows (for up to a second), and disconnect."""
-        if self._recovery.off is None:
+        if self.off is None:
             self.end(reason, sim_time_s)
         until_s = time.monotonic() + 1
-        while not self.flush() and self.session.connection and time.monotonic() < until_s:
+        while not self.flush() and self.connection and time.monotonic() < until_s:
             time.sleep(0.005)
         self._lock.acquire(this_call(), 1.0)
         try:
-            self.session.close()
+            self._disconnect()
             self._leave_waiting()
-            self._recovery.off = self._recovery.off or "the bridge is closed"
+            self.off = self.off or "the bridge is closed"
         finally:
             self._lock.release()
 
     def abandon(self) -> None:
         """In a forked child: leave connection and session to the parent, which continues."""
-        self.session.abandon()
+        # Kept for ever, so that it is never closed: SQLite forbids any use after a fork.
+        _of_parents.append(self.connection)
+        self.connection = self.registration = None
         self._lock = ConnectionLock()  # the thread that may have had it was not forked
         self._backlog.abandon()
-        self._recovery.off = "a forked process does not record for its parent"
+        self.off = "a forked process does not record for its parent"
 
-    # -- waiting rows --------------------------------------------------------------------------
+    def describe_run(self, run: Run) -> dict[str, Any]:
+        """The values of a run's own row."""
+        return {
+            "uuid": run.uuid,
+            "world": self._identity.world,
+            "step_ms": self._identity.basic_time_step_ms,
+            "reason": run.start_reason,
+            "wall_time": run.started_wall_time_s,
+            "sim_time": run.started_sim_time_s,
+        }
+
+    # -- writing: the caller has the connection lock -------------------------------------------
+
+    def _write(self, kind: Kind, run: Run | None, values: Values) -> int | None:
+        """Write a row; returns how many rows the statement changed, or None if it was deferred."""
+        if not self._is_ready(run):
+            self._keep(Row(kind, run, values))
+            return None
+        bound = bind(run.id if run else None, self._ids.session_id, values)
+        try:
+            changed = self._execute(STATEMENTS[kind], bound)
+        except Exception as error:  # noqa: BLE001  (see `is_busy`)
+            if is_unfit(error):
+                self._drop(1, str(error))
+            else:
+                self._keep(Row(kind, run, values))
+                self._put_off(error)
+            return None
+        self.rows_written += 1
+        if kind == "state" and run is not None:
+            run.rows += 1
+        return changed
+
+    def _write_together(self, kind: Kind, run: Run, rows: Sequence[tuple[Any, ...]]) -> bool:
+        """Write rows in one transaction; False where it fails: one by one, each fails by itself."""
+        if not self._is_ready(run):
+            return False
+        bound = [bind(run.id, self._ids.session_id, values) for values in rows]
+        try:
+            self._transact(lambda: self._opened.executemany(STATEMENTS[kind], bound))
+        except Exception:  # noqa: BLE001  (see `is_busy`)
+            return False
+        self.rows_written += len(rows)
+        return True
+
+    def _fetch(self, statement: str, values: Values) -> Sequence[Any] | None:
+        if not self._is_ready(None):
+            return None
+        # All rows are fetched: an UPDATE ... RETURNING keeps the write lock until its last row.
+        return self._opened.execute(statement, values).fetchall()
+
+    def _enter_signals(self, seen: Mapping[str, Seen]) -> bool:
+        """Enter names; what fails for another reason than a lock is left to the maintainer."""
+        if not self._is_ready(None):
+            return False
+        connection, robot_id = self._opened, self._ids.robot_id
+        try:
+            changes = find_changes(connection, robot_id, seen)
+            if changes.new or changes.changed:
+                self._transact(partial(write_changes, connection, robot_id, changes))
+        except FAILURES as error:
+            return not is_busy(error)
+        return True
+
+    def _beat(self, loop: LoopStatus) -> None:
+        self._look_after_files()
+        run = self.run
+        if self._is_ready(run):
+            status = RecordingStatus(self.rows_waiting, self.rows_dropped, self.errors.last_error)
+            ids = (self._ids.session_id, run.id, run.rows)
+            self._transact(partial(write_heartbeat, self._opened, loop, status, *ids))
+
+    def _is_ready(self, run: Run | None) -> bool:
+        """Whether all rows that precede a new row of that run are written; tries to write them."""
+        connection = self.connection
+        if (
+            connection is None
+            or self._backlog.waits
+            or connection.in_transaction
+            or (run is not None and run.id is None)
+            or self._unreported
+        ):
+            return self._catch_up(run)
+        return True
+
+    def _catch_up(self, run: Run | None) -> bool:
+        """Write the waiting rows and the run's own row; False where some are still waiting."""
+        if not self._is_connected():
+            return False
+        roll_back(self._opened)  # an interrupt may have left a transaction open
+        try:
+            self._take_in_waiting()
+            if run is not None and run.id is None and not self._backlog.waits:
+                self._enter_run(run)
+        except Exception as error:  # noqa: BLE001  (see `is_busy`)
+            self._backlog.save()
+            self._put_off(error)
+            return False
+        if self._unreported and not self._backlog.waits:
+            self._report_dropped()
+        return not self._backlog.waits
+
+    def _take_in_waiting(self) -> None:
+        until_s, run = time.monotonic() + _CATCH_UP_S, self.run
+        while self._backlog.waits and (entries := self._backlog.next_entries()):
+            taken = take_in(self._opened, self._ids.session_id, entries)
+            self._backlog.forget(taken.number)
+            self.rows_written += sum(entry.kind != "run" for entry in taken.written)
+            run.rows += sum(e.kind == "state" and e.run == run.uuid for e in taken.written)
+            for why in taken.unfit:
+                self._drop(1, why)
+            if time.monotonic() > until_s:
+                break
+
+    def _enter_run(self, run: Run) -> None:
+        """Write the run's row, or continue the existing one."""
+        values = bind(None, self._ids.session_id, self.describe_run(run))
+        entered = self._execute(STATEMENTS["run"], values)
+        ((run_id,),) = self._opened.execute(_RUN_ID, (run.uuid,)).fetchall()
+        if not entered and run is self.run:
+            self._execute(_GO_ON, (run_id,))
+        run.id = run_id
+
+    def _execute(self, statement: str, values: Values) -> int:
+        """Run a statement, trying again for a moment while another writer has the lock."""
+        connection = self._opened
+        try:
+            return connection.execute(statement, values).rowcount
+        except sqlite3.OperationalError as error:
+            if not is_busy(error):
+                raise
+        return _patiently(lambda: connection.execute(statement, values).rowcount)
+
+    def _transact(self, act: Callable[[], object]) -> None:
+        _patiently(lambda: in_transaction(self._opened, act))
+
+    # -- rows that wait or are dropped ---------------------------------------------------------
+
+    def _keep(self, row: Row) -> None:
+        if self.off is not None:
+            self._drop(1, self.off)
+        else:
+            self._backlog.keep(row)
+
+    def _drop(self, rows: int, why: str) -> None:
+        """Count rows as dropped, and warn; raises in strict mode."""
+        self.rows_dropped += rows
+        self._unreported += rows
+        self._why_dropped = why
+        self.errors.warn(f"dropped: {why}", f"rows are being dropped: {why}")
+
+    def _report_dropped(self) -> None:
+        """Record an event that reports the unreported drops."""
+        rows, self._unreported = self._unreported, 0
+        now, data = self._clock.newest_s(self.run), {"row_count": rows, "why": self._why_dropped}
+        values = (now, time.time(), "dropped", None, json.dumps(data))
+        self._write("event", self.run, values)
 
     def _waiting_file(self) -> WaitingFile | None:
         """The file for waiting rows; None for a database in memory, which no process outlives."""
-        if not isinstance(self.session.database, Path):
+        if not isinstance(self.database, Path):
             return None
-        path = waiting_path(self.session.database, self.session.uuid)
-        return WaitingFile(path, self.session.describe_session)
+        return WaitingFile(waiting_path(self.database, self.uuid), self._describe_session)
 
     def _leave_waiting(self) -> None:
         """Leave the rows in the file for the next process; drop those that are only in memory."""
@@ -228,3 +433,293 @@ class Recorder:
                 f"{rows} rows are still in {path}, because {why}; the next bridge or server that "
                 "opens the database adds them to it",
             )
+
+    # -- the connection ------------------------------------------------------------------------
+
+    @property
+    def _opened(self) -> sqlite3.Connection:
+        """The connection, for a caller that knows that it is open."""
+        assert self.connection is not None
+        return self.connection
+
+    @property
+    def _ids(self) -> Registration:
+        assert self.registration is not None
+        return self.registration
+
+    def _is_connected(self) -> bool:
+        """Whether a write may be tried now; tries to open a closed database once a second."""
+        if self.off is not None or time.monotonic() < self._retry_at_s:
+            return False
+        return self.connection is not None or self._open(patient=False)
+
+    def _open(self, *, patient: bool) -> bool:
+        """Open (or create) the database and enter a session; False, with a warning, on failure."""
+        if self.off is not None:
+            return False
+        try:
+            self._connect(patient=patient)
+        except _FOR_GOOD as error:
+            self._give_up(str(error))
+        except Exception as error:  # noqa: BLE001  (see `is_busy`)
+            self._backlog.why = why = text_of(error)
+            self._retry_at_s = time.monotonic() + _RETRY_INTERVAL_S
+            if is_damage(error):
+                return self._replace_damaged(why)
+            if not is_busy(error):
+                self.errors.warn(f"open {type(error).__name__}", f"not recording yet: {why}")
+        return self.connection is not None
+
+    def _connect(self, *, patient: bool) -> None:
+        """Open the database, and enter or continue the session; `patient`: wait for locks.
+
+        Raises:
+            DatabaseError, sqlite3.Error, OSError: It cannot be used, at least now.
+        """
+        connection = connect(self.database, "loop", create=True, patient=patient)
+        try:
+            if schema_version(connection) == 0:
+                create_schema(connection)
+            require_current(connection)
+            if patient and isinstance(self.database, Path):  # in the loop it takes too long
+                adopt(connection, self.database)
+            session = (self._identity, self.uuid, self._actions_text())
+            registration = register(connection, *session)
+            never_wait(connection)
+        except BaseException:
+            connection.close()
+            raise
+        self.connection, self.registration = connection, registration
+        self._files = identify_files(self.database)
+        self._log.forget()
+        if (mode := journal_mode(connection)) not in ("wal", "memory"):
+            self.errors.warn(
+                "journal",
+                f"{self.database} is on a drive where SQLite cannot share memory (journal mode "
+                f"{mode}: a network drive, or across Windows and WSL): rows will wait while others "
+                "read; use a local data folder",
+            )
+
+    def _disconnect(self) -> None:
+        """Close the connection; the session's row stays as it is."""
+        if self.registration is not None:
+            deregister(self.registration.session_id)
+        connection, self.connection, self.registration = self.connection, None, None
+        if connection is not None:
+            connection.close()
+
+    def _describe_session(self) -> dict[str, Any]:
+        """The values of robot and session, for a database that does not have this session."""
+        name = self.registration.robot_name if self.registration else self._identity.robot_name
+        return {
+            "robot": describe_robot(self._identity, name),
+            "session": describe_session(self._identity, self.uuid, self._actions_text()),
+        }
+
+    def _actions_text(self) -> str:
+        return json.dumps(self.actions, ensure_ascii=False)
+
+    # -- after a failure -----------------------------------------------------------------------
+
+    def _put_off(self, error: Exception) -> None:
+        """Decide how to continue after a failed write: at once, in a second, or in a new file."""
+        self._backlog.why = text = text_of(error)
+        if is_busy(error):
+            return  # another writer has the lock for the moment: the next call tries again
+        self._retry_at_s = time.monotonic() + _RETRY_INTERVAL_S
+        if is_damage(error):
+            self._replace_files(text)
+        elif (
+            isinstance(error, SessionGoneError) or "no such table" in text or "FOREIGN KEY" in text
+        ):
+            self._start_over(f"the database lost this session ({text})")
+        else:
+            self.errors.warn(text, f"not recorded yet, trying again each second: {text}")
+
+    def _look_after_files(self) -> None:
+        """Start over where the open files would lose rows: deleted ones still accept them."""
+        if self.connection is None:
+            return
+        if self._files != identify_files(self.database):
+            self._start_over("the database file or its write-ahead log was deleted or replaced")
+        elif not self._log.is_whole():
+            self._start_over("the database's write-ahead log was truncated")
+        else:
+            self._confirmed = self.rows_written
+
+    def _replace_damaged(self, why: str) -> bool:
+        """Move a damaged database aside, if it has our name, or the header of a database.
+
+        The header is judged by SQLite's error text. Closing a file that was read here would drop
+        the locks of this process on it, on which a maintainer's or another bridge's connection may
+        depend (SQLite, How To Corrupt, 2.2).
+        """
+        database = self.database
+        if not isinstance(database, Path) or (
+            database.name != DATABASE_NAME and "not a database" in why
+        ):
+            self._give_up(f"{why}; choose another file")
+            return False
+        self._replace_files(why)
+        return self._retry_at_s == 0 and self._open(patient=False)
+
+    def _replace_files(self, why: str) -> None:
+        """Rename a damaged database with its log and index, and begin a new one."""
+        database = self.database
+        assert isinstance(database, Path)
+        self._disconnect()
+        stamp = time.strftime("%Y%m%d-%H%M%S")
+        try:
+            for suffix in ("", "-wal", "-shm"):
+                damaged = database.with_name(database.name + suffix)
+                if damaged.exists():
+                    damaged.rename(f"{database}.damaged-{stamp}{suffix}")
+        except OSError as error:
+            why = f"{database} is damaged and cannot be renamed: {error}; move it away by hand"
+            self.errors.warn("damaged", why)
+            return
+        self._start_over(f"{database} was damaged ({why}) and moved aside")
+
+    def _start_over(self, why: str) -> None:
+        """Continue in a new database, which does not have this session yet."""
+        self._disconnect()
+        self._retry_at_s = 0.0
+        run, before = self.run, self.run.uuid
+        run.begin_anew()
+        self._backlog.rename_run(before, run.uuid)
+        moment = (self._clock.newest_s(run), time.time())
+        self._backlog.keep(Row("event", run, (*moment, "storage", None, json.dumps({"why": why}))))
+        entries = [each for make in self.new_database_entries for each in make()]
+        for kind, of_run, values in entries:
+            self._backlog.keep(Row(kind, run if of_run else None, values))
+        lost, self.rows_written = self.rows_written - self._confirmed, self._confirmed
+        if lost:
+            self._drop(lost, why)
+        self.errors.warn("storage", f"{why}; recording continues in a new database")
+
+    def _give_up(self, why: str) -> None:
+        self.off = f"not recording into {self.database}: {why}"
+        self.errors.warn("off", self.off)
+        self._backlog.drop_rows_in_memory(self.off)
+
+
+def _patiently(act: Callable[[], Result]) -> Result:
+    """Call `act`, and again for a millisecond while another writer has the lock."""
+    until_s = time.monotonic() + _WRITER_PATIENCE_S
+    while True:
+        try:
+            return act()
+        except sqlite3.OperationalError as error:
+            if not is_busy(error) or time.monotonic() >= until_s:
+                raise
+        time.sleep(_BETWEEN_TRIES_S)
+
+
+class _Log:
+    """Detects that the write-ahead log was truncated under an open connection.
+
+    SQLite keeps the length of the log in shared memory, and continues to read and write beyond the
+    end of a truncated file: the missing part reads as zeros, and what is written afterwards is lost
+    when the database is opened next. The format: sqlite.org/fileformat2.html, section 4.
+    """
+
+    _HEADER_BYTES: Final = 32
+    _FRAME_HEADER_BYTES: Final = 24
+    _MAGIC: Final = (b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x83")
+
+    def __init__(self, log: str) -> None:
+        self._log = log
+        self._last: tuple[bytes, int] | None = None  # salts of the log, and where its last frame's
+
+    def forget(self) -> None:
+        """Another file is used from now on."""
+        self._last = None
+
+    def is_whole(self) -> bool:
+        """Whether the last frame of the last call is still there, as far as can be known.
+
+        A log that a checkpoint emptied has other salts. An empty file could be either; it is judged
+        at the next call, when it has frames again.
+        """
+        last, self._last = self._last, None
+        try:
+            with open(self._log, "rb", buffering=0) as file:  # noqa: PTH123  (at each heartbeat)
+                header = file.read(self._HEADER_BYTES)
+                if len(header) < self._HEADER_BYTES:
+                    return True
+                salts, page_bytes = header[16:24], int.from_bytes(header[8:12], "big")
+                if header[:4] not in self._MAGIC:
+                    return False
+                if last is not None and last[0] == salts and _read(file, last[1]) != salts:
+                    return False
+                frame_bytes = self._FRAME_HEADER_BYTES + page_bytes
+                frames = max(1, (file.seek(0, 2) - self._HEADER_BYTES) // frame_bytes)
+                at = self._HEADER_BYTES + (frames - 1) * frame_bytes + 8
+                if _read(file, at) == salts:  # else the frame is of the generation before
+                    self._last = salts, at
+        except OSError:
+            pass
+        return True
+
+
+def _read(file: Any, at: int) -> bytes:
+    file.seek(at)
+    return file.read(8)
+
+
+# -- the connection lock -----------------------------------------------------------------------
+
+this_call: Final = sys._getframe  # pyright: ignore[reportPrivateUsage]
+_HOLDER: Final = "holder"
+
+
+class ConnectionLock:
+    """A lock that belongs to a function call, and is free again when that call has ended.
+
+    A KeyboardInterrupt may come between any two instructions, so also between a lock's `acquire()`
+    and the `try` that would release it: a `threading.Lock` would then stay locked for ever. Here
+    taking the lock and naming its holder is one instruction (`dict.setdefault`), and the lock of a
+    call that has ended is taken over by the next call of the same thread.
+    """
+
+    def __init__(self) -> None:
+        self._held: dict[str, tuple[int, FrameType]] = {}
+
+    def acquire(self, call: FrameType, patience_s: float = 0.0) -> bool:
+        """Whether `call` has the lock now; then `release` follows.
+
+        Args:
+            call: The frame that calls `release`.
+            patience_s: How long to wait for another thread.
+        """
+        mine = (get_ident(), call)
+        held = self._held.setdefault(_HOLDER, mine)
+        return held is mine or self._acquire_later(held, mine, time.monotonic() + patience_s)
+
+    def release(self) -> None:
+        """Free the lock for another call."""
+        self._held.pop(_HOLDER, None)
+
+    def _acquire_later(
+        self, held: tuple[int, FrameType], mine: tuple[int, FrameType], until_s: float
+    ) -> bool:
+        while held is not mine:
+            if held[0] == mine[0]:
+                if _is_under_way(held[1]):
+                    return False  # made from within the holder, by a signal handler: never wait
+                self._held.pop(_HOLDER)
+            elif time.monotonic() >= until_s:
+                return False
+            else:
+                time.sleep(_BETWEEN_TRIES_S)
+            held = self._held.setdefault(_HOLDER, mine)
+        return True
+
+
+def _is_under_way(call: FrameType) -> bool:
+    """Whether a call is still executing: Python refuses to clear the frame of one that is."""
+    try:
+        call.clear()
+    except RuntimeError:
+        return True
+    return False

@@ -16,7 +16,7 @@ from collections.abc import Collection, Generator
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple, TypeAlias
 
-from webots_mcp.bridge.scene_tree import MOST_NODES, SceneNode, read_value, walk
+from webots_mcp.bridge.scene import MOST_NODES, SceneNode, read_value, walk
 from webots_mcp.naming import SEEN_SPEED, SOLIDS, WORLD
 
 _DIGITS: Final = 6  # of metres and radians that are recorded

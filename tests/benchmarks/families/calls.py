@@ -14,8 +14,8 @@ from tests.benchmarks.states import make_states
 from tests.benchmarks.table import Line, Target, duration
 from tests.benchmarks.ways import BridgeWay, JsonFiles, RawSqlite, Way
 from webots_mcp import MCPBridge
-from webots_mcp.bridge.frames import scale_down
-from webots_mcp.bridge.picture_files import encode_png
+from webots_mcp.bridge.keeping import scale_down
+from webots_mcp.bridge.pictures import encode_png
 from webots_mcp.contract import KEEP_LAST_S
 from webots_mcp.standin import InProcessSupervisor
 

@@ -31,7 +31,7 @@ def main(folder: Path, number: int) -> None:
                 bridge.publish(states[i % len(states)])
                 durations.append(time.perf_counter() - started)
                 waiting.append(bridge.stats().rows_waiting)
-                in_memory.append(bridge._session.context.recorder._backlog.rows_in_memory)  # pyright: ignore[reportPrivateUsage]
+                in_memory.append(bridge._session.recorder._backlog.rows_in_memory)  # pyright: ignore[reportPrivateUsage]
                 bridge.get_command()
             say({"durations": durations, "waiting": waiting, "in_memory": in_memory})
 

@@ -12,7 +12,7 @@ import pytest
 
 from tests.bridge.conftest import STEP_MS, Recording
 from webots_mcp import MCPBridge, MemoryDatabase
-from webots_mcp.bridge import controller_session as session
+from webots_mcp.bridge import session as session
 from webots_mcp.connection import connect
 from webots_mcp.contract import UNMOVED
 from webots_mcp.standin import InProcessSupervisor

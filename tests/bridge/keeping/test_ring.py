@@ -19,7 +19,7 @@ from tests.bridge.monsters import MONSTERS, EndlessDict
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import cleaning, encoding
 from webots_mcp.bridge.encoding import copy_or_encode, encode, encode_copy
-from webots_mcp.bridge.ring import Ring, RingRow
+from webots_mcp.bridge.keeping import Ring, RingRow
 from webots_mcp.standin import InProcessSupervisor
 
 

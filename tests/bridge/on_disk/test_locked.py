@@ -21,7 +21,7 @@ from tests.bridge.conftest import (
 )
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import actions, backlog
-from webots_mcp.bridge.command_queue import ClaimedCommand
+from webots_mcp.bridge.commands import ClaimedCommand
 from webots_mcp.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 
@@ -29,7 +29,7 @@ from webots_mcp.standin import InProcessSupervisor
 def test_a_row_is_there_for_others_when_publish_returns_and_no_disk_is_waited_for(
     bridge: MCPBridge, filed: Recording
 ) -> None:
-    connection = bridge._session.context.recorder.session.connection  # pyright: ignore[reportPrivateUsage]
+    connection = bridge._session.recorder.connection  # pyright: ignore[reportPrivateUsage]
     assert connection is not None
     modes = [
         connection.execute(f"PRAGMA {name}").fetchone() for name in ("journal_mode", "synchronous")
@@ -132,7 +132,7 @@ def test_breakpoints_stay_armed_through_a_reset_at_which_they_cannot_be_read(
 def test_arming_is_answered_once_the_breakpoints_could_be_read(
     bridge: MCPBridge, file: Path
 ) -> None:
-    context = bridge._session.context  # pyright: ignore[reportPrivateUsage]
+    context = bridge._session  # pyright: ignore[reportPrivateUsage]
     with write_lock(file) as other:
         _store_breakpoint(other, "n == 2")
         bridge.publish({"n": 0})
@@ -151,7 +151,7 @@ def test_breakpoints_of_the_last_controllers_code_go_although_the_next_one_meets
     with write_lock(file) as other:
         _store_breakpoint(other, "n == 1", "controller")
         bridge.publish({"n": 0})
-        bridge._session.context.breakpoints.begin()  # pyright: ignore[reportPrivateUsage]
+        bridge._session.breakpoints.begin()  # pyright: ignore[reportPrivateUsage]
     catch_up(bridge)
 
     assert not filed.rows("SELECT condition FROM breakpoint")

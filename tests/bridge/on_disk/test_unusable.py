@@ -38,7 +38,7 @@ NOT_ROOT = pytest.mark.skipif(
 def test_a_full_disk_makes_rows_wait_until_there_is_room(
     bridge: MCPBridge, filed: Recording, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    connection = bridge._session.context.recorder.session.connection  # pyright: ignore[reportPrivateUsage]
+    connection = bridge._session.recorder.connection  # pyright: ignore[reportPrivateUsage]
     assert connection is not None
     bridge.publish({"n": 0})
     (pages,) = connection.execute("PRAGMA page_count").fetchone()
@@ -82,7 +82,7 @@ def test_breakpoints_of_the_code_stay_armed_in_a_new_database_and_others_are_tol
             "INSERT INTO breakpoint (robot_id, condition, action, created_wall_time_s) "
             "SELECT id, 'n == 1 or n > 9', 'log', 0 FROM robot"
         )
-    bridge._session.context.breakpoints.load()  # pyright: ignore[reportPrivateUsage]
+    bridge._session.breakpoints.load()  # pyright: ignore[reportPrivateUsage]
     for part in file.parent.glob(f"{DATABASE_NAME}*"):
         part.unlink()
     heartbeat_now(bridge)
@@ -286,7 +286,7 @@ def test_a_read_only_folder_costs_rows_only(robot: InProcessSupervisor, tmp_path
 def test_a_database_that_turns_read_only_costs_rows_only(
     bridge: MCPBridge, filed: Recording, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    connection = bridge._session.context.recorder.session.connection  # pyright: ignore[reportPrivateUsage]
+    connection = bridge._session.recorder.connection  # pyright: ignore[reportPrivateUsage]
     assert connection is not None
     connection.execute("PRAGMA query_only=ON")
     bridge.publish({"n": 0})

@@ -23,7 +23,7 @@ from tests.bridge.conftest import (
 )
 from tests.bridge.on_disk.conftest import POSIX, adopt_into
 from webots_mcp import MCPBridge
-from webots_mcp.bridge.row_writer import RowWriter
+from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.entries import Entry
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.waiting_file import WaitingFile
@@ -237,7 +237,7 @@ def test_a_signals_handler_that_logs_in_the_middle_of_a_row_deadlocks_nothing(
 ) -> None:
     def trace(frame: object, event: str, _: object) -> object:
         code = getattr(frame, "f_code")  # noqa: B009
-        if code is RowWriter.write.__code__ and event == "call":
+        if code is Recorder._write.__code__ and event == "call":  # pyright: ignore[reportPrivateUsage]
             sys.settrace(None)
             bridge.log("from within")
         return None

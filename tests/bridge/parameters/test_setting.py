@@ -11,7 +11,7 @@ import pytest
 from tests.bridge.conftest import Recording, eager
 from tests.bridge.parameters.conftest import VALUES, ask
 from webots_mcp import MCPBridge, MemoryDatabase
-from webots_mcp.bridge.declared_parameters import MOST_CHANGES
+from webots_mcp.bridge.parameters import MOST_CHANGES
 from webots_mcp.parameter import LARGEST_INT
 from webots_mcp.standin import InProcessSupervisor
 
@@ -140,7 +140,7 @@ def test_changes_of_one_run_are_so_many_at_most(
     lenient: MCPBridge, recording: Recording, capfd: pytest.CaptureFixture[str]
 ) -> None:
     kp = lenient.parameter("kp", 0)
-    lenient._session.context.parameters._changes = MOST_CHANGES - 1  # pyright: ignore[reportPrivateUsage]
+    lenient._session.parameters._changes = MOST_CHANGES - 1  # pyright: ignore[reportPrivateUsage]
     kp.set(1)
     lenient.get_command()
     kp.set(2)

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
 import time
-from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Final, Generic, NamedTuple, TypeVar
+from collections.abc import Callable, Container, Iterable, Mapping
+from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar, cast
 
-from webots_mcp.bridge.clock import Clock
-from webots_mcp.bridge.journal import Journal
-from webots_mcp.bridge.recorder import Recorder
-from webots_mcp.bridge.start_values import StartValues
+from webots_mcp.bridge.error_report import ErrorReport
+from webots_mcp.contract import PARAMETERS_VARIABLE
 from webots_mcp.entries import Kind, Values
-from webots_mcp.errors import CommandRefusedError, WebotsMCPError
-from webots_mcp.parameter import (
-    MOST_PARAMETERS,
-    Declaration,
-    Value,
-    require_known,
-)
+from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
+from webots_mcp.parameter import MOST_PARAMETERS, Declaration, Value, require_known
+
+if TYPE_CHECKING:
+    from webots_mcp.bridge.session import Session
+
 
 MOST_CHANGES: Final = 10_000  # in one run; each is a row of the database
 
@@ -102,31 +100,20 @@ class Parameters:
     """Holds the declared parameters, changes their values, and records each change.
 
     Args:
-        clock: Has the run and the time of each change.
-        recorder: Receives the rows.
-        journal: Receives a log line for each changed declaration.
-        start_values: The values from the environment.
-        set_later: Called by `Parameter.set` with the name and the value.
+        robot_name: Of whom the environment may have values.
     """
 
-    def __init__(
-        self,
-        clock: Clock,
-        recorder: Recorder,
-        journal: Journal,
-        start_values: StartValues,
-        set_later: Callable[[str, object], None],
-    ) -> None:
-        self._clock = clock
-        self._recorder = recorder
-        self._journal = journal
-        self._start_values = start_values
-        self._set_later = set_later
+    def __init__(self, session: Session, robot_name: str) -> None:
+        self._clock = session.clock
+        self._recorder = session.recorder
+        self._journal = session.journal
+        self._session = session
+        self._start_values = StartValues(robot_name, session.errors)
         self._held: dict[str, _Held] = {}
         self._wanted: dict[str, Value] = {}
         self._from_reset: dict[str, tuple[Value, Setter]] = {}
         self._changes = 0
-        recorder.session.new_database_entries.append(self._entries_for_new_database)
+        session.recorder.new_database_entries.append(self._entries_for_new_database)
 
     def declare(self, declaration: Declaration) -> Parameter[Any]:
         """The parameter of that name, created or updated to this declaration.
@@ -181,25 +168,29 @@ class Parameters:
         self._record_next(checked)
         return {name: (self._held[name].value, value) for name, value in checked.items()}
 
-    def want(self, name: str, value: object) -> None:
-        """Let the controller's code set a parameter with the next `get_command()`.
+    def _set_from_code(self, name: str, value: object) -> None:
+        """Set a parameter from the controller's code: at once in a handler, else at the next call.
 
-        Raises:
-            InvalidInputError: As `set_now`.
+        Within a round of the loop values must not change, so it waits for `get_command()` there.
         """
-        self._wanted |= self._checked({name: value})
+        if self._session.control.handlers.running:
+            self.set_now({name: value}, CODE)
+            return
+        try:
+            self._wanted |= self._checked({name: value})
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            self._session.errors.failed("Parameter.set", error)
 
     def take_wanted(self) -> None:
-        """Apply what the controller's code has set since the last `get_command()`.
-
-        Raises:
-            InvalidInputError, CommandRefusedError: As `set_now`.
-        """
+        """Apply what the controller's code has set since the last `get_command()`."""
         if self._held:
             self._start_values.warn_of_unknown(self._held)
         if self._wanted:
             wanted, self._wanted = self._wanted, {}
-            self.set_now(wanted, CODE)
+            try:
+                self.set_now(wanted, CODE)
+            except WebotsMCPError as error:
+                self._session.errors.failed("Parameter.set", error)
 
     def begin_run(self) -> None:
         """The world was reset: apply the values that waited for it, and record all values."""
@@ -230,7 +221,7 @@ class Parameters:
         given = self._start_values.take(declaration)
         if given is not None:
             value, setter = given, _ENVIRONMENT
-        parameter = Parameter[Any](declaration.name, value, self._set_later)
+        parameter = Parameter[Any](declaration.name, value, self._set_from_code)
         held = self._held[declaration.name] = _Held(declaration, parameter, setter)
         return held
 
@@ -285,3 +276,74 @@ def _next(values: Mapping[str, Value | None]) -> dict[str, Any]:
         for name, value in values.items()
     ]
     return {"rows": json.dumps(rows, ensure_ascii=False)}
+
+
+_MOST_NAMED: Final = 5
+
+
+class StartValues:
+    """The value of `WEBOTS_MCP_PARAMETERS`: a JSON object of values by the names of parameters.
+
+    In addition it may have objects by the names of robots, whose values are for that robot alone:
+    `{"kp": 3.0, "rover": {"kp": 4.0}}`. A value that cannot be used is warned of, and the code's
+    value is used.
+
+    Args:
+        robot: The name of this robot.
+        errors: Receives a warning for each value that cannot be used.
+    """
+
+    def __init__(self, robot: str, errors: ErrorReport) -> None:
+        self._text = text = os.environ.get(PARAMETERS_VARIABLE)
+        self._robot = robot
+        self._errors = errors
+        self._values: dict[str, Any] | None = None
+        self._unknown_reported = not text
+
+    def take(self, declaration: Declaration) -> Value | None:
+        """The first value of a parameter; None for the one in the code."""
+        values = self._read()
+        if declaration.name not in values:
+            return None
+        try:
+            return declaration.checked(values[declaration.name])
+        except InvalidInputError as error:
+            self._warn(declaration.name, f"{error}; it begins with {declaration.default!r}")
+            return None
+
+    def warn_of_unknown(self, declared: Container[str]) -> None:
+        """Warn once of names that the controller has not declared before its first command call."""
+        if self._unknown_reported:
+            return
+        self._unknown_reported = True
+        unknown = [  # an object by another name may be for another robot
+            name
+            for name, value in self._read().items()
+            if name not in declared and not isinstance(value, dict)
+        ]
+        if unknown:
+            named = ", ".join(f"{name!r:.80}" for name in unknown[:_MOST_NAMED])
+            self._warn("unknown", f"the controller declares no parameter {named}")
+
+    def _read(self) -> dict[str, Any]:
+        if self._values is None:
+            self._values = self._parsed() if self._text else {}
+        return self._values
+
+    def _parsed(self) -> dict[str, Any]:
+        try:
+            found = json.loads(self._text or "")
+        except (ValueError, RecursionError) as error:
+            found, why = None, f"it is not JSON ({error})"
+        else:
+            why = f"it is a {type(found).__name__}"
+        if not isinstance(found, dict):
+            example = 'not an object such as {"kp": 3.0}'
+            self._warn("", f"{why}, {example}; the code's values are used")
+            return {}
+        values = cast("dict[str, Any]", found)
+        own = values.get(self._robot)
+        return {**values, **cast("dict[str, Any]", own)} if isinstance(own, dict) else values
+
+    def _warn(self, kind: str, why: str) -> None:
+        self._errors.warn(f"{PARAMETERS_VARIABLE} {kind}", f"{PARAMETERS_VARIABLE}: {why}")

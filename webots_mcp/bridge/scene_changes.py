@@ -1,0 +1,554 @@
+"""The built-in actions that change the scene tree: set a field, add and remove a node.
+
+Webots sets a field with the next step, so the answer has the field's value after that step. Each
+change is an event, and is remembered, so that a reset puts it back.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+import time
+from collections.abc import Callable, Generator
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from webots_mcp.bridge.commands import ClaimedCommand, Progress
+from webots_mcp.bridge.error_report import cut
+from webots_mcp.bridge.scene import (
+    MOST_ENTRIES,
+    Pace,
+    Place,
+    checked,
+    children,
+    entries,
+    fields_of,
+    find,
+    find_node,
+    is_nearer,
+    is_same,
+    label,
+    read,
+    require_no_path,
+    write,
+)
+from webots_mcp.errors import CommandRefusedError, InvalidInputError
+
+if TYPE_CHECKING:
+    from webots_mcp.bridge.session import Session
+
+_LONGEST_NODE: Final = 50_000  # characters of a node that is added
+_LONGEST_SHOWN: Final = 1_000  # characters of a value in an answer
+_LONGEST_STEP_S: Final = 3.0  # of wall time, until the next round of the loop
+_STAY: Final = ("WorldInfo", "Viewpoint")
+_ONE_NODE: Final = re.compile(r"\s*(?:DEF\s+\S+\s+)?[A-Za-z_][\w-]*\s*\{.*\}\s*\Z", re.DOTALL)
+_WORD: Final = re.compile(r'"(?:[^"\\]|\\.)*"|#[^\r\n]*|[{}\[\]]|[^\s,"#{}\[\]]+', re.DOTALL)
+_ADDED_BEFORE: Final = "does not bring it back: it was added in this run"
+_SAYS: Final = "Webots' console has the reason (see webots_get_logs, if it is recorded)"
+
+
+def set_field(session: Session, command: ClaimedCommand) -> Progress:
+    """Set the field, or the entry of a field, at a `path` to a `value`."""
+    robot, params = session.simulation.robot, command.params
+    place = yield from find(robot, params.get("path"))
+    _require_settable(robot, place)
+    value = checked(place.path, place.type_name, params.get("value"))
+    require_no_path(str(place.webots_field.getName()), value)
+    before = read(place.field, place.entry)
+    is_remembered = session.scene.remember_field(_edit(place, before, value))
+    write(place.field, value, place.entry)
+    if params.get("stop") is True:
+        place.node.resetPhysics()
+    facts: dict[str, Any] = {"path": place.path, "type": place.type_name}
+    facts |= {"from": _shown(before), "to": _shown(value)}
+    is_stepped = yield from _until_stepped(session)
+    now = _read_again(robot, place)
+    if not is_stepped and not is_same(place.type_name, now, value):
+        facts["now"] = _shown(now)
+        facts["when"] = "it is set with the next step: simulation time stands still"
+    elif not is_nearer(place.type_name, now, value, before) and not is_same(
+        place.type_name, before, value
+    ):
+        raise CommandRefusedError(
+            f"{place.path} is {now!r:.200} after it was set: a controller set it again, or Webots "
+            f"refused the value; {_SAYS}. Fields inside a PROTO cannot be set"
+        )
+    elif not is_same(place.type_name, now, value):
+        facts["now"] = _shown(now)  # the simulation has changed it since
+    session.journal.event("set_field", facts | _asked_by(command), place.path)
+    return facts | {"sim_time_s": session.clock.sim_time_s} | _effect_of_reset(is_remembered)
+
+
+def _shown(value: Any) -> Any:
+    """A value, or the beginning of its text where it is long."""
+    text = json.dumps(value, ensure_ascii=False)
+    return value if len(text) <= _LONGEST_SHOWN else cut(text, _LONGEST_SHOWN)
+
+
+def _edit(place: Place, before: Any, value: Any) -> FieldEdit:
+    name = str(place.webots_field.getName())
+    node_id = int(place.node.getId())
+    return FieldEdit(place.path, node_id, name, place.entry, place.type_name, before, value)
+
+
+def _require_settable(robot: Any, place: Place) -> None:
+    if place.field is None:
+        raise InvalidInputError(
+            f"{place.path} is a node ({label(place.node)}): name the field to set, such as "
+            f"{place.path}.translation"
+        )
+    if place.is_hidden:
+        raise InvalidInputError(
+            f"{place.path} is inside a PROTO, where nothing can be set: set a field of the PROTO "
+            "node itself"
+        )
+    if place.entry is None and place.field.getCount() > MOST_ENTRIES:
+        raise InvalidInputError(
+            f"{place.path} has {place.field.getCount()} entries: set one, such as {place.path}[0]"
+        )
+    if place.field.getName() == "supervisor" and place.node.getId() == robot.getSelf().getId():
+        raise InvalidInputError(
+            f"{place.path} cannot be set: this bridge needs the permission of a Supervisor itself"
+        )
+
+
+def _read_again(robot: Any, place: Place) -> Any:
+    """The value of a field after setting it; setting may rebuild a PROTO, so it is found again."""
+    assert place.field is not None
+    field = find_again(robot, int(place.node.getId()), str(place.field.getName()))
+    if field is None:
+        raise CommandRefusedError(
+            f"{place.path} does not exist any more after it was set: look with webots_get_scene"
+        )
+    return read(field, place.entry)
+
+
+def _until_stepped(session: Session) -> Generator[None, None, bool]:
+    """Wait for a step of the simulation; False where simulation time stands still."""
+    clock, from_step = session.clock, session.clock.steps_seen
+    until_s = time.monotonic() + _LONGEST_STEP_S
+    while clock.steps_seen == from_step:
+        yield
+        stands = session.simulation.paused or time.monotonic() > until_s
+        if stands and clock.steps_seen == from_step:
+            return False
+    return True
+
+
+def _asked_by(command: ClaimedCommand) -> dict[str, Any]:
+    return {"command_id": command.id, "requested_by": command.requested_by}
+
+
+def _effect_of_reset(is_remembered: bool) -> dict[str, Any]:
+    if is_remembered:
+        return {"a_reset": "puts it back"}
+    return {"a_reset": f"does not undo it: at most {MOST_EDITS} changes are remembered"}
+
+
+def add_node(session: Session, command: ClaimedCommand) -> Progress:
+    """Add the node of the text `vrml` to the children of the node, or to the field, at a `path`."""
+    robot, params = session.simulation.robot, command.params
+    text = _require_one_node(params.get("vrml"))
+    place = yield from _find_room(robot, params.get("path") or "root")
+    before = _count(place)
+    node = import_node(place.field, text)
+    if node is None:
+        yield from _until_stepped(session)
+        node = _newest(robot, place, before)
+    if node is None:
+        raise CommandRefusedError(
+            f"Webots added nothing to {place.path}; {_SAYS}. A PROTO has to be declared in the "
+            "world file first: IMPORTABLE EXTERNPROTO"
+        )
+    path = _path_of(robot, node)
+    is_remembered = session.scene.remember_added(path, int(node.getId()))
+    facts: dict[str, Any] = {"path": path, "type": str(node.getTypeName()), "parent": place.path}
+    yield from _until_stepped(session)
+    session.journal.event("add_node", facts | {"vrml": cut(text, 2000)} | _asked_by(command), path)
+    reset = {"a_reset": "removes it"} if is_remembered else _effect_of_reset(is_remembered)
+    return facts | {"node": label(node), "sim_time_s": session.clock.sim_time_s} | reset
+
+
+def _count(place: Place) -> int:
+    return int(place.webots_field.getCount())
+
+
+def _newest(robot: Any, place: Place, before: int) -> Any | None:
+    """The node that was added to a field since; None where none was."""
+    field = find_again(robot, int(place.node.getId()), str(place.webots_field.getName()))
+    if field is None or place.type_name == "SFNode":
+        return None if field is None else field.getSFNode()
+    return field.getMFNode(-1) if field.getCount() > before else None
+
+
+def _require_one_node(text: object) -> str:
+    """The text of a node; a text that cannot be one is refused before Webots is asked.
+
+    Raises:
+        InvalidInputError: It is not the text of one node.
+    """
+    what = 'give vrml as one node of a world file, such as DEF BOX Solid { name "box" }'
+    if not isinstance(text, str) or len(text) > _LONGEST_NODE or not _ONE_NODE.match(text):
+        raise InvalidInputError(f"{what}; got {text!r:.100}")
+    words = [word for word in _WORD.findall(text) if not word.startswith("#")]
+    for field, value in itertools.pairwise(words):
+        if value.startswith('"'):
+            require_no_path(field, value[1:-1])
+    for opening, closing in ("{}", "[]"):
+        opened, closed = words.count(opening), words.count(closing)
+        if opened != closed:
+            raise InvalidInputError(f"{what}; this has {opened} {opening} and {closed} {closing}")
+    return text
+
+
+def _find_room(robot: Any, path: object) -> Generator[None, None, Place]:
+    """The field that a node is added to.
+
+    Raises:
+        InvalidInputError: There is none, or no room in it.
+    """
+    place = yield from find(robot, path)
+    if place.field is None:
+        room = children(place.node)
+        if room is None:
+            raise InvalidInputError(
+                f"{place.path} ({label(place.node)}) has no field children: name a field of nodes"
+            )
+        place = place._replace(path=f"{place.path}.children", field=room)
+    room = place.webots_field
+    if place.type_name == "SFNode" and room.getSFNode() is not None:
+        holds = label(room.getSFNode())
+        raise InvalidInputError(f"{place.path} already has a node ({holds}): remove that one first")
+    if not place.type_name.endswith("Node"):
+        raise InvalidInputError(
+            f"{place.path} is of type {place.type_name}, which cannot contain nodes"
+        )
+    if place.is_hidden:
+        raise InvalidInputError(f"{place.path} is inside a PROTO, where nothing can be added")
+    return place
+
+
+def _path_of(robot: Any, node: Any) -> str:
+    """A path that identifies a node as long as it exists."""
+    definition = str(node.getDef())
+    found = robot.getFromDef(definition) if definition else None
+    is_first = found is not None and found.getId() == node.getId()
+    return definition if is_first else f"#{node.getId()}"
+
+
+def remove_node(session: Session, command: ClaimedCommand) -> Progress:
+    """Remove the node at a `path`, with everything in it."""
+    robot = session.simulation.robot
+    place = yield from find_node(robot, command.params.get("path"))
+    _require_removable(robot, place)
+    node, node_id = place.node, int(place.node.getId())
+    facts: dict[str, Any] = {
+        "path": place.path,
+        "type": str(node.getTypeName()),
+        "node": label(node),
+    }
+    removal = yield from _removal(robot, place, node_id)
+    was_added = node_id in session.scene.added
+    node.remove()
+    if robot.getFromId(node_id) is not None:
+        yield from _until_stepped(session)
+    if robot.getFromId(node_id) is not None:
+        raise CommandRefusedError(f"Webots did not remove {place.path}; {_SAYS}")
+    is_remembered = removal is not None and session.scene.remember_removed(removal)
+    session.journal.event("remove_node", facts | _asked_by(command), place.path)
+    reset = _ADDED_BEFORE if was_added else _brought_back(removal, is_remembered)
+    return facts | {"sim_time_s": session.clock.sim_time_s, "a_reset": reset}
+
+
+def _brought_back(removal: Removal | None, is_remembered: bool) -> str:
+    if is_remembered:
+        return "puts it back"
+    if removal is None or not removal.is_written_out:
+        return "does not bring it back; a reload does"
+    return str(_effect_of_reset(False)["a_reset"])
+
+
+def _require_removable(robot: Any, place: Place) -> None:
+    """Refuse to remove a node that the world, or this bridge, depends on.
+
+    Raises:
+        InvalidInputError: The text has the reason.
+    """
+    node = place.node
+    if place.is_hidden:
+        raise InvalidInputError(f"{place.path} is inside a PROTO, where nothing can be removed")
+    if node.getTypeName() in _STAY or node.getId() == robot.getRoot().getId():
+        raise InvalidInputError(f"{place.path} ({label(node)}) cannot be removed from a world")
+    each = robot.getSelf()
+    while each is not None:
+        if each.getId() == node.getId():
+            raise InvalidInputError(
+                f"{place.path} contains the robot {robot.getName()!r} and cannot be removed: the "
+                "bridge of that robot runs this command"
+            )
+        each = each.getParentNode()
+
+
+def _removal(robot: Any, place: Place, node_id: int) -> Generator[None, None, Removal | None]:
+    """How to bring a node back; None where its position is not found, or it cannot be exported."""
+    found = yield from spot_of(robot, place.node)
+    export = getattr(place.node, "exportString", None)
+    if found is None or export is None:
+        return None
+    return Removal(place.path, node_id, *found, str(export() or ""))
+
+
+# Physics has changed these since a command set them, and Webots' own reset restores them.
+_MOVED_BY_PHYSICS: Final = ("translation", "rotation", "battery")
+
+_MOST_EXPORTED_CHARACTERS: Final = 200_000  # of a removed node
+
+_Spot = tuple[int | None, str, int | None]
+
+
+class FieldEdit(NamedTuple):
+    """A field, or an entry of one, that was set.
+
+    Attributes:
+        path: The path of the command.
+        node_id: The number of its node.
+        name: The name of the field.
+        entry: The index of the entry; None for the whole field.
+        type_name: The type of the value.
+        before: The value before it was set for the first time in this run.
+        value: The newest value that it was set to.
+    """
+
+    path: str
+    node_id: int
+    name: str
+    entry: int | None
+    type_name: str
+    before: Any
+    value: Any
+
+
+class Removal(NamedTuple):
+    """A node that was removed, as text, and its former position.
+
+    Attributes:
+        path: The path of the command.
+        node_id: The number of the node, or of the one that replaced it at the last reset.
+        parent_id: The number of its parent; None for the top of the tree.
+        field: The name of the field that contained it.
+        entry: Its index in the field; None in a field for a single node.
+        text: Its text as in a world file.
+    """
+
+    path: str
+    node_id: int
+    parent_id: int | None
+    field: str
+    entry: int | None
+    text: str
+
+    @property
+    def is_written_out(self) -> bool:
+        """Whether Webots exported its text, and it is short enough to be remembered."""
+        return 0 < len(self.text) <= _MOST_EXPORTED_CHARACTERS
+
+
+class Restoration:
+    """Undoes the changes of one run, after its reset.
+
+    Args:
+        robot: The Supervisor.
+        failed: Receives each error of a call to Webots.
+    """
+
+    def __init__(self, robot: Any, failed: Callable[[str, Exception], None]) -> None:
+        self._robot = robot
+        self._failed = failed
+        self._set: list[FieldEdit] = []
+        self._outcomes: dict[str, list[str]] = {"by_webots": [], "by_bridge": [], "not": []}
+
+    def put_back(
+        self, fields: list[FieldEdit], added: dict[int, str], removed: list[Removal]
+    ) -> list[Removal]:
+        """Restore fields, remove added nodes, and add removed nodes again.
+
+        Returns:
+            The removed nodes with their new numbers. They have to be remembered: to Webots they
+            are added nodes, so the next reset will remove them again.
+        """
+        for edit in reversed(fields):
+            self._try(edit.path, self._set_back, edit)
+        for node_id, path in added.items():
+            self._try(path, self._take_away, node_id, path)
+        in_order = sorted(removed, key=lambda each: each.entry or 0)
+        return [self._try(each.path, self._bring_back, each) or each for each in in_order]
+
+    def outcome(self) -> dict[str, object]:
+        """What was put back by Webots, what by the bridge, and what was not; a step later."""
+        for edit in self._set:
+            self._try(edit.path, self._check_set, edit)
+        return {how: paths for how, paths in self._outcomes.items() if paths}
+
+    def _try(self, path: str, restore: Callable[..., Any], *arguments: Any) -> Any:
+        try:
+            return restore(*arguments)
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            self._failed(f"putting {path} back", error)
+            self._outcomes["not"].append(path)
+            return None
+
+    def _set_back(self, edit: FieldEdit) -> None:
+        field = find_again(self._robot, edit.node_id, edit.name)
+        if field is None:
+            self._outcomes["not"].append(f"{edit.path}: its node does not exist any more")
+        elif edit.name in _MOVED_BY_PHYSICS or not self._holds(edit, edit.value):
+            self._outcomes["by_webots"].append(edit.path)
+        else:
+            write(field, edit.before, edit.entry)
+            self._set.append(edit)
+
+    def _check_set(self, edit: FieldEdit) -> None:
+        self._note(edit.path, done=self._holds(edit, edit.before))
+
+    def _holds(self, edit: FieldEdit, value: Any) -> bool:
+        field = find_again(self._robot, edit.node_id, edit.name)
+        return field is not None and is_same(edit.type_name, read(field, edit.entry), value)
+
+    def _take_away(self, node_id: int, path: str) -> None:
+        node = self._robot.getFromId(node_id)
+        if node is None:
+            self._outcomes["by_webots"].append(f"{path} (added)")
+            return
+        node.remove()
+        self._note(f"{path} (added)", done=self._robot.getFromId(node_id) is None)
+
+    def _bring_back(self, removal: Removal) -> Removal:
+        if self._robot.getFromId(removal.node_id) is not None:
+            return removal
+        parent = self._robot.getRoot()
+        if removal.parent_id is not None:
+            parent = self._robot.getFromId(removal.parent_id)
+        field = None if parent is None else parent.getField(removal.field)
+        node = None if field is None else import_node(field, removal.text, removal.entry)
+        self._note(f"{removal.path} (removed)", done=node is not None)
+        return removal if node is None else removal._replace(node_id=int(node.getId()))
+
+    def _note(self, path: str, *, done: bool) -> None:
+        self._outcomes["by_bridge" if done else "not"].append(path)
+
+
+def find_again(robot: Any, node_id: int, name: str) -> Any | None:
+    """The field of that name, of a node that may not exist any more."""
+    node = robot.getFromId(node_id)
+    return None if node is None else node.getField(name)
+
+
+def import_node(field: Any, text: str, index: int | None = None) -> Any | None:
+    """Add a node to a field of nodes, by default at its end.
+
+    Webots reports errors in its console only, and the package raises nothing, so the field is
+    compared with before.
+
+    Returns:
+        The new node; None if none was added.
+    """
+    if field.getTypeName() == "SFNode":
+        field.importSFNodeFromString(text)
+        return field.getSFNode()
+    before = field.getCount()
+    place = before if index is None else min(index, before)
+    field.importMFNodeFromString(place, text)
+    return field.getMFNode(place) if field.getCount() > before else None
+
+
+def spot_of(robot: Any, node: Any) -> Generator[None, None, _Spot | None]:
+    """The position of a node: the number of its parent (None: the top), the field, and the index.
+
+    Returns:
+        None where it is not found.
+    """
+    parent, root, wanted, pace = node.getParentNode(), robot.getRoot(), node.getId(), Pace()
+    parent_id, fields = None, iter((children(root),))
+    if parent is not None and parent.getId() != root.getId():
+        parent_id, fields = int(parent.getId()), fields_of(parent)
+    for field in fields:
+        if field.getTypeName() not in ("SFNode", "MFNode"):
+            continue
+        for index, each in entries(field):
+            if each.getId() == wanted:
+                return parent_id, str(field.getName()), index
+            yield from pace.rest()
+    return None
+
+
+# -- what a reset has to undo ----------------------------------------------------------------------
+# A reset by Webots restores poses and removes added nodes. It does not restore other fields or
+# removed nodes: that is done here, as long as the controller's process lives.
+
+
+MOST_EDITS: Final = 200  # that are put back
+
+
+class SceneEdits:
+    """Remembers changes of the scene, and undoes them after a reset.
+
+    Attributes:
+        fields: The fields that were set in this run, in that order.
+        added: The paths of the nodes that were added in this run, by their numbers.
+        removed: The nodes that were removed in this run or an earlier one.
+    """
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._restoration: Restoration | None = None
+        self._restored_at_step = 0
+        self.fields: dict[tuple[int, str, int | None], FieldEdit] = {}
+        self.added: dict[int, str] = {}
+        self.removed: list[Removal] = []
+
+    def remember_field(self, edit: FieldEdit) -> bool:
+        """Remember that a field is about to be set; False if that will not be undone."""
+        key = (edit.node_id, edit.name, edit.entry)
+        known = self.fields.get(key)
+        if known is None and self._is_full:
+            return False
+        self.fields[key] = edit if known is None else known._replace(value=edit.value)
+        return True
+
+    def remember_added(self, path: str, node_id: int) -> bool:
+        """Remember an added node; False if that will not be undone."""
+        if self._is_full:
+            return False
+        self.added[node_id] = path
+        return True
+
+    def remember_removed(self, removal: Removal) -> bool:
+        """Remember a removed node; False if it will not be restored."""
+        if self.added.pop(removal.node_id, None) is not None:
+            return True  # it did not exist when the run began
+        if self._is_full or not removal.is_written_out:
+            return False
+        self.removed.append(removal)
+        return True
+
+    @property
+    def _is_full(self) -> bool:
+        return len(self.fields) + len(self.added) + len(self.removed) >= MOST_EDITS
+
+    def begin_run(self) -> None:
+        """The world was reset: undo the changes that Webots has not undone."""
+        if not (self.fields or self.added or self.removed):
+            return
+
+        self._restoration = Restoration(self._session.simulation.robot, self._session.errors.failed)
+        self._restored_at_step = self._session.clock.steps_seen
+        fields, self.fields = [*self.fields.values()], {}
+        added, self.added = self.added, {}
+        self.removed = self._restoration.put_back(fields, added, self.removed)
+
+    def look(self) -> None:
+        """Record what was put back, after the step with which Webots sets the fields."""
+        restoration = self._restoration
+        if restoration is not None and self._session.clock.steps_seen != self._restored_at_step:
+            self._restoration = None
+            self._session.journal.event("put_back", restoration.outcome())

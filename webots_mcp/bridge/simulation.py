@@ -1,0 +1,344 @@
+"""The simulation as the controller sees it: Webots' API, steps, simulation time and runs.
+
+Webots is called only in the controller's own thread, and never after a quit.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple
+
+from webots_mcp.contract import new_uuid
+from webots_mcp.errors import CommandRefusedError
+
+_ROBOT_METHODS: Final = ("step", "getTime", "getName", "getBasicTimeStep")
+_INSIDE: Final = ("robot", "supervisor", "inner", "env", "unwrapped", "_robot")  # in wrappers
+
+
+class Simulation:
+    """The simulation, as the user's robot can read and control it.
+
+    Args:
+        robot: A Webots `Robot` or `Supervisor`, or an instance of a subclass.
+
+    Raises:
+        TypeError: `robot` is something else.
+    """
+
+    def __init__(self, robot: Any) -> None:
+        _require_robot(robot)
+        self.robot = robot
+        self.over = False
+        self.supervisor: bool = _may_supervise(robot)
+        self._gate = StepGate(robot)
+
+    @property
+    def time_s(self) -> float:
+        """Simulation time as of the last step; costs no request."""
+        return float(self.robot.getTime())
+
+    @property
+    def basic_time_step_s(self) -> float:
+        """WorldInfo.basicTimeStep in seconds."""
+        return float(self.robot.getBasicTimeStep()) / 1000
+
+    @property
+    def waits_for_robot(self) -> bool:
+        """Whether the simulation waits for this robot's next step (field `synchronization`)."""
+        return bool(self.robot.getSynchronization())
+
+    @property
+    def mode(self) -> int:
+        """The simulation mode in Webots' last answer."""
+        return int(self.robot.simulationGetMode())
+
+    @property
+    def paused(self) -> bool:
+        """Whether the mode in Webots' last answer is PAUSE."""
+        return self.mode == self.robot.SIMULATION_MODE_PAUSE
+
+    def set_mode(self, name: str) -> None:
+        """Set the mode `pause`, `real_time` or `fast`."""
+        self.robot.simulationSetMode(getattr(self.robot, f"SIMULATION_MODE_{name.upper()}"))
+
+    @property
+    def mode_name(self) -> str:
+        """`pause`, `real_time` or `fast`."""
+        names = {self.robot.SIMULATION_MODE_PAUSE: "pause", self.robot.SIMULATION_MODE_FAST: "fast"}
+        return names.get(self.mode, "real_time")
+
+    def pump(self) -> bool:
+        """Exchange messages with Webots without advancing time; False if it says quit."""
+        if self._gate.exchange() != QUIT:
+            return True
+        self.end()
+        return False
+
+    def guard_steps(self, guard: Guard | None) -> None:
+        """Let `guard` answer the controller's steps; None: let Webots answer them again."""
+        if self.over:
+            return
+        if guard is None:
+            self._gate.open()
+        else:
+            self._gate.close(guard)
+
+    def end(self) -> None:
+        """Webots wants the controller to end: its API must not be called any more.
+
+        Webots' library would end the process in the next `step` of the user's loop, without any
+        cleanup. So that step is answered here, with -1, on which the loop ends by itself.
+        """
+        self._gate.close(lambda _: QUIT)
+        self.over = True
+
+    def require_supervisor(self, action: str) -> None:
+        """Refuse what only a Supervisor can do.
+
+        Raises:
+            CommandRefusedError: The robot is not one; the text says what to change.
+        """
+        if self.supervisor:
+            return
+        missing = (
+            "set the field 'supervisor' of its Robot node to TRUE"
+            if hasattr(self.robot, "simulationSetMode")
+            else "create it with Supervisor() instead of Robot(), and set 'supervisor' to TRUE"
+        )
+        refused = f"{action} needs a Supervisor and this robot is not one"
+        raise CommandRefusedError(f"{refused}: {missing}")
+
+
+def _require_robot(robot: Any) -> None:
+    missing = [name for name in _ROBOT_METHODS if not _has_method(robot, name)]
+    if not missing:
+        return
+    inside = next((name for name in _INSIDE if _is_robot(getattr(robot, name, None))), None)
+    hint = f"; pass its attribute: MCPBridge(x.{inside})" if inside else ""
+    raise TypeError(
+        f"MCPBridge needs a Webots Robot or Supervisor; the class {type(robot).__name__} has no "
+        f"{', '.join(missing)}{hint}"
+    )
+
+
+def _is_robot(value: object) -> bool:
+    return all(_has_method(value, name) for name in _ROBOT_METHODS)
+
+
+def _has_method(robot: object, name: str) -> bool:
+    """Whether its class has the method: a wrapper that forwards all attributes is not a robot."""
+    return callable(getattr(type(robot), name, None))
+
+
+def _may_supervise(robot: Any) -> bool:
+    """Whether it is a Supervisor: by its class, and by the permission in the world file."""
+    return hasattr(robot, "simulationSetMode") and bool(robot.getSupervisor())
+
+
+# -- intercepting Robot.step, from wherever the controller calls it --------------------------------
+# A loop calls the robot's method, or that of a subclass whose own `step` calls it by `super()`. So
+# the method of Webots' class is replaced, and asks the robot's guard first. Robots without a guard
+# step as before.
+
+
+QUIT: Final = -1
+
+Method = Callable[..., int]
+
+_STEPPING: Final = ("step", "stepBegin", "stepEnd")
+_VEHICLE: Final = "vehicle"  # the package
+_GUARD: Final = "_webots_mcp_guard"  # of a robot; None of its class
+_MARK: Final = "_webots_mcp_asks"  # of a method
+
+
+class Step(NamedTuple):
+    """A call of a step method by the controller.
+
+    Attributes:
+        begins: It lets simulation time advance: `step(n)` and `stepBegin`, not `step(0)`.
+        ends: It waits until the time has advanced: `step(n)` and `stepEnd`.
+        make: Makes the original call.
+    """
+
+    begins: bool
+    ends: bool
+    make: Callable[[], int]
+
+    @property
+    def finishes(self) -> bool:
+        """Whether it is the second half of a step that has begun: `stepEnd`."""
+        return self.ends and not self.begins
+
+
+Guard = Callable[[Step], int]
+
+
+class StepGate:
+    """Intercepts the steps of one robot while it is closed.
+
+    Args:
+        robot: A Webots `Robot`, or an instance of a subclass.
+    """
+
+    def __init__(self, robot: Any) -> None:
+        self._robot = robot
+        self._of_robot: dict[str, Any] = vars(robot)
+        owner: Any = _owner_of_step(robot)
+        setattr(owner, _GUARD, None)
+        for cls in (owner, *_vehicles(robot)):
+            for name in _STEPPING:
+                method: Any = getattr(cls, name, None)
+                if method is not None and not hasattr(method, _MARK):
+                    setattr(cls, name, _guarded(name, method))
+        self._own_step: Method = owner.step.__wrapped__
+
+    def exchange(self) -> int:
+        """Call `step(0)` past the guard; returns 0, or -1 if Webots wants the controller to end."""
+        return self._own_step(self._robot, 0)
+
+    def close(self, guard: Guard) -> None:
+        """Let the guard answer each step of the controller."""
+        self._of_robot[_GUARD] = guard
+
+    def open(self) -> None:
+        """Let steps go to Webots directly again."""
+        self._of_robot.pop(_GUARD, None)
+
+
+def _guarded(name: str, method: Method) -> Method:
+    @functools.wraps(method)
+    def ask_first(robot: Any, *args: Any, **kwargs: Any) -> int:
+        guard: Guard | None = robot._webots_mcp_guard  # faster than getattr: runs in every step
+        if guard is None:
+            return method(robot, *args, **kwargs)
+        make = functools.partial(method, robot, *args, **kwargs)
+        if name == "step" and 0 in (*args, *kwargs.values()):
+            return guard(Step(begins=False, ends=False, make=make))
+        return guard(Step(name != "stepEnd", name != "stepBegin", make))
+
+    setattr(ask_first, _MARK, True)
+    return ask_first
+
+
+def _vehicles(robot: Any) -> list[Any]:
+    """Webots' classes whose `step` calls the C library and not `Robot.step`: `vehicle.Driver`."""
+    return [cls for cls in type(robot).__mro__ if cls.__module__.partition(".")[0] == _VEHICLE]
+
+
+def _owner_of_step(robot: Any) -> Any:
+    """The last class that defines both `step` and `getTime`.
+
+    A subclass that overrides `step` (an environment, say) hardly ever redefines `getTime` too.
+    """
+    owners = [cls for cls in type(robot).__mro__ if {"step", "getTime"} <= vars(cls).keys()]
+    return owners[-1] if owners else type(robot)
+
+
+_EPSILON_S: Final = 1e-9
+
+
+class Clock:
+    """The newest simulation time, and the run that it belongs to.
+
+    A controller is not notified of a reset: it only sees that time has gone back.
+    """
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        self.sim_time_s = simulation.time_s
+        self.moved_s: float | None = None  # by the monotonic clock
+        self.stepped_s = self.sim_time_s  # at the end of the newest step that the bridge saw
+        self.steps_seen = 0  # calls of `look` at which time had advanced, or the steps between them
+        self.step_s: float | None = None  # of a loop that only watches the steps of others
+        self.run = Run("start", self.sim_time_s)
+        self.ended_sim_time_s = self.sim_time_s  # of the run before this one
+        self._reset_from_s: float | None = None
+
+    def look(self, *, after_step: bool = False) -> bool:
+        """Read the time; True if it went back since the last look: a new run has begun.
+
+        Args:
+            after_step: A step has just ended. Where the time is the same as before, only this
+                proves that a step was made, and so that the awaited reset has happened.
+        """
+        before, now = self.sim_time_s, self._simulation.time_s
+        self.sim_time_s = now
+        if after_step:
+            self.stepped_s = now
+        if now > before + _EPSILON_S:
+            self.moved_s = time.monotonic()
+            self.steps_seen += max(round((now - before) / self.step_s), 1) if self.step_s else 1
+        if now >= before - _EPSILON_S and not self._is_awaited_reset(now, after_step):
+            return False
+        self._reset_from_s = None
+        self.ended_sim_time_s = before
+        self.run = Run("reset", now)
+        self.start_moving()
+        return True
+
+    def start_moving(self) -> None:
+        """Count time as moving from now on; it counts as standing still only after a while."""
+        self.moved_s = time.monotonic()
+
+    def newest_s(self, run: Run) -> float:
+        """The newest simulation time of the current run, or of the one before it."""
+        return self.sim_time_s if run is self.run else self.ended_sim_time_s
+
+    def await_reset(self) -> None:
+        """A reset was asked for. It happens at the end of the next physics step.
+
+        Close to the start of a run, the first time after the reset is not below the last one before
+        it. So where the last time was 0, any later time is taken for the new run's; else the same
+        time again after a step is.
+        """
+        self._reset_from_s = self.sim_time_s
+
+    def forget_reset(self) -> None:
+        """No reset happened in time: do not wait for it any more."""
+        self._reset_from_s = None
+
+    def _is_awaited_reset(self, now_s: float, after_step: bool) -> bool:
+        if self._reset_from_s is None:
+            return False
+        if self._reset_from_s < self._simulation.basic_time_step_s - _EPSILON_S:
+            return now_s > self._reset_from_s + _EPSILON_S
+        return after_step and now_s <= self._reset_from_s + _EPSILON_S
+
+
+# -- runs and simulation time ----------------------------------------------------------------------
+
+
+class Run:
+    """A stretch of rising simulation time; its id is None until its row is written.
+
+    Attributes:
+        rows: The number of its states in the database.
+        counted: Whether `rows` is exact: an interrupt may come between a row and its count.
+    """
+
+    __slots__ = (
+        "counted",
+        "id",
+        "rows",
+        "start_reason",
+        "started_sim_time_s",
+        "started_wall_time_s",
+        "uuid",
+    )
+
+    def __init__(self, start_reason: str, sim_time_s: float) -> None:
+        self.id: int | None = None
+        self.uuid = new_uuid()
+        self.rows = 0
+        self.counted = True
+        self.start_reason = start_reason
+        self.started_sim_time_s = sim_time_s
+        self.started_wall_time_s = time.time()
+
+    def begin_anew(self) -> None:
+        """Continue as a new run, in a new database."""
+        self.id = None
+        self.uuid = new_uuid()
+        self.rows = 0

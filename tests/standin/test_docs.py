@@ -9,8 +9,8 @@ from typing import Any
 import controller
 from controller.lacking import CLASSES, lacking
 
-from webots_mcp.standin.nodes import DEVICE_TYPES, NODE_TYPES
 from webots_mcp.standin.protos import PROTOS
+from webots_mcp.standin.vrml import DEVICE_TYPES, NODE_TYPES
 
 PAGE = (Path(__file__).parents[2] / "docs" / "standin.md").read_text(encoding="utf-8")
 HAD = {had.__name__ for had in controller.__all__}

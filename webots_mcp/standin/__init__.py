@@ -26,12 +26,7 @@ from webots_mcp.standin.in_process import (
 )
 from webots_mcp.standin.simulation import Simulation
 from webots_mcp.standin.simulator import Mode
-from webots_mcp.standin.standin_errors import (
-    ControllerEndedError,
-    StandInError,
-    WorldError,
-    WouldBlockError,
-)
+from webots_mcp.standin.vrml import ControllerEndedError, StandInError, WorldError, WouldBlockError
 
 __all__ = [
     "LIBRARY",

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from math import cos, hypot, pi, sin
-from typing import Final
+from dataclasses import dataclass, field
+from math import cos, hypot, isinf, pi, sin
+from typing import Any, Final
 
-from webots_mcp.standin.camera_rendering import SceneColors
-from webots_mcp.standin.frame import Frame, frame_of
-from webots_mcp.standin.shapes import Block, Color, Disc, Shape
+from webots_mcp.standin.geometry import Block, Color, Disc, Frame, Shape, frame_of
 from webots_mcp.standin.vrml import Node, children_of, descendants_of
 from webots_mcp.standin.world import World, own_frame
 
@@ -18,6 +16,14 @@ _DEFAULT_COLOR: Final[Color] = (0.5, 0.5, 0.5)
 _LIGHTS: Final = ("DirectionalLight", "PointLight", "SpotLight")
 _SLIDING_FRICTION: Final = 1.0
 """Coulomb friction of everything on the floor, Webots' default."""
+
+
+@dataclass(frozen=True)
+class SceneColors:
+    """What is neither wall nor obstacle."""
+
+    floor: Color = (0.75, 0.75, 0.72)
+    sky: Color = (0.6, 0.75, 0.9)
 
 
 @dataclass(frozen=True)
@@ -351,3 +357,188 @@ def _color_of(node: Node) -> Color:
 def _color(numbers: Sequence[float]) -> Color:
     r, g, b = numbers
     return r, g, b
+
+
+# How motors turn wheels and wheels move a robot.
+
+
+_MOTORS = ("RotationalMotor", "LinearMotor")
+_JOINTS = ("HingeJoint", "SliderJoint")
+
+
+@dataclass
+class Joint:
+    """A hinge, its motor and how far it has turned; of a slider, metres in the place of radians."""
+
+    node: Node
+    max_velocity_radps: float
+    acceleration_radps2: float
+    min_position_rad: float
+    max_position_rad: float
+    start_rad: float
+    target_rad: float = 0.0
+    """Where the motor is to turn to; inf: turn on with `target_radps` (velocity control)."""
+    target_radps: float = 0.0
+    position_rad: float = 0.0
+    velocity_radps: float = 0.0
+
+    @staticmethod
+    def of(node: Node) -> Joint:
+        """The joint that a node describes; without a motor it stands still."""
+        motors = [n for n in node.fields["device"] if n.type_name in _MOTORS]
+        fields: dict[str, Any] = motors[0].fields if motors else {}
+        parameters = node.fields["jointParameters"]
+        joint = Joint(
+            node,
+            fields.get("maxVelocity", 0.0),
+            fields.get("acceleration", -1.0),
+            fields.get("minPosition", 0.0),
+            fields.get("maxPosition", 0.0),
+            parameters.fields["position"] if parameters else 0.0,
+        )
+        joint.reset()
+        return joint
+
+    def reset(self) -> None:
+        """Back to the start; the motor stands still until its next command."""
+        self.position_rad, self.velocity_radps = self.start_rad, 0.0
+        self.hold()
+
+    def hold(self) -> None:
+        """Make the motor hold where the joint is."""
+        self.target_rad, self.target_radps = self.position_rad, self.max_velocity_radps
+
+    def turn(self, seconds: float) -> float:
+        """Turn for one time step; returns by how much, in radians."""
+        wanted = self._wanted_radps(seconds)
+        if self.acceleration_radps2 > 0.0:
+            change = self.acceleration_radps2 * seconds
+            wanted = min(max(wanted, self.velocity_radps - change), self.velocity_radps + change)
+        self.velocity_radps = wanted
+        turned = wanted * seconds
+        self.position_rad += turned
+        return turned
+
+    def _wanted_radps(self, seconds: float) -> float:
+        limit = self.max_velocity_radps
+        if isinf(self.target_rad):
+            wanted = self.target_radps if self.target_rad > 0.0 else -self.target_radps
+            return min(max(wanted, -limit), limit)
+        target = self.target_rad
+        if self.min_position_rad != self.max_position_rad:
+            target = min(max(target, self.min_position_rad), self.max_position_rad)
+        limit = min(limit, abs(self.target_radps))
+        return min(max((target - self.position_rad) / seconds, -limit), limit)
+
+
+@dataclass
+class Wheel:
+    """A joint about the robot's left-right axis that carries something round."""
+
+    joint: Joint
+    radius_m: float
+    """Negative if turning forwards drives backwards."""
+    left_m: float
+
+
+@dataclass
+class Vehicle:
+    """A robot's body and what moves it; robots without wheels stand where they are."""
+
+    body: Body
+    joints: list[Joint]
+    touching: bool = False
+    collisions: int = 0
+    """How often the robot began to touch something that does not give way."""
+    wheels: list[Wheel] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.wheels = [wheel for joint in self.joints if (wheel := _wheel_of(joint))]
+        left = [wheel for wheel in self.wheels if wheel.left_m > 0.0]
+        right = [wheel for wheel in self.wheels if wheel.left_m < 0.0]
+        self._sides = (left, right) if left and right else None
+
+    def reset(self) -> None:
+        """Back to the start; where the body stands is the world's business."""
+        for joint in self.joints:
+            joint.reset()
+        self.touching, self.collisions = False, 0
+
+    def stop(self) -> None:
+        """Take all speed away."""
+        for joint in self.joints:
+            joint.velocity_radps = 0.0
+        self.body.stop()
+
+    def drive(self, arena: Arena, seconds: float) -> None:
+        """Move the robot for one time step.
+
+        Wheels turn as their motors say, whatever is in the way: against a wall they spin, so that
+        wheel sensors and GPS disagree as they do in reality.
+        """
+        rolled = {id(joint): joint.turn(seconds) for joint in self.joints}
+        if self._sides is None:
+            self._slide(arena, seconds)
+            return
+        left, right = (
+            sum(rolled[id(wheel.joint)] * wheel.radius_m for wheel in side) / len(side)
+            for side in self._sides
+        )
+        track = self._sides[0][0].left_m - self._sides[1][0].left_m
+        self._roll((left + right) / 2.0, (right - left) / track, arena, seconds)
+
+    def _slide(self, arena: Arena, seconds: float) -> None:
+        if self.body.is_pushed:
+            arena.slide(self.body, seconds)
+            self._notice(arena.settle(self.body))
+
+    def _roll(self, ahead_m: float, turn_rad: float, arena: Arena, seconds: float) -> None:
+        body = self.body
+        x, y, yaw = body.x, body.y, body.yaw_rad
+        kick_x, kick_y, kick_rad = self._kick(seconds)
+        if ahead_m or turn_rad or body.is_pushed:
+            middle = yaw + turn_rad / 2.0  # exact to second order: the arc's chord
+            x_then, y_then = x + ahead_m * cos(middle), y + ahead_m * sin(middle)
+            body.move(x_then + kick_x, y_then + kick_y, yaw + turn_rad + kick_rad)
+            self._notice(arena.settle(body))
+        else:
+            body.touched.clear()
+        body.velocity_mps = ((body.x - x) / seconds, (body.y - y) / seconds)
+        body.yaw_rate_radps = (body.yaw_rad - yaw) / seconds
+        body.is_pushed = False
+
+    def _kick(self, seconds: float) -> tuple[float, float, float]:
+        """The way of a speed that was set from outside: after one step the wheels have it again."""
+        if not self.body.is_pushed:
+            return 0.0, 0.0, 0.0
+        (vx, vy), turn = self.body.velocity_mps, self.body.yaw_rate_radps
+        return vx * seconds, vy * seconds, turn * seconds
+
+    def _notice(self, touching: bool) -> None:
+        self.collisions += touching and not self.touching
+        self.touching = touching
+
+
+def joints_in(robot: Node) -> list[Joint]:
+    """All joints of a robot, in the order of the scene tree."""
+    return [Joint.of(node) for node in descendants_of(robot) if node.type_name in _JOINTS]
+
+
+def _wheel_of(joint: Joint) -> Wheel | None:
+    parameters, end = joint.node.fields["jointParameters"], joint.node.fields["endPoint"]
+    if parameters is None or end is None or joint.max_velocity_radps == 0.0:
+        return None
+    if joint.node.type_name != "HingeJoint":
+        return None
+    axis, anchor = parameters.fields["axis"], parameters.fields["anchor"]
+    middle = end.fields.get("translation", anchor)  # of the wheel, along the axis
+    left_m: float = middle[1] or anchor[1]
+    radius_m = _radius_m(end.fields.get("boundingObject")) or _radius_m(end)
+    if not radius_m or abs(axis[1]) < 0.9 or left_m == 0.0:
+        return None
+    return Wheel(joint, radius_m if axis[1] > 0.0 else -radius_m, left_m)
+
+
+def _radius_m(shape: Node | None) -> float:
+    nodes = (shape, *descendants_of(shape)) if shape else ()
+    return next((node.fields["radius"] for node in nodes if "radius" in node.fields), 0.0)

@@ -8,13 +8,18 @@ from typing import Any, Final, cast
 from controller.wire import Message
 
 from webots_mcp.standin.arena import Body
-from webots_mcp.standin.export import as_text
-from webots_mcp.standin.nodes import NODE_TYPES, FieldDefinition
-from webots_mcp.standin.picture import Label
+from webots_mcp.standin.pictures import Label
 from webots_mcp.standin.protos import shown_definitions
 from webots_mcp.standin.simulator import Mode, Robot, Simulator, Wanted
-from webots_mcp.standin.standin_errors import WorldError
-from webots_mcp.standin.vrml import Node, Parser, descendants_of
+from webots_mcp.standin.vrml import (
+    NODE_TYPES,
+    FieldDefinition,
+    Node,
+    Parser,
+    WorldError,
+    descendants_of,
+)
+from webots_mcp.standin.world import as_text
 
 CUSTOM_DATA_TAG: Final = 0
 """Stands for the robot itself where devices have their tags."""

@@ -15,12 +15,7 @@ from webots_mcp.contract import bundled
 from webots_mcp.standin.controller_answers import answer, description, step_over
 from webots_mcp.standin.simulator import Mode, Simulator, Wanted
 from webots_mcp.standin.simulator import Robot as SimulatedRobot
-from webots_mcp.standin.standin_errors import (
-    ControllerEndedError,
-    StandInError,
-    WorldError,
-    WouldBlockError,
-)
+from webots_mcp.standin.vrml import ControllerEndedError, StandInError, WorldError, WouldBlockError
 from webots_mcp.standin.world import load_world
 
 DEFAULT_WORLD: Final = bundled("examples") / "worlds" / "arena.wbt"

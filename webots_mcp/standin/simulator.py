@@ -12,12 +12,10 @@ from math import ceil
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
-from webots_mcp.standin.arena import Arena, Body
-from webots_mcp.standin.physics import Vehicle, joints_in
-from webots_mcp.standin.picture import Label, Picture, save_picture
-from webots_mcp.standin.simulated_devices import Device, devices_in
-from webots_mcp.standin.standin_errors import WorldError
-from webots_mcp.standin.vrml import Node
+from webots_mcp.standin.arena import Arena, Body, Vehicle, joints_in
+from webots_mcp.standin.devices import Device, devices_in
+from webots_mcp.standin.pictures import Label, Picture, save_picture
+from webots_mcp.standin.vrml import Node, WorldError
 from webots_mcp.standin.world import World
 
 PoseKey: TypeAlias = "tuple[int, int | None]"

@@ -1,15 +1,90 @@
-"""Upright shapes on a plane: how rays hit them, and how they push a disc away.
-
-The stand-in is two-dimensional with heights: a box is a turned rectangle, a cylinder or a ball a
-disc, each between a bottom and a top.
-"""
+"""Places in space: a rotation matrix and a translation, put one after the other."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from math import hypot, inf, sqrt
-from typing import NamedTuple, TypeAlias
+from math import atan2, cos, hypot, inf, sin, sqrt
+from typing import Final, NamedTuple, TypeAlias, cast
+
+Matrix = tuple[float, float, float, float, float, float, float, float, float]
+"""A rotation by rows, as `Node.getOrientation` gives it."""
+Vector = tuple[float, float, float]
+
+UNTURNED: Final[Matrix] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
+
+class Frame(NamedTuple):
+    """Where something is, seen from what it stands in."""
+
+    rotation: Matrix = UNTURNED
+    translation: Vector = (0.0, 0.0, 0.0)
+
+    @property
+    def yaw_rad(self) -> float:
+        """Heading: the turn about the vertical axis."""
+        return atan2(self.rotation[3], self.rotation[0])
+
+    def point(self, local: Sequence[float]) -> Vector:
+        """A point given in this frame, seen from outside."""
+        x, y, z = local
+        r, (tx, ty, tz) = self.rotation, self.translation
+        return (
+            r[0] * x + r[1] * y + r[2] * z + tx,
+            r[3] * x + r[4] * y + r[5] * z + ty,
+            r[6] * x + r[7] * y + r[8] * z + tz,
+        )
+
+    def inverse(self) -> Frame:
+        """What this frame stands in, seen from this frame."""
+        r = self.rotation
+        turned = Frame((r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]))
+        x, y, z = turned.point(self.translation)
+        return Frame(turned.rotation, (-x, -y, -z))
+
+    def direction(self, outside: Sequence[float]) -> Vector:
+        """A direction given outside, seen from this frame."""
+        return self.inverse().turned(outside)
+
+    def turned(self, local: Sequence[float]) -> Vector:
+        """A direction given in this frame, seen from outside."""
+        return Frame(self.rotation).point(local)
+
+    def then(self, inner: Frame) -> Frame:
+        """A frame given in this frame, seen from outside."""
+        a, b = self.rotation, inner.rotation
+        rows = ((a[i], a[i + 1], a[i + 2]) for i in (0, 3, 6))
+        product = (p * b[k] + q * b[k + 3] + r * b[k + 6] for p, q, r in rows for k in (0, 1, 2))
+        return Frame(cast("Matrix", tuple(product)), self.point(inner.translation))
+
+
+def _rotation_matrix(axis_angle: Sequence[float]) -> Matrix:
+    """The matrix of an SFRotation (axis x, y, z and angle in radians)."""
+    x, y, z, angle = axis_angle
+    length = hypot(x, y, z)
+    if length == 0.0:
+        return UNTURNED
+    x, y, z = x / length, y / length, z / length
+    c, s = cos(angle), sin(angle)
+    v = 1.0 - c
+    return (
+        *(x * x * v + c, x * y * v - z * s, x * z * v + y * s),
+        *(y * x * v + z * s, y * y * v + c, y * z * v - x * s),
+        *(z * x * v - y * s, z * y * v + x * s, z * z * v + c),
+    )
+
+
+def frame_of(translation: Sequence[float], axis_angle: Sequence[float]) -> Frame:
+    """The frame that a `translation` and a `rotation` field describe."""
+    x, y, z = translation
+    return Frame(_rotation_matrix(axis_angle), (x, y, z))
+
+
+# Upright shapes on a plane: how rays hit them, and how they push a disc away.
+#
+# The stand-in is two-dimensional with heights: a box is a turned rectangle, a cylinder or a ball a
+# disc, each between a bottom and a top.
+
 
 Color = tuple[float, float, float]
 """Red, green and blue, each 0 to 1."""

@@ -32,8 +32,8 @@ from webots_mcp.errors import (
 from webots_mcp.plotting import Picture, PlotKind, Sheet, image_format_of, plot, plot_signals
 from webots_mcp.plotting.canvas import draw
 from webots_mcp.plotting.fonts import fit_fonts
+from webots_mcp.plotting.intervals import Interval
 from webots_mcp.plotting.palette import DASHES, LINES
-from webots_mcp.plotting.plotted_intervals import Interval
 from webots_mcp.plotting.signal_axes import paint_signals
 from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory

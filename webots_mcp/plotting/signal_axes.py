@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from webots_mcp.plotting.canvas import BESIDE_PX, ROW_PX, paint_title, short, wrapped
-from webots_mcp.plotting.curves import Curve
+from webots_mcp.plotting.curves import Curve, Panel
+from webots_mcp.plotting.intervals import Interval, Lane
 from webots_mcp.plotting.legend import Entry, paint_legend
 from webots_mcp.plotting.palette import DASHES, FAINT, INK, LINES, Area, area_styles
-from webots_mcp.plotting.panels import Panel
-from webots_mcp.plotting.plotted_intervals import Interval, Lane
 
 _LETTER_PX: Final = 6
 _GAP: Final[dict[str, Any]] = {"facecolor": "none", "edgecolor": "#AAAAAA", "hatch": "////"}

@@ -10,11 +10,11 @@ from functools import partial
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.naming import listed
 from webots_mcp.plotting.canvas import LEAST_HEIGHT_PX, Picture, Room, Sheet, draw, media_type
-from webots_mcp.plotting.curves import Curve, curve_of
-from webots_mcp.plotting.event_lanes import event_lanes
-from webots_mcp.plotting.panels import by_scale, by_signal
+from webots_mcp.plotting.curves import Curve, by_scale, by_signal, curve_of
+from webots_mcp.plotting.intervals import Interval, Lane, lane_of, merged_notes
 from webots_mcp.plotting.parts import (
     Part,
+    event_lanes,
     known_signals,
     mode_signal,
     parts_of,
@@ -22,7 +22,6 @@ from webots_mcp.plotting.parts import (
     title_of,
     unread_parts,
 )
-from webots_mcp.plotting.plotted_intervals import Interval, Lane, lane_of, merged_notes
 from webots_mcp.plotting.signal_axes import SignalAxes, paint_signals
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
 from webots_mcp.store.reading.ranges import TimeRange

@@ -10,7 +10,7 @@ from typing import Final
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.naming import listed
 from webots_mcp.plotting.canvas import Picture, Sheet, draw, media_type
-from webots_mcp.plotting.event_lanes import stuck_mark
+from webots_mcp.plotting.intervals import Lane, lane_of, merged_notes
 from webots_mcp.plotting.parts import (
     Known,
     Part,
@@ -18,10 +18,10 @@ from webots_mcp.plotting.parts import (
     mode_signal,
     parts_of,
     range_notes,
+    stuck_mark,
     title_of,
 )
 from webots_mcp.plotting.path import read_path
-from webots_mcp.plotting.plotted_intervals import Lane, lane_of, merged_notes
 from webots_mcp.plotting.trajectory_axes import Track, TrajectoryAxes, paint_trajectory
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import motion_in

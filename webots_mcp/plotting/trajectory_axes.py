@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from webots_mcp.plotting.canvas import paint_title, short
+from webots_mcp.plotting.intervals import Lane
 from webots_mcp.plotting.legend import Entry, paint_legend
 from webots_mcp.plotting.palette import DASHES, FAINT, INK, LINES, area_styles
 from webots_mcp.plotting.path import Path, Place, extent, headings, thinned
-from webots_mcp.plotting.plotted_intervals import Lane
 
 _ARROWS: Final = 9
 _BREAK: Final = Place(math.nan, math.nan, math.nan)

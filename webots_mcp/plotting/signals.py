@@ -5,11 +5,10 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.naming import listed
-from webots_mcp.plotting.canvas import LEAST_HEIGHT_PX, Picture, Room, Sheet, draw, media_type
+from webots_mcp.plotting.canvas import LEAST_HEIGHT_PX, Picture, Room, Sheet
 from webots_mcp.plotting.curves import Curve, by_scale, by_signal, curve_of
 from webots_mcp.plotting.intervals import Interval, Lane, lane_of, merged_notes
 from webots_mcp.plotting.parts import (
@@ -62,8 +61,8 @@ def plot_signals(
     if not plot.panels:
         rows = len(plot.lanes) + len(plot.events)
         sheet = replace(sheet, height_px=_height_of_rows(rows, sheet))
-    data, font_notes = draw(sheet, partial(paint_signals, plot=plot))
-    return Picture(data, media_type(sheet), _caption(plot), (*notes, *font_notes))
+    canvas, _ = paint_signals(plot, sheet.width_px, sheet.height_px)
+    return canvas.picture(sheet.image_format, _caption(plot), notes)
 
 
 def compose_signals(

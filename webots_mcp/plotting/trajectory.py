@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Sequence
-from functools import partial
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.naming import listed
-from webots_mcp.plotting.canvas import Picture, Sheet, draw, media_type
+from webots_mcp.plotting.canvas import Picture, Sheet
 from webots_mcp.plotting.intervals import Lane, lane_of, merged_notes
 from webots_mcp.plotting.parts import (
     Known,
@@ -61,9 +60,9 @@ def plot_trajectory(
     """
     sheet = sheet or Sheet()
     plot, notes = compose_trajectory(connection, ranges, position, bands=bands, events=events)
-    data, font_notes = draw(sheet, partial(paint_trajectory, plot=plot))
+    canvas, _ = paint_trajectory(plot, sheet.width_px, sheet.height_px)
     caption = "; ".join([f"{plot.title}: {plot.y_label} over {plot.x_label}", *_cut(plot.tracks)])
-    return Picture(data, media_type(sheet), caption, (*notes, *font_notes))
+    return canvas.picture(sheet.image_format, caption, notes)
 
 
 def compose_trajectory(

@@ -21,7 +21,7 @@ from statistics import fmean
 from typing import Any, Final
 
 import anyio
-import matplotlib
+import resvg_py
 from PIL import Image
 
 from webots_mcp.cli import main as webots_mcp
@@ -163,7 +163,7 @@ def main() -> int:
             with started_browser() as browser:
                 photograph_report(browser, data_dir, IMAGES)
                 photograph_page(browser, data_dir, IMAGES)
-                by = {"matplotlib": matplotlib.__version__, "chromium": browser.version}
+                by = {"resvg": resvg_py.__version__, "chromium": browser.version}
             drawn = {"by": by, "means": means(simulation)}
             DRAWN.write_text(json.dumps(drawn, indent=2) + "\n", "utf-8")
             said = conversation(data_dir)

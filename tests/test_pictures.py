@@ -7,8 +7,8 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-import matplotlib
 import pytest
+import resvg_py
 from PIL import Image, ImageChops, ImageStat
 
 from docs import pictures
@@ -41,8 +41,8 @@ def test_what_was_drawn_is_what_the_demo_records(simulation: RecordedSimulation)
 
 @pytest.mark.usefixtures("simulation")
 def test_the_plots_look_as_they_are_drawn_today(data_dir: Path, tmp_path: Path) -> None:
-    if matplotlib.__version__ != DRAWN["by"]["matplotlib"]:
-        pytest.skip("another version of matplotlib drew the pictures")
+    if resvg_py.__version__ != DRAWN["by"]["resvg"]:
+        pytest.skip("another version of resvg drew the pictures")
     pictures.draw_plots(data_dir, tmp_path)
     for name in pictures.PLOTS:
         assert difference(tmp_path / name, pictures.IMAGES / name) < NEAR, f"{name} {ANEW}"

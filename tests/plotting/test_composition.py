@@ -16,9 +16,8 @@ from tests.plotting.conftest import Record, whole
 from tests.recordings.rover import WALL_START_S
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.plotting.canvas import MOST_PANELS, Sheet
-from webots_mcp.plotting.curves import Curve
+from webots_mcp.plotting.curves import MOST_CURVES, Curve, by_scale, by_signal
 from webots_mcp.plotting.palette import MERGED, MOST_VALUES, OTHER_VALUES, area_styles
-from webots_mcp.plotting.panels import MOST_CURVES, by_scale, by_signal
 from webots_mcp.plotting.path import Path, Place, headings, thinned
 from webots_mcp.plotting.signal_axes import SignalAxes
 from webots_mcp.plotting.signals import compose_signals

@@ -1,7 +1,4 @@
-"""Pictures of a recording: signals over time, and the way of a robot; PNG or SVG.
-
-matplotlib is imported with the first picture, never with this package.
-"""
+"""Pictures of a recording: signals over time, and the way of a robot; PNG or SVG."""
 
 from webots_mcp.plotting.canvas import (
     HEIGHT_PX,

@@ -12,14 +12,25 @@ from typing import Final, NamedTuple
 from zlib import crc32
 
 LINES: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-DASHES: Final = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.5, 1.5, 1.5)))
+DASHES: Final = ("none", "6 2", "2 1.6", "6 2 2 2")  # in pixels
 AREAS: Final = (
     "#77AADD", "#EE8866", "#44BB99", "#EEDD88", "#FFAABB", "#AAAA00", "#99DDFF", "#BBCC33",
 )  # fmt: skip
 _FIRST_CHOICE: Final = 4  # of the areas; the others are each close to one of these
 OTHER_VALUES: Final = "others"  # the name that values share of which there are too many
-INK: Final = "#333333"
 FAINT: Final = "#767676"  # the lightest grey that is readable as text on white
+INK: Final = "#333333"  # on areas, whatever the ground of the picture is
+# Scales of colour whose lightness grows evenly, at equal distances: matplotlib's viridis and
+# cividis, which are in the public domain.
+_VIRIDIS: Final = (
+    "#440154", "#472D7B", "#3B528B", "#2C728E", "#21918C", "#28AE80", "#5EC962", "#ADDC30",
+    "#FDE725",
+)  # fmt: skip
+_CIVIDIS: Final = (
+    "#00224E", "#123570", "#3B496C", "#575D6D", "#707173", "#8A8678", "#A59C74", "#C3B369",
+    "#FEE838",
+)  # fmt: skip
+SCALES: Final = {"time": _VIRIDIS, "score": _CIVIDIS}
 
 
 class Area(NamedTuple):
@@ -47,3 +58,13 @@ def area_styles(values: Iterable[str]) -> dict[str, Area]:
         free = (style for style in styled if style not in styles.values())
         styles[value] = MERGED if value == OTHER_VALUES else next(free, MERGED)
     return styles
+
+
+def scaled(share: float, scale: str) -> str:
+    """The colour at a share, from 0 to 1, of a scale."""
+    stops = SCALES[scale]
+    place = min(max(share, 0.0), 1.0) * (len(stops) - 1)
+    index = min(int(place), len(stops) - 2)
+    low, high = (bytes.fromhex(stops[index + i][1:]) for i in (0, 1))
+    mixed = (round(a + (place - index) * (b - a)) for a, b in zip(low, high, strict=True))
+    return "#" + bytes(mixed).hex().upper()

@@ -1,4 +1,4 @@
-"""What a picture is about: the runs in its ranges, each with what was recorded in it."""
+"""What a picture is about: the runs in its ranges, what was recorded in each, and its events."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ from typing import Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plotting.canvas import short
-from webots_mcp.plotting.plotted_intervals import Interval
-from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.plotting.intervals import Interval, Lane
+from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.motion import find_motion
+from webots_mcp.store.detection.registry import drawn_kinds
+from webots_mcp.store.detection.verdict import Verdicts
 from webots_mcp.store.parameters import differing, parameters_of
+from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.questions.series import MOST_POINTS, History, RunHistory, query_history
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
@@ -221,3 +224,80 @@ def mode_signal(known: Known, wanted: str | None) -> str | None:
     if signal.is_number and not signal.is_choice:
         raise InvalidInputError(f"{wanted!r} holds numbers: a text or a flag colours a picture")
     return signal.name
+
+
+MOST_EVENTS: Final = 500
+MOST_LANES: Final = 5  # in one picture
+
+
+def event_lanes(
+    connection: sqlite3.Connection, part: Part, names: Sequence[str], rows: int = MOST_LANES
+) -> tuple[list[Lane], list[str]]:
+    """One lane per kind of event, and notes: of the drawn signals, and of the robot as a whole.
+
+    Args:
+        connection: Any.
+        part: The run.
+        names: The drawn signals.
+        rows: How many lanes have room.
+    """
+    most = min(rows, MOST_LANES)
+    drawn = tuple(kind.name for kind in drawn_kinds())
+    options = EventOptions(kinds=drawn, signals=tuple(names))
+    found = find_events(connection, part.range, options, limit=MOST_EVENTS, around=(), group=False)
+    kinds = [kind for kind in drawn if any(event.kind == kind for event in found.events)]
+    lanes = [_lane(kind, found, part) for kind in kinds[:most]]
+    notes = [note for note in found.notes if note not in part.notes]
+    notes += _not_looked_for(found.verdicts)
+    if found.left_out:
+        kind, rest = max(found.left_out.items(), key=lambda item: item[1].count)
+        notes.append(
+            f"{rest.count} events of kind {kind} up to {rest.last.start_s:.3f} s are not drawn"
+        )
+    if left_out := kinds[most:]:
+        notes.append(f"events left out: {', '.join(left_out)}")
+    return lanes, notes
+
+
+def _not_looked_for(verdicts: Verdicts) -> list[str]:
+    """Where a picture shows no number, there is none to be judged: that is no news."""
+    of_numbers = [kind.name for kind in drawn_kinds() if kind.of_numbers]
+    told = {
+        kind: reasons
+        for kind, reasons in verdicts.reasons.items()
+        if kind not in of_numbers or verdicts.unlooked(kind) is None
+    }
+    gaps = replace(verdicts, reasons=told).gaps
+    return [f"not looked for: {kinds}: {why}" for kinds, why in gaps.items()]
+
+
+def _lane(kind: str, found: Events, part: Part) -> Lane:
+    events = sorted((e for e in found.events if e.kind == kind), key=lambda event: event.start_s)
+    intervals = [_interval(event, part).moved(part.origin_s) for event in events]
+    return Lane(kind, intervals, ())
+
+
+def _interval(event: Event, part: Part) -> Interval:
+    """Named by what it is about: the signal, the action, the level, or what the bridge noticed."""
+    what = event.details.get("what") if event.kind == "bridge_event" else event.name
+    return _within(Interval(str(what or ""), event.start_s, event.end_s), part)
+
+
+def _within(interval: Interval, part: Part) -> Interval:
+    """What of an event is in the picture: it may have begun before, and gone on."""
+    start_s = max(interval.start_s, min(part.start_s, interval.end_s))
+    return Interval(interval.value, start_s, min(interval.end_s, max(part.end_s, start_s)))
+
+
+def stuck_mark(
+    connection: sqlite3.Connection, part: Part, position: tuple[str, str], deadline_s: float
+) -> tuple[Lane, list[str]]:
+    """When the robot was stuck, and where that was not looked for."""
+    options = EventOptions(kinds=("stuck",), signals=position, position=position)
+    found = find_events(
+        connection, part.range, options, limit=MOST_EVENTS, around=(), group=False,
+        deadline_s=deadline_s,
+    )  # fmt: skip
+    intervals = [_within(Interval("stuck", e.start_s, e.end_s), part) for e in found.events]
+    lane = Lane(f"stuck over {options.stuck_s:g} s", intervals, ())
+    return lane, _not_looked_for(found.verdicts)

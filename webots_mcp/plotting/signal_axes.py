@@ -5,26 +5,49 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Final
 
-from webots_mcp.plotting.canvas import BESIDE_PX, ROW_PX, paint_title, short, wrapped
-from webots_mcp.plotting.curves import Curve
-from webots_mcp.plotting.legend import Entry, paint_legend
-from webots_mcp.plotting.palette import DASHES, FAINT, INK, LINES, Area, area_styles
-from webots_mcp.plotting.panels import Panel
-from webots_mcp.plotting.plotted_intervals import Interval, Lane
+from webots_mcp.plotting.canvas import (
+    ON_PAPER,
+    ROW_PX,
+    Canvas,
+    Frame,
+    Look,
+    axis_range,
+    fitted,
+    short,
+    ticks,
+    width_of,
+    wrapped,
+)
+from webots_mcp.plotting.curves import Curve, Panel
+from webots_mcp.plotting.intervals import Interval, Lane
+from webots_mcp.plotting.legend import (
+    LINE_PX,
+    Entry,
+    area_sample,
+    hatch_sample,
+    line_sample,
+    paint_area,
+    paint_grid,
+    paint_mark,
+    paint_rows,
+    paint_title,
+    paint_x_axis,
+    paint_y_axis,
+    rows_of,
+)
+from webots_mcp.plotting.palette import DASHES, INK, LINES, Area, area_styles
+from webots_mcp.store.analysis.arrays import np
 
-_LETTER_PX: Final = 6
-_GAP: Final[dict[str, Any]] = {"facecolor": "none", "edgecolor": "#AAAAAA", "hatch": "////"}
-_UNREAD: Final[dict[str, Any]] = {
-    "facecolor": "none",
-    "edgecolor": LINES[1],
-    "hatch": "xx",
-    "alpha": 0.5,
-}
-_DOT_HATCH: Final = "..."
-_FLAGS: Final = {"true": Area(INK, dotted=False), "false": Area("#F0F0F0", dotted=False)}
-_BAND_ALPHA: Final = 0.35
+_SMALL_PX: Final = 9.5  # of the letters in rows of intervals
+_TICK_PX: Final = 70.0  # between the labels of the time axis, and
+_LEVEL_PX: Final = 20.0  # between those of the others, at least
+_RIGHT_PX: Final = 16.0
+_BELOW_PX: Final = 24.0  # the labels of the time axis
+_FLAGS: Final = {"true": Area(INK, dotted=False), "false": Area("#EDEDED", dotted=False)}
+_BAND_OPACITY: Final = 0.35
 _LINES_THROUGH: Final = 30  # more instants would be a curtain
 
 
@@ -52,190 +75,276 @@ class SignalAxes:
     gaps: Sequence[Interval]
     unread: Sequence[Interval] = ()
 
-
-def paint_signals(figure: Any, plot: SignalAxes) -> None:
-    """Paint it on an empty figure."""
-    width_px = figure.get_figwidth() * figure.dpi
-    paint_title(figure, plot.title)
-    rows = len(plot.lanes) + len(plot.events)
-    heights = _heights(figure, len(plot.panels), rows)
-    axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
-    axes[-1].set_xlim(*plot.x_range)
-    panels = axes[: len(plot.panels)]
-    for each, panel in zip(panels, plot.panels, strict=True):
-        _paint_panel(each, panel, plot)
-    if rows:
-        _paint_lanes(axes[-1], plot)
-    axes[-1].set_xlabel(wrapped(plot.x_label, width_px - 60))
-    figure.align_ylabels(panels)
-    paint_legend(figure, _entries(axes[-1], plot))
+    @property
+    def rows(self) -> Sequence[Lane]:
+        """All that stands in rows below the curves."""
+        return [*self.lanes, *self.events]
 
 
-def _heights(figure: Any, panels: int, rows: int) -> list[float]:
-    """Rows of intervals take the pixels that they need, the panels share the rest."""
-    height_px = figure.get_figheight() * figure.dpi - 110
-    rows_px = min(rows * ROW_PX, height_px / 2) if panels else height_px
-    panel_px = (height_px - rows_px) / max(panels, 1)
-    return [*[panel_px] * panels, *([rows_px] if rows else [])]
+def paint_signals(
+    plot: SignalAxes, width_px: int, height_px: int, look: Look = ON_PAPER, *, titled: bool = True
+) -> tuple[Canvas, list[Frame]]:
+    """Paint it; the frames are those of the panels, and of the rows below them as the last."""
+    return _Painter(plot, width_px, height_px, look).paint(titled=titled)
 
 
-def _paint_panel(axes: Any, panel: Panel, plot: SignalAxes) -> None:
-    _shade(axes, plot)
-    for event in [interval for lane in plot.events for interval in lane.intervals][:_LINES_THROUGH]:
-        axes.axvline(event.start_s, color=FAINT, linewidth=0.6, linestyle=(0, (1, 3)), zorder=1.5)
-    handles = [
-        _paint_curve(axes, curve, *_pen(panel, index, plot), len(panel.curves))
-        for index, curve in enumerate(panel.curves)
-    ]
-    unit = f"[{panel.unit}]" if panel.unit else ""
-    axes.grid(axis="y", color="#E3E3E3", linewidth=0.6)
-    axes.margins(y=0.08)
-    if len(panel.names) == 1:
-        axes.set_title(f"{short(panel.names[0])} {unit}".strip(), loc="left", pad=3)
-        return
-    axes.set_ylabel(unit)
-    labels = [short(curve.name) for curve in panel.curves]
-    axes.legend(handles, labels, loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2)
+class _Painter:
+    """Paints what shares a clock and the margins."""
+
+    def __init__(self, plot: SignalAxes, width_px: int, height_px: int, look: Look) -> None:
+        self._plot = plot
+        self._canvas = Canvas(width_px, height_px, look)
+        behind = plot.bands.values if plot.bands else ()
+        values = [value for lane in plot.lanes for value in lane.values]
+        # The same value has the same style in every row, and behind the panels.
+        self._styles = area_styles([v for v in (*behind, *values) if v not in _FLAGS]) | _FLAGS
+
+    def paint(self, *, titled: bool) -> tuple[Canvas, list[Frame]]:
+        plot, canvas = self._plot, self._canvas
+        top = paint_title(canvas, plot.title) if titled else 6.0
+        heads = [
+            rows_of(self._head(panel), canvas.width_px - 60, 4 * canvas.height_px)
+            for panel in plot.panels
+        ]
+        label = wrapped(plot.x_label, canvas.width_px - 70)
+        scales = [
+            axis_range(min(c.low for c in panel.curves), max(c.high for c in panel.curves))
+            for panel in plot.panels
+        ]
+        left = self._left_px(scales)
+        legend = rows_of(self._entries(left), canvas.width_px - 20, canvas.height_px)
+        below = _BELOW_PX + LINE_PX * (len(label) + len(legend)) + 4
+        heads_px = sum(LINE_PX * len(rows) + 8 for rows in heads)
+        room = max(20.0, canvas.height_px - top - below - heads_px)
+        rows_px = self._rows_px(room)
+        panel_px = (room - rows_px) / max(1, len(plot.panels))
+        frames: list[Frame] = []
+        width = canvas.width_px - left - _RIGHT_PX
+        for panel, rows, scale in zip(plot.panels, heads, scales, strict=True):
+            paint_rows(canvas, rows, top, left)
+            top += LINE_PX * len(rows) + 2
+            frames.append(Frame(left, top, width, panel_px - 2, plot.x_range, scale))
+            self._panel(panel, frames[-1])
+            top += panel_px + 6
+        if plot.rows:
+            frames.append(Frame(left, top, width, rows_px, plot.x_range, (len(plot.rows), 0.0)))
+            self._rows(frames[-1])
+        marks = self._time_marks(frames[-1])
+        for frame in frames[:-1]:
+            paint_x_axis(canvas, frame, [(value, "") for value, _ in marks])
+        paint_x_axis(canvas, frames[-1], marks, label)
+        paint_rows(canvas, legend, canvas.height_px - LINE_PX * len(legend) - 2)
+        return canvas, frames
+
+    def _left_px(self, scales: Sequence[tuple[float, float]]) -> float:
+        """What labels at the left take; of a long name of a row the end is shown."""
+        most = 0.3 * self._canvas.width_px
+        named = [width_of(short(lane.name)) for lane in self._plot.rows]
+        labels = [width_of(text) for scale in scales for _, text in ticks(*scale, 5)]
+        return 12 + min(most, max([24.0, *named, *labels]))
+
+    def _rows_px(self, room: float) -> float:
+        """Rows take the pixels that they need, the panels share the rest."""
+        if not self._plot.panels:
+            return room
+        return min(len(self._plot.rows) * float(ROW_PX), room / 2)
+
+    def _time_marks(self, frame: Frame) -> list[tuple[float, str]]:
+        low, high = self._plot.x_range
+        room = max(_TICK_PX, 1.6 * max(width_of(text) for _, text in ticks(low, high, 8)))
+        return ticks(low, high, frame.width / room)
+
+    # Panels ---------------------------------------------------------------------------------------
+
+    def _head(self, panel: Panel) -> list[Entry]:
+        """What stands above a panel: the name of its signal, or each with a sample of its line."""
+        unit = [f"[{panel.unit}]"] if panel.unit else []
+        room = self._canvas.width_px - 90
+        if len(panel.names) == 1:
+            return [Entry(fitted(" ".join([panel.names[0], *unit]), room))]
+        entries = [
+            Entry(short(curve.name), line_sample(*self._pen(panel, index)), curve.name)
+            for index, curve in enumerate(panel.curves)
+        ]
+        return [*entries, *map(Entry, unit)]
+
+    def _pen(self, panel: Panel, index: int) -> tuple[str, str]:
+        """Colour and dashes: by run where several are overlaid, else by signal."""
+        runs = list(self._plot.colour_by_run)
+        index = runs.index(panel.curves[index].run_id) if runs else index
+        colour = LINES[index % len(LINES)]
+        return (self._canvas.look.ink if colour == "#000000" else colour), DASHES[index % 4]
+
+    def _panel(self, panel: Panel, frame: Frame) -> None:
+        canvas = self._canvas
+        levels = ticks(*frame.y, max(2.0, frame.height / _LEVEL_PX))
+        self._open(frame)
+        self._ground(frame)
+        paint_grid(canvas, frame, (), levels)
+        for event in [each for lane in self._plot.events for each in lane.intervals][
+            :_LINES_THROUGH
+        ]:
+            x = float(frame.px(event.start_s))
+            pen = {"stroke": canvas.look.faint, "stroke_width": 0.6, "stroke_dasharray": "1 3"}
+            canvas.add("path", d=f"M{x:.1f} {frame.top:.1f}V{frame.bottom:.1f}", **pen)
+        for index, curve in enumerate(panel.curves):
+            self._curve(frame, curve, *self._pen(panel, index), len(panel.curves))
+        self._close()
+        paint_y_axis(canvas, frame, levels)
+
+    def _open(self, frame: Frame) -> None:
+        """Begin what is cut off at the frame, and scaled in a page that is zoomed."""
+        box = {"x": frame.left, "y": frame.top, "width": frame.width, "height": frame.height}
+        view = f"{frame.left:.2f} {frame.top:.2f} {frame.width:.2f} {frame.height:.2f}"
+        self._canvas.open("svg", **box, viewBox=view, preserveAspectRatio="none")
+        self._canvas.open(class_="zoom")
+
+    def _close(self) -> None:
+        self._canvas.close()
+        self._canvas.close("svg")
+
+    def _curve(self, frame: Frame, curve: Curve, colour: str, dash: str, count: int) -> None:
+        canvas = self._canvas
+        canvas.open(data_curve=curve.name, data_run=curve.run_id)
+        rows: Any = np.array(curve.points, np.float64)
+        x = frame.px(rows[:, 0])
+        mean, low, high = (frame.py(rows[:, column]) for column in (1, 2, 3))
+        edges = [-1, *np.flatnonzero(np.isnan(rows[:, 0])).tolist(), len(rows)]
+        pieces = [
+            slice(start + 1, end) for start, end in pairwise(edges)
+            if end > start + 1
+        ]  # fmt: skip
+        bands = "".join(
+            f"{line_through(x[piece], high[piece])}L"
+            f"{line_through(x[piece][::-1], low[piece][::-1])[1:]}Z"
+            for piece in pieces
+            if (np.abs(high[piece] - low[piece]) > 0.2).any()
+        )
+        if bands:
+            canvas.add("path", d=bands, fill=colour, fill_opacity=0.28 / math.sqrt(count))
+        line = "".join(line_through(x[piece], mean[piece]) for piece in pieces)
+        canvas.add("path", d=line, fill="none", stroke=colour, stroke_width=1.4,
+                   stroke_linejoin="round", stroke_dasharray=dash)  # fmt: skip
+        for piece in pieces:
+            if piece.stop - piece.start == 1:  # a line would not show it
+                at = piece.start
+                canvas.add("path", d=f"M{x[at]:.1f} {low[at]:.1f}V{high[at]:.1f}",
+                           stroke=colour, stroke_width=2, stroke_opacity=0.4)  # fmt: skip
+                canvas.add("path", d=f"M{x[at]:.1f} {mean[at]:.1f}h.01", stroke=colour,
+                           stroke_width=4, stroke_linecap="round")  # fmt: skip
+        canvas.close()
+
+    def _ground(self, frame: Frame) -> None:
+        """Modes and gaps, over the whole height behind the curves."""
+        bands = self._plot.bands
+        for each in bands.intervals if bands else ():
+            box = (*self._stretch(frame, each), frame.height)
+            paint_area(self._canvas, self._styles[each.value], box, _BAND_OPACITY)
+        self._hatch(frame)
+
+    def _hatch(self, frame: Frame) -> None:
+        """Where nothing was recorded, or read, whatever stands there in the last row's name."""
+        canvas = self._canvas
+        for stretches, name in ((self._plot.gaps, "gap"), (self._plot.unread, "unread")):
+            for each in stretches:
+                left, top, width = self._stretch(frame, each)
+                for fill in (canvas.look.ground, f"url(#hatch-{name})"):
+                    canvas.add("rect", x=left, y=top, width=width, height=frame.height, fill=fill)
+
+    def _stretch(self, frame: Frame, interval: Interval) -> tuple[float, float, float]:
+        """Left, top and width."""
+        left, right = float(frame.px(interval.start_s)), float(frame.px(interval.end_s))
+        return left, frame.top, right - left
+
+    # Rows -----------------------------------------------------------------------------------------
+
+    def _rows(self, frame: Frame) -> None:
+        canvas, plot = self._canvas, self._plot
+        row_px = frame.height / len(plot.rows)
+        self._open(frame)
+        for row, lane in enumerate(plot.rows):
+            top = frame.top + (row + 0.1) * row_px
+            for each in lane.intervals:
+                left, _, width = self._stretch(frame, each)
+                box = (left, top, width, 0.8 * row_px)
+                if row < len(plot.lanes):
+                    paint_area(canvas, self._styles[each.value], box)
+                else:
+                    paint_area(canvas, Area(LINES[1], dotted=False), box, 0.3)
+        self._hatch(frame)
+        self._close()
+        for row, lane in enumerate(plot.rows):
+            middle = frame.top + (row + 0.5) * row_px
+            name = fitted(short(lane.name), frame.left - 10)
+            canvas.text(frame.left - 7, middle + 4, name, anchor="end")
+            canvas.open(class_="marks")
+            if row < len(plot.lanes):
+                self._name_states(frame, middle, lane)
+            else:
+                self._mark_events(frame, middle, lane)
+            canvas.close()
+
+    def _name_states(self, frame: Frame, middle: float, lane: Lane) -> None:
+        for each in lane.intervals:
+            if _has_room(frame, each):
+                ink = "#FFFFFF" if self._styles[each.value].colour == INK else INK
+                x = float(frame.px((each.start_s + each.end_s) / 2))
+                self._name(short(each.value), x, middle, colour=ink, anchor="middle")
+
+    def _mark_events(self, frame: Frame, middle: float, lane: Lane) -> None:
+        """A mark at the start of each, its name where there is room."""
+        ends = [*(each.start_s for each in lane.intervals[1:]), frame.x[1]]
+        for each, end_s in zip(lane.intervals, ends, strict=True):
+            x = float(frame.px(each.start_s))
+            paint_mark(self._canvas, "diamond", (x, middle), 4.0, fill=LINES[1])
+            if _has_room(frame, Interval(each.value, each.start_s, end_s)):
+                self._name(short(each.value), x, middle, shift=7.0)
+
+    def _name(self, text: str, x: float, y: float, *, shift: float = 0.0, **style: Any) -> None:
+        canvas = self._canvas
+        canvas.open(class_="at", data_x=x, data_y=y, transform=f"translate({x:.1f} {y:.1f})")
+        canvas.text(shift, 3.5, text, size=_SMALL_PX, **style)
+        canvas.close()
+
+    # Legend ---------------------------------------------------------------------------------------
+
+    def _entries(self, left: float) -> list[Entry]:
+        """What the legend below the axes has to tell."""
+        plot = self._plot
+        entries: list[Entry] = []
+        for index, name in enumerate(plot.colour_by_run.values()):
+            sample = line_sample(LINES[index % len(LINES)], DASHES[index % len(DASHES)])
+            entries.append(Entry(fitted(name, self._canvas.width_px - 80), sample))
+        if plot.gaps:
+            entries.append(Entry("nothing recorded", hatch_sample("hatch-gap")))
+        if plot.unread:
+            entries.append(Entry("not all was read", hatch_sample("hatch-unread")))
+        if plot.bands is not None and plot.panels:
+            entries.append(Entry(f"{short(plot.bands.name)}:"))
+            entries += [
+                Entry(short(value), area_sample(self._styles[value], _BAND_OPACITY))
+                for value in plot.bands.values
+            ]
+        width = self._canvas.width_px - left - _RIGHT_PX
+        frame = Frame(left, 0, width, 1, plot.x_range, (0, 1))
+        return entries + [
+            Entry(short(value), area_sample(self._styles[value]))
+            for value in _unnamed(plot.lanes, frame)
+        ]
 
 
-def _pen(panel: Panel, index: int, plot: SignalAxes) -> tuple[str, Any]:
-    """Colour and dashes: by run where several are overlaid, else by signal."""
-    runs = list(plot.colour_by_run)
-    if runs:
-        index = runs.index(panel.curves[index].run_id)
-    return LINES[index % len(LINES)], DASHES[index % len(DASHES)]
+def line_through(x: Any, y: Any) -> str:
+    """The path through places in pixels."""
+    return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
 
 
-def _paint_curve(axes: Any, curve: Curve, colour: str, dashes: Any, neighbours: int) -> Any:
-    """The band is the fainter the more of them lie on top of each other."""
-    times, means, lows, highs = zip(*curve.points, strict=True)
-    alpha = 0.28 / math.sqrt(neighbours)
-    axes.fill_between(times, lows, highs, color=colour, alpha=alpha, linewidth=0, zorder=2)
-    for time, mean, low, high in curve.lone_points:
-        axes.plot([time, time], [low, high], color=colour, alpha=0.4, linewidth=2, zorder=2)
-        axes.plot([time], [mean], color=colour, marker=".", markersize=4, zorder=3)
-    (line,) = axes.plot(times, means, color=colour, linestyle=dashes, linewidth=1.3, zorder=3)
-    return line
+def _has_room(frame: Frame, interval: Interval) -> bool:
+    width = frame.width * (interval.end_s - interval.start_s) / (frame.x[1] - frame.x[0])
+    return width > 10 + width_of(short(interval.value), _SMALL_PX)
 
 
-def _shade(axes: Any, plot: SignalAxes) -> None:
-    """Modes and gaps, over the whole height behind the curves."""
-    if plot.bands is not None:
-        styles = _lane_styles(plot)
-        for value in plot.bands.values:
-            intervals = [interval for interval in plot.bands.intervals if interval.value == value]
-            _bars(axes, intervals, **_fill(styles[value]), alpha=_BAND_ALPHA, zorder=0.5)
-    _hatch(axes, plot, zorder=0.6)
-
-
-def _hatch(axes: Any, plot: SignalAxes, zorder: float) -> None:
-    """Whatever stands there in the last row's name, nothing was recorded, or read."""
-    for stretches, style in ((plot.gaps, _GAP), (plot.unread, _UNREAD)):
-        _bars(axes, stretches, color="white", zorder=zorder)
-        _bars(axes, stretches, **style, zorder=zorder)
-
-
-def _bars(axes: Any, intervals: Sequence[Interval], **style: Any) -> None:
-    """Over the whole height of the axes."""
-    if intervals:
-        whole = {"transform": axes.get_xaxis_transform(), "linewidth": 0}
-        axes.broken_barh(_lengths(intervals), (0, 1), **(whole | style))
-
-
-def _lengths(intervals: Sequence[Interval]) -> list[tuple[float, float]]:
-    return [(interval.start_s, interval.end_s - interval.start_s) for interval in intervals]
-
-
-def _paint_lanes(axes: Any, plot: SignalAxes) -> None:
-    lanes = [*plot.lanes, *plot.events]
-    styles = _lane_styles(plot)
-    for row, lane in enumerate(lanes):
-        if row < len(plot.lanes):
-            _paint_states(axes, row, lane, styles)
-        else:
-            _paint_events(axes, row, lane)
-    _hatch(axes, plot, zorder=2)
-    axes.set_ylim(len(lanes), 0)
-    axes.set_yticks([row + 0.5 for row in range(len(lanes))], [short(lane.name) for lane in lanes])
-    axes.tick_params(axis="y", length=0)
-    axes.grid(visible=False)
-    for edge in ("left", "top"):
-        axes.spines[edge].set_visible(False)
-
-
-def _lane_styles(plot: SignalAxes) -> dict[str, Area]:
-    """The same value has the same style in every lane, and behind the panels."""
-    behind = plot.bands.values if plot.bands else ()
-    values = [value for lane in plot.lanes for value in lane.values]
-    return area_styles([v for v in (*behind, *values) if v not in _FLAGS]) | _FLAGS
-
-
-def _fill(style: Area) -> dict[str, Any]:
-    hatch = _DOT_HATCH if style.dotted else None
-    return {"facecolor": style.colour, "edgecolor": INK, "hatch": hatch, "linewidth": 0}
-
-
-def _paint_states(axes: Any, row: int, lane: Lane, styles: Mapping[str, Area]) -> None:
-    for value in lane.values:
-        intervals = [interval for interval in lane.intervals if interval.value == value]
-        axes.broken_barh(_lengths(intervals), (row + 0.1, 0.8), **_fill(styles[value]))
-    for interval in lane.intervals:
-        if _has_room(axes, interval):
-            ink = "white" if styles[interval.value].colour == INK else INK
-            middle = (interval.start_s + interval.end_s) / 2
-            centred = {"ha": "center", "va": "center", "fontsize": 7, "clip_on": True}
-            axes.text(middle, row + 0.52, short(interval.value), color=ink, **centred)
-
-
-def _has_room(axes: Any, interval: Interval) -> bool:
-    start_s, end_s = axes.get_xlim()
-    share = (interval.end_s - interval.start_s) / (end_s - start_s)
-    axis_px = axes.figure.get_figwidth() * axes.figure.dpi - BESIDE_PX
-    return share * axis_px > 8 + _LETTER_PX * len(short(interval.value))
-
-
-def _paint_events(axes: Any, row: int, lane: Lane) -> None:
-    """A mark at the start of each, a bar for what lasted, its name where there is room."""
-    bar = {"color": LINES[1], "alpha": 0.3, "linewidth": 0}
-    axes.broken_barh(_lengths(lane.intervals), (row + 0.1, 0.8), **bar)
-    starts = [interval.start_s for interval in lane.intervals]
-    style = {"linestyle": "", "marker": "d", "markersize": 5, "color": LINES[1]}
-    axes.plot(starts, [row + 0.5] * len(starts), clip_on=False, zorder=4, **style)
-    ends = [*starts[1:], axes.get_xlim()[1]]
-    for interval, end_s in zip(lane.intervals, ends, strict=True):
-        if _has_room(axes, Interval(interval.value, interval.start_s, end_s)):
-            axes.annotate(
-                short(interval.value), (interval.start_s, row + 0.52), (5, 0), va="center",
-                textcoords="offset points", fontsize=7, zorder=5,
-            )  # fmt: skip
-
-
-def _entries(axes: Any, plot: SignalAxes) -> list[Entry]:
-    """What the legend has to tell."""
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
-    entries: list[Entry] = []
-    for index, name in enumerate(plot.colour_by_run.values()):
-        pen: dict[str, Any] = {"color": LINES[index % len(LINES)], "linewidth": 1.5}
-        entries.append((Line2D([], [], linestyle=DASHES[index % len(DASHES)], **pen), name))
-    if plot.gaps:
-        darker: dict[str, Any] = _GAP | {"edgecolor": "#999999"}
-        entries.append((Patch(**darker, linewidth=0), "nothing recorded"))
-    if plot.unread:
-        entries.append((Patch(**_UNREAD, linewidth=0), "not all was read"))
-    styles = _lane_styles(plot)
-    if plot.bands is not None and plot.panels:
-        entries.append((Patch(visible=False), f"{short(plot.bands.name)}:"))
-        patches = [Patch(**_fill(styles[v]), alpha=_BAND_ALPHA) for v in plot.bands.values]
-        entries += zip(patches, map(short, plot.bands.values), strict=True)
-    entries += [(Patch(**_fill(styles[v])), short(v)) for v in _unlabelled(axes, plot)]
-    return entries
-
-
-def _unlabelled(axes: Any, plot: SignalAxes) -> list[str]:
+def _unnamed(lanes: Sequence[Lane], frame: Frame) -> list[str]:
     """Values in the rows below that no interval had room for."""
-    intervals = [interval for lane in plot.lanes for interval in lane.intervals]
-    labelled = {interval.value for interval in intervals if _has_room(axes, interval)}
-    values = dict.fromkeys(interval.value for interval in intervals)
-    return [value for value in values if value not in labelled]
+    intervals = [interval for lane in lanes for interval in lane.intervals]
+    named = {interval.value for interval in intervals if _has_room(frame, interval)}
+    return [v for v in dict.fromkeys(each.value for each in intervals) if v not in named]

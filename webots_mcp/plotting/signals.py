@@ -5,16 +5,15 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.naming import listed
-from webots_mcp.plotting.canvas import LEAST_HEIGHT_PX, Picture, Room, Sheet, draw, media_type
-from webots_mcp.plotting.curves import Curve, curve_of
-from webots_mcp.plotting.event_lanes import event_lanes
-from webots_mcp.plotting.panels import by_scale, by_signal
+from webots_mcp.plotting.canvas import LEAST_HEIGHT_PX, Picture, Room, Sheet
+from webots_mcp.plotting.curves import Curve, by_scale, by_signal, curve_of
+from webots_mcp.plotting.intervals import Interval, Lane, lane_of, merged_notes
 from webots_mcp.plotting.parts import (
     Part,
+    event_lanes,
     known_signals,
     mode_signal,
     parts_of,
@@ -22,7 +21,6 @@ from webots_mcp.plotting.parts import (
     title_of,
     unread_parts,
 )
-from webots_mcp.plotting.plotted_intervals import Interval, Lane, lane_of, merged_notes
 from webots_mcp.plotting.signal_axes import SignalAxes, paint_signals
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
 from webots_mcp.store.reading.ranges import TimeRange
@@ -63,8 +61,8 @@ def plot_signals(
     if not plot.panels:
         rows = len(plot.lanes) + len(plot.events)
         sheet = replace(sheet, height_px=_height_of_rows(rows, sheet))
-    data, font_notes = draw(sheet, partial(paint_signals, plot=plot))
-    return Picture(data, media_type(sheet), _caption(plot), (*notes, *font_notes))
+    canvas, _ = paint_signals(plot, sheet.width_px, sheet.height_px)
+    return canvas.picture(sheet.image_format, _caption(plot), notes)
 
 
 def compose_signals(

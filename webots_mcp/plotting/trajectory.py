@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Sequence
-from functools import partial
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.naming import listed
-from webots_mcp.plotting.canvas import Picture, Sheet, draw, media_type
-from webots_mcp.plotting.event_lanes import stuck_mark
+from webots_mcp.plotting.canvas import Picture, Sheet
+from webots_mcp.plotting.intervals import Lane, lane_of, merged_notes
 from webots_mcp.plotting.parts import (
     Known,
     Part,
@@ -18,10 +17,10 @@ from webots_mcp.plotting.parts import (
     mode_signal,
     parts_of,
     range_notes,
+    stuck_mark,
     title_of,
 )
 from webots_mcp.plotting.path import read_path
-from webots_mcp.plotting.plotted_intervals import Lane, lane_of, merged_notes
 from webots_mcp.plotting.trajectory_axes import Track, TrajectoryAxes, paint_trajectory
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import motion_in
@@ -61,9 +60,9 @@ def plot_trajectory(
     """
     sheet = sheet or Sheet()
     plot, notes = compose_trajectory(connection, ranges, position, bands=bands, events=events)
-    data, font_notes = draw(sheet, partial(paint_trajectory, plot=plot))
+    canvas, _ = paint_trajectory(plot, sheet.width_px, sheet.height_px)
     caption = "; ".join([f"{plot.title}: {plot.y_label} over {plot.x_label}", *_cut(plot.tracks)])
-    return Picture(data, media_type(sheet), caption, (*notes, *font_notes))
+    return canvas.picture(sheet.image_format, caption, notes)
 
 
 def compose_trajectory(

@@ -2,19 +2,47 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from webots_mcp.plotting.canvas import paint_title, short
-from webots_mcp.plotting.legend import Entry, paint_legend
-from webots_mcp.plotting.palette import INK, LINES
+from webots_mcp.plotting.canvas import (
+    Canvas,
+    Frame,
+    axis_range,
+    fitted,
+    short,
+    ticks,
+    width_of,
+)
+from webots_mcp.plotting.legend import (
+    LINE_PX,
+    SCALE_PX,
+    Entry,
+    line_sample,
+    mark_sample,
+    paint_grid,
+    paint_mark,
+    paint_rows,
+    paint_scale,
+    paint_title,
+    paint_x_axis,
+    paint_y_axis,
+    paint_y_label,
+    rows_of,
+)
+from webots_mcp.plotting.palette import INK, LINES, scaled
+from webots_mcp.plotting.signal_axes import line_through
+from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.analysis.ranking import Ranked
 
 _MOST_TOLD_CELLS: Final = 60  # more texts in a grid would not fit
-_AT_THE_BOTTOM: Final = 0.03  # of the height of the axes
 _DARK: Final = 0.5  # of the colour scale: on darker cells texts are white
+_BELOW_PX: Final = 42.0
+_RING: Final[dict[str, Any]] = {"fill": "none", "stroke": LINES[1], "stroke_width": 2.4}
+_DOT: Final[dict[str, Any]] = {"fill": INK}
+_MEAN: Final[dict[str, Any]] = {"fill": LINES[0]}
+_FAILED: Final[dict[str, Any]] = {"fill": LINES[1]}
 
 
 @dataclass(frozen=True)
@@ -34,122 +62,125 @@ class TrialAxes:
     best: dict[str, Any] | None
 
 
-def paint_trials(figure: Any, plot: TrialAxes) -> None:
-    """Paint it on an empty figure."""
-    paint_title(figure, f"{plot.title}: {plot.score}")
-    axes = figure.subplots()
-    axes.set_xlabel(short(plot.names[0]))
-    (_paint_scores if len(plot.names) == 1 else _paint_grid)(figure, axes, plot)
+def paint_trials(plot: TrialAxes, width_px: int, height_px: int) -> Canvas:
+    """Paint it."""
+    canvas = Canvas(width_px, height_px)
+    top = paint_title(canvas, f"{plot.title}: {plot.score}")
+    (_paint_scores if len(plot.names) == 1 else _paint_grid)(canvas, plot, top)
+    return canvas
 
 
-def _paint_scores(figure: Any, axes: Any, plot: TrialAxes) -> None:
+def _paint_scores(canvas: Canvas, plot: TrialAxes, top: float) -> None:
     """Over one parameter: each score, and the mean of each value with its range."""
     (name,) = plot.names
-    axes.set_ylabel("score")
-    axes.grid(color="#E9E9E9", linewidth=0.6)
-    places = _places(axes.xaxis, [each.parameters[name] for each in plot.sets])
-    told = [(places[repr(each.parameters[name])], each) for each in plot.sets]
-    scored = sorted((pair for pair in told if pair[1].score is not None), key=lambda pair: pair[0])
-    entries = [_paint_means(axes, scored), _paint_each(axes, scored)]
-    if plot.best is not None:
-        entries.append(_paint_best(axes, places[repr(plot.best[name])], plot))
+    places, named = _places([each.parameters[name] for each in plot.sets])
+    told = sorted(((places[repr(each.parameters[name])], each) for each in plot.sets),
+                  key=lambda pair: pair[0])  # fmt: skip
+    scored = [(place, each, each.score) for place, each in told if each.score is not None]
     failed = [place for place, each in told if each.failures]
-    if failed:
-        entries.append(_paint_failed(axes, failed))
-    paint_legend(figure, entries)
+    entries = [
+        Entry("mean, and least to greatest", _mean_sample),
+        Entry("one trial", mark_sample("circle", 2.2, **_DOT)),
+    ]
+    entries += [Entry("best", mark_sample("circle", 8.0, **_RING))] if plot.best else []
+    entries += [Entry("with failures", mark_sample("cross", 5.0, **_FAILED))] if failed else []
+    legend = rows_of(entries, canvas.width_px - 20, canvas.height_px)
+    y = axis_range(min(s.low for *_, s in scored), max(s.high for *_, s in scored))
+    x = axis_range(min(places.values()), max(places.values()), 0.05)
+    left = 34 + max(width_of(text) for _, text in ticks(*y, 8))
+    height = max(20.0, canvas.height_px - top - _BELOW_PX - LINE_PX * len(legend))
+    frame = Frame(left, top, canvas.width_px - left - 16, height, x, y)
+    marks = named or ticks(*x, frame.width / 80), ticks(*y, height / 40)
+    paint_grid(canvas, frame, *marks)
+    for place, _, score in scored:
+        at, low, high = float(frame.px(place)), float(frame.py(score.low)), frame.py(score.high)
+        canvas.add("path", d=f"M{at:.1f} {low:.1f}V{high:.1f}", stroke=LINES[0], stroke_width=5,
+                   stroke_opacity=0.3)  # fmt: skip
+    means = np.array([(frame.px(place), frame.py(score.mean)) for place, _, score in scored])
+    line = line_through(means[:, 0], means[:, 1])
+    canvas.add("path", d=line, fill="none", stroke=LINES[0], stroke_width=1.6)
+    for place, each, score in scored:
+        at = float(frame.px(place))
+        paint_mark(canvas, "circle", (at, float(frame.py(score.mean))), 4.0, **_MEAN)
+        for value in each.scores:
+            paint_mark(canvas, "circle", (at, float(frame.py(value))), 2.2, **_DOT)
+        if each.parameters == plot.best:
+            paint_mark(canvas, "circle", (at, float(frame.py(score.mean))), 9.0, **_RING)
+    for place in failed:
+        paint_mark(canvas, "cross", (float(frame.px(place)), frame.bottom - 9), 5.0, **_FAILED)
+    paint_x_axis(canvas, frame, marks[0], [fitted(name, frame.width)])
+    paint_y_axis(canvas, frame, marks[1])
+    paint_y_label(canvas, frame, "score")
+    paint_rows(canvas, legend, canvas.height_px - LINE_PX * len(legend) - 2)
 
 
-def _paint_means(axes: Any, scored: Sequence[tuple[float, Ranked]]) -> Entry:
-    spreads = [(place, each.score) for place, each in scored if each.score is not None]
-    places = [place for place, _ in spreads]
-    low, high = [each.low for _, each in spreads], [each.high for _, each in spreads]
-    axes.vlines(places, low, high, color=LINES[0], linewidth=4, alpha=0.3)
-    means = [each.mean for _, each in spreads]
-    (line,) = axes.plot(places, means, color=LINES[0], marker="o", markersize=6)
-    return line, "mean, and least to greatest"
+def _mean_sample(canvas: Canvas, x: float, y: float) -> None:
+    line_sample(LINES[0])(canvas, x, y)
+    paint_mark(canvas, "circle", (x, y), 4.0, **_MEAN)
 
 
-def _paint_each(axes: Any, scored: Sequence[tuple[float, Ranked]]) -> Entry:
-    points = [(place, score) for place, each in scored for score in each.scores]
-    (dots,) = axes.plot(
-        *zip(*points, strict=True), color=INK, marker=".", linestyle="", markersize=5
-    )
-    return dots, "one trial"
-
-
-def _paint_best(axes: Any, place: float, plot: TrialAxes) -> Entry:
-    (best,) = (each for each in plot.sets if each.parameters == plot.best)
-    assert best.score is not None
-    (ring,) = axes.plot(
-        [place], [best.score.mean], color=LINES[1], marker="o", linestyle="", markersize=14,
-        markerfacecolor="none", markeredgewidth=2,
-    )  # fmt: skip
-    return ring, "best"
-
-
-def _paint_failed(axes: Any, places: Sequence[float]) -> Entry:
-    (crosses,) = axes.plot(
-        places, [_AT_THE_BOTTOM] * len(places), color=LINES[1], marker="x", linestyle="",
-        transform=axes.get_xaxis_transform(), clip_on=False,
-    )  # fmt: skip
-    return crosses, "with failures"
-
-
-def _paint_grid(figure: Any, axes: Any, plot: TrialAxes) -> None:
+def _paint_grid(canvas: Canvas, plot: TrialAxes, top: float) -> None:
     """Over two parameters: a cell for each pair of values, coloured by its mean."""
     first, second = plot.names
-    axes.set_ylabel(short(second))
     x = _ordered([each.parameters[first] for each in plot.sets])
     y = _ordered([each.parameters[second] for each in plot.sets])
-    means = [[math.nan] * len(x) for _ in y]
+    means = [each.score.mean for each in plot.sets if each.score is not None]
+    bounds = (min(means), max(means))
+    bounds = bounds if bounds[0] < bounds[1] else axis_range(*bounds)
+    left = 34 + min(0.3 * canvas.width_px, max(24.0, *(width_of(_text(value)) for value in y)))
+    width = canvas.width_px - left - SCALE_PX
+    height = max(20.0, canvas.height_px - top - _BELOW_PX - LINE_PX)
+    frame = Frame(left, top, width, height, (-0.5, len(x) - 0.5), (-0.5, len(y) - 0.5))
+    cell_px = width / len(x), height / len(y)
+    # Seen where no trial has a score.
+    canvas.add("rect", x=left, y=top, width=width, height=height, fill="#EEEEEE")
     for each in plot.sets:
-        if each.score is not None:
-            column, row = _cell(each.parameters, plot.names, x, y)
-            means[row][column] = each.score.mean
-    image = axes.imshow(means, cmap="cividis", origin="lower", aspect="auto")
-    axes.set_facecolor("#EEEEEE")  # seen where no trial has a score
-    figure.colorbar(image, ax=axes, label="mean score")
-    for axis, values in ((axes.xaxis, x), (axes.yaxis, y)):
-        axis.set_ticks(range(len(values)), [_text(value) for value in values])
-    if len(plot.sets) <= _MOST_TOLD_CELLS:
-        for each in plot.sets:
-            _paint_text(axes, image, each, _cell(each.parameters, plot.names, x, y))
-    if plot.best is not None:
-        _paint_frame(axes, _cell(plot.best, plot.names, x, y))
-    paint_legend(figure, [_frame_entry()])
+        column, row = x.index(each.parameters[first]), y.index(each.parameters[second])
+        corner = left + column * cell_px[0], frame.bottom - (row + 1) * cell_px[1]
+        share = (each.score.mean - bounds[0]) / (bounds[1] - bounds[0]) if each.score else None
+        _paint_cell(canvas, each, corner, cell_px, share, told=len(plot.sets) <= _MOST_TOLD_CELLS)
+        if each.parameters == plot.best:
+            canvas.add("rect", x=corner[0] + 3, y=corner[1] + 3, width=cell_px[0] - 6,
+                       height=cell_px[1] - 6, **_RING)  # fmt: skip
+    room = cell_px[0] - 4
+    paint_x_axis(canvas, frame, [(i, fitted(_text(v), room)) for i, v in enumerate(x)],
+                 [fitted(first, width)])  # fmt: skip
+    paint_y_axis(canvas, frame, [(i, fitted(_text(v), left - 30)) for i, v in enumerate(y)])
+    paint_y_label(canvas, frame, fitted(second, height))
+    paint_scale(canvas, frame, "score", bounds, "mean score")
+    entry = Entry("best; cells: mean, spread", _frame_sample)
+    paint_rows(canvas, [[entry]], canvas.height_px - LINE_PX - 2)
 
 
-def _paint_text(axes: Any, image: Any, ranked: Ranked, cell: tuple[int, int]) -> None:
+def _frame_sample(canvas: Canvas, x: float, y: float) -> None:
+    canvas.add("rect", x=x - 10, y=y - 5, width=20, height=10, **_RING)
+
+
+def _paint_cell(
+    canvas: Canvas, ranked: Ranked, corner: tuple[float, float], size: tuple[float, float],
+    share: float | None, *, told: bool,
+) -> None:  # fmt: skip
     lines = [f"{len(ranked.failures)} failed"] if ranked.failures else []
-    colour = INK
-    if ranked.score is not None:
+    if ranked.score is not None and share is not None:
+        colour = scaled(share, "score")
+        canvas.add("rect", x=corner[0], y=corner[1], width=size[0] + 0.3, height=size[1] + 0.3,
+                   fill=colour)  # fmt: skip
         low, mean, high = ranked.score.low, ranked.score.mean, ranked.score.high
         spread = [f"{low:.3g} to {high:.3g}"] if low != high else []
         lines = [f"{mean:.4g}", *spread, *lines]
-        colour = "white" if image.norm(mean) < _DARK else INK
-    axes.text(*cell, "\n".join(lines), ha="center", va="center", color=colour, fontsize=8)
+    ink = "#FFFFFF" if share is not None and share < _DARK else INK
+    for row, line in enumerate(lines if told else ()):
+        y = corner[1] + size[1] / 2 + 4 + (row - (len(lines) - 1) / 2) * (LINE_PX - 3)
+        canvas.text(corner[0] + size[0] / 2, y, line, colour=ink, anchor="middle")
 
 
-def _paint_frame(axes: Any, cell: tuple[int, int]) -> None:
-    from matplotlib.patches import Rectangle
-
-    corner = (cell[0] - 0.48, cell[1] - 0.48)
-    axes.add_patch(Rectangle(corner, 0.96, 0.96, fill=False, edgecolor=LINES[1], linewidth=2.5))
-
-
-def _frame_entry() -> Entry:
-    from matplotlib.patches import Patch
-
-    return Patch(fill=False, edgecolor=LINES[1], linewidth=2), "best; cells: mean, spread"
-
-
-def _places(axis: Any, values: Sequence[Any]) -> dict[str, float]:
-    """Where each value stands on an axis: numbers by what they are, others in a row."""
+def _places(values: Sequence[Any]) -> tuple[dict[str, float], list[tuple[float, str]]]:
+    """Where each value stands on an axis, and ticks: numbers by what they are, others in a row."""
     if all(isinstance(each, (int, float)) and not isinstance(each, bool) for each in values):
-        return {repr(each): float(each) for each in values}
+        return {repr(each): float(each) for each in values}, []
     ordered = _ordered(values)
-    axis.set_ticks(range(len(ordered)), [_text(value) for value in ordered])
-    return {repr(value): float(place) for place, value in enumerate(ordered)}
+    places = {repr(value): float(place) for place, value in enumerate(ordered)}
+    return places, [(place, _text(value)) for place, value in enumerate(ordered)]
 
 
 def _ordered(values: Sequence[Any]) -> list[Any]:
@@ -159,13 +190,6 @@ def _ordered(values: Sequence[Any]) -> list[Any]:
     return sorted(numbers) + sorted(
         (value for value in each.values() if not isinstance(value, (int, float))), key=str
     )
-
-
-def _cell(
-    values: dict[str, Any], names: Sequence[str], x: Sequence[Any], y: Sequence[Any]
-) -> tuple[int, int]:
-    first, second = names
-    return x.index(values[first]), y.index(values[second])
 
 
 def _text(value: Any) -> str:

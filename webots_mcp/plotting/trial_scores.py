@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import sqlite3
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.naming import listed, nearest_first
-from webots_mcp.plotting.canvas import Picture, Sheet, draw, media_type
+from webots_mcp.plotting.canvas import Picture, Sheet
 from webots_mcp.plotting.trial_axes import TrialAxes, paint_trials
 from webots_mcp.store.analysis.ranking import Outcome, rank
 from webots_mcp.store.trials import Trial, best_of, fetch_trial_set, trials_of
@@ -37,9 +36,9 @@ def plot_trials(
     """
     sheet = sheet or Sheet()
     plot, notes = compose_trials(connection, set_id, names)
-    data, font_notes = draw(sheet, partial(paint_trials, plot=plot))
+    canvas = paint_trials(plot, sheet.width_px, sheet.height_px)
     caption = f"{plot.title}: {plot.score} over {' and '.join(plot.names)}"
-    return Picture(data, media_type(sheet), caption, (*notes, *font_notes))
+    return canvas.picture(sheet.image_format, caption, notes)
 
 
 def compose_trials(

@@ -95,8 +95,8 @@ async def _ask_all(bench: Bench) -> list[_Answer]:
 
 
 def _without() -> tuple[str, ...]:
-    """The tools that need what is not there: Webots itself, perhaps matplotlib."""
-    return _OF_WEBOTS if find_spec("matplotlib") else (*_OF_WEBOTS, _PLOT)
+    """The tools that need what is not there: Webots itself, perhaps what draws."""
+    return _OF_WEBOTS if find_spec("resvg_py") else (*_OF_WEBOTS, _PLOT)
 
 
 def _order(tool: Tool) -> tuple[bool, bool]:

@@ -155,7 +155,7 @@ def _questions(db: sqlite3.Connection, rows: int) -> Iterator[Question]:
         "SELECT * FROM log WHERE run_id = 1 AND message LIKE '%slip%' ORDER BY sim_time_s",
         "LIKE",
     )
-    if importlib.util.find_spec("matplotlib"):
+    if importlib.util.find_spec("resvg_py"):
         path = numbers[_OVERVIEW]
         yield Question(
             "plot, whole run, 1 signal",

@@ -11,8 +11,9 @@ from typing import Final, NamedTuple
 from webots_mcp.contract import MODE_EVENT, WORLD_EVENT
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.naming import find_mode
-from webots_mcp.plugins.report.grid import Grid, Row
 from webots_mcp.plugins.report.words import (
+    Grid,
+    Row,
     clock,
     counted,
     cut,

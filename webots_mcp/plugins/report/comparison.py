@@ -9,8 +9,7 @@ from typing import Final
 
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.naming import listed
-from webots_mcp.plugins.report.grid import Grid, Row
-from webots_mcp.plugins.report.words import length, number, spelled
+from webots_mcp.plugins.report.words import Grid, Row, length, number, spelled
 from webots_mcp.store.analysis.spread import Spread
 from webots_mcp.store.questions.compare import Comparison, compare_runs
 from webots_mcp.store.questions.differences import Difference

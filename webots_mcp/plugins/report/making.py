@@ -1,21 +1,23 @@
-"""How a report is put together, in the room that it may take."""
+"""How a report is put together in the room that it may take, and becomes HTML and a file."""
 
 from __future__ import annotations
 
 import sqlite3
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+from webots_mcp import __version__
+from webots_mcp.contract import make_folder, whole_file
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.naming import spelled_out
 from webots_mcp.plugins.report.chapter import Chapter, chapter_of
-from webots_mcp.plugins.report.comparison import beside
-from webots_mcp.plugins.report.figures import figures_of, library
-from webots_mcp.plugins.report.page import Page, render
+from webots_mcp.plugins.report.comparison import Beside, beside
+from webots_mcp.plugins.report.figures import Figures, figures_of, library, moment_key
 from webots_mcp.plugins.report.run_pictures import Pictures, pictures_of
-from webots_mcp.plugins.report.words import counted
+from webots_mcp.plugins.report.words import clock, counted, size
 from webots_mcp.store.invalid_rows import left_out_so_far
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.run_rows import fetch_run
@@ -164,3 +166,118 @@ def _holds(page: Page) -> dict[str, int]:
             counts[name] = counts.get(name, 0) + len(grid.rows)
     counts["pictures"] = sum(len(each.shown) for each in page.pictures.values())
     return {name: count for name, count in counts.items() if count}
+
+
+_TEMPLATES: Final = Path(__file__).parent / "templates"
+# Nothing may be loaded, whatever a text of the recording says; Bokeh's own parts are inside.
+_POLICY: Final = (
+    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+    "img-src data: blob:; font-src data:; base-uri 'none'; form-action 'none'"
+)
+
+
+@dataclass(frozen=True)
+class Page:
+    """All that a report shows.
+
+    Attributes:
+        made_wall_time_s: When it was made.
+        max_mb: What it may take.
+        library: Bokeh's script.
+        beside: The comparison of two runs; None of one.
+        pictures: By run.
+        left_out: What is not in it.
+        size_bytes: What it takes, about; None while that is not known.
+    """
+
+    title: str
+    made_wall_time_s: float
+    max_mb: float
+    library: str
+    chapters: Sequence[Chapter]
+    beside: Beside | None
+    figures: Figures
+    pictures: dict[int, Pictures] = field(default_factory=dict[int, Pictures])
+    left_out: Sequence[str] = ()
+    size_bytes: int | None = None
+
+
+def _spelled_out(value: object) -> object:
+    """Texts, but for what is markup of ours."""
+    return spelled_out(value) if type(value) is str else value
+
+
+def render(page: Page) -> bytes:
+    """The file. Every text of the recording is escaped: it is shown, and never run."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(_TEMPLATES),
+        autoescape=True,
+        finalize=_spelled_out,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    told: Mapping[str, Any] = {
+        "page": page,
+        "policy": _POLICY,
+        "version": __version__,
+        "made": clock(page.made_wall_time_s),
+        "size": size(page.size_bytes or 0),
+        "counted": counted,
+        "moment_key": moment_key,
+    }
+    return environment.get_template("report.html").render(told).encode("utf-8", "replace")
+
+
+def file_name(run_ids: Sequence[int]) -> str:
+    """How the file is called if nobody says: run-3.html, run-3-5.html."""
+    return f"run-{'-'.join(map(str, run_ids))}.html"
+
+
+def require_free(file: Path, *, overwrite: bool) -> None:
+    """See that the file may be written, before the work is done.
+
+    Raises:
+        InvalidInputError: Something is there already, or it is no page's name.
+    """
+    try:
+        is_folder, is_there = file.is_dir(), file.exists()
+    except OSError as error:  # too long a name
+        raise InvalidInputError(f"{str(file)[:200]} cannot be written: {error.strerror}") from error
+    if is_folder:
+        raise InvalidInputError(f"{file} is a folder: name a file in it")
+    if file.suffix.lower() not in (".html", ".htm"):
+        raise InvalidInputError(f"{file.name!r} is no page's name: end it in .html")
+    if is_there and not overwrite:
+        raise InvalidInputError(
+            f"{file} is there already: name another one, or give overwrite (--overwrite)"
+        )
+
+
+def require_folder(file: Path) -> None:
+    """See that there is a folder to write into.
+
+    Raises:
+        InvalidInputError: There is none.
+    """
+    if not file.parent.is_dir():
+        raise InvalidInputError(f"there is no folder {file.parent}: make it, or name another file")
+
+
+def write_report(file: Path, html: bytes, *, overwrite: bool = False) -> None:
+    """Write it as a file of its owner alone that appears only when it is complete.
+
+    A folder that is not there is made.
+
+    Raises:
+        InvalidInputError: It cannot be written, or something is there already.
+    """
+    require_free(file, overwrite=overwrite)
+    try:
+        make_folder(file.parent)
+        with whole_file(file) as aside:
+            aside.write_bytes(html)
+    except OSError as error:
+        raise InvalidInputError(f"{file} cannot be written: {error}") from error

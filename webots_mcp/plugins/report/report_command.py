@@ -49,9 +49,9 @@ def report(
     trends and the timeline in words), interactive figures, the way, pictures, commands and log. The
     file needs nothing else and opens without a network.
     """
-    from webots_mcp.plugins.report.making import make_report
-    from webots_mcp.plugins.report.report_file import (
+    from webots_mcp.plugins.report.making import (
         file_name,
+        make_report,
         require_folder,
         require_free,
         write_report,

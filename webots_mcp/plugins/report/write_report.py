@@ -8,8 +8,7 @@ from typing import Annotated, Final
 from pydantic import Field
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plugins.report.making import make_report
-from webots_mcp.plugins.report.report_file import file_name, require_free, write_report
+from webots_mcp.plugins.report.making import file_name, make_report, require_free, write_report
 from webots_mcp.questions.argument_types import AnyNames, RobotName, RunIds
 from webots_mcp.questions.budget import notes_of
 from webots_mcp.questions.declaring import DESTROYS, question

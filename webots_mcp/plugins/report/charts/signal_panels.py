@@ -24,10 +24,9 @@ from bokeh.models import (
 from bokeh.plotting import figure
 
 from webots_mcp.plotting.canvas import Room, short
-from webots_mcp.plotting.curves import Curve, Point
+from webots_mcp.plotting.curves import Curve, Panel, Point
+from webots_mcp.plotting.intervals import Interval, Lane
 from webots_mcp.plotting.palette import FAINT, INK, LINES, Area, area_styles
-from webots_mcp.plotting.panels import Panel
-from webots_mcp.plotting.plotted_intervals import Interval, Lane
 from webots_mcp.plotting.question import changed_most
 from webots_mcp.plotting.signal_axes import SignalAxes
 from webots_mcp.plotting.signals import compose_signals

@@ -22,9 +22,9 @@ from bokeh.models import (
 from bokeh.plotting import figure
 
 from webots_mcp.plotting.canvas import short
+from webots_mcp.plotting.intervals import Lane
 from webots_mcp.plotting.palette import FAINT, INK, LINES, area_styles
 from webots_mcp.plotting.path import Path, Place, headings
-from webots_mcp.plotting.plotted_intervals import Lane
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plotting.trajectory_axes import Track, TrajectoryAxes
 from webots_mcp.plugins.report.charts.chart import (

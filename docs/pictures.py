@@ -26,7 +26,7 @@ from PIL import Image
 
 from webots_mcp.cli import main as webots_mcp
 from webots_mcp.contract import DATABASE_NAME, THROTTLE_VARIABLE
-from webots_mcp.plugins.demo import conversation as demo
+from webots_mcp.plugins.demo import demo_command as demo
 from webots_mcp.testing import RecordedSimulation
 
 CHECKOUT: Final = Path(__file__).parent.parent

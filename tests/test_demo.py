@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from webots_mcp.errors import WebotsMCPError
-from webots_mcp.plugins.demo import conversation as demo
+from webots_mcp.plugins.demo import demo_command as demo
 from webots_mcp.questions import all_questions
 from webots_mcp.setup.client_entries import can_be_started, is_ours, words_of
 

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from webots_mcp.plugins.pool.row_batch import Row
-from webots_mcp.plugins.pool.shipped_tables import table
+from webots_mcp.plugins.pool.pool_interface import Row, table
 from webots_mcp.store.chunks.codec import Encoded, decode
 from webots_mcp.store.chunks.statistics import Statistics
 from webots_mcp.store.chunks.stored import SIM_TIMES

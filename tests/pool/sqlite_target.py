@@ -10,9 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from webots_mcp.errors import PoolBusyError, PoolError, PoolUnavailableError
-from webots_mcp.plugins.pool.row_batch import Batch, batches
-from webots_mcp.plugins.pool.shipped_tables import SQLValue, Table, table, tables
-from webots_mcp.plugins.pool.target import PooledSize
+from webots_mcp.plugins.pool.pool_interface import (
+    Batch,
+    PooledSize,
+    SQLValue,
+    Table,
+    batches,
+    table,
+    tables,
+)
 from webots_mcp.store.questions.sql import Result, query_sql
 
 

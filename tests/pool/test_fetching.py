@@ -26,9 +26,8 @@ from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.errors import InvalidInputError, PoolError
 from webots_mcp.plugins.pool import fetching
-from webots_mcp.plugins.pool.engines import open_pool, open_target
-from webots_mcp.plugins.pool.key_order import in_order
-from webots_mcp.plugins.pool.pool_contents import pooled_runs
+from webots_mcp.plugins.pool.fetching import in_order
+from webots_mcp.plugins.pool.pool_contents import open_pool, open_target, pooled_runs
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.questions.runs import run_info

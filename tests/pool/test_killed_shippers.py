@@ -21,12 +21,9 @@ from tests.pool.sqlite_target import recorded
 from tests.postgres import Server
 from tests.recordings.bridge import STEP_MS, Rover
 from webots_mcp.connection import connect
-from webots_mcp.plugins.pool.engines import open_pool, open_target
-from webots_mcp.plugins.pool.following import follow
-from webots_mcp.plugins.pool.report import Report
-from webots_mcp.plugins.pool.row_batch import Row
-from webots_mcp.plugins.pool.shipped_tables import Table, tables
-from webots_mcp.plugins.pool.shipping import Order, ship
+from webots_mcp.plugins.pool.pool_contents import open_pool, open_target
+from webots_mcp.plugins.pool.pool_interface import Row, Table, tables
+from webots_mcp.plugins.pool.shipping import Order, Report, follow, ship
 from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.recording import Recording
 
@@ -81,8 +78,8 @@ def processes() -> Iterator[ForkServerContext]:
     """Processes that have everything imported when they start."""
     context = multiprocessing.get_context("forkserver")
     engines = [
-        "webots_mcp.plugins.pool.postgres.postgres_writing",
-        "webots_mcp.plugins.pool.parquet.parquet_writing",
+        "webots_mcp.plugins.pool.postgres_pool",
+        "webots_mcp.plugins.pool.parquet_pool",
     ]
     context.set_forkserver_preload([__name__, "webots_mcp.store.models", *engines])
     yield context

@@ -23,13 +23,9 @@ from webots_mcp.errors import (
     PoolUnavailableError,
     SchemaTooOldError,
 )
-from webots_mcp.plugins.pool.following import follow
 from webots_mcp.plugins.pool.pool_contents import pooled_runs
-from webots_mcp.plugins.pool.reading import Source
-from webots_mcp.plugins.pool.report import Report
-from webots_mcp.plugins.pool.row_batch import BATCH_BYTES
-from webots_mcp.plugins.pool.shipped_tables import table
-from webots_mcp.plugins.pool.target import is_whole
+from webots_mcp.plugins.pool.pool_interface import BATCH_BYTES, is_whole, table
+from webots_mcp.plugins.pool.shipping import Report, Source, follow
 from webots_mcp.schema import OLDER_SCHEMA, create_schema
 from webots_mcp.store.chunks.making import chunk_whole_run
 from webots_mcp.store.merging import merge
@@ -304,7 +300,7 @@ def ship_unwritable(shipped: Shipped, *, full: bool) -> str:
     code = (
         "import functools, sys; from pathlib import Path; "
         "from tests.pool.sqlite_target import SQLiteTarget; "
-        "from webots_mcp.plugins.pool.report import Report; "
+        "from webots_mcp.plugins.pool.shipping import Report; "
         "from webots_mcp.plugins.pool.shipping import Order, ship; "
         "from webots_mcp.store.recording import Recording; folder, pool = map(Path, sys.argv[1:]); "
         "recording = Recording(folder / 'webots.db', folder, read_only=True); report = Report(); "

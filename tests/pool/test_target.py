@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plugins.pool.engines import open_target
-from webots_mcp.plugins.pool.shipped_tables import tables
-from webots_mcp.plugins.pool.target import redacted
+from webots_mcp.plugins.pool.pool_contents import open_target
+from webots_mcp.plugins.pool.pool_interface import redacted, tables
 
 SECRET = "hunter2"
 

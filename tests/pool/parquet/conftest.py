@@ -13,9 +13,8 @@ import pytest
 from tests.pool.parquet import bucket
 from tests.recordings.rows import Recorded
 from webots_mcp.contract import DATABASE_NAME, new_uuid
-from webots_mcp.plugins.pool.parquet.parquet_writing import ParquetTarget
-from webots_mcp.plugins.pool.report import Report
-from webots_mcp.plugins.pool.shipping import Order, ship
+from webots_mcp.plugins.pool.parquet_pool import ParquetTarget
+from webots_mcp.plugins.pool.shipping import Order, Report, ship
 from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.recording import Recording
 

@@ -10,10 +10,16 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-from webots_mcp.plugins.pool.parquet.parquet_reading import ParquetPool
-from webots_mcp.plugins.pool.parquet.parquet_writing import ParquetShipment, ParquetTarget
-from webots_mcp.plugins.pool.row_batch import Batch, Row, batches
-from webots_mcp.plugins.pool.shipped_tables import SQLValue, Table, table, tables
+from webots_mcp.plugins.pool.parquet_pool import ParquetPool, ParquetShipment, ParquetTarget
+from webots_mcp.plugins.pool.pool_interface import (
+    Batch,
+    Row,
+    SQLValue,
+    Table,
+    batches,
+    table,
+    tables,
+)
 
 parquet: Any = import_module("pyarrow.parquet")  # it has no types
 

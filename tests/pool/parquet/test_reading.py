@@ -17,11 +17,11 @@ from tests.pool.parquet.conftest import RECORDINGS, Many
 from tests.pool.parquet.rows import batch, pooled, rows_of, ship, shipping, uuid_of
 from webots_mcp.connection import connect
 from webots_mcp.errors import InvalidInputError, PoolError
-from webots_mcp.plugins.pool.parquet import duckdb_statement as asking
-from webots_mcp.plugins.pool.parquet.parquet_reading import ParquetPool
-from webots_mcp.plugins.pool.parquet.storage import Storage
+from webots_mcp.plugins.pool import duckdb_statement as asking
+from webots_mcp.plugins.pool.parquet_files import Storage
+from webots_mcp.plugins.pool.parquet_pool import ParquetPool
 from webots_mcp.plugins.pool.pool_contents import pooled_runs, pooled_trial_sets
-from webots_mcp.plugins.pool.shipped_tables import table
+from webots_mcp.plugins.pool.pool_interface import table
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.questions.runs import list_runs

@@ -15,12 +15,9 @@ from tests.pool.parquet.rows import globbed, parquet, pooled, rows_of, shipping,
 from tests.recordings.rows import Recorded
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plugins.pool.parquet.parquet_reading import ParquetPool
-from webots_mcp.plugins.pool.parquet.parquet_writing import ParquetTarget
-from webots_mcp.plugins.pool.report import Report
-from webots_mcp.plugins.pool.row_batch import Batch
-from webots_mcp.plugins.pool.shipped_tables import table
-from webots_mcp.plugins.pool.shipping import Order, ship
+from webots_mcp.plugins.pool.parquet_pool import ParquetPool, ParquetTarget
+from webots_mcp.plugins.pool.pool_interface import Batch, table
+from webots_mcp.plugins.pool.shipping import Order, Report, ship
 from webots_mcp.store.chunks.making import chunk_whole_run
 from webots_mcp.store.recording import Recording
 

@@ -42,12 +42,10 @@ from tests.pool.parquet.rows import (
 )
 from webots_mcp.connection import connect
 from webots_mcp.errors import InvalidInputError, PoolBusyError, PoolError, PoolUnavailableError
-from webots_mcp.plugins.pool.parquet import arrow_rows
-from webots_mcp.plugins.pool.parquet.lease import LEASE_S
-from webots_mcp.plugins.pool.parquet.parquet_reading import ParquetPool
-from webots_mcp.plugins.pool.parquet.parquet_writing import PART_BYTES, ParquetTarget
-from webots_mcp.plugins.pool.row_batch import Batch, Row
-from webots_mcp.plugins.pool.shipped_tables import SQLValue, table, tables
+from webots_mcp.plugins.pool import parquet_pool
+from webots_mcp.plugins.pool.parquet_files import LEASE_S
+from webots_mcp.plugins.pool.parquet_pool import PART_BYTES, ParquetPool, ParquetTarget
+from webots_mcp.plugins.pool.pool_interface import Batch, Row, SQLValue, table, tables
 from webots_mcp.store.chunks.making import chunk_whole_run
 
 DAY_S = 86_400.0
@@ -55,7 +53,7 @@ MIDNIGHT_S = 19_700 * DAY_S
 
 HOLDER = """
 import os, sys
-from webots_mcp.plugins.pool.parquet.parquet_writing import ParquetTarget
+from webots_mcp.plugins.pool.parquet_pool import ParquetTarget
 with ParquetTarget(sys.argv[1]) as target:
     target.prepare()
     with target.shipment(sys.argv[2]):
@@ -349,13 +347,13 @@ def test_what_is_damaged_is_named_and_nothing_is_written_over_it(tmp_path: Path,
 def test_of_a_file_that_unpacks_to_far_more_only_what_was_shipped_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(arrow_rows, "_MOST_BYTES", 20_000_000)
+    monkeypatch.setattr(parquet_pool, "_MOST_BYTES", 20_000_000)
     with shipping(tmp_path) as shipment:
         shipment.write([logs(1, 2)], {})
     (file,) = tmp_path.glob(f"recording={UUID}/table=log/*/*.parquet")
     own: Any = parquet.ParquetFile(file).read()
     (more,) = logs(3, message="x" * 10_000).rows
-    one = arrow_rows.as_arrow(table("log"), [more], Counter())
+    one = parquet_pool.as_arrow(table("log"), [more], Counter())
     whole: Any = import_module("pyarrow").concat_tables([own, *[one] * 100_000])
     parquet.write_table(whole, file, use_dictionary=True)
     assert file.stat().st_size < 1_000_000 < 1_000_000_000 < whole.nbytes

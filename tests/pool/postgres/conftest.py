@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.postgres import Server
-from webots_mcp.plugins.pool.postgres.postgres_schema import prepare
+from webots_mcp.plugins.pool.postgres_schema import prepare
 
 
 @pytest.fixture

@@ -9,9 +9,8 @@ from typing import Any
 from uuid import UUID
 
 from tests.postgres import Server
-from webots_mcp.plugins.pool.postgres.postgres_writing import PostgresTarget
-from webots_mcp.plugins.pool.row_batch import Batch, batches
-from webots_mcp.plugins.pool.shipped_tables import Table, tables
+from webots_mcp.plugins.pool.pool_interface import Batch, Table, batches, tables
+from webots_mcp.plugins.pool.postgres_pool import PostgresTarget
 
 
 def uuid_of(recording: sqlite3.Connection) -> str:

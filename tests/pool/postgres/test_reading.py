@@ -16,10 +16,10 @@ from tests.pool.postgres.shipped import rows_of, ship, uuid_of
 from tests.postgres import Server
 from tests.recordings.rover import Recorder, record_rover
 from webots_mcp.errors import InvalidInputError, PoolError
+from webots_mcp.plugins.pool import postgres_pool as reading
 from webots_mcp.plugins.pool.pool_contents import pooled_runs, pooled_trial_sets
-from webots_mcp.plugins.pool.postgres import postgres_reading as reading
-from webots_mcp.plugins.pool.postgres.postgres_reading import PostgresPool
-from webots_mcp.plugins.pool.shipped_tables import Table, table, tables
+from webots_mcp.plugins.pool.pool_interface import Table, table, tables
+from webots_mcp.plugins.pool.postgres_pool import PostgresPool
 from webots_mcp.store.chunks.making import make_chunks
 
 # What jsonb has not, or has otherwise; each comes back as it was, also where it is no JSON object.

@@ -12,9 +12,8 @@ import pytest
 from tests.postgres import Server
 from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.errors import PoolError, PoolUnavailableError
-from webots_mcp.plugins.pool.postgres.postgres_schema import prepare
-from webots_mcp.plugins.pool.postgres.postgres_views import VIEWS
-from webots_mcp.plugins.pool.shipped_tables import Table, tables
+from webots_mcp.plugins.pool.pool_interface import Table, tables
+from webots_mcp.plugins.pool.postgres_schema import VIEWS, prepare
 
 COLUMNS = (
     "SELECT column_name, data_type, is_nullable = 'YES' FROM information_schema.columns "

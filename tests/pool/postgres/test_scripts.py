@@ -19,8 +19,8 @@ from tests.pool.postgres.shipped import assert_equal, ship
 from tests.postgres import Server
 from tests.recordings.rover import record_rover
 from webots_mcp.contract import bundled
-from webots_mcp.plugins.pool.postgres.postgres_views import VIEWS
-from webots_mcp.plugins.pool.shipped_tables import tables
+from webots_mcp.plugins.pool.pool_interface import tables
+from webots_mcp.plugins.pool.postgres_schema import VIEWS
 
 REFUSALS: Final = """
 CREATE TABLE done (name text, by text, beside text);

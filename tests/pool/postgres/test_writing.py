@@ -28,10 +28,9 @@ from tests.postgres import Server
 from tests.recordings.rover import record_rover
 from webots_mcp.connection import connect
 from webots_mcp.errors import PoolBusyError, PoolError, PoolUnavailableError
-from webots_mcp.plugins.pool.postgres import postgres_writing as writing
-from webots_mcp.plugins.pool.postgres.postgres_writing import PostgresShipment, PostgresTarget
-from webots_mcp.plugins.pool.row_batch import Batch, Row
-from webots_mcp.plugins.pool.shipped_tables import table, tables
+from webots_mcp.plugins.pool import postgres_pool as writing
+from webots_mcp.plugins.pool.pool_interface import Batch, Row, table, tables
+from webots_mcp.plugins.pool.postgres_pool import PostgresShipment, PostgresTarget
 from webots_mcp.store.chunks.making import make_chunks
 
 SECRET = "quite-a-secret-7"

@@ -20,7 +20,7 @@ from tests.recordings.rover import Recorder
 from tests.recordings.runs import Recorded
 from tests.store.export.test_export import STATES, publish, recorded_run, same, without_odd
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plugins.formats.foxglove import layout_file
+from webots_mcp.plugins.formats.mcap import layout_file
 from webots_mcp.store.export import export_for_viewers
 from webots_mcp.store.reading.ranges import Scope, find_range
 

@@ -5,6 +5,6 @@ from webots_mcp.plugins import Cluster, Plugin
 PLUGIN = Plugin(
     cluster=Cluster(
         simulators=f"{__name__}.dask_cluster:cluster",
-        worker=f"{__name__}.cluster_worker:ClusterWorker",
+        worker=f"{__name__}.dask_cluster:ClusterWorker",
     )
 )

@@ -1,12 +1,78 @@
-"""The command that shows the main job without Webots."""
+"""`webots-mcp demo`: the main job from end to end, with nothing installed but this package.
+
+A robot drives in the stand-in's arena (a real controller process that records into a real
+database), an MCP server runs next to it, and a real MCP client asks over stdio.
+"""
 
 from __future__ import annotations
 
+import base64
+import contextlib
+import json
+import os
+import shlex
+import sys
+import time
+from collections.abc import AsyncGenerator, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from webots_mcp.cli.recordings import Json
+from webots_mcp.cli.rendering import answer_lines, print_json
+from webots_mcp.cli.terminal import rewrite
 from webots_mcp.cli.values import Parameter
+from webots_mcp.connection import connect
+from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, full_path, whole_file
+from webots_mcp.errors import NothingRecordedError, WebotsMCPError
+from webots_mcp.requirements import quoted
+from webots_mcp.setup.client_entries import server_command
+from webots_mcp.store.recording import Recording
+
+if TYPE_CHECKING:
+    from mcp import Client
+    from mcp.types import CallToolResult, ImageContent
+
+    from webots_mcp.standin import Simulation
+
+
+DEFAULT_DATA_DIR: Final = Path.home() / ".webots-mcp" / "demo"
+_ROBOT: Final = "rover"
+_START_TIMEOUT_S: Final = 30.0
+_ANSWER_LINES: Final = 24
+_ROWS: Final = 6  # of a table
+
+Turn = tuple[str, str, dict[str, Any]]
+# What a person would say, and the tool call that an assistant makes of it.
+CONVERSATION: Final[tuple[Turn, ...]] = (
+    ("What is the robot doing?", "webots_get_robot_state", {}),
+    ("What do its sensors say?", "webots_get_sensors", {}),
+    ("What does it see?", "webots_get_camera", {}),
+    ("What can be tuned?", "webots_list_commands", {"what": "parameters"}),
+    ("Drive faster.", "webots_set_parameters", {"values": {"speed": 6.0}}),
+    ("Pause.", "webots_simulation_control", {"command": "pause"}),
+    ("Five steps.", "webots_simulation_control", {"command": "step", "steps": 5}),
+    (
+        "Which cruising speed gets farther in five seconds?",
+        "webots_run_trials",
+        {"parameters": {"speed": [3.0, 8.0]}, "score": "max(pose.x) - first(pose.x)", "for_s": 5},
+    ),
+    ("Go on.", "webots_simulation_control", {"command": "resume"}),
+    ("Show me the arena.", "webots_take_screenshot", {}),
+    (
+        "Go on as fast as you can until its mode changes, at most 20 s.",
+        "webots_run",
+        {"until": "changed(mode)", "for_s": 20, "then": "as_before"},
+    ),
+    ("Watch it for five seconds.", "webots_monitor", {"duration_wall_s": 5}),
+    ("What has each signal done since the start?", "webots_get_trends", {}),
+    (
+        "Since when, and how often, was it avoiding something or stuck?",
+        "webots_find_events",
+        {"kinds": ["change", "stuck"], "signals": ["mode"]},
+    ),
+    ("Draw the way it took.", "webots_plot", {"kind": "trajectory"}),
+    ("Start over.", "webots_simulation_control", {"command": "reset"}),
+)
 
 
 def demo(
@@ -24,8 +90,205 @@ def demo(
 
     With --json the conversation appears on stderr, and then its answers as one object on stdout.
     """
-    from webots_mcp.contract import full_path
-    from webots_mcp.plugins.demo.conversation import DEFAULT_DATA_DIR, run
-
     chosen = full_path(data_dir) if data_dir is not None else None
     run(chosen or DEFAULT_DATA_DIR, keep=keep, as_json=as_json)
+
+
+def run(
+    data_dir: Path = DEFAULT_DATA_DIR,
+    *,
+    keep: bool = False,
+    as_json: bool = False,
+    conversation: tuple[Turn, ...] = CONVERSATION,
+) -> None:
+    """Run the demo; prints each question with its answer.
+
+    Args:
+        data_dir: Where the database and the pictures go.
+        keep: Leave the robot running until Ctrl-C, so that another client can connect.
+        as_json: Print this to stderr, and to stdout one JSON object of the answers.
+        conversation: What is asked.
+
+    Raises:
+        DatabaseError: Nothing can be recorded there.
+        NothingRecordedError: The controller did not come up.
+        WebotsMCPError: The server answered with an error.
+    """
+    import anyio
+
+    from webots_mcp.standin import Simulation
+    from webots_mcp.standin.in_process import DEFAULT_WORLD
+
+    Recording(data_dir / DATABASE_NAME, data_dir).create()  # a robot only waits for a bad folder
+    shown = contextlib.redirect_stdout(sys.stderr if as_json else sys.stdout)
+    with shown:
+        _say(f"Starting {DEFAULT_WORLD.name} on the stand-in simulator (this is not Webots) ...")
+    with Simulation(DEFAULT_WORLD, environment={DATA_DIR_VARIABLE: str(data_dir)}) as simulation:
+        _wait_for_rows(simulation, data_dir)
+        with shown:
+            answers = anyio.run(converse, data_dir, conversation)
+            _tell_where(data_dir)
+            _tell_how_to_connect(data_dir, keep=keep)
+        if as_json:
+            print_json({"database": str(data_dir / DATABASE_NAME), "answers": answers})
+        if keep:
+            _keep(simulation)
+
+
+def _wait_for_rows(simulation: Simulation, data_dir: Path) -> None:
+    """Until the controller that was just started has published and saved a picture."""
+    before = _newest_image(data_dir)
+    try:
+        simulation.wait_for(lambda: _newest_image(data_dir) > before, _START_TIMEOUT_S)
+    except TimeoutError as error:
+        raise NothingRecordedError(f"the demo's controller recorded nothing: {error}") from error
+
+
+def _newest_image(data_dir: Path) -> int:
+    database = data_dir / DATABASE_NAME
+    if not database.exists():
+        return 0
+    with contextlib.closing(connect(database, "reader")) as connection:
+        tables = connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'image'").fetchone()
+        sql = "SELECT coalesce(max(id), 0) FROM image WHERE kind = 'camera'"
+        return int(connection.execute(sql).fetchone()[0]) if tables else 0
+
+
+async def converse(data_dir: Path, conversation: tuple[Turn, ...]) -> list[dict[str, Any]]:
+    """Ask everything, and print it; returns each question with its call and its answer.
+
+    Raises:
+        WebotsMCPError: An answer is an error.
+    """
+    answers: list[dict[str, Any]] = []
+    async with _client(data_dir) as client:
+        for question, tool, arguments in conversation:
+            given = ", ".join(f"{name}={_as_json(arguments[name])}" for name in arguments)
+            _say(f"\n> {question}\n  {tool}({given})")
+            started_s = time.monotonic()
+            result = await client.call_tool(tool, arguments, progress_callback=_show_progress)
+            _clear_progress()
+            _show(result)
+            took_s = time.monotonic() - started_s
+            _say(f"  ({took_s:.2f} s)")
+            if result.is_error:
+                break
+            answers.append(
+                {
+                    "question": question,
+                    "tool": tool,
+                    "arguments": arguments,
+                    "answer": _data_of(result) or "\n".join(_texts_of(result)),
+                    "took_s": round(took_s, 3),
+                }
+            )
+            if tool == "webots_plot":
+                _save_plot(result, data_dir / f"{arguments.get('kind', 'signals')}.png")
+        else:
+            return answers
+    # only here: what is raised before the client has ended comes out as a group of exceptions
+    raise WebotsMCPError("the demo's server answered with an error, see above")
+
+
+@contextlib.asynccontextmanager
+async def _client(data_dir: Path) -> AsyncGenerator[Client, None]:
+    """A client on a server of its own; what the server warns of appears on stderr."""
+    from mcp import Client, StdioServerParameters
+
+    server = StdioServerParameters(
+        command=sys.executable,
+        args=["-m", "webots_mcp", "serve", "--data-dir", str(data_dir)],
+        env=dict(os.environ),
+    )
+    async with Client(server) as client:
+        yield client
+
+
+async def _show_progress(progress: float, total: float | None, message: str | None) -> None:
+    rewrite(sys.stdout, f"  {message or progress}")
+
+
+def _clear_progress() -> None:
+    rewrite(sys.stdout)
+
+
+def _show(result: CallToolResult) -> None:
+    """The answer as a person reads it; the assistant gets the same as JSON."""
+    if data := _data_of(result):
+        return _show_answer(data)
+    for text in _texts_of(result):
+        _say(f"  {text}")
+    for block in result.content:
+        if block.type == "image":
+            _say(f"  a picture for the assistant ({block.mime_type}, {len(_bytes(block))} bytes)")
+
+
+def _data_of(result: CallToolResult) -> dict[str, Any] | None:
+    """What it answers as data; None where it is pictures with captions, or an error."""
+    if result.is_error or result.structured_content is not None:
+        return None if result.is_error else result.structured_content
+    found = (json.loads(text) for text in _texts_of(result) if text.startswith("{"))
+    return next(found, None)
+
+
+def _texts_of(result: CallToolResult) -> list[str]:
+    return [block.text for block in result.content if block.type == "text"]
+
+
+def _show_answer(answer: Mapping[str, Any]) -> None:
+    """Its first lines, and how many more there are."""
+    lines = list(answer_lines(answer, most_rows=_ROWS))
+    for line in lines[:_ANSWER_LINES]:
+        _say(f"    {line}")
+    if len(lines) > _ANSWER_LINES:
+        _say(f"    ... and {len(lines) - _ANSWER_LINES} more lines")
+
+
+def _save_plot(result: CallToolResult, file: Path) -> None:
+    """A plot is in its answer alone; what cameras saw and screenshots lie in files already."""
+    (image,) = (block for block in result.content if block.type == "image")
+    with whole_file(file) as aside:
+        aside.write_bytes(_bytes(image))
+    _say(f"  The plot is saved: {file}")
+
+
+def _bytes(image: ImageContent) -> bytes:
+    return base64.b64decode(image.data)
+
+
+def _as_json(value: object) -> str:
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _tell_where(data_dir: Path) -> None:
+    database = shlex.quote(str(data_dir / DATABASE_NAME))
+    _say(f"\nThe database: {database}\nThree questions for the sqlite3 shell:")
+    for sql in (
+        "SELECT sim_time_s, data ->> '$.mode' FROM state ORDER BY id DESC LIMIT 5",
+        "SELECT action, status, result FROM command ORDER BY id DESC LIMIT 5",
+        "SELECT id, start_reason, row_count, end_reason FROM run",
+    ):
+        _say(f'  sqlite3 {database} "{sql}"')
+
+
+def _tell_how_to_connect(data_dir: Path, *, keep: bool) -> None:
+    """As docs/clients.md says it, with this environment's full paths."""
+    command = server_command(data_dir)
+    entry = {"mcpServers": {"webots": {"command": command[0], "args": command[1:]}}}
+    _say("\nConnect an assistant to this recording. Claude Code by one line:")
+    _say(f"  {quoted(['claude', 'mcp', 'add', 'webots', '--', *command])}")
+    _say("Cursor and Claude Desktop by JSON (VS Code: servers instead of mcpServers):")
+    _say(f"  {_as_json(entry)}")
+    if not keep:
+        _say("With 'webots-mcp demo --keep' the robot goes on driving meanwhile.")
+    _say("In a Webots project of your own 'webots-mcp init' writes these entries.")
+
+
+def _keep(simulation: Simulation) -> None:
+    _say("\nThe robot keeps running until Ctrl-C.")
+    while simulation.is_running:
+        time.sleep(0.2)
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)

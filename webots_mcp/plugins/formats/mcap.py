@@ -12,22 +12,27 @@ import base64
 import json
 import math
 import re
+import sqlite3
 from collections import Counter
+from dataclasses import dataclass, field
 from functools import partial, singledispatchmethod
 from importlib import import_module
 from itertools import chain, count
-from typing import Any, BinaryIO, Final
+from pathlib import Path
+from typing import Any, BinaryIO, Final, cast
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.formats.contents import KINDS, Contents, PlacedCommand, Pose, Way
-from webots_mcp.plugins.formats.mcap_schemas import FIXED, Schema, Shape
 from webots_mcp.requirements import explain_extra
-from webots_mcp.store.export.export_rows import Recorded, value_at
+from webots_mcp.store.export import Exported, placed
+from webots_mcp.store.export.export_rows import Progress, Recorded, value_at
 from webots_mcp.store.export.text_formats import json_text
 from webots_mcp.store.images import StoredImage
 from webots_mcp.store.logs import LogLine
+from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.run_rows import Event
 from webots_mcp.store.signals.flatten import parse
+from webots_mcp.store.signals.registry import Signal
 
 WORLD_FRAME: Final = "world"
 _PROFILE: Final = ""  # of no middleware
@@ -276,3 +281,236 @@ def _time(time_s: float) -> dict[str, int]:
 def _nanoseconds(time_s: float) -> int:
     """MCAP knows no time before 0."""
     return max(0, round(time_s * 1e9))
+
+
+# JSON schemas of the messages in an MCAP file.
+#
+# Viewers know the ones called `foxglove.NAME` and draw them; the schema of states is made of what
+# they hold. Foxglove's and Lichtblick's readers of schemas take one type per field, and arrays of
+# one scalar type or of objects; a schema with anything else makes a whole topic unreadable. What a
+# state holds besides is therefore in the messages, but not in the schema: it is shown, not offered
+# to plot.
+
+
+Schema = dict[str, Any]
+
+_NUMBER: Final[Schema] = {"type": "number"}
+_INTEGER: Final[Schema] = {"type": "integer"}
+_TEXT: Final[Schema] = {"type": "string"}
+
+
+def _object(**properties: Schema) -> Schema:
+    return {"type": "object", "properties": properties}
+
+
+_TIME: Final = _object(sec=_INTEGER, nsec=_INTEGER)
+_VECTOR: Final = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER)
+_QUATERNION: Final = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
+_POSE: Final = _object(position=_VECTOR, orientation=_QUATERNION)
+
+FIXED: Final[dict[str, Schema]] = {
+    "foxglove.FrameTransform": _object(
+        timestamp=_TIME,
+        parent_frame_id=_TEXT,
+        child_frame_id=_TEXT,
+        translation=_VECTOR,
+        rotation=_QUATERNION,
+    ),
+    "foxglove.PosesInFrame": _object(
+        timestamp=_TIME,
+        frame_id=_TEXT,
+        poses={"type": "array", "items": _POSE},
+    ),
+    "foxglove.CompressedImage": _object(
+        timestamp=_TIME,
+        frame_id=_TEXT,
+        data={"type": "string", "contentEncoding": "base64"},
+        format=_TEXT,
+    ),
+    "foxglove.Log": _object(
+        timestamp=_TIME,
+        level=_INTEGER,
+        message=_TEXT,
+        name=_TEXT,
+        file=_TEXT,
+        line=_INTEGER,
+    ),
+    "webots_mcp.Event": _object(timestamp=_TIME, kind=_TEXT, name=_TEXT, data=_object()),
+    "webots_mcp.Command": _object(
+        timestamp=_TIME,
+        id=_INTEGER,
+        action=_TEXT,
+        params=_object(),
+        status=_TEXT,
+        requested_by=_TEXT,
+        finished_sim_time_s=_NUMBER,
+        took_wall_s=_NUMBER,
+        error=_TEXT,
+    ),
+}
+
+_SCALARS: Final = {bool: "boolean", int: "number", float: "number", str: "string"}
+
+
+@dataclass
+class Shape:
+    """What values of one field were seen to be: of which types, and what is inside of them."""
+
+    types: set[str] = field(default_factory=set[str])
+    fields: dict[str, Shape] = field(default_factory=dict[str, "Shape"])
+    items: Shape | None = None
+
+    def see(self, value: Any) -> None:
+        """Take in a value; null says nothing."""
+        scalar = _SCALARS.get(cast("type[Any]", type(value)))
+        if scalar is not None:
+            self.types.add(scalar)
+        elif isinstance(value, dict):
+            self.types.add("object")
+            for name, inner in cast("dict[str, Any]", value).items():
+                shape = self.fields.get(name)
+                if shape is None:
+                    shape = self.fields[name] = Shape()
+                shape.see(inner)
+        elif isinstance(value, list):
+            self.types.add("array")
+            self.items = self.items or Shape()
+            self.items.see_each(cast("list[Any]", value))
+
+    def see_each(self, values: list[Any]) -> None:
+        """Take in the items of an array: of thousands of numbers only the types."""
+        kinds = {cast("type[Any]", type(value)) for value in values}
+        if kinds.isdisjoint((dict, list)):
+            self.types.update(_SCALARS[kind] for kind in kinds & _SCALARS.keys())
+        else:
+            for value in values:
+                self.see(value)
+
+    def schema(self) -> Schema | None:
+        """None where a schema cannot say it."""
+        if len(self.types) != 1:
+            return None
+        (name,) = self.types
+        if name == "object":
+            inner = {key: shape.schema() for key, shape in self.fields.items()}
+            return _object(**{key: schema for key, schema in inner.items() if schema is not None})
+        if name == "array":
+            items = self.items.schema() if self.items else None
+            told = items is not None and items["type"] != "array"
+            return {"type": "array", "items": items} if told else None
+        return {"type": name}
+
+
+# An MCAP file with a layout for Foxglove and Lichtblick that shows what it holds.
+
+
+# What a message path can say without quotes: others are plotted by hand.
+_PLAIN_PATH: Final = re.compile(r"\$(\.[A-Za-z_]\w*|\[\d+\])+")
+_MOST_PLOTTED: Final = 8
+_MOST_CAMERAS: Final = 4
+_GRID: Final = {
+    "layerId": "foxglove.Grid",
+    "instanceId": "grid",
+    "label": "Grid",
+    "visible": True,
+    "size": 10,
+    "divisions": 10,
+    "position": [0, 0, 0],
+    "rotation": [0, 0, 0],
+}
+
+
+def export_mcap(
+    connection: sqlite3.Connection,
+    data_dir: Path,
+    wanted: TimeRange,
+    file: Path,
+    progress: Progress | None = None,
+) -> Exported:
+    """As `export_for_viewers`, with the layout beside the file."""
+    contents = Contents.of(connection, data_dir, wanted, 2, progress)
+    with placed(file) as aside, aside.open("wb") as sink:
+        counts = write_mcap(contents, sink)
+    with placed(layout_file(file)) as aside:
+        aside.write_text(json.dumps(layout(contents), indent=2), "utf-8")
+    beside = f"layout for Foxglove and Lichtblick: {layout_file(file)}"
+    return Exported(counts, beside, contents.source.notes)
+
+
+def layout_file(file: Path) -> Path:
+    """The layout beside a file for viewers."""
+    return file.with_suffix(".layout.json")
+
+
+def layout(contents: Contents) -> dict[str, Any]:
+    """Panels for the main signals, the mode, the way, the pictures and the log."""
+    topics, panels = Topics(contents), dict[str, dict[str, Any]]()
+    _add_signals(panels, contents, topics)
+    columns = [list(panels)]
+    if contents.motion.position is not None:
+        panels["3D!way"] = _way(contents, topics)
+    cameras = {topics.image(image): None for image in contents.images()}
+    for number, topic in enumerate([*cameras][:_MOST_CAMERAS]):
+        panels[f"Image!{number}"] = {"imageMode": {"imageTopic": topic}}
+    newest = contents.run_ids[-1]
+    panels["RosOut!log"] = {"topicToRender": topics.topic(newest, "log"), "minLogLevel": 1}
+    panels["RawMessages!state"] = {"topicPath": topics.topic(newest, "state")}
+    columns.append([name for name in panels if name not in columns[0]])
+    return {
+        "configById": panels,
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": {"speed": 1},
+        "layout": _split([_split(each, "column") for each in columns if each], "row"),
+    }
+
+
+def main_signals(contents: Contents) -> list[Signal]:
+    """What tells most of a run: how the robot moves, else the first numbers that it published."""
+    numbers = [signal for signal in contents.signals.values() if signal.kind in ("num", "angle")]
+    moving = [signal for signal in contents.motion.evidence if signal in numbers]
+    return (moving or numbers)[:_MOST_PLOTTED]
+
+
+def _add_signals(panels: dict[str, dict[str, Any]], contents: Contents, topics: Topics) -> None:
+    position = contents.motion.position or ()
+    places = [signal for signal in main_signals(contents) if signal in position]
+    others = [signal for signal in main_signals(contents) if signal not in position]
+    mode = [signal for signal in (contents.motion.mode,) if signal is not None]
+    plots = (("Plot!position", places), ("Plot!signals", others), ("StateTransitions!mode", mode))
+    for name, signals in plots:
+        paths = [path for signal in signals for path in _paths(contents, topics, signal)]
+        if paths:
+            panels[name] = {"paths": paths, "isSynced": True}
+
+
+def _paths(contents: Contents, topics: Topics, signal: Signal) -> list[dict[str, Any]]:
+    if signal.reduction or not _PLAIN_PATH.fullmatch(signal.path):
+        return []
+    return [
+        {
+            "value": f"{topics.topic(run_id, 'state')}{signal.path[1:]}",
+            "enabled": True,
+            "timestampMethod": "receiveTime",
+        }
+        for run_id in contents.run_ids
+    ]
+
+
+def _way(contents: Contents, topics: Topics) -> dict[str, Any]:
+    shown = {
+        topics.topic(run_id, "way"): {"visible": True, "type": "line"}
+        for run_id in contents.run_ids
+    }
+    return {"followTf": WORLD_FRAME, "followMode": "follow-none", "topics": shown,
+            "layers": {"grid": _GRID}}  # fmt: skip
+
+
+def _split(parts: list[Any], direction: str) -> Any:
+    """One part after the other, all of the same size."""
+    if len(parts) == 1:
+        return parts[0]
+    rest = _split(parts[1:], direction)
+    percentage = 100 / len(parts)
+    return {"first": parts[0], "second": rest, "direction": direction,
+            "splitPercentage": percentage}  # fmt: skip

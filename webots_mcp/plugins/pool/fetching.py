@@ -7,7 +7,9 @@ and repeated. Of a run without all its rows what is left comes: it is one whose 
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import shutil
 import sqlite3
 import tempfile
@@ -18,16 +20,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, cast
 
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.errors import PoolError
 from webots_mcp.liveness import process_alive
-from webots_mcp.plugins.pool.key_order import Order, in_order, order_of
 from webots_mcp.plugins.pool.pool_contents import Meant
-from webots_mcp.plugins.pool.row_batch import Batch
-from webots_mcp.plugins.pool.shipped_tables import SQLValue, table
-from webots_mcp.plugins.pool.target import Pool, PooledRun, is_whole
+from webots_mcp.plugins.pool.pool_interface import Batch, Pool, PooledRun, SQLValue, is_whole, table
 from webots_mcp.store.bundle import END_SESSIONS, small_recording
 from webots_mcp.store.chunks.making import chunk_whole_run
 from webots_mcp.store.chunks.stored import STATE_IDS
@@ -388,3 +387,63 @@ def _sweep(data_dir: Path) -> None:
         pid = each.name.removeprefix(_FOLDER).partition("-")[0]
         if pid.isdigit() and not process_alive(int(pid), None, time.time()):
             shutil.rmtree(each, ignore_errors=True)
+
+
+# The keys of a state in the order in which its controller gave them.
+#
+# A pool that holds JSON parsed (PostgreSQL's jsonb) has an order of its own. The register of
+# signals knows the one from before: names are entered as they first come.
+
+
+_STEP: Final = re.compile(r'\.("(?:[^"\\]|\\.)*"|[^."\[\]]+)|\[(\d+)\]')
+_ENCODED: Final = json.JSONEncoder(ensure_ascii=False, separators=(",", ":")).encode
+_LONG: Final = re.compile(r"\d{19}")
+
+Order = dict[str, Any]
+
+
+def order_of(paths: Iterable[str]) -> Order:
+    """The order of keys that the paths of a robot's signals tell, in the order of their ids."""
+    order: Order = {}
+    for path in paths:
+        level = order
+        for key, index in _STEP.findall(path):
+            level = level.setdefault(_key(key) if key else index, {})
+    return order
+
+
+def _key(step: str) -> str:
+    try:
+        return str(json.loads(step)) if step.startswith('"') else step
+    except ValueError:
+        return step[1:-1]
+
+
+def in_order(text: str, order: Order) -> str:
+    """A state as JSON text with its keys in that order; what the order lacks comes last.
+
+    A whole number beyond those of SQLite was a float, which a pool without exponents spells out.
+    """
+    try:
+        state = json.loads(text, parse_int=_number if _LONG.search(text) else None)
+        ordered = _ENCODED(_sorted(state, order))
+        ordered.encode()
+    except (ValueError, OverflowError, RecursionError):
+        return text  # no JSON, or halves of characters: a pool holds it as the text that it was
+    return ordered
+
+
+def _number(digits: str) -> int | float:
+    number = int(digits)
+    return number if -(2**63) <= number < 2**63 else float(number)
+
+
+def _sorted(value: Any, order: Order) -> Any:
+    if isinstance(value, dict):
+        members = cast("dict[str, Any]", value)
+        known = {key: _sorted(members[key], order[key]) for key in order if key in members}
+        return known if len(known) == len(members) else known | members | known
+    if isinstance(value, list) and any(order.values()):
+        items = cast("list[Any]", value)
+        return [_sorted(item, order.get(str(at), {})) for at, item in enumerate(items)]
+    return cast("Any", value)

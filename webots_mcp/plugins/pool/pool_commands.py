@@ -25,8 +25,8 @@ from webots_mcp.plugins.pool.pool_contents import (
 
 if TYPE_CHECKING:
     from webots_mcp.plugins.pool.fetching import Fetched
-    from webots_mcp.plugins.pool.report import Report
-    from webots_mcp.plugins.pool.target import Pool
+    from webots_mcp.plugins.pool.pool_interface import Pool
+    from webots_mcp.plugins.pool.shipping import Report
     from webots_mcp.store.questions.sql import Result
 
 _MOST_NAMED: Final = 3
@@ -55,8 +55,8 @@ def fetch(
     shipped and no states, the chunks come: the values of all of its signals. A run that goes on or
     is still being shipped is not taken: fetch it again when it is whole.
     """
-    from webots_mcp.plugins.pool.engines import open_pool
     from webots_mcp.plugins.pool.fetching import fetch as fetch_runs
+    from webots_mcp.plugins.pool.pool_contents import open_pool
 
     with open_pool(url) as pool:
         wanted = meant(pool, choice)  # first: no database is made for nothing
@@ -150,7 +150,7 @@ def pool(
 
         webots-mcp pool postgresql:///lab --sql 'SELECT count(*) FROM run'
     """
-    from webots_mcp.plugins.pool.engines import open_pool
+    from webots_mcp.plugins.pool.pool_contents import open_pool
 
     with open_pool(url) as opened:
         if sql is not None:
@@ -282,12 +282,11 @@ def ship(
     with --full each state. A password comes from PGPASSWORD, ~/.pgpass or a service file, never
     from the URL.
     """
-    from webots_mcp.plugins.pool.engines import open_target, pause_of
-    from webots_mcp.plugins.pool.following import follow as follow_recording
-    from webots_mcp.plugins.pool.report import Report
-    from webots_mcp.plugins.pool.shipping import Order
+    from webots_mcp.plugins.pool.pool_contents import open_target, pause_of
+    from webots_mcp.plugins.pool.pool_interface import redacted
+    from webots_mcp.plugins.pool.shipping import Order, Report
+    from webots_mcp.plugins.pool.shipping import follow as follow_recording
     from webots_mcp.plugins.pool.shipping import ship as ship_once
-    from webots_mcp.plugins.pool.target import redacted
 
     if len(urls) > 1:
         raise InvalidInputError(

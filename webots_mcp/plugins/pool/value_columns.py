@@ -15,9 +15,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final, TypeAlias
 
 from webots_mcp.naming import Value
-from webots_mcp.plugins.pool.parquet.packages import package
-from webots_mcp.plugins.pool.row_batch import Row
-from webots_mcp.plugins.pool.shipped_tables import table
+from webots_mcp.plugins.pool.parquet_files import package
+from webots_mcp.plugins.pool.pool_interface import Row, table
 from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.chunks.codec import (
     FIRST_LABEL,

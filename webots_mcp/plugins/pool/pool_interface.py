@@ -1,20 +1,210 @@
-"""What a pool can do, and how its URL may be shown."""
+"""Which tables are shipped to a pool, and how: derived from the models."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias, cast
 from urllib.parse import parse_qsl
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plugins.pool.row_batch import Batch
-from webots_mcp.plugins.pool.shipped_tables import Table
 
 if TYPE_CHECKING:
     from webots_mcp.store.questions.sql import Result
+
+SQLValue: TypeAlias = "int | float | str | bytes | None"
+Kind: TypeAlias = type[int] | type[float] | type[str] | type[bytes]
+
+_DATED: Final = ("state", "kept_state", "log", "event", "image", "parameter_value")
+CHUNKS: Final = ("row_group", "chunk")
+# Of one machine or one moment: who maintains it, what is kept there, and console lines that wait
+# to become log lines.
+_LOCAL: Final = ("lease", "watermark", "retention_limit", "console_line")
+# How many rows wait for chunks there, how many of a group are left, and what they take on the disk.
+_LOCAL_COLUMNS: Final = {
+    "run": ("is_chunked",),
+    "row_group": ("stored_row_count", "stored_row_bytes", "chunk_bytes", "is_complete"),
+}
+_OF_TRIALS: Final = ("trial_set", "trial")
+_TYPES: Final[dict[str, Kind]] = {
+    "INTEGER": int, "BIGINT": int, "FLOAT": float, "TEXT": str, "VARCHAR": str, "BLOB": bytes,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table that is shipped; its columns in the order in which a batch has their values.
+
+    Attributes:
+        key: Its primary key in a recording; in a pool the recording's UUID stands before it.
+        columns: Those of the key and all others that are shipped, by their names in the recording.
+        types: Of the columns, as the model declares them; SQLite may hold others.
+        json_columns: Those that hold JSON as text.
+        json_values: Of them, those in which a text is as good as an object.
+        nullable: Those that may be null.
+        lasting: References that retention sets to null where it deletes what they name: a null
+            does not replace the value that the pool has.
+        is_appended: Rows come with rising ids and never change; otherwise a row replaces the one
+            of the same key.
+        time_column: The wall time by which a pool may cut it into parts, of appended tables but
+            row groups and chunks.
+        run_column: The column that names the row's run, where it belongs to one.
+        session_column: The column that names its session.
+        outlasts_runs: It stays where the run or session that it names is not shipped.
+    """
+
+    name: str
+    key: tuple[str, ...]
+    columns: tuple[str, ...]
+    types: tuple[Kind, ...]
+    json_columns: frozenset[str]
+    json_values: frozenset[str]
+    nullable: frozenset[str]
+    lasting: frozenset[str]
+    is_appended: bool
+    time_column: str | None
+    run_column: str | None
+    session_column: str | None
+    outlasts_runs: bool
+
+
+@cache
+def tables() -> tuple[Table, ...]:
+    """All that are shipped, each after those that it refers to. Importing the models costs."""
+    from webots_mcp.store import models
+
+    ordered: list[Any] = cast("Any", models).SQLModel.metadata.sorted_tables
+    return tuple(_table(each) for each in ordered if each.name not in _LOCAL)
+
+
+def table(name: str) -> Table:
+    """The table of that name.
+
+    Raises:
+        KeyError: None of that name is shipped.
+    """
+    return {each.name: each for each in tables()}[name]
+
+
+def _table(model: Any) -> Table:
+    name: str = model.name
+    local = _LOCAL_COLUMNS.get(name, ())
+    shipped: list[Any] = [column for column in model.columns if column.name not in local]
+    columns = tuple(str(column.name) for column in shipped)
+    return Table(
+        name=name,
+        key=tuple(column.name for column in model.primary_key.columns),
+        columns=columns,
+        types=tuple(_TYPES[str(column.type)] for column in shipped),
+        json_columns=frozenset(column.name for column in shipped if _is_json(column)),
+        json_values=frozenset(column.name for column in shipped if _is_value(column)),
+        nullable=frozenset(column.name for column in shipped if column.nullable),
+        lasting=frozenset(column.name for column in shipped if _is_lasting(column)),
+        is_appended=name in _DATED + CHUNKS,
+        time_column="wall_time_s" if name in _DATED else None,
+        run_column=_column_of("run", name, columns),
+        session_column=_column_of("session", name, columns),
+        outlasts_runs=name in _OF_TRIALS,
+    )
+
+
+def _column_of(owner: str, name: str, columns: tuple[str, ...]) -> str | None:
+    if name == owner:
+        return "id"
+    return f"{owner}_id" if f"{owner}_id" in columns else None
+
+
+def _is_json(column: Any) -> bool:
+    return (column.comment or "").startswith("JSON") or column.name == "replaced"
+
+
+def _is_value(column: Any) -> bool:
+    return (column.comment or "").startswith("JSON value")
+
+
+def _is_lasting(column: Any) -> bool:
+    return any(key.ondelete == "SET NULL" for key in column.foreign_keys)
+
+
+# Rows of one table that are written together, bounded in bytes: memory is bounded as well.
+
+
+BATCH_BYTES: Final = 4_000_000
+BATCH_ROWS: Final = 20_000
+_VALUE_BYTES: Final = 8
+_SIZED: Final = (str, bytes)
+
+Row = tuple[SQLValue, ...]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Rows in the order of the table's columns, with the values that SQLite holds.
+
+    JSON is text, a flag 0 or 1. SQLite may hold any type in any column: what a target cannot hold
+    it turns into what comes nearest, and counts.
+    """
+
+    table: Table
+    rows: Sequence[Row]
+
+
+def batches(table: Table, rows: Iterable[Row]) -> Iterator[Batch]:
+    """Rows as batches of bounded size; a row that is larger by itself is a batch of its own."""
+    held: list[Row] = []
+    size = 0
+    for row in rows:
+        added = row_bytes(row)
+        if held and (size + added > BATCH_BYTES or len(held) >= BATCH_ROWS):
+            yield Batch(table, held)
+            held, size = [], 0
+        held.append(row)
+        size += added
+    if held:
+        yield Batch(table, held)
+
+
+def nearest(value: SQLValue, kind: type, *, nullable: bool) -> SQLValue:
+    """The value of a type that comes nearest to one that SQLite holds."""
+    if value is None:
+        return None if nullable else kind()
+    if kind is str:
+        text = value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+        return text.encode("utf-8", "surrogatepass").decode("utf-8", "replace")
+    if kind is bytes:
+        return value if isinstance(value, bytes) else None
+    number = number_in(value)
+    if number is None:
+        return None if nullable else kind()
+    if kind is float:
+        return float(number)
+    if math.isfinite(number) and abs(number) < 2**63:
+        return int(number)
+    return None if nullable else 0
+
+
+def number_in(value: SQLValue) -> int | float | None:
+    """The number that it is, or says; None of what is none."""
+    if isinstance(value, int | float):
+        return value
+    try:
+        return float(value or "")
+    except ValueError:
+        return None
+
+
+def row_bytes(row: Row) -> int:
+    """About how many bytes of memory a row's values take."""
+    sized = sum([len(value) for value in row if isinstance(value, _SIZED)])
+    return sized + _VALUE_BYTES * len(row)
+
+
+# What a pool can do, and how its URL may be shown.
+
 
 _SECRET: Final = re.compile(
     "password|passwd|secret|token|credential|signature|authorization|(access|api|account)[_-]?key|"

@@ -1,0 +1,637 @@
+"""Objects below the root of a pool, on a filesystem of fsspec: placed as a whole or not at all.
+
+In a folder an object is written beside and moved to its place; object stores do as much with a
+single put. Other filesystems are as atomic as their rename is.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+import os
+import posixpath
+import re
+import time
+from collections import defaultdict
+from collections.abc import Generator, Iterable, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field, replace
+from datetime import datetime, timedelta, timezone
+from importlib import import_module
+from pathlib import Path, PurePosixPath
+from typing import Any, Final
+from uuid import uuid4
+
+from webots_mcp.contract import PRIVATE_FOLDER, SCHEMA_VERSION, host_name, make_folder
+from webots_mcp.errors import (
+    InvalidInputError,
+    PoolBusyError,
+    PoolError,
+    PoolUnavailableError,
+    WebotsMCPError,
+)
+from webots_mcp.liveness import process_identity
+from webots_mcp.plugins.pool.pool_interface import Row, SQLValue, Table, redacted
+from webots_mcp.requirements import explain_extra, install_line
+
+_PUT_WHOLE: Final = frozenset(
+    {"memory", "s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl", "oci", "oss", "hf"}
+)
+_INCOMING: Final = "_incoming"  # what is written, before it is moved to its place
+_NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_REFUSED: Final = (errno.EACCES, errno.EPERM, errno.EROFS)
+_OTHERS: Final = (0o070, 0o007)  # the group, and everybody
+_WRITING: Final = 0o022
+_SEARCH: Final = 0o111
+_INHERITED: Final = 0o7000  # the group's sign, which a folder hands on
+_NOT_A_FOLDER: Final = (errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG)
+
+
+class Storage:
+    """What is below the root; paths are relative to it and have `/`.
+
+    Each method raises PoolUnavailableError where the filesystem does not answer or has no room,
+    and PoolError where it refuses.
+
+    Attributes:
+        address: The root without secrets.
+        files: The filesystem, as other libraries take it.
+        root: The root as that filesystem names it.
+        is_local: Whether it is a folder of this machine.
+    """
+
+    def __init__(self, url: str) -> None:
+        self.files, self.root = _filesystem(url)
+        self.is_local = bool({"file", "local"} & _protocols(self.files))
+        self.address = self.root if self.is_local else redacted(url)
+        self._puts_whole = bool(_PUT_WHOLE & _protocols(self.files))
+
+    def full(self, path: str, root: str | None = None) -> str:
+        """A path as the filesystem names it."""
+        return f"{(root or self.root).rstrip('/')}/{path}" if path else self.root
+
+    def url_of(self, path: str) -> str:
+        """An object as other libraries name it."""
+        full = self.full(path)
+        return full if self.is_local else str(self.files.unstrip_protocol(full))
+
+    def read(self, path: str) -> bytes | None:
+        """The content of an object; None where there is none."""
+        with self._answering(path):
+            try:
+                return self.files.cat_file(self.full(path))
+            except FileNotFoundError:
+                return None
+
+    def place(self, path: str, content: bytes) -> None:
+        """Put an object, in the place of another of that path."""
+        with self._answering(path):
+            full = self.full(path)
+            if self.is_local:
+                with self._written(content) as written:
+                    self._make_folder(Path(full).parent)
+                    written.replace(full)
+            elif self._puts_whole:
+                self.files.pipe_file(full, content)
+            else:
+                beside = self.full(f"{_INCOMING}/{uuid4().hex}")
+                self.files.makedirs(posixpath.dirname(beside), exist_ok=True)
+                self.files.makedirs(posixpath.dirname(full), exist_ok=True)
+                self.files.pipe_file(beside, content)
+                self.files.mv(beside, full)
+
+    def create(self, path: str, content: bytes) -> bool:
+        """Put an object where there is none; whether there was none.
+
+        Of two that do so at once in a folder one is told so; elsewhere, as a rule.
+        """
+        if not self.is_local:
+            if self.read(path) is not None:
+                return False
+            self.place(path, content)
+            return self.read(path) == content
+        with self._answering(path), self._written(content) as written:
+            full = Path(self.full(path))
+            self._make_folder(full.parent)
+            return _linked(written, full, content)
+
+    def remove(self, path: str) -> None:
+        """Remove an object, which may be gone already."""
+        with self._answering(path), suppress(FileNotFoundError):
+            self.files.rm_file(self.full(path))
+
+    def find(self, pattern: str) -> list[str]:
+        """The paths that match, `*` being any part of one name, in their order."""
+        with self._answering(pattern):
+            found = self.files.glob(self.full(pattern, _escaped(self.root)))
+        return sorted(self._relative(each) for each in found)
+
+    def sizes(self, pattern: str) -> dict[str, int]:
+        """The objects that match, with their bytes."""
+        with self._answering(pattern):
+            found = self.files.glob(self.full(pattern, _escaped(self.root)), detail=True)
+        return {self._relative(path): int(about["size"] or 0) for path, about in found.items()}
+
+    @contextmanager
+    def opened(self, path: str) -> Generator[Any]:
+        """An object as a file to read here and there."""
+        with self._answering(path), self.files.open(self.full(path), "rb") as file:
+            yield file
+
+    def is_empty(self) -> bool:
+        """Whether nothing is below the root."""
+        with self._answering(""):
+            try:
+                beside = [self._relative(each) for each in self.files.ls(self.root, detail=False)]
+            except FileNotFoundError:
+                return True
+        return not [each for each in beside if each not in ("", ".", _INCOMING)]
+
+    def clear(self, older_than_s: float) -> None:
+        """Remove what killed processes left half written."""
+        if not self.is_local:
+            return
+        for file in Path(self.full(_INCOMING)).glob("*"):
+            with suppress(OSError):
+                if file.stat().st_mtime < older_than_s:
+                    file.unlink()
+
+    def _relative(self, full: str) -> str:
+        root = str(self.root).strip("/")
+        return str(PurePosixPath(full.strip("/").removeprefix(root).lstrip("/")))
+
+    @property
+    def _rights(self) -> int:
+        """Of folders: the owner's alone, and whose the folder of the pool lets write into it."""
+        root = Path(self.root).stat().st_mode
+        return PRIVATE_FOLDER | sum(who for who in _OTHERS if root & who & _WRITING)
+
+    def _make_folder(self, folder: Path) -> None:
+        if folder.is_dir():
+            return
+        if folder == Path(self.root):
+            make_folder(folder)
+            return
+        self._make_folder(folder.parent)
+        with suppress(FileExistsError):  # another shipper was first
+            folder.mkdir(PRIVATE_FOLDER)
+            folder.chmod(folder.stat().st_mode & _INHERITED | self._rights)
+
+    @contextmanager
+    def _written(self, content: bytes) -> Generator[Path]:
+        """The content in a file beside the others, which is gone afterwards."""
+        file = Path(self.full(f"{_INCOMING}/{uuid4().hex}"))
+        self._make_folder(file.parent)
+        try:
+            with file.open("xb") as sink:
+                file.chmod(self._rights & ~_SEARCH)
+                sink.write(content)
+                sink.flush()
+                os.fsync(sink.fileno())
+            yield file
+        finally:
+            file.unlink(missing_ok=True)
+
+    @contextmanager
+    def _answering(self, path: str) -> Generator[None]:
+        try:
+            yield
+        except WebotsMCPError:  # from inside the block
+            raise
+        except OSError as error:
+            raise self._explained(error, path) from error
+        except Exception as error:  # each client of an object store has its own
+            raise PoolUnavailableError(
+                f"{self.address} does not answer ({path}): {error}"
+            ) from error
+
+    def _explained(self, error: OSError, path: str) -> PoolError:
+        what = error.strerror or str(error) or type(error).__name__
+        where = f"{self.address} ({path})" if path else self.address
+        if error.errno in _NO_ROOM:
+            return PoolUnavailableError(f"there is no room in {where}: {what}")
+        if error.errno in _REFUSED or isinstance(error, PermissionError):
+            return PoolError(f"{where} cannot be used by this user: {what}")
+        if error.errno in _NOT_A_FOLDER or isinstance(error, NotADirectoryError):
+            return PoolError(f"{where} cannot be a pool: {what}")
+        return PoolUnavailableError(f"{where} does not answer: {what}")
+
+
+def _filesystem(url: str) -> tuple[Any, str]:
+    """Of a URL or a folder.
+
+    Raises:
+        PoolError: A package is missing; the text names it.
+        InvalidInputError: No filesystem is known by that name.
+    """
+    core = package("fsspec.core")
+    try:
+        # What was listed before may have changed since: others ship to the same pool.
+        files, root = core.url_to_fs(url, use_listings_cache=False)
+    except ImportError as error:
+        raise PoolError(f"{redacted(url)} needs another package: {error}") from error
+    except ValueError as error:
+        raise InvalidInputError(
+            f"{redacted(url)} is on no filesystem that fsspec knows: {error}"
+        ) from error
+    except OSError as error:
+        raise PoolUnavailableError(f"{redacted(url)} does not answer: {error}") from error
+    return files, str(root)
+
+
+def _protocols(files: Any) -> set[str]:
+    named: str | tuple[str, ...] = files.protocol
+    return {named} if isinstance(named, str) else set(named)
+
+
+def _escaped(path: str) -> str:
+    """As a pattern that matches this path only."""
+    return re.sub(r"([*?\[])", r"[\1]", path)
+
+
+def _linked(written: Path, full: Path, content: bytes) -> bool:
+    """Whether the file is at its place now; not where another was there before it."""
+    try:
+        full.hardlink_to(written)
+    except FileExistsError:
+        return False
+    except OSError:  # no hard links there
+        try:
+            with full.open("xb") as sink:
+                sink.write(content)
+        except FileExistsError:
+            return False
+    return True
+
+
+# The lease of a recording in a pool: one shipper at a time, on whatever host.
+
+
+LEASE_S: Final = 60.0
+# One that ends later was taken before a clock was set back. It is not one lease from now: it may
+# be renewed after this host looked at its clock, and the clock of the other host may be ahead.
+_LATEST_S: Final = 2 * LEASE_S
+_RENEW_AFTER_S: Final = 15.0
+
+
+@dataclass(frozen=True)
+class _Holder:
+    """Who ships, and until when nobody else may."""
+
+    host: str
+    pid: int
+    process: str | None
+    token: str
+    until_wall_time_s: float
+
+    def encoded(self) -> bytes:
+        return json.dumps(asdict(self)).encode()
+
+    def is_gone(self, now_s: float) -> bool:
+        """Whether another may take over: this host knows that the process ended, or it is silent.
+
+        A shipper of this host that waits for long between two looks is not gone.
+        """
+        if self.host == host_name() and self.process is not None:
+            return process_identity(self.pid) != self.process
+        return not now_s < self.until_wall_time_s <= now_s + _LATEST_S
+
+
+class Lease:
+    """Held from `take` to `give_back`, as long as it is renewed."""
+
+    def __init__(self, storage: Storage, path: str) -> None:
+        self._storage = storage
+        self._path = path
+        self._token = os.urandom(8).hex()
+        self._until_s = 0.0
+
+    def take(self) -> None:
+        """Become the one who ships.
+
+        Raises:
+            PoolBusyError: Another does.
+        """
+        now_s = time.time()
+        if self._storage.create(self._path, self._mine(now_s)):
+            return
+        holder = self._holder()
+        if holder is not None and not holder.is_gone(now_s):
+            raise PoolBusyError(self._taken(holder))
+        self._storage.place(self._path, self._mine(now_s))
+        self.require_mine()
+
+    def renew(self) -> None:
+        """Before each thing that only the holder may do: see that this one still is.
+
+        Raises:
+            PoolBusyError: It had not renewed its lease for too long, and another has it.
+        """
+        now_s = time.time()
+        if LEASE_S - _RENEW_AFTER_S < self._until_s - now_s <= LEASE_S:
+            return
+        self.require_mine()
+        self._storage.place(self._path, self._mine(now_s))
+
+    def give_back(self) -> None:
+        """Let others take it at once."""
+        holder = self._holder()
+        if holder is not None and holder.token == self._token:
+            self._storage.remove(self._path)
+
+    def require_mine(self) -> None:
+        """See in the pool that nobody else has taken it.
+
+        Raises:
+            PoolBusyError: Another has.
+        """
+        holder = self._holder()
+        if holder is None or holder.token != self._token:
+            raise PoolBusyError(self._taken(holder))
+
+    def _mine(self, now_s: float) -> bytes:
+        self._until_s = now_s + LEASE_S
+        pid = os.getpid()
+        mine = _Holder(host_name(), pid, process_identity(pid), self._token, self._until_s)
+        return mine.encoded()
+
+    def _holder(self) -> _Holder | None:
+        content = self._storage.read(self._path)
+        if content is None:
+            return None
+        try:
+            told: dict[str, Any] = json.loads(content)
+            return _Holder(**told)
+        except (ValueError, TypeError):  # nobody's: it is taken over
+            return None
+
+    def _taken(self, holder: _Holder | None) -> str:
+        by = f"process {holder.pid} on {holder.host}" if holder else "another process"
+        return (
+            f"{by} ships this recording to {self._storage.address}: end it, or wait "
+            f"{LEASE_S:g} s after it is gone"
+        )
+
+
+# Which file of a pool a row is in: one of them, at any moment.
+#
+#     _pool                                       what this is, and of which version
+#     _runs/UUID                                  the recording that a run belongs to
+#     recording=UUID/_progress                    written last: what it says is there, is there
+#     recording=UUID/_lease                       who ships this recording
+#     recording=UUID/_pictures/PATH
+#     recording=UUID/table=NAME/day=YYYY-MM-DD/part-NUMBER.parquet    rows that never change
+#     recording=UUID/table=NAME/part-BLOCK.parquet                    rows that change
+#     recording=UUID/table=value/run=ID/part-NUMBER.parquet           a column for each signal
+#
+# A file is replaced as a whole, by itself with more rows. So whoever reads `*.parquet` while
+# somebody ships sees each row once or, for a moment, not yet. Engines pass over names that begin
+# with `_`.
+#
+# Rows that never change are in the part that was open when they came, and stay there: a part is
+# over once it is large. The progress says which one is open and how many rows of its files count:
+# rows beyond are those of a shipper that was killed. Rows that change are in blocks of ids.
+
+
+POOL: Final = "_pool"
+RUNS: Final = "_runs"
+PROGRESS: Final = "_progress"
+LEASE: Final = "_lease"
+CHUNK: Final = "chunk"
+VALUES: Final = "value"  # in the place of chunks a table with a column for each signal
+NO_DAY: Final = "__HIVE_DEFAULT_PARTITION__"  # read as null by engines
+
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=timezone.utc)
+_IDS_IN_BLOCK: Final = 4096
+
+
+def folder_of(recording_uuid: str) -> str:
+    """Where a recording is in the pool."""
+    return f"recording={recording_uuid}"
+
+
+def day_of(wall_time_s: SQLValue) -> str:
+    """The day in UTC, as it stands in a path; `NO_DAY` where the time is none."""
+    if not isinstance(wall_time_s, int | float):
+        return NO_DAY
+    try:
+        return (_EPOCH + timedelta(seconds=wall_time_s)).date().isoformat()
+    except (OverflowError, ValueError):  # NaN, or no year from 1 to 9999
+        return NO_DAY
+
+
+def picture_file(path: str) -> str:
+    """A picture, by the path in its row.
+
+    Raises:
+        PoolError: The path leads out of the folder of pictures.
+    """
+    parts = PurePosixPath(path).parts
+    if not parts or ".." in parts or path.startswith(("/", "\\")) or "\\" in path:
+        raise PoolError(f"{path!r} is no path of a picture: it leads out of the recording")
+    return f"_pictures/{'/'.join(parts)}"
+
+
+def name_of(table: Table) -> str:
+    """What a table is called in a pool of files."""
+    return VALUES if table.name == CHUNK else table.name
+
+
+def is_cut(table: Table) -> bool:
+    """Whether its rows never change and are in parts, of a day or of a run."""
+    return table.name == CHUNK or table.time_column is not None
+
+
+def appended_file(table: Table, folder: str, number: int | str) -> str:
+    """The part of a table whose rows never change."""
+    part = f"{number:06}" if isinstance(number, int) else number
+    return f"table={name_of(table)}/{folder}/part-{part}.parquet"
+
+
+def files_of(table: Table, recording_uuid: str = "*") -> str:
+    """The pattern of all files of a table, of one recording or of all."""
+    cut = "day=*/" if table.time_column else "run=*/" if table.name == CHUNK else ""
+    return f"{folder_of(recording_uuid)}/table={name_of(table)}/{cut}part-*.parquet"
+
+
+def uuid_in(path: str) -> str:
+    """The recording of a path."""
+    return path.partition("/")[0].removeprefix("recording=")
+
+
+def part_of(path: str) -> tuple[str, int]:
+    """The folder (`day=...`, `run=...`) and the number of a part."""
+    folder, _, name = path.rpartition("/part-")
+    return folder.rpartition("/")[2], int(name.removesuffix(".parquet"))
+
+
+def run_of(path: str) -> int | None:
+    """The run of a part, where it has the rows of one only."""
+    name, _, run_id = path.rpartition("/")[0].rpartition("/")[2].partition("=")
+    return int(run_id) if name == "run" else None
+
+
+def by_folder(table: Table, rows: Iterable[Row]) -> Mapping[str, list[Row]]:
+    """Rows that never change by their folders: those of a day, chunks of a run."""
+    place = table.columns.index(table.time_column or "run_id")
+    found: dict[str, list[Row]] = defaultdict(list)
+    for row in rows:
+        name = f"day={day_of(row[place])}" if table.time_column else f"run={row[place]}"
+        found[name].append(row)
+    return found
+
+
+def by_block(table: Table, rows: Iterable[Row]) -> Mapping[str, list[Row]]:
+    """Rows of a table that changes, by the files in which they are."""
+    found: dict[str, list[Row]] = defaultdict(list)
+    for row in rows:
+        found[f"table={table.name}/part-{_block(table, row)}.parquet"].append(row)
+    return found
+
+
+def _block(table: Table, row: Row) -> str:
+    if table.key == ("id",):
+        return f"{_whole(row[table.columns.index('id')]) // _IDS_IN_BLOCK:09}"
+    return f"{0:09}"
+
+
+def _whole(value: SQLValue) -> int:
+    if not isinstance(value, int | float) or not math.isfinite(value):
+        return 0
+    return math.floor(value)
+
+
+# What a pool says of itself, and what it holds of a recording: small objects of JSON.
+
+
+FORMAT: Final = 1
+
+
+@dataclass(frozen=True)
+class Part:
+    """The part of a table that is open: of a table whose rows never change.
+
+    Attributes:
+        number: Of the part; those before it are over.
+        rows: By the folder of its files, how many rows of each count.
+    """
+
+    number: int = 1
+    rows: Mapping[str, int] = field(default_factory=dict[str, int])
+
+    def counted(self, path: str) -> int | None:
+        """How many rows of a file count; None where all do."""
+        folder, number = part_of(path)
+        if number < self.number:
+            return None
+        return self.rows.get(folder, 0) if number == self.number else 0
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What the pool holds of a recording.
+
+    Attributes:
+        numbers: As the shipper gave them.
+        parts: By table.
+    """
+
+    numbers: Mapping[str, int] = field(default_factory=dict[str, int])
+    parts: Mapping[str, Part] = field(default_factory=dict[str, Part])
+
+    def part(self, table: str) -> Part:
+        """Of a table, the first where it has no rows yet."""
+        return self.parts.get(table, Part())
+
+    def with_part(self, table: str, part: Part) -> Progress:
+        """After rows of a table have come."""
+        return replace(self, parts={**self.parts, table: part})
+
+
+def read_progress(storage: Storage, recording_uuid: str) -> Progress:
+    """What the pool holds of a recording: nothing where it is new.
+
+    Raises:
+        PoolError: It cannot be read.
+    """
+    path = f"{folder_of(recording_uuid)}/{PROGRESS}"
+    content = storage.read(path)
+    if content is None:
+        return Progress()
+    try:
+        told: dict[str, Any] = json.loads(content)
+        parts = {str(name): Part(**part) for name, part in told["parts"].items()}
+        return Progress({str(name): int(n) for name, n in told["numbers"].items()}, parts)
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise PoolError(f"{path} in {storage.address} cannot be read: {error}") from error
+
+
+def place_progress(storage: Storage, recording_uuid: str, progress: Progress) -> None:
+    """Say what is there: rows count from now on."""
+    content = json.dumps(asdict(progress)).encode()
+    storage.place(f"{folder_of(recording_uuid)}/{PROGRESS}", content)
+
+
+def require_pool(storage: Storage) -> None:
+    """Raise unless a pool of exactly this version is there.
+
+    Raises:
+        PoolError: There is none, or an older or a newer one.
+    """
+    content = storage.read(POOL)
+    if content is None:
+        raise PoolError(f"there is no pool in {storage.address}: ship a recording to it first")
+    try:
+        told: dict[str, Any] = json.loads(content)
+        its_format, schema = int(told["format"]), int(told["schema"])
+    except (ValueError, TypeError, KeyError) as error:
+        raise PoolError(f"{POOL} in {storage.address} cannot be read: {error}") from error
+    if its_format > FORMAT or schema > SCHEMA_VERSION:
+        raise PoolError(
+            f"the pool in {storage.address} has format {its_format} and schema {schema}, this "
+            f"webots-mcp knows {FORMAT} and {SCHEMA_VERSION}: update webots-mcp"
+        )
+    if schema < SCHEMA_VERSION:
+        raise PoolError(
+            f"the pool in {storage.address} has schema {schema}, of an older webots-mcp: ship the "
+            "recordings anew, into another folder"
+        )
+
+
+def make_pool(storage: Storage) -> None:
+    """Make a pool where there is nothing.
+
+    Raises:
+        PoolError: Other things are there, or another version made it.
+    """
+    if storage.read(POOL) is None:
+        if not storage.is_empty():
+            raise PoolError(
+                f"{storage.address} holds other things and is no pool: name a new or empty folder"
+            )
+        about = {"format": FORMAT, "schema": SCHEMA_VERSION}
+        return storage.place(POOL, json.dumps(about).encode())
+    require_pool(storage)
+
+
+# Packages that need not be there, and have no types: what they give is `Any`.
+
+
+_EXTRA: Final = ("pyarrow", "fsspec")
+
+
+def package(name: str) -> Any:
+    """A module of a package of the extra `parquet`, or of DuckDB.
+
+    Raises:
+        PoolError: It is not installed; the text says what to install.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        whose = name.partition(".")[0]
+        if whose in _EXTRA:
+            raise PoolError(explain_extra("a pool of Parquet files", "parquet")) from error
+        asked = f"a SELECT over a pool of Parquet files needs {whose}"
+        raise PoolError(f"{asked}: {install_line([whose])}") from error

@@ -10,7 +10,7 @@ from tests.detection.asking import Answer, Claim, claims_of
 from tests.detection.goals import missed_goals
 from tests.detection.judging import Tally, judge
 from tests.detection.labelled import Incident
-from webots_mcp.store.detection.event import Event
+from webots_mcp.store.detection.kinds import Event
 
 STOPS = (Incident("standstill", 10.0, 20.0), Incident("standstill", 40.0, 50.0))
 

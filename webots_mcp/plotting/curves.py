@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-from webots_mcp.store.analysis.rhythm import rhythm_of
+from webots_mcp.store.analysis.arrays import rhythm_of
 from webots_mcp.store.questions.series import NumberColumns, RunHistory
 
 Point = tuple[float, float, float, float]  # time, mean, minimum, maximum

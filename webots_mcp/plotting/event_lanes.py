@@ -9,10 +9,8 @@ from typing import Final
 
 from webots_mcp.plotting.parts import Part
 from webots_mcp.plotting.plotted_intervals import Interval, Lane
-from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.registry import drawn_kinds
-from webots_mcp.store.detection.verdict import Verdicts
-from webots_mcp.store.questions.events import Events, find_events
+from webots_mcp.store.detection.events import Events, drawn_kinds, find_events
+from webots_mcp.store.detection.kinds import Event, EventOptions, Verdicts
 
 MOST_EVENTS: Final = 500
 MOST_LANES: Final = 5  # in one picture

@@ -10,15 +10,15 @@ from typing import Final
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plotting.canvas import short
 from webots_mcp.plotting.plotted_intervals import Interval
-from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.parameters import differing, parameters_of
 from webots_mcp.store.questions.series import MOST_POINTS, History, RunHistory, query_history
-from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
+from webots_mcp.store.reading.catalogue import one_signal, signals_of
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
+from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
 from webots_mcp.store.run_rows import fetch_run
-from webots_mcp.store.signals.catalogue import one_signal, signals_of
-from webots_mcp.store.signals.registry import Signal
+from webots_mcp.store.signals import Signal
 
 Known = dict[str, Signal]
 

@@ -24,8 +24,8 @@ from webots_mcp.plotting.parts import (
 )
 from webots_mcp.plotting.plotted_intervals import Interval, Lane, lane_of, merged_notes
 from webots_mcp.plotting.signal_axes import SignalAxes, paint_signals
-from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
 from webots_mcp.store.reading.ranges import TimeRange
+from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
 
 
 def plot_signals(

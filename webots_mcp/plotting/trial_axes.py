@@ -10,7 +10,7 @@ from typing import Any, Final
 from webots_mcp.plotting.canvas import paint_title, short
 from webots_mcp.plotting.legend import Entry, paint_legend
 from webots_mcp.plotting.palette import INK, LINES
-from webots_mcp.store.analysis.ranking import Ranked
+from webots_mcp.store.analysis.spread import Ranked
 
 _MOST_TOLD_CELLS: Final = 60  # more texts in a grid would not fit
 _AT_THE_BOTTOM: Final = 0.03  # of the height of the axes

@@ -22,10 +22,10 @@ from webots_mcp.plugins.pool.parquet.parquet_reading import ParquetPool
 from webots_mcp.plugins.pool.parquet.storage import Storage
 from webots_mcp.plugins.pool.pool_contents import pooled_runs, pooled_trial_sets
 from webots_mcp.plugins.pool.shipped_tables import table
-from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.detection.events import find_events
+from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.questions.runs import list_runs
-from webots_mcp.store.questions.sql_process import FOLDER
+from webots_mcp.store.questions.sql import FOLDER
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.ranges import Scope, find_range
 

@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from webots_mcp.store.analysis.ranking import Best, Outcome, rank
+from webots_mcp.store.analysis.spread import Best, Outcome, rank
 
 
 def outcomes(**scores: list[float | None]) -> list[Outcome]:

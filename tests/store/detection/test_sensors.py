@@ -13,11 +13,11 @@ import pytest
 from tests.recordings.rover import start_run
 from webots_mcp.errors import UnknownSignalError
 from webots_mcp.store.chunks.making import make_chunks
-from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.questions.events import Events, find_events
+from webots_mcp.store.detection.events import Events, find_events
+from webots_mcp.store.detection.kinds import Event, EventOptions
 from webots_mcp.store.questions.trends import trends
+from webots_mcp.store.reading.catalogue import known_signals, list_signals, resolve_signals
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.signals.catalogue import known_signals, list_signals, resolve_signals
 
 State = Callable[[float], dict[str, Any]]
 

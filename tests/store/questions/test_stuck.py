@@ -11,15 +11,14 @@ import pytest
 
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from tests.store.questions.asking import ask, spans
-from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.mode_use import ModeUses
-from webots_mcp.store.detection.motion import RunNoise, find_motion
+from webots_mcp.store.detection.events import find_events
+from webots_mcp.store.detection.kinds import Event, EventOptions
+from webots_mcp.store.detection.motion import ModeUses, RunNoise, find_motion
 from webots_mcp.store.detection.standstill import judge_standstills
-from webots_mcp.store.questions.events import find_events
-from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.signals.catalogue import known_signals
+from webots_mcp.store.reading.segment import Deadline
 
 
 def publish_stuck(empty: sqlite3.Connection, **moving_and_standing: Any) -> tuple[Event, ...]:

@@ -13,7 +13,7 @@ from webots_mcp.plugins.formats.mcap import WORLD_FRAME, Topics, write_mcap
 from webots_mcp.store.export import Exported, placed
 from webots_mcp.store.export.export_rows import Progress
 from webots_mcp.store.reading.ranges import TimeRange
-from webots_mcp.store.signals.registry import Signal
+from webots_mcp.store.signals import Signal
 
 # What a message path can say without quotes: others are plotted by hand.
 _PLAIN_PATH: Final = re.compile(r"\$(\.[A-Za-z_]\w*|\[\d+\])+")

@@ -27,7 +27,7 @@ from webots_mcp.store.export.text_formats import json_text
 from webots_mcp.store.images import StoredImage
 from webots_mcp.store.logs import LogLine
 from webots_mcp.store.run_rows import Event
-from webots_mcp.store.signals.flatten import parse
+from webots_mcp.store.signals import parse
 
 WORLD_FRAME: Final = "world"
 _PROFILE: Final = ""  # of no middleware

@@ -13,7 +13,7 @@ from webots_mcp.cli.values import Parameter
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.naming import nearest_first
 from webots_mcp.plugins.pool.target import Pool, PooledRun, PooledTrialSet
-from webots_mcp.store.reading.wall_time import parse_wall_time
+from webots_mcp.store.reading.ranges import parse_wall_time
 
 _MOST_OFFERED: Final = 3
 _OF_RUN: Final = (

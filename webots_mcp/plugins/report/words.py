@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
 from typing import Any, Final, cast
 
-from webots_mcp.store.detection.event import Event
+from webots_mcp.store.detection.kinds import Event
 
 LONGEST_TEXT: Final = 1_000  # characters of a cell
 _LONGEST_VALUE: Final = 400  # of a value within one

@@ -20,8 +20,15 @@ from webots_mcp.plugins.pool.parquet.packages import package
 from webots_mcp.plugins.pool.parquet.storage import Storage
 from webots_mcp.plugins.pool.pool_statement import Kind, answered, bounded
 from webots_mcp.plugins.pool.shipped_tables import Table, tables
-from webots_mcp.store.questions.sql import MAX_BYTES, Result, require_max_rows
-from webots_mcp.store.questions.sql_process import FOLDER, Statement, decode, main
+from webots_mcp.store.questions.sql import (
+    FOLDER,
+    MAX_BYTES,
+    Result,
+    Statement,
+    decode,
+    main,
+    require_max_rows,
+)
 
 DEADLINE_S: Final = 60.0
 _MEMORY: Final = "2GB"

@@ -23,6 +23,8 @@ from webots_mcp.store.detection.events import find_events
 from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.reading.ranges import Scope, find_range
 
+pytestmark = pytest.mark.slow
+
 _REPEATABLE = settings.default is not None and settings.default.derandomize
 EXAMPLES = 4 if _REPEATABLE else 100
 MOST_VALUES = 10_000  # that are added to a run: enough to be searched, and read in no time

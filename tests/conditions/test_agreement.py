@@ -14,9 +14,9 @@ from webots_mcp.conditions import parse_condition
 from webots_mcp.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.detection.condition import values_at, where_held
-from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import whole_run
+from webots_mcp.store.reading.segment import Deadline
 
 Held = list[tuple[float, dict[str, Any]]]
 

@@ -17,7 +17,7 @@ from tests.frames import frame_of_states
 from webots_mcp.conditions import parse_condition
 from webots_mcp.errors import ConditionFailedError
 from webots_mcp.naming import find_position
-from webots_mcp.store.conditions_on_arrays import OnArrays, first_failure
+from webots_mcp.store.detection.condition import OnArrays, first_failure
 from webots_mcp.store.reading.frame import Frame
 
 Failing = tuple[int, str]

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from tests.detection.labelled import Measure
-from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.detection.events import find_events
+from webots_mcp.store.detection.kinds import Event, EventOptions
 from webots_mcp.store.questions.compare import Comparison, compare_runs
-from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 # Without a deadline that a busy machine would meet; how long it took is measured beside.

@@ -19,9 +19,11 @@ from tests.detection.writing import write_all
 from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S
 from webots_mcp.store.analysis.swings import MUCH_SLOWER
-from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.detection.events import find_events
+from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.reading.ranges import Scope, find_range
+
+pytestmark = pytest.mark.slow
 
 _REPEATABLE = settings.default is not None and settings.default.derandomize
 EXAMPLES = 4 if _REPEATABLE else 100

@@ -11,12 +11,10 @@ import numpy as np
 import pytest
 
 from tests.detection.drawing import KINDS, draw_case
-from tests.detection.driving import DRAWN as DRIVES
 from tests.detection.driving import drive_of, driven, held, phase
 from tests.detection.labelled import Incident, LabelledRun, cut_at, repeated
-from tests.detection.sensing import draw_dead, draw_dropouts, draw_gaps, draw_leaps, draw_silent
+from tests.detection.sensing import draw_dead, draw_leaps, draw_silent
 from tests.detection.swinging import DRAWN as SWINGS
-from tests.detection.swinging import course_of
 
 SEEDS = range(4)
 
@@ -74,19 +72,6 @@ def test_a_robot_without_noise_moves_except_where_it_stands(seed: int) -> None:
             assert (step_m == 0) == at_rest
 
 
-@pytest.mark.parametrize("kind", DRIVES)
-def test_the_distance_is_that_of_the_way_without_noise(kind: str) -> None:
-    rng = np.random.default_rng(1)
-    run = driven(rng, drive_of(rng, 60, 0.3, kind), 0.008, 0.0)
-    assert run.distance_m == pytest.approx(sum(steps_m(run)), rel=1e-3)
-    assert run.distance_m == pytest.approx(0.3 * 60, rel=1e-3)
-
-
-def test_noise_is_as_strong_as_it_is_said_to_be() -> None:
-    run = driven(np.random.default_rng(1), [phase(300, 0, "idle")], 0.1, 0.02)
-    assert np.std(np.array(places(run)), axis=0) == pytest.approx([0.02, 0.02], rel=0.05)
-
-
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_sensor_has_no_value_exactly_while_it_is_silent(seed: int) -> None:
     for run in (drawn(draw_silent, seed), drawn(draw_dead, seed)):
@@ -98,21 +83,6 @@ def test_a_sensor_has_no_value_exactly_while_it_is_silent(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_dropouts_are_the_only_rows_at_an_end_of_the_scale(seed: int) -> None:
-    run = drawn(draw_dropouts, seed)
-    out = {t for t, v in zip(run.times.tolist(), run.columns["front"], strict=True) if v in (0, 2)}
-    told = {time_s for each in run.incidents for time_s in (each.start_s, each.end_s)}
-    assert out == told
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_gaps_lie_between_two_rows_and_nowhere_else(seed: int) -> None:
-    run = drawn(draw_gaps, seed)
-    wide = [ends for ends in pairwise(run.times.tolist()) if ends[1] - ends[0] > 2]
-    assert wide == [(each.start_s, each.end_s) for each in of(run, "gap")]
-
-
-@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("copies", [1, 3])
 def test_leaps_are_the_only_long_steps_also_where_a_run_is_repeated(seed: int, copies: int) -> None:
     run = drawn(draw_leaps, seed)
@@ -120,18 +90,6 @@ def test_leaps_are_the_only_long_steps_also_where_a_run_is_repeated(seed: int, c
     found = zip(run.times[1:].tolist(), steps_m(run), strict=True)
     assert [time_s for time_s, step_m in found if step_m > 0.3] == pytest.approx(
         [each.start_s for each in of(run, "leap")]
-    )
-
-
-def test_a_repeated_run_goes_on_without_a_step_and_its_truth_with_it() -> None:
-    run = drawn(draw_dead, 1)
-    (dead,) = run.incidents
-    both = repeated(run, 2 * len(run.times))
-    assert set(np.round(np.diff(both.times), 6)) == {run.interval_s}
-    (longer,) = both.incidents
-    assert longer.start_s == dead.start_s
-    assert longer.end_s - longer.start_s == pytest.approx(
-        2 * (dead.end_s - dead.start_s) + run.interval_s
     )
 
 
@@ -157,10 +115,3 @@ def test_a_swing_reaches_as_far_and_as_often_as_it_is_said_to(seed: int) -> None
     assert halves == pytest.approx(round(halves)) and 6 <= round(halves) <= 30
     crossings = int(np.count_nonzero(np.diff(about[1:-1] > 0)))
     assert abs(crossings - (round(halves) - 1)) <= 1
-
-
-def test_a_course_that_turns_changes_its_slope_and_never_steps() -> None:
-    times = np.arange(0, 60, 0.05)
-    course = course_of(np.random.default_rng(1), times, "turns")
-    slopes = {round(slope, 6) for slope in (np.diff(course) / 0.05).tolist()}
-    assert slopes <= {0.0, 0.8, -0.8, 0.3} and len(slopes) > 1

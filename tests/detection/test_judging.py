@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
@@ -10,7 +11,7 @@ from tests.detection.asking import Answer, Claim, claims_of
 from tests.detection.goals import missed_goals
 from tests.detection.judging import Tally, judge
 from tests.detection.labelled import Incident
-from webots_mcp.store.detection.event import Event
+from webots_mcp.store.detection.kinds import Event
 
 STOPS = (Incident("standstill", 10.0, 20.0), Incident("standstill", 40.0, 50.0))
 
@@ -26,41 +27,26 @@ def tally(*verdicts: object, admitted: bool = False) -> Tally:
     return found
 
 
-def test_who_tells_all_and_nothing_else_is_right() -> None:
-    found = tally(judge(STOPS, [stand(10, 20), stand(40.1, 49.8)], 0.1))
-    assert (found.recall, found.precision, found.said_share) == (1.0, 1.0, None)
-    assert found.begin_errors == pytest.approx([0.0, 1.0])
-    assert found.end_errors == pytest.approx([0.0, 2.0])
-    assert missed_goals(("drive", "standstill", ""), found) == []
+SHORT = (replace(STOPS[0], optional=True),)
+# What happened, what is told of it, and how much of that is found, missed and false.
+TOLD = [
+    (STOPS, [(10, 20), (40.1, 49.8)], (2, 0, 0)),
+    (STOPS, [(10, 20), (70, 80)], (1, 1, 1)),
+    (STOPS[:1], [(10, 14), (14.2, 16), (16.2, 18), (18.2, 20)], (1, 0, 3)),
+    (STOPS, [(0, 600)], (0, 2, 1)),
+    *((SHORT, told, (0, 0, 0)) for told in ([], [(10, 20)], [(10, 13), (15, 20)])),
+]
 
 
-def test_what_is_not_told_costs_recall_and_what_did_not_happen_precision() -> None:
-    found = tally(judge(STOPS, [stand(10, 20), stand(70, 80)], 0.1))
-    assert (found.recall, found.precision, found.said_share) == (0.5, 0.5, 0.0)
-    assert missed_goals(("drive", "standstill", ""), found) == ["recall", "precision"]
-
-
-def test_one_standstill_told_as_four_is_found_once_and_thrice_wrong() -> None:
-    parts = [stand(10, 14), stand(14.2, 16), stand(16.2, 18), stand(18.2, 20)]
-    verdict = judge(STOPS[:1], parts, 0.1)
-    assert len(verdict.found) == 1 and verdict.false == 3
-
-
-def test_two_standstills_told_as_one_are_found_at_most_once() -> None:
-    verdict = judge(STOPS, [stand(10, 50)], 0.1)
-    assert len(verdict.found) + len(verdict.missed) == 2 and len(verdict.missed) >= 1
-
-
-def test_an_answer_that_covers_the_whole_run_has_found_nothing_in_it() -> None:
-    verdict = judge(STOPS, [stand(0, 600)], 0.1)
-    assert not verdict.found and verdict.false == 1
-
-
-def test_what_lies_at_a_limit_is_right_whether_it_is_told_or_not() -> None:
-    short = replace(STOPS[0], optional=True)
-    for claims in ([], [stand(10, 20)], [stand(10, 13), stand(15, 20)]):
-        found = tally(judge([short], claims, 0.1))
-        assert (found.incidents, found.false, found.precision) == (0, 0, 1.0)
+@pytest.mark.parametrize(("happened", "told", "counts"), TOLD)
+def test_what_is_told_is_found_or_false_and_the_rest_is_missed(
+    happened: Sequence[Incident], told: list[tuple[float, float]], counts: tuple[int, int, int]
+) -> None:
+    verdict = judge(happened, [stand(*each) for each in told], 0.1)
+    found = tally(verdict)
+    assert (found.found, found.incidents - found.found, verdict.false) == counts
+    goals = ["recall"] * (counts[1] > 0) + ["precision"] * (counts[2] > 0)
+    assert missed_goals(("drive", "standstill", ""), found) == goals
 
 
 def test_where_nothing_happened_each_run_is_clean_or_not() -> None:
@@ -103,12 +89,6 @@ def test_what_several_items_of_an_array_tell_at_once_is_one_claim() -> None:
     assert [(each.name, each.start_s) for each in claims] == [
         ("lidar", 3.0), ("front", 3.0), ("lidar", 20.0),
     ]  # fmt: skip
-
-
-def test_a_leap_of_the_robot_and_a_jump_of_a_sensor_are_two_things() -> None:
-    events = [Event("jump", 1, 3.0, 3.0, 0.0, name) for name in ("position", "front")]
-    assert [each.name for each in claims_of(events, "leap")] == [None]
-    assert [each.name for each in claims_of(events, "dropout")] == ["front"]
 
 
 def test_an_answer_admits_what_it_says_it_did_not_search() -> None:

@@ -30,8 +30,8 @@ from webots_mcp.questions import all_questions
 from webots_mcp.questions.merged_questions import MergedQuestion
 from webots_mcp.server import create_server
 from webots_mcp.store.export import TrialTable, export, export_for_viewers
-from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import Scope, find_range
+from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 
 Answers = dict[str, Any]
 

@@ -16,9 +16,9 @@ from webots_mcp.cli import main
 from webots_mcp.connection import connect
 from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.questions.trends import trends
-from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, find_range, whole_run
+from webots_mcp.store.reading.segment import Deadline
 
 
 @pytest.fixture

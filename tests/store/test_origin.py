@@ -17,7 +17,7 @@ from webots_mcp.errors import DatabaseError, ForeignDatabaseError
 from webots_mcp.schema import shipped_objects
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.merging import merge
-from webots_mcp.store.questions.schema_text import describe_schema
+from webots_mcp.store.questions.sql import describe_schema
 from webots_mcp.store.recording import Recording
 
 ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT {} FROM n"

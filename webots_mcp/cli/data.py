@@ -182,8 +182,7 @@ def _notes_of(wanted: TimeRange) -> list[str]:
 def _export_bundle(recorded: Where, part: Range, file: Path) -> _Written:
     from webots_mcp.store.bundle import write_bundle
     from webots_mcp.store.export import placed
-    from webots_mcp.store.reading.ranges import Scope
-    from webots_mcp.store.reading.subject import find_subject
+    from webots_mcp.store.reading.ranges import Scope, find_subject
 
     scope, recording = part.scope(), recorded.recording()
     if scope != Scope(robot=scope.robot, run_id=scope.run_id):

@@ -20,7 +20,7 @@ from webots_mcp.cli.values import Count, Parameter
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 
 if TYPE_CHECKING:
-    from webots_mcp.store.analysis.ranking import Ranking
+    from webots_mcp.store.analysis.spread import Ranking
     from webots_mcp.store.recording import Recording
     from webots_mcp.store.trials import Result, Trial
     from webots_mcp.trials.plan import WorldPlan
@@ -262,7 +262,7 @@ class _Progress:
 
 
 def _show(recording: Recording, set_id: int, plan: WorldPlan, *, as_json: bool) -> None:
-    from webots_mcp.store.questions.score import unseen
+    from webots_mcp.store.questions.outcomes import unseen
     from webots_mcp.store.trials import ranking_of, trials_of
 
     with recording.reader() as connection:

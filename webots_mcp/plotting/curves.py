@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Final
 
-from webots_mcp.store.analysis.rhythm import rhythm_of
+from webots_mcp.store.analysis.arrays import rhythm_of
 from webots_mcp.store.questions.series import NumberColumns, RunHistory
 
 Point = tuple[float, float, float, float]  # time, mean, minimum, maximum

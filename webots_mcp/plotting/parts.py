@@ -17,11 +17,11 @@ from webots_mcp.store.detection.verdict import Verdicts
 from webots_mcp.store.parameters import differing, parameters_of
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.questions.series import MOST_POINTS, History, RunHistory, query_history
-from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
+from webots_mcp.store.reading.catalogue import one_signal, signals_of
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
+from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
 from webots_mcp.store.run_rows import fetch_run
-from webots_mcp.store.signals.catalogue import one_signal, signals_of
-from webots_mcp.store.signals.registry import Signal
+from webots_mcp.store.signals import Signal
 
 Known = dict[str, Signal]
 

@@ -11,12 +11,11 @@ from itertools import accumulate, pairwise
 from typing import Final, NamedTuple
 
 from webots_mcp.plotting.parts import Part
-from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.analysis.rhythm import rhythm_of
+from webots_mcp.store.analysis.arrays import np, rhythm_of
 from webots_mcp.store.analysis.summary import LARGEST
-from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import read_frame
-from webots_mcp.store.signals.registry import Signal
+from webots_mcp.store.reading.segment import Deadline
+from webots_mcp.store.signals import Signal
 
 MOST_PLACES: Final = 20_000  # of a way; a picture has a thousandth as many pixels
 _LEAP: Final = 10.0  # times the speed that 95 % of the steps keep to

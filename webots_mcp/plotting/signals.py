@@ -22,8 +22,8 @@ from webots_mcp.plotting.parts import (
     unread_parts,
 )
 from webots_mcp.plotting.signal_axes import SignalAxes, paint_signals
-from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
 from webots_mcp.store.reading.ranges import TimeRange
+from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
 
 
 def plot_signals(

@@ -22,13 +22,13 @@ from webots_mcp.plotting.parts import (
 )
 from webots_mcp.plotting.path import read_path
 from webots_mcp.plotting.trajectory_axes import Track, TrajectoryAxes, paint_trajectory
-from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.detection.motion import motion_in
-from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
+from webots_mcp.store.reading.catalogue import one_signal
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import TimeRange
-from webots_mcp.store.signals.catalogue import one_signal
-from webots_mcp.store.signals.registry import Signal
+from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
+from webots_mcp.store.signals import Signal
 
 _FLAGS: Final = ("bumper", "collision", "collided", "contact", "touching", "stuck")
 

@@ -11,7 +11,7 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.naming import listed, nearest_first
 from webots_mcp.plotting.canvas import Picture, Sheet
 from webots_mcp.plotting.trial_axes import TrialAxes, paint_trials
-from webots_mcp.store.analysis.ranking import Outcome, rank
+from webots_mcp.store.analysis.spread import Outcome, rank
 from webots_mcp.store.trials import Trial, best_of, fetch_trial_set, trials_of
 
 

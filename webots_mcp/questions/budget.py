@@ -20,7 +20,7 @@ from webots_mcp.questions.shortening import (
     shorten,
     tokens_of,
 )
-from webots_mcp.store.reading.ranges import shown_time
+from webots_mcp.store.reading.segment import shown_time
 from webots_mcp.store.recording import View, look, storage
 
 ANSWER_TOKENS: Final = 2_000

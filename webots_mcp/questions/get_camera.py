@@ -18,8 +18,7 @@ from webots_mcp.questions.pictures import load_picture, load_sheet
 from webots_mcp.questions.shortening import compact_json
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.images import StoredImage, camera_frames, cameras, inside
-from webots_mcp.store.reading.kept import kept_stretches
-from webots_mcp.store.reading.ranges import just_after
+from webots_mcp.store.reading.segment import just_after, kept_stretches
 from webots_mcp.store.recording import Recording, View
 
 _WAIT_S: Final = 15.0

@@ -16,9 +16,8 @@ from webots_mcp.questions.declaring import READS, question
 from webots_mcp.questions.find_events import TimelineKinds, events_table, verdicts_of
 from webots_mcp.questions.history_answers import TimelineAnswer
 from webots_mcp.questions.shortening import tokens_of
-from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.detection.registry import stored_kinds
-from webots_mcp.store.questions.events import timeline
+from webots_mcp.store.detection.events import stored_kinds, timeline
+from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import Recording, View
 

@@ -19,8 +19,8 @@ from webots_mcp.questions.budget import (
 )
 from webots_mcp.questions.declaring import READS, question
 from webots_mcp.questions.history_answers import SignalsAnswer
+from webots_mcp.store.reading.catalogue import SignalInfo, list_signals
 from webots_mcp.store.recording import Recording, View
-from webots_mcp.store.signals.catalogue import SignalInfo, list_signals
 
 SIGNAL_COLUMNS: Final = ("signal", "kind", "unit", "last", "min", "max", "missing")
 

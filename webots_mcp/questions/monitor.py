@@ -21,10 +21,8 @@ from webots_mcp.questions.find_events import fitting_events, not_shown_of, verdi
 from webots_mcp.questions.get_trends import MOST_SIGNALS, trend_tables
 from webots_mcp.questions.history_answers import MonitorAnswer
 from webots_mcp.steering.watching import Window, movement, window_from
-from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.registry import asked_kinds
-from webots_mcp.store.detection.verdict import Verdicts
-from webots_mcp.store.questions.events import search_events
+from webots_mcp.store.detection.events import asked_kinds, search_events
+from webots_mcp.store.detection.kinds import Event, EventOptions, Verdicts
 from webots_mcp.store.questions.trends import RunTrends, trends
 from webots_mcp.store.recording import Recording, View
 

@@ -41,13 +41,14 @@ from webots_mcp.store.questions.series import (
     DEFAULT_POINTS,
     ChangeColumns,
     NumberColumns,
+    Page,
     RunHistory,
     query_history,
+    query_rows,
 )
-from webots_mcp.store.reading.pages import Page, query_rows
+from webots_mcp.store.reading.catalogue import signals_of
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import Recording, View
-from webots_mcp.store.signals.catalogue import signals_of
 
 _SHOWN_GAPS: Final = 10
 _CELL_TOKENS: Final = 15  # of a bucket of a numeric signal: min, max, mean and last

@@ -29,7 +29,7 @@ from webots_mcp.questions.shortening import (
     tokens_in,
     tokens_of,
 )
-from webots_mcp.store.reading.kept import newest_kept
+from webots_mcp.store.reading.segment import newest_kept
 from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.run_rows import State, newest_events, select
 from webots_mcp.store.sessions import fetch_session

@@ -11,7 +11,7 @@ from webots_mcp.connection import connect
 from webots_mcp.contract import MemoryDatabase
 from webots_mcp.errors import NoDatabaseError, WebotsMCPError
 from webots_mcp.schema import create_schema
-from webots_mcp.store.questions.schema_text import describe_schema
+from webots_mcp.store.questions.sql import describe_schema
 from webots_mcp.store.recording import Recording
 
 SCHEMA_URI = "webots://schema"

@@ -16,9 +16,9 @@ from webots_mcp.questions.answers import BreakpointAnswer, CommandAnswer
 from webots_mcp.questions.shortening import cut_text
 from webots_mcp.steering.dispatch import Dispatcher, Report
 from webots_mcp.steering.running import holds_since
-from webots_mcp.store.reading.subject import Subject
+from webots_mcp.store.reading.catalogue import catalogue
+from webots_mcp.store.reading.ranges import Subject
 from webots_mcp.store.recording import Recording, View
-from webots_mcp.store.signals.catalogue import catalogue
 
 COLUMNS: Final = (
     "id", "condition", "action", "after_hits", "hit_count", "newest_hit_run_id", "newest_hit_s",

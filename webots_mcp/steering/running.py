@@ -26,16 +26,15 @@ from webots_mcp.questions.shortening import shorten
 from webots_mcp.queue import Command
 from webots_mcp.steering.target_robot import find_target
 from webots_mcp.steering.watching import movement
-from webots_mcp.store.detection.event import Event
-from webots_mcp.store.questions.events import search_events
+from webots_mcp.store.detection.events import search_events
+from webots_mcp.store.detection.kinds import Event
 from webots_mcp.store.questions.runs import pace
 from webots_mcp.store.questions.trends import trends
-from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, whole_run
-from webots_mcp.store.reading.subject import Subject
+from webots_mcp.store.reading.catalogue import known_signals
+from webots_mcp.store.reading.ranges import Scope, Subject, TimeRange, find_range, whole_run
 from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.run_rows import State, state_at
 from webots_mcp.store.sessions import fetch_session
-from webots_mcp.store.signals.catalogue import known_signals
 
 ACTION: Final = "run"
 _ROWS_AROUND: Final = 6

@@ -24,13 +24,11 @@ from webots_mcp.questions.shortening import cut_text
 from webots_mcp.steering.running import ACTION, known_names, require_possible
 from webots_mcp.steering.target_robot import find_target
 from webots_mcp.steering.tuning import settable
-from webots_mcp.store.analysis.ranking import Ranked, Ranking
+from webots_mcp.store.analysis.spread import Ranked, Ranking
 from webots_mcp.store.parameters import Declared, declared_for
-from webots_mcp.store.questions.outcomes import way_of_run
-from webots_mcp.store.questions.score import require_kinds, unseen
-from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.snapshot import in_one_snapshot
-from webots_mcp.store.reading.subject import Subject
+from webots_mcp.store.questions.outcomes import require_kinds, unseen, way_of_run
+from webots_mcp.store.reading.ranges import Subject
+from webots_mcp.store.reading.segment import Deadline, in_one_snapshot
 from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.robots import robot_name
 from webots_mcp.store.trials import (

@@ -22,7 +22,7 @@ from webots_mcp.steering.running import ACTION
 from webots_mcp.steering.target_robot import find_target
 from webots_mcp.store.jobs import Job
 from webots_mcp.store.parameters import described, parameters_of
-from webots_mcp.store.questions.score import score_run
+from webots_mcp.store.questions.outcomes import score_run
 from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.robots import robot_name
 from webots_mcp.store.trials import (

@@ -9,18 +9,18 @@ from typing import Any, Final
 
 from webots_mcp.questions.bounds import newest_runs
 from webots_mcp.questions.budget import figure, seconds
-from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.detection.motion import (
     doubt_of_length,
     doubt_of_unit,
     motion_in,
 )
 from webots_mcp.store.questions.outcomes import Way, way_in
-from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
+from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.frame import read_frame
-from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range, row_before
+from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, row_before
+from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline, Segment
 from webots_mcp.store.recording import View
-from webots_mcp.store.signals.catalogue import known_signals
 
 _NAMING: Final = ("position", "unit")  # said once where it is the same of all runs
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.contract import LOG_LEVELS, LogSource
-from webots_mcp.store.reading.ranges import Scope, moment_of
+from webots_mcp.store.reading.ranges import Scope
+from webots_mcp.store.reading.segment import moment_of
 from webots_mcp.store.run_rows import columns_of
 
 COUNT_LIMIT: Final = 10_000  # beyond it a count would cost more than it is worth

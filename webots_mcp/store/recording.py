@@ -29,7 +29,7 @@ from webots_mcp.queue import any_unfinished
 from webots_mcp.schema import create_schema, require_current, schema_version
 from webots_mcp.store.chunks.aside import is_chunked_aside, show_chunks_aside
 from webots_mcp.store.invalid_rows import is_past_invalid_rows, shadow_if_asked
-from webots_mcp.store.reading.subject import Subject, choose, require_run
+from webots_mcp.store.reading.ranges import Subject, choose, require_run
 from webots_mcp.store.retention.limits import Asked
 from webots_mcp.store.robots import Robot
 from webots_mcp.store.run_rows import Run, State, current_run, newest_state

@@ -14,7 +14,7 @@ from webots_mcp.contract import host_name, new_uuid
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
 from webots_mcp.leases import Lease, give_back, holder_of, lease_of, take
 from webots_mcp.liveness import process_alive, process_identity
-from webots_mcp.store.analysis.ranking import Best, Outcome, Ranking, rank
+from webots_mcp.store.analysis.spread import Best, Outcome, Ranking, rank
 from webots_mcp.store.run_rows import columns_of
 from webots_mcp.transactions import transaction
 

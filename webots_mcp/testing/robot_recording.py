@@ -17,19 +17,18 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.parameter import Value
 from webots_mcp.queue import Command, CommandQueue, fetch_command, list_commands
 from webots_mcp.schema import require_current, schema_version
-from webots_mcp.store.detection.event import Event as FoundEvent
-from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.events import find_events
+from webots_mcp.store.detection.kinds import Event as FoundEvent
+from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.export.export_rows import Source
 from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines
 from webots_mcp.store.parameters import parameters_of
-from webots_mcp.store.questions.events import find_events
-from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.catalogue import resolve_signals, signals_of_frame
 from webots_mcp.store.reading.frame import read_frame
-from webots_mcp.store.reading.ranges import Scope, find_range, whole_run
-from webots_mcp.store.reading.subject import Subject, find_subject
+from webots_mcp.store.reading.ranges import Scope, Subject, find_range, find_subject, whole_run
+from webots_mcp.store.reading.segment import Deadline
 from webots_mcp.store.run_rows import Event, State, newest_events, runs_of
-from webots_mcp.store.signals.catalogue import resolve_signals, signals_of_frame
-from webots_mcp.store.signals.registry import cleaned, registered
+from webots_mcp.store.signals import cleaned, registered
 from webots_mcp.testing.recorded_signal import RecordedSignal
 
 COMMAND_TIME_TO_LIVE_S: Final = 60.0  # a test on a busy machine is slower than a person
@@ -141,7 +140,7 @@ class RobotRecording:
         Args:
             kinds: `standstill`, `stuck`, `jump`, `oscillation`, `missing`, `gap`, ...; none for all
                 but pictures.
-            options: More fields of `webots_mcp.store.detection.event.EventOptions`.
+            options: More fields of `webots_mcp.store.detection.kinds.EventOptions`.
 
         Raises:
             InvalidInputError: There is no such kind.

@@ -19,13 +19,13 @@ from webots_mcp.connection import connect
 from webots_mcp.questions.monitor import look_back
 from webots_mcp.store.analysis.arrays import Array
 from webots_mcp.store.chunks.making import make_chunks
-from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.detection.events import find_events
+from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.questions.series import query_history
 from webots_mcp.store.questions.trends import trends
-from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, find_range, whole_run
+from webots_mcp.store.reading.segment import Deadline
 from webots_mcp.store.recording import Recording
 
 _SMALL: Final = 10_000  # rows

@@ -25,7 +25,7 @@ from webots_mcp.plugins.pool.pool_interface import table
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.questions.runs import list_runs
-from webots_mcp.store.questions.sql_process import FOLDER
+from webots_mcp.store.questions.sql import FOLDER
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.ranges import Scope, find_range
 

@@ -14,8 +14,8 @@ from tests.server.conftest import Connect, ask, fail
 from tests.server.history.conftest import STORY, refuse, tell
 from tests.server.story import WAYS, Way, client_on, copy_of, rows_of
 from webots_mcp.connection import connect
-from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.detection.registry import asked_kinds
+from webots_mcp.store.detection.events import asked_kinds
+from webots_mcp.store.detection.kinds import EventOptions
 
 pytestmark = pytest.mark.anyio
 

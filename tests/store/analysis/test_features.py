@@ -12,15 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from webots_mcp.store.analysis.arrays import Array
-from webots_mcp.store.analysis.features import (
+from webots_mcp.store.analysis.summary import (
     find_spikes,
     fit_line,
     flat_since,
     is_monotonic,
     leaps_in,
+    summarise_numbers,
     time_effect,
 )
-from webots_mcp.store.analysis.summary import summarise_numbers
 
 numbers = st.lists(st.floats(-1e6, 1e6), min_size=3, max_size=50).map(np.array)
 few = st.lists(st.sampled_from([0.0, 1.0, 2.0, 7.0]), min_size=1, max_size=40).map(np.array)

@@ -15,9 +15,9 @@ from webots_mcp.connection import connect
 from webots_mcp.schema import create_schema
 from webots_mcp.store.chunks import making
 from webots_mcp.store.chunks.making import GROUP_ROWS, chunk_whole_run, make_chunks
-from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import whole_run
+from webots_mcp.store.reading.segment import Deadline
 
 ROWS = 2500
 
@@ -99,7 +99,7 @@ def test_a_short_end_is_chunked_before_its_rows_go_and_answers_stay(
 
 
 def making_segment(times: list[float]) -> Any:
-    from webots_mcp.store.reading.ranges import Segment, just_after
+    from webots_mcp.store.reading.segment import Segment, just_after
 
     return Segment(1, times[0], just_after(times[-1]))
 

@@ -9,11 +9,11 @@ import pytest
 
 from tests.recordings.rover import start_run
 from webots_mcp.store.chunks.making import make_chunks
-from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.events import Events, find_events
+from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.detection.motion import find_motion
-from webots_mcp.store.questions.events import Events, find_events
+from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.signals.catalogue import known_signals
 
 
 def changes(connection: sqlite3.Connection) -> Events:

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import Recorder, start_run
-from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.detection.events import Events, find_events
+from webots_mcp.store.detection.kinds import Event, EventOptions
 from webots_mcp.store.detection.stored import MOST_CHANGES
-from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 CYCLE_S, STAND_S, CYCLES = 20.0, 6.0, 10

@@ -10,14 +10,12 @@ import pytest
 
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp.store.chunks.making import make_chunks
-from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.detection.registry import asked_kinds
+from webots_mcp.store.detection.events import asked_kinds, find_events
+from webots_mcp.store.detection.kinds import EventOptions, Ledger
 from webots_mcp.store.detection.search import Search, events_touching
-from webots_mcp.store.detection.verdict import Ledger
-from webots_mcp.store.questions.events import find_events
-from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.signals.catalogue import known_signals
+from webots_mcp.store.reading.segment import Deadline
 
 SWING_S = (100.0, 130.0)
 BORDER_S = 307.2  # of two chunks of 1,024 rows

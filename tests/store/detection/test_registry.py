@@ -11,13 +11,13 @@ import pytest
 
 import webots_mcp
 from tests.recordings.rover import Recorder
-from webots_mcp.plotting.parts import event_lanes, parts_of
-from webots_mcp.store.detection import registry
-from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.kind import EventKind
+from webots_mcp.plotting.event_lanes import event_lanes
+from webots_mcp.plotting.parts import parts_of
+from webots_mcp.store.detection import events
+from webots_mcp.store.detection.events import find_events, timeline
+from webots_mcp.store.detection.kinds import Event, EventKind, EventOptions
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.questions.compare import compare_runs
-from webots_mcp.store.questions.events import find_events, timeline
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 
@@ -32,7 +32,7 @@ def tilted(search: Search) -> Iterator[Event]:
 def tilting(empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch) -> sqlite3.Connection:
     """Two runs in which the robot leant over twice, and a kind of event that tells so."""
     kind = EventKind("tilted", "it leant over", tilted, of_numbers=True, drawn=0, stored=True)
-    monkeypatch.setattr(registry, "KINDS", [*registry.KINDS, kind])
+    monkeypatch.setattr(events, "KINDS", [*events.KINDS, kind])
     recorder = Recorder(empty)
     robot_id = recorder.robot("rover")
     session_id = recorder.session(robot_id, "a" * 64)
@@ -58,11 +58,11 @@ def test_a_kind_that_is_entered_once_is_found_compared_told_and_drawn(
     assert lanes[0].name == "tilted" and len(lanes[0].intervals) == 2
 
 
-def test_nothing_but_its_own_file_and_the_registry_names_a_kind() -> None:
+def test_nothing_but_its_own_module_and_the_registry_names_a_kind() -> None:
     """`log`, `run`, `missing` and the like are words of other things too."""
     names = {"oscillation", "jump", "threshold", "flat"}
     folder = Path(webots_mcp.__file__).parent
-    own = {f"{name}.py" for name in names}
+    own = {"jump.py", "condition.py", "sensors.py"}
     naming = {
         path.relative_to(folder).as_posix(): named
         for path in folder.rglob("*.py")
@@ -80,6 +80,6 @@ def strings_in(path: Path) -> Iterator[str]:
 
 
 def test_options_name_kinds_of_the_registry() -> None:
-    names = [kind.name for kind in registry.asked_kinds(EventOptions())]
+    names = [kind.name for kind in events.asked_kinds(EventOptions())]
     assert "image" not in names and "threshold" not in names and "stuck" in names
-    assert len(set(registry.kind_names())) == len(registry.KINDS)
+    assert len(set(events.kind_names())) == len(events.KINDS)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sqlite3
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,11 @@ import pytest
 from tests.recordings.rover import start_run
 from webots_mcp.errors import UnknownSignalError
 from webots_mcp.store.chunks.making import make_chunks
-from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.questions.events import Events, find_events
+from webots_mcp.store.detection.events import Events, find_events
+from webots_mcp.store.detection.kinds import Event, EventOptions
 from webots_mcp.store.questions.trends import trends
+from webots_mcp.store.reading.catalogue import known_signals, list_signals, resolve_signals
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.signals.catalogue import known_signals, list_signals, resolve_signals
 
 State = Callable[[float], dict[str, Any]]
 
@@ -50,12 +51,89 @@ def waking(time_s: float) -> dict[str, Any]:
     return {"lidar": None if time_s < 30 else [range_m(time_s)] * 20, "x": time_s}
 
 
-def test_what_was_null_before_its_first_value_has_not_been_silent(
-    empty: sqlite3.Connection,
+@lru_cache
+def noisy(seed: int) -> Callable[[float], float]:
+    """A force with noise, the same at each time again."""
+    noise = np.random.default_rng(seed).normal(3.3, 0.05, 2000).tolist()
+    return lambda time_s: noise[round(10 * time_s)]
+
+
+def held(time_s: float, measured: float, value: float) -> float:
+    """What is measured, but for ten seconds in which it is that value."""
+    return measured if not 50 < time_s < 60 else value
+
+
+# What a robot publishes, what is looked for, and when it is found (name, begin, end).
+SCENARIOS: dict[str, tuple[State, str, list[tuple[str, float, float]]]] = {
+    "null before its first value": (
+        lambda t: {"front": None if t < 30 else range_m(t), "x": t}, "missing", [],
+    ),
+    "a scalar null before a lidar's first scan": (waking, "missing", []),
+    "a lidar that dies is silent once": (
+        lambda t: waking(t) if t < 60 else {"lidar": None, "x": t},
+        "missing", [("lidar.*", 60.0, 119.9)],
+    ),
+    "an array that crosses 16 items": (
+        lambda t: {"hit_count": [range_m(t)] * (14 if t % 40 < 20 else 20)}, "missing", [],
+    ),
+    "a list that is shorter at times, and one with a dead item": (
+        lambda t: {
+            "seen": [range_m(t)] * (3 if t % 40 < 20 else 14),
+            "near": [1.0, None if t > 60 else range_m(t)],
+        },
+        "missing", [("near.1", 60.1, 119.9)],
+    ),
+    "dead for most of the run": (
+        lambda t: {"front": range_m(t) if t < 20 else None, "x": t},
+        "missing", [("front", 20.0, 119.9)],
+    ),
+    "frozen for most of the run": (
+        lambda t: {"front": range_m(min(t, 30.0)), "target": 3, "goal": float(t > 60)},
+        "flat", [("front", 30.0, 119.9)],
+    ),
+    "from one value to the next": (lambda t: {"index": t // 25, "x": t}, "flat", []),
+    "noisy, and frozen for 20 s at the end": (
+        lambda t: {"gripForceN": noisy(1)(t) if t < 100.2 else 3.3, "x": t},
+        "flat", [("gripForceN", 100.2, 119.9)],
+    ),
+    "frozen for 12 s while another is at its limit": (
+        lambda t: {
+            "force": 3.3 if 100 <= t < 112 else noisy(1)(t),
+            "side": 4.0 if t % 60 > 35 else noisy(2)(t),
+        },
+        "flat", [("side", 35.1, 59.9), ("side", 95.1, 119.9), ("force", 100.0, 111.9)],
+    ),
+    "left behind by its target": (
+        lambda t: {
+            "joints": [math.sin((60 if 60 < t < 66 else t) / 3)],
+            "joint_targets": [math.sin(t / 3)],
+        },
+        "flat", [("joints.0", 60.0, 65.9)],
+    ),
+    # At rest by nature, for less than 20 s.
+    "nothing to feel": (lambda t: {"force": held(t, noisy(2)(t), 0.0)}, "flat", []),
+    "saturates at times": (lambda t: {"force": min(noisy(2)(t), 3.32)}, "flat", []),
+    "saturates": (lambda t: {"force": held(t, noisy(2)(t), 3.6)}, "flat", []),
+    "quantised": (lambda t: {"force": round(noisy(2)(t), 1)}, "flat", []),
+    "smooth": (lambda t: {"force": held(t, math.sin(t), 0.3)}, "flat", []),
+    "comes back to it": (lambda t: {"force": noisy(2)(t) if int(t / 10) % 2 else 3.3}, "flat", []),
+    "with a robot at rest": (
+        lambda t: {"accel": held(t, noisy(2)(t), 3.3), "pose": [held(t, t, 50), 0]}, "flat", [],
+    ),
+    "commanded": (lambda t: {"wheel_speed": held(t, noisy(2)(t), 3.3), "x": t}, "flat", []),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("state", "kind", "expected"), SCENARIOS.values(), ids=SCENARIOS)
+def test_a_sensor_is_silent_or_flat_when_it_is_and_at_no_other_time(
+    empty: sqlite3.Connection, state: State, kind: str, expected: list[tuple[str, float, float]]
 ) -> None:
-    record(empty, lambda t: {"front": None if t < 30 else range_m(t), "x": t})
-    assert told(ask(empty, "missing")) == []
-    assert told(ask(empty, "missing", start_s=10.0, end_s=20.0)) == []
+    record(empty, state)
+    assert told(ask(empty, kind)) == expected
+    for name, start_s, end_s in expected:  # whole, also where a range holds a part of it
+        middle_s = (start_s + end_s) / 2
+        found = told(ask(empty, kind, start_s=middle_s, end_s=middle_s + 1))
+        assert (name, start_s, end_s) in found
 
 
 def test_a_scalar_null_is_the_missing_value_of_what_comes_below_it(
@@ -67,15 +145,7 @@ def test_a_scalar_null_is_the_missing_value_of_what_comes_below_it(
         "lidar.count", "lidar.min", "lidar.max", "lidar.mean", "lidar.argmin",
     }  # fmt: skip
     assert "lidar" not in [signal.name for signal in list_signals(empty).signals]
-    assert told(ask(empty, "missing")) == []
     assert trends(empty, find_range(empty, Scope())).runs[0].without_value == ()
-
-
-def test_a_lidar_that_dies_is_silent_once(empty: sqlite3.Connection) -> None:
-    record(empty, lambda t: waking(t) if t < 60 else {"lidar": None, "x": t})
-    assert told(ask(empty, "missing")) == [("lidar.*", 60.0, 119.9)]
-    (event,) = ask(empty, "missing", start_s=80.0, end_s=90.0).events
-    assert (event.start_s, event.end_s) == (60.0, pytest.approx(119.9))
 
 
 def test_a_silence_that_is_exactly_as_long_as_asked_for_is_told(
@@ -86,29 +156,6 @@ def test_a_silence_that_is_exactly_as_long_as_asked_for_is_told(
     for scope in (Scope(), Scope(start_s=20.5, end_s=40.0)):  # its end is the range's first row
         found = find_events(empty, find_range(empty, scope), options)
         assert told(found) == [("front", 20.0, 20.5)]
-
-
-def test_an_array_that_crosses_16_items_is_not_silent(empty: sqlite3.Connection) -> None:
-    record(empty, lambda t: {"hit_count": [range_m(t)] * (14 if t % 40 < 20 else 20)})
-    assert told(ask(empty, "missing")) == []
-
-
-def test_a_list_that_is_shorter_at_times_is_not_silent_and_a_dead_item_is(
-    empty: sqlite3.Connection,
-) -> None:
-    def state(time_s: float) -> dict[str, Any]:
-        seen = [range_m(time_s)] * (3 if time_s % 40 < 20 else 14)
-        return {"seen": seen, "near": [1.0, None if time_s > 60 else range_m(time_s)]}
-
-    record(empty, state)
-    assert told(ask(empty, "missing")) == [("near.1", 60.1, 119.9)]
-
-
-def test_a_sensor_that_is_dead_for_most_of_the_run_is_silent(
-    empty: sqlite3.Connection,
-) -> None:
-    record(empty, lambda t: {"front": range_m(t) if t < 20 else None, "x": t})
-    assert told(ask(empty, "missing")) == [("front", 20.0, 119.9)]
 
 
 def test_a_signal_that_never_had_a_value_is_not_said_to_be_silent_for_good(
@@ -199,20 +246,6 @@ def test_what_comes_now_and_then_is_not_silent_meanwhile_and_the_answer_says_so(
     assert "gps is intermittent (a value about every 1.8 s)" in answer.notes[0]
 
 
-def test_a_sensor_that_is_frozen_for_most_of_the_run_is_flat(
-    empty: sqlite3.Connection,
-) -> None:
-    record(empty, lambda t: {"front": range_m(min(t, 30.0)), "target": 3, "goal": float(t > 60)})
-    assert told(ask(empty, "flat")) == [("front", 30.0, 119.9)]
-
-
-def test_what_goes_from_one_value_to_the_next_is_not_flat_at_each_of_them(
-    empty: sqlite3.Connection,
-) -> None:
-    record(empty, lambda t: {"index": t // 25, "x": t}, until_s=400.0)
-    assert told(ask(empty, "flat")) == []
-
-
 @pytest.mark.parametrize("count", [2, 10, 40])
 @pytest.mark.parametrize("quiet", [True, False])
 def test_dropouts_are_told_however_many_there_are(
@@ -259,61 +292,6 @@ def test_a_freeze_that_is_too_short_to_count_is_told_as_what_came_nearest(
     assert nearest.endswith(" for 14.9 s from 45 s")
 
 
-def noisy(seed: int) -> Callable[[float], float]:
-    """A force with noise, the same at each time again."""
-    noise = np.random.default_rng(seed).normal(3.3, 0.05, 2000).tolist()
-    return lambda time_s: noise[round(10 * time_s)]
-
-
-def test_a_noisy_sensor_that_freezes_is_flat_long_before_one_that_rests_by_nature(
-    empty: sqlite3.Connection,
-) -> None:
-    force = noisy(1)
-    record(empty, lambda t: {"gripForceN": force(t) if t < 100.2 else 3.3, "x": t})
-    (flat,) = ask(empty, "flat").events
-    assert (flat.name, flat.start_s, flat.end_s) == ("gripForceN", 100.2, 119.9)
-    assert flat.details["value"] == 3.3
-
-
-def test_a_sensor_that_freezes_is_flat_though_another_is_at_its_limit_meanwhile(
-    empty: sqlite3.Connection,
-) -> None:
-    force, side = noisy(1), noisy(2)
-
-    def state(time_s: float) -> dict[str, Any]:
-        limited = 4.0 if time_s % 60 > 35 else side(time_s)
-        return {"force": 3.3 if 100 <= time_s < 112 else force(time_s), "side": limited}
-
-    record(empty, state)
-    assert told(ask(empty, "flat"))[-1] == ("force", 100.0, 111.9)
-
-
-def held(time_s: float, measured: float, value: float) -> float:
-    """What is measured, but for ten seconds in which it is that value."""
-    return measured if not 50 < time_s < 60 else value
-
-
-RESTS_BY_NATURE: dict[str, Callable[[float, float], dict[str, Any]]] = {
-    "nothing to feel": lambda t, n: {"force": held(t, n, 0.0)},
-    "saturates at times": lambda t, n: {"force": min(n, 3.32)},
-    "saturates": lambda t, n: {"force": held(t, n, 3.6)},
-    "quantised": lambda t, n: {"force": round(n, 1)},
-    "smooth": lambda t, n: {"force": held(t, math.sin(t), 0.3)},
-    "comes back to it": lambda t, n: {"force": n if int(t / 10) % 2 else 3.3},
-    "with a robot at rest": lambda t, n: {"accel": held(t, n, 3.3), "pose": [held(t, t, 50), 0]},
-    "commanded": lambda t, n: {"wheel_speed": held(t, n, 3.3), "x": t},
-}
-
-
-@pytest.mark.parametrize("state", RESTS_BY_NATURE.values(), ids=RESTS_BY_NATURE)
-def test_what_rests_by_nature_for_less_than_20_s_is_not_flat(
-    empty: sqlite3.Connection, state: Callable[[float, float], dict[str, Any]]
-) -> None:
-    force = noisy(2)
-    record(empty, lambda t: state(t, force(t)))
-    assert ask(empty, "flat").events == ()
-
-
 def front(time_s: float) -> float:
     """A distance that a sensor with noise measures up to 2 m."""
     return min(2.0, 1.5 + math.sin(time_s / 15) + noisy(1)(time_s) - 3.3)
@@ -345,29 +323,6 @@ def test_what_stays_the_same_is_told_with_what_shows_why(
     record(empty, state)
     (flat,) = ask(empty, "flat").events
     assert flat.details.get("says") == says
-
-
-def test_a_joint_that_its_target_leaves_behind_is_flat_after_3_s(empty: sqlite3.Connection) -> None:
-    def state(time_s: float) -> dict[str, Any]:
-        angle = 60 if 60 < time_s < 66 else time_s
-        return {"joints": [math.sin(angle / 3)], "joint_targets": [math.sin(time_s / 3)]}
-
-    record(empty, state)
-    (flat,) = ask(empty, "flat").events
-    assert (flat.name, flat.start_s, flat.end_s) == ("joints.0", 60.0, 65.9)
-    assert "its target joint_targets.0 went from" in flat.details["says"]
-
-
-def test_what_a_device_gave_that_is_no_number_is_told_of_its_silence(
-    empty: sqlite3.Connection,
-) -> None:
-    recorder = start_run(empty)
-    for step in range(300):
-        free = 100 <= step < 200
-        replaced = {"front": "inf"} if free else None
-        recorder.publish(step / 10, {"front": None if free else range_m(step / 10)}, replaced)
-    (silent,) = ask(empty, "missing").events
-    assert silent.details == {"value": "inf"}
 
 
 def test_a_short_freeze_of_a_long_run_does_not_contradict_the_verdict(

@@ -12,8 +12,8 @@ import pytest
 
 from tests.recordings.rover import start_run
 from webots_mcp.store.chunks.making import make_chunks
-from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.questions.events import Events, find_events
+from webots_mcp.store.detection.events import Events, find_events
+from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 OPTIONS = EventOptions(kinds=("standstill", "stuck"))
@@ -106,65 +106,120 @@ def test_a_slow_drift_in_much_noise_is_not_called_a_standstill(empty: sqlite3.Co
     assert "hides slow motion" in found.verdicts.not_searched["standstill"]
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        {"targetSpeed": 0.2}, {"cmdVel": 0.2}, {"commandedSpeed": 0.2}, {"speedSetpoint": 0.2},
-        {"cmd": {"v": 0.2, "w": 0.0}}, {"cmd_vel": [0.2, 0.0]}, {"cmdVel": {"linear": [0.2, 0, 0]}},
-    ],
-)  # fmt: skip
-def test_a_command_is_found_in_camel_case_and_as_a_pair(
-    empty: sqlite3.Connection, command: dict[str, Any]
-) -> None:
-    def pushes(time_s: float) -> dict[str, Any]:
-        return {"pose": [0.2 * min(30.0, time_s), 0.0]} | command
-
-    (stuck,) = ask(empty, pushes).events
-    assert (stuck.kind, stuck.details["commanded"]) == ("stuck", 0.2)
+def drives(time_s: float, aside_m: float = 0.0) -> dict[str, Any]:
+    """30 s at 0.2 m/s, then it stands."""
+    return {"pose": {"x": 0.2 * min(30.0, time_s) + aside_m, "y": 0.0}}
 
 
-def test_wheels_are_found_in_camel_case(empty: sqlite3.Connection) -> None:
-    def pushes(time_s: float) -> dict[str, Any]:
-        return {"pose": [0.2 * min(30.0, time_s), 0.0], "leftMotor": 5.0, "rightMotor": 5.0}
-
-    (stuck,) = ask(empty, pushes).events
-    assert stuck.details["evidence_for"] == "wheels at 5"
+def turns(time_s: float, speed: float) -> float:
+    return speed * max(0.0, time_s - 30)
 
 
-def test_wheels_that_rest_speak_against_being_stuck(empty: sqlite3.Connection) -> None:
-    def drives_then_waits(time_s: float) -> dict[str, Any]:
-        speed = 5.0 if time_s < 30 else 0.0
-        x_m = 0.2 * min(30.0, time_s)
-        return {"pose": [x_m, 0.0], "mode": "drive", "wheels": [speed, speed]}
-
-    (stuck,) = ask(empty, drives_then_waits).events
-    assert stuck.kind == "stuck"
-    assert stuck.details["evidence_for"].startswith("in mode drive")
-    assert stuck.details["evidence_against"] == "wheels at rest"
+def sways(time_s: float, period_s: float) -> dict[str, Any]:
+    swing = math.sin(math.tau * (time_s - 30) / period_s) if time_s > 30 else 0.0
+    wheel = math.copysign(5.0, swing) if time_s > 30 else 5.0
+    return drives(time_s, 0.03 * swing) | {"mode": "drive", "wheels": [wheel, wheel]}
 
 
-@pytest.mark.parametrize("other", ["TWO", "LEFT_WHEEL"])
-def test_how_fast_an_observer_sees_a_robot_is_nothing_that_it_was_told(
-    empty: sqlite3.Connection, other: str
-) -> None:
-    def seen(time_s: float) -> dict[str, Any]:
-        one = {"x_m": min(5.0, time_s), "y_m": 0.0, "speed_mps": float(time_s < 5)}
-        return {"world": {"ONE": one}, "solid": {other: {"x_m": time_s, "speed_mps": 1.0}}}
-
-    (still,) = ask(empty, seen).events
-    assert still.kind == "standstill"
-    assert still.details["why_not_stuck"].startswith("no published signal shows that it should")
+def seen(time_s: float, other: str) -> dict[str, Any]:
+    """By an observer."""
+    one = {"x_m": 0.2 * min(30.0, time_s), "y_m": 0.0, "speed_mps": 0.2 * (time_s < 30)}
+    return {"world": {"ONE": one}, "solid": {other: {"x_m": time_s, "speed_mps": 1.0}}}
 
 
-def test_a_command_that_was_in_force_for_a_moment_is_no_evidence(
-    empty: sqlite3.Connection,
-) -> None:
-    def drives_then_hovers(time_s: float) -> dict[str, Any]:
-        speed_m_s = 0.2 if time_s < 30.05 else 0.0
-        return {"pose": [0.2 * min(30.0, time_s), 0.0], "speed": speed_m_s, "mode": "go"}
+MOVED = "in mode {}, in which it moved at 0.2 m/s"
+# What it publishes, what it is told to have been, and a detail of that.
+EVIDENCE: dict[str, tuple[Callable[[float], dict[str, Any]], str, str, Any]] = {
+    **{
+        str(command): (lambda t, c=command: drives(t) | c, "stuck", "commanded", 0.2)
+        for command in (
+            {"targetSpeed": 0.2}, {"cmdVel": 0.2}, {"commandedSpeed": 0.2}, {"cmd_vel": [0.2, 0.0]},
+            {"speedSetpoint": 0.2}, {"cmd": {"v": 0.2, "w": 0.0}}, {"cmdVel": {"linear": [0.2, 0]}},
+            {"commanded_m_s": 0.2, "status": "ready", "arm": {"state": "idle"}},
+        )
+    },
+    **{
+        mode: (
+            lambda t, m=mode: drives(t) | {"mode": m}, "stuck", "evidence_for", MOVED.format(mode),
+        )
+        for mode in ("returning", "threshold_wait", "forest", "already_home", "idle")
+    },
+    "measured speed of 0": (
+        lambda t: drives(t) | {"speed": 0.2 * (t < 30), "mode": "go"},
+        "stuck", "evidence_for", MOVED.format("go"),
+    ),
+    "command for a moment": (
+        lambda t: drives(t) | {"speed": 0.2 * (t < 30.05), "mode": "go"},
+        "stuck", "evidence_for", MOVED.format("go"),
+    ),
+    "told to stand": (
+        lambda t: drives(t) | {"commanded_m_s": 0.2 * (t < 30), "mode": "drive"},
+        "standstill", "why_not_stuck", "commanded_m_s 0",
+    ),
+    "in another mode": (
+        lambda t: drives(t) | {"mode": "go" if t < 30 else "S0"},
+        "standstill", "why_not_stuck", "not seen moving in mode S0",
+    ),
+    "no evidence": (
+        lambda t: drives(t) | {"volts": 12.0 + t}, "standstill", "why_not_stuck",
+        "no published signal shows",
+    ),
+    "wheels": (
+        lambda t: drives(t) | {"wheels": {"left": 4.0, "right": 4.0}},
+        "stuck", "evidence_for", "wheels at 4",
+    ),
+    "motors": (
+        lambda t: drives(t) | {"leftMotor": 5.0, "rightMotor": 5.0},
+        "stuck", "evidence_for", "wheels at 5",
+    ),
+    "wheels at rest": (
+        lambda t: drives(t) | {"mode": "drive", "wheels": [5.0 * (t < 30)] * 2},
+        "stuck", "evidence_against", "wheels at rest",
+    ),
+    "wheels against each other": (
+        lambda t: drives(t) | {"wheels": {"left": 5.0, "right": 5 - 10 * (t >= 30)}, "mode": "go"},
+        "standstill", "why_not_stuck", "its wheels turned in opposite directions",
+    ),
+    "turns in place, in radians": (
+        lambda t: {"pose": [0.2 * min(30.0, t), 0.0, math.remainder(turns(t, 0.5), math.tau)],
+                   "mode": "go"},
+        "standstill", "why_not_stuck", "it turned in place",
+    ),
+    "turns in place, in degrees": (
+        lambda t: drives(t) | {"headingDeg": turns(t, 30.0) % 360, "mode": "go"},
+        "standstill", "why_not_stuck", "it turned in place",
+    ),
+    **{
+        f"to and fro in {period_s} s": (
+            lambda t, p=period_s: sways(t, p), "standstill", "why_not_stuck",
+            "it moved back and forth within 0.06 m",
+        )
+        for period_s in (0.8, 2.0, 5.0)
+    },
+    "trembles at a wall": (
+        lambda t: drives(t, 0.002 * math.sin(40 * t) * (t > 30)) | {"wheels": [5.0, 5.0]},
+        "stuck", "evidence_for", "wheels at 5",
+    ),
+    **{
+        f"an observer sees {other}": (
+            lambda t, o=other: seen(t, o), "standstill", "why_not_stuck",
+            "no published signal shows",
+        )
+        for other in ("TWO", "LEFT_WHEEL")
+    },
+}  # fmt: skip
 
-    (stuck,) = ask(empty, drives_then_hovers).events
-    assert stuck.details["evidence_for"] == "in mode go, in which it moved at 0.2 m/s"
+
+@pytest.mark.parametrize(("state", "kind", "detail", "said"), EVIDENCE.values(), ids=EVIDENCE)
+def test_what_a_robot_publishes_tells_whether_it_is_stuck(
+    empty: sqlite3.Connection, state: Callable[[float], dict[str, Any]], kind: str, detail: str,
+    said: Any,
+) -> None:  # fmt: skip
+    (event,) = ask(empty, state).events
+    assert (event.kind, event.start_s) == (kind, pytest.approx(30.0, abs=1.0))
+    assert event.end_s > 57
+    told = event.details[detail]
+    assert said in told if isinstance(said, str) else told == said
 
 
 def test_who_stands_while_rows_come_seldom_stands(empty: sqlite3.Connection) -> None:
@@ -189,42 +244,6 @@ def test_a_position_in_another_unit_is_understood_by_its_name(
     (still,) = ask(empty, drives_then_stands).events
     assert (still.start_s, still.end_s) == pytest.approx((30.0, 59.9), abs=0.3)
     assert still.details["x_m"] == pytest.approx(0.6, abs=0.01)
-
-
-def test_who_turns_in_place_is_not_stuck_in_degrees_either(empty: sqlite3.Connection) -> None:
-    def drives_then_turns(time_s: float) -> dict[str, Any]:
-        turned_deg = 30.0 * max(0.0, time_s - 30) % 360
-        pose = {"x": 0.2 * min(30.0, time_s), "y": 0.0}
-        return {"pose": pose, "headingDeg": turned_deg, "mode": "go"}
-
-    (still,) = ask(empty, drives_then_turns).events
-    assert still.kind == "standstill"
-    assert "it turned in place" in still.details["why_not_stuck"]
-
-
-@pytest.mark.parametrize("period_s", [0.8, 2.0, 5.0])
-def test_who_goes_to_and_fro_in_a_place_is_not_stuck(
-    empty: sqlite3.Connection, period_s: float
-) -> None:
-    def drives_then_sways(time_s: float) -> dict[str, Any]:
-        swing = math.sin(math.tau * (time_s - 30) / period_s) if time_s > 30 else 0.0
-        wheel = 5.0 * math.copysign(1.0, swing) if time_s > 30 else 5.0
-        x_m = 0.2 * min(30.0, time_s) + 0.03 * swing
-        return {"pose": [x_m, 0.0], "mode": "drive", "wheels": [wheel, wheel]}
-
-    (still,) = ask(empty, drives_then_sways).events
-    assert still.kind == "standstill"
-    assert "it moved back and forth within 0.06 m" in still.details["why_not_stuck"]
-
-
-def test_who_trembles_at_a_wall_is_stuck(empty: sqlite3.Connection) -> None:
-    def drives_then_pushes(time_s: float) -> dict[str, Any]:
-        trembling_m = 0.002 * math.sin(40 * time_s) if time_s > 30 else 0.0
-        x_m = 0.2 * min(30.0, time_s) + trembling_m
-        return {"pose": [x_m, 0.0], "mode": "drive", "wheels": [5.0, 5.0]}
-
-    (stuck,) = ask(empty, drives_then_pushes).events
-    assert stuck.kind == "stuck"
 
 
 @pytest.mark.parametrize(

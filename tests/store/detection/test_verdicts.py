@@ -6,9 +6,8 @@ import math
 import sqlite3
 
 from tests.recordings.rover import start_run
-from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.detection.verdict import Verdicts
-from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.detection.events import find_events
+from webots_mcp.store.detection.kinds import EventOptions, Verdicts
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 

@@ -13,8 +13,8 @@ from tests.recordings.rover import Recorder, start_run
 from webots_mcp.errors import InvalidConditionError, InvalidInputError, UnknownSignalError
 from webots_mcp.store.chunks import making
 from webots_mcp.store.chunks.making import chunk_whole_run
-from webots_mcp.store.detection.event import EventOptions, Threshold
-from webots_mcp.store.questions.events import Events, find_events
+from webots_mcp.store.detection.events import Events, find_events
+from webots_mcp.store.detection.kinds import EventOptions, Threshold
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 

@@ -14,16 +14,14 @@ from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from tests.store.questions.asking import ask, spans
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.store.chunks.making import make_chunks
-from webots_mcp.store.detection.event import Event, EventOptions, Threshold
+from webots_mcp.store.detection.events import asked_kinds, find_events
 from webots_mcp.store.detection.jump import find_jumps
-from webots_mcp.store.detection.registry import asked_kinds
+from webots_mcp.store.detection.kinds import Event, EventOptions, Ledger, Threshold
 from webots_mcp.store.detection.search import Search, events_touching
-from webots_mcp.store.detection.verdict import Ledger
-from webots_mcp.store.questions.events import find_events
-from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.signals.catalogue import known_signals
+from webots_mcp.store.reading.segment import Deadline
 
 
 def test_a_robot_that_should_move_and_does_not_is_stuck(

@@ -12,7 +12,7 @@ import pytest
 
 from tests.recordings.rover import Recorder
 from webots_mcp.store.chunks.making import chunk_whole_run
-from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.questions.compare import Comparison, compare_runs
 from webots_mcp.store.questions.outcomes import Measure
 

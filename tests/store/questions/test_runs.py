@@ -18,8 +18,7 @@ from webots_mcp.errors import (
     UnknownRunError,
 )
 from webots_mcp.store.analysis.spread import Spread
-from webots_mcp.store.questions.compare import Comparison, compare_runs
-from webots_mcp.store.questions.differences import Difference
+from webots_mcp.store.questions.compare import Comparison, Difference, compare_runs
 from webots_mcp.store.questions.runs import annotate_run, list_runs, run_info
 
 

@@ -15,8 +15,7 @@ from tests.recordings.rover import record_rover
 from webots_mcp.connection import connect
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.schema import create_schema
-from webots_mcp.store.questions.schema_text import describe_schema
-from webots_mcp.store.questions.sql import query_sql
+from webots_mcp.store.questions.sql import describe_schema, query_sql
 
 
 def test_a_select_answers_with_columns_and_rows(rover: sqlite3.Connection) -> None:

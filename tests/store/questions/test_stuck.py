@@ -11,15 +11,14 @@ import pytest
 
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from tests.store.questions.asking import ask, spans
-from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.mode_use import ModeUses
-from webots_mcp.store.detection.motion import RunNoise, find_motion
+from webots_mcp.store.detection.events import find_events
+from webots_mcp.store.detection.kinds import Event, EventOptions
+from webots_mcp.store.detection.motion import ModeUses, RunNoise, find_motion
 from webots_mcp.store.detection.standstill import judge_standstills
-from webots_mcp.store.questions.events import find_events
-from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.signals.catalogue import known_signals
+from webots_mcp.store.reading.segment import Deadline
 
 
 def publish_stuck(empty: sqlite3.Connection, **moving_and_standing: Any) -> tuple[Event, ...]:
@@ -29,35 +28,6 @@ def publish_stuck(empty: sqlite3.Connection, **moving_and_standing: Any) -> tupl
         state = {name: pair[step > 100] for name, pair in moving_and_standing.items()}
         recorder.publish(step * 0.1, state | {"gps": {"x": min(step, 100) * 0.02, "y": 0}})
     return ask(empty, "stuck").events
-
-
-def test_a_measured_speed_of_zero_does_not_hide_that_it_is_stuck(empty: sqlite3.Connection) -> None:
-    (stuck,) = publish_stuck(empty, speed=(0.2, 0.0), mode=("drive", "drive"))
-    assert stuck.start_s == pytest.approx(10.0, abs=0.2) and stuck.ongoing
-
-
-def test_a_robot_told_to_stand_is_not_stuck(empty: sqlite3.Connection) -> None:
-    assert not publish_stuck(empty, commanded_m_s=(0.2, 0.0), mode=("drive", "drive"))
-
-
-@pytest.mark.parametrize("mode", ["returning", "threshold_wait", "forest", "already_home", "idle"])
-def test_no_verdict_hangs_on_what_a_mode_is_called(empty: sqlite3.Connection, mode: str) -> None:
-    (stuck,) = publish_stuck(empty, mode=(mode, mode))
-    assert stuck.start_s == pytest.approx(10.0, abs=0.2)
-    assert stuck.details["evidence_for"] == f"in mode {mode}, in which it moved at 0.2 m/s"
-
-
-def test_what_is_ready_or_idle_beside_switches_nothing_off(empty: sqlite3.Connection) -> None:
-    arm = {"state": "idle"}
-    others = {"status": ("ready", "ready"), "arm": (arm, arm)}
-    (stuck,) = publish_stuck(empty, commanded_m_s=(0.2, 0.2), **others)
-    assert stuck.details["commanded"] == 0.2
-
-
-def test_wheels_that_turn_show_that_it_is_stuck(empty: sqlite3.Connection) -> None:
-    wheels = {"left": 4.0, "right": 4.0}
-    (stuck,) = publish_stuck(empty, wheels=(wheels, wheels))
-    assert "wheels at 4" in stuck.details["evidence_for"]
 
 
 def test_a_mode_of_an_earlier_run_in_which_it_moved_is_evidence(empty: sqlite3.Connection) -> None:
@@ -81,47 +51,6 @@ def test_an_earlier_run_without_a_position_tells_nothing_of_its_modes(
     for step in range(100):
         recorder.publish(step * 0.1, {"mode": "S3", "gps": {"x": 1, "y": 0}})
     assert ask(empty, "stuck", bounds={"run_id": 2}).events == ()
-
-
-def test_what_stood_is_told_also_where_nothing_shows_that_it_was_stuck(
-    empty: sqlite3.Connection,
-) -> None:
-    assert not publish_stuck(empty, mode=("go", "S0"))
-    (still,) = ask(empty, "standstill").events
-    assert (still.start_s, still.ongoing) == (pytest.approx(10.0, abs=0.2), True)
-    assert still.details["mode"] == "S0"
-    assert still.details["why_not_stuck"] == "not seen moving in mode S0"
-
-
-def test_without_any_evidence_a_standstill_says_that_there_is_none(
-    empty: sqlite3.Connection,
-) -> None:
-    assert not publish_stuck(empty, volts=(12.0, 12.1))
-    (still,) = ask(empty, "standstill").events
-    assert "no published signal shows" in still.details["why_not_stuck"]
-
-
-def test_who_turns_on_the_spot_is_not_stuck(empty: sqlite3.Connection) -> None:
-    recorder = start_run(empty)
-    for step in range(300):
-        turned, driven = max(0, step - 150) * 0.05, min(step, 150) * 0.02
-        place = [driven, 0.0, math.remainder(turned, 2 * math.pi)]
-        recorder.publish(step * 0.1, {"pose": place, "mode": "go"})
-    assert ask(empty, "stuck").events == ()
-    (still,) = ask(empty, "standstill").events
-    assert still.details["turned_rad"] == pytest.approx(7.45, abs=0.3)
-    assert "it turned in place" in still.details["why_not_stuck"]
-
-
-def test_wheels_against_each_other_are_no_turn_that_was_seen(empty: sqlite3.Connection) -> None:
-    recorder = start_run(empty)
-    for step in range(300):
-        wheels = {"left": 5.0, "right": 5.0 if step < 150 else -5.0}
-        state = {"x": min(step, 150) * 0.02, "y": 0.0, "wheels": wheels, "mode": "go"}
-        recorder.publish(step * 0.1, state)
-    (still,) = ask(empty, "standstill").events
-    assert "its wheels turned in opposite directions" in still.details["why_not_stuck"]
-    assert "it turned in place" not in still.details["why_not_stuck"]
 
 
 @pytest.mark.parametrize("period_s", [0.6, 1.5, 2.0])

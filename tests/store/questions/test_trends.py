@@ -16,8 +16,7 @@ import pytest
 from tests.recordings.rover import start_run
 from webots_mcp.store.chunks import making
 from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
-from webots_mcp.store.questions.trend import Trend
-from webots_mcp.store.questions.trends import RunTrends, trends
+from webots_mcp.store.questions.trends import RunTrends, Trend, trends
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 Course = Callable[[float], float | None]  # from the time; None leaves the key out

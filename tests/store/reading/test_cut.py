@@ -12,18 +12,16 @@ import pytest
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
-from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.registry import asked_kinds
+from webots_mcp.store.detection.events import asked_kinds
+from webots_mcp.store.detection.kinds import Event, EventOptions, Ledger, Verdicts
 from webots_mcp.store.detection.search import Search, events_touching
-from webots_mcp.store.detection.verdict import Ledger, Verdicts
-from webots_mcp.store.questions.series import RunHistory, query_history
+from webots_mcp.store.questions.series import RunHistory, query_history, query_rows
 from webots_mcp.store.questions.trends import trends
-from webots_mcp.store.reading.changes import change_points
-from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.pages import query_rows
-from webots_mcp.store.reading.ranges import Scope, Segment, find_range
-from webots_mcp.store.signals.catalogue import known_signals
-from webots_mcp.store.signals.registry import Signal
+from webots_mcp.store.reading.catalogue import known_signals
+from webots_mcp.store.reading.frame_summary import change_points
+from webots_mcp.store.reading.ranges import Scope, find_range
+from webots_mcp.store.reading.segment import Deadline, Segment
+from webots_mcp.store.signals import Signal
 
 ROWS = 20_000
 INTERVAL_S = 0.1

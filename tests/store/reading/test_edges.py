@@ -13,11 +13,12 @@ from hypothesis import strategies as st
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
 from webots_mcp.store.chunks.making import make_chunks
-from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.detection.events import find_events, timeline
+from webots_mcp.store.detection.kinds import Event, EventOptions
 from webots_mcp.store.logs import window_of
-from webots_mcp.store.questions.events import find_events, timeline
-from webots_mcp.store.reading.pages import query_rows
-from webots_mcp.store.reading.ranges import Scope, find_range, moment_of, shown_time
+from webots_mcp.store.questions.series import query_rows
+from webots_mcp.store.reading.ranges import Scope, find_range
+from webots_mcp.store.reading.segment import moment_of, shown_time
 
 STEP_S = 0.032
 ROWS = 700

@@ -20,9 +20,9 @@ from webots_mcp.store.chunks import making
 from webots_mcp.store.chunks.codec import decoded_of
 from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.chunks.statistics import statistics_of
-from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import Frame, Zones, read_frame
-from webots_mcp.store.reading.ranges import Segment, whole_run
+from webots_mcp.store.reading.ranges import whole_run
+from webots_mcp.store.reading.segment import Deadline, Segment
 
 VALUES = st.one_of(
     st.floats(-1e6, 1e6), st.integers(-1000, 1000), st.booleans(), st.none(), st.sampled_from("abc")

@@ -14,8 +14,8 @@ from tests.memory import memory_connection
 from tests.recordings.rover import start_run
 from webots_mcp.store.chunks import making
 from webots_mcp.store.chunks.making import chunk_whole_run
-from webots_mcp.store.detection.event import EventOptions, Threshold
-from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.detection.events import find_events
+from webots_mcp.store.detection.kinds import EventOptions, Threshold
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 Spans = list[tuple[str | None, float, float]]

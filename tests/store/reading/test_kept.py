@@ -19,14 +19,13 @@ from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.detection.events import EventOptions, find_events
 from webots_mcp.store.export.export_rows import Source
-from webots_mcp.store.questions.events import EventOptions, find_events
-from webots_mcp.store.questions.series import query_history
+from webots_mcp.store.questions.series import query_history, query_rows
 from webots_mcp.store.questions.trends import trends
-from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import read_frame
-from webots_mcp.store.reading.pages import query_rows
-from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range
+from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
+from webots_mcp.store.reading.segment import Deadline, Segment
 from webots_mcp.store.run_rows import newest_state
 
 STEP_MS = 16

@@ -22,8 +22,8 @@ from webots_mcp.errors import (
     UnknownRunError,
 )
 from webots_mcp.store.chunks.making import make_chunks
-from webots_mcp.store.reading.ranges import Scope, Segment, find_range
-from webots_mcp.store.reading.wall_time import parse_wall_time
+from webots_mcp.store.reading.ranges import Scope, find_range, parse_wall_time
+from webots_mcp.store.reading.segment import Segment
 
 IN_SEGMENT = (
     "SELECT id FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ? "

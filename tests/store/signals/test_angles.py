@@ -14,12 +14,11 @@ from hypothesis import strategies as st
 
 from tests.recordings.rover import start_run
 from webots_mcp.store.analysis.arrays import Array
-from webots_mcp.store.analysis.features import unwrap
+from webots_mcp.store.analysis.summary import unwrap
 from webots_mcp.store.chunks.making import make_chunks
-from webots_mcp.store.questions.trend import Trend
-from webots_mcp.store.questions.trends import trends
+from webots_mcp.store.questions.trends import Trend, trends
+from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.signals.catalogue import known_signals
 
 
 def turning(time_s: float) -> dict[str, Any]:

@@ -12,11 +12,10 @@ from webots_mcp.naming import flatten
 from webots_mcp.signal_kinds import Place, places
 from webots_mcp.signal_register import MAX_SIGNALS
 from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
+from webots_mcp.store.questions.series import query_rows
 from webots_mcp.store.questions.trends import trends
-from webots_mcp.store.reading.pages import query_rows
-from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.reading.subject import find_subject
-from webots_mcp.store.signals.catalogue import catalogue, list_signals, resolve_signals
+from webots_mcp.store.reading.catalogue import catalogue, list_signals, resolve_signals
+from webots_mcp.store.reading.ranges import Scope, find_range, find_subject
 
 
 def test_every_leaf_has_a_dotted_name() -> None:

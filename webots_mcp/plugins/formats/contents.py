@@ -14,15 +14,16 @@ from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.naming import FARTHEST_M, metres_in
-from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.detection.motion import Motion, find_motion
 from webots_mcp.store.export.export_rows import CHUNK_ROWS, Progress, Recorded, Source
 from webots_mcp.store.images import MAX_FILE_BYTES, StoredImage
 from webots_mcp.store.logs import LogLine
-from webots_mcp.store.reading.ranges import Segment, TimeRange
+from webots_mcp.store.reading.catalogue import known_signals
+from webots_mcp.store.reading.ranges import TimeRange
+from webots_mcp.store.reading.segment import Segment
 from webots_mcp.store.run_rows import Event, columns_of
-from webots_mcp.store.signals.catalogue import known_signals
-from webots_mcp.store.signals.registry import Signal
+from webots_mcp.store.signals import Signal
 
 # What there is to count, in the order in which it is told.
 KINDS: Final = (

@@ -14,7 +14,7 @@ from webots_mcp.naming import Value, spelled_out
 from webots_mcp.plotting.palette import FAINT, area_styles
 from webots_mcp.plugins.page.tab_data import NewRows
 from webots_mcp.plugins.report.charts import SignalsChart, WayChart
-from webots_mcp.store.reading.changes import spelled
+from webots_mcp.store.reading.frame_summary import spelled
 
 MOST_POINTS: Final = 20_000  # of a curve in the browser; the oldest go first
 _PALE: Final = "#EEEEEE"

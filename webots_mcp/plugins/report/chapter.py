@@ -27,16 +27,13 @@ from webots_mcp.plugins.report.words import (
     told,
     valued,
 )
-from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.registry import KINDS, stored_kinds
-from webots_mcp.store.detection.verdict import Verdicts
+from webots_mcp.store.detection.events import KINDS, Found, choose, search_events, stored_kinds
+from webots_mcp.store.detection.kinds import Event, EventOptions, Verdicts
 from webots_mcp.store.logs import COUNT_LIMIT, LogFilter, LogLine, Window, count_lines, newest_lines
 from webots_mcp.store.parameters import described
 from webots_mcp.store.questions.compare import compare_runs
-from webots_mcp.store.questions.events import Found, choose, search_events
 from webots_mcp.store.questions.runs import RunInfo, run_info
-from webots_mcp.store.questions.trend import Trend
-from webots_mcp.store.questions.trends import RunTrends, StateTrend, trends
+from webots_mcp.store.questions.trends import RunTrends, StateTrend, Trend, trends
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.sessions import Session, fetch_session

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plugins.report.chapter import Chapter, Moment
+from webots_mcp.store.reading.catalogue import known_signals, resolve_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
-from webots_mcp.store.signals.catalogue import known_signals, resolve_signals
-from webots_mcp.store.signals.registry import Signal
+from webots_mcp.store.signals import Signal
 
 if TYPE_CHECKING:
     from webots_mcp.plugins.report.charts import Chart

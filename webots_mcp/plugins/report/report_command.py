@@ -57,7 +57,7 @@ def report(
         write_report,
     )
     from webots_mcp.plugins.report.words import size
-    from webots_mcp.store.reading.subject import find_subject
+    from webots_mcp.store.reading.ranges import find_subject
 
     recording = recorded.recording()
     make_chunks_first(recording)

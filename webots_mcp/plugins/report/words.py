@@ -11,7 +11,7 @@ from datetime import datetime, timezone
 from html import escape
 from typing import Any, Final, NamedTuple, cast
 
-from webots_mcp.store.detection.event import Event
+from webots_mcp.store.detection.kinds import Event
 
 LONGEST_TEXT: Final = 1_000  # characters of a cell
 _LONGEST_VALUE: Final = 400  # of a value within one

@@ -18,8 +18,16 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final, cast
 
-from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, median, noise_of, np, sums_of
-from webots_mcp.store.analysis.rhythm import gap_borders
+from webots_mcp.store.analysis.arrays import (
+    Array,
+    Flags,
+    Indexes,
+    gap_borders,
+    median,
+    noise_of,
+    np,
+    sums_of,
+)
 
 LEAST_HALF_SWINGS: Final = 6  # four are made by a value that fell, rested, and rose again
 SLOW_PERIOD_S: Final = 5.0  # beyond, bends of a way come as regularly by chance ...

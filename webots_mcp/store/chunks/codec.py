@@ -17,7 +17,6 @@ from typing import Any, Final, NamedTuple, TypeAlias, cast
 from webots_mcp.errors import DatabaseError
 from webots_mcp.naming import Value
 from webots_mcp.store.analysis.arrays import Array, Indexes, np
-from webots_mcp.store.signals.flatten import MAX_TEXT
 
 IS_NUMBER: Final = 0  # codes
 IS_ABSENT: Final = 1
@@ -26,6 +25,7 @@ FIRST_LABEL: Final = 2  # and those above: the place of a label, counted from it
 _LEVEL: Final = 4  # of pcodec: a quarter of the time of its default, for 2 % more bytes
 _CODES_LEVEL: Final = 1
 _CHECKSUM_BYTES: Final = 4  # CRC-32: a decompressor is not asked what it makes of damaged bytes
+MAX_TEXT: Final = 200  # characters of a text value that are kept and compared
 EXACT_INTEGERS: Final = 2**53  # beyond, a float does not hold every integer
 _FLOATS, _INTEGERS = "pcodec/float64", "pcodec/int64"
 _NOTHING: Final = "none"  # no row holds a number

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from webots_mcp.naming import Value, flatten
 from webots_mcp.store.chunks.codec import ABSENT, Recorded, Replaced
-from webots_mcp.store.signals.flatten import is_replaced, parse, replaced_names
+from webots_mcp.store.signals import is_replaced, parse, replaced_names
 
 _NUMBERS: Final = frozenset({int, float})
 STATE_COLUMNS: Final = "id, sim_time_s, wall_time_s, data, replaced"

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.errors import warn
-from webots_mcp.store.chunks.codec import ABSENT, EXACT_INTEGERS, decoded_of, pack
+from webots_mcp.store.chunks.codec import ABSENT, EXACT_INTEGERS, MAX_TEXT, decoded_of, pack
 from webots_mcp.store.chunks.columns import STATE_COLUMNS, StateColumns
 from webots_mcp.store.chunks.statistics import Statistics, statistics_of
 from webots_mcp.store.chunks.stored import (
@@ -29,8 +29,7 @@ from webots_mcp.store.chunks.stored import (
 )
 from webots_mcp.store.invalid_rows import is_over_a_value, valid_rows
 from webots_mcp.store.retention.disk_size import INDEX_BYTES, disk_bytes
-from webots_mcp.store.signals.flatten import MAX_TEXT
-from webots_mcp.store.signals.registry import Signal, enter_signals, registered, seen_in, tell_more
+from webots_mcp.store.signals import Signal, enter_signals, registered, seen_in, tell_more
 from webots_mcp.transactions import LONGEST_WRITE_S, Step
 
 GROUP_ROWS: Final = 1024

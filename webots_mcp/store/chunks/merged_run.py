@@ -18,7 +18,7 @@ from webots_mcp.signal_register import Seen
 from webots_mcp.store.chunks.codec import DamagedChunkError, Encoded, decode, decoded_of, encode
 from webots_mcp.store.chunks.statistics import Statistics, statistics_of
 from webots_mcp.store.chunks.stored import SIM_TIMES, STATE_IDS, WALL_TIMES
-from webots_mcp.store.signals.registry import enter_signals
+from webots_mcp.store.signals import enter_signals
 
 # Ids between the first and the last row of a run; other robots could not have recorded more.
 _MOST_IDS: Final = 2**40

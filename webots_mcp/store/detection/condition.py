@@ -1,24 +1,32 @@
-"""`condition`: a condition that the asker gives held, in rows one after the other."""
+"""Conditions over the past: where one that the asker gives held, and what scores are made of.
+
+The kinds `condition` and `threshold`, and the tree of a condition asked of arrays.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
-from typing import Final
+import ast
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import starmap
+from typing import Any, Final, NamedTuple, TypeAlias, cast
 
 from webots_mcp.conditions import Condition, parse_condition
-from webots_mcp.errors import InvalidInputError, UnknownSignalError
-from webots_mcp.naming import NO_POSITION, Value
-from webots_mcp.store.analysis.arrays import Runs, np, runs_of
-from webots_mcp.store.conditions_on_arrays import OnArrays, first_failure, position_in
-from webots_mcp.store.detection.event import Event
-from webots_mcp.store.detection.kind import Alike, EventKind, NotSearchableError
+from webots_mcp.conditions.compiler import ARITHMETIC, COMPARISONS
+from webots_mcp.conditions.scoring import Aggregate
+from webots_mcp.conditions.signal_values import PLACES_KEPT, SAME_TIME_S
+from webots_mcp.conditions.syntax import FLAGS, Nodes, Scanned, function_of, is_signal
+from webots_mcp.errors import ConditionFailedError, InvalidInputError, UnknownSignalError
+from webots_mcp.naming import FARTHEST_M, NO_POSITION, Value, find_position, metres_in
+from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, Runs, extremes_in, np, runs_of
+from webots_mcp.store.detection.kinds import Alike, Event, EventKind, NotSearchableError, Threshold
 from webots_mcp.store.detection.search import Search
+from webots_mcp.store.reading.catalogue import resolve_signals, say_unknown
 from webots_mcp.store.reading.frame import Frame, read_frame
-from webots_mcp.store.reading.kept import kept_parts
-from webots_mcp.store.reading.ranges import Segment, recorded_share
-from webots_mcp.store.reading.wall_time import frame_of_purged
-from webots_mcp.store.signals.catalogue import say_unknown
+from webots_mcp.store.reading.ranges import frame_of_purged, recorded_share
+from webots_mcp.store.reading.segment import Segment, kept_parts
+from webots_mcp.store.signals import Signal
 
 _MOST_VALUES: Final = 8
 _ROWS_BEFORE: Final = 20  # a range: what was there last, for `changed` and `rate`
@@ -126,3 +134,565 @@ CONDITION: Final = EventKind(
     counted=False,
     alike=Alike(lambda events, unit: "stretches"),
 )
+
+
+# -- `threshold`: a signal was beyond a limit that the asker gives, for long enough ----------------
+
+
+def thresholds_on(
+    names: Sequence[str], above: float | None, below: float | None, for_s: float
+) -> tuple[Threshold, ...]:
+    """One threshold per signal and limit; none where neither limit is given.
+
+    Args:
+        names: Signals, with `*`.
+        above: In the unit of the signals.
+        below: In the unit of the signals.
+        for_s: At least so many simulated seconds.
+
+    Raises:
+        InvalidInputError: A limit without a signal, or a duration without a limit.
+    """
+    if for_s and above is None and below is None:
+        raise InvalidInputError(f"for_s={for_s:g} needs a limit: give above or below")
+    limits = [{"above": above}] * (above is not None) + [{"below": below}] * (below is not None)
+    if limits and not names:
+        raise InvalidInputError("above and below need signals: name those to compare")
+    return tuple(Threshold(name, for_s=for_s, **limit) for name in names for limit in limits)
+
+
+def threshold_events(search: Search) -> Iterator[Event]:
+    """Each stretch of each signal beyond each of its limits."""
+    if not search.options.thresholds:
+        raise NotSearchableError("no limit was given: give signals, and above or below")
+    for threshold in search.options.thresholds:
+        signals = resolve_signals(search.known, [threshold.signal])
+        for signal in search.in_time("threshold", signals, judged=False):
+            yield from _beyond(search, signal, threshold)
+
+
+def _beyond(search: Search, signal: Signal, threshold: Threshold) -> Iterator[Event]:
+    frame, is_above = search.frame, threshold.above is not None
+    (limit,) = (each for each in (threshold.above, threshold.below) if each is not None)
+    holds = compared(frame, signal.name, ast.Gt if is_above else ast.Lt, limit)
+    runs = runs_of(holds, frame.times)
+    long = runs.only(runs.durations_s >= threshold.for_s)
+    numbers = frame.numbers(signal.name) if len(long) else np.zeros(0)
+    for run, low, high in zip(long.each(), *extremes_in(long, numbers), strict=True):
+        details = {"above" if is_above else "below": limit, "min": float(low), "max": float(high)}
+        yield search.event("threshold", run.start_s, run.end_s, signal.name, **details)
+    zones = frame.zones(signal.name)
+    extremes = (zones.max if is_above else zones.min)[
+        (zones.value_count > 0) & ~np.isnan(zones.min)
+    ]
+    if len(runs) > len(long):
+        longest_s = float(runs.durations_s[runs.durations_s < threshold.for_s].max())
+        what = f"{signal.name} was beyond the limit for at most {longest_s:.3g} s"
+        search.note_nearest("threshold", longest_s / threshold.for_s, what)
+    elif not len(runs) and len(extremes):
+        extreme = extremes.max() if is_above else extremes.min()
+        search.note_nearest("threshold", 0.0, f"{signal.name} reached {extreme:.4g}")
+
+
+THRESHOLD: Final = EventKind(
+    "threshold",
+    "",
+    threshold_events,
+    usual=lambda options: bool(options.thresholds),
+    lasts=True,
+    least_s=lambda options: max((each.for_s for each in options.thresholds), default=0.0),
+    counted=False,
+    alike=Alike(
+        lambda events, unit: "stretches",
+        sort=lambda e: (e.details.get("above"), e.details.get("below")),
+    ),
+)
+
+
+# -- the parsed tree asked of all rows at once -----------------------------------------------------
+#
+# In each row the outcome is that of the closures that the controller asks of each state; see
+# docs/conditions.md. A value is NaN where a row has no number. Integers beyond 2^53 are those of
+# 64-bit floats.
+
+
+_FOLDING: Final = {"min": "minimum", "max": "maximum"}
+_MIRRORED: Final[dict[type[ast.cmpop], type[ast.cmpop]]] = {
+    ast.Lt: ast.Gt, ast.LtE: ast.GtE, ast.Gt: ast.Lt, ast.GtE: ast.LtE,
+    ast.Eq: ast.Eq, ast.NotEq: ast.NotEq,
+}  # fmt: skip
+
+
+class Failure(NamedTuple):
+    """Rows of which something cannot be asked: the place in the text, and why not of one row."""
+
+    rows: Flags
+    place: str
+    why: Callable[[int], str]
+
+
+Failures: TypeAlias = tuple[Failure, ...]
+
+
+class Outcome(NamedTuple):
+    """Whether a condition holds in each row; False where it fails."""
+
+    holds: Flags
+    failures: Failures = ()
+
+
+class Texts(NamedTuple):
+    """The texts of a value: per row the place of its label, or one for all; 0 for none."""
+
+    codes: Any
+    labels: Sequence[Value]
+
+
+class Values(NamedTuple):
+    """A value in each row, or one for all of them: a number, a text, or none."""
+
+    numbers: Any  # NaN where it is none
+    texts: Texts | None = None
+    failures: Failures = ()
+
+    @property
+    def missing(self) -> Flags:
+        """Where it is neither a number nor a text."""
+        lacking = np.isnan(self.numbers)
+        return lacking if self.texts is None else lacking & (self.texts.codes == 0)
+
+    def shown(self, row: int) -> str:
+        """In one row, for messages."""
+        if self.texts is not None and (code := int(_at(self.texts.codes, row))) > 0:
+            return f"the text {str(self.texts.labels[code])[:50]!r}"
+        return f"the number {float(_at(self.numbers, row)):.15g}"
+
+
+@dataclass(frozen=True)
+class Failed:
+    """The first row of which a condition could not be asked."""
+
+    row: int
+    why: str
+
+
+class OnArrays(Nodes):
+    """Asks the nodes of a parsed condition, or of a number within a score, of the rows of a frame.
+
+    Args:
+        scanned: What the tree was parsed from.
+        frame: The rows.
+        position: The names of x and y, for displacements; None where none are known.
+    """
+
+    def __init__(
+        self, scanned: Scanned, frame: Frame, position: tuple[str, str] | None = None
+    ) -> None:
+        super().__init__(scanned)
+        self._frame = frame
+        self._position = position
+
+    def condition(self, node: ast.expr) -> Outcome:
+        """Whether it holds in each row."""
+        outcome = self._condition(node)
+        return Outcome(self._in_each_row(outcome.holds), outcome.failures)
+
+    def number(self, node: ast.expr) -> Values:
+        """Its numbers; NaN where it has none."""
+        found = self._number(node)
+        return found._replace(numbers=self._in_each_row(found.numbers))
+
+    def _in_each_row(self, found: Any) -> Any:
+        """A constant is the same in each row."""
+        return np.broadcast_to(found, (len(self._frame),))
+
+    # -- conditions ----------------------------------------------------------------------------
+
+    def _condition(self, node: ast.expr) -> Outcome:
+        if isinstance(node, ast.BoolOp):
+            return _in_turn(
+                map(self._condition, node.values), together=isinstance(node.op, ast.And)
+            )
+        if isinstance(node, ast.UnaryOp):
+            holds, failures = self._condition(node.operand)
+            return _outcome(~holds, failures)
+        if isinstance(node, ast.Compare):
+            return self._comparison(node)
+        if isinstance(node, ast.Tuple):
+            held, seconds = self.condition(node.elts[0]), _seconds(node.elts[1])
+            return self._remembered(held.failures, lasting, held.holds, seconds)
+        if function_of(node) == "missing":
+            asked = self._value(cast("ast.Call", node).args[0])
+            return _outcome(asked.missing, asked.failures)
+        if function_of(node) == "changed":
+            asked = self._value(cast("ast.Call", node).args[0])
+            codes = asked.texts.codes if asked.texts else np.intp(0)
+            ways = self._in_each_row(asked.numbers), self._in_each_row(codes)
+            return self._remembered(asked.failures, changed, *ways)
+        return self._flag(node)
+
+    def _remembered(self, failures: Failures, ask: Callable[..., Flags], *of: Any) -> Outcome:
+        """What depends on the rows before; those that fail are passed over."""
+        return _outcome(self._over_asked(failures, ask, *of), failures)
+
+    def _over_asked(self, failures: Failures, ask: Callable[..., Any], *of: Any) -> Any:
+        if not failures:
+            return ask(self._frame.times, *of)
+        asked = np.ones(len(self._frame), np.bool_)
+        for failure in failures:
+            asked &= ~failure.rows
+        parts = [each[asked] if np.ndim(each) else each for each in of]
+        found = ask(self._frame.times[asked], *parts)
+        whole = np.zeros(len(asked), found.dtype)
+        whole[asked] = found
+        return whole
+
+    def _flag(self, node: ast.expr) -> Outcome:
+        value = self._signal(node)
+        holds = ~np.isnan(value.numbers) & (value.numbers != 0)
+        return _outcome(holds, self._no_text(value, node, "by itself is no condition"))
+
+    def _comparison(self, node: ast.Compare) -> Outcome:
+        sides = [node.left, *node.comparators]
+        simple = self._by_zones(sides[0], sides[1], type(node.ops[0])) if len(sides) == 2 else None
+        if simple is not None:
+            return simple
+        values = [self._value(side) for side in sides]
+        steps = zip(node.ops, values, values[1:], sides, strict=False)
+        return _in_turn(starmap(self._compared, steps), together=True)
+
+    def _compared(self, operator: ast.cmpop, left: Values, right: Values, at: ast.expr) -> Outcome:
+        op = type(operator)
+        sign, compare = COMPARISONS[op]
+        holds = compare(left.numbers, right.numbers)
+        if op is ast.NotEq:
+            holds = holds & ~np.isnan(left.numbers) & ~np.isnan(right.numbers)
+        failures = left.failures + right.failures
+        if left.texts is None and right.texts is None:
+            return _outcome(holds, failures)
+        one, other = _ranked(left.texts, right.texts)
+        holds = holds | (compare(one, other) & (one > 0) & (other > 0))
+        mixed = (one > 0) & ~np.isnan(right.numbers) | (other > 0) & ~np.isnan(left.numbers)
+        if op is ast.NotEq:
+            holds = holds | mixed
+        elif op is not ast.Eq:
+
+            def why(row: int) -> str:
+                return f"{left.shown(row)} {sign} {right.shown(row)}?"
+
+            failures += self._failing(mixed, at, why)
+        return _outcome(holds, failures)
+
+    def _by_zones(self, left: ast.expr, right: ast.expr, op: type[ast.cmpop]) -> Outcome | None:
+        """A signal beside a number: decoded is only where a chunk's extremes leave it open."""
+        if is_signal(right):
+            left, right, op = right, left, _MIRRORED[op]
+        number = right.value if isinstance(right, ast.Constant) else None
+        if not is_signal(left) or type(number) not in (int, float):
+            return None
+        name = self._signal_name(left)
+        if name not in self._frame or self._texts(name) is not None:
+            return None
+        return Outcome(compared(self._frame, name, op, float(cast("float", number))))
+
+    # -- values --------------------------------------------------------------------------------
+
+    def _value(self, node: ast.expr) -> Values:
+        if isinstance(node, ast.Name) and node.id in FLAGS:
+            return Values(np.float64(FLAGS[node.id]))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            return Values(np.float64(math.nan), Texts(np.intp(1), (None, node.value)))
+        return self._signal(node) if is_signal(node) else self._number(node)
+
+    def _number(self, node: ast.expr) -> Values:
+        if isinstance(node, ast.Constant):
+            return Values(np.float64(cast("float", node.value)))
+        if is_signal(node):
+            value = self._signal(node)
+            return Values(value.numbers, None, self._no_text(value, node, "is no number"))
+        if isinstance(node, ast.BinOp):
+            return _worked_out(
+                ARITHMETIC[type(node.op)], self._number(node.left), self._number(node.right)
+            )
+        if isinstance(node, ast.UnaryOp):
+            found = self._number(node.operand)
+            return found._replace(numbers=-found.numbers) if _is_minus(node) else found
+        return self._call(cast("ast.Call", node))
+
+    def _call(self, node: ast.Call) -> Values:
+        name = function_of(node)
+        if name == "displacement":
+            return self._displacement(_seconds(node.args[0]))
+        numbers = [self._number(each) for each in node.args]
+        if name == "abs":
+            return numbers[0]._replace(numbers=np.abs(numbers[0].numbers))
+        if name == "rate":
+            (found,) = numbers
+            values = self._in_each_row(found.numbers)
+            return Values(self._over_asked(found.failures, rate, values), None, found.failures)
+        fold = getattr(np, _FOLDING[str(name)])
+        found = numbers[0]
+        for each in numbers[1:]:
+            found = _worked_out(fold, found, each)
+        return found
+
+    def _displacement(self, seconds: float) -> Values:
+        if self._position is None:
+            return Values(np.float64(math.nan))
+        metres = metres_in(self._position[0])
+        x, y = (self._numbers(name) for name in self._position)
+        near = (np.abs(x) <= FARTHEST_M) & (np.abs(y) <= FARTHEST_M)
+        found = np.full(len(x), math.nan)
+        places = self._frame.times[near], x[near] * metres, y[near] * metres
+        found[near] = displacement(*places, seconds)
+        return Values(found)
+
+    def _signal(self, node: ast.expr) -> Values:
+        name = self._signal_name(node)
+        return Values(self._numbers(name), self._texts(name))
+
+    def _numbers(self, name: str) -> Array:
+        if name not in self._frame:
+            return np.full(len(self._frame), math.nan)
+        return self._frame.numbers(name)
+
+    def _texts(self, name: str) -> Texts | None:
+        zones = self._frame.zones(name)
+        if not ((zones.value_count < zones.held_count) | np.isnan(zones.min)).any():
+            return None
+        texts = Texts(*self._frame.texts(name))
+        return texts if len(texts.labels) > 1 else None
+
+    # -- failures ------------------------------------------------------------------------------
+
+    def _no_text(self, value: Values, node: ast.expr, why: str) -> Failures:
+        if value.texts is None:
+            return value.failures
+
+        def said(row: int) -> str:
+            return f"{value.shown(row)} {why}"
+
+        return value.failures + self._failing(value.texts.codes > 0, node, said)
+
+    def _failing(self, rows: Any, node: ast.expr, why: Callable[[int], str]) -> Failures:
+        rows = self._in_each_row(rows)
+        place = self._scanned.place(self._column(node))
+        return (Failure(rows, place, why),) if rows.any() else ()
+
+
+def compared(frame: Frame, name: str, op: type[ast.cmpop], limit: float) -> Flags:
+    """In which rows the number of a signal compares so with a limit.
+
+    Decoded is only where the extremes of a chunk leave it open.
+    """
+    zones = frame.zones(name)
+    is_full = zones.value_count == zones.row_count
+    always, never = _verdicts(op, zones.min, zones.max, limit)
+    holds = np.repeat(always & is_full, zones.row_count)
+    never = never & is_full | (zones.held_count == 0)
+    for start, numbers in frame.opened(name, ~(always & is_full | never)):
+        found = COMPARISONS[op][1](numbers, limit)
+        found = found & ~np.isnan(numbers) if op is ast.NotEq else found
+        holds[start : start + len(numbers)] = found
+    return holds
+
+
+def first_failure(failures: Failures) -> Failed | None:
+    """The first row that fails, and what is asked first of it; None where none does."""
+    found = [failure for failure in failures if failure.rows.any()]
+    if not found:
+        return None
+    first = min(found, key=lambda failure: int(failure.rows.argmax()))
+    row = int(first.rows.argmax())
+    return Failed(row, f"{first.place}: {first.why(row)}")
+
+
+def position_in(frame: Frame, known: Mapping[str, Signal]) -> tuple[str, str] | None:
+    """The names of x and y of a robot, as far as they have values in a frame; None without any."""
+    numbers = [name for name, signal in known.items() if signal.is_number]
+    while (found := find_position(numbers)) is not None:
+        lacking = [name for name in found if not frame.zones(name).value_count.any()]
+        if not lacking:
+            return found
+        numbers = [name for name in numbers if name not in lacking]
+    return None
+
+
+def aggregated(
+    aggregate: Aggregate, frame: Frame, position: tuple[str, str] | None = None
+) -> float | None:
+    """What the values of a run come to; None where no row has a value.
+
+    Rows count for as long as they last, up to the next one, in means and times, so that a stretch
+    with more rows than others does not count more. Where no time has passed, rows count alike.
+
+    Raises:
+        ConditionFailedError: The values are not of the kinds that it can be asked of.
+    """
+    rows, lasts_s = OnArrays(aggregate.scanned, frame, position), np.diff(frame.times)
+    if aggregate.function == "time":
+        holds, failures = rows.condition(aggregate.tree)
+        _raise_first(failures)
+        return float(lasts_s[holds[:-1]].sum()) if len(frame) else None
+    numbers, _, failures = rows.number(aggregate.tree)
+    _raise_first(failures)
+    there = ~np.isnan(numbers)
+    found = numbers[there]
+    if not len(found):
+        return None
+    if aggregate.function in ("first", "last"):
+        return float(found[0 if aggregate.function == "first" else -1])
+    if aggregate.function != "mean":
+        return float(found.min() if aggregate.function == "min" else found.max())
+    known_s = lasts_s[there[:-1]]
+    if known_s.sum() > 0:
+        return float((numbers[:-1][there[:-1]] * known_s).sum() / known_s.sum())
+    return float(found.mean())
+
+
+def _raise_first(failures: Failures) -> None:
+    if failed := first_failure(failures):
+        raise ConditionFailedError(failed.why)
+
+
+# -- of the rows before ------------------------------------------------------------------------
+
+
+def lasting(times: Array, holds: Flags, seconds: float) -> Flags:
+    """Whether it has held in every row for so many seconds."""
+    begins = np.flatnonzero(np.diff(holds, prepend=False) & holds)
+    begun = np.searchsorted(begins, np.arange(len(times)), "right") - 1
+    since_s = times[begins[np.maximum(begun, 0)]] if len(begins) else times
+    return holds & (times - since_s >= seconds - SAME_TIME_S)
+
+
+def changed(times: Array, numbers: Array, codes: Indexes) -> Flags:
+    """Whether a value is another than the last one that was there.
+
+    Args:
+        times: Of the rows.
+        numbers: NaN where there is none.
+        codes: Of texts; 0 where there is none.
+    """
+    there = np.flatnonzero(~np.isnan(numbers) | (codes > 0))
+    of_texts = codes[there]
+    own = np.where(of_texts == 0, numbers[there], 0.0)
+    others = (own[1:] != own[:-1]) | (of_texts[1:] != of_texts[:-1])
+    found = np.zeros(len(times), np.bool_)
+    found[there[1:]] = others
+    return found
+
+
+def rate(times: Array, numbers: Array) -> Array:
+    """By how much it changes per second, from one row that has a value to the next.
+
+    While time stands still the rate stays as it is.
+    """
+    there = np.flatnonzero(~np.isnan(numbers))
+    newer = there[_apart(times[there], SAME_TIME_S, strictly=True)]
+    known = np.zeros(len(times), np.bool_)  # where the rate is set anew
+    found = np.full(len(times), math.nan)
+    with np.errstate(all="ignore"):
+        found[newer[1:]] = np.diff(numbers[newer]) / np.diff(times[newer])
+    found[~np.isfinite(found)] = math.nan
+    known[newer] = True
+    known[np.isnan(numbers)] = True
+    latest = np.maximum.accumulate(np.where(known, np.arange(len(times)), 0))
+    return found[latest]
+
+
+def displacement(times: Array, x: Array, y: Array, seconds: float) -> Array:
+    """Metres between each place and where the robot was so many seconds before.
+
+    Compared is with the newest of 200 places that is at least as old; NaN where it is over twice
+    as old, or none is.
+    """
+    if not len(times):
+        return np.zeros(0)
+    kept = _apart(times, seconds / PLACES_KEPT)
+    kept_s = times[kept]
+    newest = np.searchsorted(kept, np.arange(len(times)), "right") - 1
+    then = np.searchsorted(kept_s, kept_s - seconds + SAME_TIME_S, "right") - 1
+    was = kept[np.maximum(then, 0)[newest]]
+    older_s = times - times[was] - seconds
+    found = np.hypot(x - x[was], y - y[was])
+    return np.where((older_s >= -SAME_TIME_S) & (older_s <= seconds + SAME_TIME_S), found, math.nan)
+
+
+def _apart(times: Array, least_s: float, *, strictly: bool = False) -> Indexes:
+    """The first row, and each that comes so long after the one that was taken before."""
+    far = np.greater if strictly else np.greater_equal
+    if far(np.diff(times), least_s).all():
+        return np.arange(len(times))
+    after = np.searchsorted(times, times + least_s, "right" if strictly else "left")
+    after -= far(times[after - 1] - times, least_s)  # where the sum was rounded
+    after += (after < len(times)) & ~far(times[np.minimum(after, len(times) - 1)] - times, least_s)
+    rows, taken = after.tolist(), [0]
+    while (row := rows[taken[-1]]) < len(times):
+        taken.append(row)
+    return np.array(taken)
+
+
+# -- all of a kind -----------------------------------------------------------------------------
+
+
+def _in_turn(outcomes: Iterable[Outcome], *, together: bool) -> Outcome:
+    """All, or any, of them: the next is asked only where those before leave it open."""
+    holds, failures = np.bool_(together), ()
+    for outcome in outcomes:
+        is_open = holds if together else ~holds
+        failures += tuple(
+            failure._replace(rows=failure.rows & is_open) for failure in outcome.failures
+        )
+        holds = holds & outcome.holds if together else holds | outcome.holds
+    return _outcome(holds, failures)
+
+
+def _outcome(holds: Any, failures: Failures) -> Outcome:
+    for failure in failures:
+        holds = holds & ~failure.rows
+    return Outcome(holds, failures)
+
+
+def _worked_out(apply: Callable[[Any, Any], Any], left: Values, right: Values) -> Values:
+    with np.errstate(all="ignore"):
+        found = apply(left.numbers, right.numbers)
+    usable = np.where(np.isfinite(found), found, math.nan)
+    return Values(usable, None, left.failures + right.failures)
+
+
+def _seconds(node: ast.expr) -> float:
+    return float(cast("Any", node).value)
+
+
+def _is_minus(node: ast.UnaryOp) -> bool:
+    return isinstance(node.op, ast.USub)
+
+
+def _ranked(left: Texts | None, right: Texts | None) -> tuple[Any, Any]:
+    """Codes of both whose order is that of the texts; 0 for none."""
+    labels = {str(label) for each in (left, right) if each for label in each.labels[1:]}
+    ranks = {label: rank for rank, label in enumerate(sorted(labels), 1)}
+    return _ranks(left, ranks), _ranks(right, ranks)
+
+
+def _ranks(texts: Texts | None, ranks: dict[str, int]) -> Any:
+    if texts is None:
+        return np.intp(0)
+    return np.array([0, *(ranks[str(label)] for label in texts.labels[1:])], np.intp)[texts.codes]
+
+
+def _verdicts(op: type[ast.cmpop], low: Array, high: Array, limit: float) -> tuple[Any, Any]:
+    """In which chunks all numbers, and in which none, compare so with a limit."""
+    if op is ast.Eq:
+        return (low == limit) & (high == limit), (low > limit) | (high < limit)
+    if op is ast.NotEq:
+        always, never = _verdicts(ast.Eq, low, high, limit)
+        return never, always
+    compare = COMPARISONS[op][1]
+    least, most = (low, high) if op in (ast.Gt, ast.GtE) else (high, low)
+    return compare(least, limit), ~(compare(most, limit) | np.isnan(most))
+
+
+def _at(values: Any, row: int) -> Any:
+    return values[row] if np.ndim(values) else values

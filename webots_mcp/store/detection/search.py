@@ -7,24 +7,24 @@ import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from webots_mcp.naming import listed
 from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.analysis.summary import LARGEST
-from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.kind import EventKind, NotSearchableError
+from webots_mcp.store.detection.kinds import (
+    Event,
+    EventKind,
+    EventOptions,
+    Ledger,
+    NotSearchableError,
+)
 from webots_mcp.store.detection.motion import Motion, motion_in
-from webots_mcp.store.detection.verdict import Ledger
-from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.catalogue import resolve_signals
 from webots_mcp.store.reading.frame import Frame, read_frame
-from webots_mcp.store.reading.ranges import Segment, just_after, recorded_bounds
-from webots_mcp.store.reading.wall_time import UP_TO, RunClock
-from webots_mcp.store.signals.catalogue import resolve_signals
-from webots_mcp.store.signals.registry import Signal
-
-if TYPE_CHECKING:
-    from webots_mcp.store.detection.standstill import Findings
+from webots_mcp.store.reading.ranges import UP_TO, RunClock, recorded_bounds
+from webots_mcp.store.reading.segment import Deadline, Segment, just_after
+from webots_mcp.store.signals import Signal
 
 FARTHER: Final = 8.0  # times as far is looked for the ends of what reaches out of a segment
 MOST_NAMED: Final = 5
@@ -41,6 +41,7 @@ class Search:
         kinds: All that are looked for in it.
         asked: The part of the segment that was asked about, where that was widened to find ends.
         ledger: What could not be looked at, and what came near to an event.
+        shared: What a detector found that others of its module, and later looks, need as well.
     """
 
     connection: sqlite3.Connection
@@ -51,6 +52,7 @@ class Search:
     deadline: Deadline
     ledger: Ledger = field(default_factory=Ledger)
     asked: Segment | None = None
+    shared: dict[type, Any] = field(default_factory=dict[type, Any])
 
     def of(self, segment: Segment, **changes: Any) -> Search:
         """The same in another segment of the run, of which it is known what is known of this."""
@@ -145,13 +147,6 @@ class Search:
         part = Segment(self.segment.run_id, self.began_s, just_after(self.ended_s))
         is_all = replace(self.segment, open_start=False, open_end=False) == part
         return self.frame if is_all else read_frame(self.connection, part, self.deadline)
-
-    @cached_property
-    def standstills(self) -> Findings:
-        """Found once for both kinds that tell of them; how the other kinds look is not imported."""
-        from webots_mcp.store.detection.standstill import standstills_in
-
-        return standstills_in(self)
 
     def event(
         self, kind: str, start_s: float, end_s: float, name: str | None, **details: Any

@@ -5,23 +5,365 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from functools import cached_property
+from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.naming import NAME_POSITION
-from webots_mcp.store.analysis.arrays import Array, Indexes, noise_of, np
-from webots_mcp.store.analysis.creep import MOST_AROUND
-from webots_mcp.store.analysis.standstill import NEARLY, find_standstills, shortest_seen_s
+from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, median, noise_of, np
+from webots_mcp.store.analysis.standstill import (
+    MOST_AROUND,
+    NEARLY,
+    find_standstills,
+    shortest_seen_s,
+)
 from webots_mcp.store.analysis.track import Track, track_of
-from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.kind import Alike, EventKind, NotSearchableError
-from webots_mcp.store.detection.mode_use import ModeUses
-from webots_mcp.store.detection.motion import Motion, RunNoise, in_metres, tracks_in
-from webots_mcp.store.detection.search import NO_TIME
-from webots_mcp.store.detection.stuck import Judged, Place, Standings
+from webots_mcp.store.detection.kinds import (
+    Alike,
+    Event,
+    EventKind,
+    EventOptions,
+    NotSearchableError,
+)
+from webots_mcp.store.detection.motion import (
+    ModeUse,
+    ModeUses,
+    Motion,
+    RunNoise,
+    in_metres,
+    tracks_in,
+)
+from webots_mcp.store.detection.search import NO_TIME, Search
+from webots_mcp.store.reading.frame import Frame
+from webots_mcp.store.signals import shown
 
-if TYPE_CHECKING:
-    from webots_mcp.store.detection.search import Search
-    from webots_mcp.store.reading.frame import Frame
+# -- whether it should have moved: what shows it, and what speaks against it -----------------------
+#
+# No verdict depends on the name of a mode. What was commanded, what its wheels did, and that it
+# moves in the same mode is evidence; a measured speed of 0 is none against it. The rows of all
+# standstills are judged at once.
+
+
+WHEELS_TURN: Final = 0.1  # rad/s, or in whatever unit they are published
+ON_THE_SPOT: Final = 0.2  # of the fastest wheel: where the mean of all is less, none drives ahead
+COMMAND_NOISE: Final = 4.0  # deviations of a speed's own noise: what is less is no command
+ONE_COURSE: Final = 3.0  # deviations that the median of a command is from 0 ...
+ONE_SIGN: Final = 0.95  # ... with the same sign in such a share of its rows
+USUALLY_STANDS: Final = 10.0  # deviations, in a mode in which it usually stands
+CELL_S: Final = 2.0  # in which a robot turns or sways, or not
+TURNED_RAD: Final = 0.1  # from the mean of one cell to that of the next
+HEADING_NOISE: Final = 6.0  # standard deviations of such a mean
+SWAY_M: Final = 0.0035  # of 1 cm to and fro; less is how a robot trembles at a wall
+SWAY_NOISE: Final = 3.5  # deviations in each coordinate: noise alone comes to 1.4 of them
+MOSTLY: Final = 0.5
+TOLD_SHARE: Final = 0.1  # of the rows: what holds in fewer, at the ends, shows nothing
+BRIDGED_S: Final = 0.5  # evidence that is missing for less goes on
+_HEADING_ROWS: Final = 5  # at each end, whose median is its heading
+
+
+class Judged(NamedTuple):
+    """An event, before it is known of which run.
+
+    Attributes:
+        kind: `standstill` for all of one, `stuck` for a part in which it should have moved, and
+            `apart` for what such parts leave of the standstill.
+    """
+
+    kind: str
+    start_s: float
+    end_s: float
+    details: dict[str, Any]
+
+
+class Place(NamedTuple):
+    """Where it stood, and the rows of the frame in which it did: those with a position.
+
+    Attributes:
+        left_m: What is left of the noise in each of x and y, which are smoothed.
+    """
+
+    rows: Indexes
+    times: Array
+    x: Array
+    y: Array
+    x_m: float
+    y_m: float
+    left_m: float
+
+    @property
+    def lasts_s(self) -> float:
+        """From the first row to the last."""
+        return float(self.times[-1] - self.times[0])
+
+
+class Standings:
+    """The rows of all standstills one after the other, and what each of them shows.
+
+    Attributes:
+        starts: Where each standstill begins among these rows, and the end of the last one.
+        owner: Of each row, which standstill it is of.
+        speeds: As commanded, or as named so that they may be.
+        told: It was commanded to move; `stops`: to stand.
+        wheel_drives: 1 where its wheels drive it ahead, -1 back; `resting`: none of them turns.
+        turns: It turned in place; `sways`: it went to and fro.
+        in_moving_mode: It was in a mode in which it moves.
+    """
+
+    def __init__(
+        self,
+        frame: Frame,
+        motion: Motion,
+        options: EventOptions,
+        places: Sequence[Place],
+        noise: RunNoise,
+        uses: ModeUses,
+    ) -> None:
+        self.motion, self.options, self.places, self.noise = motion, options, places, noise
+        self._uses = uses
+        rows = np.concatenate([place.rows for place in places])
+        self.times, self._x, self._y = (
+            np.concatenate([getattr(place, name) for place in places])
+            for name in ("times", "x", "y")
+        )
+        lengths = [len(place.rows) for place in places]
+        self.starts: Indexes = np.concatenate(([0], np.cumsum(lengths)))
+        self.owner = np.repeat(np.arange(len(places)), lengths)
+        self.speed = motion.commanded or motion.speed
+        self.speeds = np.full(len(rows), np.nan)
+        least = 0.0
+        if self.speed is not None and self.speed.name in frame:
+            self.speeds = frame.numbers(self.speed.name)[rows]
+            least = max(options.min_commanded_m_s, COMMAND_NOISE * noise.of(self.speed.name))
+        self.told = np.abs(self.speeds) >= least
+        # A speed whose name leaves open whether it is commanded or measured says so where it is 0.
+        self.stops = (np.abs(self.speeds) < least) & (motion.commanded is not None)
+        wheels = motion.wheel_commands or motion.wheels
+        self.wheels = [each for each in wheels if each.name in frame]
+        turned = np.nan_to_num([frame.numbers(each.name)[rows] for each in self.wheels])
+        turned = turned if self.wheels else np.zeros((1, len(rows)))
+        self.fastest: Array = np.abs(turned).max(axis=0)
+        mean = turned.mean(axis=0)
+        noises = [noise.of(each.name) for each in self.wheels]
+        turn: Flags = self.fastest >= max([WHEELS_TURN, *(COMMAND_NOISE * each for each in noises)])
+        ahead: Flags = turn & (np.abs(mean) >= ON_THE_SPOT * self.fastest)
+        self.resting = ~turn & bool(self.wheels)
+        # Where the heading is known, it shows whether wheels against each other turn it.
+        self.wheel_drives = np.where(
+            ahead, np.sign(mean), 1.0 * (turn & (motion.heading is not None))
+        )
+        self.course: Array | None = None
+        if (heading := motion.heading) is not None and heading.name in frame:
+            self.course = frame.numbers(heading.name)[rows] * math.tau / (heading.turn or math.tau)
+            there = np.isfinite(self.course)
+            self.course[there] = np.unwrap(self.course[there])
+        self.turns = self._turning()
+        if heading is None:  # wheels that turn it on the spot move it nowhere
+            self.turns |= turn & ~ahead
+        self.sways = self._swaying()
+        coded = None if motion.mode is None else frame.coded(motion.mode.name)
+        self.modes = np.zeros(len(rows), np.intp) if coded is None else coded.codes[rows]
+        self.labels = [None] if coded is None else coded.labels
+        self._by_mode = {code: self._moves_in(code) for code in self.codes(slice(None))}
+        moves = [bool(self._by_mode.get(code, (None,))[0]) for code in range(len(self.labels))]
+        self.in_moving_mode = np.array(moves)[self.modes]
+
+    @cached_property
+    def _cells(self) -> tuple[Indexes, Indexes, Flags]:
+        """Where parts of about two seconds of each standstill begin, how many rows each has, and
+        whether it is of the same standstill as the next one.
+        """
+        begins: list[Array] = [
+            np.linspace(place.times[0], place.times[-1], parts, endpoint=False)
+            for place in self.places
+            for parts in [max(1, round(place.lasts_s / CELL_S))]
+        ]
+        found = np.searchsorted(self.times, np.concatenate(begins))
+        cells: Indexes = np.unique(np.append(found, self.starts[:-1]))
+        same: Flags = np.diff(self.owner[cells]) == 0
+        return cells, np.diff(cells, append=len(self.times)), same
+
+    def _turning(self) -> Flags:
+        """Whether it looks elsewhere in each part than in those next to it.
+
+        Means are compared: who wiggles about one heading does not turn; nor who is turned once.
+        """
+        if self.course is None or self.motion.heading is None:
+            return np.zeros(len(self.times), np.bool_)
+        cells, rows, same = self._cells
+        heading = self.motion.heading
+        noise = self.noise.of(heading.name) * math.tau / (heading.turn or math.tau)
+        there = np.isfinite(self.course)
+        known = np.maximum(1, np.add.reduceat(there * 1.0, cells))
+        means = np.add.reduceat(np.where(there, self.course, 0.0), cells) / known
+        limit = np.maximum(TURNED_RAD, HEADING_NOISE * noise / np.sqrt(known))
+        turned = ~same | (np.abs(np.diff(means)) > limit[1:])
+        alone = np.append(True, ~same) & np.append(~same, True)
+        return np.repeat(np.append(True, turned) & np.append(turned, True) & ~alone, rows)
+
+    def _swaying(self) -> Flags:
+        """Whether it goes about in each part: within a place who does so moves, and is not stuck.
+
+        What counts is how far its places are from their mean (root mean square): of many rows some
+        few are always far away. A single twitch is none.
+        """
+        cells, rows, same = self._cells
+        away_m2 = np.zeros(len(cells))
+        for values in (self._x, self._y):
+            off = values - np.repeat(np.add.reduceat(values, cells) / rows, rows)
+            away_m2 += np.add.reduceat(off**2, cells) / rows
+        left_m = np.array([place.left_m for place in self.places])[self.owner[cells]]
+        moved = away_m2 > np.maximum(SWAY_M, SWAY_NOISE * left_m) ** 2
+        both = same & moved[1:] & moved[:-1]
+        return np.repeat(np.append(False, both) | np.append(both, False), rows)
+
+    def spans(self, flags: Flags, bridged_s: float) -> list[tuple[int, int]]:
+        """Rows [start, stop) of one standstill in which flags hold for the shortest time that
+        counts, but for moments.
+        """
+        rows = np.flatnonzero(flags)
+        apart = (np.diff(rows) > 1) & (np.diff(self.times[rows]) > bridged_s)
+        edges = np.flatnonzero(apart | (np.diff(self.owner[rows]) != 0)) + 1
+        firsts, ends = np.append(0, edges), np.append(edges, len(rows))
+        if not len(rows):
+            return []
+        starts, stops = rows[firsts], rows[ends - 1] + 1
+        long = self.times[stops - 1] - self.times[starts] >= NEARLY * self.options.stuck_s
+        return list(zip(starts[long].tolist(), stops[long].tolist(), strict=True))
+
+    def codes(self, rows: slice) -> list[int]:
+        """The modes in some of the rows."""
+        return np.flatnonzero(np.bincount(self.modes[rows])).tolist()
+
+    def facts(self, place: Place, rows: slice) -> dict[str, Any]:
+        """What is told of rows of a standstill, whether it was stuck or not."""
+        facts: dict[str, Any] = {"x_m": place.x_m, "y_m": place.y_m}
+        if self.motion.mode is not None:
+            facts["mode"] = self.labels[int(np.argmax(np.bincount(self.modes[rows])))]
+        if self.course is not None:
+            course = self.course[rows]
+            course = course[~np.isnan(course)]
+            few = max(1, min(_HEADING_ROWS, len(course) // 2))
+            if len(course):
+                facts["turned_rad"] = round(median(course[-few:]) - median(course[:few]), 3)
+        return facts
+
+    def judged(self) -> list[Judged]:
+        """Each standstill, what of it the robot was stuck for, and what that leaves of it."""
+        events = list[Judged]()
+        hindered = np.zeros(len(self.times), np.bool_)  # it moved in its place for long enough
+        for start, stop in self.spans(self.turns | self.sways, 0.0):
+            hindered[start:stop] = True
+        drives = self.told | (self.wheel_drives != 0) | self.in_moving_mode
+        spans: dict[int, list[tuple[int, int]]] = {}
+        for span in self.spans(drives & ~self.stops & ~hindered, BRIDGED_S):
+            spans.setdefault(int(self.owner[span[0]]), []).append(span)
+        for at, place in enumerate(self.places):
+            whole = slice(int(self.starts[at]), int(self.starts[at + 1]))
+            against, stuck = self._against(at, whole), list[tuple[int, int]]()
+            for start, stop in spans.get(at, []):
+                if stop - start >= NEARLY * (whole.stop - whole.start):
+                    start, stop = whole.start, whole.stop
+                reasons, doubt = self._shown(slice(start, stop))
+                if doubt is not None:
+                    against.append(doubt)
+                    continue
+                stuck.append((start, stop))
+                speeds = self.speeds[start:stop][np.isfinite(self.speeds[start:stop])]
+                details = self.facts(place, slice(start, stop))
+                details |= {"commanded": round(median(speeds), 9)} if len(speeds) else {}
+                details["evidence_for"] = "; ".join(reasons)
+                details |= {"evidence_against": "; ".join(against)} if against else {}
+                events.append(self._event("stuck", start, stop, details))
+            details = self.facts(place, whole)
+            if not stuck:
+                modeless = "" if self.motion.mode else "; if one holds the mode, give mode=NAME"
+                nothing = f"no published signal shows that it should have moved{modeless}"
+                details["why_not_stuck"] = "; ".join(against) or nothing
+            events.append(self._event("standstill", whole.start, whole.stop, details))
+            edges = [whole.start, *(edge for span in stuck for edge in span), whole.stop]
+            for start, stop in zip(edges[::2], edges[1::2], strict=True):
+                # It ends in the row in which it begins to be stuck, and begins in their last one.
+                first, last = start - (start > whole.start), min(stop, whole.stop - 1)
+                part = self._event("apart", first, last + 1, details)
+                if part.end_s - part.start_s >= NEARLY * self.options.stuck_s or not stuck:
+                    own = self.facts(place, slice(first, last + 1)) if stuck else details
+                    events.append(part._replace(details=own))
+        return events
+
+    def _event(self, kind: str, start: int, stop: int, details: dict[str, Any]) -> Judged:
+        return Judged(kind, float(self.times[start]), float(self.times[stop - 1]), details)
+
+    def _moves_in(self, code: int) -> tuple[str | None, str | None]:
+        """Why a robot in that mode should move, and what speaks against it."""
+        mode = shown(self.labels[code])
+        if mode is None:
+            return None, None
+        if (moving := self.options.moving_modes) is not None:
+            return (f"mode {mode} is one of moving_modes" if mode in moving else None), None
+        use = self._uses.of(mode)
+        if use.moving and not use.usually_stands:
+            where = "" if use.run_id == self._uses.run_id else f" in run {use.run_id}"
+            return f"in mode {mode}, in which it moved at {use.speed_m_s:.2g} m/s{where}", None
+        if use.moving:
+            return None, f"it usually stands in mode {mode}"
+        if self._uses.is_cut:
+            return None, f"not checked whether it moves in mode {mode}: time limit reached"
+        return None, f"not seen moving in mode {mode}"
+
+    def _shown(self, rows: slice) -> tuple[list[str], str | None]:
+        """What shows that it should have moved in these rows; or why that is in doubt."""
+        codes = self.codes(rows)
+        said = [why for code in codes for why in self._by_mode[code][:1] if why]
+        told, wheels = self.told[rows], self.wheel_drives[rows] != 0
+        speeds, is_measured = np.zeros(0), self.motion.commanded is None
+        if self.speed is not None and told.sum() > TOLD_SHARE * len(told):
+            speeds = self.speeds[rows][told]
+            said.append(f"{self.speed.name} {median(speeds):.3g}")
+        if wheels.any():
+            unit = " rad/s" if all(wheel.unit == "rad/s" for wheel in self.wheels) else ""
+            turning = (self.wheel_drives * self.fastest)[rows][wheels]
+            said.append(f"wheels at {median(abs(turning)):.3g}{unit}")
+            if wheels.sum() > told.sum():
+                speeds, is_measured = turning, not self.motion.wheel_commands
+        if self.in_moving_mode[rows].mean() >= MOSTLY or not len(speeds):
+            return said, None
+        # Speeds that are hardly beyond their noise, or go to and fro, are no command.
+        middle = median(speeds)
+        spread = median(np.abs(speeds - middle)) / 0.6745
+        same = np.count_nonzero(np.sign(speeds) == np.sign(middle))
+        stands = is_measured and any(self._use(code).usually_stands for code in codes)
+        needed = USUALLY_STANDS if stands else ONE_COURSE
+        if abs(middle) >= needed * spread and same >= ONE_SIGN * len(speeds):
+            return said, None
+        return said, f"commanded or measured speeds of {middle:.2g} are hardly beyond their noise"
+
+    def _use(self, code: int) -> ModeUse:
+        mode = shown(self.labels[code])
+        return ModeUse() if mode is None else self._uses.of(mode)
+
+    def _against(self, at: int, rows: slice) -> list[str]:
+        """What speaks against that it should have moved in a standstill."""
+        said = list[str]()
+
+        def mostly(flags: Flags) -> bool:
+            return np.count_nonzero(flags[rows]) > MOSTLY * (rows.stop - rows.start)
+
+        if self.motion.commanded and mostly(self.stops):
+            stopped = median(self.speeds[rows][self.stops[rows]])
+            said.append(f"{self.motion.commanded.name} {stopped:.3g}")
+        if mostly(self.resting):
+            said.append("wheels at rest")
+        said += [why for code in self.codes(rows) for why in self._by_mode[code][1:] if why]
+        if mostly(self.turns):
+            opposite = "its wheels turned in opposite directions, as for a turn in place"
+            # What only the wheels tell, a quadcopter's do as well.
+            seen = self.motion.heading is not None
+            said.append("it turned in place" if seen else f"{opposite}; no heading recorded")
+        if mostly(self.sways):
+            place = self.places[at]
+            reach_m = math.hypot(np.ptp(place.x), np.ptp(place.y))
+            said.append(f"it moved back and forth within {reach_m:.2g} m")
+        return said
+
 
 NOISE_RANGE: Final = 6.0  # deviations of noise from the least of some hundred rows to the greatest
 SHORTEST_SHARE: Final = 4.0  # of the shortest standstill: shorter ones came nowhere near
@@ -46,11 +388,13 @@ class Findings:
 
 
 def standstills_in(search: Search) -> Findings:
-    """Those that touch the segment of a search, from as many rows as bear on them.
+    """Those that touch the segment of a search, from as many rows as bear on them; found once.
 
     Raises:
         NotSearchableError: No position is known, or there is none, or no time.
     """
+    if Findings in search.shared:
+        return cast("Findings", search.shared[Findings])
     if search.deadline.passed:
         raise NotSearchableError(NO_TIME)
     motion, run, asked = search.motion, search.frame, search.asked or search.segment
@@ -66,6 +410,7 @@ def standstills_in(search: Search) -> Findings:
         found = judge_standstills(rows, motion, search.options, uses, noise, asked_rows)
         if len(rows) == len(run) or search.deadline.passed or not _may_reach_out(found, rows, run):
             break
+    search.shared[Findings] = found
     return found
 
 
@@ -193,12 +538,12 @@ def _standstills(search: Search) -> Iterator[Event]:
 
 def _stuck(search: Search) -> Iterator[Event]:
     """It should have moved and stayed where it was."""
-    search.not_searched("stuck", *search.standstills.undecided)
+    search.not_searched("stuck", *standstills_in(search).undecided)
     return _events(search, "stuck", "stuck")
 
 
 def _events(search: Search, kind: str, judged_as: str) -> Iterator[Event]:
-    found = search.standstills
+    found = standstills_in(search)
     search.not_searched(kind, *found.unseen)
     if found.nearest is not None:
         search.note_nearest(kind, *found.nearest)

@@ -13,10 +13,9 @@ from typing import Any, ClassVar, Final, Literal, NamedTuple, cast
 
 from webots_mcp.naming import LONGEST_SPREAD_ARRAY, flatten
 from webots_mcp.store.export.purged_rows import PurgedRows
-from webots_mcp.store.reading.kept import kept_parts
-from webots_mcp.store.reading.ranges import Segment
+from webots_mcp.store.reading.segment import Segment, kept_parts
 from webots_mcp.store.run_rows import put_back
-from webots_mcp.store.signals.flatten import parse
+from webots_mcp.store.signals import parse
 
 Progress = Callable[[int, int], object]
 ColumnKind = Literal["null", "bool", "int", "num", "text", "numbers"]

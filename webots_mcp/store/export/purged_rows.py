@@ -26,8 +26,8 @@ from webots_mcp.store.chunks.stored import (
 )
 from webots_mcp.store.reading.frame import deleted_part
 from webots_mcp.store.reading.frame_source import Unread
-from webots_mcp.store.reading.ranges import Segment
-from webots_mcp.store.signals.registry import Signal, registered
+from webots_mcp.store.reading.segment import Segment
+from webots_mcp.store.signals import Signal, registered
 
 _PURGED: Final = (
     "SELECT id, row_count - stored_row_count, lost_value_count FROM row_group WHERE run_id = ? "

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
-from webots_mcp.store.analysis.ranking import Ranked
+from webots_mcp.store.analysis.spread import Ranked
 from webots_mcp.store.export.export_rows import Column, Row, Table
 from webots_mcp.store.trials import (
     Trial,

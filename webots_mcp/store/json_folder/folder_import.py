@@ -34,7 +34,7 @@ from webots_mcp.store.json_folder.folder_reading import (
     is_there,
     read_folder,
 )
-from webots_mcp.store.signals.registry import enter_signals, seen_in
+from webots_mcp.store.signals import enter_signals, seen_in
 from webots_mcp.transactions import transaction
 
 Progress = Callable[[int, int], object]

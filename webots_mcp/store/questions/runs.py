@@ -13,7 +13,7 @@ from webots_mcp.liveness import dead_sessions
 from webots_mcp.parameter import Value
 from webots_mcp.pauses import paused_s
 from webots_mcp.store.parameters import HAD_VALUES, as_filter, notable_parameters
-from webots_mcp.store.reading.snapshot import in_one_snapshot
+from webots_mcp.store.reading.segment import in_one_snapshot
 from webots_mcp.store.robots import resolve_robot
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.transactions import transaction

@@ -11,17 +11,26 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import json
 import math
+import os
 import re
 import sqlite3
 import sys
-from collections.abc import Generator, Iterable
-from dataclasses import dataclass
+import tempfile
+import threading
+from collections.abc import Callable, Generator, Iterable
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Final
 
-from webots_mcp.errors import InvalidInputError
-from webots_mcp.store.questions.schema_text import columns_by_table
-from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
+import webots_mcp
+from webots_mcp.connection import connect
+from webots_mcp.contract import DATABASE_NAME, Database
+from webots_mcp.errors import InvalidInputError, WebotsMCPError
+from webots_mcp.schema import shipped_objects
+from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 
 MOST_ROWS: Final = 1000
 MAX_BYTES: Final = 20_000  # about 5,000 tokens
@@ -264,3 +273,190 @@ def _near(connection: sqlite3.Connection, statement: str, what: str, name: str) 
         "a published value is inside state.data: json_extract(data, '$.name'); "
         "the signal table has the paths"
     )
+
+
+# -- a process of its own, which the deadline ends whatever the engine is doing --------------------
+#
+# SQLite looks at its deadline between the steps of its virtual machine, and one call of `replace`
+# on long texts is one step of half a minute; DuckDB is no quicker. A process can be ended inside
+# it, and takes its memory along. It gets one request as JSON on stdin and gives one answer as
+# JSON on stdout.
+
+
+LINE: Final = (sys.executable, "-m", __name__)
+# Modules are looked for here first, so that no file of the user's folder is taken for one.
+FOLDER: Final = Path(webots_mcp.__file__).parent.parent
+
+_MAX_HEAP_BYTES: Final = 400_000_000
+_TIMED_OUT: Final = 124  # the exit code of timeout(1): no other end of the process has it
+_GRACE_S: Final = 0.3  # SQLite's own deadline comes first: it keeps the rows that were found
+
+
+@dataclass(frozen=True)
+class Statement:
+    """What is asked; see `query_sql`. The database is a file, or the URL of a pool."""
+
+    database: str
+    sql: str
+    max_rows: int
+    max_bytes: int
+    deadline_s: float
+
+    def encoded(self) -> bytes:
+        """The request as the process takes it."""
+        return json.dumps(asdict(self), ensure_ascii=False).encode()  # what is no text fails here
+
+
+def decode(answer: bytes, exit_code: int, asked: Statement, slow: str | None = None) -> Result:
+    """What the process answered; one that ended itself before it could answer took too long.
+
+    Args:
+        answer: What it wrote to stdout.
+        exit_code: Its own.
+        asked: What it was asked.
+        slow: What to do about a statement that takes too long, where it is not asked of SQLite.
+
+    Raises:
+        InvalidInputError: As `query_sql`.
+        WebotsMCPError: The process ended for another reason, not because of the statement.
+    """
+    if exit_code == _TIMED_OUT:
+        raise InvalidInputError(slow or too_slow(asked.deadline_s))
+    if exit_code < 0:
+        raise InvalidInputError(f"signal {-exit_code} ended the statement; perhaps {TOO_LARGE}")
+    if exit_code != 0:
+        raise WebotsMCPError(
+            f"the process that runs the statement ended without an answer (exit code {exit_code}); "
+            "the server's stderr may tell why. Was webots-mcp updated or moved since the server "
+            "started? Then start the server again"
+        )
+    found = json.loads(answer)
+    if "error" in found:
+        raise InvalidInputError(found["error"])
+    rows: tuple[tuple[Cell, ...], ...] = tuple(tuple(row) for row in found["rows"])
+    return Result(tuple(found["columns"]), rows, found["truncated"], found["shortened"])
+
+
+@contextlib.contextmanager
+def as_file(database: Database) -> Generator[Path]:
+    """The database as a file that another process can open; one in memory is copied to a file."""
+    if isinstance(database, Path):
+        yield database
+        return
+    with tempfile.TemporaryDirectory(prefix="webots-mcp-") as folder:
+        file = Path(folder) / DATABASE_NAME
+        with closing(connect(database, "reader")) as memory, closing(sqlite3.connect(file)) as copy:
+            memory.backup(copy)
+        yield file
+
+
+def main(ask: Callable[[Statement], Result]) -> None:
+    """Answer the request on stdin."""
+    asked = Statement(**json.load(sys.stdin))
+    end = threading.Timer(asked.deadline_s + _GRACE_S, os._exit, [_TIMED_OUT])
+    end.daemon = True
+    end.start()
+    try:
+        answer = asdict(ask(asked))
+    except (WebotsMCPError, sqlite3.Error) as error:
+        answer = {"error": str(error)}
+    except MemoryError:
+        answer = {"error": TOO_LARGE}
+    sys.stdout.write(json.dumps(answer))
+
+
+def _ask(asked: Statement) -> Result:
+    with closing(connect(Path(asked.database), "reader")) as connection:
+        connection.execute(f"PRAGMA hard_heap_limit={_MAX_HEAP_BYTES}")
+        return query_sql(
+            connection, asked.sql, max_rows=asked.max_rows, max_bytes=asked.max_bytes,
+            deadline_s=asked.deadline_s,
+        )  # fmt: skip
+
+
+if __name__ == "__main__":
+    main(_ask)
+
+
+# -- the schema as a short text, read from the database itself -------------------------------------
+
+
+_OBJECTS: Final = (
+    "SELECT name, type, sql FROM sqlite_master WHERE type IN ('table', 'view') "
+    "AND name NOT LIKE 'sqlite_%' AND name <> 'alembic_version' ORDER BY type, rowid"
+)
+# What serves the recording itself: a question needs the names at most.
+_BOOKKEEPING: Final = (
+    "console_line",
+    "lease",
+    "watermark",
+    "recording",
+    "retention_limit",
+    "kept_state",
+    "row_group",
+    "chunk",
+)
+_BOOKKEEPING_COLUMNS: Final = (
+    "uuid",
+    "process",
+    "last_adopted_entry",
+    "last_seen_monotonic_s",
+    "mode_before_pause",
+    "is_chunked",
+)
+_COLUMNS: Final = "SELECT name FROM pragma_table_info(?) ORDER BY cid"
+_COMMENT: Final = re.compile(r'^\s*"?(\w+)"?\s[^\n,]*?/\* (.*?) \*/', re.MULTILINE)
+_RULES: Final = (
+    "Times are seconds: sim_time_s of the simulation, wall_time_s Unix. state.data is JSON: "
+    "json_extract(data, '$.pose[0]'); signal.path has the path of each name. A range of a run is "
+    "fast by run_id and sim_time_s; for a long one use robot_statistics (min, max, mean of about "
+    "1,024 rows each, also of purged ones; not of rows in no chunk: the newest of a run that goes "
+    "on, up to 1,023, and the last of an ended one where they are fewer than 256)."
+)
+
+
+def columns_by_table(connection: sqlite3.Connection) -> dict[str, list[str]]:
+    """The columns of each table and view of ours; those of a person are not looked into."""
+    return {
+        name: [column for (column,) in connection.execute(_COLUMNS, (name,))]
+        for name, _, _ in connection.execute(_OBJECTS).fetchall()
+        if name in shipped_objects()
+    }
+
+
+def describe_schema(connection: sqlite3.Connection) -> str:
+    """One line for tables and views with the same columns: those of the first, with comments.
+
+    What is said of a column is not repeated for one of the same name in a later table. Bookkeeping
+    is named only.
+    """
+    columns = columns_by_table(connection)
+    names: dict[frozenset[str], list[str]] = {}
+    listed: dict[frozenset[str], str] = {}
+    listed_before = set[tuple[str, str]]()
+    for name, kind, sql in connection.execute(_OBJECTS).fetchall():
+        if name in _BOOKKEEPING or name not in columns:
+            continue
+        same = frozenset(columns[name]).difference(_BOOKKEEPING_COLUMNS)
+        names.setdefault(same, []).append(f"{kind} {name}")
+        if same not in listed:
+            found = dict.fromkeys(_COMMENT.findall(sql) if kind == "table" else ())
+            listed[same] = _listed(
+                columns[name], dict(each for each in found if each not in listed_before)
+            )
+            listed_before.update(found)
+    lines = (f"{', '.join(alike)}: {listed[same]}" for same, alike in names.items())
+    return "\n".join((_RULES, *lines, _bookkeeping()))
+
+
+def _listed(columns: list[str], comments: dict[str, str]) -> str:
+    return ", ".join(
+        f"{name} [{comments[name]}]" if name in comments else name
+        for name in columns
+        if name not in _BOOKKEEPING_COLUMNS
+    )
+
+
+def _bookkeeping() -> str:
+    tables, columns = ", ".join(_BOOKKEEPING), ", ".join(_BOOKKEEPING_COLUMNS)
+    return f"bookkeeping, not listed: tables {tables}; columns {columns}"

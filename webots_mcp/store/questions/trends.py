@@ -6,31 +6,492 @@ import math
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final, Literal
 
-from webots_mcp.store.analysis.arrays import Array, np
-from webots_mcp.store.analysis.features import FLAT_BAND, Spike, find_spikes
-from webots_mcp.store.analysis.summary import LARGEST, Summary, summarise_numbers, with_extremes
-from webots_mcp.store.analysis.swings import SHORTEST_PERIOD_ROWS
+from webots_mcp.naming import words_of
+from webots_mcp.store.analysis.arrays import Array, Indexes, np
+from webots_mcp.store.analysis.summary import (
+    FLAT_BAND,
+    LARGEST,
+    Line,
+    Spike,
+    Step,
+    Summary,
+    find_spikes,
+    find_step,
+    fit_line,
+    flat_since,
+    is_monotonic,
+    leaps_in,
+    summarise_numbers,
+    time_effect,
+    unwrap,
+    with_extremes,
+    with_extremes_of,
+)
+from webots_mcp.store.analysis.swings import (
+    LEAST_HALF_SWINGS,
+    SHORTEST_PERIOD_ROWS,
+    Swing,
+    find_swings,
+)
 from webots_mcp.store.chunks import making
 from webots_mcp.store.questions.series import STATES_SHARE, signals_left
-from webots_mcp.store.questions.trend import (
-    Course,
-    Trend,
-    course_of_means,
-    course_of_values,
-    in_means,
-    judge,
-)
 from webots_mcp.store.reading import frame_summary
-from webots_mcp.store.reading.changes import Changes, change_points
-from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
-from webots_mcp.store.reading.frame import Frame, read_frame, read_kept
-from webots_mcp.store.reading.frame_summary import reads_values, summary_of
-from webots_mcp.store.reading.ranges import Segment, TimeRange, recorded_bounds
-from webots_mcp.store.reading.snapshot import in_one_snapshot
-from webots_mcp.store.signals.catalogue import signals_of
-from webots_mcp.store.signals.registry import Signal
+from webots_mcp.store.reading.catalogue import signals_of
+from webots_mcp.store.reading.frame import Frame, Zones, read_frame, read_kept
+from webots_mcp.store.reading.frame_summary import Changes, change_points, reads_values, summary_of
+from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
+from webots_mcp.store.reading.segment import (
+    QUESTION_DEADLINE_S,
+    Deadline,
+    Segment,
+    in_one_snapshot,
+    shown_time,
+)
+from webots_mcp.store.signals import Signal
+
+# -- one numeric signal: its trend, and what a person would notice ---------------------------------
+
+
+STRAIGHT_R2: Final = 0.8  # a line that explains less is not how a person would describe it
+TOLD_MISSING_SHARE: Final = 0.001
+SLOW_SHARE: Final = 0.5  # of the variance must be left in means for their course to be the values'
+SWINGING_SHARE: Final = 0.6  # of the range: what swung for less did something else as well
+WIDE_SHARE: Final = 0.3  # of the range of values: who swings by less swings about a moving place
+TOLD_BEYOND_ENDS: Final = 0.05  # of the range: extremes nearer to the ends are as good as them
+# Words of a clock or a counter, and how straight its course is, also in means of a tenth of it.
+_CLOCKS: Final = frozenset((
+    "time", "clock", "timestamp", "stamp", "elapsed", "t", "seconds", "step", "steps", "tick",
+    "ticks", "frame", "frames", "iteration", "iterations",
+))  # fmt: skip
+_CLOCK_R2: Final = 0.99
+_DUST: Final = 1e-12  # of a value: what adding leaves of it
+
+Shape = Literal["constant", "rising", "falling", "oscillating", "resting", "varying"]
+Monotonic = Literal["rising", "falling"]
+
+
+@dataclass(frozen=True)
+class Trend:
+    """A numeric signal over a range.
+
+    Attributes:
+        summary: Count, first, last, extremes with their times, mean, deviation. Where the turns of
+            an angle are counted, its extremes are those of the unwrapped angle too.
+        mean: Of an angle the circular mean. What is less than a few millionths of the range is
+            rounded away: it comes from adding.
+        deviation: Standard deviation; of an angle that of the unwrapped angle, or the circular one
+            where turns cannot be counted, next to extremes as they were recorded.
+        turned: How far an angle turned, positive as it grows, turns counted; else None.
+        leaps: An angle that changed by more than a quarter turn from row to row, as the bearing to
+            the nearest of several things does: its turns cannot be counted.
+        monotonic: "rising", "falling" (never the other way, and not constant), or None.
+        fast: It varies so fast that the means of chunks do not show its course.
+        swings: Where it moved to and fro, as `find_events` reports it, but of any period.
+        resolution_s: Length of the means in which swings were seen; None where rows were.
+        flat_since_s: Since when it rests; None if it does not.
+        spikes: Values that stand out from both neighbours; None where rows were not looked at.
+        step: The one change that makes most of its range; None where rows were not looked at, and
+            of an angle.
+        missing: Of the rows, those without a value; of many rows also those with one beyond 1e100.
+        too_large: Of the rows, those with a number beyond 1e100; None where rows were not read.
+        change: How much it changed with time, 0 to 2: the share of its variance that is slow
+            (`time_effect`) times its range in units of its largest magnitude. Free of units.
+        says: What a person would notice.
+    """
+
+    name: str
+    kind: str
+    unit: str | None
+    summary: Summary
+    mean: float | None
+    deviation: float | None
+    turned: float | None
+    leaps: bool
+    slope_per_s: float | None
+    r2: float | None
+    shape: Shape
+    monotonic: Monotonic | None
+    fast: bool
+    swings: tuple[Swing, ...]
+    resolution_s: float | None
+    flat_since_s: float | None
+    spikes: tuple[Spike, ...] | None
+    step: Step | None
+    missing: int
+    too_large: int | None
+    change: float
+    says: str
+
+    @property
+    def is_lacking(self) -> bool:
+        """Whether so many rows have no value that it is reported."""
+        return self.missing > TOLD_MISSING_SHARE * self.summary.rows
+
+    @property
+    def is_clock(self) -> bool:
+        """Whether it rises with simulation time and its name says so: it has no news.
+
+        A straight rise alone is not enough: a robot at constant speed has one too.
+        """
+        is_straight = self.monotonic == "rising" and (self.r2 or 0.0) >= _CLOCK_R2
+        return is_straight and not _CLOCKS.isdisjoint(words_of(self.name.rpartition(".")[2]))
+
+
+@dataclass(frozen=True)
+class Course:
+    """How a signal went.
+
+    Attributes:
+        times: In s.
+        numbers: The values, of an angle with turns counted; or the means of many of them.
+        inner: What these come to.
+        counted: What the values of an angle come to whose turns are counted; else None.
+        leaps: An angle whose turns cannot be counted.
+        monotonic: Whether the values go one way; of chunks as far as their ends and extremes tell.
+        rest_s: Since when the values rest; None if they do not.
+        inner_variance: That of the values within what the means are of. Where more of it lies there
+            than between them, the course of the means is not that of the values.
+        resolution_s: The usual length of what the means are of; None where the numbers are values.
+    """
+
+    times: Array
+    numbers: Array
+    inner: Summary
+    counted: Summary | None = None
+    leaps: bool = False
+    monotonic: Monotonic | None = None
+    rest_s: float | None = None
+    inner_variance: float = 0.0
+    resolution_s: float | None = None
+
+
+def course_of_values(times: Array, recorded: Array, turn: float | None, summary: Summary) -> Course:
+    """The course of a signal of which every value is looked at.
+
+    Args:
+        times: In s, one at least.
+        recorded: The usable values.
+        turn: A whole turn of an angle, in its unit; None of what is none.
+        summary: What the values come to.
+    """
+    leaps = turn is not None and leaps_in(recorded, turn)
+    numbers = recorded if turn is None or leaps else unwrap(recorded, turn)
+    counted = None if turn is None or leaps else summarise_numbers(times, numbers)
+    monotonic, rest_s = _monotonic(numbers), flat_since(times, numbers)
+    return Course(times, numbers, counted or summary, counted, leaps, monotonic, rest_s)
+
+
+def in_means(course: Course, rows: int) -> Course:
+    """A course in the means of so many values each, for what takes long to find in all of them."""
+    starts = np.arange(0, len(course.times), rows)
+    counts = np.diff(starts, append=len(course.times))
+    means = np.add.reduceat(course.numbers, starts) / counts
+    off = course.numbers - np.repeat(means, counts)
+    times = np.add.reduceat(course.times, starts) / counts
+    return replace(
+        course,
+        times=times,
+        numbers=means,
+        inner=summarise_numbers(times, means),
+        inner_variance=float(np.mean(off * off)),
+        resolution_s=_digits(np.median(np.diff(times))) if len(times) > 1 else None,
+    )
+
+
+def course_of_means(frame: Frame, name: str, zones: Zones) -> Course:
+    """The course of a signal with numbers, of many rows, from what its chunks come to."""
+    held = np.flatnonzero(~np.isnan(zones.sum))
+    counts, means = zones.value_count[held], zones.sum[held] / zones.value_count[held]
+    variances = np.where(
+        zones.min[held] < zones.max[held],
+        zones.squared_deviations[held] / np.maximum(1, counts - 1),
+        0.0,
+    )
+    starts = zones.start_s[held]
+    lengths = np.diff(starts) if len(held) > 1 else zones.end_s[held] - starts
+    times = (starts + zones.end_s[held]) / 2
+    return Course(
+        times,
+        means,
+        summarise_numbers(times, means),
+        monotonic=_monotonic_chunks(zones, held),
+        rest_s=_rest_of_chunks(frame, name, zones, held),
+        inner_variance=math.fsum(variances.tolist()) / len(held),
+        resolution_s=_digits(np.median(lengths)),
+    )
+
+
+def _digits(length_s: Any) -> float:
+    return float(f"{float(length_s):.3g}")
+
+
+def _rest_of_chunks(frame: Frame, name: str, zones: Zones, held: Indexes) -> float | None:
+    """Since when all values stay within 0.5 % of their range, as `flat_since` says it."""
+    low, high = float(zones.min[held].min()), float(zones.max[held].max())
+    if low == high:
+        return float(frame.rows(0, int(zones.row_count[: held[0] + 1].sum())).usable(name)[0][0])
+    last = float(zones.last[held[-1]])
+    farthest = np.maximum(zones.max[held] - last, last - zones.min[held])
+    away = np.flatnonzero(farthest > FLAT_BAND * (high - low))
+    first = int(zones.first_row[held[away[-1] if len(away) else 0]])
+    times, values = frame.rows(first, len(frame)).usable(name)
+    return flat_since(times, values, span=high - low, start_s=float(zones.start_s[held[0]]))
+
+
+def _monotonic_chunks(zones: Zones, held: Indexes) -> Monotonic | None:
+    """As far as the ends and extremes of the chunks tell, taken in the one order or the other."""
+    low, high = zones.min[held], zones.max[held]
+    orders = ((low, high), (high, low))
+    ends = [np.stack((zones.first[held], *each, zones.last[held]), 1).ravel() for each in orders]
+    return _monotonic(ends[0]) or _monotonic(ends[1])
+
+
+def judge(
+    signal: Signal,
+    summary: Summary,
+    course: Course,
+    spikes: list[Spike] | None = None,
+    too_large: int | None = None,
+) -> Trend:
+    """Combine the summary with the course of the numbers.
+
+    Args:
+        signal: Whose trend.
+        summary: Of the whole range.
+        course: How it went.
+        spikes: None where not every value was looked at.
+        too_large: How many of the values are beyond 1e100; None where that is not known.
+    """
+    times, numbers, inner = course.times, course.numbers, course.inner
+    turn = signal.turn if summary.sines is not None else None
+    slow = _slow_share(inner, course.inner_variance)
+    fast = slow < SLOW_SHARE or course.leaps
+    line = None if course.leaps else _of_all(fit_line(times, numbers, inner.mean or 0.0), slow)
+    monotonic, rest_s = (None, None) if fast else (course.monotonic, course.rest_s)
+    swings = () if fast or monotonic else _swings(times, numbers, course.resolution_s)
+    mean = summary.mean if turn is None else summary.centre(turn)
+    counted = None if fast else course.counted
+    deviation = summary.deviation_in(turn) if counted is None else counted.deviation_in(None)
+    if counted is not None:
+        summary = with_extremes_of(summary, counted)
+    shape = _shape(summary, line, monotonic, swings, rest_s, float(times[-1] - times[0]))
+    trend = Trend(
+        name=signal.name,
+        kind=signal.kind,
+        unit=signal.unit,
+        summary=summary,
+        mean=_rounded(mean, inner),
+        deviation=deviation,
+        turned=None if counted is None else (counted.last or 0.0) - (counted.first or 0.0),
+        leaps=course.leaps,
+        slope_per_s=line.slope_per_s if line else None,
+        r2=line.r2 if line else None,
+        shape=shape,
+        monotonic=monotonic,
+        fast=fast,
+        swings=swings,
+        resolution_s=course.resolution_s,
+        flat_since_s=rest_s,
+        spikes=None if spikes is None else tuple(spikes),
+        step=None if spikes is None or turn is not None else find_step(times, numbers),
+        missing=summary.rows - summary.present - (too_large or 0),
+        too_large=too_large,
+        change=time_effect(times, numbers, inner.mean or 0.0, inner.squares or 0.0)
+        * slow
+        * _relative_range(summary),
+        says="",
+    )
+    return replace(trend, says="; ".join(_remarks(trend)))
+
+
+def _slow_share(means: Summary, inner_variance: float) -> float:
+    """The share of the variance that lies between the means."""
+    if inner_variance == 0:
+        return 1.0
+    between = (means.squares or 0.0) / means.present
+    return between / (between + inner_variance)
+
+
+def _of_all(line: Line | None, slow: float) -> Line | None:
+    """Of the variance of all values, the line through their means explains so much less."""
+    return line and replace(line, r2=line.r2 * slow)
+
+
+def _swings(times: Array, course: Array, resolution_s: float | None) -> tuple[Swing, ...]:
+    """Of any period of which six half swings fit in; means show less of a swing than it is high."""
+    longest_s = 2 * float(times[-1] - times[0]) / LEAST_HALF_SWINGS
+    found = find_swings(
+        times, course, least_half_swings=LEAST_HALF_SWINGS, longest_period_s=longest_s
+    )
+    if resolution_s is None:
+        return tuple(found)
+    return tuple(
+        replace(swing, amplitude=swing.amplitude / float(np.sinc(resolution_s / swing.period_s)))
+        for swing in found
+    )
+
+
+def _rounded(mean: float | None, inner: Summary) -> float | None:
+    """A mean to a few millionths of the range: about -1.48e-17 is about 0."""
+    span = (inner.max or 0.0) - (inner.min or 0.0)
+    if mean is None or span <= 0:
+        return mean
+    return round(mean, 5 - math.floor(math.log10(span)))
+
+
+def _monotonic(values: Array) -> Monotonic | None:
+    if not is_monotonic(values):
+        return None
+    return "rising" if values[-1] > values[0] else "falling"
+
+
+def _shape(
+    summary: Summary,
+    line: Line | None,
+    monotonic: Monotonic | None,
+    swings: Sequence[Swing],
+    rest_s: float | None,
+    whole_s: float,
+) -> Shape:
+    if _is_constant(summary):
+        return "constant"
+    wide = [each for each in swings if _is_wide(each, summary)]
+    if wide and sum(each.end_s - each.start_s for each in wide) >= SWINGING_SHARE * whole_s:
+        return "oscillating"
+    if monotonic is not None:
+        return monotonic
+    if line is not None and line.r2 >= STRAIGHT_R2:
+        return "rising" if line.slope_per_s > 0 else "falling"
+    return "resting" if rest_s is not None else "varying"
+
+
+def _is_wide(swing: Swing, summary: Summary) -> bool:
+    """Whether the swing makes the range, rather than a slow course on which it rides."""
+    return 2 * swing.amplitude >= WIDE_SHARE * ((summary.max or 0.0) - (summary.min or 0.0))
+
+
+def _is_constant(summary: Summary) -> bool:
+    """Whether it never changed but for what adding leaves: 6.000000000000005 is 6."""
+    low, high = summary.min or 0.0, summary.max or 0.0
+    return high - low <= _DUST * max(abs(low), abs(high))
+
+
+def _relative_range(summary: Summary) -> float:
+    assert summary.min is not None and summary.max is not None
+    largest = max(abs(summary.min), abs(summary.max))
+    return (summary.max - summary.min) / largest if largest else 0.0
+
+
+def _remarks(trend: Trend) -> Iterator[str]:
+    summary, unit = trend.summary, f" {trend.unit}" if trend.unit else ""
+    yield _course(trend, unit)
+    if trend.leaps:
+        yield "changes by more than a quarter turn between rows: turns are not counted"
+    elif trend.fast:
+        yield f"varies within {trend.resolution_s:g} s: ask for a shorter range"
+    yield from _beyond_ends(trend)
+    if trend.swings and not any(_is_wide(each, summary) for each in trend.swings):
+        yield f"also {_swinging(trend, unit)}"
+    if trend.flat_since_s is not None and trend.shape != "constant" and summary.changes != 1:
+        yield f"flat at {_in_digits(summary.last, summary)} since {trend.flat_since_s:.6g} s"
+    if trend.spikes:
+        largest = max(trend.spikes, key=lambda spike: abs(spike.value - (trend.mean or 0.0)))
+        yield (
+            f"{len(trend.spikes)} spike{'s' if len(trend.spikes) > 1 else ''}, the largest "
+            f"{largest.value:.4g} at {largest.sim_time_s:.6g} s"
+        )
+    if trend.too_large:
+        yield f"beyond {LARGEST:g} in {trend.too_large} of {summary.rows} rows"
+    if trend.is_lacking:
+        usable = "usable " if trend.too_large is None else ""  # chunks do not tell the two apart
+        yield (
+            f"no {usable}value in {trend.missing} of {summary.rows} rows, the last value at "
+            f"{summary.last_sim_time_s:.6g} s"
+        )
+
+
+def _course(trend: Trend, unit: str) -> str:
+    summary = trend.summary
+    if trend.shape == "constant":
+        return f"constant at {summary.last or 0.0:.4g}{unit}"
+    if any(_is_wide(each, summary) for each in trend.swings):
+        return _swinging(trend, unit)
+    if trend.step is not None:
+        before, after = (
+            _in_digits(value, summary) for value in (trend.step.before, trend.step.after)
+        )
+        return f"steps from {before} to {after}{unit} at {trend.step.sim_time_s:.6g} s"
+    if trend.shape in ("rising", "falling"):
+        slope = f" ({_mean_rate(trend):.3g}{unit}/s)" if _is_straight(trend) else ""
+        if trend.turned is not None:
+            return f"turns by {trend.turned:.3g}{unit}{slope}"
+        verb = "rises" if trend.shape == "rising" else "falls"
+        first, last = _in_digits(summary.first, summary), _in_digits(summary.last, summary)
+        if summary.changes == 1:
+            extreme_s = (summary.min_sim_time_s, summary.max_sim_time_s)[trend.shape == "rising"]
+            return f"steps from {first} to {last}{unit} at {extreme_s:.6g} s"
+        return f"{verb} from {first} to {last}{unit}{slope}"
+    low, high = _in_digits(summary.min, summary), _in_digits(summary.max, summary)
+    return f"between {low} (at {summary.min_sim_time_s:.6g} s) and {high}{unit} " + (
+        f"(at {summary.max_sim_time_s:.6g} s)"
+    )
+
+
+def _mean_rate(trend: Trend) -> float:
+    """From the first value to the last, which are next to it in the sentence."""
+    summary = trend.summary
+    change = (summary.last or 0.0) - (summary.first or 0.0)
+    lasts_s = (summary.last_sim_time_s or 0.0) - (summary.first_sim_time_s or 0.0)
+    return (change if trend.turned is None else trend.turned) / lasts_s
+
+
+def _is_straight(trend: Trend) -> bool:
+    """Whether a slope describes its course: a step or an accelerating growth has none."""
+    return trend.slope_per_s is not None and (trend.r2 or 0.0) >= STRAIGHT_R2
+
+
+def _beyond_ends(trend: Trend) -> Iterator[str]:
+    """The extremes of what rises or falls that are not its ends: it went the other way in between.
+
+    They are reported where the spikes do not show them.
+    """
+    summary = trend.summary
+    if trend.shape not in ("rising", "falling") or trend.turned is not None or trend.spikes:
+        return
+    ends = (summary.first or 0.0, summary.last or 0.0)
+    span = TOLD_BEYOND_ENDS * ((summary.max or 0.0) - (summary.min or 0.0))
+    if summary.min is not None and min(ends) - summary.min > span:
+        yield f"min {_in_digits(summary.min, summary)} at {summary.min_sim_time_s:.6g} s"
+    if summary.max is not None and summary.max - max(ends) > span:
+        yield f"max {_in_digits(summary.max, summary)} at {summary.max_sim_time_s:.6g} s"
+
+
+def _in_digits(value: float | None, summary: Summary) -> str:
+    """A value with four digits, or so many that the range is shown with two.
+
+    0 where it is only a rounding error compared to the extremes.
+    """
+    largest = max(abs(summary.min or 0.0), abs(summary.max or 0.0))
+    if value is None or abs(value) <= _DUST * largest:
+        return "0"
+    share = _relative_range(summary)
+    digits = max(4, 2 - math.floor(math.log10(share))) if share else 4
+    return f"{value:.{min(digits, 15)}g}"
+
+
+def _swinging(trend: Trend, unit: str) -> str:
+    """Of several stretches the longest."""
+    swing = max(trend.swings, key=lambda each: each.end_s - each.start_s)
+    seen = f" (seen in means of {trend.resolution_s:g} s)" if trend.resolution_s else ""
+    how = f"amplitude {swing.amplitude:.3g}{unit}, period {swing.period_s:.3g} s{seen}"
+    if trend.shape == "oscillating":
+        return f"oscillates about {trend.mean or 0.0:.4g}: {how}"
+    others = f" (longest of {len(trend.swings)})" if trend.swings[1:] else ""
+    stretch = f"from {shown_time(swing.start_s):g} to {shown_time(swing.end_s):g} s"
+    return f"oscillated {stretch}{others}: {how}"
+
 
 TOO_LARGE: Final = "its numbers are beyond 1e100"
 

@@ -36,11 +36,15 @@ from webots_mcp.store.chunks.stored import (
     groups_as_array,
     reached,
 )
-from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.frame_source import Column, FrameSource, Unread, nothing
-from webots_mcp.store.reading.kept import MOST_ROWS, kept_parts
-from webots_mcp.store.reading.newest_rows import read_rows, rows_in_no_chunk
-from webots_mcp.store.reading.ranges import HAS_LOST_ROWS, Segment
+from webots_mcp.store.reading.frame_source import (
+    Column,
+    FrameSource,
+    Unread,
+    nothing,
+    read_rows,
+    rows_in_no_chunk,
+)
+from webots_mcp.store.reading.segment import HAS_LOST_ROWS, MOST_ROWS, Deadline, Segment, kept_parts
 
 _FEW: Final = 4  # times that few chunks are opened one by one; else all of them at once
 

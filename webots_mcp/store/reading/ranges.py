@@ -20,21 +20,29 @@ from __future__ import annotations
 
 import math
 import sqlite3
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from datetime import datetime
 from typing import Final, Literal
 
 from webots_mcp.errors import InvalidRangeError, NothingRecordedError
-from webots_mcp.store.reading.kept import is_at_full_rate, kept_notes
-from webots_mcp.store.reading.subject import Subject, find_subject
-from webots_mcp.store.reading.wall_time import (
-    frame_of_purged,
-    parse_wall_time,
-    rising_parts,
-    simulation_times,
+from webots_mcp.store.analysis.arrays import np
+from webots_mcp.store.chunks.stored import WALL_TIMES
+from webots_mcp.store.reading.frame import Frame, read_frame
+from webots_mcp.store.reading.segment import (
+    HAS_LOST_ROWS,
+    Deadline,
+    Segment,
+    is_at_full_rate,
+    just_after,
+    kept_notes,
+    moment_of,
+    shown_time,
 )
+from webots_mcp.store.robots import Robot, resolve_robot, robot_name
+from webots_mcp.store.run_rows import Run, current_run, fetch_run
 
-_DECIMALS: Final = 3
 _LAST_BEFORE: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s < ?"
 _FIRST_FROM: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s >= ?"
 
@@ -58,10 +66,6 @@ _RECORDED: Final = (
 )
 _MOST_HITS: Final = 1000
 _LEAST_ROWS_PER_HIT: Final = 200  # fewer than 0.5 % of the rows hardly move a mean
-HAS_LOST_ROWS: Final = (  # of a run `r`: some were deleted of which no chunk is left
-    "r.purged_rows > coalesce((SELECT sum(row_count - stored_row_count) FROM row_group "
-    "WHERE run_id = r.id AND is_complete = 1), 0)"
-)
 _LOST: Final = (
     f"SELECT started_sim_time_s, last_sim_time_s FROM run r WHERE id = ? AND {HAS_LOST_ROWS}"
 )
@@ -94,22 +98,6 @@ _SHOWN_ALIKE: Final = "SELECT min(time_s) FROM ({})".format(
 )
 USE_EVERY_ROW: Final = "; ask for such a stretch alone to use every row"
 MOST_RUNS: Final = 50  # that one range in wall time may hold
-
-
-def shown_time(time_s: float) -> float:
-    """A simulation time as answers show it: to the millisecond."""
-    return round(time_s, _DECIMALS)
-
-
-def moment_of(time_s: float) -> float:
-    """The earliest time that is shown like this one: where a bound of a range really lies."""
-    shown_s = shown_time(time_s)
-    moment_s = shown_s - 0.5 / 10**_DECIMALS
-    while shown_time(moment_s) < shown_s:
-        moment_s = math.nextafter(moment_s, math.inf)
-    while shown_time(before_s := math.nextafter(moment_s, -math.inf)) >= shown_s:
-        moment_s = before_s
-    return moment_s
 
 
 def row_before(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> float | None:
@@ -198,47 +186,6 @@ def unrecorded(connection: sqlite3.Connection, run_id: int) -> str | None:
     share = f"one publish() call in {interval} is a row" if interval else fewer
     share += " and some were dropped" if dropped else ""
     return f"{share}: what happened in between is not seen"
-
-
-@dataclass(frozen=True)
-class Segment:
-    """The part of a range that lies in one run: [start_s, end_s) of simulation time.
-
-    The limits in wall time matter where simulation time stood still (a paused simulation).
-
-    Attributes:
-        open_start: The start is that of the first row: what was stored before it (the begin of
-            the run, a log line) is in the range as well.
-        open_end: The same at the newest row: a last log line, the end of the run.
-        full_rate: It lies in a kept stretch: each call of `publish` is a row of it.
-    """
-
-    run_id: int
-    start_s: float
-    end_s: float
-    wall_start_s: float = -math.inf
-    wall_end_s: float = math.inf
-    open_start: bool = False
-    open_end: bool = False
-    full_rate: bool = False
-
-    def until(self, end_s: float) -> Segment:
-        """Its part before that time."""
-        return replace(self, end_s=end_s, open_end=False)
-
-    def through(self, last_s: float) -> Segment:
-        """Its part up to that time, with what is shown as of it."""
-        return self.until(moment_of(shown_time(last_s) + 0.001))
-
-    @property
-    def holds_from_s(self) -> float:
-        """Where the range begins for what is not a state row."""
-        return -math.inf if self.open_start else self.start_s
-
-    @property
-    def holds_to_s(self) -> float:
-        """Where the range ends for what is not a state row."""
-        return math.inf if self.open_end else self.end_s
 
 
 @dataclass(frozen=True)
@@ -370,11 +317,6 @@ def _row_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float, flo
     return None if bounds[0] is None else (bounds[0], bounds[1])
 
 
-def just_after(time_s: float) -> float:
-    """The end of a half-open range that holds `time_s` as its last moment."""
-    return math.nextafter(time_s, math.inf)
-
-
 def whole_run(connection: sqlite3.Connection, run_id: int) -> Segment | None:
     """All rows of a run; None without any."""
     bounds = recorded_bounds(connection, run_id)
@@ -495,3 +437,227 @@ def _cut(
     start_s, last_s = found
     segment = Segment(run_id, start_s, just_after(last_s), *walls, open_start=True, open_end=True)
     return _rated(connection, segment)
+
+
+# -- wall times as a person gives them, and what of a run lies between two of them -----------------
+
+
+_ENDS: Final = (
+    "SELECT started_sim_time_s, started_wall_time_s, last_sim_time_s, last_wall_time_s "
+    "FROM run WHERE id = ?"
+)
+_IS_PURGED: Final = "SELECT 1 FROM run WHERE id = ? AND purged_rows > 0"
+_FIRST_ROW: Final = (
+    "SELECT sim_time_s, wall_time_s FROM state WHERE run_id = ? ORDER BY sim_time_s, id LIMIT 1"
+)
+UP_TO: Final = (  # of the last row at or before a simulation time
+    "SELECT wall_time_s FROM state WHERE run_id = ? AND sim_time_s <= ? "
+    "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+)
+_FROM: Final = (  # of the first row at or after a simulation time
+    "SELECT wall_time_s FROM state WHERE run_id = ? AND sim_time_s >= ? "
+    "ORDER BY sim_time_s, id LIMIT 1"
+)
+_SET_BACK_S: Final = 1.0  # less is what keeps a clock right
+# Whether wall time falls with simulation time: by what chunks come to, and by rows in none.
+_FALLS: Final = (
+    "SELECT 1 FROM (SELECT min, max, first, last, lag(last) OVER (ORDER BY at_s, id) AS before "
+    "FROM (SELECT g.start_sim_time_s AS at_s, 0 AS id, min, max, first, last FROM chunk c "
+    "JOIN row_group g ON g.id = c.group_id "
+    f"WHERE c.run_id = :run AND c.signal_id = {WALL_TIMES} AND g.is_complete = 1 UNION ALL "
+    "SELECT sim_time_s, id, wall_time_s, wall_time_s, wall_time_s, wall_time_s FROM state "
+    "WHERE run_id = :run AND sim_time_s > coalesce((SELECT max(end_sim_time_s) FROM row_group "
+    "WHERE run_id = :run AND is_complete = 1), -9e999))) "
+    f"WHERE first < before - {_SET_BACK_S} OR min < first - {_SET_BACK_S} "
+    f"OR max > last + {_SET_BACK_S} LIMIT 1"
+)
+_BISECTIONS: Final = 60
+_LONGEST_SHOWN: Final = 80
+
+
+def parse_wall_time(value: float | str | None, default_s: float = math.nan) -> float:
+    """Unix seconds of a wall time, given as such or in ISO 8601.
+
+    Without an offset ISO times are local times of this machine.
+
+    Raises:
+        InvalidRangeError: Neither a finite number nor ISO 8601.
+    """
+    if value is None:
+        return default_s
+    try:
+        seconds = float(value)
+    except ValueError:
+        seconds = _iso_seconds(str(value))
+    if not math.isfinite(seconds):
+        raise InvalidRangeError(f"{value!r} is not a finite time in Unix seconds")
+    return seconds
+
+
+def _iso_seconds(text: str) -> float:
+    try:
+        return datetime.fromisoformat(text.strip().replace("Z", "+00:00")).timestamp()
+    except (ValueError, OverflowError, OSError) as error:
+        raise InvalidRangeError(
+            f"{text[:_LONGEST_SHOWN]!r} is no time: give Unix seconds or ISO 8601 such as "
+            "2026-05-04T13:30:00+02:00"
+        ) from error
+
+
+def rising_parts(
+    connection: sqlite3.Connection, run_id: int, recorded: tuple[float, float]
+) -> list[tuple[float, float]]:
+    """Simulation times between which the wall clock of a run was not set back, the newest first.
+
+    Args:
+        connection: Any.
+        run_id: Which.
+        recorded: Simulation times of its first and newest row.
+    """
+    if not connection.execute(_FALLS, {"run": run_id}).fetchone():
+        return [recorded]
+    frame = _all_rows(connection, run_id)
+    after = np.flatnonzero(np.diff(frame.wall_times) < -_SET_BACK_S) + 1
+    starts = [recorded[0], *frame.times[after].tolist()]
+    return list(zip(starts, [*frame.times[after - 1].tolist(), recorded[1]], strict=True))[::-1]
+
+
+def simulation_times(
+    connection: sqlite3.Connection,
+    run_id: int,
+    recorded: tuple[float, float],
+    walls: tuple[float, float],
+) -> tuple[float, float] | None:
+    """First and last simulation time of a run in [start, end) of wall time; None without any.
+
+    Wall time rises with simulation time there, so both are found by bisection.
+
+    Args:
+        connection: Any.
+        run_id: Which.
+        recorded: Simulation times between which to look; see `rising_parts`.
+        walls: Unix times.
+    """
+    clock = RunClock(connection, run_id)
+
+    def begun(time_s: float) -> bool:
+        return clock.wall_s(UP_TO, time_s) >= walls[0]
+
+    def over(time_s: float) -> bool:
+        return clock.wall_s(_FROM, time_s) >= walls[1]
+
+    first_s, newest_s = recorded
+    if not begun(newest_s) or over(first_s):
+        return None
+    start_s = first_s if begun(first_s) else _turning_point(first_s, newest_s, begun)[1]
+    last_s = _turning_point(first_s, newest_s, over)[0] if over(newest_s) else newest_s
+    return (start_s, last_s) if start_s <= last_s else None  # else between two rows
+
+
+def frame_of_purged(connection: sqlite3.Connection, run_id: int) -> Frame | None:
+    """All rows of a run that has lost some from `state`; None where that table has all of them."""
+    if not connection.execute(_IS_PURGED, (run_id,)).fetchone():
+        return None
+    return _all_rows(connection, run_id)
+
+
+def _all_rows(connection: sqlite3.Connection, run_id: int) -> Frame:
+    return read_frame(connection, Segment(run_id, -math.inf, math.inf), Deadline())
+
+
+class RunClock:
+    """The wall times of a run; of rows that are in no chunk either as if it had risen evenly."""
+
+    def __init__(self, connection: sqlite3.Connection, run_id: int) -> None:
+        self._connection = connection
+        self._run_id = run_id
+        *start, last_s, last_wall_s = connection.execute(_ENDS, (run_id,)).fetchone()
+        self._frame = frame_of_purged(connection, run_id)
+        first_row: tuple[float, float] | None = None
+        if self._frame is None:
+            first_row = connection.execute(_FIRST_ROW, (run_id,)).fetchone()
+        elif len(self._frame):
+            first_row = self._frame.bounds_s[0], float(self._frame.rows(0, 1).wall_times[0])
+        self._start_s, self._start_wall_s = start
+        self._rows_from_s, self._rows_from_wall_s = first_row or (last_s, last_wall_s)
+
+    def wall_s(self, query: str, time_s: float) -> float:
+        """At a simulation time; before the recording that of its start."""
+        if time_s >= self._rows_from_s and self._frame is not None and len(self._frame):
+            from_s = time_s if query == _FROM else math.nextafter(time_s, math.inf)
+            place = int(self._frame.places([from_s])[0]) - (query != _FROM)
+            place = min(place, len(self._frame) - 1)
+            return float(self._frame.rows(place, place + 1).wall_times[0])
+        if time_s >= self._rows_from_s:
+            row = self._connection.execute(query, (self._run_id, time_s)).fetchone()
+            return float(row[0]) if row else self._rows_from_wall_s
+        if time_s <= self._start_s:
+            return self._start_wall_s
+        share = (time_s - self._start_s) / (self._rows_from_s - self._start_s)
+        return self._start_wall_s + share * (self._rows_from_wall_s - self._start_wall_s)
+
+
+def _turning_point(
+    before_s: float, after_s: float, has_turned: Callable[[float], bool]
+) -> tuple[float, float]:
+    """The last time before and the first after something turned from false to true."""
+    for _ in range(_BISECTIONS):
+        middle_s = (before_s + after_s) / 2
+        if has_turned(middle_s):
+            after_s = middle_s
+        else:
+            before_s = middle_s
+    return before_s, after_s
+
+
+# -- which robot and which run a question is about -------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A robot, and the run that is meant unless a question is about all of them."""
+
+    robot_id: int
+    robot: str
+    run_id: int
+
+
+def choose(
+    connection: sqlite3.Connection, robot: str | None, run_id: int | None, now_s: float
+) -> tuple[Robot, Run | None]:
+    """The run that was named, or the newest run of the robot that was named or is the only one.
+
+    Without a run the robot's controller has never recorded.
+
+    Raises:
+        UnknownRobotError, AmbiguousRobotError: As they say.
+        UnknownRunError: There is no such run, or it is another robot's.
+        NothingRecordedError: No robot has been recorded.
+    """
+    if robot is None and run_id is not None:
+        robot = robot_name(connection, fetch_run(connection, run_id).robot_id)
+    chosen = resolve_robot(connection, robot, now_s)
+    if run_id is not None:
+        return chosen, fetch_run(connection, run_id, chosen.id)
+    return chosen, current_run(connection, chosen.id)
+
+
+def require_run(robot: Robot, run: Run | None) -> Run:
+    """The run.
+
+    Raises:
+        NothingRecordedError: The robot's controller has begun none.
+    """
+    if run is None:
+        raise NothingRecordedError(
+            f"robot {robot.name!r} has no run yet: its controller never recorded"
+        )
+    return run
+
+
+def find_subject(
+    connection: sqlite3.Connection, robot: str | None = None, run_id: int | None = None
+) -> Subject:
+    """The subject of a question; see `choose` and `require_run`."""
+    chosen, run = choose(connection, robot, run_id, time.time())
+    return Subject(chosen.id, chosen.name, require_run(chosen, run).id)

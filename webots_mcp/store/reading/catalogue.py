@@ -16,13 +16,11 @@ from webots_mcp.signal_register import MAX_SIGNALS
 from webots_mcp.store.analysis.arrays import Indexes, np
 from webots_mcp.store.chunks.columns import STATE_COLUMNS, StateColumns
 from webots_mcp.store.chunks.stored import reached, signals_in
-from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.frame import Frame, read_frame
-from webots_mcp.store.reading.newest_rows import has_few_new_rows, rows_in_no_chunk
-from webots_mcp.store.reading.ranges import Segment, TimeRange
-from webots_mcp.store.reading.snapshot import in_one_snapshot
-from webots_mcp.store.reading.subject import Subject, find_subject
-from webots_mcp.store.signals.registry import Signal, cleaned, registered, seen_with
+from webots_mcp.store.reading.frame_source import has_few_new_rows, rows_in_no_chunk
+from webots_mcp.store.reading.ranges import Subject, TimeRange, find_subject
+from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline, Segment, in_one_snapshot
+from webots_mcp.store.signals import Signal, cleaned, registered, seen_with
 
 SAMPLED_ROWS: Final = 200  # in no chunk yet, that are searched for new names and kinds
 _MOST_OFFERED: Final = 5

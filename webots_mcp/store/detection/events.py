@@ -6,7 +6,7 @@ import json
 import math
 import sqlite3
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import Any, Final
@@ -14,19 +14,30 @@ from typing import Any, Final
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.liveness import dead_sessions
 from webots_mcp.naming import flatten
-from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.grouping import grouped
+from webots_mcp.store.detection import condition, jump, sensors, standstill, stored
+from webots_mcp.store.detection import condition as threshold
+from webots_mcp.store.detection import jump as oscillation
+from webots_mcp.store.detection.kinds import (
+    Event,
+    EventKind,
+    EventOptions,
+    Ledger,
+    Verdicts,
+    count_by_kind,
+)
 from webots_mcp.store.detection.motion import find_motion
-from webots_mcp.store.detection.registry import asked_kinds, kind_named, stored_kinds
 from webots_mcp.store.detection.search import Search, events_touching
-from webots_mcp.store.detection.verdict import Ledger, Verdicts, count_by_kind
-from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
+from webots_mcp.store.reading.catalogue import known_signals, resolve_signals
 from webots_mcp.store.reading.frame import read_frame
-from webots_mcp.store.reading.ranges import Segment, TimeRange, just_after
-from webots_mcp.store.reading.snapshot import in_one_snapshot
-from webots_mcp.store.signals.catalogue import known_signals, resolve_signals
-from webots_mcp.store.signals.flatten import parse
-from webots_mcp.store.signals.registry import Signal
+from webots_mcp.store.reading.ranges import TimeRange
+from webots_mcp.store.reading.segment import (
+    QUESTION_DEADLINE_S,
+    Deadline,
+    Segment,
+    in_one_snapshot,
+    just_after,
+)
+from webots_mcp.store.signals import Signal, parse
 
 _ERRORS: Final = ("error", "critical")  # levels of log lines
 MOST_AROUND: Final = 6  # values that are reported with an event
@@ -406,3 +417,114 @@ def _read_page_cursor(text: str) -> Place:
         raise InvalidInputError(
             f"{text!r} is not a cursor: give the `cursor` of the previous page unchanged"
         ) from error
+
+
+# -- the registry of kinds: all that reports, counts or draws events reads it ----------------------
+#
+# A new kind is a file that holds an `EventKind`, and a line here.
+
+
+KINDS: Final[list[EventKind]] = [
+    stored.RUN,
+    stored.GAP,
+    stored.CHANGE,
+    standstill.STANDSTILL,
+    standstill.STUCK,
+    threshold.THRESHOLD,
+    condition.CONDITION,
+    sensors.MISSING,
+    sensors.FLAT,
+    jump.JUMP,
+    oscillation.OSCILLATION,
+    stored.COMMAND,
+    stored.LOG,
+    stored.NOTICED,
+    stored.KEPT,
+    stored.IMAGE,
+]
+
+
+def kind_named(name: str) -> EventKind:
+    """The kind of that name.
+
+    Raises:
+        InvalidInputError: There is none.
+    """
+    found = next((kind for kind in KINDS if kind.name == name), None)
+    if found is None:
+        raise InvalidInputError(f"unknown kind {name!r}; there is {', '.join(kind_names())}")
+    return found
+
+
+def kind_names() -> list[str]:
+    """The names of all kinds."""
+    return [kind.name for kind in KINDS]
+
+
+def asked_kinds(options: EventOptions) -> list[EventKind]:
+    """The kinds that the options name, in the order of the registry; else the usual ones.
+
+    Raises:
+        InvalidInputError: There is no kind of such a name.
+    """
+    wanted = {kind_named(name).name for name in options.kinds}
+    return [kind for kind in KINDS if (kind.name in wanted if wanted else kind.usual(options))]
+
+
+def stored_kinds() -> tuple[str, ...]:
+    """The names of the kinds that were stored when they happened."""
+    return tuple(kind.name for kind in KINDS if kind.stored)
+
+
+def drawn_kinds() -> list[EventKind]:
+    """Those that have a row below a plot: what a person would look for first comes first."""
+    drawn = [(kind.drawn, kind) for kind in KINDS if kind.drawn is not None]
+    return [kind for _, kind in sorted(drawn, key=lambda each: each[0])]
+
+
+# -- many similar events as one: "10 dropouts to 0 m, the first at 3.2 s, ..." ---------------------
+
+
+def grouped(events: Sequence[Event], known: dict[str, Signal]) -> list[Event]:
+    """The same events; what the items of an array did at once, and many alike, is one of them.
+
+    A group begins with its first event and ends with its last one. Its details say what they are,
+    when, and what they have in common. An event that is still going on is reported by itself.
+    """
+    grouped: list[Event] = []
+    alike: dict[Hashable, list[Event]] = {}
+    for event in _of_arrays(events):
+        kind = kind_named(event.kind)
+        if kind.alike is None or (event.ongoing and kind.lasts and not kind.stored):
+            grouped.append(event)
+        else:
+            sort = (event.run_id, event.kind, event.name, kind.alike.sort(event))
+            alike.setdefault(sort, []).append(event)
+    for some in alike.values():
+        how, signal = kind_named(some[0].kind).alike, known.get(some[0].name or "")
+        if how is None or len(some) <= how.most_single:
+            grouped += some
+        else:
+            unit = f" {signal.unit}" if signal and signal.unit else ""
+            grouped.append(how.as_one(sorted(some, key=lambda each: each.start_s), unit))
+    return grouped
+
+
+def _of_arrays(events: Iterable[Event]) -> list[Event]:
+    """What several items of one array, or parts of one branch, did at once is reported as one.
+
+    Its details are those that all of them have.
+    """
+    found: dict[tuple[object, ...], Event] = {}
+    alone: list[Event] = []
+    for event in events:
+        how, branch = kind_named(event.kind).alike, (event.name or "").rpartition(".")[0]
+        if how is None or not (how.of_arrays and branch):
+            alone.append(event)
+            continue
+        key = (event.kind, event.run_id, branch, event.start_s, event.end_s)
+        if other := found.get(key):
+            same = dict(each for each in event.details.items() if each in other.details.items())
+            event = replace(event, name=f"{branch}.*", details=same)
+        found[key] = event
+    return [*alone, *found.values()]

@@ -1,0 +1,388 @@
+"""What an event is, and what counts as one."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from statistics import median
+from typing import TYPE_CHECKING, Any, Final
+
+from webots_mcp.contract import LOG_LEVELS
+from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.naming import Value
+from webots_mcp.store.analysis.swings import LEAST_HALF_SWINGS
+from webots_mcp.store.reading.frame_source import NOT_READ
+
+if TYPE_CHECKING:
+    from webots_mcp.store.detection.search import Search
+
+LEVELS: Final = LOG_LEVELS
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened in a run.
+
+    Attributes:
+        kind: The name of one of `registry.KINDS`.
+        end_s: Equal to the start for what has no duration; of a change when the value ended.
+        ongoing: It lasts up to the newest row of a run that goes on; of a command, it is not
+            finished.
+        name: The signal, the action, the level or the device that it is about.
+        details: What there is to say about it, by kind.
+        around: Values of a few signals when it began.
+        count: How many alike events it stands for; it begins with the first, ends with the last.
+    """
+
+    kind: str
+    run_id: int
+    start_s: float
+    end_s: float
+    wall_time_s: float
+    name: str | None = None
+    details: dict[str, Any] = field(default_factory=dict[str, Any])
+    ongoing: bool = False
+    around: dict[str, Value] = field(default_factory=dict[str, Value])
+    count: int = 1
+
+    @property
+    def duration_s(self) -> float:
+        """How long it lasted, in simulated seconds."""
+        return self.end_s - self.start_s
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """A signal above or below a value for at least `for_s` simulated seconds."""
+
+    signal: str
+    above: float | None = None
+    below: float | None = None
+    for_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        if (self.above is None) == (self.below is None):
+            raise InvalidInputError(f"threshold on {self.signal!r}: give either above or below")
+
+
+def both_of(names: Sequence[str] | None) -> tuple[str, str] | None:
+    """The signals of x and y that were named, if any.
+
+    Raises:
+        InvalidInputError: They are not two.
+    """
+    if names is None:
+        return None
+    if len(names) != 2:
+        raise InvalidInputError(f"position={list(names)} must name two signals, of x and of y")
+    return names[0], names[1]
+
+
+@dataclass(frozen=True)
+class EventOptions:
+    """What counts as an event.
+
+    Attributes:
+        kinds: Names of the kinds that are looked for; without any the usual ones, which pictures
+            and thresholds are not.
+        signals: Names, with `*`, of the signals that are looked at.
+        position: The two signals of the position in metres; None finds them by name (`pose.0`
+            and `pose.1`, `position.x` and `position.y`, `gps.0` and so on).
+        mode: The signal of the mode, a text or a number; None finds a text by name (`mode`,
+            `state`, ...).
+        moving_modes: Modes in which the robot should move; None for those in which it has been
+            seen moving, in this run or an earlier one.
+        commanded: The signal of the commanded speed; None finds it by name (`commanded`, `cmd`,
+            `target_speed`). Of `speed` and `velocity` it is open whether they are commanded.
+        min_commanded_m_s: A commanded speed of at least this should move the robot.
+        stuck_m: Who stays within this distance (more where the noise of the position is more) is at
+            a standstill, and stuck who should move besides, ...
+        stuck_s: ... for so long.
+        thresholds: For the kind "threshold".
+        where: For the kind "condition"; see docs/conditions.md.
+        missing_s: Without a value for so long, though it mostly has one.
+        flat_s: Exactly the same number for so long, though it mostly changes; for a signal that
+            is noisy otherwise 0.15 of that are enough.
+        jump_min_score: How many times larger than the usual step (modified z-score) a jump is.
+        jump_m: A position jumps by at least so much between two rows.
+        min_half_periods: Half periods in a row; with a period of more than 5 s at least 12.
+        oscillation_period_s: The longest period that counts; None for as long a one as fits in
+            the stretch, and for 5 s where that is too long to be read row by row.
+        log_level: Log lines of this level and above.
+    """
+
+    kinds: tuple[str, ...] = ()
+    signals: tuple[str, ...] = ("*",)
+    position: tuple[str, str] | None = None
+    mode: str | None = None
+    moving_modes: tuple[str, ...] | None = None
+    commanded: str | None = None
+    min_commanded_m_s: float = 0.01
+    stuck_m: float = 0.05
+    stuck_s: float = 3.0
+    thresholds: tuple[Threshold, ...] = ()
+    where: str | None = None
+    missing_s: float = 1.0
+    flat_s: float = 20.0
+    jump_min_score: float = 12.0
+    jump_m: float = 0.3
+    min_half_periods: int = LEAST_HALF_SWINGS
+    oscillation_period_s: float | None = None
+    log_level: str = "warning"
+
+    def __post_init__(self) -> None:
+        if self.log_level not in LEVELS:
+            raise InvalidInputError(
+                f"unknown log level {self.log_level!r}; there is {', '.join(LEVELS)}"
+            )
+        for name in ("stuck_m", "stuck_s", "missing_s", "flat_s", "jump_min_score", "jump_m"):
+            value = getattr(self, name)
+            if not 0 < value < math.inf:
+                raise InvalidInputError(f"{name}={value} must be a number above 0")
+
+
+# -- what a kind of event is: how it is found, reported, counted and drawn -------------------------
+
+
+MOST_TIMES: Final = 3  # of a group that are named
+_SAME_LENGTH: Final = 0.05  # of the longest: so near each other they last equally long
+_NUMBER: Final = re.compile(r"\d+(\.\d+)?")
+
+
+class NotSearchableError(NothingRecordedError):
+    """Nothing was recorded in which a kind could be looked for; the text says what is missing."""
+
+
+def but_for_numbers(text: object) -> str:
+    """What texts that differ in their numbers only have in common."""
+    return _NUMBER.sub("#", str(text))
+
+
+@dataclass(frozen=True)
+class Alike:
+    """How similar events of a kind are reported as one.
+
+    Attributes:
+        says: What they are, in the plural, given them in order and the unit of their signal.
+        sort: What they share besides the run and the signal.
+        adds: More of their details than what all of them have in common.
+        most_single: So many of a sort are reported one by one.
+        of_arrays: What several items of one array did at once is one event.
+    """
+
+    says: Callable[[Sequence[Event], str], str]
+    sort: Callable[[Event], Hashable] = lambda event: None
+    adds: Callable[[Sequence[Event]], dict[str, Any]] = lambda events: {}
+    most_single: int = 3
+    of_arrays: bool = False
+
+    def as_one(self, alike: Sequence[Event], unit: str = "") -> Event:
+        """Several of one sort, in order; what they are, when, and what they have in common."""
+        first, last = alike[0], max(alike, key=lambda event: event.end_s)
+        times_s = [round(each.start_s, 3) for each in alike]
+        span = f"the first at {times_s[0]:.6g} s, the last at {times_s[-1]:.6g} s"
+        lasted = _lengths([each.duration_s for each in alike])
+        says = f"{len(alike)} {self.says(alike, unit)}, {span}{lasted}"
+        details = _in_common([event.details for event in alike]) | self.adds(alike)
+        details |= {"says": says, "first_times_s": times_s[:MOST_TIMES]}
+        ends = {"end_s": last.end_s, "ongoing": last.ongoing}
+        return replace(first, **ends, details=details, count=len(alike))
+
+
+@dataclass(frozen=True)
+class EventKind:
+    """A kind of event. One of these, entered in `registry.KINDS`, is all that a new kind takes.
+
+    Attributes:
+        name: Its name in questions and answers.
+        means: What the name leaves open, in a few words; empty where it leaves nothing open.
+        find: Finds the events in the segment of a search. It reports to the search what it could
+            not search (`not_searched`) and what came nearest to an event (`note_nearest`), and
+            raises `NotSearchableError` where it cannot search at all.
+        stored: It was stored when it happened: nothing is judged, and a timeline shows it.
+        usual: Whether it is looked for where no kinds are named.
+        lasts: It has a begin and an end, which are followed out of the range.
+        least_s: How long it has to last; a shorter range has to be widened by as much.
+        around_s: How far around a range it has to be looked for, where it may be shorter than that.
+        ends_within_s: How exactly its begin and end are known: nearer to the end of what was
+            looked at it may go on there.
+        of_numbers: The numeric signals are looked at.
+        routine: It happens all the time; it is shown in the room that all other kinds leave.
+        counted: Comparisons of runs count it.
+        drawn: Its place among the rows below a plot, the least first; None if it has none there.
+        alike: How similar ones are reported as one; None where each is reported by itself.
+    """
+
+    name: str
+    means: str
+    find: Callable[[Search], Iterable[Event]]
+    stored: bool = False
+    usual: Callable[[EventOptions], bool] = lambda options: True
+    lasts: bool = False
+    least_s: Callable[[EventOptions], float] = lambda options: 0.0
+    around_s: Callable[[EventOptions], float] = lambda options: 0.0
+    ends_within_s: Callable[[Event], float] = lambda event: 0.0
+    of_numbers: bool = False
+    routine: bool = False
+    counted: bool = True
+    drawn: int | None = None
+    alike: Alike | None = None
+
+
+def _lengths(lengths_s: Sequence[float]) -> str:
+    """How long they lasted, where they did."""
+    least_s, most_s, middle_s = min(lengths_s), max(lengths_s), median(lengths_s)
+    if not most_s:
+        return ""
+    if most_s - least_s <= _SAME_LENGTH * most_s:
+        return f", each {middle_s:.3g} s long"
+    total = f"{sum(lengths_s):.4g} s in total"
+    return f", {least_s:.3g} to {most_s:.3g} s long (median {middle_s:.3g} s), {total}"
+
+
+def _in_common(all_details: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """What the details of all of them are, or lie between."""
+    first, *others = all_details
+    names = [name for name in first if all(name in other for other in others)]
+    shared = {name: _shared([details[name] for details in all_details]) for name in names}
+    return {name: value for name, value in shared.items() if value is not None}
+
+
+def _shared(values: Sequence[Any]) -> Any:
+    """The one value; of numbers the least and the greatest; of texts the clauses that all have."""
+    if all(value == values[0] for value in values):
+        return values[0]
+    if all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values):
+        return f"{min(values):.4g} to {max(values):.4g}"
+    if all(isinstance(value, dict) for value in values):
+        return _in_common(values) or None
+    if all(isinstance(value, str) for value in values):
+        clauses: list[list[str]] = [value.split("; ") for value in values]
+        return "; ".join(e for e in clauses[0] if all(e in each for each in clauses)) or None
+    return None
+
+
+# -- what became of each kind: found, not found, or not looked for and why -------------------------
+
+
+def count_by_kind(events: Iterable[Event]) -> Counter[str]:
+    """How many there are of each kind, where one may stand for many that are alike."""
+    counts = Counter[str]()
+    for event in events:
+        counts[event.kind] += event.count
+    return counts
+
+
+@dataclass(frozen=True)
+class Verdicts:
+    """What the answer says of each kind that was asked for; none of them is passed over.
+
+    Attributes:
+        found: How many there are.
+        not_found: Kinds that were looked for, be it in a part, and of which there is none, each
+            with what came nearest, or with an empty text.
+        reasons: Why kinds were not looked for, or not everywhere, and what to ask to have them
+            looked for. A kind that stands here and above is found, or not, in what was.
+
+    Shown are the properties, which name each kind that was not found once.
+    """
+
+    found: dict[str, int] = field(default_factory=dict[str, int])
+    not_found: dict[str, str] = field(default_factory=dict[str, str])
+    reasons: dict[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
+
+    @property
+    def not_searched(self) -> dict[str, str]:
+        """By kind, all reasons in one text."""
+        return {kind: "; ".join(reasons) for kind, reasons in self.reasons.items()}
+
+    @property
+    def far(self) -> list[str]:
+        """Kinds that were found nowhere, and to which nothing came near."""
+        return [kind for kind in self._nowhere if not self.not_found[kind]]
+
+    @property
+    def nearest(self) -> dict[str, str]:
+        """Kinds that were found nowhere, with what came nearest."""
+        return {kind: self.not_found[kind] for kind in self._nowhere if self.not_found[kind]}
+
+    @property
+    def gaps(self) -> dict[str, str]:
+        """What was not searched: each reason once, with the kinds that share it as the key."""
+        sharing: dict[str, list[str]] = {}
+        for kind, reasons in self.reasons.items():
+            for reason in (*reasons, *self._in_what_was_searched(kind)):
+                sharing.setdefault(reason, []).append(kind)
+        named: dict[str, list[str]] = {}
+        for reason, kinds in sharing.items():
+            named.setdefault(", ".join(kinds), []).append(reason)
+        return {kinds: "; ".join(reasons) for kinds, reasons in named.items()}
+
+    @property
+    def _nowhere(self) -> list[str]:
+        return [kind for kind in self.not_found if kind not in self.reasons]
+
+    def _in_what_was_searched(self, kind: str) -> list[str]:
+        near = self.not_found.get(kind)
+        return [] if near is None else [f"none in the searched part{near and f' ({near})'}"]
+
+    def unlooked(self, kind: str) -> str | None:
+        """Why a kind was not looked for anywhere; None if it was, at least in a part."""
+        looked = kind in self.found or kind in self.not_found
+        return None if looked else self.not_searched.get(kind)
+
+    def unread(self, kind: str) -> list[str]:
+        """What of the range could not be read for a kind: its count is that of the rest."""
+        return [each for each in self.reasons.get(kind, ()) if each.startswith(NOT_READ)]
+
+
+@dataclass
+class Ledger:
+    """What was noted of each kind while it was looked for.
+
+    Attributes:
+        searched: Kinds that were looked for at least in a part.
+        notes: Remarks that are about no kind.
+        of_several_runs: What came near has to say in which run.
+        rows: Those in which a condition held nowhere, of all runs.
+    """
+
+    searched: set[str] = field(default_factory=set[str])
+    notes: list[str] = field(default_factory=list[str])
+    of_several_runs: bool = False
+    rows: int = 0
+    _of_runs: dict[str, list[int]] = field(default_factory=dict[str, list[int]])
+    _reasons: dict[str, dict[str, None]] = field(default_factory=dict[str, dict[str, None]])
+    _nearest: dict[str, tuple[float, str]] = field(default_factory=dict[str, tuple[float, str]])
+
+    def not_searched(self, kind: str, *reasons: str) -> None:
+        """Note why a kind was not looked for, or where it was not."""
+        self._reasons.setdefault(kind, {}).update(dict.fromkeys(reasons))
+
+    def note_of_run(self, run_id: int, note: str) -> None:
+        """A remark on a run; runs with the same remark are reported together."""
+        self._of_runs.setdefault(note, []).append(run_id)
+
+    @property
+    def all_notes(self) -> tuple[str, ...]:
+        """The remarks, each once."""
+        runs = {note: ", ".join(map(str, run_ids)) for note, run_ids in self._of_runs.items()}
+        of_runs = (f"run {listed}: {note}" for note, listed in runs.items())
+        return tuple(dict.fromkeys([*self.notes, *of_runs]))
+
+    def note_nearest(self, kind: str, share: float, what: str) -> None:
+        """Note what came near to an event, as a share of what would be one; the most counts."""
+        self._nearest[kind] = max(self._nearest.get(kind, (0.0, "")), (share, what))
+
+    def verdicts(self, kinds: Sequence[EventKind], events: Iterable[Event]) -> Verdicts:
+        """On each of the kinds, in their order, given all that was found."""
+        counts, names = count_by_kind(events), [kind.name for kind in kinds]
+        not_found = [name for name in names if name in self.searched and not counts[name]]
+        return Verdicts(
+            {name: counts[name] for name in names if counts[name]},
+            {name: self._nearest.get(name, (0.0, ""))[1] for name in not_found},
+            {name: tuple(self._reasons[name]) for name in names if self._reasons.get(name)},
+        )

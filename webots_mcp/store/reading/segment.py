@@ -1,0 +1,305 @@
+"""What every reader of the past takes: a segment of one run, a deadline, one state of the database.
+
+And which parts of a run are kept at full rate.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import math
+import sqlite3
+import time
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, replace
+from typing import Concatenate, Final, NamedTuple, ParamSpec, TypeVar
+
+from webots_mcp.connection import keep_deadline
+from webots_mcp.store.chunks.codec import Decoded
+from webots_mcp.store.chunks.stored import SIM_TIMES, groups_in, values_in
+
+_DECIMALS: Final = 3
+HAS_LOST_ROWS: Final = (  # of a run `r`: some were deleted of which no chunk is left
+    "r.purged_rows > coalesce((SELECT sum(row_count - stored_row_count) FROM row_group "
+    "WHERE run_id = r.id AND is_complete = 1), 0)"
+)
+
+
+def shown_time(time_s: float) -> float:
+    """A simulation time as answers show it: to the millisecond."""
+    return round(time_s, _DECIMALS)
+
+
+def moment_of(time_s: float) -> float:
+    """The earliest time that is shown like this one: where a bound of a range really lies."""
+    shown_s = shown_time(time_s)
+    moment_s = shown_s - 0.5 / 10**_DECIMALS
+    while shown_time(moment_s) < shown_s:
+        moment_s = math.nextafter(moment_s, math.inf)
+    while shown_time(before_s := math.nextafter(moment_s, -math.inf)) >= shown_s:
+        moment_s = before_s
+    return moment_s
+
+
+def just_after(time_s: float) -> float:
+    """The end of a half-open range that holds `time_s` as its last moment."""
+    return math.nextafter(time_s, math.inf)
+
+
+@dataclass(frozen=True)
+class Segment:
+    """The part of a range that lies in one run: [start_s, end_s) of simulation time.
+
+    The limits in wall time matter where simulation time stood still (a paused simulation).
+
+    Attributes:
+        open_start: The start is that of the first row: what was stored before it (the begin of
+            the run, a log line) is in the range as well.
+        open_end: The same at the newest row: a last log line, the end of the run.
+        full_rate: It lies in a kept stretch: each call of `publish` is a row of it.
+    """
+
+    run_id: int
+    start_s: float
+    end_s: float
+    wall_start_s: float = -math.inf
+    wall_end_s: float = math.inf
+    open_start: bool = False
+    open_end: bool = False
+    full_rate: bool = False
+
+    def until(self, end_s: float) -> Segment:
+        """Its part before that time."""
+        return replace(self, end_s=end_s, open_end=False)
+
+    def through(self, last_s: float) -> Segment:
+        """Its part up to that time, with what is shown as of it."""
+        return self.until(moment_of(shown_time(last_s) + 0.001))
+
+    @property
+    def holds_from_s(self) -> float:
+        """Where the range begins for what is not a state row."""
+        return -math.inf if self.open_start else self.start_s
+
+    @property
+    def holds_to_s(self) -> float:
+        """Where the range ends for what is not a state row."""
+        return math.inf if self.open_end else self.end_s
+
+
+# -- a limit in wall time on what a question may cost ----------------------------------------------
+
+QUESTION_DEADLINE_S: Final = 2.0
+_STEPS_PER_LOOK: Final = 20_000  # of SQLite's virtual machine: about 0.5 ms
+
+
+class Deadline:
+    """When a question has to be answered with what is known by then."""
+
+    def __init__(
+        self, limit_s: float = QUESTION_DEADLINE_S, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._clock = clock
+        self._until_s = clock() + limit_s
+
+    def part(self, share: float) -> Deadline:
+        """One for a part of the work: after that share of the time that is left."""
+        return Deadline(share * self.left_s, self._clock)
+
+    @contextlib.contextmanager
+    def narrowed(self, share: float) -> Generator[None]:
+        """Inside, the time is over after that share of what is left, for all that hold this one."""
+        until_s = self._until_s
+        self._until_s = self._clock() + share * self.left_s
+        try:
+            yield
+        finally:
+            self._until_s = until_s
+
+    @property
+    def passed(self) -> bool:
+        """Whether the time is over."""
+        return self._clock() >= self._until_s
+
+    @property
+    def left_s(self) -> float:
+        """Seconds that are left; 0 once it has passed."""
+        return max(0.0, self._until_s - self._clock())
+
+    @contextlib.contextmanager
+    def interrupting(self, connection: sqlite3.Connection) -> Generator[None]:
+        """Interrupt the connection's statements once the time is over.
+
+        An interrupted statement raises `sqlite3.OperationalError`; `passed` distinguishes it from
+        other errors. A connection has one progress handler, so these blocks do not nest.
+        """
+        connection.set_progress_handler(lambda: self.passed, _STEPS_PER_LOOK)
+        try:
+            yield
+        finally:
+            keep_deadline(connection)
+
+
+# -- one state of the database for a whole answer, while a robot records ---------------------------
+
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def in_one_snapshot(
+    question: Callable[Concatenate[sqlite3.Connection, P], T],
+) -> Callable[Concatenate[sqlite3.Connection, P], T]:
+    """Let a question that takes several statements see one state of the database.
+
+    Without it rows could be put into chunks between two of its statements, and be counted twice. It
+    neither waits nor makes another process wait (write-ahead log); a transaction that is already
+    open is used as it is.
+    """
+
+    @functools.wraps(question)
+    def answer(connection: sqlite3.Connection, *args: P.args, **kwargs: P.kwargs) -> T:
+        if connection.in_transaction:
+            return question(connection, *args, **kwargs)
+        connection.execute("BEGIN")
+        try:
+            return question(connection, *args, **kwargs)
+        finally:
+            connection.execute("COMMIT")
+
+    return answer
+
+
+# -- kept stretches: seconds of a run of which each call of `publish` is a row ---------------------
+#
+# The rows that only they have stand in `kept_state`, apart from those that the throttle let
+# through. A range inside a stretch is answered from both. In a longer one means and counts are
+# those of the rows that were let through, of which there are equally many in each second; what
+# is about single states (extremes, changes, conditions) takes in both.
+
+
+MOST_STRETCHES: Final = 200  # newest of a range that are looked at
+MOST_ROWS: Final = 30_000  # of a range that is answered from each call
+_NAMED: Final = 2
+
+_IS_NUMBER: Final = "IN ('real', 'integer')"
+_STRETCHES: Final = (
+    "SELECT start_sim_time_s, end_sim_time_s, CAST(reason AS TEXT), wall_time_s FROM kept_stretch "
+    "WHERE run_id = ? AND end_sim_time_s >= ? AND start_sim_time_s < ? "
+    f"AND typeof(start_sim_time_s) {_IS_NUMBER} AND typeof(end_sim_time_s) {_IS_NUMBER} "
+    "ORDER BY start_sim_time_s DESC LIMIT ?"
+)
+# Of a stretch that was not ended, up to when its rows are there, which are written in order; and
+# whether rows that the throttle let through follow each other after that. NULL where it is whole.
+_WRITTEN: Final = (
+    "SELECT CASE WHEN (SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = :run "
+    "AND sim_time_s > time_s AND sim_time_s <= :end LIMIT 2)) = 2 THEN time_s END FROM ("
+    "SELECT coalesce(max(sim_time_s), :start) AS time_s FROM kept_state "
+    "WHERE run_id = :run AND sim_time_s BETWEEN :start AND :end) "
+    "WHERE EXISTS (SELECT 1 FROM run r JOIN session s ON s.id = r.session_id "
+    "WHERE r.id = :run AND r.last_sim_time_s < :end AND s.throttle_interval > 1)"
+)
+_IN: Final = "WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
+_ANY: Final = f"SELECT EXISTS (SELECT 1 FROM {{table}} {_IN})"
+_COUNT: Final = f"SELECT count(*) FROM (SELECT 1 FROM {{table}} {_IN} LIMIT {MOST_ROWS + 1})"
+
+
+class KeptStretch(NamedTuple):
+    """From when to when, and why; `wall_time_s` is when it was asked for."""
+
+    start_s: float
+    end_s: float
+    reason: str
+    wall_time_s: float
+
+
+def kept_stretches(
+    connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
+) -> list[KeptStretch]:
+    """The stretches that touch [start_s, end_s) of a run, in order, as far as they are written."""
+    rows = connection.execute(_STRETCHES, (run_id, start_s, end_s, MOST_STRETCHES)).fetchall()
+    return [_as_written(connection, run_id, KeptStretch(*row)) for row in reversed(rows)]
+
+
+def newest_kept(connection: sqlite3.Connection, run_id: int) -> KeptStretch | None:
+    """The stretch of a run that begins last."""
+    row = connection.execute(_STRETCHES, (run_id, -math.inf, math.inf, 1)).fetchone()
+    return row and _as_written(connection, run_id, KeptStretch(*row))
+
+
+def _as_written(connection: sqlite3.Connection, run_id: int, stretch: KeptStretch) -> KeptStretch:
+    """A controller that is killed leaves a stretch whose first rows are there, and not the last."""
+    values = {"run": run_id, "start": stretch.start_s, "end": stretch.end_s}
+    (until_s,) = connection.execute(_WRITTEN, values).fetchone() or (None,)
+    if until_s is None:
+        return stretch
+    reason = f"{stretch.reason}; rows after {until_s:.3f} s are not written"
+    return stretch._replace(end_s=until_s, reason=reason)
+
+
+def kept_parts(
+    connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
+) -> list[KeptStretch]:
+    """Of those the ones that have rows of their own."""
+    found = kept_stretches(connection, run_id, start_s, end_s)
+    spans = [(each, each.start_s, _after(each.end_s)) for each in found]  # the last row is in it
+    return [each for each, *span in spans if _any(connection, "kept_state", run_id, *span)]
+
+
+def is_at_full_rate(
+    connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
+) -> bool:
+    """Whether [start_s, end_s) holds nothing but rows of one stretch, and not too many of them."""
+    for each in kept_parts(connection, run_id, start_s, end_s):
+        outside = ((start_s, each.start_s), (_after(each.end_s), end_s))
+        if not any(
+            _any(connection, "state", run_id, *span) or _any_in_chunks(connection, run_id, *span)
+            for span in outside
+        ):
+            bounds = (run_id, start_s, end_s)
+            counts = [
+                connection.execute(_COUNT.format(table=table), bounds).fetchone()[0]
+                for table in ("state", "kept_state")
+            ]
+            return counts[1] > 0 and sum(counts) <= MOST_ROWS
+    return False
+
+
+def kept_notes(
+    connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
+) -> list[str]:
+    """Which parts of a range are kept at full rate, and why."""
+    found = kept_parts(connection, run_id, start_s, end_s)
+    if not found:
+        return []
+    named = [f"{each.start_s:.3f}-{each.end_s:.3f} s ({each.reason})" for each in found[-_NAMED:]]
+    more = f", and {len(found) - _NAMED} before" if len(found) > _NAMED else ""
+    return [f"run {run_id} is kept at full rate: {', '.join(named)}{more}"]
+
+
+def _any(
+    connection: sqlite3.Connection, table: str, run_id: int, start_s: float, end_s: float
+) -> bool:
+    query = _ANY.format(table=table)
+    return bool(connection.execute(query, (run_id, start_s, end_s)).fetchone()[0])
+
+
+def _any_in_chunks(
+    connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
+) -> bool:
+    """Whether a row is there that may have been deleted since it was put into a chunk."""
+    groups = groups_in(connection, run_id, start_s, end_s) if start_s < end_s else []
+    if any(group.start_s >= start_s or group.end_s < end_s for group in groups):
+        return True
+    wanted = {group.id: group.row_count for group in groups}
+    times = (values for _, values in values_in(connection, run_id, SIM_TIMES, wanted))
+    return any(
+        bool(((each.numbers >= start_s) & (each.numbers < end_s)).any())
+        for each in times
+        if isinstance(each, Decoded)
+    )
+
+
+def _after(time_s: float) -> float:
+    """Beyond what simulation times differ by where a clock adds up steps."""
+    return time_s + 1e-9

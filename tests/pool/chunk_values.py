@@ -9,9 +9,7 @@ import numpy as np
 
 from webots_mcp.plugins.pool.row_batch import Row
 from webots_mcp.plugins.pool.shipped_tables import table
-from webots_mcp.store.chunks.codec import Encoded, decode
-from webots_mcp.store.chunks.statistics import Statistics
-from webots_mcp.store.chunks.stored import SIM_TIMES
+from webots_mcp.store.chunks import SIM_TIMES, Encoded, Statistics, decode
 
 NAMES = table("chunk").columns
 

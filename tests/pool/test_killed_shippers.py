@@ -27,7 +27,7 @@ from webots_mcp.plugins.pool.report import Report
 from webots_mcp.plugins.pool.row_batch import Row
 from webots_mcp.plugins.pool.shipped_tables import Table, tables
 from webots_mcp.plugins.pool.shipping import Order, ship
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.recording import Recording
 
 KILLS = {"postgresql": 20, "parquet": 8}

@@ -12,14 +12,13 @@ import pytest
 
 from tests.recordings.runs import Recorded
 from webots_mcp import MCPBridge
-from webots_mcp.connection import connect
+from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import new_uuid
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.schema import create_schema
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
+from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.merging import merge
-from webots_mcp.store.trials import (
+from webots_mcp.store.parameters import (
     Result,
     create_trial_set,
     fetch_trial_set,

@@ -17,8 +17,7 @@ from webots_mcp.bridge.text import cut, describe, storable
 from webots_mcp.bridge.webots_api import Simulation
 from webots_mcp.contract import BREAKPOINT_ACTIONS, MAX_BREAKPOINTS
 from webots_mcp.errors import ConditionFailedError, InvalidConditionError, InvalidInputError
-from webots_mcp.pauses import Cause
-from webots_mcp.stored_breakpoints import ARMED, OF_CONTROLLER, SET
+from webots_mcp.pauses import ARMED, OF_CONTROLLER, SET, Cause
 
 if TYPE_CHECKING:
     from webots_mcp.conditions import Condition, Evaluator

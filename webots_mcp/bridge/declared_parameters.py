@@ -11,7 +11,6 @@ from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.start_values import StartValues
-from webots_mcp.entries import Kind, Values
 from webots_mcp.errors import CommandRefusedError, WebotsMCPError
 from webots_mcp.parameter import (
     MOST_PARAMETERS,
@@ -19,6 +18,7 @@ from webots_mcp.parameter import (
     Value,
     require_known,
 )
+from webots_mcp.waiting_file import Kind, Values
 
 MOST_CHANGES: Final = 10_000  # in one run; each is a row of the database
 

@@ -8,10 +8,15 @@ from pathlib import Path
 
 from webots_mcp.bridge.identity import Identity
 from webots_mcp.bridge.registration import Registration, register
-from webots_mcp.connection import connect, journal_mode
+from webots_mcp.connection import (
+    connect,
+    create_schema,
+    journal_mode,
+    never_wait,
+    require_current,
+    schema_version,
+)
 from webots_mcp.contract import DATABASE_NAME, Database, MemoryDatabase
-from webots_mcp.schema import create_schema, require_current, schema_version
-from webots_mcp.transactions import never_wait
 from webots_mcp.waiting_file import adopt
 
 

@@ -31,12 +31,11 @@ from webots_mcp.bridge.row_counts import RowCounts
 from webots_mcp.bridge.row_writer import RowWriter
 from webots_mcp.bridge.run import Run
 from webots_mcp.bridge.session_connection import SessionConnection, patiently
+from webots_mcp.connection import in_transaction
 from webots_mcp.contract import Database
-from webots_mcp.entries import Kind, Values
 from webots_mcp.liveness import LoopStatus, RecordingStatus, write_heartbeat
 from webots_mcp.signal_register import Seen
-from webots_mcp.transactions import in_transaction
-from webots_mcp.waiting_file import WaitingFile, waiting_path
+from webots_mcp.waiting_file import Kind, Values, WaitingFile, waiting_path
 
 _LOCK_PATIENCE_S: Final = 0.001  # how long to wait for another thread of this process
 

@@ -13,6 +13,7 @@ from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.opening import is_ours, move_aside
 from webots_mcp.bridge.row_counts import RowCounts
 from webots_mcp.bridge.session_connection import SessionConnection
+from webots_mcp.connection import is_busy, is_damage, text_of
 from webots_mcp.errors import (
     ForeignDatabaseError,
     ForkedProcessError,
@@ -20,7 +21,6 @@ from webots_mcp.errors import (
     SchemaTooOldError,
     SessionGoneError,
 )
-from webots_mcp.transactions import is_busy, is_damage, text_of
 
 _RETRY_INTERVAL_S: Final = 1.0
 

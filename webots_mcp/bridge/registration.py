@@ -10,8 +10,8 @@ from typing import Any, Final, NamedTuple
 
 from webots_mcp import liveness
 from webots_mcp.bridge.identity import Identity
+from webots_mcp.connection import transaction
 from webots_mcp.pauses import PAUSED
-from webots_mcp.transactions import transaction
 from webots_mcp.waiting_file import enter_robot, enter_session
 
 _OPEN_SESSIONS: Final = (

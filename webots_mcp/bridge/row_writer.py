@@ -13,10 +13,9 @@ from webots_mcp.bridge.recovery import Recovery
 from webots_mcp.bridge.row_counts import RowCounts
 from webots_mcp.bridge.run import Run
 from webots_mcp.bridge.session_connection import SessionConnection, patiently
-from webots_mcp.entries import STATEMENTS, Kind, Values, bind
+from webots_mcp.connection import FAILURES, in_transaction, is_busy, roll_back
 from webots_mcp.signal_register import Seen, find_changes, write_changes
-from webots_mcp.transactions import FAILURES, in_transaction, is_busy, roll_back
-from webots_mcp.waiting_file import Taken, is_unfit, take_in
+from webots_mcp.waiting_file import STATEMENTS, Kind, Taken, Values, bind, is_unfit, take_in
 
 _CATCH_UP_S: Final = 0.002  # per call: writing waiting rows must not stall the loop
 

@@ -21,10 +21,9 @@ from webots_mcp.bridge.registration import (
     describe_session,
 )
 from webots_mcp.bridge.run import Run
-from webots_mcp.connection import identify_files
+from webots_mcp.connection import identify_files, is_busy
 from webots_mcp.contract import Database, new_uuid
-from webots_mcp.entries import STATEMENTS, Kind, Values, bind
-from webots_mcp.transactions import is_busy
+from webots_mcp.waiting_file import STATEMENTS, Kind, Values, bind
 
 Result = TypeVar("Result")
 

@@ -9,11 +9,19 @@ from itertools import islice
 from typing import Any, Final, cast
 
 from webots_mcp.bridge.recorder import Recorder
-from webots_mcp.entries import Kind as EntryKind
-from webots_mcp.entries import Values
 from webots_mcp.naming import flatten
-from webots_mcp.signal_kinds import Kind, ends_pose, kind_of, places, widen
-from webots_mcp.signal_register import ADDED_AT_ONCE, MAX_SIGNALS, Seen
+from webots_mcp.signal_register import (
+    ADDED_AT_ONCE,
+    MAX_SIGNALS,
+    Kind,
+    Seen,
+    ends_pose,
+    kind_of,
+    places,
+    widen,
+)
+from webots_mcp.waiting_file import Kind as EntryKind
+from webots_mcp.waiting_file import Values
 
 _MOST_SHAPES: Final = 64  # keys made of ids or times would make every state a new one
 _MOST_KEYS: Final = 1000  # of a state that are compared

@@ -43,6 +43,7 @@ from webots_mcp.questions.history_answers import ComparisonAnswer, RunsAnswer
 from webots_mcp.questions.shortening import DETAIL_BUDGET_TOKENS, WHOLE, shorten
 from webots_mcp.store.analysis.spread import MIN_EFFECT_SD, Spread
 from webots_mcp.store.detection.event import EventOptions, both_of
+from webots_mcp.store.parameters import scored_runs
 from webots_mcp.store.questions.compare import (
     Comparison,
     Difference,
@@ -59,7 +60,6 @@ from webots_mcp.store.questions.runs import (
     run_info,
 )
 from webots_mcp.store.recording import Recording, View, look
-from webots_mcp.store.trials import scored_runs
 
 RUN_COLUMNS: Final = (
     "run_id", "robot", "label", "parameters", "started", "began_by", "ended_by", "duration_s",

@@ -17,10 +17,10 @@ from webots_mcp.questions.declaring import CHANGES, READS, Caller, question
 from webots_mcp.questions.pictures import load_picture, load_sheet
 from webots_mcp.questions.shortening import compact_json
 from webots_mcp.steering.dispatch import Dispatcher
-from webots_mcp.store.images import StoredImage, camera_frames, cameras, inside
 from webots_mcp.store.reading.kept import kept_stretches
 from webots_mcp.store.reading.ranges import just_after
 from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.run_rows import StoredImage, camera_frames, cameras, inside
 
 _WAIT_S: Final = 15.0
 _MOST_RUNS: Final = 5

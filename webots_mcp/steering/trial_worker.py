@@ -20,26 +20,26 @@ from webots_mcp.plugins import cluster_offered, load
 from webots_mcp.queue import Command, CommandQueue, fetch_command, find_command
 from webots_mcp.steering.running import ACTION
 from webots_mcp.steering.target_robot import find_target
-from webots_mcp.store.jobs import Job
-from webots_mcp.store.parameters import described, parameters_of
-from webots_mcp.store.questions.score import score_run
-from webots_mcp.store.recording import Recording, View
-from webots_mcp.store.robots import robot_name
-from webots_mcp.store.trials import (
+from webots_mcp.store.parameters import (
     Result,
     Trial,
     TrialSet,
     begin_trial,
     borrow_parameters,
+    described,
     fetch_trial_set,
     finish_trial,
     lay_down,
     next_trial,
+    parameters_of,
     put_back,
     stop_trial_set,
     take_up,
     trials_of,
 )
+from webots_mcp.store.questions.score import score_run
+from webots_mcp.store.recording import Job, Recording, View
+from webots_mcp.store.robots import robot_name
 from webots_mcp.trials.plan import TrialPlan, WorldPlan, stored_plan
 
 _LOOK_EVERY_S: Final = 0.02

@@ -27,11 +27,11 @@ from webots_mcp.errors import (
 )
 from webots_mcp.store.logs import LogFilter, Window, newest_lines
 from webots_mcp.store.merging import settled
+from webots_mcp.store.parameters import Result
 from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.questions.score import score_run
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.signals.flatten import parse
-from webots_mcp.store.trials import Result
 from webots_mcp.trials.plan import TrialPlan, WorldPlan
 from webots_mcp.webots.starting import CommandLine, KeptProgram, Start, any_port
 

@@ -18,7 +18,7 @@ from tests.benchmarks.table import Line, Target, duration
 from webots_mcp.connection import connect
 from webots_mcp.questions.monitor import look_back
 from webots_mcp.store.analysis.arrays import Array
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.questions.series import query_history

@@ -19,6 +19,7 @@ from tests.benchmarks.states import make_states
 from tests.benchmarks.table import Line, Target
 from tests.postgres import NoServerError, Server, running_server
 from webots_mcp.connection import connect as connect_recording
+from webots_mcp.connection import create_schema
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.plugins.pool.engines import open_pool, open_target
 from webots_mcp.plugins.pool.fetching import fetch
@@ -30,7 +31,6 @@ from webots_mcp.plugins.pool.report import Report
 from webots_mcp.plugins.pool.row_batch import Batch, batches
 from webots_mcp.plugins.pool.shipped_tables import Table, table
 from webots_mcp.plugins.pool.shipping import Order, ship
-from webots_mcp.schema import create_schema
 from webots_mcp.store.recording import Recording
 
 _ROWS: Final = 20_000

@@ -24,9 +24,8 @@ from tests.bridge.conftest import (
 from tests.bridge.on_disk.conftest import POSIX, adopt_into
 from webots_mcp import MCPBridge
 from webots_mcp.bridge.row_writer import RowWriter
-from webots_mcp.entries import Entry
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.waiting_file import WaitingFile
+from webots_mcp.waiting_file import Entry, WaitingFile
 
 
 @pytest.fixture

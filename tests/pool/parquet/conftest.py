@@ -16,7 +16,7 @@ from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.plugins.pool.parquet.parquet_writing import ParquetTarget
 from webots_mcp.plugins.pool.report import Report
 from webots_mcp.plugins.pool.shipping import Order, ship
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.recording import Recording
 
 RECORDINGS: Final = 50

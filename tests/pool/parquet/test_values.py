@@ -21,7 +21,7 @@ from webots_mcp.plugins.pool.report import Report
 from webots_mcp.plugins.pool.row_batch import Batch
 from webots_mcp.plugins.pool.shipped_tables import table
 from webots_mcp.plugins.pool.shipping import Order, ship
-from webots_mcp.store.chunks.making import chunk_whole_run
+from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.recording import Recording
 
 STATES: list[tuple[dict[str, Any], dict[str, str] | None]] = [

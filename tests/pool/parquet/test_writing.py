@@ -48,7 +48,7 @@ from webots_mcp.plugins.pool.parquet.parquet_reading import ParquetPool
 from webots_mcp.plugins.pool.parquet.parquet_writing import PART_BYTES, ParquetTarget
 from webots_mcp.plugins.pool.row_batch import Batch, Row
 from webots_mcp.plugins.pool.shipped_tables import SQLValue, table, tables
-from webots_mcp.store.chunks.making import chunk_whole_run
+from webots_mcp.store.chunk_making import chunk_whole_run
 
 DAY_S = 86_400.0
 MIDNIGHT_S = 19_700 * DAY_S

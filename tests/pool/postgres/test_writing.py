@@ -32,7 +32,7 @@ from webots_mcp.plugins.pool.postgres import postgres_writing as writing
 from webots_mcp.plugins.pool.postgres.postgres_writing import PostgresShipment, PostgresTarget
 from webots_mcp.plugins.pool.row_batch import Batch, Row
 from webots_mcp.plugins.pool.shipped_tables import table, tables
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 
 SECRET = "quite-a-secret-7"
 OTHER = "00000000-0000-4000-8000-00000000000a"

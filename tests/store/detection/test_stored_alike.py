@@ -14,12 +14,12 @@ import pytest
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold
+from webots_mcp.store.purge import prune
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.retention.policy import Limit, Retention
-from webots_mcp.store.retention.purge import prune
+from webots_mcp.store.retention import Limit, Retention
 
 ROWS = 6000
 NOISE = np.random.default_rng(1).normal(0, 0.01, (ROWS, 3)).tolist()

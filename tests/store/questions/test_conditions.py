@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp.errors import InvalidConditionError, InvalidInputError, UnknownSignalError
-from webots_mcp.store.chunks import making
-from webots_mcp.store.chunks.making import chunk_whole_run
+from webots_mcp.store import chunk_making
+from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.detection.event import EventOptions, Threshold
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.reading.ranges import Scope, find_range
@@ -205,7 +205,7 @@ def test_thresholds_are_a_short_form_of_a_condition(
 def test_where_a_condition_could_not_be_asked_of_a_damaged_chunk_is_said(
     counting: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(making, "GROUP_ROWS", 100)
+    monkeypatch.setattr(chunk_making, "GROUP_ROWS", 100)
     connection = counting.connection
     for step in range(400):
         counting.publish(step * 0.1, {"n": step, "m": step})

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import start_run
-from webots_mcp.store.chunks import making
-from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
+from webots_mcp.store import chunk_making
+from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.questions.trend import Trend
 from webots_mcp.store.questions.trends import RunTrends, trends
 from webots_mcp.store.reading.ranges import Scope, find_range
@@ -391,7 +391,7 @@ def test_a_signal_whose_chunk_is_damaged_is_not_said_to_have_no_value(
 def test_a_damaged_chunk_costs_its_own_signal_alone(
     empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(making, "GROUP_ROWS", 100)
+    monkeypatch.setattr(chunk_making, "GROUP_ROWS", 100)
     recorder = start_run(empty)
     for step in range(300):
         mode = "a" if step < 50 else "b"

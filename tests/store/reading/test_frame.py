@@ -14,12 +14,10 @@ from hypothesis import strategies as st
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
-from webots_mcp.connection import connect
-from webots_mcp.schema import create_schema
-from webots_mcp.store.chunks import making
-from webots_mcp.store.chunks.codec import decoded_of
-from webots_mcp.store.chunks.making import make_chunks
-from webots_mcp.store.chunks.statistics import statistics_of
+from webots_mcp.connection import connect, create_schema
+from webots_mcp.store import chunk_making
+from webots_mcp.store.chunk_making import make_chunks
+from webots_mcp.store.chunks import decoded_of, statistics_of
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import Frame, Zones, read_frame
 from webots_mcp.store.reading.ranges import Segment, whole_run
@@ -35,8 +33,8 @@ STATES = st.lists(
 @pytest.fixture
 def short_groups(monkeypatch: pytest.MonkeyPatch) -> None:
     """Groups of eight rows, so that a short recording has several."""
-    monkeypatch.setattr(making, "GROUP_ROWS", 8)
-    monkeypatch.setattr(making, "LEAST_AT_END", 8)
+    monkeypatch.setattr(chunk_making, "GROUP_ROWS", 8)
+    monkeypatch.setattr(chunk_making, "LEAST_AT_END", 8)
 
 
 def recorded(connection: sqlite3.Connection, states: list[dict[str, Any]]) -> None:

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
+from webots_mcp.store import chunk_making
 from webots_mcp.store.analysis.rhythm import rhythm_of
-from webots_mcp.store.chunks import making
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading import frame_summary as reading
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import read_frame
@@ -22,7 +22,7 @@ from webots_mcp.store.reading.ranges import Segment
 @pytest.fixture
 def short_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Chunks of sixteen rows, and no range in which every row is looked at."""
-    monkeypatch.setattr(making, "GROUP_ROWS", 16)
+    monkeypatch.setattr(chunk_making, "GROUP_ROWS", 16)
     monkeypatch.setattr(reading, "FULL_ROWS", 0)
 
 

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
-from webots_mcp.store.chunks import making
-from webots_mcp.store.chunks.making import chunk_whole_run
+from webots_mcp.store import chunk_making
+from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.detection.event import EventOptions, Threshold
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading.ranges import Scope, find_range
@@ -96,6 +96,6 @@ def test_chunks_and_rows_tell_the_same_spans(stretches: list[tuple[Any, int]]) -
     with memory_connection() as connection, pytest.MonkeyPatch.context() as patch:
         record(connection, states, 1.0)
         from_rows = spans(connection, **asked)
-        patch.setattr(making, "GROUP_ROWS", 3)
+        patch.setattr(chunk_making, "GROUP_ROWS", 3)
         assert chunk_whole_run(connection, 1)
         assert spans(connection, **asked) == from_rows

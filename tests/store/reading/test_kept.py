@@ -18,8 +18,8 @@ from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.chunks.making import make_chunks
-from webots_mcp.store.export.export_rows import Source
+from webots_mcp.store.chunk_making import make_chunks
+from webots_mcp.store.export_rows import Source
 from webots_mcp.store.questions.events import EventOptions, find_events
 from webots_mcp.store.questions.series import query_history
 from webots_mcp.store.questions.trends import trends
@@ -289,7 +289,7 @@ def test_stretches_are_events_with_their_reason(connection: sqlite3.Connection) 
 def test_an_export_has_each_call_once_and_in_order(
     connection: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("webots_mcp.store.export.export_rows.CHUNK_ROWS", 7)
+    monkeypatch.setattr("webots_mcp.store.export_rows.CHUNK_ROWS", 7)
     kept, every = (Source.of(connection, each.segments, 1, None) for each in inside(connection))
     numbers = [row.values["n"] for row in kept.rows()]
     assert numbers == [row.values["n"] for row in every.rows()]

@@ -10,15 +10,15 @@ import pytest
 
 from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S, start_run
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.purge import prune
 from webots_mcp.store.questions.compare import compare_runs
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.questions.series import RunHistory, query_history
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.retention.policy import Limit, Retention
-from webots_mcp.store.retention.purge import prune
+from webots_mcp.store.retention import Limit, Retention
 
 
 def overview(connection: sqlite3.Connection, start_s: float | None = None) -> RunHistory:

@@ -21,7 +21,7 @@ from webots_mcp.errors import (
     UnknownRobotError,
     UnknownRunError,
 )
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading.ranges import Scope, Segment, find_range
 from webots_mcp.store.reading.wall_time import parse_wall_time
 

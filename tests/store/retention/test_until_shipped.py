@@ -11,12 +11,10 @@ import pytest
 
 from tests.recordings.runs import Recorded, states
 from webots_mcp.cli import main
-from webots_mcp.connection import connect
-from webots_mcp.schema import create_schema
-from webots_mcp.store.retention.planning import plan
-from webots_mcp.store.retention.policy import Limit, Retention
-from webots_mcp.store.retention.shipped import Shipped, write_shipped
-from webots_mcp.store.retention.upkeep import Upkeep
+from webots_mcp.connection import connect, create_schema
+from webots_mcp.store.purge import Upkeep
+from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_plan import Shipped, plan, write_shipped
 
 MB = 1_000_000
 Say = Callable[..., str]

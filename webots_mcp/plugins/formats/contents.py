@@ -16,11 +16,10 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.naming import FARTHEST_M, metres_in
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import Motion, find_motion
-from webots_mcp.store.export.export_rows import CHUNK_ROWS, Progress, Recorded, Source
-from webots_mcp.store.images import MAX_FILE_BYTES, StoredImage
+from webots_mcp.store.export_rows import CHUNK_ROWS, Progress, Recorded, Source
 from webots_mcp.store.logs import LogLine
 from webots_mcp.store.reading.ranges import Segment, TimeRange
-from webots_mcp.store.run_rows import Event, columns_of
+from webots_mcp.store.run_rows import MAX_FILE_BYTES, Event, StoredImage, columns_of
 from webots_mcp.store.signals.catalogue import known_signals
 from webots_mcp.store.signals.registry import Signal
 

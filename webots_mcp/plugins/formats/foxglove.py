@@ -11,7 +11,7 @@ from typing import Any, Final
 from webots_mcp.plugins.formats.contents import Contents
 from webots_mcp.plugins.formats.mcap import WORLD_FRAME, Topics, write_mcap
 from webots_mcp.store.export import Exported, placed
-from webots_mcp.store.export.export_rows import Progress
+from webots_mcp.store.export_rows import Progress
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.signals.registry import Signal
 

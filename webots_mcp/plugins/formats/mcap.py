@@ -22,11 +22,10 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.formats.contents import KINDS, Contents, PlacedCommand, Pose, Way
 from webots_mcp.plugins.formats.mcap_schemas import FIXED, Schema, Shape
 from webots_mcp.requirements import explain_extra
-from webots_mcp.store.export.export_rows import Recorded, value_at
-from webots_mcp.store.export.text_formats import json_text
-from webots_mcp.store.images import StoredImage
+from webots_mcp.store.export import json_text
+from webots_mcp.store.export_rows import Recorded, value_at
 from webots_mcp.store.logs import LogLine
-from webots_mcp.store.run_rows import Event
+from webots_mcp.store.run_rows import Event, StoredImage
 from webots_mcp.store.signals.flatten import parse
 
 WORLD_FRAME: Final = "world"

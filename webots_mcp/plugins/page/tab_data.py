@@ -25,7 +25,6 @@ from webots_mcp.plotting.trajectory_axes import TrajectoryAxes
 from webots_mcp.plugins.page.choice import Choice
 from webots_mcp.plugins.report.charts.obstacles import Obstacle, obstacles_of
 from webots_mcp.plugins.report.charts.signal_panels import ROOM
-from webots_mcp.store.images import StoredImage, newest_image
 from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines
 from webots_mcp.store.parameters import described
 from webots_mcp.store.questions.runs import RunInfo, list_runs
@@ -34,7 +33,7 @@ from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range
 from webots_mcp.store.recording import Recording, View, view_of
 from webots_mcp.store.robots import list_robots, without_observers
-from webots_mcp.store.run_rows import Run, current_run, fetch_run
+from webots_mcp.store.run_rows import Run, StoredImage, current_run, fetch_run, newest_image
 from webots_mcp.store.signals.catalogue import catalogue, known_signals
 from webots_mcp.store.signals.registry import Signal
 

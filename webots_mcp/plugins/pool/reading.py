@@ -20,7 +20,7 @@ from webots_mcp.plugins.pool.row_batch import (
     row_bytes,
 )
 from webots_mcp.plugins.pool.shipped_tables import SQLValue, Table, table
-from webots_mcp.store.chunks.stored import reached
+from webots_mcp.store.chunks import reached
 
 CHUNK_ROWS: Final = 32
 GROUPS_AT_ONCE: Final = 64

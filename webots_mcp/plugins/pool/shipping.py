@@ -30,11 +30,11 @@ from webots_mcp.plugins.pool.report import Report
 from webots_mcp.plugins.pool.row_batch import Batch
 from webots_mcp.plugins.pool.shipped_tables import CHUNKS, SQLValue, Table, table, tables
 from webots_mcp.plugins.pool.target import Shipment, Target, is_whole, whole_runs
-from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
-from webots_mcp.store.images import MAX_FILE_BYTES, PICTURES, inside
+from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.merging import settled
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.retention.shipped import Shipped, read_shipped, write_shipped
+from webots_mcp.store.retention_plan import Shipped, read_shipped, write_shipped
+from webots_mcp.store.run_rows import MAX_FILE_BYTES, PICTURES, inside
 
 MOST_BATCHES: Final = 8  # of a table in a round, before the others get their turn
 _HANDOVER_S: Final = (0.02, 0.1, 0.3, 0.6)

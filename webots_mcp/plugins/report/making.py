@@ -16,8 +16,8 @@ from webots_mcp.plugins.report.figures import figures_of, library
 from webots_mcp.plugins.report.page import Page, render
 from webots_mcp.plugins.report.run_pictures import Pictures, pictures_of
 from webots_mcp.plugins.report.words import counted
-from webots_mcp.store.invalid_rows import left_out_so_far
 from webots_mcp.store.reading.snapshot import in_one_snapshot
+from webots_mcp.store.recording import left_out_so_far
 from webots_mcp.store.run_rows import fetch_run
 
 MAX_MB: Final = 10.0

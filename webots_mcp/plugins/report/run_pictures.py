@@ -12,9 +12,9 @@ from typing import Final, NamedTuple
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plugins.report.words import time_at
 from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.images import inside, opened
 from webots_mcp.store.questions.events import search_events
 from webots_mcp.store.reading.ranges import TimeRange
+from webots_mcp.store.run_rows import inside, opened
 
 MOST_PICTURES: Final = 24  # of a run
 LONGEST_SIDE_PX: Final = 640

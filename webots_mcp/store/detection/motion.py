@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from webots_mcp.naming import FARTHEST_M, metres_in, unit_in
-from webots_mcp.signal_roles import first_in, pair_in
+from webots_mcp.signal_register import first_in, pair_in
 from webots_mcp.store.analysis.arrays import Array, Indexes, median, noise_of, np
 from webots_mcp.store.analysis.summary import LARGEST
 from webots_mcp.store.detection.event import EventOptions

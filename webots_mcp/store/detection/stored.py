@@ -18,12 +18,12 @@ from webots_mcp.store.detection.kind import (
     but_for_numbers,
 )
 from webots_mcp.store.detection.search import Search
-from webots_mcp.store.images import count_kept_frames
 from webots_mcp.store.reading.changes import MOST_VALUES, Point, change_points
 from webots_mcp.store.reading.frame_summary import frame_around, rhythm_in
 from webots_mcp.store.reading.kept import kept_stretches
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.reading.wall_time import frame_of_purged
+from webots_mcp.store.run_rows import count_kept_frames
 
 MOST_OF_A_KIND: Final = 2000  # newest rows of a table that are looked at, per run
 AROUND_S: Final = 10.0  # before and after: what changes all the time there, measures

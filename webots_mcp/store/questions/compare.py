@@ -17,7 +17,7 @@ from webots_mcp.store.analysis.spread import MIN_EFFECT_SD
 from webots_mcp.store.analysis.summary import Summary
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import motion_in
-from webots_mcp.store.parameters import differing, parameters_of
+from webots_mcp.store.parameters import differing, parameters_of, scored_runs
 from webots_mcp.store.questions.differences import Difference, difference_of, only_in, size_of
 from webots_mcp.store.questions.outcomes import (
     OUT_OF_TIME,
@@ -36,7 +36,6 @@ from webots_mcp.store.robots import resolve_robot
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.signals.catalogue import catalogue, resolve_signals
 from webots_mcp.store.signals.registry import Signal
-from webots_mcp.store.trials import scored_runs
 
 COMPARE_DEADLINE_S: Final = 5.0
 MOST_COMPARED: Final = 10

@@ -6,7 +6,7 @@ import re
 import sqlite3
 from typing import Final
 
-from webots_mcp.schema import shipped_objects
+from webots_mcp.connection import shipped_objects
 
 _OBJECTS: Final = (
     "SELECT name, type, sql FROM sqlite_master WHERE type IN ('table', 'view') "

@@ -8,11 +8,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
+from webots_mcp.store import chunk_making
 from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.features import FLAT_BAND, Spike, find_spikes
 from webots_mcp.store.analysis.summary import LARGEST, Summary, summarise_numbers, with_extremes
 from webots_mcp.store.analysis.swings import SHORTEST_PERIOD_ROWS
-from webots_mcp.store.chunks import making
 from webots_mcp.store.questions.series import STATES_SHARE, signals_left
 from webots_mcp.store.questions.trend import (
     Course,
@@ -194,7 +194,7 @@ def _trend(frame: Frame, signal: Signal, kept: Frame | None) -> Trend | None:
         times, numbers = frame.usable(name)
         course = course_of_values(times, numbers, signal.turn, summary)
         if is_long:
-            course = in_means(course, making.GROUP_ROWS)
+            course = in_means(course, chunk_making.GROUP_ROWS)
         else:
             spikes = find_spikes(times, numbers, signal.turn)
         too_large = int(np.count_nonzero(np.abs(frame.numbers(name)) > LARGEST))

@@ -12,8 +12,7 @@ import math
 import sqlite3
 from typing import Final, NamedTuple
 
-from webots_mcp.store.chunks.codec import Decoded
-from webots_mcp.store.chunks.stored import SIM_TIMES, groups_in, values_in
+from webots_mcp.store.chunks import SIM_TIMES, Decoded, groups_in, values_in
 
 MOST_STRETCHES: Final = 200  # newest of a range that are looked at
 MOST_ROWS: Final = 30_000  # of a range that is answered from each call

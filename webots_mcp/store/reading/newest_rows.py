@@ -11,8 +11,7 @@ import threading
 from collections import OrderedDict
 from typing import Final, NamedTuple
 
-from webots_mcp.store.chunks.columns import STATE_COLUMNS, StateColumns
-from webots_mcp.store.chunks.stored import Reached
+from webots_mcp.store.chunks import STATE_COLUMNS, Reached, StateColumns
 from webots_mcp.store.reading.deadline import Deadline
 
 ROWS_AT_ONCE: Final = 1024  # between two looks at the deadline

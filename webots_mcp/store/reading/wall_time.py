@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from webots_mcp.errors import InvalidRangeError
 from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.chunks.stored import WALL_TIMES
+from webots_mcp.store.chunks import WALL_TIMES
 from webots_mcp.store.reading.deadline import Deadline
 
 if TYPE_CHECKING:

@@ -11,11 +11,9 @@ from typing import Final
 
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.naming import REDUCTIONS, Value, nearest_first
-from webots_mcp.signal_kinds import Kind
-from webots_mcp.signal_register import MAX_SIGNALS
+from webots_mcp.signal_register import MAX_SIGNALS, Kind
 from webots_mcp.store.analysis.arrays import Indexes, np
-from webots_mcp.store.chunks.columns import STATE_COLUMNS, StateColumns
-from webots_mcp.store.chunks.stored import reached, signals_in
+from webots_mcp.store.chunks import STATE_COLUMNS, StateColumns, reached, signals_in
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.newest_rows import has_few_new_rows, rows_in_no_chunk

@@ -9,20 +9,22 @@ from functools import lru_cache
 from typing import Any, Final
 
 from webots_mcp.naming import Value, find_mode
-from webots_mcp.signal_kinds import (
+from webots_mcp.signal_register import (
+    MOST_CHOICES,
     Kind,
     Place,
+    Seen,
+    decide_roles,
     ends_pose,
+    find_changes,
     kind_of,
     places,
     turn_of,
     unit_of,
     widen,
+    write_changes,
 )
-from webots_mcp.signal_register import MOST_CHOICES, Seen, find_changes, write_changes
-from webots_mcp.signal_roles import decide_roles
-from webots_mcp.store.chunks.codec import ABSENT, Absent, Replaced
-from webots_mcp.store.chunks.columns import StateColumns
+from webots_mcp.store.chunks import ABSENT, Absent, Replaced, StateColumns
 from webots_mcp.store.signals.flatten import parse, shown
 
 _OF_ROBOT: Final = (

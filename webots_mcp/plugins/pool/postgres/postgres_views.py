@@ -5,9 +5,9 @@ from __future__ import annotations
 import re
 from typing import Final
 
+from webots_mcp.connection import shipped_objects
 from webots_mcp.naming import METRES
 from webots_mcp.plugins.pool.postgres.connecting import Connection
-from webots_mcp.schema import shipped_objects
 
 # From the first Julian day to 1970: SQLite adds it before it rounds, and so loses some digits.
 _JULIAN_MS: Final = "210866760000000.0::double precision"

@@ -73,7 +73,7 @@ class Limits:
         str | None,
         _option(
             _RUNS,
-            "Keep what is left of a run this many times longer than its states ({}), or for ever: "
+            "Keep what is left of a run this many times longer than its chunks ({}), or for ever: "
             "all.",
         ),
     ] = None

@@ -26,9 +26,16 @@ from webots_mcp.connection import (
     require_shipped,
     transaction,
 )
-from webots_mcp.contract import DATABASE_NAME, PRIVATE_FILE, make_folder, whole_file
+from webots_mcp.contract import (
+    DATABASE_NAME,
+    PRIVATE_FILE,
+    REMOTE_SILENCE_S,
+    host_name,
+    make_folder,
+    whole_file,
+)
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.liveness import reap
+from webots_mcp.liveness import end_session, reap
 from webots_mcp.signal_register import Kind, Seen
 from webots_mcp.store.chunks import (
     SIM_TIMES,
@@ -52,6 +59,10 @@ from webots_mcp.waiting_file import adopt
 _SESSIONS: Final = (
     "SELECT id, uuid, robot_id FROM source.session s WHERE :run IS NULL "
     "OR id = (SELECT session_id FROM source.run WHERE id = :run) ORDER BY id"
+)
+_SILENT_ELSEWHERE: Final = (
+    "SELECT id FROM session WHERE ended_wall_time_s IS NULL AND host IS NOT ? "
+    "AND last_seen_wall_time_s < ?"
 )
 _NEW_RUNS: Final = (
     "SELECT id, uuid FROM source.run r WHERE session_id = :session AND (:run IS NULL OR id = :run) "
@@ -156,13 +167,19 @@ def merge(
 def settled(database: Path) -> Recording:
     """A recording with all rows that waited next to it, and its sessions ended that are over.
 
+    A session of another host is over when its last heartbeat is more than 10 s old.
+
     Raises:
         DatabaseError: There is none, or it is none of ours.
     """
     recording = Recording(database, database.parent)
     with recording.writer() as connection:
         adopt(connection, database)
-        reap(connection, time.time())
+        now_s = time.time()
+        silent = (host_name(), now_s - REMOTE_SILENCE_S)  # their processes cannot be asked
+        for (session_id,) in connection.execute(_SILENT_ELSEWHERE, silent).fetchall():
+            end_session(connection, session_id, "crashed")
+        reap(connection, now_s)
     return recording
 
 

@@ -77,10 +77,10 @@ class Retention:
         log: Log lines.
         event: Events; its age also holds for finished commands.
         image: Pictures, with their files.
-        outlive: When this many times the limits of `state` was recorded after a run, or it ended
-            that many times their age ago (and as many states as an age spares were recorded since),
-            all that is left of it goes, and with the last run of that time the commands. 0 keeps
-            runs for ever.
+        outlive: When this many times the limits of `chunk` and of `state` was recorded after a run,
+            or it ended that many times their age ago (and as many states as an age spares were
+            recorded since), all that is left of it goes, and with the last run of that time the
+            commands. 0 keeps runs for ever.
         kept_state: Rows of kept stretches: those that the throttle dropped, and those that went
             from `state`. A stretch that loses a row is none any more.
         unshipped: What is beyond these limits stays until it is shipped to a pool; of more than
@@ -276,7 +276,7 @@ def _said(setting: Setting) -> str:
 def _text(value: Limit | float) -> str:
     if isinstance(value, Limit):
         return limit_text(value)
-    return f"{value:g} times as long as states" if value else NO_LIMIT
+    return f"{value:g} times as long as chunks" if value else NO_LIMIT
 
 
 def _another_server(connection: sqlite3.Connection) -> bool:

@@ -484,22 +484,32 @@ class _Planner:
         return [each for each in self._held[table] if self._runs[each.run_id].is_kept == is_kept]
 
     def _find_forgotten(self) -> set[int]:
-        """Finished runs after which `outlive` times the limits of state was recorded.
+        """Finished runs after which `outlive` times the limits of chunks and states was recorded.
 
-        As of states, age alone does not do it where few were recorded since.
+        As of these, age alone does not do it where few were recorded since.
         """
-        states = self._kept("state", is_kept=False)
-        row_bytes = _size_of(states) / max(sum(portion.rows for portion in states), 1)
-        limit, after, forgotten = self._retention.state, 0, set[int]()
+        limits = [(getattr(self._retention, table), self._row_bytes(table))
+                  for table in ("chunk", "state")]  # fmt: skip
+        after, forgotten, times = 0, set[int](), self._retention.outlive
         free = [run for run in self._runs.values() if not run.is_kept]
         for run in sorted(free, key=lambda run: (-run.started_wall_time_s, -run.id)):
-            age_s = self._now_s - run.last_wall_time_s if after >= limit.spared_rows else 0
-            if not run.is_current and limit.is_exceeded(
-                size_bytes=after * row_bytes, rows=after, age_s=age_s, times=self._retention.outlive
+            age_s = self._now_s - run.last_wall_time_s
+            if not run.is_current and all(
+                limit.is_exceeded(
+                    size_bytes=after * row_bytes,
+                    rows=after,
+                    age_s=age_s if after >= limit.spared_rows else 0,
+                    times=times,
+                )
+                for limit, row_bytes in limits
             ):
                 forgotten.add(run.id)
             after += run.recorded_rows
         return forgotten
+
+    def _row_bytes(self, table: str) -> float:
+        held = self._kept(table, is_kept=False)
+        return _size_of(held) / max(sum(portion.rows for portion in held), 1)
 
     def _beyond(self, table: str, whole_groups: set[int]) -> Iterator[Going]:
         """What goes of a table, the newest first; all of runs that are forgotten."""

@@ -164,7 +164,7 @@ def test_a_run_that_is_forgotten_leaves_no_file_of_a_camera_frame(
     filmed: sqlite3.Connection, tmp_path: Path
 ) -> None:
     one = Limit(rows=1, spared_rows=0)
-    prune(filmed, tmp_path, Retention(state=one, kept_state=ALL, outlive=1), rest=False)
+    prune(filmed, tmp_path, Retention(state=one, chunk=one, kept_state=ALL, outlive=1), rest=False)
     runs = [run_id for (run_id,) in filmed.execute("SELECT id FROM run")]
     assert 1 not in runs
     assert set(frames(filmed, "kept")) <= set(runs)

@@ -88,7 +88,7 @@ def test_beyond_the_size_the_oldest_goes_all_the_same_and_the_plan_says_so(
 def test_a_run_is_not_forgotten_while_rows_of_it_wait(recorded: Recorded) -> None:
     for _ in range(4):
         recorded.add_run(20)
-    forgetting = replace(states(rows=10), outlive=2.0)
+    forgetting = replace(states(rows=10), chunk=Limit(rows=10), outlive=2.0)
     recorded.prune(keeping(forgetting, MB))
     assert (recorded.count("run"), recorded.count("state")) == (6, 120)
     tell_shipped(recorded, state=999, log=999, event=999, image=999, kept_state=999)

@@ -13,8 +13,7 @@ import anyio
 import webots_mcp
 from webots_mcp import MemoryDatabase, pytest_plugin, testing
 from webots_mcp.cli.commands import described
-from webots_mcp.connection import connect
-from webots_mcp.schema import create_schema
+from webots_mcp.connection import connect, create_schema
 from webots_mcp.server import create_server
 
 _COMMENT: Final = re.compile(r"/\*(.*?)\*/", re.DOTALL)

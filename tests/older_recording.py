@@ -4,8 +4,7 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
-from webots_mcp.connection import connect
-from webots_mcp.schema import OLDER_SCHEMA, create_schema
+from webots_mcp.connection import OLDER_SCHEMA, connect, create_schema
 
 
 def make_older(file: Path) -> None:

@@ -17,46 +17,34 @@ PACKAGE = Path(webots_mcp.__file__).parent
 ALLOWED = {
     "contract": {"errors"},
     "errors": set[str](),
-    "transactions": set[str](),
-    "schema": {"contract", "errors", "transactions"},
-    "connection": {"contract", "errors", "schema", "transactions"},
-    "liveness": {"contract", "queue", "waiting_file"},
-    "queue": {"contract", "errors", "transactions"},
+    "connection": {"contract", "errors"},
+    "liveness": {"connection", "contract", "errors", "queue", "waiting_file"},
+    "queue": {"connection", "contract", "errors"},
     "requirements": set[str](),
-    "leases": {"contract", "errors", "transactions"},
-    "pauses": set[str](),
-    "stored_breakpoints": {"conditions", "contract", "errors", "transactions"},
+    "pauses": {"conditions", "connection", "contract", "errors"},
     "naming": set[str](),
-    "signal_kinds": {"naming"},
-    "signal_roles": {"naming", "signal_kinds"},
-    "signal_register": {"signal_kinds", "signal_roles"},
+    "signal_register": {"naming"},
     "conditions": {"conditions", "errors", "naming"},
     "parameter": {"errors", "naming"},
-    "entries": {"queue"},
-    "waiting_file": {"entries", "errors", "transactions"},
-    "maintenance": {"connection", "errors", "leases", "schema", "transactions", "waiting_file"},
+    "waiting_file": {"connection", "errors", "queue"},
+    "maintenance": {"connection", "errors", "liveness", "waiting_file"},
     "standin": {"standin", "contract"},
     "webots": {"connection", "contract", "errors", "liveness", "webots"},
 }
 ALLOWED["setup"] = {"contract", "errors", "requirements", "setup", "webots", "__version__"}
-ENTRIES = {
+STDLIB = {
     "conditions",
+    "connection",
+    "contract",
+    "errors",
+    "liveness",
     "maintenance",
     "naming",
     "parameter",
     "pauses",
-    "liveness",
     "queue",
-    "signal_kinds",
     "signal_register",
-    "signal_roles",
-    "stored_breakpoints",
-}
-STDLIB = {
-    *ENTRIES,
-    *ALLOWED["maintenance"],
-    *ALLOWED["liveness"],
-    *ALLOWED["waiting_file"],
+    "waiting_file",
 }
 ALLOWED["bridge"] = STDLIB | {"bridge", "__version__"}
 ALLOWED["observer"] = STDLIB | {"bridge", "observer"}
@@ -140,7 +128,7 @@ def test_nothing_but_plugins_knows_a_plugin_by_its_name() -> None:
 
 
 def test_only_what_needs_a_simulator_in_this_process_imports_the_stand_in() -> None:
-    above = (PACKAGE / "standin", PACKAGE / "testing", PACKAGE / "pytest_plugin.py", PLUGINS)
+    above = (PACKAGE / "standin", PACKAGE / "testing.py", PACKAGE / "pytest_plugin.py", PLUGINS)
     for file in PACKAGE.rglob("*.py"):
         if not any(file.is_relative_to(each) for each in above):
             assert "standin" not in {part_of(n) for n in imports(file) if "webots_mcp." in n}, file

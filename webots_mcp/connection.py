@@ -1,4 +1,4 @@
-"""Opening the database: its PRAGMAs, its files and who may open them, for both sides.
+"""Opening the database: its PRAGMAs, its files, its schema and transactions, for both sides.
 
 Standard library only, because the bridge imports it inside a robot's controller.
 """
@@ -6,28 +6,453 @@ Standard library only, because the bridge imports it inside a robot's controller
 from __future__ import annotations
 
 import os
+import re
 import sqlite3
 import time
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterable
+from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, TypeVar
 
 from webots_mcp.contract import (
+    APPLICATION_ID,
     PRIVATE_FILE,
     SCHEMA_VERSION,
     Database,
     MemoryDatabase,
     make_folder,
+    new_uuid,
 )
 from webots_mcp.errors import (
     DatabaseError,
+    ForeignDatabaseError,
     ForkedProcessError,
     NoDatabaseError,
+    SchemaTooNewError,
+    SchemaTooOldError,
 )
-from webots_mcp.schema import require_shipped, schema_version
-from webots_mcp.transactions import is_unwritable
+
+# Transactions on a database that control loops write to as well, and what SQLite's errors mean.
+
+
+Result = TypeVar("Result")
+
+_UNINTERRUPTED_MS: Final = 100
+LONGEST_WRITE_S: Final = 0.001  # of maintenance: a robot that wants to write waits so long
+_UNWRITABLE: Final = ("readonly database", "unable to open database file")
+_CALLED_OFF: Final = "called off"
+_DAMAGE: Final = ("malformed", "not a database", "unsupported file format")
+_SAYS_NOTHING: Final = "malformed database, which SQLite names in bytes that are not text"
+_ABOUT_A_VALUE: Final = (
+    "malformed JSON", "JSON cannot hold", "JSON path", "to UTF-8 column", "integer overflow",
+    "user-defined function",
+)  # fmt: skip
+
+# All that a statement may raise because of the database.
+FAILURES: Final = (sqlite3.Error, sqlite3.Warning, UnicodeDecodeError, SystemError)
+
+
+def never_wait(connection: sqlite3.Connection) -> None:
+    """From now on a lock that is held by another is an error at once, not a wait."""
+    connection.execute("PRAGMA busy_timeout=0")
+
+
+@contextmanager
+def transaction(connection: sqlite3.Connection) -> Generator[None]:
+    """All that is written inside is stored, or nothing; the write lock is taken before the first.
+
+    Args:
+        connection: In autocommit mode and in no transaction, as `connect` gives it.
+
+    Raises:
+        sqlite3.Error: Also where the lock is not to be had (`is_busy`); then nothing ran inside.
+    """
+    try:
+        _begin(connection)
+        yield
+        connection.execute("COMMIT")
+    except BaseException:
+        roll_back(connection)
+        raise
+
+
+def _begin(connection: sqlite3.Connection) -> None:
+    """Take the write lock, waiting for it in pieces: SQLite's own wait cannot be interrupted."""
+    (patience_ms,) = connection.execute("PRAGMA busy_timeout").fetchone()
+    if patience_ms <= _UNINTERRUPTED_MS:
+        connection.execute("BEGIN IMMEDIATE")
+        return
+    until_s = time.monotonic() + patience_ms / 1000
+    connection.execute(f"PRAGMA busy_timeout={_UNINTERRUPTED_MS}")
+    try:
+        while not _begun(connection, last=time.monotonic() > until_s):
+            pass
+    finally:
+        connection.execute(f"PRAGMA busy_timeout={patience_ms}")
+
+
+def _begun(connection: sqlite3.Connection, *, last: bool) -> bool:
+    """Whether the write lock is had; the last attempt raises where it is not."""
+    try:
+        connection.execute("BEGIN IMMEDIATE")
+    except sqlite3.OperationalError as error:
+        if last or not is_busy(error):
+            raise
+        return False
+    return True
+
+
+def in_transaction(connection: sqlite3.Connection, act: Callable[[], Result]) -> Result:
+    """As `transaction`, also where a KeyboardInterrupt comes between any two lines.
+
+    A `with` statement has a moment after BEGIN and one before COMMIT that are outside of it.
+    """
+    try:
+        connection.execute("BEGIN IMMEDIATE")
+        result = act()
+        connection.execute("COMMIT")
+    except BaseException:
+        roll_back(connection)
+        raise
+    return result
+
+
+def roll_back(connection: sqlite3.Connection) -> None:
+    """End the transaction, if one is still open: on a full disk SQLite has ended it already."""
+    if connection.in_transaction:
+        connection.execute("ROLLBACK")
+
+
+class ShortWrites:
+    """Work in transactions that hold the write lock for about a millisecond, commit included.
+
+    What an item costs differs a hundredfold from one recording to another, so it is measured: a
+    transaction ends when the next item and the commit of all of them would go beyond the time.
+
+    Attributes:
+        held_s: How long the last transaction held the lock.
+        longest_held_s: How long the longest one did.
+    """
+
+    def __init__(self, connection: sqlite3.Connection, limit_s: float = LONGEST_WRITE_S) -> None:
+        self._connection = connection
+        self._limit_s = limit_s
+        self._commit_s = 0.0  # of an item, about
+        self.held_s = 0.0
+        self.longest_held_s = 0.0
+
+    def write(self, items: Iterable[Result], store: Callable[[Result], object]) -> int:
+        """Store the first items in one transaction; returns how many: one at least, if any.
+
+        Raises:
+            sqlite3.Error: Also where the lock is not to be had (`is_busy`); nothing was stored.
+        """
+        stored, started_s, working_s = 0, 0.0, 0.0
+        with transaction(self._connection):
+            started_s = time.perf_counter()
+            for item in items:
+                store(item)
+                stored += 1
+                working_s = time.perf_counter() - started_s
+                if (stored + 1) * (working_s / stored + self._commit_s) > self._limit_s:
+                    break
+        self._measure(time.perf_counter() - started_s, working_s, stored)
+        return stored
+
+    def _measure(self, held_s: float, working_s: float, stored: int) -> None:
+        self.held_s = held_s
+        self.longest_held_s = max(self.longest_held_s, held_s)
+        if stored:
+            self._commit_s = (self._commit_s + (held_s - working_s) / stored) / 2
+
+
+class Step:
+    """Statements that SQLite runs as one: one short transaction in one call.
+
+    Work done while control loops run holds the write lock for a millisecond at most. In a
+    process with several threads a `transaction` cannot promise that: between any two of its
+    statements another thread may run for 5 ms and more, while every robot waits for the lock.
+    Statements in the body of a trigger run without Python in between.
+
+    What a step writes is prepared before it, in temporary tables, which lock no other process out.
+
+    Args:
+        name: Of the step, unlike that of any table.
+        parameters: Names of the values that it is run with: `NEW.name` in the statements.
+        statements: Tables without the name of a database, no LIMIT on a DELETE or an UPDATE (so
+            SQLite wants it in triggers).
+        unless: A condition in SQL under which nothing is done: what was prepared is out of date.
+    """
+
+    def __init__(
+        self, name: str, parameters: tuple[str, ...], *statements: str, unless: str = "0"
+    ) -> None:
+        call_off = f"SELECT RAISE(ABORT, '{_CALLED_OFF}') WHERE {unless}"
+        body = "".join(f"{statement}; " for statement in (call_off, *statements))
+        nulls, marks = (", ".join([one] * len(parameters)) for one in ("NULL", "?"))
+        self._prepare = (
+            f"CREATE TEMP VIEW IF NOT EXISTS {name} ({', '.join(parameters)}) AS SELECT {nulls}",
+            f"CREATE TEMP TRIGGER IF NOT EXISTS do_{name} INSTEAD OF INSERT ON {name} "
+            f"BEGIN {body}END",
+        )
+        self._run = f"INSERT INTO {name} VALUES ({marks})"
+
+    def run(self, connection: sqlite3.Connection, *values: object) -> bool:
+        """Do all of it and return True, or nothing.
+
+        Args:
+            connection: In autocommit mode; it has the temporary tables that the statements name.
+            values: One for each parameter.
+
+        Raises:
+            sqlite3.Error: Also where the write lock is not to be had (`is_busy`).
+        """
+        for statement in self._prepare:
+            connection.execute(statement)
+        try:
+            connection.execute(self._run, values)
+        except sqlite3.IntegrityError as error:
+            if str(error) != _CALLED_OFF:
+                raise
+            return False
+        return True
+
+
+def is_busy(error: Exception) -> bool:
+    """Whether another connection held the lock at that instant: trying again helps.
+
+    `sqlite3` raises more than its own errors: a damaged file makes it quote bytes in a message,
+    which are no UTF-8. So who writes catches any Exception, and asks here what it means.
+    """
+    return isinstance(error, sqlite3.OperationalError) and "locked" in str(error)
+
+
+def is_about_a_value(error: Exception) -> bool:
+    """Whether a single value cannot be read, by SQLite or as text; the file is whole."""
+    if isinstance(error, UnicodeDecodeError):  # else it is SQLite's own message that is no text
+        return not any(words in text_of(error) for words in _DAMAGE)
+    return isinstance(error, sqlite3.Error) and any(s in str(error) for s in _ABOUT_A_VALUE)
+
+
+def is_damage(error: Exception) -> bool:
+    """Whether SQLite says that the file itself is broken, or never was a database."""
+    if not isinstance(error, FAILURES) or is_about_a_value(error):
+        return False
+    return any(words in text_of(error) for words in _DAMAGE)
+
+
+def text_of(error: Exception) -> str:
+    """What went wrong, also where SQLite's own message is no text."""
+    if isinstance(error, UnicodeDecodeError):
+        return error.object.decode("utf-8", "replace")
+    # Python 3.10 leaves such a message out; of this class itself, it was about the file.
+    return str(error) or (_SAYS_NOTHING if type(error) is sqlite3.DatabaseError else "")
+
+
+def is_unwritable(error: Exception) -> bool:
+    """Whether the file, or the folder that it needs for its log, cannot be written."""
+    return isinstance(error, sqlite3.OperationalError) and any(
+        text in str(error) for text in _UNWRITABLE
+    )
+
+
+# Whether a database is ours, whole and of our version, and making an empty one ready.
+#
+# The schema is defined by `store/models.py` and the views in `migrations`; `schema.sql` is
+# generated from them (a test compares the two), so that a controller can make a database in
+# milliseconds and without importing anything but the standard library.
+#
+# A file of foreign origin may hold anything: a view under the name of a table of ours, or a
+# trigger on one, would run its author's SQL in every process that opens the file, and a recursion
+# in it need never end. So what has a name of ours must be what we ship under it, and nothing that
+# runs may hang on it. Further objects that a person has added are left alone.
+
+
+SCHEMA_FILE: Final = Path(__file__).with_name("schema.sql")
+
+OLDER_SCHEMA: Final = 9  # of the recordings before the values lay in chunks
+_FROM_OLDER: Final = (
+    "{file} has schema {version}, of an older webots-mcp, and this one knows {known}: move it "
+    "aside, so that a new one is begun, and {then}"
+)
+_THEN: Final = "take it in with 'webots-mcp import FILE'"
+_IF_OLDEST: Final = "read it with the webots-mcp that made it"
+_MADE: Final = re.compile(r'CREATE (?:UNIQUE )?(?:TABLE|VIEW|INDEX|TRIGGER) "?(\w+)', re.IGNORECASE)
+_TOKENS: Final = re.compile(
+    r"('(?:[^']|'')*'|\"[^\"]*\"|`[^`]*`|\[[^\]]*\]|\w+|/\*.*?\*/|--[^\n]*|[^\s\w])", re.DOTALL
+)
+_OF_COLUMNS: Final = re.compile(
+    r'CREATE (UNIQUE )?INDEX "?\w+"? ON "?\w+"? ?\("?\w+"?( (ASC|DESC))?'
+    r'(, ?"?\w+"?( (ASC|DESC))?)*\)',
+    re.IGNORECASE,
+)
+_INDEX: Final = re.compile(r"CREATE (UNIQUE )?INDEX")
+_OBJECTS: Final = (
+    "SELECT type, CAST(name AS TEXT), CAST(tbl_name AS TEXT), CAST(sql AS TEXT) "
+    "FROM {}.sqlite_master WHERE sql IS NOT NULL"
+)
+# SQLite's own, which our questions use: a table or view of that name would be read in their place.
+_OF_SQLITE: Final = re.compile(r"pragma_|json_(each|tree)$|sqlite_")
+_OF_SQLITE_MADE: Final = "CREATE TABLE sqlite_"  # for AUTOINCREMENT, and by ANALYZE
+_NEW_RECORDING: Final = "INSERT INTO recording (uuid, created_wall_time_s) VALUES (?, ?)"
+
+
+def schema_version(connection: sqlite3.Connection) -> int:
+    """The schema version of a database of ours; 0 for an empty file.
+
+    Raises:
+        ForeignDatabaseError: The file holds tables of another application.
+        sqlite3.DatabaseError: The file is no database, or is damaged.
+    """
+    # In this order: another starter may be making the tables now, in one transaction. By PRAGMAs:
+    # in the place of SQLite's own `pragma_user_version` a view of that name would be read.
+    (tables,) = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
+    (application_id,) = connection.execute("PRAGMA application_id").fetchone()
+    _, _, file = connection.execute("PRAGMA database_list").fetchone()
+    if application_id == APPLICATION_ID:
+        version = int(connection.execute("PRAGMA user_version").fetchone()[0])
+        if version < 0 or (version == 0 and tables):
+            raise ForeignDatabaseError(
+                f"{file or 'the database'} has tables of schema {version}, which no version of "
+                "webots-mcp makes; choose another file"
+            )
+        return version
+    if tables:
+        raise ForeignDatabaseError(
+            f"the SQLite database {file} belongs to another application (application_id "
+            f"{application_id}, expected {APPLICATION_ID}); choose another file"
+        )
+    return 0
+
+
+def require_current(connection: sqlite3.Connection) -> None:
+    """Raise unless the database has exactly the schema of this version.
+
+    Raises:
+        SchemaTooNewError, SchemaTooOldError, ForeignDatabaseError: As they say.
+    """
+    version = schema_version(connection)
+    if version > SCHEMA_VERSION:
+        raise SchemaTooNewError(
+            f"the database has schema {version}, this webots-mcp knows {SCHEMA_VERSION}: "
+            "upgrade it with 'pip install --upgrade', from where it was installed"
+        )
+    if version < SCHEMA_VERSION:
+        raise SchemaTooOldError(
+            _FROM_OLDER.format(
+                file=_file(connection, "main"),
+                version=version,
+                known=SCHEMA_VERSION,
+                then=_THEN if version == OLDER_SCHEMA else _IF_OLDEST,
+            )
+        )
+
+
+def create_schema(connection: sqlite3.Connection) -> None:
+    """Make the tables in an empty database; of several starters at once, one does it.
+
+    The database gets its UUID, the one row of `recording`. The check, the tables and that row
+    stand in one transaction that takes the write lock first.
+    """
+    with transaction(connection):
+        if schema_version(connection) == 0:
+            for statement in shipped_statements():
+                connection.execute(statement)
+            connection.execute(_NEW_RECORDING, (new_uuid(), time.time()))
+
+
+@cache
+def shipped_statements() -> tuple[str, ...]:
+    """The statements of `schema.sql`; each ends with a semicolon at the end of a line."""
+    return tuple(each for each in SCHEMA_FILE.read_text("utf-8").split(";\n") if each.strip())
+
+
+@cache
+def shipped_objects() -> dict[str, str]:
+    """By their names, the statements that make tables, views and indexes."""
+    return _by_name(shipped_statements())
+
+
+def _by_name(statements: Iterable[str]) -> dict[str, str]:
+    made = ((_MADE.match(each), each.rstrip()) for each in statements)
+    return {match[1].lower(): each for match, each in made if match}
+
+
+def require_shipped(
+    connection: sqlite3.Connection,
+    statements: Iterable[str] | None = None,
+    *,
+    schema: str = "main",
+) -> None:
+    """Raise where a table, view or index of ours is not what we ship, or something runs on one.
+
+    A table or view that is missing is as wrong; an index is not.
+
+    Args:
+        connection: Nothing but PRAGMAs was asked of that database yet.
+        statements: Those that make what we ship, in another version; None for this one.
+        schema: The name that the database was attached under.
+
+    Raises:
+        ForeignDatabaseError: The text names what it is, and what to do.
+    """
+    shipped = shipped_objects() if statements is None else _by_name(statements)
+    texts = set(shipped.values())
+    found = connection.execute(_OBJECTS.format(schema)).fetchall()
+    names = {name.lower() for _, name, _, _ in found}
+    for name, sql in shipped.items():
+        if name not in names and not _INDEX.match(sql):  # without one, all is slower, and true
+            raise ForeignDatabaseError(
+                f"{_file(connection, schema)} has no {name!r}, which webots-mcp makes in each "
+                "recording: use a copy from before it was removed"
+            )
+    others = [row for row in found if row[3].rstrip() not in texts]
+    if not others:  # as a rule
+        return
+    referring = {name.lower() for kind, name, _, sql in others if kind == "table" and _refers(sql)}
+    for kind, name, table, sql in others:
+        if (why := _why_refused(kind, name, table, sql, shipped, referring)) is not None:
+            raise ForeignDatabaseError(
+                f"the {kind} {name[:60]!r} in {_file(connection, schema)} {why}, and webots-mcp "
+                "has not made it, so nothing of the file is used: if it is your own, remove it "
+                f"(sqlite3 FILE 'DROP {kind.upper()} ...'), else do not trust the file"
+            )
+
+
+def _file(connection: sqlite3.Connection, schema: str) -> str:
+    files = connection.execute("PRAGMA database_list").fetchall()
+    return next((path for _, each, path in files if each == schema and path), "the database")
+
+
+def _why_refused(
+    kind: str, name: str, table: str, sql: str, shipped: dict[str, str], referring: set[str]
+) -> str | None:
+    """Why an object is refused; None where it is harmless, or ours in another spelling."""
+    if (ours := shipped.get(name.lower())) is not None:
+        return None if _spelled(sql) == _spelled(ours) else "stands where another is in recordings"
+    if _OF_SQLITE.match(name.lower()) and not sql.startswith(_OF_SQLITE_MADE):
+        return "has a name of SQLite's own"
+    if kind == "trigger" and (table.lower() in shipped or table.lower() in referring):
+        return f"runs when {table[:60]!r} is written to"
+    if kind == "index" and table.lower() in shipped and not _OF_COLUMNS.fullmatch(sql.strip()):
+        return f"computes when {table[:60]!r} is written to"
+    return None
+
+
+def _refers(sql: str) -> bool:
+    """Whether a table may have foreign keys, by which a deleted row of ours deletes rows there."""
+    return "references" in sql.lower()
+
+
+def _spelled(sql: str) -> list[str]:
+    """The words of a statement: versions of SQLite and ours differ in spaces and comments."""
+    return [
+        each if each.startswith("'") else each.strip('"').lower()
+        for each in _TOKENS.findall(sql)
+        if not each.startswith(("/*", "--"))
+    ]
+
 
 Role = Literal["loop", "writer", "reader"]
 

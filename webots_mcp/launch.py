@@ -9,7 +9,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from webots_mcp.console.console_follower import as_row
+from webots_mcp.connection import transaction
+from webots_mcp.console import as_row
 from webots_mcp.contract import (
     WORLD_ENDING,
     find_project,
@@ -19,9 +20,8 @@ from webots_mcp.contract import (
 )
 from webots_mcp.errors import InvalidInputError, NoDatabaseError
 from webots_mcp.setup.webots_project import controllers_in, has_bridge
-from webots_mcp.store.console_lines import ConsoleRows
+from webots_mcp.store.logs import ConsoleRows
 from webots_mcp.store.recording import Recording
-from webots_mcp.transactions import transaction
 from webots_mcp.webots.starting import LaunchedWebots, Show, Start
 from webots_mcp.webots.stream import WebotsAddress, WebotsLine, address_of
 

@@ -1,4 +1,4 @@
-"""Whether a session lives: its process, its heartbeat, and what becomes of what a dead one left.
+"""Whether a session lives, and what becomes of what a dead one left; leases of one process.
 
 The host's operating system says whether a process runs. Bridge and store close dead sessions alike.
 
@@ -11,10 +11,14 @@ import os
 import sqlite3
 import sys
 import time
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from webots_mcp.connection import transaction
 from webots_mcp.contract import ISSUED_TIME_TO_LIVE_S, REMOTE_SILENCE_S, host_name
+from webots_mcp.errors import LeaseLostError
 from webots_mcp.queue import CLAIMED_BY_ENDED, EXPIRE, LOSE
 from webots_mcp.waiting_file import waiting_path
 
@@ -292,3 +296,101 @@ def end_session(connection: sqlite3.Connection, session_id: int, reason: str) ->
         connection.execute(END_RUN, {"id": run_id, "reason": reason, "rows": rows, **times})
     # Last: a process that is killed before this leaves a session that will be settled again.
     connection.execute(END_SESSION, {"id": session_id, "reason": reason})
+
+
+# Leases: one process at a time does a job, on whatever host; who is gone or stopped loses it.
+#
+# The holder renews its lease while it works. Where it does not any more, whatever the reason, the
+# lease runs out and another takes it. A holder that was only stopped finds out at its next write:
+# what it writes for the job, it writes with the lease in the same transaction (`still_held`).
+
+
+LEASE_S: Final = 30.0
+# One that ends later was taken before the clock was set back. It is not one lease from now: the
+# holder may renew after the asker looked at the clock and before its statement reads the row.
+_TIMES: Final = 2
+_TAKE: Final = (
+    "INSERT INTO lease (name, holder, until_wall_time_s) VALUES (:name, :holder, :until) "
+    "ON CONFLICT (name) DO UPDATE SET holder = :holder, until_wall_time_s = :until "
+    "WHERE holder = :holder OR until_wall_time_s NOT BETWEEN :now AND :latest "
+    "OR :forced OR holder LIKE :outranked"
+)
+_RENEW: Final = "UPDATE lease SET until_wall_time_s = ? WHERE name = ? AND holder = ?"
+_GIVE_BACK: Final = "DELETE FROM lease WHERE name = ? AND holder = ?"
+_HOLDER: Final = "SELECT holder FROM lease WHERE name = ? AND until_wall_time_s BETWEEN ? AND ?"
+_LOST: Final = (
+    "{} was taken over by another process{}, since this one had not renewed its lease for {:g} s: "
+    "it wrote nothing more"
+)
+
+
+class Lease(NamedTuple):
+    """The right to do a job.
+
+    Attributes:
+        name: Of the job.
+        holder: Of the process that does it, as no other has it.
+        lasts_s: Of wall time, each time that it is taken or renewed.
+    """
+
+    name: str
+    holder: str
+    lasts_s: float = LEASE_S
+
+    def latest_s(self, now_s: float) -> float:
+        """The latest wall time up to which a held lease may last."""
+        return now_s + _TIMES * self.lasts_s
+
+
+def lease_of(name: str) -> Lease:
+    """A lease that this process may take, by the name of the job."""
+    return Lease(name, f"{host_name()} {os.getpid()} {os.urandom(4).hex()}")
+
+
+def holder_of(connection: sqlite3.Connection, name: str) -> str | None:
+    """Who renewed the lease of that job lately; None where no process did."""
+    now_s = time.time()
+    row = connection.execute(_HOLDER, (name, now_s, now_s + _TIMES * LEASE_S)).fetchone()
+    return row and str(row[0])
+
+
+def take(
+    connection: sqlite3.Connection,
+    lease: Lease,
+    *,
+    forced: bool = False,
+    outranked: str | None = None,
+) -> bool:
+    """Take a lease, or renew it; False where another process has it.
+
+    Args:
+        connection: In the role "writer".
+        lease: The lease, and its holder.
+        forced: Take it from its holder, whose process is known to have ended.
+        outranked: Live holders from which it may be taken, as a pattern of SQL's LIKE.
+    """
+    now_s = time.time()
+    times = {"now": now_s, "until": now_s + lease.lasts_s, "latest": lease.latest_s(now_s)}
+    names = {"name": lease.name, "holder": lease.holder, "outranked": outranked}
+    return connection.execute(_TAKE, {**names, **times, "forced": forced}).rowcount > 0
+
+
+def give_back(connection: sqlite3.Connection, lease: Lease) -> None:
+    """Let others take it at once."""
+    connection.execute(_GIVE_BACK, (lease.name, lease.holder))
+
+
+@contextmanager
+def still_held(connection: sqlite3.Connection, lease: Lease) -> Generator[None]:
+    """A transaction for what only the holder may write; it renews the lease.
+
+    Raises:
+        LeaseLostError: Another process has taken it; nothing is written.
+    """
+    with transaction(connection):
+        values = (time.time() + lease.lasts_s, lease.name, lease.holder)
+        if connection.execute(_RENEW, values).rowcount == 0:
+            holder = holder_of(connection, lease.name)  # None where that one is done by now
+            by = f" ({holder})" if holder else ""
+            raise LeaseLostError(_LOST.format(lease.name, by, lease.lasts_s))
+        yield

@@ -24,11 +24,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Literal
 
-from webots_mcp.connection import CHECKPOINT_TIMEOUT_MS, connect, identify_files
+from webots_mcp.connection import (
+    CHECKPOINT_TIMEOUT_MS,
+    connect,
+    identify_files,
+    is_busy,
+    never_wait,
+    require_current,
+    text_of,
+)
 from webots_mcp.errors import WebotsMCPError, warn
-from webots_mcp.leases import Lease, give_back, take
-from webots_mcp.schema import require_current
-from webots_mcp.transactions import is_busy, never_wait, text_of
+from webots_mcp.liveness import Lease, give_back, take
 from webots_mcp.waiting_file import adopt
 
 INTERVAL_S: Final = 1.0

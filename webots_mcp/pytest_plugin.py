@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from webots_mcp.testing import RobotFactory, RobotRecording, SimulationFactory
 
 _PACKAGE = str(Path(__file__).parent) + os.sep
-_TESTING = _PACKAGE + "testing" + os.sep
+_TESTING = _PACKAGE + "testing.py"
 
 
 @pytest.fixture
@@ -154,7 +154,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_assertrepr_compare(op: str, left: object, right: object) -> list[str] | None:
     """Show a command's status with the reason, which pytest itself would cut off."""
-    asked = sys.modules.get("webots_mcp.testing.robot_recording")
+    asked = sys.modules.get("webots_mcp.testing")
     if asked is None or not isinstance(left, asked.CommandStatus):
         return None
     return [f"{left!r} {op} {right!r}"]

@@ -17,9 +17,9 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple, TypeVar
 
+from webots_mcp.connection import is_busy
 from webots_mcp.contract import COMMAND_TIME_TO_LIVE_S, FINAL_STATUSES, new_uuid
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.transactions import is_busy
 
 MAX_PARAMS_BYTES: Final = 65_536
 # A writer connection waits 5 s for the lock by itself; then the statement is sent again.

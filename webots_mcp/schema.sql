@@ -252,7 +252,7 @@ CREATE TABLE image (
 	run_id INTEGER NOT NULL, 
 	sim_time_s FLOAT NOT NULL, 
 	wall_time_s FLOAT NOT NULL, 
-	kind TEXT NOT NULL /* camera or screenshot */, 
+	kind TEXT NOT NULL /* camera, screenshot or kept (of a kept stretch) */, 
 	device TEXT /* name of the camera */, 
 	path TEXT NOT NULL /* relative to the data folder */, 
 	width INTEGER NOT NULL /* pixels */, 
@@ -342,7 +342,7 @@ CREATE TABLE retention_limit (
 	size_bytes BIGINT /* on the disk; of pictures their files */, 
 	row_count BIGINT, 
 	age_s FLOAT /* since it was recorded, in wall time */, 
-	outlive_factor FLOAT /* run only: what is left of one stays so many times longer than its states; 0 for ever */, 
+	outlive_factor FLOAT /* run only: what is left of one stays so many times longer than its chunks; 0 for ever */, 
 	set_by TEXT NOT NULL /* serve, prune or retain */, 
 	set_wall_time_s FLOAT NOT NULL, 
 	PRIMARY KEY (kind)

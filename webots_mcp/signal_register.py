@@ -1,18 +1,336 @@
-"""Writing the register of signals: every dotted name that a robot's states ever held.
+"""The register of signals: every dotted name that a robot's states ever held, and what it means.
 
-The bridge enters names when it first records them, and the maintainer those that came otherwise.
+A name and its values tell the kind and unit of a signal, the names of a robot together which of
+them tell how it moves (its roles). The bridge enters names when it first records them, and the
+maintainer those that came otherwise.
 
 Standard library only, because the bridge imports it inside a robot's controller.
 """
 
 from __future__ import annotations
 
+import json
+import math
+import re
 import sqlite3
-from collections.abc import Mapping
-from typing import Final, NamedTuple
+from collections.abc import Container, Iterable, Mapping, Sequence
+from functools import lru_cache
+from typing import Any, Final, Literal, NamedTuple, cast
 
-from webots_mcp.signal_kinds import Kind, unit_of, widen
-from webots_mcp.signal_roles import decide_roles
+from webots_mcp.naming import (
+    LONGEST_SPREAD_ARRAY,
+    METRES,
+    REDUCTIONS,
+    Value,
+    angle_unit,
+    in_snake_case,
+    is_seen_speed,
+    modes_in,
+    positions_in,
+    unit_in,
+    words_of,
+)
+
+# What a name and its values tell of a signal, and where its value stands in a recorded state.
+
+
+Kind = Literal["num", "bool", "text", "angle", "null"]
+MAX_ANGLE_RAD: Final = 6.3  # a value beyond is in degrees, or turns were counted
+MAX_YAW_RAD: Final = 3.2  # the last item of a pose that goes beyond is no yaw
+
+_END_OF_POSE: Final = re.compile(r"(^|[._])(?:pose|odom|odometry)\.([235])$")
+
+
+class Place(NamedTuple):
+    """Where a signal's value stands in a state row.
+
+    Attributes:
+        path: For `json_extract(state.data, path)`.
+        reduction: None, or how the long array at `path` becomes one number.
+    """
+
+    path: str
+    reduction: str | None
+
+
+def places(state: dict[str, Any]) -> dict[str, Place]:
+    """Where each leaf of a state stands; the same names as `flatten`, but slower."""
+    found: dict[str, Place] = {}
+    for key, value in state.items():
+        _locate(key, f"$.{_step(key)}", value, found)
+    return found
+
+
+def _locate(name: str, path: str, value: Any, found: dict[str, Place]) -> None:
+    prefix = f"{name}."
+    if isinstance(value, dict):
+        for key, item in cast("dict[str, Any]", value).items():
+            _locate(prefix + key, f"{path}.{_step(key)}", item, found)
+    elif not isinstance(value, list):
+        found[name] = Place(path, None)
+    elif len(cast("list[Any]", value)) <= LONGEST_SPREAD_ARRAY:
+        for index, item in enumerate(cast("list[Any]", value)):
+            _locate(f"{prefix}{index}", f"{path}[{index}]", item, found)
+    else:
+        for reduction in REDUCTIONS:
+            found[prefix + reduction] = Place(path, reduction)
+
+
+def _step(key: str) -> str:
+    if key.isidentifier() and key.isascii():
+        return key
+    return f'"{key}"' if is_reachable(key) else json.dumps(key, ensure_ascii=False)
+
+
+def is_reachable(name: str) -> bool:
+    """Whether a JSON path finds that name whatever the version of SQLite, however it is escaped."""
+    return not any(character in '"\\' or character < " " for character in name)
+
+
+def kind_of(name: str, value: Value, *, ends_pose: bool = False) -> Kind:
+    """What a single value says about its signal; an angle also by the signal's name.
+
+    Args:
+        name: Of the signal.
+        value: One that it had.
+        ends_pose: It is the yaw of a pose, if it is an angle at all: see `ends_pose`.
+    """
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return "bool"
+    if isinstance(value, str):
+        return "text"
+    limit = MAX_YAW_RAD if ends_pose else MAX_ANGLE_RAD if angle_unit(name) == "rad" else -1.0
+    return "angle" if abs(value) <= limit else "num"
+
+
+def turn_of(name: str, kind: Kind) -> float | None:
+    """A whole turn of an angle: 2 pi, or 360 where the name says degrees; else None."""
+    if kind == "angle":
+        return math.tau
+    return 360.0 if kind == "num" and angle_unit(name) == "deg" else None
+
+
+def ends_pose(name: str, names: Container[str]) -> bool:
+    """Whether it is the last of three, four or six items of a pose or of odometry.
+
+    There the yaw stands, if anywhere: `[x, y, yaw]`, `[x, y, z, yaw]`, `[x, y, z, roll, pitch,
+    yaw]`.
+    """
+    last = _END_OF_POSE.search(in_snake_case(name))
+    return last is not None and f"{name[:-1]}{int(last[2]) + 1}" not in names
+
+
+def widen(known: Kind, seen: Kind) -> Kind:
+    """The kind of a signal that was `known` when a value of kind `seen` comes."""
+    if known == seen or seen == "null":
+        return known
+    if known == "null":
+        return seen
+    return "text" if "text" in (known, seen) else "num"
+
+
+def unit_of(name: str, kind: Kind) -> str | None:
+    """The unit, where a part of the name ends in one (`speed_m_s`, `distance_m.left`)."""
+    if kind == "angle":
+        return "rad"
+    if kind != "num" or name.rpartition(".")[2] in ("count", "argmin"):
+        return None
+    return unit_in(name)
+
+
+# Which signals of a robot tell how it moves: decided here alone, by their names and kinds.
+#
+# The outcome stands in `signal.role`, where tools, views and pools read it:
+#
+#     x, y, z           position; z where it has one
+#     yaw               where the robot looks
+#     mode              what it is doing: a text, or a whole number with few different values
+#     commanded_speed   how fast it shall be
+#     speed             how fast it is; the name leaves open whether it is commanded or measured
+#     wheel             how fast one of its several wheels or driving motors turns
+#     commanded_wheel   how fast one of them shall turn
+#
+# The robot's other names decide as well: `pose.0` is x only beside `pose.1`. Where several signals
+# fit, a run may have the second alone, as its code was another: so each has a place in line, `x`
+# before `x2` (with `y2`, `z2`) up to `x9`, and the first that is there counts.
+
+
+PLACES: Final = ("", *(str(place) for place in range(2, 10)))  # in line for a role
+
+_TAIL: Final = r"([._](x|vx|linear|speed|velocity|m_s|mps)|\.v)*$"  # `_v` is in volts
+_COMMANDED: Final = re.compile(
+    r"(^|[._])(commanded|command|cmd|cmd_vel(\.linear)?(\.0)?|target_speed"
+    rf"|(speed|velocity)[._](setpoint|target|ref)){_TAIL}"
+)
+_SPEED: Final = re.compile(rf"(^|[._])(speed|velocity|linear){_TAIL}")
+_WHEEL: Final = re.compile(
+    r"(^|[._])(wheels?|(left|right)_motors?|motors?[._]?(left|right|\d)?)([._]|$)"
+)
+_NO_SPEED: Final = re.compile(  # of a wheel or a motor; and motors that move no robot
+    r"(^|[._])(position|pos|angle|encoders?|ticks?|odo\w*|distance|torque|force|current|power"
+    r"|temp\w*|radius|base|track|width|slip|contact|max|min|limit|gain|count|volt\w*"
+    r"|arm|gripper|hand|head|neck|joint|finger|lidar|camera|mast|lift)([._]|$)",
+)
+_SIDE: Final = r"(\d|[lr]|(front|rear|back)?_?(left|right))"
+_COMMANDED_WHEEL: Final = re.compile(
+    rf"(^|[._])(commands?|cmds?|commanded|target_speeds?)[._]{_SIDE}([._](speed|velocity|rad_s))*$"
+)
+_ANGLES: Final = ("rad", "deg", *METRES)  # units of where a wheel is, not of how fast it turns
+_THIRD_AXES: Final = {"0": "2", "x": "z", "x_m": "z_m", "x_cm": "z_cm", "x_mm": "z_mm"}
+_HEADING: Final = re.compile(r"(^|\.)(deg\w*_)?(heading|yaw|theta|bearing)[^.]*")
+_ALTITUDE: Final = ("altitude", "alt")
+_MOTIONS: Final = ("commanded_speed", "speed", "wheel", "commanded_wheel")
+_KEPT: Final = 4096  # names whose motion is remembered
+
+
+def decide_roles(
+    kinds: Mapping[str, Kind],
+    choices: Container[str] = (),
+    position: tuple[str, str] | None = None,
+) -> dict[str, str]:
+    """The role of each signal of a robot that has one.
+
+    Args:
+        kinds: Of all names that the robot has published.
+        choices: Of the numbers, those that are whole and have few different values.
+        position: x and y, where they are known already; else they are found by their names.
+    """
+    # A path in SQL does not reach all names, whatever the version of SQLite.
+    known: dict[str, Kind] = {name: kind for name, kind in kinds.items() if is_reachable(name)}
+    roles: dict[str, str] = {}
+    pairs = _positions(known)
+    if position is not None:
+        pairs = [position, *(pair for pair in pairs if pair != position)]
+    for (x, y), place in zip(_apart(pairs), PLACES, strict=False):
+        roles |= {x: f"x{place}", y: f"y{place}"}
+        if (z := _height(known, x, first=not place)) is not None:
+            roles.setdefault(z, f"z{place}")
+    _line_up(roles, "yaw", _yaws(known, pairs))
+    texts = [name for name, kind in known.items() if kind == "text"]
+    numbers = [name for name, kind in known.items() if kind == "num"]
+    _line_up(roles, "mode", modes_in(texts, [name for name in numbers if name in choices]))
+    _add_speeds(roles, numbers)
+    return roles
+
+
+def _line_up(roles: dict[str, str], role: str, names: Iterable[str]) -> None:
+    """Give a role to names that have none, the best first."""
+    free = (name for name in names if name not in roles)
+    roles.update({name: f"{role}{place}" for name, place in zip(free, PLACES, strict=False)})
+
+
+def _positions(known: Mapping[str, Kind]) -> list[tuple[str, str]]:
+    """Those that never held a number yet come last."""
+    held = {name for name, kind in known.items() if kind in ("num", "angle")}
+    numeric = held | {name for name, kind in known.items() if kind == "null"}
+    pairs = positions_in(held)
+    return pairs if len(held) == len(numeric) else [*pairs, *positions_in(numeric)]
+
+
+def _apart(pairs: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Those that share no name with one before them."""
+    taken: set[str] = set()
+    found: list[tuple[str, str]] = []
+    for pair in pairs:
+        if taken.isdisjoint(pair):
+            taken.update(pair)
+            found.append(pair)
+    return found
+
+
+def _height(known: Mapping[str, Kind], x: str, *, first: bool) -> str | None:
+    """The third of the position's numbers, or an altitude next to it; for the first at the top too.
+
+    The third of a pose or odometry of three is where it looks.
+    """
+    branch, _, axis = x.rpartition(".")
+    third = f"{branch}.{_THIRD_AXES.get(axis, '')}".removeprefix(".")
+    if known.get(third) == "num" and not ends_pose(third, known):
+        return third
+    branches = (branch, "") if first else (branch,)
+    altitudes = (name for name, kind in known.items() if kind == "num" and _is_altitude(name))
+    return min((each for each in altitudes if _branch_of(each) in branches), default=None)
+
+
+@lru_cache(maxsize=_KEPT)
+def _is_altitude(name: str) -> bool:
+    return words_of(name.rpartition(".")[2])[0] in _ALTITUDE
+
+
+def _branch_of(name: str) -> str:
+    return name.rpartition(".")[0]
+
+
+def _yaws(known: Mapping[str, Kind], pairs: Sequence[tuple[str, str]]) -> list[str]:
+    """Angles next to the first position; those whose names say so; those next to other positions.
+
+    Of each the shortest first.
+    """
+    angles = sorted(_angles(known), key=_shortest)
+    branches = [branch for x, _ in pairs if (branch := _branch_of(x))]
+    first = branches[0] if branches and _branch_of(pairs[0][0]) else None
+    beside = [name for name in angles if _branch_of(name) == first]
+    named = [name for name in angles if _says_heading(name)]
+    others = [name for name in angles if _branch_of(name) in branches]
+    return list(dict.fromkeys([*beside, *named, *others]))
+
+
+def _angles(known: Mapping[str, Kind]) -> list[str]:
+    return [name for name, kind in known.items() if turn_of(name, kind) is not None]
+
+
+@lru_cache(maxsize=_KEPT)
+def _says_heading(name: str) -> bool:
+    return _HEADING.search(in_snake_case(name)) is not None
+
+
+def _add_speeds(roles: dict[str, str], numbers: Iterable[str]) -> None:
+    """The first commanded speed is no wheel; of the others, a wheel is rather that."""
+    by_motion: dict[str, list[str]] = {each: [] for each in _MOTIONS}
+    for name in numbers:
+        for motion in _motions_of(name):
+            by_motion[motion].append(name)
+    commanded = sorted(by_motion["commanded_speed"], key=_shortest)
+    wheels = {name for name in by_motion["wheel"] if name not in roles}.difference(commanded[:1])
+    _line_up(roles, "commanded_speed", [name for name in commanded if name not in wheels])
+    _line_up(roles, "speed", sorted(by_motion["speed"], key=_shortest))
+    roles.update(dict.fromkeys(wheels, "wheel"))
+    roles.update(dict.fromkeys(by_motion["commanded_wheel"], "commanded_wheel"))
+
+
+@lru_cache(maxsize=_KEPT)
+def _motions_of(name: str) -> tuple[str, ...]:
+    """What a number may tell by its name."""
+    if is_seen_speed(name):
+        return ()
+    words = in_snake_case(name)
+    is_wheel = _WHEEL.search(words) is not None
+    if _COMMANDED_WHEEL.search(words) and not _NO_SPEED.search(words):
+        return ("commanded_wheel",)
+    if _COMMANDED.search(words):
+        found = ["commanded_speed"]
+    else:
+        found = ["speed"] if _SPEED.search(words) and not is_wheel else []
+    if is_wheel and not _NO_SPEED.search(words) and unit_in(name) not in _ANGLES:
+        found.append("wheel")
+    return tuple(found)
+
+
+def _shortest(name: str) -> tuple[int, str]:
+    return len(name), name
+
+
+def pair_in(roles: Container[str]) -> str | None:
+    """The place in line of the first position of which both x and y are there."""
+    return next((place for place in PLACES if f"x{place}" in roles and f"y{place}" in roles), None)
+
+
+def first_in(role: str, roles: Container[str]) -> str | None:
+    """The first in line for a role, of those that are there."""
+    return next((f"{role}{place}" for place in PLACES if f"{role}{place}" in roles), None)
+
 
 MAX_SIGNALS: Final = 2000  # of one robot: keys made of ids or times would grow without end
 MOST_CHOICES: Final = 20  # that a number which names a mode has

@@ -10,7 +10,7 @@ from typing import Final
 from tests.recordings.long import CYCLE_S, INTERVAL_S, build
 from tests.recordings.rover import WALL_START_S
 from webots_mcp.connection import connect
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 
 LINE_INTERVAL_S: Final = 1.0
 _PART_ROWS: Final = 16 * round(CYCLE_S / INTERVAL_S)  # whole cycles: the story goes on at a seam

@@ -16,9 +16,8 @@ from typing import Any, NamedTuple
 import webots_mcp
 from tests.benchmarks.rover import Rover
 from webots_mcp import MCPBridge
-from webots_mcp.connection import connect
+from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.schema import create_schema
 from webots_mcp.waiting_file import adopt
 
 PACKAGE = str(Path(webots_mcp.__file__).parent)

@@ -21,9 +21,8 @@ from tests.store.json_folder.conftest import Peer
 from webots_mcp.cli import main
 from webots_mcp.connection import connect
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.store.retention.notation import limit_text, parse_limit, size_text
-from webots_mcp.store.retention.policy import DEFAULT, Limit
-from webots_mcp.store.trials import Result, create_trial_set, finish_trial, trials_of
+from webots_mcp.store.parameters import Result, create_trial_set, finish_trial, trials_of
+from webots_mcp.store.retention import DEFAULT, Limit, limit_text, parse_limit, size_text
 
 Say = Callable[..., str]
 

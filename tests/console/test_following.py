@@ -21,10 +21,10 @@ import pytest
 
 from tests.recordings.rows import Recorded
 from tests.webots.server import WebotsServer
-from webots_mcp.console import console_follower
-from webots_mcp.console.console_follower import follow_console, job_of
+from webots_mcp import console
+from webots_mcp.console import follow_console, job_of
 from webots_mcp.contract import host_name
-from webots_mcp.leases import holder_of
+from webots_mcp.liveness import holder_of
 from webots_mcp.store.recording import Recording
 from webots_mcp.webots.instances import Instance
 
@@ -67,7 +67,7 @@ def until(condition: Callable[[], bool]) -> None:
 def at_short_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody else records these lines, and nothing has to be spared."""
     for interval in ("_HOLD_S", "_LOOK_S", "_SHORTEST_PAUSE_S"):
-        monkeypatch.setattr(console_follower, interval, 0.05)
+        monkeypatch.setattr(console, interval, 0.05)
 
 
 @pytest.fixture
@@ -118,7 +118,7 @@ def test_what_controllers_print_and_what_webots_says_become_rows_with_their_sour
 def test_of_what_was_said_before_it_is_told_that_nobody_knows_when(
     recorded: Recorded, follow: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(console_follower, "MOST_OLD_LINES", 2)
+    monkeypatch.setattr(console, "MOST_OLD_LINES", 2)
     with WebotsServer(streams=False) as server:
         begin_run(recorded, server.port)
         for each in range(5):
@@ -214,7 +214,7 @@ def test_who_does_not_answer_is_named_and_asked_again(
     greeting: bytes,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(console_follower, "_CONNECTING_S", 0.3)
+    monkeypatch.setattr(console, "_CONNECTING_S", 0.3)
     callers: list[socket.socket] = []
     with socket.create_server(("127.0.0.1", 0)) as door:
 

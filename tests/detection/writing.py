@@ -11,9 +11,9 @@ from typing import Any, Final
 
 from tests.detection.labelled import LabelledRun
 from tests.recordings.rover import WALL_PER_SIM, Recorder
-from webots_mcp.store.chunks.making import make_chunks
-from webots_mcp.store.retention.policy import Limit, Retention
-from webots_mcp.store.retention.purge import prune
+from webots_mcp.store.chunk_making import make_chunks
+from webots_mcp.store.purge import prune
+from webots_mcp.store.retention import Limit, Retention
 
 _INSERT: Final = (
     "INSERT INTO state (run_id, sim_time_s, wall_time_s, data, replaced) VALUES (?, ?, ?, ?, ?)"

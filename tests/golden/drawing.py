@@ -20,15 +20,14 @@ from tests.recordings.long import build as build_long
 from tests.recordings.rounds import record_rounds
 from tests.recordings.rover import Recorder, record_rover
 from webots_mcp import MCPBridge
-from webots_mcp.connection import connect
+from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import new_uuid
-from webots_mcp.schema import create_schema
 from webots_mcp.standin import InProcessRobot, InProcessSupervisor
 from webots_mcp.standin.in_process import InProcessSimulation
-from webots_mcp.store.chunks.making import make_chunks
-from webots_mcp.store.retention.policy import Limit, Retention
-from webots_mcp.store.retention.purge import prune
-from webots_mcp.store.trials import Result, create_trial_set, finish_trial, trials_of
+from webots_mcp.store.chunk_making import make_chunks
+from webots_mcp.store.parameters import Result, create_trial_set, finish_trial, trials_of
+from webots_mcp.store.purge import prune
+from webots_mcp.store.retention import Limit, Retention
 
 CHECKOUT: Final = Path(__file__).parents[2]
 _EXAMPLES: Final = CHECKOUT / "examples"

@@ -13,13 +13,12 @@ from bokeh.document import Document
 
 from tests.recordings.long import build
 from tests.recordings.rover import start_run
-from webots_mcp.connection import connect
+from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.plugins.page.chunk_maker import ChunkMaker
 from webots_mcp.plugins.page.tab import Tab
-from webots_mcp.schema import create_schema
-from webots_mcp.store.chunks.on_demand import LEAST_ROWS
-from webots_mcp.store.chunks.stored import watermark
+from webots_mcp.store.chunk_making import LEAST_ROWS
+from webots_mcp.store.chunks import watermark
 from webots_mcp.store.recording import Recording
 
 

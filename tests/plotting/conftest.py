@@ -11,7 +11,7 @@ import pytest
 
 from tests.memory import memory_connection
 from tests.recordings.rover import Recorder, record_rover
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 
 State = Callable[[float], dict[str, Any]]

@@ -22,7 +22,7 @@ from webots_mcp.plotting.path import Path, Place, headings, thinned
 from webots_mcp.plotting.signal_axes import SignalAxes
 from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
-from webots_mcp.store.chunks.making import chunk_whole_run
+from webots_mcp.store.chunk_making import chunk_whole_run
 
 
 def signals_of_run(connection: sqlite3.Connection, *names: str, **limits: Any) -> SignalAxes:

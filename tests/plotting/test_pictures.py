@@ -36,7 +36,7 @@ from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plotting.trajectory_axes import paint_trajectory
 from webots_mcp.questions.argument_types import RunIds
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 Ask = dict[str, Any]

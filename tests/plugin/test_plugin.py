@@ -140,7 +140,7 @@ def test_an_error_that_the_package_does_not_explain_keeps_its_frames(
         """
     )
     said = pytester.runpytest_subprocess("-p", "no:cacheprovider").stdout.str()
-    assert "robot_recording.py:" in said
+    assert "testing.py:" in said
 
 
 def test_a_marker_that_no_parameter_takes_fails_its_test(pytester: pytest.Pytester) -> None:

@@ -15,9 +15,9 @@ from webots_mcp.errors import (
     UnknownSignalError,
 )
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.chunks.making import chunk_whole_run
-from webots_mcp.store.retention.policy import Limit, Retention
-from webots_mcp.store.retention.purge import prune
+from webots_mcp.store.chunk_making import chunk_whole_run
+from webots_mcp.store.purge import prune
+from webots_mcp.store.retention import Limit, Retention
 from webots_mcp.testing import RobotRecording
 
 

@@ -17,7 +17,7 @@ from tests.pool.sqlite_target import SQLitePool, SQLiteTarget, pooled
 from tests.pool.sqlite_target import recorded as recorded_rows
 from tests.postgres import NoServerError, Server, running_server
 from tests.recordings.runs import Recorded
-from webots_mcp.connection import connect
+from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.plugins.pool.pool_contents import open_pool, open_target
 from webots_mcp.plugins.pool.shipping import Order, Report, ship

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.recordings.runs import Recorded
-from webots_mcp.connection import connect
+from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.plugins.pool.fetching import Fetched, fetch
 from webots_mcp.plugins.pool.pool_contents import Choice, meant
@@ -17,7 +17,6 @@ from webots_mcp.plugins.pool.pool_interface import Pool, Target
 from webots_mcp.plugins.pool.shipping import Order, Report, ship
 from webots_mcp.schema import create_schema
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.trials import Result, create_trial_set, finish_trial, trials_of
 
 
 class Lab:

@@ -29,16 +29,13 @@ from webots_mcp.plugins.pool import fetching
 from webots_mcp.plugins.pool.fetching import in_order
 from webots_mcp.plugins.pool.pool_contents import open_pool, open_target, pooled_runs
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
+from webots_mcp.store.parameters import find_trial_set, trials_of
+from webots_mcp.store.purge import prune
 from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.retention.policy import Limit, Retention
-from webots_mcp.store.retention.purge import prune
-from webots_mcp.store.trials import (
-    find_trial_set,
-    trials_of,
-)
+from webots_mcp.store.retention import Limit, Retention
 
 OF_RUN = ("kept_stretch", "kept_state", "log", "event", "image", "parameter_value", "state")
 LOCAL = {"id", "run_id", "session_id", "robot_id", "command_id", "trial_set_id", "path",

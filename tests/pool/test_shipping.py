@@ -14,7 +14,7 @@ from tests import unprivileged
 from tests.pool.conftest import Shipped
 from tests.pool.sqlite_target import SQLitePool, SQLiteTarget, pooled
 from tests.recordings.runs import states
-from webots_mcp.connection import connect
+from webots_mcp.connection import OLDER_SCHEMA, connect, create_schema
 from webots_mcp.contract import host_name, new_uuid
 from webots_mcp.errors import (
     DatabaseError,
@@ -30,7 +30,7 @@ from webots_mcp.schema import OLDER_SCHEMA, create_schema
 from webots_mcp.store.chunks.making import chunk_whole_run
 from webots_mcp.store.merging import merge
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.retention.shipped import read_shipped
+from webots_mcp.store.retention_plan import read_shipped
 
 
 def test_a_pool_at_full_rate_holds_every_row_as_the_recording_does(shipped: Shipped) -> None:

@@ -12,9 +12,8 @@ import pytest
 
 from tests.bridge.conftest import Recording
 from tests.processes.conftest import Start, has_states, last_number
-from webots_mcp.connection import connect
+from webots_mcp.connection import connect, create_schema
 from webots_mcp.liveness import reap
-from webots_mcp.schema import create_schema
 from webots_mcp.waiting_file import adopt
 
 COUNTING = """
@@ -258,7 +257,7 @@ CLAIMER = """
 import sqlite3, sys, time
 from webots_mcp.queue import CLAIM, PEEK
 from webots_mcp.connection import connect
-from webots_mcp.transactions import never_wait
+from webots_mcp.connection import never_wait
 from pathlib import Path
 
 connection = connect(Path(sys.argv[1]), "loop")

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from tests.recordings.rows import Recorded, RecordedRobot, insert
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 
 CYCLE_S: Final = 40.0  # 32 s on the way, 8 s at a dock
 STAND_S: Final = 8.0

@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from tests.recordings.rover import WALL_START_S, start_run
-from webots_mcp.connection import connect
-from webots_mcp.schema import create_schema
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.connection import connect, create_schema
+from webots_mcp.store.chunk_making import make_chunks
 
 INTERVAL_S: Final = 0.032
 CYCLE_S: Final = 100.0  # 70 s cruise, 6 s stuck within it, 10 s back up, 20 s turn

@@ -23,9 +23,8 @@ from PIL import Image
 
 from tests.recordings.rows import Recorded, RecordedRobot, insert
 from webots_mcp.server import create_server
-from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
-from webots_mcp.store.retention.limits import set_limits
-from webots_mcp.store.retention.policy import Limit
+from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
+from webots_mcp.store.retention import Limit, set_limits
 
 ROWS: Final = 60
 JSON_COLUMNS: Final = {

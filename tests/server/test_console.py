@@ -23,8 +23,8 @@ from tests.webots.conftest import (
     wait_for_line,
     write_project,
 )
-from webots_mcp.console import console_follower
-from webots_mcp.console.ownership import belongs
+from webots_mcp import console
+from webots_mcp.console import belongs
 from webots_mcp.server import create_server
 from webots_mcp.store.recording import Recording
 from webots_mcp.webots.instances import instances
@@ -40,8 +40,8 @@ import nothing_of_that_name
 @pytest.fixture(autouse=True)
 def looked_for_often(monkeypatch: pytest.MonkeyPatch) -> None:
     """A Webots that starts is followed at once, not five seconds later."""
-    monkeypatch.setattr(console_follower, "_FIRST_LOOK_S", 0.2)
-    monkeypatch.setattr(console_follower, "_LOOK_EVERY_S", 0.5)
+    monkeypatch.setattr(console, "_FIRST_LOOK_S", 0.2)
+    monkeypatch.setattr(console, "_LOOK_EVERY_S", 0.5)
 
 
 async def lines_with(client: Client, text: str, **arguments: object) -> list[list[Any]]:

@@ -12,8 +12,8 @@ from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask
 from tests.store.test_status import dead_pid
 from webots_mcp.server import create_server
-from webots_mcp.store.retention.policy import Limit, Retention
-from webots_mcp.store.retention.purge import prune
+from webots_mcp.store.purge import prune
+from webots_mcp.store.retention import Limit, Retention
 
 pytestmark = pytest.mark.anyio
 

@@ -12,8 +12,8 @@ from tests.memory import memory_connection
 from tests.recordings.rover import record_rover
 from tests.recordings.rows import Recorded
 from webots_mcp.contract import Database, MemoryDatabase
-from webots_mcp.store.chunks import making
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store import chunk_making
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading import frame_summary
 
 
@@ -56,7 +56,7 @@ CHUNK_ROWS = 100
 
 
 def _shorten_chunks(patched: pytest.MonkeyPatch) -> None:
-    patched.setattr(making, "GROUP_ROWS", CHUNK_ROWS)
+    patched.setattr(chunk_making, "GROUP_ROWS", CHUNK_ROWS)
 
 
 @pytest.fixture(params=["values", "chunks"])

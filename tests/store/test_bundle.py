@@ -17,14 +17,12 @@ from hypothesis import given, settings
 from tests.recordings.runs import Recorded
 from tests.store.export.test_export import STATES, publish
 from webots_mcp import MCPBridge
-from webots_mcp.connection import connect
+from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.errors import DatabaseError, InvalidInputError
-from webots_mcp.schema import create_schema
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.bundle import is_bundle, unpacked, write_bundle
-from webots_mcp.store.merging import merge, settled
-from webots_mcp.store.trials import Result, create_trial_set, finish_trial, trials_of
+from webots_mcp.store.merging import is_bundle, merge, settled, unpacked, write_bundle
+from webots_mcp.store.parameters import Result, create_trial_set, finish_trial, trials_of
 
 OF_RUN = ("state", "kept_stretch", "kept_state", "log", "event", "image", "parameter_value")
 # What a row is called, and where it stands, in each recording; and whether it is in chunks.
@@ -297,7 +295,7 @@ def test_what_is_no_part_of_a_bundle_is_not_unpacked(
     said: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("webots_mcp.store.bundle._HARMLESS_BYTES", 1_000_000)
+    monkeypatch.setattr("webots_mcp.store.merging._HARMLESS_BYTES", 1_000_000)
     with pytest.raises(InvalidInputError, match=said):
         here.take_in(changed(there.bundled(1), change))
     assert not here.database.exists()

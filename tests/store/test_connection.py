@@ -12,9 +12,15 @@ from pathlib import Path
 import pytest
 
 from tests.memory import memory_connection
-from webots_mcp.connection import connect
-from webots_mcp.schema import create_schema
-from webots_mcp.transactions import ShortWrites, Step, is_busy, is_damage, transaction
+from webots_mcp.connection import (
+    ShortWrites,
+    Step,
+    connect,
+    create_schema,
+    is_busy,
+    is_damage,
+    transaction,
+)
 
 LEASE = "INSERT INTO lease (name, holder, until_wall_time_s) VALUES (?, 'somebody', 0)"
 COUNT = "SELECT count(*) FROM lease"

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from tests.recordings.rows import Recorded, RecordedRobot
-from webots_mcp.store.console_lines import MOST_WAITING, ConsoleRows, Said
+from webots_mcp.store.logs import MOST_WAITING, ConsoleRows, Said
 
 HERE = "here:1234"
 NOW = time.time()

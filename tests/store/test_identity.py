@@ -15,12 +15,11 @@ import pytest
 
 from tests.bridge.conftest import heartbeat_now
 from webots_mcp import MCPBridge
-from webots_mcp.connection import connect
+from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import new_uuid
 from webots_mcp.liveness import process_identity
-from webots_mcp.schema import create_schema
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.json_folder.folder_import import import_folder
+from webots_mcp.store.json_folder import import_folder
 
 
 def is_random_uuid(text: str) -> bool:

@@ -12,7 +12,7 @@ import pytest
 
 from tests.recordings.rows import Recorded
 from webots_mcp.connection import connect
-from webots_mcp.leases import LEASE_S, Lease, give_back, holder_of, lease_of, still_held, take
+from webots_mcp.liveness import LEASE_S, Lease, give_back, holder_of, lease_of, still_held, take
 
 JOB = "trial set 1"
 

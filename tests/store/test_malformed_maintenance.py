@@ -12,10 +12,10 @@ from tests.recordings.rows import Recorded, insert
 from tests.server.malformed import NOT_UTF8, Damage
 from webots_mcp.liveness import dead_sessions
 from webots_mcp.maintenance import Maintainer
-from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
-from webots_mcp.store.retention.planning import plan
-from webots_mcp.store.retention.policy import Limit, Retention
-from webots_mcp.store.retention.purge import prune
+from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
+from webots_mcp.store.purge import prune
+from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_plan import plan
 from webots_mcp.waiting_file import FORMAT, adopt
 
 BLOB = b"\x00\xff\x01"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -12,14 +13,13 @@ import pytest
 
 from tests.recordings.runs import Recorded
 from webots_mcp import MCPBridge
-from webots_mcp.connection import connect
+from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import new_uuid
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.schema import create_schema
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
-from webots_mcp.store.merging import merge
-from webots_mcp.store.trials import (
+from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
+from webots_mcp.store.merging import merge, settled
+from webots_mcp.store.parameters import (
     Result,
     create_trial_set,
     fetch_trial_set,
@@ -127,6 +127,23 @@ def test_what_broke_off_is_not_there_at_all(
 
     target.execute("DROP TRIGGER full")
     assert len(merge(target, tmp_path / "here", source)) == 2
+
+
+@pytest.mark.parametrize(("silent_s", "open_sessions"), [(11.0, 0), (5.0, 1)])
+def test_a_session_of_another_host_is_over_once_its_last_heartbeat_is_old(
+    source: Path, silent_s: float, open_sessions: int
+) -> None:
+    """Of a computer that lost its power: no process ends it, and none here can be asked."""
+    is_open = "UPDATE {} SET ended_wall_time_s = NULL, end_reason = NULL WHERE {} = 2"
+    with closing(connect(source, "writer")) as connection:
+        connection.execute(is_open.format("session", "id"))
+        connection.execute(is_open.format("run", "session_id"))
+        beat = "UPDATE session SET host = 'elsewhere', last_seen_wall_time_s = ? WHERE id = 2"
+        connection.execute(beat, (time.time() - silent_s,))
+    with settled(source).reader() as connection:
+        for table in ("session", "run"):
+            left = f"SELECT count(*) FROM {table} WHERE ended_wall_time_s IS NULL"
+            assert connection.execute(left).fetchone() == (open_sessions,)
 
 
 def test_a_robot_that_records_here_just_now_keeps_its_name_for_itself(

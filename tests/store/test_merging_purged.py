@@ -14,16 +14,14 @@ from tests.recordings.answers import answers
 from tests.recordings.rounds import PART, ROWS, record_rounds
 from tests.recordings.rover import Recorder, rover_state, start_run
 from tests.store.retention.test_chunks import framed
-from webots_mcp.connection import connect
+from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.schema import create_schema
-from webots_mcp.store.bundle import unpacked, write_bundle
-from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
-from webots_mcp.store.merging import merge
+from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
+from webots_mcp.store.merging import merge, unpacked, write_bundle
+from webots_mcp.store.purge import prune
 from webots_mcp.store.questions.runs import run_info
-from webots_mcp.store.retention.policy import Limit, Retention
-from webots_mcp.store.retention.purge import prune
+from webots_mcp.store.retention import Limit, Retention
 
 SIGNALS = (
     "SELECT name, kind, unit, path, reduction, role FROM signal "

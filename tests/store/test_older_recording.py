@@ -14,7 +14,7 @@ import pytest
 from tests.older_recording import record_older
 from webots_mcp.cli import main
 from webots_mcp.connection import connect
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, find_range, whole_run

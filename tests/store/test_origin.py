@@ -12,9 +12,8 @@ import pytest
 from tests.recordings.rows import Recorded
 from webots_mcp import MCPBridge, connection
 from webots_mcp.cli import main
-from webots_mcp.connection import Role, connect, keep_deadline
+from webots_mcp.connection import Role, connect, keep_deadline, shipped_objects
 from webots_mcp.errors import DatabaseError, ForeignDatabaseError
-from webots_mcp.schema import shipped_objects
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.merging import merge
 from webots_mcp.store.questions.sql import describe_schema

@@ -10,7 +10,7 @@ from sqlalchemy.dialects import postgresql
 from sqlalchemy.schema import CreateIndex, CreateTable
 from sqlmodel import SQLModel
 
-from webots_mcp.schema import shipped_statements
+from webots_mcp.connection import shipped_statements
 from webots_mcp.store import models
 from webots_mcp.store.migrate import generated_statements
 

@@ -14,8 +14,8 @@ import pytest
 from tests.memory import memory_connection
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp.naming import USUAL_POSITIONS, find_position, flatten, metres_in
-from webots_mcp.store.chunks.making import chunk_whole_run
-from webots_mcp.store.detection.kinds import EventOptions
+from webots_mcp.store.chunk_making import chunk_whole_run
+from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.ranges import Subject

@@ -24,7 +24,7 @@ from webots_mcp import __version__
 from webots_mcp.plugins.cluster import dask_cluster as cluster
 from webots_mcp.plugins.cluster.dask_cluster import Needs, digest_of, packed, what_lacks
 from webots_mcp.server import create_server
-from webots_mcp.store.trials import Result
+from webots_mcp.store.parameters import Result
 
 __all__ = ["anyio_backend"]
 Write = Callable[[str], Path]

@@ -14,8 +14,8 @@ import pytest
 
 from tests.trials.conftest import Run, command, rows, wait_for_trial
 from webots_mcp.steering.trial_sets import set_facts
+from webots_mcp.store.parameters import Trial
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.trials import Trial
 from webots_mcp.trials.plan import Range, Search, TrialPlan
 from webots_mcp.trials.set_runner import next_parameters
 

@@ -14,7 +14,6 @@ from webots_mcp import liveness
 from webots_mcp.contract import host_name
 from webots_mcp.liveness import process_identity
 from webots_mcp.pauses import PAUSED
-from webots_mcp.transactions import transaction
 from webots_mcp.waiting_file import enter_robot, enter_session
 
 # -- the identity of a process ---------------------------------------------------------------------

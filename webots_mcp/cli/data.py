@@ -18,11 +18,11 @@ from webots_mcp.plugins import export_formats
 if TYPE_CHECKING:
     import sqlite3
 
+    from webots_mcp.store.purge import Purged
     from webots_mcp.store.reading.ranges import TimeRange
     from webots_mcp.store.recording import Recording
-    from webots_mcp.store.retention.planning import Plan
-    from webots_mcp.store.retention.policy import Retention
-    from webots_mcp.store.retention.purge import Purged
+    from webots_mcp.store.retention import Retention
+    from webots_mcp.store.retention_plan import Plan
 
     _Format = str
 else:
@@ -180,7 +180,6 @@ def _notes_of(wanted: TimeRange) -> list[str]:
 
 
 def _export_bundle(recorded: Where, part: Range, file: Path) -> _Written:
-    from webots_mcp.store.bundle import write_bundle
     from webots_mcp.store.export import placed
     from webots_mcp.store.reading.ranges import Scope, find_subject
 
@@ -238,7 +237,7 @@ def import_(
     and screenshots/ become one finished run; if a file is damaged, nothing does. It has no
     simulation times: they are counted in seconds of wall time from its earliest entry.
     """
-    from webots_mcp.store.bundle import is_bundle, unpacked
+    from webots_mcp.store.merging import is_bundle, unpacked
 
     if not source.is_file():
         return _import_folder(recorded, source, robot, as_json=json)
@@ -269,7 +268,7 @@ def _import_folder(recorded: Where, folder: Path, robot: str, *, as_json: bool) 
 
 def _import_recording(recorded: Where, source: Path) -> dict[str, Any]:
     """What the import has brought, of the runs that are in both recordings now."""
-    from webots_mcp.store.older_recording import converted, copy_breakpoints, is_older
+    from webots_mcp.store.migrate import converted, copy_breakpoints, is_older
 
     if not is_older(source):
         return _take_in(recorded, source, source.parent)
@@ -326,9 +325,8 @@ def prune(
     age spares the newest rows, as many as the options tell. Robots may record meanwhile. The MCP
     server does the same every few seconds.
     """
-    from webots_mcp.store.retention.limits import in_force, set_limits
-    from webots_mcp.store.retention.planning import plan
-    from webots_mcp.store.retention.usage import file_sizes
+    from webots_mcp.store.retention import in_force, set_limits
+    from webots_mcp.store.retention_plan import file_sizes, plan
 
     asked = limits.asked()
 
@@ -368,8 +366,7 @@ def retain(
     The limits belong to the database and hold at once, whoever maintains it; 'default' goes back
     to what holds where nothing is set. 'webots-mcp status' shows them.
     """
-    from webots_mcp.store.retention.limits import described, set_limits
-    from webots_mcp.store.retention.policy import mark_kept
+    from webots_mcp.store.retention import described, mark_kept, set_limits
 
     asked = limits.asked()
     if not run_ids and not asked:
@@ -386,7 +383,7 @@ def _prune(recording: Recording, connection: sqlite3.Connection, retention: Rete
     """Purge, with somebody who keeps the log of the database short meanwhile."""
     from webots_mcp.connection import CHECKPOINT_TIMEOUT_MS
     from webots_mcp.maintenance import Maintainer
-    from webots_mcp.store.retention.purge import prune as purge
+    from webots_mcp.store.purge import prune as purge
     from webots_mcp.store.robots import list_robots
 
     assert isinstance(recording.database, Path)
@@ -418,7 +415,7 @@ def _as_data(wanted: Plan) -> dict[str, Any]:
 
 
 def _print_plan(wanted: Plan, going: str) -> None:
-    from webots_mcp.store.retention.notation import size_text
+    from webots_mcp.store.retention import size_text
 
     rows = wanted.rows_by_table()
     table = [
@@ -460,7 +457,7 @@ def _on_disk(wanted: Plan, sizes: dict[str, int]) -> dict[str, Any]:
 
 
 def _print_disk(disk: dict[str, Any]) -> None:
-    from webots_mcp.store.retention.notation import size_text
+    from webots_mcp.store.retention import size_text
 
     def listed(sizes: dict[str, int]) -> str:
         return ", ".join(f"{name} {size_text(size)}" for name, size in sizes.items())
@@ -470,7 +467,7 @@ def _print_disk(disk: dict[str, Any]) -> None:
 
 
 def _print_purged(purged: Purged) -> None:
-    from webots_mcp.store.retention.notation import size_text
+    from webots_mcp.store.retention import size_text
 
     if purged.freed_bytes:
         print(f"{size_text(purged.freed_bytes)} of the database file freed")

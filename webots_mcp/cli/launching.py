@@ -193,7 +193,7 @@ class _Recorder(ExitStack):
 
     def begin(self) -> None:
         """Unless it has begun, or Webots does not listen yet."""
-        from webots_mcp.console.console_follower import follow_console
+        from webots_mcp.console import follow_console
 
         instance = None if self._begun else self._launched.webots.instance
         if instance is not None:

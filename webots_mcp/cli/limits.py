@@ -8,9 +8,15 @@ from typing import Annotated, Final
 
 from webots_mcp.cli.values import Parameter
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.store.retention.limits import Asked
-from webots_mcp.store.retention.notation import NO_LIMIT, limit_text, option_of, parse_limit
-from webots_mcp.store.retention.policy import DEFAULT, Limit
+from webots_mcp.store.retention import (
+    DEFAULT,
+    NO_LIMIT,
+    Asked,
+    Limit,
+    limit_text,
+    option_of,
+    parse_limit,
+)
 
 _BACK: Final = "default"
 _RUNS: Final = "outlive"
@@ -67,7 +73,7 @@ class Limits:
         str | None,
         _option(
             _RUNS,
-            "Keep what is left of a run this many times longer than its states ({}), or for ever: "
+            "Keep what is left of a run this many times longer than its chunks ({}), or for ever: "
             "all.",
         ),
     ] = None

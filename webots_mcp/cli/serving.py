@@ -20,7 +20,7 @@ from webots_mcp.errors import CommandRefusedError, WebotsMCPError
 
 if TYPE_CHECKING:
     from webots_mcp.contract import Database
-    from webots_mcp.store.retention.limits import Asked
+    from webots_mcp.store.retention import Asked
 
 
 _AS_BEFORE: Final = Limits()
@@ -128,7 +128,7 @@ def _ask_for(limits: Asked, database: Database, data_dir: Path) -> None:
     """Set the limits where that is this server's to do; say which others hold."""
     from webots_mcp.errors import NoDatabaseError
     from webots_mcp.store.recording import Recording
-    from webots_mcp.store.retention.limits import ask_at_start
+    from webots_mcp.store.retention import ask_at_start
 
     try:
         with Recording(database, data_dir).writer() as connection:

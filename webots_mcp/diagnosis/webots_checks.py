@@ -20,8 +20,7 @@ from webots_mcp.diagnosis.doctor import Examined, Finding, check, last_seen_s, w
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.pauses import PAUSED, SEEN_PAUSED, SEEN_RUNNING
 from webots_mcp.store.recording import View
-from webots_mcp.store.sessions import Session, companions
-from webots_mcp.store.status import SILENT
+from webots_mcp.store.robots import SILENT, Session, companions
 from webots_mcp.webots.installations import Installation, find_webots, installations
 from webots_mcp.webots.stream import address_of
 

@@ -59,7 +59,6 @@ from webots_mcp.store.questions.runs import (
     run_info,
 )
 from webots_mcp.store.recording import Recording, View, look
-from webots_mcp.store.trials import scored_runs
 
 RUN_COLUMNS: Final = (
     "run_id", "robot", "label", "parameters", "started", "began_by", "ended_by", "duration_s",

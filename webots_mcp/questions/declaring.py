@@ -29,9 +29,8 @@ from webots_mcp.errors import (
 from webots_mcp.questions.answers import Answer, ShownPicture
 from webots_mcp.questions.argument_types import SCOPE
 from webots_mcp.questions.shortening import compact_json
-from webots_mcp.store.invalid_rows import past_invalid_rows
 from webots_mcp.store.reading.ranges import Scope
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import Recording, past_invalid_rows
 
 if TYPE_CHECKING:
     from webots_mcp.steering.launcher import Companions

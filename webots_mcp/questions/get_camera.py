@@ -20,6 +20,7 @@ from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.images import StoredImage, camera_frames, cameras, inside
 from webots_mcp.store.reading.segment import just_after, kept_stretches
 from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.run_rows import StoredImage, camera_frames, cameras, inside
 
 _WAIT_S: Final = 15.0
 _MOST_RUNS: Final = 5

@@ -8,7 +8,7 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from webots_mcp.console.console_follower import console_state
+from webots_mcp.console import console_state
 from webots_mcp.contract import LogLevel, LogSource
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
 from webots_mcp.questions.answers import LogsAnswer, Table

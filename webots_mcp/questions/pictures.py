@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from webots_mcp.questions.answers import ShownPicture
-from webots_mcp.store.images import opened
+from webots_mcp.store.run_rows import opened
 
 if TYPE_CHECKING:
     from PIL.Image import Image as Picture

@@ -31,9 +31,8 @@ from webots_mcp.questions.shortening import (
 )
 from webots_mcp.store.reading.segment import newest_kept
 from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.robots import fetch_session, rows_waiting
 from webots_mcp.store.run_rows import State, newest_events, select
-from webots_mcp.store.sessions import fetch_session
-from webots_mcp.store.status import rows_waiting
 
 _PUBLISH: Final = (
     "nothing was recorded in this run yet: of the calls of bridge.publish({...}) in the "

@@ -17,8 +17,8 @@ from webots_mcp.questions.history_answers import RunAnswer
 from webots_mcp.questions.pictures import load_picture
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.steering.running import ACTION, require_possible
-from webots_mcp.store.images import camera_frames, inside
 from webots_mcp.store.recording import Recording
+from webots_mcp.store.run_rows import camera_frames, inside
 
 _WAIT_S: Final = 60.0
 _PICTURE_WAIT_S: Final = 8.0

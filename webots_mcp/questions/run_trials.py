@@ -18,7 +18,6 @@ from webots_mcp.steering import trial_sets
 from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.analysis.spread import Best
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.trials import TrialSet, fetch_trial_set, is_at_work, progress_of
 from webots_mcp.trials.plan import stored_world_plan
 
 _WAIT_S: Final = 60.0

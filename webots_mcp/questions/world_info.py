@@ -14,12 +14,18 @@ from webots_mcp.questions.budget import cut_for_a_model, fitting, room_tokens
 from webots_mcp.questions.declaring import READS, is_for_a_person, question
 from webots_mcp.questions.shortening import cut_text, round_number, shorten
 from webots_mcp.store.recording import GETTING_STARTED, Recording, View, name_of, storage, view_of
-from webots_mcp.store.retention.limits import described, unheeded
-from webots_mcp.store.retention.usage import file_sizes
-from webots_mcp.store.robots import WorldSeen, list_robots, world_seen
+from webots_mcp.store.retention import described, unheeded
+from webots_mcp.store.retention_plan import file_sizes
+from webots_mcp.store.robots import (
+    Session,
+    WorldSeen,
+    companions,
+    fetch_session,
+    list_robots,
+    rows_waiting,
+    world_seen,
+)
 from webots_mcp.store.run_rows import Run, count_runs, real_time_factor
-from webots_mcp.store.sessions import Session, companions, fetch_session
-from webots_mcp.store.status import rows_waiting
 
 _SHOWN_ROBOTS: Final = 50
 _SHOWN_IN_WORLD: Final = 40

@@ -14,7 +14,7 @@ from anyio import CancelScope, to_thread
 from mcp.server import CacheHint, MCPServer
 
 from webots_mcp import __version__
-from webots_mcp.console.console_follower import ConsoleWatch
+from webots_mcp.console import ConsoleWatch
 from webots_mcp.contract import Database
 from webots_mcp.errors import WebotsMCPError, warn
 from webots_mcp.liveness import reap_if_dead
@@ -26,11 +26,10 @@ from webots_mcp.server.resources import add_resources
 from webots_mcp.server.tools import ToolServer, tool_of
 from webots_mcp.steering.launcher import Companions, Launcher
 from webots_mcp.steering.trial_worker import TrialWorkers
-from webots_mcp.store.chunks.making import make_chunks
-from webots_mcp.store.chunks.on_demand import make_missing_chunks
+from webots_mcp.store.chunk_making import make_chunks, make_missing_chunks
+from webots_mcp.store.purge import Upkeep
 from webots_mcp.store.recording import OpenReaders, Recording
-from webots_mcp.store.retention.limits import Asked, ask_where_unset
-from webots_mcp.store.retention.upkeep import Upkeep
+from webots_mcp.store.retention import Asked, ask_where_unset
 
 INSTRUCTIONS: Final = (
     "A flight recorder and remote control for Webots robot simulations. Begin with "

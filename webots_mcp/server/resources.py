@@ -7,7 +7,7 @@ from contextlib import closing
 from mcp.server import MCPServer
 from mcp.server.mcpserver.exceptions import ResourceError
 
-from webots_mcp.connection import connect
+from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import MemoryDatabase
 from webots_mcp.errors import NoDatabaseError, WebotsMCPError
 from webots_mcp.schema import create_schema

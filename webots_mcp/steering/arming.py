@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from anyio import to_thread
 
-from webots_mcp import stored_breakpoints as stored
+from webots_mcp import pauses as stored
 from webots_mcp.conditions import Condition, parse_condition
 from webots_mcp.contract import BreakpointAction
 from webots_mcp.errors import CommandRefusedError, InvalidInputError

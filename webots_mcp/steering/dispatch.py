@@ -21,8 +21,7 @@ from webots_mcp.steering.running import ACTION as RUN
 from webots_mcp.steering.running import progress_of, run_facts
 from webots_mcp.steering.target_robot import find_target
 from webots_mcp.store.recording import Recording, View, look
-from webots_mcp.store.robots import robot_name
-from webots_mcp.store.status import handler_at_work
+from webots_mcp.store.robots import handler_at_work, robot_name
 
 Report = Callable[[float, float | None, str], Awaitable[None]]
 

@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 import anyio
 from anyio import to_thread
 
-from webots_mcp.console.ownership import belongs
+from webots_mcp.console import belongs
 from webots_mcp.contract import HEARTBEAT_LATE_S, UNMOVED
 from webots_mcp.errors import (
     AmbiguousRobotError,
@@ -26,9 +26,7 @@ from webots_mcp.questions.answers import CommandAnswer
 from webots_mcp.steering.request import CLAIMING_S, LEAST_S, UNCLAIMED, Request
 from webots_mcp.steering.target_robot import find_target
 from webots_mcp.store.recording import Recording, View, look
-from webots_mcp.store.robots import list_robots, live_observer
-from webots_mcp.store.sessions import Session
-from webots_mcp.store.status import find_holder
+from webots_mcp.store.robots import Session, find_holder, list_robots, live_observer
 from webots_mcp.webots.instances import Instance, instance_at, instances
 from webots_mcp.webots.key_presses import KEYS, press
 from webots_mcp.webots.stream import (

@@ -33,6 +33,7 @@ from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import Scope, Subject, TimeRange, find_range, whole_run
 from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.robots import fetch_session
 from webots_mcp.store.run_rows import State, state_at
 from webots_mcp.store.sessions import fetch_session
 

@@ -14,9 +14,7 @@ from webots_mcp.errors import AmbiguousRobotError, CommandRefusedError, InvalidI
 from webots_mcp.questions.answers import CommandAnswer
 from webots_mcp.steering.dispatch import Dispatcher, Report
 from webots_mcp.store.recording import Recording, look
-from webots_mcp.store.robots import list_robots
-from webots_mcp.store.sessions import Session
-from webots_mcp.store.status import find_holder
+from webots_mcp.store.robots import Session, find_holder, list_robots
 
 _WAIT_S: Final = 15.0  # of wall time
 _NO_SUPERVISOR: Final = (

@@ -11,9 +11,14 @@ from webots_mcp.contract import BUILT_IN_ACTIONS, ISSUED_TIME_TO_LIVE_S
 from webots_mcp.errors import CommandRefusedError, UnknownActionError
 from webots_mcp.naming import same_in_meaning
 from webots_mcp.store.recording import View, look
-from webots_mcp.store.robots import list_robots, robot_name, without_observers
-from webots_mcp.store.sessions import Session, companions
-from webots_mcp.store.status import find_holder
+from webots_mcp.store.robots import (
+    Session,
+    companions,
+    find_holder,
+    list_robots,
+    robot_name,
+    without_observers,
+)
 
 _SHOWN_ACTIONS: Final = 30
 _MAKE_ONE: Final = (

@@ -37,6 +37,7 @@ from webots_mcp.store.trials import (
     best_of,
     count_planned,
     create_trial_set,
+    declared_for,
     fetch_trial_set,
     find_trial_set,
     is_at_work,
@@ -44,6 +45,13 @@ from webots_mcp.store.trials import (
     stop_trial_set,
     trials_of,
 )
+from webots_mcp.store.questions.outcomes import way_of_run
+from webots_mcp.store.questions.score import require_kinds, unseen
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.snapshot import in_one_snapshot
+from webots_mcp.store.reading.subject import Subject
+from webots_mcp.store.recording import Recording, View, look
+from webots_mcp.store.robots import robot_name
 from webots_mcp.trials.plan import SCHEDULER, TrialPlan, WorldPlan, combinations
 
 CANCELLED: Final = "it was cancelled"

@@ -31,15 +31,20 @@ from webots_mcp.store.trials import (
     TrialSet,
     begin_trial,
     borrow_parameters,
+    described,
     fetch_trial_set,
     finish_trial,
     lay_down,
     next_trial,
+    parameters_of,
     put_back,
     stop_trial_set,
     take_up,
     trials_of,
 )
+from webots_mcp.store.questions.score import score_run
+from webots_mcp.store.recording import Job, Recording, View
+from webots_mcp.store.robots import robot_name
 from webots_mcp.trials.plan import TrialPlan, WorldPlan, stored_plan
 
 _LOOK_EVERY_S: Final = 0.02

@@ -10,26 +10,59 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+import tempfile
 import time
-from collections.abc import Generator
-from contextlib import contextmanager
-from pathlib import Path
-from typing import Any, Final
+import zipfile
+import zlib
+from collections.abc import Generator, Sequence
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path, PurePosixPath
+from typing import Any, Final, get_args
 
-from webots_mcp.contract import make_folder, whole_file
+from webots_mcp.connection import (
+    FrozenConnection,
+    connect,
+    create_schema,
+    require_shipped,
+    transaction,
+)
+from webots_mcp.contract import (
+    DATABASE_NAME,
+    PRIVATE_FILE,
+    REMOTE_SILENCE_S,
+    host_name,
+    make_folder,
+    whole_file,
+)
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.liveness import reap
-from webots_mcp.schema import require_shipped
-from webots_mcp.store.chunks.merged_run import take_in_chunks
-from webots_mcp.store.images import PICTURES, inside
+from webots_mcp.liveness import end_session, reap
+from webots_mcp.signal_register import Kind, Seen
+from webots_mcp.store.chunks import (
+    SIM_TIMES,
+    STATE_IDS,
+    WALL_TIMES,
+    DamagedChunkError,
+    Encoded,
+    Statistics,
+    decode,
+    decoded_of,
+    encode,
+    statistics_of,
+)
+from webots_mcp.store.export_rows import Progress
+from webots_mcp.store.parameters import fetch_trial_set, is_at_work
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.trials import fetch_trial_set, is_at_work
-from webots_mcp.transactions import transaction
+from webots_mcp.store.run_rows import MAX_FILE_BYTES, PICTURES, inside
+from webots_mcp.store.signals.registry import enter_signals
 from webots_mcp.waiting_file import adopt
 
 _SESSIONS: Final = (
     "SELECT id, uuid, robot_id FROM source.session s WHERE :run IS NULL "
     "OR id = (SELECT session_id FROM source.run WHERE id = :run) ORDER BY id"
+)
+_SILENT_ELSEWHERE: Final = (
+    "SELECT id FROM session WHERE ended_wall_time_s IS NULL AND host IS NOT ? "
+    "AND last_seen_wall_time_s < ?"
 )
 _NEW_RUNS: Final = (
     "SELECT id, uuid FROM source.run r WHERE session_id = :session AND (:run IS NULL OR id = :run) "
@@ -134,13 +167,19 @@ def merge(
 def settled(database: Path) -> Recording:
     """A recording with all rows that waited next to it, and its sessions ended that are over.
 
+    A session of another host is over when its last heartbeat is more than 10 s old.
+
     Raises:
         DatabaseError: There is none, or it is none of ours.
     """
     recording = Recording(database, database.parent)
     with recording.writer() as connection:
         adopt(connection, database)
-        reap(connection, time.time())
+        now_s = time.time()
+        silent = (host_name(), now_s - REMOTE_SILENCE_S)  # their processes cannot be asked
+        for (session_id,) in connection.execute(_SILENT_ELSEWHERE, silent).fetchall():
+            end_session(connection, session_id, "crashed")
+        reap(connection, now_s)
     return recording
 
 
@@ -342,3 +381,288 @@ def _copy_image_rows(connection: sqlite3.Connection, run_id: int, run: int, run_
     for image_id, path, _ in _images(connection, "r.id = ?", run_id):
         own = {"run_id": run, "path": _path_here(path, run_uuid)}
         _insert(connection, "image", "id = ?", image_id, own)
+
+
+# One run as a file to send: a ZIP archive with a small recording of its own and its pictures.
+
+
+_PIECE_BYTES: Final = 1_000_000
+# Rows that are all alike become a fiftieth of their size; who unpacks to far more wants to harm.
+_MOST_TIMES: Final = 100
+_HARMLESS_BYTES: Final = 100_000_000
+_LINK: Final = 0o120000  # of a file's type in Unix, as archives keep it
+END_SESSIONS: Final = (  # with the last of their runs that is here
+    "UPDATE session SET ended_wall_time_s = (SELECT max(ended_wall_time_s) FROM run "
+    "WHERE session_id = session.id), end_reason = 'finished' WHERE ended_wall_time_s IS NULL"
+)
+_DAMAGED: Final = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
+
+
+def write_bundle(
+    connection: sqlite3.Connection,
+    database: Path,
+    data_dir: Path,
+    run_id: int,
+    file: Path,
+    progress: Progress | None = None,
+) -> None:
+    """Write a run that is over: everything of it that `merge` takes in, and its pictures.
+
+    Where its session still records, the session in the bundle ends with the run.
+
+    Args:
+        connection: A reader of the recording.
+        database: The recording.
+        data_dir: The folder of its pictures.
+        run_id: The run.
+        file: To write to, in a folder with room for the rows that are not compressed.
+        progress: Called now and then with the bytes that are packed and that there are.
+
+    Raises:
+        InvalidInputError: The run goes on, or has no UUID.
+    """
+    with tempfile.TemporaryDirectory(prefix=".bundle-", dir=file.parent) as name:
+        folder = Path(name)
+        with small_recording(folder) as writer:
+            frozen = "&immutable=1" if isinstance(connection, FrozenConnection) else ""
+            address = f"{database.absolute().as_uri()}?mode=ro{frozen}"
+            merge(writer, folder, database, run_id=run_id, address=address, pictures=data_dir)
+            writer.execute(END_SESSIONS)
+        pack(folder, file, progress)
+
+
+@contextmanager
+def small_recording(folder: Path) -> Generator[sqlite3.Connection]:
+    """A new recording to write in that folder, in one file, and not to keep."""
+    with closing(connect(folder / DATABASE_NAME, "writer", create=True)) as writer:
+        create_schema(writer)
+        writer.execute("PRAGMA journal_mode=DELETE")  # all of it in the one file, written once
+        writer.execute("PRAGMA synchronous=OFF")  # a killed process leaves nothing worth keeping
+        yield writer
+
+
+def pack(folder: Path, file: Path, progress: Progress | None = None) -> None:
+    """Write only the database of a folder, which no process has open, and its pictures.
+
+    Args:
+        folder: Of the recording.
+        file: To write to.
+        progress: As in `write_bundle`.
+    """
+    found = [each for each in sorted(folder.rglob("*.*")) if _is_packed(each.relative_to(folder))]
+    packed, of = 0, sum(each.stat().st_size for each in found)
+    with zipfile.ZipFile(file, "w") as archive:
+        for each in found:
+            entry = zipfile.ZipInfo.from_file(each, each.relative_to(folder).as_posix())
+            is_picture = each.suffix.lower() in PICTURES  # is compressed already
+            entry.compress_type = zipfile.ZIP_STORED if is_picture else zipfile.ZIP_DEFLATED
+            with each.open("rb") as source, archive.open(entry, "w") as target:
+                while piece := source.read(_PIECE_BYTES):
+                    target.write(piece)
+                    packed += len(piece)
+                    if progress is not None:
+                        progress(packed, of)
+
+
+def _is_packed(path: Path) -> bool:
+    return str(path) == DATABASE_NAME or (len(path.parts) > 1 and path.suffix.lower() in PICTURES)
+
+
+def is_bundle(file: Path) -> bool:
+    """Whether a file is one, or says that it is: a damaged one is reported as such."""
+    return file.suffix.lower() == ".zip" or zipfile.is_zipfile(file)
+
+
+@contextmanager
+def unpacked(file: Path) -> Generator[Path]:
+    """The database of a bundle with its pictures next to it, for the duration of the block.
+
+    Nothing is trusted: what is no database of ours and no picture, leads out of the folder, is a
+    link or unpacks to far more than it holds is refused before anything is written.
+
+    Raises:
+        InvalidInputError: It is damaged or no bundle, or there is no room to unpack it.
+    """
+    with tempfile.TemporaryDirectory(prefix="webots-mcp-") as name:
+        unpack(file, Path(name))
+        yield Path(name) / DATABASE_NAME
+
+
+def unpack(file: Path, folder: Path) -> None:
+    """Unpack a bundle as `unpacked` does; a process killed meanwhile leaves no database there.
+
+    Raises:
+        InvalidInputError: As there.
+    """
+    aside = folder / f"{DATABASE_NAME}.part"
+    try:
+        with zipfile.ZipFile(file) as archive:
+            _require_ours(file, archive)
+            for entry in archive.infolist():
+                is_database = entry.filename == DATABASE_NAME
+                target = aside if is_database else folder / entry.filename
+                target.parent.mkdir(parents=True, exist_ok=True)
+                with archive.open(entry) as source, target.open("wb") as sink:
+                    target.chmod(PRIVATE_FILE)
+                    shutil.copyfileobj(source, sink, _PIECE_BYTES)
+        aside.replace(folder / DATABASE_NAME)
+    except _DAMAGED as error:
+        raise InvalidInputError(f"{file} is damaged, or no ZIP archive: {error}") from error
+    except OSError as error:
+        raise InvalidInputError(f"{file} cannot be unpacked in {folder}: {error}") from error
+
+
+def _require_ours(file: Path, archive: zipfile.ZipFile) -> None:
+    entries = archive.infolist()
+    names = [entry.filename for entry in entries]
+    if DATABASE_NAME not in names:
+        raise InvalidInputError(
+            f"{file} holds no {DATABASE_NAME}: it is not a bundle of 'webots-mcp export -o RUN.zip'"
+        )
+    for entry in entries:
+        if not _is_ours(entry):
+            raise InvalidInputError(
+                f"{file} holds {entry.filename!r}, which no bundle does: it is not unpacked"
+            )
+    if len(set(names)) < len(names):
+        raise InvalidInputError(f"{file} holds a name twice, which no bundle does")
+    size = sum(entry.file_size for entry in entries)
+    if size > max(_HARMLESS_BYTES, _MOST_TIMES * file.stat().st_size):
+        raise InvalidInputError(
+            f"{file} would unpack to {size:,} bytes, which no bundle of its size does"
+        )
+
+
+def _is_ours(entry: zipfile.ZipInfo) -> bool:
+    path = PurePosixPath(entry.filename)
+    if entry.filename == DATABASE_NAME:
+        return not _is_link(entry)
+    plain = not path.is_absolute() and ".." not in path.parts and len(path.parts) > 1
+    named = plain and not any(sign in entry.filename for sign in "\\:\0")
+    fits = path.suffix.lower() in PICTURES and entry.file_size <= MAX_FILE_BYTES
+    return named and fits and not _is_link(entry)
+
+
+def _is_link(entry: zipfile.ZipInfo) -> bool:
+    return entry.external_attr >> 16 & 0o170000 == _LINK
+
+
+# The chunks of a merged run: of one of another recording, whose rows are not all there any more.
+#
+# The other recording is attached as `source`. Its signals are found here by their names, or
+# entered. Row groups name state rows by ids, also those that are gone: so all ids of the run rise
+# alike here, beyond those that were ever given, and what came before what remains so.
+
+
+# Ids between the first and the last row of a run; other robots could not have recorded more.
+_MOST_IDS: Final = 2**40
+_IDS: Final = (
+    "SELECT min(id), max(id) FROM (SELECT id FROM source.state WHERE run_id = :run UNION ALL "
+    "SELECT max_state_id FROM source.row_group WHERE run_id = :run "
+    f"UNION ALL SELECT CAST(min AS INTEGER) FROM source.chunk WHERE run_id = :run "
+    f"AND signal_id = {STATE_IDS})"
+)
+_LAST_HERE: Final = "SELECT coalesce(max(seq), 0) FROM main.sqlite_sequence WHERE name = 'state'"
+_RESERVE: Final = (
+    "DELETE FROM main.sqlite_sequence WHERE name = 'state'",
+    "INSERT INTO main.sqlite_sequence (name, seq) VALUES ('state', ?)",
+)
+_SIGNALS: Final = (
+    "SELECT name, path, reduction, kind, role, first_seen_wall_time_s FROM source.signal s "
+    "WHERE robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
+    f"AND typeof(name) = 'text' AND kind IN {get_args(Kind)} "
+    "AND EXISTS (SELECT 1 FROM source.chunk WHERE run_id = :run AND signal_id = s.id) ORDER BY id"
+)
+_MAP: Final = "CREATE TEMP TABLE IF NOT EXISTS signal_here (there INTEGER PRIMARY KEY, here)"
+_FILL_MAP: Final = (
+    "INSERT INTO temp.signal_here SELECT s.id, n.id FROM source.signal s JOIN main.signal n "
+    "ON n.robot_id = :here AND n.name = s.name "
+    "WHERE s.robot_id = (SELECT robot_id FROM source.run WHERE id = :run) "
+    f"UNION ALL VALUES ({SIM_TIMES}, {SIM_TIMES}), ({WALL_TIMES}, {WALL_TIMES})"
+)
+_GROUP: Final = (
+    "start_sim_time_s, end_sim_time_s, row_count, stored_row_count, lost_value_count, "
+    "stored_row_bytes, chunk_bytes, "
+    "is_complete"
+)
+_GROUPS: Final = "SELECT id, row_count FROM source.row_group WHERE run_id = ? AND is_complete = 1"
+_COPY_GROUP: Final = (
+    f"INSERT INTO main.row_group (run_id, last_state_id, max_state_id, {_GROUP}) "
+    f"SELECT :run, last_state_id + :shift, max_state_id + :shift, {_GROUP} "
+    "FROM source.row_group WHERE id = :group"
+)
+_PACKED: Final = "codec, numbers, codes, labels"
+_VALUES: Final = f"{', '.join(Statistics._fields)}, {_PACKED}"
+_COPY_CHUNKS: Final = (
+    f"INSERT INTO main.chunk (group_id, run_id, signal_id, {_VALUES}) "
+    f"SELECT :here, :run, m.here, {_VALUES} FROM source.chunk c "
+    "JOIN temp.signal_here m ON m.there = c.signal_id WHERE c.group_id = :group"
+)
+_STATE_IDS: Final = (
+    f"SELECT {_PACKED} FROM source.chunk WHERE group_id = ? AND signal_id = {STATE_IDS}"
+)
+_INSERT: Final = (
+    f"INSERT INTO main.chunk (group_id, run_id, signal_id, {_VALUES}) "
+    f"VALUES ({', '.join('?' * (3 + len(_VALUES.split(','))))})"
+)
+
+
+def take_in_chunks(connection: sqlite3.Connection, there: int, here: int, robot_id: int) -> int:
+    """Take in the row groups and chunks of a run, and the names of their signals.
+
+    Args:
+        connection: In a transaction; the other recording is attached.
+        there: The run's id in the other recording.
+        here: Its id here; none of its state rows is here yet.
+        robot_id: Its robot here.
+
+    Returns:
+        By how much the ids of its state rows rise here.
+
+    Raises:
+        InvalidInputError: Its ids are spread as no bridge gives them.
+    """
+    shift = _reserve_ids(connection, there)
+    asked = {"run": there, "here": robot_id}
+    seen = {
+        name: Seen(path, reduction, kind, (role or "").startswith("mode"), first_s)
+        for name, path, reduction, kind, role, first_s in connection.execute(_SIGNALS, asked)
+    }
+    enter_signals(connection, robot_id, seen)
+    connection.execute(_MAP)
+    connection.execute("DELETE FROM temp.signal_here")
+    connection.execute(_FILL_MAP, asked)
+    for group, rows in connection.execute(_GROUPS, (there,)).fetchall():
+        values: dict[str, Any] = {"run": here, "shift": shift, "group": group}
+        values["here"] = connection.execute(_COPY_GROUP, values).lastrowid
+        connection.execute(_COPY_CHUNKS, values)
+        packed = connection.execute(_STATE_IDS, (group,)).fetchone()
+        if packed is not None:
+            with suppress(DamagedChunkError):  # who reads them is told that they are missing
+                shifted = _shifted(packed, rows, shift)
+                connection.execute(_INSERT, (values["here"], here, STATE_IDS, *shifted))
+    return shift
+
+
+def _shifted(packed: Sequence[Any], rows: int, shift: int) -> tuple[Any, ...]:
+    """A chunk of ids that are so much greater."""
+    numbers = decode(Encoded(*packed), rows).numbers.tolist()
+    ids = [int(number) + shift for number in numbers]
+    return *statistics_of(decoded_of(ids)), *encode(ids)
+
+
+def _reserve_ids(connection: sqlite3.Connection, there: int) -> int:
+    (last_here,) = connection.execute(_LAST_HERE).fetchone()
+    first, last = connection.execute(_IDS, {"run": there}).fetchone()
+    if first is None:
+        return 0
+    if last - first > _MOST_IDS:
+        raise InvalidInputError(
+            f"the ids of run {there}'s state rows reach from {first} to {last}, which no bridge "
+            "gives: the recording is damaged"
+        )
+    shift = last_here + 1 - first
+    delete, insert = _RESERVE
+    connection.execute(delete)
+    connection.execute(insert, (last + shift,))
+    return shift

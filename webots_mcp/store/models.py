@@ -23,15 +23,14 @@ from sqlalchemy import (
 )
 from sqlmodel import Field, SQLModel
 
+from webots_mcp.store.chunks import Statistics
+
 SQLModel.metadata.naming_convention = {
     "ix": "ix_%(table_name)s_%(column_0_N_name)s",
     "fk": "fk_%(table_name)s_%(column_0_name)s",
     "uq": "uq_%(table_name)s_%(column_0_name)s",
 }
-STATISTICS = (
-    "row_count", "value_count", "change_count", "first", "last", "min", "max", "sum",
-    "squared_deviations", "largest_step",
-)  # fmt: skip
+STATISTICS = Statistics._fields
 _KEEP_IDS = {"sqlite_autoincrement": True}
 _UUID = "random (version 4); names the row among those of all machines"
 
@@ -410,7 +409,7 @@ class Image(SQLModel, table=True):
     run_id: int = _to("run")
     sim_time_s: float = _number(nullable=False)
     wall_time_s: float = _number(nullable=False)
-    kind: str = _text("camera or screenshot", nullable=False)
+    kind: str = _text("camera, screenshot or kept (of a kept stretch)", nullable=False)
     device: str | None = _text("name of the camera")
     path: str = _text("relative to the data folder", nullable=False)
     width: int = _column(Integer, "pixels", nullable=False)
@@ -529,7 +528,7 @@ class RetentionLimit(SQLModel, table=True):
     row_count: int | None = _column(BigInteger)
     age_s: float | None = _number("since it was recorded, in wall time")
     outlive_factor: float | None = _number(
-        "run only: what is left of one stays so many times longer than its states; 0 for ever"
+        "run only: what is left of one stays so many times longer than its chunks; 0 for ever"
     )
     set_by: str = _text("serve, prune or retain", nullable=False)
     set_wall_time_s: float = _number(nullable=False)

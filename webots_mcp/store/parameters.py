@@ -1,16 +1,30 @@
-"""Parameters: what a controller declares, and the values that they had in its runs."""
+"""Parameters: what a controller declares, what they were in its runs, and trials that vary them."""
 
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
+import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.errors import InvalidInputError
+from webots_mcp.connection import transaction
+from webots_mcp.contract import host_name, new_uuid
+from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
+from webots_mcp.liveness import (
+    Lease,
+    give_back,
+    holder_of,
+    lease_of,
+    process_alive,
+    process_identity,
+    take,
+)
 from webots_mcp.parameter import Declaration, Value, require_known
-from webots_mcp.store.run_rows import Run
+from webots_mcp.store.analysis.ranking import Best, Outcome, Ranking, rank
+from webots_mcp.store.run_rows import Run, columns_of
 
 COLUMNS: Final = (
     "name", "value", "unit", "default", "low", "high", "choices", "next", "since_s", "set_by",
@@ -208,3 +222,344 @@ def _declared(row: tuple[Any, ...]) -> Declared:
 
 def _text(value: Value) -> str:
     return json.dumps(value, ensure_ascii=False) if isinstance(value, (bool, str)) else f"{value:g}"
+
+
+# Trial sets and their trials: what is planned, what goes on, and what came of it.
+
+
+_NEW_SET: Final = (
+    "INSERT INTO trial_set (uuid, plan, created_wall_time_s, robot_id) VALUES (?, ?, ?, ?) "
+    "RETURNING id"
+)
+_NEW_TRIAL: Final = (
+    "INSERT INTO trial (trial_set_id, uuid, number, parameters, status) "
+    "VALUES (?, ?, ?, ?, 'waiting')"
+)
+_NEWEST: Final = "SELECT max(id) FROM trial_set WHERE plan = coalesce(?, plan)"
+_OF_ROBOT: Final = "SELECT id FROM trial_set WHERE robot_id = ? ORDER BY id DESC"
+_STOP: Final = "UPDATE trial_set SET stop_reason = ? WHERE id = ?"
+_BORROW: Final = "UPDATE trial_set SET session_id = ?, former_values = ? WHERE id = ?"
+_WORK: Final = "UPDATE trial_set SET host = ?, pid = ?, process = ? WHERE id = ?"
+_FORGET: Final = "UPDATE trial SET pid = NULL, process = NULL WHERE trial_set_id = ?"
+_BEGIN: Final = (
+    "UPDATE trial SET status = 'running', started_wall_time_s = ?, pid = ?, process = ? "
+    "WHERE id = ?"
+)
+_PUT_BACK: Final = (
+    "UPDATE trial SET status = 'waiting', started_wall_time_s = NULL, pid = NULL, process = NULL "
+    "WHERE id = ? AND status = 'running'"
+)
+_FINISH: Final = (
+    "UPDATE trial SET status = :status, run_id = :run_id, score = :score, ended_by = :ended_by, "
+    "ended_sim_time_s = :ended_sim_time_s, error = :error, finished_wall_time_s = :now, "
+    "pid = NULL, process = NULL WHERE id = :id"
+)
+_LABEL: Final = "UPDATE run SET label = coalesce(label, ?) WHERE id = ?"
+
+
+@dataclass(frozen=True)
+class TrialSet:
+    """Runs with chosen parameters. Columns as in `store.models`; two are JSON text."""
+
+    id: int
+    uuid: str
+    plan: str
+    created_wall_time_s: float
+    host: str | None
+    pid: int | None
+    process: str | None
+    robot_id: int | None
+    session_id: int | None
+    former_values: str | None
+    stop_reason: str | None
+
+    @property
+    def job(self) -> str:
+        """The name of the lease for working on it."""
+        return f"trial set {self.id}"
+
+    @property
+    def is_left(self) -> bool:
+        """Whether the process that worked on it is known to be gone, without waiting."""
+        if self.pid is None:
+            return True
+        return self.host == host_name() and not process_alive(self.pid, self.process, time.time())
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One run of a trial set. Columns as in `store.models`; `parameters` is JSON text."""
+
+    id: int
+    trial_set_id: int
+    uuid: str
+    number: int
+    parameters: str
+    status: str
+    run_id: int | None
+    score: float | None
+    ended_by: str | None
+    ended_sim_time_s: float | None
+    error: str | None
+    started_wall_time_s: float | None
+    finished_wall_time_s: float | None
+    pid: int | None
+    process: str | None
+
+    @property
+    def values(self) -> dict[str, Any]:
+        """The parameters."""
+        return json.loads(self.parameters)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it need not be run any more."""
+        return self.status in ("done", "failed", "pruned")
+
+
+@dataclass(frozen=True)
+class Result:
+    """What became of a trial: a score, or an error.
+
+    Attributes:
+        error: Why there is no score.
+        ended_by: `for_s`, `until` or `prune`; None where it did not come to an end.
+        pruned: It was ended early because it was not worth going on with.
+    """
+
+    run_id: int | None
+    score: float | None
+    error: str | None
+    ended_by: str | None = None
+    ended_sim_time_s: float | None = None
+    pruned: bool = False
+
+    @property
+    def status(self) -> str:
+        """Of the trial, with this."""
+        if self.pruned:
+            return "pruned"
+        return "failed" if self.score is None else "done"
+
+
+_SET: Final = f"SELECT {columns_of(TrialSet)} FROM trial_set WHERE id = ?"
+_NEXT: Final = (
+    f"SELECT {columns_of(Trial)} FROM trial WHERE trial_set_id = ? AND status IN ('running', "
+    "'waiting') ORDER BY status = 'waiting', number LIMIT 1"
+)
+_PROGRESS: Final = (
+    "SELECT count(finished_wall_time_s), count(*), (SELECT score FROM trial WHERE trial_set_id = "
+    "t.trial_set_id ORDER BY finished_wall_time_s DESC LIMIT 1) FROM trial t WHERE trial_set_id = ?"
+)
+_TRIALS: Final = f"SELECT {columns_of(Trial)} FROM trial WHERE trial_set_id = ? ORDER BY number"
+
+
+def create_trial_set(
+    connection: sqlite3.Connection,
+    plan: str,
+    parameters: list[dict[str, Any]],
+    robot_id: int | None = None,
+) -> int:
+    """Enter a set and its trials, in the order in which they are to be run; returns its id.
+
+    Args:
+        connection: In the role "writer".
+        plan: JSON text.
+        parameters: Of each trial.
+        robot_id: In whose simulation they run; None where each has one of its own.
+
+    Raises:
+        CommandRefusedError: Another set of that robot is not over.
+    """
+    with transaction(connection):
+        if robot_id is not None:
+            _require_free(connection, robot_id)
+        values = (new_uuid(), plan, time.time(), robot_id)
+        set_id = int(connection.execute(_NEW_SET, values).fetchone()[0])
+        for number, values in enumerate(parameters, 1):
+            _enter(connection, set_id, number, values)
+    return set_id
+
+
+def add_trial(connection: sqlite3.Connection, set_id: int, values: dict[str, Any]) -> Trial:
+    """Enter one more trial of a set that is searched as it goes on."""
+    _enter(connection, set_id, len(trials_of(connection, set_id)) + 1, values)
+    return trials_of(connection, set_id)[-1]
+
+
+def _enter(
+    connection: sqlite3.Connection, set_id: int, number: int, values: dict[str, Any]
+) -> None:
+    text = json.dumps(values, ensure_ascii=False)
+    connection.execute(_NEW_TRIAL, (set_id, new_uuid(), number, text))
+
+
+def _require_free(connection: sqlite3.Connection, robot_id: int) -> None:
+    """In one simulation one set at a time."""
+    for (set_id,) in connection.execute(_OF_ROBOT, (robot_id,)).fetchall():
+        found = fetch_trial_set(connection, set_id)
+        if is_at_work(connection, found):
+            raise CommandRefusedError(
+                f"trial set {set_id} of this robot is under way: wait for it with "
+                f"webots_run_trials(trial_set={set_id}), or end it with cancel=true"
+            )
+        is_left = found.stop_reason is None and next_trial(connection, set_id) is not None
+        if is_left or found.former_values is not None:
+            why = found.stop_reason or "its server ended"
+            raise CommandRefusedError(
+                f"trial set {set_id} of this robot is not over ({why}): "
+                f"webots_run_trials(trial_set={set_id}) continues it, cancel=true ends it"
+            )
+
+
+def find_trial_set(connection: sqlite3.Connection, plan: str | None = None) -> int | None:
+    """The newest set with exactly this plan; without one the newest of all."""
+    return connection.execute(_NEWEST, (plan,)).fetchone()[0]
+
+
+def fetch_trial_set(connection: sqlite3.Connection, set_id: int) -> TrialSet:
+    """The set of that id.
+
+    Raises:
+        InvalidInputError: There is none.
+    """
+    row = connection.execute(_SET, (set_id,)).fetchone()
+    if row is None:
+        newest = find_trial_set(connection)
+        there = "none was begun" if newest is None else f"the newest is {newest}"
+        raise InvalidInputError(f"there is no trial set {set_id}: {there}")
+    return TrialSet(*row)
+
+
+def is_at_work(connection: sqlite3.Connection, found: TrialSet) -> bool:
+    """Whether a process works on a set: it is alive, as far as is known, and renews its lease."""
+    return not found.is_left and holder_of(connection, found.job) is not None
+
+
+def next_trial(connection: sqlite3.Connection, set_id: int) -> Trial | None:
+    """The trial that is to be run next, or was begun; None where all are over."""
+    row = connection.execute(_NEXT, (set_id,)).fetchone()
+    return Trial(*row) if row else None
+
+
+def stop_trial_set(connection: sqlite3.Connection, set_id: int, reason: str | None) -> None:
+    """Say why a set does not go on after its current trial; None has it go on."""
+    connection.execute(_STOP, (reason, set_id))
+
+
+def borrow_parameters(
+    connection: sqlite3.Connection, set_id: int, session_id: int, former: dict[str, Any] | None
+) -> None:
+    """Note what the parameters of a controller were before; None once they are so again."""
+    text = None if former is None else json.dumps(former, ensure_ascii=False)
+    connection.execute(_BORROW, (session_id, text, set_id))
+
+
+def trials_of(connection: sqlite3.Connection, set_id: int) -> list[Trial]:
+    """The trials of a set, in order.
+
+    Raises:
+        InvalidInputError: There is no such set.
+    """
+    fetch_trial_set(connection, set_id)
+    return [Trial(*row) for row in connection.execute(_TRIALS, (set_id,)).fetchall()]
+
+
+def take_up(connection: sqlite3.Connection, set_id: int) -> Lease:
+    """Become the process that works on a set, as long as it renews the lease.
+
+    Raises:
+        CommandRefusedError: Another one does.
+    """
+    with transaction(connection):
+        found = fetch_trial_set(connection, set_id)
+        lease = lease_of(found.job)
+        if not take(connection, lease, forced=found.is_left):
+            raise CommandRefusedError(
+                f"process {found.pid} on {found.host} works on trial set {set_id}: wait for it, "
+                "or end it"
+            )
+        if found.host not in (None, host_name()):  # its simulators run on that host
+            connection.execute(_FORGET, (set_id,))
+        own = os.getpid()
+        connection.execute(_WORK, (host_name(), own, process_identity(own), set_id))
+    return lease
+
+
+def lay_down(connection: sqlite3.Connection, set_id: int, lease: Lease) -> None:
+    """Let others work on a set: at once, where this is in the transaction of a `Job`."""
+    connection.execute(_WORK, (None, None, None, set_id))
+    give_back(connection, lease)
+
+
+def begin_trial(connection: sqlite3.Connection, trial: Trial, pid: int | None = None) -> Trial:
+    """It runs: in a simulator of that pid, or in that of a live controller."""
+    process = None if pid is None else process_identity(pid)
+    now_s = time.time()
+    connection.execute(_BEGIN, (now_s, pid, process, trial.id))
+    return replace(trial, status="running", started_wall_time_s=now_s, pid=pid, process=process)
+
+
+def put_back(connection: sqlite3.Connection, trial: Trial) -> None:
+    """It was not run to its end, and waits again."""
+    connection.execute(_PUT_BACK, (trial.id,))
+
+
+def finish_trial(connection: sqlite3.Connection, trial: Trial, result: Result) -> None:
+    """Enter what became of it; its run gets a label, unless it has one."""
+    label = f"trial {trial.number} of set {trial.trial_set_id}: {spelled(trial.values)}"[:100]
+    now = {"id": trial.id, "status": result.status, "now": time.time()}
+    connection.execute(_FINISH, vars(result) | now)
+    connection.execute(_LABEL, (label, result.run_id))
+
+
+def spelled(values: Mapping[str, Any]) -> str:
+    """Values of parameters in one line."""
+    return ", ".join(f"{name} {value}" for name, value in values.items())
+
+
+def scored_runs(connection: sqlite3.Connection, set_id: int) -> dict[str, list[int]]:
+    """The runs that have a score by their parameters in one line, the best set first.
+
+    Raises:
+        InvalidInputError: There is no such set.
+        NothingRecordedError: No run of it is there that has a score.
+    """
+    trials = trials_of(connection, set_id)
+    plan = json.loads(fetch_trial_set(connection, set_id).plan)
+    runs: dict[str, list[int]] = {}
+    for each in trials:
+        if each.score is not None and each.run_id is not None:
+            runs.setdefault(spelled(each.values), []).append(each.run_id)
+    if not runs:
+        raise NothingRecordedError(f"no run of trial set {set_id} is recorded that has a score")
+    ranked = [spelled(each.parameters) for each in ranking_of(trials, best_of(plan)).sets]
+    return {name: runs[name] for name in ranked if name in runs}
+
+
+def best_of(plan: Mapping[str, Any]) -> Best:
+    """Which scores of a stored plan are the best."""
+    return "lowest" if plan.get("best") == "lowest" else "highest"
+
+
+def count_planned(plan: Mapping[str, Any], trials: Sequence[Trial]) -> int:
+    """How many trials a set has in the end; those of a search are entered as it goes on."""
+    return max(len(trials), int(plan.get("sets") or 0) * int(plan.get("repeats") or 1))
+
+
+def progress_of(connection: sqlite3.Connection, set_id: int) -> tuple[float, float, str]:
+    """How many trials of a set are over, of how many, and a word."""
+    over, of, last = connection.execute(_PROGRESS, (set_id,)).fetchone()
+    return over, of, f"{over} of {of} trials" + ("" if last is None else f", the last: {last:g}")
+
+
+def ranking_of(trials: list[Trial], best: Best) -> Ranking:
+    """The parameter sets of the trials that are over, the best first."""
+    return rank(
+        [
+            Outcome(each.values, each.score, each.error, pruned=each.status == "pruned")
+            for each in trials
+            if each.is_over
+        ],
+        best,
+    )

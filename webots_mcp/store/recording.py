@@ -1,48 +1,57 @@
-"""A recording as questions are asked of it: opened anew for each, but by a server."""
+"""A recording as questions are asked of it: opened anew for each, but by a server.
+
+Questions that fail over a row which no bridge writes are asked again without such rows, and jobs
+that one process at a time does in a recording hold a lease of it.
+"""
 
 from __future__ import annotations
 
+import json
+import logging
+import math
 import sqlite3
+import threading
 import time
 from collections.abc import Callable, Generator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from webots_mcp import liveness
 from webots_mcp.connection import (
+    FAILURES,
     LONGEST_READ_S,
     FrozenConnection,
     Role,
     connect,
+    create_schema,
     identify_files,
-)
-from webots_mcp.contract import DATABASE_NAME, Database, MemoryDatabase
-from webots_mcp.errors import (
-    DatabaseError,
-    MalformedRowError,
-    NoDatabaseError,
-    NothingRecordedError,
-)
-from webots_mcp.queue import any_unfinished
-from webots_mcp.schema import create_schema, require_current, schema_version
-from webots_mcp.store.chunks.aside import is_chunked_aside, show_chunks_aside
-from webots_mcp.store.invalid_rows import is_past_invalid_rows, shadow_if_asked
-from webots_mcp.store.reading.ranges import Subject, choose, require_run
-from webots_mcp.store.retention.limits import Asked
-from webots_mcp.store.robots import Robot
-from webots_mcp.store.run_rows import Run, State, current_run, newest_state
-from webots_mcp.store.sessions import Session
-from webots_mcp.store.status import Status, judge, stopped_for
-from webots_mcp.transactions import (
-    FAILURES,
     is_about_a_value,
     is_busy,
     is_damage,
     is_unwritable,
+    require_current,
+    schema_version,
+    shipped_statements,
     text_of,
 )
+from webots_mcp.contract import DATABASE_NAME, Database, MemoryDatabase
+from webots_mcp.errors import (
+    DatabaseError,
+    LeaseLostError,
+    MalformedRowError,
+    NoDatabaseError,
+    NothingRecordedError,
+)
+from webots_mcp.liveness import Lease, still_held
+from webots_mcp.queue import any_unfinished
+from webots_mcp.store.chunks import is_chunked_aside, show_chunks_aside
+from webots_mcp.store.reading.subject import Subject, choose, require_run
+from webots_mcp.store.retention import Asked
+from webots_mcp.store.robots import Robot, Session, Status, judge, stopped_for
+from webots_mcp.store.run_rows import Run, State, current_run, newest_state
 from webots_mcp.waiting_file import adopt, waiting_paths
 
 GETTING_STARTED: Final = (
@@ -359,3 +368,292 @@ def _explain(error: Exception, database: Database) -> str:
             "and 'webots-mcp serve --read-only', work"
         )
     return f"the database at {name} cannot be used: {text}; check free space and permissions"
+
+
+# Jobs that one process at a time does in a recording, as long as it holds their lease.
+
+
+_RENEW_EVERY_S: Final = 3.0
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Job:
+    """What this process does as long as it holds the lease.
+
+    Attributes:
+        recording: In which the lease is.
+        lease: Which this process has taken.
+    """
+
+    recording: Recording
+    lease: Lease
+
+    @contextmanager
+    def writer(self) -> Generator[sqlite3.Connection]:
+        """A connection in a transaction, for what only the holder may write.
+
+        Raises:
+            LeaseLostError: Another process has the lease; nothing is written.
+        """
+        with self.recording.writer() as connection, still_held(connection, self.lease):
+            yield connection
+
+    def require_held(self) -> None:
+        """See that it is still this process that does it.
+
+        Raises:
+            LeaseLostError: Another one does.
+        """
+        with self.writer():
+            pass
+
+    @contextmanager
+    def renewed(self) -> Generator[None]:
+        """While this lasts, the lease does not run out."""
+        over = threading.Event()
+        thread = threading.Thread(target=self._renew, args=(over,), daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
+
+    def _renew(self, over: threading.Event) -> None:
+        while not over.wait(_RENEW_EVERY_S):
+            with suppress(LeaseLostError):  # the worker finds out when it writes
+                self._renew_now()
+
+    def _renew_now(self) -> None:
+        try:
+            self.require_held()
+        except DatabaseError as error:  # there is time to try again
+            _log.warning("%s is not renewed: %s", self.lease.name, error)
+
+
+# Reading past rows that hold what no bridge writes: the one place that says what is invalid.
+#
+# Other programs may write to a recording, and SQLite takes any value in any column. Checking each
+# value would cost every question half of its time, so that a question is asked without it first;
+# one that fails over a value is asked again of `shadow`, which leaves out the invalid rows only.
+
+
+MAX_DEPTH: Final = 100  # of JSON: the bridge records 20 levels
+MAX_SIM_TIME_S: Final = 1e10
+MAX_WALL_TIME_S: Final = 253_402_300_799.0  # the end of the year 9999
+_MAX_INTEGER: Final = 2**53  # no id or count is larger, and a float holds it
+_MAX_FLOAT: Final = 1.7e308
+_SHOWN: Final = 5
+
+_OBJECTS: Final = frozenset(
+    {"robot.devices", "session.versions", "session.actions", "state.data", "state.replaced",
+     "kept_state.data", "kept_state.replaced",
+     "event.data", "command.params", "trial_set.plan", "trial_set.former_values",
+     "trial.parameters"}
+)  # fmt: skip
+_PLAIN: Final = (bool, int, float, str)
+_OF_TEXTS: Final = frozenset(
+    {"robot.devices", "session.actions", "state.replaced", "kept_state.replaced"}
+)
+_SHAPES: Final = {  # of JSON that is no object
+    "command.result": "any", "parameter.choices": "values", "parameter.default_value": "value",
+    "parameter.next_value": "value", "parameter_value.value": "value",
+}  # fmt: skip
+# A row that refers to an invalid one would lead there.
+_REFERENCES: Final = {
+    "session": (("robot_id", "robot"),),
+    "run": (("session_id", "session"), ("robot_id", "robot")),
+    "trial": (("trial_set_id", "trial_set"),),
+}
+_TABLES: Final = ("robot", "session", "run", "state", "log", "event", "image", "command",
+                  "signal", "watermark",
+                  "retention_limit", "parameter", "parameter_value", "breakpoint", "trial_set",
+                  "trial", "kept_stretch", "kept_state", "console_line",
+                  "row_group", "chunk")  # fmt: skip
+# What a row of foreign origin may hold: values of any type, numbers, text and nesting that cannot
+# be stored, a run that is not there.
+_UNSTORABLE: Final = (
+    TypeError, OverflowError, ValueError, RecursionError, sqlite3.DataError, sqlite3.IntegrityError,
+)  # fmt: skip
+# Where several tables are read as one, a view of `main` would go on to read the tables themselves.
+_COLUMNS: Final = 'SELECT name, type, "notnull", dflt_value, pk FROM pragma_table_info(?)'
+
+
+class InvalidValues:
+    """The values that a question met and left out, in the order in which it met them."""
+
+    def __init__(self) -> None:
+        self._met: dict[str, None] = {}
+
+    def note(self, table: str, row: object, column: str, kind: str) -> None:
+        """Called by SQLite for each such value; its row, or the value, is not seen."""
+        self._met[f"{table} {row}: {column} holds no valid {kind}"] = None
+
+    def described(self) -> list[str]:
+        """The first few, and how many more there are."""
+        more = len(self._met) - _SHOWN
+        return [*list(self._met)[:_SHOWN], *([f"and {more} more"] if more > 0 else [])]
+
+
+_reading: ContextVar[InvalidValues | None] = ContextVar("reading past invalid rows", default=None)
+
+
+def is_over_a_value(error: Exception) -> bool:
+    """Whether work on rows failed over what no bridge writes, not over the file."""
+    if is_damage(error):
+        return False
+    return isinstance(error, _UNSTORABLE) or is_about_a_value(error)
+
+
+@contextmanager
+def past_invalid_rows() -> Generator[InvalidValues]:
+    """Readers that are opened inside, in this context, do not see invalid rows and values."""
+    invalid = InvalidValues()
+    token = _reading.set(invalid)
+    try:
+        yield invalid
+    finally:
+        _reading.reset(token)
+
+
+def left_out_so_far() -> list[str]:
+    """What readers that were opened inside `past_invalid_rows` have left out until now."""
+    invalid = _reading.get()
+    return invalid.described() if invalid is not None else []
+
+
+@contextmanager
+def valid_rows(connection: sqlite3.Connection) -> Generator[InvalidValues]:
+    """Inside, a writer has the view `valid_NAME` of each table, and reads any text."""
+    invalid, text_factory = InvalidValues(), connection.text_factory
+    _show_valid(connection, invalid, prefix="valid_")
+    try:
+        yield invalid
+    finally:
+        connection.text_factory = text_factory
+        for table in _TABLES:
+            connection.execute(f"DROP VIEW temp.valid_{table}")
+
+
+def is_past_invalid_rows() -> bool:
+    """Whether this is inside `past_invalid_rows`."""
+    return _reading.get() is not None
+
+
+def shadow_if_asked(connection: sqlite3.Connection) -> None:
+    """Inside `past_invalid_rows` give a reader views of the valid rows under the tables' names."""
+    if (invalid := _reading.get()) is not None:
+        _shadow(connection, invalid)
+
+
+def _shadow(connection: sqlite3.Connection, invalid: InvalidValues) -> None:
+    connection.execute("PRAGMA query_only=OFF")  # a view of this connection alone
+    _show_valid(connection, invalid)
+    for sql in shipped_statements():
+        if sql.startswith("CREATE VIEW"):
+            connection.execute(sql.replace("CREATE VIEW", "CREATE TEMP VIEW", 1))
+    connection.execute("PRAGMA query_only=ON")
+
+
+def _show_valid(connection: sqlite3.Connection, invalid: InvalidValues, prefix: str = "") -> None:
+    connection.text_factory = _as_text
+    connection.create_function("note_invalid", 4, invalid.note)
+    connection.create_function("valid_json", 2, _is_valid_json, deterministic=True)
+    for table in _TABLES:
+        connection.execute(_view(connection, table, prefix))
+
+
+def _as_text(stored: bytes) -> str:
+    return stored.decode("utf-8", "replace")
+
+
+def _view(connection: sqlite3.Connection, table: str, prefix: str) -> str:
+    columns = connection.execute(_COLUMNS, (table,)).fetchall()
+    keys = [name for name, _, _, _, key in columns if key]
+    row = " || '/' || ".join(keys)
+    shown: list[str] = []
+    needed: list[str] = []
+    for name, kind, required, default, key in columns:
+        check, said = _check(table, name, kind)
+        left_out = f"note_invalid('{table}', {row}, '{name}', '{said}')"
+        if key and len(keys) == 1:
+            shown.append(name)
+        elif required and default is None:
+            shown.append(name)
+            needed.append(f"CASE WHEN {check} THEN 1 ELSE {left_out} END")
+        else:
+            whole = check if required else f"{name} IS NULL OR {check}"
+            shown.append(
+                f"CASE WHEN {whole} THEN {name} "
+                f"ELSE coalesce({left_out}, {default or 'NULL'}) END AS {name}"
+            )
+    for name, other in _REFERENCES.get(table, ()):
+        there = (
+            f"EXISTS (SELECT 1 FROM temp.{prefix}{other} AS other WHERE other.id = {table}.{name})"
+        )
+        left_out = f"note_invalid('{table}', {row}, '{name}', 'reference')"
+        needed.append(f"CASE WHEN {there} THEN 1 ELSE {left_out} END")
+    where = " AND ".join(needed) or "1"
+    rows = f"SELECT {', '.join(shown)} FROM main.{table} WHERE {where}"
+    return f"CREATE TEMP VIEW {prefix}{table} AS {rows}"
+
+
+def _check(table: str, name: str, kind: str) -> tuple[str, str]:
+    """An SQL condition that a valid value meets, and what such a value is called."""
+    place = f"{table}.{name}"
+    if place in _OBJECTS or place in _SHAPES:
+        what = "texts" if place in _OF_TEXTS else _SHAPES.get(place, "object")
+        checked = f"valid_json(CAST({name} AS BLOB), '{what}')"  # it may be no UTF-8
+        return f"CASE typeof({name}) WHEN 'text' THEN {checked} ELSE 0 END", "JSON"
+    if kind == "TEXT":
+        return f"typeof({name}) = 'text'", "text"
+    if kind == "BLOB":
+        return f"typeof({name}) = 'blob'", "bytes"
+    if "INT" in kind:
+        return f"typeof({name}) = 'integer' AND abs({name} / 2) <= {_MAX_INTEGER // 2}", "integer"
+    limit = _MAX_FLOAT
+    if name.endswith("time_s"):
+        limit = MAX_WALL_TIME_S if name.endswith("wall_time_s") else MAX_SIM_TIME_S
+    return f"typeof({name}) IN ('real', 'integer') AND abs({name}) <= {limit!r}", "number"
+
+
+def _is_valid_json(stored: bytes, what: str) -> int:
+    """Whether it is JSON that SQLite, Python and a client read alike, and of the right shape."""
+    try:
+        value: Any = json.loads(stored.decode(), parse_constant=_refuse)
+        json.dumps(value, ensure_ascii=False).encode()
+        _require_plain(value, MAX_DEPTH)
+    except (ValueError, RecursionError, OverflowError):
+        return 0
+    return int(_has_shape(value, what))
+
+
+def _has_shape(value: Any, what: str) -> bool:
+    """Whether it is anything, an object, one of texts, a parameter's value, or a list of these."""
+    if what in ("object", "texts"):
+        members = cast("dict[str, Any]", value).values() if isinstance(value, dict) else None
+        return members is not None and (
+            what == "object" or all(isinstance(member, str) for member in members)
+        )
+    if what == "values":
+        listed = cast("list[Any]", value) if isinstance(value, list) else [None]
+        return all(isinstance(each, _PLAIN) for each in listed)
+    return what == "any" or isinstance(value, _PLAIN)
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(constant)
+
+
+def _require_plain(value: Any, levels: int) -> None:
+    """Raise where it is nested too deeply, or holds a number that is no finite float."""
+    if isinstance(value, (dict, list)):
+        if not levels:
+            raise ValueError("too deep")
+        each = cast("dict[str, Any] | list[Any]", value)
+        for member in each.values() if isinstance(each, dict) else each:
+            _require_plain(member, levels - 1)
+    elif isinstance(value, (int, float)) and not math.isfinite(value):
+        raise ValueError("not finite")

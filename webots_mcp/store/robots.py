@@ -1,18 +1,153 @@
-"""Which robots were ever seen, which one is meant, which are alive; and what an observer saw."""
+"""Which robots were ever seen, which one is meant, their sessions, and whether their time moves."""
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import json
 import sqlite3
+import time
 from dataclasses import dataclass
-from typing import Any, Final
+from pathlib import Path
+from typing import Any, Final, NamedTuple
 
-from webots_mcp.contract import OBSERVER, WORLD_EVENT
+from webots_mcp.contract import (
+    BUILT_IN_ACTIONS,
+    ENDED_BY,
+    HEARTBEAT_INTERVAL_S,
+    HEARTBEAT_LATE_S,
+    MODE_EVENT,
+    OBSERVER,
+    UNMOVED,
+    UNSEEN,
+    WORLD_EVENT,
+    host_name,
+)
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError, UnknownRobotError
+from webots_mcp.liveness import EXTERN, is_living, process_alive
 from webots_mcp.naming import SOLIDS, WORLD
-from webots_mcp.store.run_rows import Run, state_at
-from webots_mcp.store.sessions import Session, newest_session
+from webots_mcp.pauses import (
+    HELD_ELSEWHERE,
+    LEFT_PAUSED,
+    PAUSE,
+    PAUSED,
+    RESUME,
+    SEEN_PAUSED_BY,
+    SEEN_RUNNING,
+    SEEN_RUNNING_BY,
+    breakpoint_at,
+    change_since,
+)
+from webots_mcp.store.run_rows import Run, columns_of, newest_state, recent_interval_s, state_at
+from webots_mcp.waiting_file import Entry, count_rows, next_entries, read_header, waiting_path
+
+# Controller processes: who they are, and whether they still live.
+
+
+@dataclass(frozen=True)
+class Session:
+    """One controller process; the row is its bridge's heartbeat. Columns as in `store.models`."""
+
+    id: int
+    robot_id: int
+    pid: int
+    process: str | None
+    host: str
+    instance: str
+    extern: bool
+    controller: str | None
+    controller_sha256: str | None
+    git_commit: str | None
+    versions: dict[str, Any]
+    supervisor: bool
+    actions: dict[str, Any]
+    started_wall_time_s: float
+    last_seen_wall_time_s: float
+    last_seen_monotonic_s: float | None
+    last_poll_wall_time_s: float | None
+    moved_wall_time_s: float | None
+    sim_time_s: float | None
+    pause_state: str | None
+    rows_waiting: int
+    rows_dropped: int
+    last_error: str | None
+    ended_wall_time_s: float | None
+    end_reason: str | None
+
+    def is_alive(self, now_s: float) -> bool:
+        """Whether it has not ended, and its process still runs."""
+        process = (self.host, self.pid, self.process, self.last_seen_wall_time_s)
+        return self.ended_wall_time_s is None and is_living(*process, now_s)
+
+    def silent_s(self, now_s: float) -> float:
+        """Time since its newest sign of life; of a process here by a clock that cannot be set."""
+        beat_s = self.last_seen_monotonic_s
+        if beat_s is None or self.process is None or not self._is_of_this_boot():
+            return now_s - self.last_seen_wall_time_s
+        return time.monotonic() - beat_s  # the wall clock may have been set meanwhile
+
+    def age_s(self, wall_time_s: float, now_s: float) -> float:
+        """How long ago that was, which its bridge stamped for its newest sign of life."""
+        return self.silent_s(now_s) + self.last_seen_wall_time_s - wall_time_s
+
+    def heartbeat_is_fresh(self, now_s: float) -> bool:
+        """Whether its loop gave a sign of life lately."""
+        return self.silent_s(now_s) <= HEARTBEAT_LATE_S
+
+    def _is_of_this_boot(self) -> bool:
+        """A clock that counts from the boot knows nothing of the time before it."""
+        process = (self.pid, self.process, self.last_seen_wall_time_s)
+        return self.host == host_name() and process_alive(*process)
+
+
+_COLUMNS: Final = columns_of(Session)
+_NEWEST: Final = f"SELECT {_COLUMNS} FROM session WHERE robot_id = ? ORDER BY id DESC LIMIT 1"
+_BY_ID: Final = f"SELECT {_COLUMNS} FROM session WHERE id = ?"
+_COMPANIONS: Final = (
+    f"SELECT {_COLUMNS} FROM session WHERE instance = :instance "
+    "AND id <> :id AND ended_wall_time_s IS NULL ORDER BY id"
+)
+_LEFT_HOLDING: Final = (
+    f"SELECT {_COLUMNS} FROM session WHERE instance = :instance AND pause_state = '{PAUSED}' "
+    "AND last_seen_wall_time_s >= :started AND id = (SELECT max(id) FROM session n "
+    "WHERE n.robot_id = session.robot_id) ORDER BY id DESC LIMIT 1"
+)
+
+
+def newest_session(connection: sqlite3.Connection, robot_id: int) -> Session | None:
+    """The robot's latest controller process, alive or not."""
+    return _session(connection.execute(_NEWEST, (robot_id,)).fetchone())
+
+
+def fetch_session(connection: sqlite3.Connection, session_id: int) -> Session | None:
+    """The session of that id."""
+    return _session(connection.execute(_BY_ID, (session_id,)).fetchone())
+
+
+def companions(connection: sqlite3.Connection, session: Session, now_s: float) -> list[Session]:
+    """The other living sessions in the same simulation."""
+    values = {"instance": session.instance, "id": session.id}
+    rows = connection.execute(_COMPANIONS, values).fetchall()
+    return [found for row in rows if (found := _session(row)) and found.is_alive(now_s)]
+
+
+def left_holding(connection: sqlite3.Connection, session: Session, now_s: float) -> Session | None:
+    """The newest session in the same simulation, if it is gone and held its loop to the end."""
+    values = {"instance": session.instance, "started": session.started_wall_time_s}
+    found = _session(connection.execute(_LEFT_HOLDING, values).fetchone())
+    return found if found is not None and not found.is_alive(now_s) else None
+
+
+def _session(row: tuple[Any, ...] | None) -> Session | None:
+    if row is None:
+        return None
+    values = dict(zip(_COLUMNS.split(", "), row, strict=True))
+    values["versions"] = json.loads(values["versions"] or "{}")
+    values["actions"] = json.loads(values["actions"] or "{}")
+    values["supervisor"] = bool(values["supervisor"])
+    values["extern"] = bool(values["extern"])
+    return Session(**values)
+
 
 _ALL: Final = (
     "SELECT id, name, kind, devices, first_seen_wall_time_s, last_seen_wall_time_s "
@@ -177,3 +312,304 @@ def _places(connection: sqlite3.Connection, run_id: int, run: Run) -> dict[str, 
     state = state_at(connection, run_id, until_s)
     seen = state.value() if state else {}
     return {**seen.get(WORLD, {}), **seen.get(SOLIDS, {})}
+
+
+# Whether a robot's time is moving, judged from its session row, its process and its companions.
+
+
+NEVER_SEEN: Final = "never seen"
+RUNNING: Final = "running"
+STARTING: Final = "starting"
+
+_CLAIMED: Final = (
+    "SELECT id, action, coalesce(claimed_wall_time_s, created_wall_time_s) FROM command "
+    "WHERE robot_id = ? AND session_id = ? "
+    "AND status = 'claimed' ORDER BY id DESC"
+)
+
+_STILL_MOVING_S: Final = 1.0
+_SLOWEST_STILL_MOVING_S: Final = 15.0
+
+_UNPUBLISHED_S: Final = 5.0  # of wall time without a row
+_UNPUBLISHED_INTERVALS: Final = 10.0  # of the usual time between two rows
+_UNPUBLISHED: Final = (
+    "its loop runs, but for {:.1f} s of simulation time it recorded no state: is bridge.publish() "
+    "still called in the loop?"
+)
+
+_ENDED: Final = {
+    "finished": "its controller finished",
+    "reload": "the world was reloaded and no new controller session has appeared yet",
+    "crashed": "its controller process is gone without having finished (killed or crashed)",
+    "superseded": "a newer session took its place",
+}
+_ENDED_BY: Final = (
+    "SELECT message FROM log WHERE run_id = (SELECT max(id) FROM run WHERE session_id = ?) "
+    "AND level = 'error' AND source = 'controller' AND message GLOB ? "
+    "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+)
+_MOST_ERROR_CHARACTERS: Final = 300
+_RELOADED_EXTERN: Final = f"the world was reloaded, which ended its controller; {EXTERN}"
+# From inside these look alike; `diagnosis.webots_checks` looks at it from outside.
+SILENT: Final = (
+    "its controller process lives but its loop is silent: paused by hand in Webots, at a "
+    "breakpoint, another controller looping, or an extern controller missing; from inside the "
+    "simulation these look alike"
+)
+_WAITING: Final = (
+    "the database takes no rows: those of its controller wait in {0} next to it, for {1:.0f} s now "
+    "(is the disk full, or does another program hold a lock?); what is shown here is older"
+)
+_LEFT_WAITING: Final = (
+    "its last rows wait in {} next to the database, until a server that may write there (not "
+    "--read-only) takes them in: what is shown here is older"
+)
+_STARTED: Final = "its controller has just started; simulation time has not moved yet"
+_NOT_STARTED: Final = (
+    "its controller has started, but simulation time has not moved since: the simulation may be "
+    "paused in Webots, or the controller has not reached its loop"
+)
+_SEEN_MODE: Final = (
+    "SELECT json_extract(data, '$.mode') FROM event WHERE run_id IN "
+    f"(SELECT id FROM run WHERE session_id = ?) AND kind = '{MODE_EVENT}' ORDER BY id DESC LIMIT 1"
+)
+_STANDING: Final = (
+    "its loop is alive but simulation time stands still: paused by the controller's own code, or "
+    "it calls step(0) only"
+)
+
+
+class Status(NamedTuple):
+    """What to say about a robot, and why where that helps."""
+
+    text: str
+    why: str | None = None
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether simulation time is going on."""
+        return self.text == RUNNING
+
+
+def judge(
+    connection: sqlite3.Connection, session: Session | None, run: Run | None, now_s: float
+) -> Status:
+    """Say whether the robot's time is moving now.
+
+    Args:
+        connection: An open database.
+        session: The robot's latest session.
+        run: Its latest run; the pace of its rows decides how soon silence is significant.
+        now_s: Unix time.
+    """
+    if session is None:
+        return Status(NEVER_SEEN)
+    moved_s = _moved_wall_time_s(connection, session, run)
+    if not session.is_alive(now_s):
+        why = _why_ended(connection, session)
+        if (backlog := find_backlog(connection, session)) is not None:
+            moved_s = max(moved_s or 0.0, backlog.newest_wall_time_s)
+            why = "; ".join(filter(None, (why, _LEFT_WAITING.format(backlog.file_name))))
+        return _stopped(session, moved_s, now_s, why)
+    if holder := find_holder(connection, session, now_s):
+        if holder is session:
+            return Status(PAUSED, breakpoint_at(connection, session.id))
+        return Status(PAUSED, HELD_ELSEWHERE.format(robot_name(connection, holder.robot_id)))
+    fresh = session.heartbeat_is_fresh(now_s)
+    if fresh and _change_since_beat(connection, session) == RESUME:
+        return Status(RUNNING)
+    still_moving_s = _still_moving_s(connection, run)
+    if not fresh and (backlog := find_backlog(connection, session)) is not None:
+        moved_s = max(moved_s or 0.0, backlog.newest_wall_time_s)
+        why = _WAITING.format(backlog.file_name, max(now_s - backlog.oldest_wall_time_s, 0.0))
+        if session.age_s(moved_s, now_s) <= still_moving_s:
+            return Status(RUNNING, why)
+        return _stopped(session, moved_s, now_s, why)
+    if moved_s is None and session.age_s(session.started_wall_time_s, now_s) <= still_moving_s:
+        return Status(STARTING, _STARTED)
+    if moved_s is not None and session.age_s(moved_s, now_s) <= still_moving_s:
+        return Status(RUNNING, _why_unpublished(connection, session, run))
+    return _stopped(session, moved_s, now_s, _why_standing(connection, session, moved_s, now_s))
+
+
+def _moved_wall_time_s(
+    connection: sqlite3.Connection, session: Session, run: Run | None
+) -> float | None:
+    """When simulation time last grew: a row that is newer than the heartbeat shows it sooner."""
+    row = newest_state(connection, run.id) if run and run.session_id == session.id else None
+    if row is None or row.sim_time_s <= (session.sim_time_s or 0.0):
+        return session.moved_wall_time_s
+    return max(row.wall_time_s, session.moved_wall_time_s or row.wall_time_s)
+
+
+def _why_unpublished(
+    connection: sqlite3.Connection, session: Session, run: Run | None
+) -> str | None:
+    """That the loop goes on and records no state; None where it records, or has just begun."""
+    if run is None or run.session_id != session.id or session.sim_time_s is None:
+        return None
+    row = newest_state(connection, run.id)
+    since_s = run.started_sim_time_s if row is None else row.sim_time_s
+    usual_s = recent_interval_s(connection, run.id) or 0.0
+    unpublished_s = session.sim_time_s - since_s
+    beaten_since_s = session.last_seen_wall_time_s - (
+        run.started_wall_time_s if row is None else row.wall_time_s
+    )
+    if (
+        beaten_since_s <= max(_UNPUBLISHED_S, _UNPUBLISHED_INTERVALS * usual_s)
+        or unpublished_s <= 0
+    ):
+        return None
+    return _unseen(session) or _UNPUBLISHED.format(unpublished_s)
+
+
+def _unseen(session: Session) -> str | None:
+    """That its loop stepped in a way that the bridge did not see, as its bridge found."""
+    return UNSEEN if (session.last_error or "").startswith(UNSEEN) else None
+
+
+def _why_ended(connection: sqlite3.Connection, session: Session) -> str | None:
+    if session.end_reason == "reload" and session.extern:
+        return _RELOADED_EXTERN
+    if session.end_reason == "finished" and (unseen := _unseen(session)):
+        return unseen
+    if session.end_reason == "crashed" and (error := ended_by(connection, session.id)):
+        return f"its controller ended by {error}"
+    return _ENDED.get(session.end_reason or "crashed")
+
+
+def ended_by(connection: sqlite3.Connection, session_id: int) -> str | None:
+    """The exception that ended a controller, as its bridge logged it; None where it had no time."""
+    found = connection.execute(_ENDED_BY, (session_id, f"{ENDED_BY} *")).fetchone()
+    return found[0].removeprefix(f"{ENDED_BY} ")[:_MOST_ERROR_CHARACTERS] if found else None
+
+
+def _why_standing(
+    connection: sqlite3.Connection, session: Session, moved_s: float | None, now_s: float
+) -> str:
+    """Why the time of a living controller, which its bridge does not hold, stands still."""
+    if inside := handler_at_work(connection, session, now_s):
+        return inside
+    unseen = moved_s is None and session.last_poll_wall_time_s is None
+    seen = _seen_by_observer(connection, session, now_s)
+    if seen and not (unseen and seen.startswith(SEEN_RUNNING)):
+        return seen
+    if unseen:
+        return UNMOVED
+    if moved_s is None:
+        return _NOT_STARTED
+    # A loop that hangs in a step beat last when it last moved: only a later beat shows it alive.
+    beaten_since_s = session.last_seen_wall_time_s - moved_s
+    if session.heartbeat_is_fresh(now_s) and beaten_since_s > HEARTBEAT_INTERVAL_S:
+        return _STANDING
+    left = left_holding(connection, session, now_s)
+    return SILENT if left is None else LEFT_PAUSED.format(robot_name(connection, left.robot_id))
+
+
+def _seen_by_observer(connection: sqlite3.Connection, session: Session, now_s: float) -> str | None:
+    """What a live observer of the simulation knows of it; None where there is none."""
+    for each in (session, *companions(connection, session, now_s)):
+        found = connection.execute(_SEEN_MODE, (each.id,)).fetchone()
+        if found is not None and each.heartbeat_is_fresh(now_s):
+            text = SEEN_PAUSED_BY if found[0] == "pause" else SEEN_RUNNING_BY
+            return text.format(robot_name(connection, each.robot_id))
+    return None
+
+
+def handler_at_work(connection: sqlite3.Connection, session: Session, now_s: float) -> str | None:
+    """The custom action that the loop is inside of; it beats and steps only by itself there."""
+    claimed = connection.execute(_CLAIMED, (session.robot_id, session.id)).fetchall()
+    for command_id, action, since_s in claimed:
+        built_in = BUILT_IN_ACTIONS.get(action)
+        if built_in is None or built_in.runs_user_code:
+            return (
+                f"its loop is inside the handler of command {command_id} ({action}) for "
+                f"{max(now_s - since_s, 0.0):.1f} s"
+            )
+    return None
+
+
+def stopped_for(seconds: float) -> str:
+    """`stopped N s ago`, with a decimal only where it matters."""
+    return f"stopped {max(seconds, 0.0):.{1 if seconds < 10 else 0}f} s ago"
+
+
+def _stopped(session: Session, moved_s: float | None, now_s: float, why: str | None) -> Status:
+    seconds = session.age_s(moved_s or session.started_wall_time_s, now_s)
+    if why == UNMOVED:
+        return Status(f"not seen moving for {max(seconds, 0.0):.0f} s", why)
+    return Status(stopped_for(seconds), why)
+
+
+def find_holder(connection: sqlite3.Connection, session: Session, now_s: float) -> Session | None:
+    """The session whose bridge holds the loop: one that is held freezes its whole simulation."""
+    for candidate in (session, *companions(connection, session, now_s)):
+        if candidate.heartbeat_is_fresh(now_s) and _is_holding(connection, candidate):
+            return candidate
+    return None
+
+
+def _is_holding(connection: sqlite3.Connection, session: Session) -> bool:
+    since = _change_since_beat(connection, session)
+    return session.pause_state == PAUSED if since is None else since == PAUSE
+
+
+def _change_since_beat(connection: sqlite3.Connection, session: Session) -> str | None:
+    beat = (session.sim_time_s or 0.0, session.last_seen_wall_time_s)
+    return change_since(connection, session.id, *beat)
+
+
+def _still_moving_s(connection: sqlite3.Connection, run: Run | None) -> float:
+    """How old the last movement may be; heartbeats tell it only every so often."""
+    interval_s = (recent_interval_s(connection, run.id) if run else None) or 0.0
+    pace_s = min(max(_STILL_MOVING_S, 3 * interval_s), _SLOWEST_STILL_MOVING_S)
+    return pace_s + HEARTBEAT_INTERVAL_S
+
+
+class FileBacklog(NamedTuple):
+    """Rows that wait in a file next to the database: when the first and the newest came."""
+
+    file_name: str
+    oldest_wall_time_s: float
+    newest_wall_time_s: float
+
+
+def rows_waiting(connection: sqlite3.Connection, session: Session | None) -> dict[str, Any]:
+    """`rows_waiting`, and `waiting_in` where there are any: a file next to the database, or memory.
+
+    The session's row has the number at the last heartbeat, which waits for the same lock.
+    """
+    if session is None:
+        return {"rows_waiting": 0}
+    path = _path_of(connection, session)
+    if path is not None and (rows := count_rows(path)):
+        return {"rows_waiting": rows, "waiting_in": path.name}
+    if session.rows_waiting:
+        return {"rows_waiting": session.rows_waiting, "waiting_in": "the controller's memory"}
+    return {"rows_waiting": 0}
+
+
+def find_backlog(connection: sqlite3.Connection, session: Session) -> FileBacklog | None:
+    """What waits in the file of a session; None where nothing does."""
+    path = _path_of(connection, session)
+    if path is None:
+        return None
+    with contextlib.suppress(OSError, ValueError), path.open("rb") as file:
+        if read_header(file) is not None and (entries := next_entries(file, file.tell())):
+            newest_s = path.stat().st_mtime
+            return FileBacklog(path.name, min(_oldest_s(entries), newest_s), newest_s)
+    return None
+
+
+def _path_of(connection: sqlite3.Connection, session: Session) -> Path | None:
+    """None for a database in memory."""
+    (file,) = connection.execute("SELECT file FROM pragma_database_list").fetchone()
+    (uuid,) = connection.execute("SELECT uuid FROM session WHERE id = ?", (session.id,)).fetchone()
+    return waiting_path(Path(file), uuid) if file else None
+
+
+def _oldest_s(entries: list[tuple[int, Entry]]) -> float:
+    """When the first state, log line or event came; infinite where there is none."""
+    stamped = ("state", "log", "event")
+    times = (entry.values for _, entry in entries if entry.kind in stamped)
+    return next((float(values[1]) for values in times if isinstance(values, tuple)), float("inf"))

@@ -28,10 +28,8 @@ from typing import TYPE_CHECKING, Any, Final
 from webots_mcp.contract import DATABASE_NAME, make_folder
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.requirements import explain_extra
-from webots_mcp.store.jobs import Job
 from webots_mcp.store.merging import merge
-from webots_mcp.store.recording import Recording
-from webots_mcp.store.trials import (
+from webots_mcp.store.parameters import (
     Result,
     Trial,
     add_trial,
@@ -44,6 +42,7 @@ from webots_mcp.store.trials import (
     take_up,
     trials_of,
 )
+from webots_mcp.store.recording import Job, Recording
 from webots_mcp.trials.plan import Range, TrialPlan, WorldPlan
 from webots_mcp.trials.trial_run import Simulators, StoppedError, TrialAttempt, recorded_result
 from webots_mcp.webots.starting import end_left_over

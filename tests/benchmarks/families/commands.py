@@ -17,10 +17,9 @@ from tests.benchmarks.registry import Bench, benchmark
 from tests.benchmarks.rover import STEP_S
 from tests.benchmarks.servers import our_server
 from tests.benchmarks.table import Line, Target, duration
-from webots_mcp.connection import connect
+from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.queue import CommandQueue, fetch_command
-from webots_mcp.schema import create_schema
 
 _ROUND_TRIPS = 300
 _LOOK_INTERVAL_S = 0.001

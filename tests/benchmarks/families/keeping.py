@@ -17,14 +17,13 @@ from tests.benchmarks.processes import Program
 from tests.benchmarks.recordings import record
 from tests.benchmarks.registry import Bench, NotMeasurableError, benchmark
 from tests.benchmarks.table import Line, Target, duration
-from webots_mcp.connection import connect
+from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.schema import create_schema
 from webots_mcp.store.export import FORMATS, export_file
 from webots_mcp.store.json_folder import import_folder
+from webots_mcp.store.purge import Purged, prune
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.retention.policy import Limit, Retention
-from webots_mcp.store.retention.purge import Purged, prune
+from webots_mcp.store.retention import Limit, Retention
 
 _ROWS: Final = 100_000
 _ROBOT_STEPS: Final = 100  # of 8 ms, between two looks whether the purge is over

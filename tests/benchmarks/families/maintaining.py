@@ -16,10 +16,9 @@ from tests.benchmarks.registry import Bench, benchmark
 from tests.benchmarks.states import State, make_states, make_wide_states
 from tests.benchmarks.table import Line, Target, duration
 from tests.recordings.rover import Recorder
-from webots_mcp.connection import connect
+from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.schema import create_schema
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 
 _ROBOTS: Final = 6
 _SECONDS: Final = 30

@@ -19,6 +19,7 @@ from tests.benchmarks.states import make_states
 from tests.benchmarks.table import Line, Target
 from tests.postgres import NoServerError, Server, running_server
 from webots_mcp.connection import connect as connect_recording
+from webots_mcp.connection import create_schema
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.plugins.pool.fetching import fetch
 from webots_mcp.plugins.pool.pool_contents import Choice, meant, open_pool, open_target

@@ -18,7 +18,7 @@ from tests.benchmarks.registry import Bench, NotMeasurableError, benchmark
 from tests.benchmarks.table import Line, Target, duration
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.store.retention.usage import file_sizes
+from webots_mcp.store.retention_plan import file_sizes
 
 _ROBOTS: Final = 6
 _SECONDS: Final = 240

@@ -11,9 +11,8 @@ import time
 from pathlib import Path
 
 from tests.benchmarks.processes import say
-from webots_mcp.connection import connect
+from webots_mcp.connection import connect, never_wait
 from webots_mcp.queue import CLAIM, PEEK
-from webots_mcp.transactions import never_wait
 
 
 def main(database: Path) -> None:

@@ -23,10 +23,9 @@ from tests.bridge.conftest import (
 )
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.bridge import backlog, recorder
-from webots_mcp.connection import connect
+from webots_mcp.connection import OLDER_SCHEMA, connect, create_schema
 from webots_mcp.contract import DATABASE_NAME, SCHEMA_VERSION
 from webots_mcp.errors import DatabaseError
-from webots_mcp.schema import OLDER_SCHEMA, create_schema
 from webots_mcp.standin import InProcessSupervisor
 
 NOT_ROOT = pytest.mark.skipif(

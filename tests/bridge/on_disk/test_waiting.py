@@ -26,7 +26,7 @@ from webots_mcp import MCPBridge
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.entries import Entry
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.waiting_file import WaitingFile
+from webots_mcp.waiting_file import Entry, WaitingFile
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from tests.server.story import client_on, copy_of, rows_of
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 
 pytestmark = pytest.mark.anyio
 

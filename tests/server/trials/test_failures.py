@@ -14,7 +14,7 @@ from tests.server.conftest import Connect, Driver, ask, fail
 from tests.server.story import rows_of
 from tests.server.trials.conftest import HANGS_AT, TunableDriver, trials, value_of
 from webots_mcp.connection import connect as database
-from webots_mcp.store.retention.policy import KEPT
+from webots_mcp.store.retention import KEPT
 
 pytestmark = pytest.mark.anyio
 

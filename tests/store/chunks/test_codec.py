@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from webots_mcp.store.chunks.codec import (
+from webots_mcp.store.chunks import (
     ABSENT,
     DamagedChunkError,
     Encoded,

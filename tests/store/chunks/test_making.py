@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import Recorder, start_run
-from webots_mcp.connection import connect
-from webots_mcp.schema import create_schema
-from webots_mcp.store.chunks import making
-from webots_mcp.store.chunks.making import GROUP_ROWS, chunk_whole_run, make_chunks
+from webots_mcp.connection import connect, create_schema
+from webots_mcp.store import chunk_making
+from webots_mcp.store.chunk_making import GROUP_ROWS, chunk_whole_run, make_chunks
+from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import whole_run
 from webots_mcp.store.reading.segment import Deadline
@@ -149,7 +149,7 @@ def test_one_who_is_stopped_leaves_nothing_half_done(
         raise StoppedError
 
     with monkeypatch.context() as patched:
-        patched.setattr(making._COMPLETE, "run", stop)  # type: ignore[attr-defined]
+        patched.setattr(chunk_making._COMPLETE, "run", stop)  # type: ignore[attr-defined]
         with pytest.raises(StoppedError):
             make_chunks(empty, 100_000)
     assert groups(empty) == []
@@ -168,7 +168,7 @@ def test_of_two_that_make_the_same_chunk_one_stores(tmp_path: Path) -> None:
         record(one, range(ROWS))
         before = contents(one)
         with closing(connect(file, "writer")) as other:
-            store = making._RunChunks._store  # type: ignore[attr-defined]
+            store = chunk_making._RunChunks._store  # type: ignore[attr-defined]
             seen = False
 
             def overtaken(self: Any, columns: Any, at: Any) -> bool:
@@ -178,11 +178,11 @@ def test_of_two_that_make_the_same_chunk_one_stores(tmp_path: Path) -> None:
                     make_chunks(other, 100_000)
                 return store(self, columns, at)
 
-            making._RunChunks._store = overtaken  # type: ignore[attr-defined,method-assign]
+            chunk_making._RunChunks._store = overtaken  # type: ignore[attr-defined,method-assign]
             try:
                 make_chunks(one, 100_000)
             finally:
-                making._RunChunks._store = store  # type: ignore[attr-defined,method-assign]
+                chunk_making._RunChunks._store = store  # type: ignore[attr-defined,method-assign]
         make_chunks(one, 100_000)
         assert groups(one) == [GROUP_ROWS, GROUP_ROWS]
         assert contents(one) == before
@@ -262,17 +262,17 @@ def test_a_group_that_is_completed_while_another_clears_up_keeps_its_chunks(
         create_schema(one)
         record(one, range(ROWS))
         before = contents(one)
-        complete = making._COMPLETE.run  # type: ignore[attr-defined]
+        complete = chunk_making._COMPLETE.run  # type: ignore[attr-defined]
 
         def beside_another(*values: Any) -> bool:
             completed = list[bool]()
             with closing(sqlite3.connect(file, factory=Overtaken, isolation_level=None)) as other:
-                other.looks_for = making._LEFT_BEHIND  # type: ignore[attr-defined]
+                other.looks_for = chunk_making._LEFT_BEHIND  # type: ignore[attr-defined]
                 other.go_on = lambda: completed.append(complete(*values))
-                making._delete_left_behind(other, 0.0)  # type: ignore[attr-defined]
+                chunk_making._delete_left_behind(other, 0.0)  # type: ignore[attr-defined]
             return completed[0]
 
-        monkeypatch.setattr(making._COMPLETE, "run", beside_another)  # type: ignore[attr-defined]
+        monkeypatch.setattr(chunk_making._COMPLETE, "run", beside_another)  # type: ignore[attr-defined]
         make_chunks(one, 100_000)
         assert groups(one) == [GROUP_ROWS, GROUP_ROWS]
         assert contents(one) == before
@@ -285,8 +285,8 @@ def test_one_whose_group_another_clears_up_goes_on_with_the_next(tmp_path: Path)
         one.execute("PRAGMA foreign_keys=ON")
         record(one, range(ROWS))
         before = contents(one)
-        one.looks_for = making._BEGIN_GROUP  # type: ignore[attr-defined]
-        one.go_on = lambda: making._delete_left_behind(one, 0.0)  # type: ignore[attr-defined]
+        one.looks_for = chunk_making._BEGIN_GROUP  # type: ignore[attr-defined]
+        one.go_on = lambda: chunk_making._delete_left_behind(one, 0.0)  # type: ignore[attr-defined]
         assert not make_chunks(one, 100_000).done
         one.looks_for = ""
         assert make_chunks(one, 100_000).done
@@ -299,13 +299,13 @@ def test_the_range_of_a_signal_is_known_whenever_its_maker_is_stopped(
 ) -> None:
     recorder = record(empty, range(GROUP_ROWS))
     recorder.end_run("finished")
-    complete = making._COMPLETE.run  # type: ignore[attr-defined]
+    complete = chunk_making._COMPLETE.run  # type: ignore[attr-defined]
 
     def and_stop(*values: Any) -> bool:
         complete(*values)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(making._COMPLETE, "run", and_stop)  # type: ignore[attr-defined]
+    monkeypatch.setattr(chunk_making._COMPLETE, "run", and_stop)  # type: ignore[attr-defined]
     with pytest.raises(KeyboardInterrupt):
         make_chunks(empty, 100_000)
     make_chunks(empty, 100_000)

@@ -13,7 +13,7 @@ import pytest
 from tests.recordings.long import build
 from webots_mcp.cli import main
 from webots_mcp.connection import connect
-from webots_mcp.store.chunks.on_demand import LEAST_ROWS, make_missing_chunks
+from webots_mcp.store.chunk_making import LEAST_ROWS, make_missing_chunks
 from webots_mcp.store.recording import Recording
 
 ROWS = 4 * LEAST_ROWS

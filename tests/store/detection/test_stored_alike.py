@@ -18,8 +18,7 @@ from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.detection.events import find_events
 from webots_mcp.store.detection.kinds import Event, EventOptions, Threshold
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.retention.policy import Limit, Retention
-from webots_mcp.store.retention.purge import prune
+from webots_mcp.store.retention import Limit, Retention
 
 ROWS = 6000
 NOISE = np.random.default_rng(1).normal(0, 0.01, (ROWS, 3)).tolist()

@@ -20,11 +20,11 @@ from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.connection import connect
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.chunks.making import GROUP_ROWS, make_chunks
+from webots_mcp.store.chunk_making import GROUP_ROWS, make_chunks
 from webots_mcp.store.export import FOR_VIEWERS, export, export_for_viewers
+from webots_mcp.store.purge import prune
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.retention.policy import Limit, Retention
-from webots_mcp.store.retention.purge import prune
+from webots_mcp.store.retention import Limit, Retention
 
 NAMES = st.text('ab."\\[ é', min_size=1, max_size=3)
 VALUES = st.recursive(

@@ -14,8 +14,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from webots_mcp.connection import connect
-from webots_mcp.schema import create_schema
+from webots_mcp.connection import connect, create_schema
 
 NOON = datetime(2026, 5, 4, 12, 0, 0)
 STATUS = {"pose": [1.0, 2.0, 0.5], "mode": "navigate", "timestamp": "2026-05-04T12:00:00.250000"}

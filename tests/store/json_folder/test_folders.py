@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from tests.store.json_folder.conftest import NOON, STATUS, Peer, counts, rows
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.store.json_folder import import_folder
-from webots_mcp.store.json_folder.folder_reading import read_folder
+from webots_mcp.store.json_folder import import_folder, read_folder
 
 
 def test_a_folder_becomes_a_finished_run(

@@ -205,7 +205,7 @@ def test_thresholds_are_a_short_form_of_a_condition(
 def test_where_a_condition_could_not_be_asked_of_a_damaged_chunk_is_said(
     counting: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(making, "GROUP_ROWS", 100)
+    monkeypatch.setattr(chunk_making, "GROUP_ROWS", 100)
     connection = counting.connection
     for step in range(400):
         counting.publish(step * 0.1, {"n": step, "m": step})

@@ -390,7 +390,7 @@ def test_a_signal_whose_chunk_is_damaged_is_not_said_to_have_no_value(
 def test_a_damaged_chunk_costs_its_own_signal_alone(
     empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(making, "GROUP_ROWS", 100)
+    monkeypatch.setattr(chunk_making, "GROUP_ROWS", 100)
     recorder = start_run(empty)
     for step in range(300):
         mode = "a" if step < 50 else "b"

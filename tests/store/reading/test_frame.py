@@ -35,8 +35,8 @@ STATES = st.lists(
 @pytest.fixture
 def short_groups(monkeypatch: pytest.MonkeyPatch) -> None:
     """Groups of eight rows, so that a short recording has several."""
-    monkeypatch.setattr(making, "GROUP_ROWS", 8)
-    monkeypatch.setattr(making, "LEAST_AT_END", 8)
+    monkeypatch.setattr(chunk_making, "GROUP_ROWS", 8)
+    monkeypatch.setattr(chunk_making, "LEAST_AT_END", 8)
 
 
 def recorded(connection: sqlite3.Connection, states: list[dict[str, Any]]) -> None:

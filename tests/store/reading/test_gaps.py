@@ -21,7 +21,7 @@ from webots_mcp.store.reading.segment import Deadline, Segment
 @pytest.fixture
 def short_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Chunks of sixteen rows, and no range in which every row is looked at."""
-    monkeypatch.setattr(making, "GROUP_ROWS", 16)
+    monkeypatch.setattr(chunk_making, "GROUP_ROWS", 16)
     monkeypatch.setattr(reading, "FULL_ROWS", 0)
 
 

@@ -96,6 +96,6 @@ def test_chunks_and_rows_tell_the_same_spans(stretches: list[tuple[Any, int]]) -
     with memory_connection() as connection, pytest.MonkeyPatch.context() as patch:
         record(connection, states, 1.0)
         from_rows = spans(connection, **asked)
-        patch.setattr(making, "GROUP_ROWS", 3)
+        patch.setattr(chunk_making, "GROUP_ROWS", 3)
         assert chunk_whole_run(connection, 1)
         assert spans(connection, **asked) == from_rows

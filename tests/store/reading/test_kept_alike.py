@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.questions.compare import compare_runs
 from webots_mcp.store.questions.outcomes import score_run
 from webots_mcp.store.questions.series import query_history

@@ -17,8 +17,7 @@ from webots_mcp.store.questions.compare import compare_runs
 from webots_mcp.store.questions.series import RunHistory, query_history
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.retention.policy import Limit, Retention
-from webots_mcp.store.retention.purge import prune
+from webots_mcp.store.retention import Limit, Retention
 
 
 def overview(connection: sqlite3.Connection, start_s: float | None = None) -> RunHistory:

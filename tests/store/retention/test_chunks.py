@@ -15,16 +15,15 @@ from tests.recordings.rounds import PART, record_rounds
 from tests.recordings.runs import ROW_S, Recorded, states
 from tests.store.retention.test_size import bytes_by_name
 from webots_mcp import signal_register
-from webots_mcp.connection import connect
-from webots_mcp.schema import create_schema
-from webots_mcp.store.chunks.making import GROUP_ROWS, make_chunks
-from webots_mcp.store.reading.catalogue import list_signals
+from webots_mcp.connection import connect, create_schema
+from webots_mcp.store.chunk_making import GROUP_ROWS, make_chunks
+from webots_mcp.store.purge import prune
+from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import Frame, read_frame
-from webots_mcp.store.reading.ranges import whole_run
-from webots_mcp.store.reading.segment import Deadline, Segment
-from webots_mcp.store.retention.planning import plan
-from webots_mcp.store.retention.policy import Limit, Retention
-from webots_mcp.store.retention.purge import prune
+from webots_mcp.store.reading.ranges import Segment, whole_run
+from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_plan import plan
+from webots_mcp.store.signals.catalogue import list_signals
 
 NO_STATES = Limit(rows=0, spared_rows=0)
 

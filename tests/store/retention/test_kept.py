@@ -12,12 +12,12 @@ import pytest
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.connection import connect
 from webots_mcp.standin import InProcessSupervisor
+from webots_mcp.store.purge import prune
 from webots_mcp.store.questions.series import query_history
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.recording import look
-from webots_mcp.store.retention.planning import plan
-from webots_mcp.store.retention.policy import Limit, Retention
-from webots_mcp.store.retention.purge import prune
+from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_plan import plan
 from webots_mcp.store.run_rows import newest_state
 
 NONE = Limit(rows=0)
@@ -164,7 +164,7 @@ def test_a_run_that_is_forgotten_leaves_no_file_of_a_camera_frame(
     filmed: sqlite3.Connection, tmp_path: Path
 ) -> None:
     one = Limit(rows=1, spared_rows=0)
-    prune(filmed, tmp_path, Retention(state=one, kept_state=ALL, outlive=1), rest=False)
+    prune(filmed, tmp_path, Retention(state=one, chunk=one, kept_state=ALL, outlive=1), rest=False)
     runs = [run_id for (run_id,) in filmed.execute("SELECT id FROM run")]
     assert 1 not in runs
     assert set(frames(filmed, "kept")) <= set(runs)

@@ -16,18 +16,18 @@ import pytest
 
 from tests.recordings.runs import Recorded
 from webots_mcp.cli import main
-from webots_mcp.connection import connect
+from webots_mcp.connection import connect, create_schema
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.schema import create_schema
-from webots_mcp.store.retention.limits import (
+from webots_mcp.store.purge import Upkeep
+from webots_mcp.store.retention import (
+    DEFAULT,
+    Limit,
     ask_at_start,
     ask_where_unset,
     in_force,
     set_limits,
     unheeded,
 )
-from webots_mcp.store.retention.policy import DEFAULT, Limit
-from webots_mcp.store.retention.upkeep import Upkeep
 
 Say = Callable[..., str]
 MB = 1_000_000

@@ -8,7 +8,7 @@ import pytest
 
 from tests.recordings.runs import Recorded
 from tests.store.retention.conftest import TABLES
-from webots_mcp.store.retention.policy import Limit, Retention
+from webots_mcp.store.retention import Limit, Retention
 
 
 def test_logs_events_and_pictures_have_limits_of_their_own(recorded: Recorded) -> None:
@@ -35,11 +35,13 @@ def test_finished_commands_go_with_the_age_of_events(recorded: Recorded) -> None
     assert rows == [(1,), (2,)]  # the one that waits, and the one of the run that is kept
 
 
-def test_what_is_left_of_a_run_outlives_its_rows_ten_times(recorded: Recorded) -> None:
+def test_what_is_left_of_a_run_outlives_the_limits_of_states_and_chunks_ten_times(
+    recorded: Recorded,
+) -> None:
     for _ in range(13):
         recorded.add_run(10)
-    limits = Retention(Limit(rows=10, spared_rows=0), Limit(), Limit(), Limit(), Limit())
-    recorded.prune(limits)
+    few = Limit(rows=10, spared_rows=0)
+    recorded.prune(Retention(few, few, Limit(), Limit(), Limit()))
     assert recorded.rows() == {13: 10}
     for table in ("run", "session", "command"):
         assert recorded.connection.execute(f"SELECT min(id) FROM {table}").fetchone() == (3,)
@@ -49,6 +51,17 @@ def test_what_is_left_of_a_run_outlives_its_rows_ten_times(recorded: Recorded) -
         sql = f"SELECT count(DISTINCT run_id), min(run_id) FROM {table}"
         assert recorded.connection.execute(sql).fetchone() == (11, 3)
     assert recorded.connection.execute("PRAGMA foreign_key_check").fetchall() == []
+
+
+@pytest.mark.parametrize("limits", [{"state": Limit(rows=0)}, {"chunk": Limit(rows=0)}])
+def test_a_run_is_not_forgotten_while_its_states_or_chunks_are_within_their_limit(
+    recorded: Recorded, limits: dict[str, Limit]
+) -> None:
+    for _ in range(3):
+        recorded.add_run(10)
+    recorded.prune(Retention(**limits))
+    held = "SELECT run_id FROM state UNION SELECT run_id FROM row_group"
+    assert recorded.connection.execute(held).fetchall() == [(1,), (2,), (3,)]
 
 
 def test_a_picture_whose_path_leads_out_of_the_folder_is_forgotten_but_not_deleted(

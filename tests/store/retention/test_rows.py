@@ -16,11 +16,10 @@ from tests.recordings.runs import ROW_S, Recorded, states
 from tests.store.retention.conftest import TABLES
 from webots_mcp.errors import InvalidInputError, UnknownRunError
 from webots_mcp.liveness import end_session
-from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
-from webots_mcp.store.retention.planning import plan
-from webots_mcp.store.retention.policy import Limit, Retention, mark_kept
-from webots_mcp.store.retention.purge import purge
-from webots_mcp.store.retention.usage import Holdings
+from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
+from webots_mcp.store.purge import purge
+from webots_mcp.store.retention import Limit, Retention, mark_kept
+from webots_mcp.store.retention_plan import Holdings, plan
 
 
 def test_finished_runs_lose_their_oldest_rows_first(recorded: Recorded) -> None:

@@ -12,13 +12,12 @@ from pathlib import Path
 import pytest
 
 from tests.recordings.runs import Recorded, states
-from webots_mcp.connection import connect
-from webots_mcp.schema import create_schema
-from webots_mcp.store.chunks.making import make_chunks
-from webots_mcp.store.retention import upkeep as upkeep_work
-from webots_mcp.store.retention.planning import plan
-from webots_mcp.store.retention.policy import Limit, Retention
-from webots_mcp.store.retention.upkeep import Upkeep
+from webots_mcp.connection import connect, create_schema
+from webots_mcp.store import purge as upkeep_work
+from webots_mcp.store.chunk_making import make_chunks
+from webots_mcp.store.purge import Upkeep
+from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_plan import plan
 
 NO_LIMIT = Retention(Limit(), Limit(), Limit(), Limit(), Limit(), outlive=0)
 

@@ -11,12 +11,10 @@ import pytest
 
 from tests.recordings.runs import Recorded, states
 from webots_mcp.cli import main
-from webots_mcp.connection import connect
-from webots_mcp.schema import create_schema
-from webots_mcp.store.retention.planning import plan
-from webots_mcp.store.retention.policy import Limit, Retention
-from webots_mcp.store.retention.shipped import Shipped, write_shipped
-from webots_mcp.store.retention.upkeep import Upkeep
+from webots_mcp.connection import connect, create_schema
+from webots_mcp.store.purge import Upkeep
+from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention_plan import Shipped, plan, write_shipped
 
 MB = 1_000_000
 Say = Callable[..., str]
@@ -90,7 +88,7 @@ def test_beyond_the_size_the_oldest_goes_all_the_same_and_the_plan_says_so(
 def test_a_run_is_not_forgotten_while_rows_of_it_wait(recorded: Recorded) -> None:
     for _ in range(4):
         recorded.add_run(20)
-    forgetting = replace(states(rows=10), outlive=2.0)
+    forgetting = replace(states(rows=10), chunk=Limit(rows=10), outlive=2.0)
     recorded.prune(keeping(forgetting, MB))
     assert (recorded.count("run"), recorded.count("state")) == (6, 120)
     tell_shipped(recorded, state=999, log=999, event=999, image=999, kept_state=999)

@@ -33,7 +33,8 @@ from webots_mcp.contract import DATABASE_NAME, host_name
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, LeaseLostError, WebotsMCPError
 from webots_mcp.plugins.pool.pool_contents import open_pool, open_target
 from webots_mcp.requirements import explain_extra
-from webots_mcp.store.bundle import pack, unpack
+from webots_mcp.store.merging import pack, unpack
+from webots_mcp.store.parameters import Result
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.trials import Result, Trial
 from webots_mcp.trials.plan import WorldPlan

@@ -16,8 +16,7 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.naming import FARTHEST_M, metres_in
 from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.detection.motion import Motion, find_motion
-from webots_mcp.store.export.export_rows import CHUNK_ROWS, Progress, Recorded, Source
-from webots_mcp.store.images import MAX_FILE_BYTES, StoredImage
+from webots_mcp.store.export_rows import CHUNK_ROWS, Progress, Recorded, Source
 from webots_mcp.store.logs import LogLine
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import TimeRange

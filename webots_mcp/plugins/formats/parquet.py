@@ -9,7 +9,7 @@ from typing import Any, BinaryIO, Final
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.requirements import install_line
-from webots_mcp.store.export.export_rows import Column, ColumnKind, Row, Table, as_text
+from webots_mcp.store.export_rows import Column, ColumnKind, Row, Table, as_text
 
 _GROUP_ROWS: Final = 10_000  # about 10 MB of rows in memory at a time
 

@@ -6,7 +6,7 @@ import threading
 from typing import Final
 
 from webots_mcp.errors import WebotsMCPError
-from webots_mcp.store.chunks.on_demand import make_missing_chunks
+from webots_mcp.store.chunk_making import make_missing_chunks
 from webots_mcp.store.recording import Recording
 
 _PERIOD_S: Final = 1.0

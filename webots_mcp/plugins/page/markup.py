@@ -12,9 +12,9 @@ from typing import Any, Final
 from webots_mcp.errors import NoDatabaseError, NothingRecordedError, WebotsMCPError
 from webots_mcp.naming import spelled_out
 from webots_mcp.plugins.page.tab_data import Look
-from webots_mcp.store.images import StoredImage, opened
 from webots_mcp.store.logs import LogLine
-from webots_mcp.store.status import RUNNING
+from webots_mcp.store.robots import RUNNING
+from webots_mcp.store.run_rows import StoredImage, opened
 
 _LONGEST_LINE: Final = 1000  # characters of a log line
 _DEFECT: Final = (

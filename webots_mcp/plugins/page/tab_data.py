@@ -25,7 +25,6 @@ from webots_mcp.plotting.trajectory_axes import TrajectoryAxes
 from webots_mcp.plugins.page.choice import Choice
 from webots_mcp.plugins.report.charts.obstacles import Obstacle, obstacles_of
 from webots_mcp.plugins.report.charts.signal_panels import ROOM
-from webots_mcp.store.images import StoredImage, newest_image
 from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines
 from webots_mcp.store.parameters import described
 from webots_mcp.store.questions.runs import RunInfo, list_runs

@@ -22,6 +22,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, Final, cast
 
+from webots_mcp.connection import transaction
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.errors import PoolError
 from webots_mcp.liveness import process_alive

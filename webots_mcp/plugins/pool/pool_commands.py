@@ -214,7 +214,7 @@ def _listed(pool: Pool, part: str, choice: Choice) -> _List:
 
 
 def _print_sizes(pool: Pool, *, as_json: bool) -> None:
-    from webots_mcp.store.retention.notation import size_text
+    from webots_mcp.store.retention import size_text
 
     found = list(pool.sizes())
     if as_json:

@@ -18,19 +18,21 @@ from webots_mcp.naming import Value
 from webots_mcp.plugins.pool.parquet_files import package
 from webots_mcp.plugins.pool.pool_interface import Row, table
 from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.chunks.codec import (
+from webots_mcp.store.chunks import (
     FIRST_LABEL,
     IS_ABSENT,
     IS_NUMBER,
+    SIM_TIMES,
+    STATE_IDS,
+    WALL_TIMES,
     DamagedChunkError,
     Decoded,
     Encoded,
     Replaced,
     decode,
     pack,
+    statistics_of,
 )
-from webots_mcp.store.chunks.statistics import statistics_of
-from webots_mcp.store.chunks.stored import SIM_TIMES, STATE_IDS, WALL_TIMES
 
 _PLACES: Final = {"state_id": STATE_IDS, "sim_time_s": SIM_TIMES, "wall_time_s": WALL_TIMES}
 _FIXED: Final = frozenset({"group_id", "others", *_PLACES, "recording", "recording_uuid", "run",

@@ -35,8 +35,8 @@ from webots_mcp.store.questions.compare import compare_runs
 from webots_mcp.store.questions.runs import RunInfo, run_info
 from webots_mcp.store.questions.trends import RunTrends, StateTrend, Trend, trends
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
+from webots_mcp.store.robots import Session, fetch_session
 from webots_mcp.store.run_rows import fetch_run
-from webots_mcp.store.sessions import Session, fetch_session
 
 MOST_EVENTS: Final = 200
 MOST_ENTRIES: Final = 500  # of the timeline

@@ -15,6 +15,7 @@ from webots_mcp.store.detection.events import search_events
 from webots_mcp.store.detection.kinds import Event, EventOptions
 from webots_mcp.store.images import inside, opened
 from webots_mcp.store.reading.ranges import TimeRange
+from webots_mcp.store.run_rows import inside, opened
 
 MOST_PICTURES: Final = 24  # of a run
 LONGEST_SIDE_PX: Final = 640

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from webots_mcp.naming import FARTHEST_M, metres_in, unit_in
-from webots_mcp.signal_roles import first_in, pair_in
+from webots_mcp.signal_register import first_in, pair_in
 from webots_mcp.store.analysis.arrays import Array, Indexes, median, noise_of, np
 from webots_mcp.store.analysis.summary import LARGEST
 from webots_mcp.store.analysis.track import PathLength, Track, tracks_of

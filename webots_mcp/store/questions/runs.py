@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from webots_mcp.connection import transaction
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.liveness import dead_sessions
 from webots_mcp.parameter import Value
@@ -16,7 +17,6 @@ from webots_mcp.store.parameters import HAD_VALUES, as_filter, notable_parameter
 from webots_mcp.store.reading.segment import in_one_snapshot
 from webots_mcp.store.robots import resolve_robot
 from webots_mcp.store.run_rows import fetch_run
-from webots_mcp.transactions import transaction
 
 MOST_RUNS: Final = 200
 MAX_LABEL: Final = 100

@@ -655,7 +655,7 @@ def _trend(frame: Frame, signal: Signal, kept: Frame | None) -> Trend | None:
         times, numbers = frame.usable(name)
         course = course_of_values(times, numbers, signal.turn, summary)
         if is_long:
-            course = in_means(course, making.GROUP_ROWS)
+            course = in_means(course, chunk_making.GROUP_ROWS)
         else:
             spikes = find_spikes(times, numbers, signal.turn)
         too_large = int(np.count_nonzero(np.abs(frame.numbers(name)) > LARGEST))

@@ -11,8 +11,7 @@ from typing import Final
 
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.naming import REDUCTIONS, Value, nearest_first
-from webots_mcp.signal_kinds import Kind
-from webots_mcp.signal_register import MAX_SIGNALS
+from webots_mcp.signal_register import MAX_SIGNALS, Kind
 from webots_mcp.store.analysis.arrays import Indexes, np
 from webots_mcp.store.chunks.columns import STATE_COLUMNS, StateColumns
 from webots_mcp.store.chunks.stored import reached, signals_in

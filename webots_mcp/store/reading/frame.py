@@ -16,25 +16,25 @@ from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.naming import Value
+from webots_mcp.store import chunk_making
 from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
 from webots_mcp.store.analysis.summary import usable_part
-from webots_mcp.store.chunks import making
-from webots_mcp.store.chunks.codec import (
+from webots_mcp.store.chunks import (
     EXACT_INTEGERS,
     FIRST_LABEL,
     IS_ABSENT,
     IS_NUMBER,
-    Decoded,
-    Replaced,
-)
-from webots_mcp.store.chunks.columns import STATE_COLUMNS, StateColumns
-from webots_mcp.store.chunks.statistics import Statistics, statistics_of
-from webots_mcp.store.chunks.stored import (
     SIM_TIMES,
+    STATE_COLUMNS,
     STATE_IDS,
     WALL_TIMES,
+    Decoded,
+    Replaced,
+    StateColumns,
+    Statistics,
     groups_as_array,
     reached,
+    statistics_of,
 )
 from webots_mcp.store.reading.frame_source import (
     Column,
@@ -350,7 +350,7 @@ class Frame:
     def _edges(self) -> Indexes:
         """The first row of each chunk that it touches, and behind the last; else every 1,024th."""
         if self._source.order is not None:
-            return np.append(np.arange(0, len(self), making.GROUP_ROWS), len(self))
+            return np.append(np.arange(0, len(self), chunk_making.GROUP_ROWS), len(self))
         parts = self._source.parts(self._start, self._stop)
         edges = self._source.first_rows[parts.start : parts.stop + 1]
         return np.minimum(np.maximum(edges, self._start), self._stop) - self._start

@@ -8,18 +8,17 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple, TypeVar, cast
 
+from webots_mcp.store import chunk_making
 from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
-from webots_mcp.store.chunks import making
-from webots_mcp.store.chunks.codec import DamagedChunkError, Decoded, decoded_of
-from webots_mcp.store.chunks.columns import STATE_COLUMNS, StateColumns
-from webots_mcp.store.chunks.statistics import Statistics, statistics_of
-from webots_mcp.store.chunks.stored import (
+from webots_mcp.store.chunks import (
     SIM_TIMES,
+    STATE_COLUMNS,
     STATE_IDS,
     WALL_TIMES,
     Reached,
     groups_with_steps,
     statistics_in,
+    statistics_of,
     values_in,
 )
 from webots_mcp.store.reading.segment import Deadline
@@ -84,8 +83,8 @@ class FrameSource:
             self.unread[Unread(start_s, end_s, "its row group is damaged")] = None
         groups = groups[sound]
         self._group_ids: Indexes = groups[:, 0].astype(np.intp)
-        new = np.arange(0, len(columns), making.GROUP_ROWS)
-        ends = np.minimum(new + making.GROUP_ROWS, len(columns))
+        new = np.arange(0, len(columns), chunk_making.GROUP_ROWS)
+        ends = np.minimum(new + chunk_making.GROUP_ROWS, len(columns))
         rows = np.concatenate(([0.0], groups[:, 3], ends - new))
         self.first_rows: Indexes = np.cumsum(rows.astype(np.intp))
         times: Array = np.array(columns.times, np.float64)
@@ -151,8 +150,8 @@ class FrameSource:
                     yield place, values
         rows = _of_rows(self.columns, column) or ()
         for place in (each for each in places if each >= groups and len(rows)):
-            first = (place - groups) * making.GROUP_ROWS
-            yield place, decoded_of(rows[first : first + making.GROUP_ROWS])
+            first = (place - groups) * chunk_making.GROUP_ROWS
+            yield place, decoded_of(rows[first : first + chunk_making.GROUP_ROWS])
 
     def _signal_id(self, column: Column) -> int | None:
         return self.ids.get(column) if isinstance(column, str) else column
@@ -200,8 +199,8 @@ class FrameSource:
             at, known = self._places_of(stored[:, 0])
             table[at] = stored[known, 1:]
         values = _of_rows(self.columns, column) or ()
-        for at, first in enumerate(range(0, len(values), making.GROUP_ROWS)):
-            part = decoded_of(values[first : first + making.GROUP_ROWS])
+        for at, first in enumerate(range(0, len(values), chunk_making.GROUP_ROWS)):
+            part = decoded_of(values[first : first + chunk_making.GROUP_ROWS])
             table[len(self._group_ids) + at] = statistics_of(part)
         return table
 

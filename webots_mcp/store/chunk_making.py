@@ -9,28 +9,40 @@ looked at. Rows that come late, into a time that is in chunks, become a group of
 
 from __future__ import annotations
 
+import math
 import sqlite3
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.errors import warn
-from webots_mcp.store.chunks.codec import ABSENT, EXACT_INTEGERS, MAX_TEXT, decoded_of, pack
-from webots_mcp.store.chunks.columns import STATE_COLUMNS, StateColumns
-from webots_mcp.store.chunks.statistics import Statistics, statistics_of
-from webots_mcp.store.chunks.stored import (
+from webots_mcp.connection import FAILURES, LONGEST_WRITE_S, FrozenConnection, Step
+from webots_mcp.errors import DatabaseError, warn
+from webots_mcp.liveness import holder_of
+from webots_mcp.maintenance import Maintainer
+from webots_mcp.store.chunks import (
+    ABSENT,
+    EXACT_INTEGERS,
     IS_MARK,
     SIM_TIMES,
+    STATE_COLUMNS,
     STATE_IDS,
     WALL_TIMES,
     Reached,
+    StateColumns,
+    Statistics,
+    chunks_aside,
+    decoded_of,
+    pack,
     reached,
+    statistics_of,
     watermark,
 )
-from webots_mcp.store.invalid_rows import is_over_a_value, valid_rows
-from webots_mcp.store.retention.disk_size import INDEX_BYTES, disk_bytes
-from webots_mcp.store.signals import Signal, enter_signals, registered, seen_in, tell_more
-from webots_mcp.transactions import LONGEST_WRITE_S, Step
+from webots_mcp.store.recording import Recording, is_over_a_value, valid_rows
+from webots_mcp.store.robots import list_robots
+from webots_mcp.store.signals.flatten import MAX_TEXT
+from webots_mcp.store.signals.registry import Signal, enter_signals, registered, seen_in, tell_more
 
 GROUP_ROWS: Final = 1024
 LEAST_AT_END: Final = 256  # fewer rows, with which a run ended, are read as they are
@@ -369,3 +381,153 @@ def _delete_left_behind(connection: sqlite3.Connection, pause_s: float) -> None:
         while connection.execute(_DELETE_CHUNKS, (group_id,)).rowcount:
             time.sleep(pause_s)
         connection.execute(_DELETE_GROUP, (group_id,))
+
+
+# Making chunks on demand, where no server does it in the background.
+#
+# What is in no chunk is read row by row until a deadline, and what was not read is left out of the
+# answer. A server makes chunks of what comes; of a recording that none looks after, who asks does
+# it.
+
+
+LEAST_ROWS: Final = 2000  # a question reads fewer as they are
+_BATCH_ROWS: Final = 2000
+_PAUSE_S: Final = 0.002  # between two short writes, for robots to write theirs
+_LEFT: Final = (  # ids are given without gaps, but for rows that were deleted
+    "SELECT max(0, (SELECT coalesce(max(id), 0) FROM state) - :mark - (SELECT "
+    "coalesce(sum(row_count), 0) FROM row_group WHERE is_complete = 1 AND max_state_id > :mark))"
+)
+
+
+def make_missing_chunks(
+    recording: Recording,
+    progress: Callable[[int, int], object] | None = None,
+    *,
+    limit_s: float = math.inf,
+    called_off: Callable[[], bool] = lambda: False,
+    write: bool = True,
+) -> str:
+    """Put the states that are there now and in no chunk yet into chunks, unless a server does.
+
+    It may end at any moment, also by an exception: the chunks that are made stay, and the next call
+    goes on from there.
+
+    Args:
+        recording: Of the current schema.
+        progress: Called now and then with how many rows are done, and how many there are to do.
+        limit_s: Wall seconds after which it stops.
+        called_off: Asked between two batches whether to stop.
+        write: Where false, or where the file cannot be written, the chunks are made in a temporary
+            file of this process.
+
+    Returns:
+        How many states are left in no chunk, and why; "" where there are none, or so few that a
+        question reads all of them.
+
+    Raises:
+        DatabaseError: There is no such recording, or it cannot be read.
+    """
+    with recording.reader() as connection:
+        total = left = _rows_left(connection)
+        holder = holder_of(connection, "maintainer") or ""
+        is_frozen = isinstance(connection, FrozenConnection)
+    if total < LEAST_ROWS:
+        return ""
+    if holder.startswith("server ") and not is_frozen:
+        return _say(total, "the server that maintains the recording makes them")
+    until_s, why = time.monotonic() + limit_s, ""
+    try:
+        with _opened(recording, write=write, frozen=is_frozen) as connection:
+            live = not is_frozen and any(
+                robot.live for robot in list_robots(connection, time.time())
+            )
+            while not why:
+                done = make_chunks(connection, _BATCH_ROWS, _PAUSE_S if live else 0.0).done
+                left = 0 if done else min(left, _rows_left(connection))
+                if progress is not None:
+                    progress(total - left, total)
+                if done:
+                    return ""
+                if called_off() or time.monotonic() > until_s:
+                    why = "ask again to continue"
+    except (DatabaseError, *FAILURES) as error:
+        why = str(error)
+    return _say(left, why) if left >= LEAST_ROWS else ""
+
+
+def _rows_left(connection: sqlite3.Connection) -> int:
+    """About how many rows are in no chunk."""
+    return int(connection.execute(_LEFT, {"mark": watermark(connection)}).fetchone()[0])
+
+
+@contextmanager
+def _opened(recording: Recording, *, write: bool, frozen: bool) -> Generator[sqlite3.Connection]:
+    """A connection to make chunks on, with a maintainer that keeps the log short meanwhile."""
+    database = recording.database
+    if isinstance(database, Path) and (frozen or not write):
+        with chunks_aside(database, frozen=frozen) as connection:
+            yield connection
+        return
+    # Idle while a bridge is it.
+    maintainer = Maintainer(database, "question") if isinstance(database, Path) else None
+    with recording.writer() as connection:
+        if maintainer is not None:
+            maintainer.start()
+        try:
+            yield connection
+        finally:
+            if maintainer is not None:
+                maintainer.stop()
+
+
+def _say(rows: int, why: str) -> str:
+    return f"the newest {rows} rows are in no chunk yet: {why}"
+
+
+# How rows lie on the pages of a file: what a table takes on the disk is more than its text.
+#
+# The rows of a table fill its pages in the order of their ids. One that does not fit the rest of a
+# page begins the next, and what is too long for a page lies on pages of its own (SQLite, Database
+# File Format, section 1.6: B-tree Pages).
+
+
+_PAGE_HEAD_BYTES: Final = 8
+_CELL_HEAD_BYTES: Final = 7  # pointer, length and id
+_LINK_BYTES: Final = 4  # to the next page of a long row
+INDEX_BYTES: Final = 21  # an entry (run_id, sim_time_s, id) of a time index, measured
+
+
+def disk_bytes(payloads: Iterable[int], page_bytes: int) -> float:
+    """Bytes that rows which follow each other in a table take on the disk, without its indexes.
+
+    Args:
+        payloads: Bytes of the record of each row.
+        page_bytes: Of the database.
+    """
+    room = page_bytes - _PAGE_HEAD_BYTES
+    full_pages = own_bytes = filled = used = rows = 0
+    for payload in payloads:
+        local, own = _cell(payload, page_bytes)
+        own_bytes += own
+        if used + local > room:
+            full_pages, filled, used, rows = full_pages + 1, filled + used, 0, 0
+        used, rows = used + local, rows + 1
+    if not rows:
+        return 0.0
+    # The last page goes on with other rows: it will be as full as the others.
+    per_byte = page_bytes / (room - used / rows / 2)
+    if full_pages:
+        per_byte = full_pages * page_bytes / filled
+    return full_pages * page_bytes + used * per_byte + own_bytes
+
+
+def _cell(payload: int, page_bytes: int) -> tuple[int, int]:
+    """Bytes of a row on its table page, and bytes of the pages that it has for itself."""
+    most, least = page_bytes - 35, (page_bytes - 12) * 32 // 255 - 23
+    if payload <= most:
+        return payload + _CELL_HEAD_BYTES, 0
+    link_room = page_bytes - _LINK_BYTES
+    local = least + (payload - least) % link_room
+    local = local if local <= most else least
+    pages = -(-(payload - local) // link_room)
+    return local + _CELL_HEAD_BYTES + _LINK_BYTES, pages * page_bytes

@@ -1,0 +1,657 @@
+"""Chunks: the values of one signal over some rows, as they become bytes and values again.
+
+Numbers are compressed by pcodec, which loses nothing. Each row has a code: it holds a number, or
+its state lacks the signal, or it holds one of a few other values (a text, a flag, null), which
+stand as JSON in a list of labels. Where every row holds a number there are no codes.
+"""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import json
+import shutil
+import sqlite3
+import tempfile
+import zlib
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Final, NamedTuple, TypeAlias, cast
+
+from webots_mcp.connection import connect, create_schema
+from webots_mcp.contract import DATABASE_NAME
+from webots_mcp.errors import DatabaseError
+from webots_mcp.naming import Value, flatten
+from webots_mcp.store.analysis.arrays import Array, Indexes, inner, np
+from webots_mcp.store.signals.flatten import MAX_TEXT, is_replaced, parse, replaced_names
+
+IS_NUMBER: Final = 0  # codes
+IS_ABSENT: Final = 1
+FIRST_LABEL: Final = 2  # and those above: the place of a label, counted from it on
+
+_LEVEL: Final = 4  # of pcodec: a quarter of the time of its default, for 2 % more bytes
+_CODES_LEVEL: Final = 1
+_CHECKSUM_BYTES: Final = 4  # CRC-32: a decompressor is not asked what it makes of damaged bytes
+EXACT_INTEGERS: Final = 2**53  # beyond, a float does not hold every integer
+_FLOATS, _INTEGERS = "pcodec/float64", "pcodec/int64"
+_NOTHING: Final = "none"  # no row holds a number
+_NUMBERS: Final = frozenset({int, float})
+_HOW_TO_INSTALL: Final = "install it: pip install --only-binary pcodec 'pcodec>=1.0'"
+
+
+class Absent:
+    """What a row has of a signal that its state lacks."""
+
+
+class Replaced(NamedTuple):
+    """What a row has where JSON cannot hold the value: why, such as nan or inf."""
+
+    why: str
+
+
+ABSENT: Final = Absent()
+Recorded: TypeAlias = "Value | Absent | Replaced"
+
+
+class DamagedChunkError(DatabaseError):
+    """A chunk cannot be read; the text says why."""
+
+
+class Encoded(NamedTuple):
+    """The values of a signal as a row of the table `chunk` holds them.
+
+    Attributes:
+        codec: How `numbers` are compressed.
+        numbers: Of the rows that hold one.
+        codes: One for each row, compressed by zlib; None where every row holds a number.
+        labels: JSON array of what codes from 2 on mean.
+    """
+
+    codec: str
+    numbers: bytes | None
+    codes: bytes | None
+    labels: str | None
+
+
+class Decoded(NamedTuple):
+    """The values of a signal over some rows.
+
+    Attributes:
+        numbers: One for each row: NaN where it holds none; flags are 0 and 1.
+        codes: One for each row; None where every row holds a number.
+        labels: What codes from 2 on mean; of a replaced value `Replaced`.
+        is_whole: All numbers were integers when they were stored.
+    """
+
+    numbers: Array
+    codes: Indexes | None
+    labels: Sequence[Value | Replaced]
+    is_whole: bool = False
+
+
+def decoded_of(values: Sequence[Recorded]) -> Decoded:
+    """The same of values that were not stored: nothing is compressed."""
+    types = set(map(type, values))
+    if _NUMBERS.issuperset(types):
+        held = _numbers(values)
+        return Decoded(held, None, (), types == {int} and _is_exact(held))
+    codes, labels = _coded(values)
+    numbers = np.full(len(values), np.nan)
+    held = _numbers([value for value in values if type(value) in _NUMBERS])
+    numbers[codes == IS_NUMBER] = held
+    _fill_flags(numbers, codes, labels)
+    return Decoded(numbers, codes, labels, float not in types and _is_exact(held))
+
+
+def encode(values: Sequence[Recorded]) -> Encoded:
+    """Compress the values of some rows; see `pack`.
+
+    What is lost: integers beyond 2^53 become floats, texts are cut after 200 characters, and where
+    integers and floats are mixed all are floats.
+    """
+    return pack(decoded_of(values))
+
+
+def pack(values: Decoded) -> Encoded:
+    """Compress values that are numbers and codes already."""
+    if values.codes is None:
+        return Encoded(*_compressed(values.numbers, values.is_whole), None, None)
+    listed = [[label.why] if isinstance(label, Replaced) else label for label in values.labels]
+    width = np.uint8 if len(listed) + FIRST_LABEL < 2**8 else np.uint16
+    return Encoded(
+        *_compressed(values.numbers[values.codes == IS_NUMBER], values.is_whole),
+        zlib.compress(values.codes.astype(width).tobytes(), _CODES_LEVEL),
+        json.dumps(listed, separators=(",", ":"), ensure_ascii=False),
+    )
+
+
+def decode(encoded: Encoded, rows: int) -> Decoded:
+    """The values of some rows.
+
+    Raises:
+        DamagedChunkError: The bytes are not what `encode` makes of so many rows.
+    """
+    try:
+        if encoded.codes is None:
+            numbers = np.empty(rows)
+            _decompress(encoded, numbers)
+            return Decoded(numbers, None, (), encoded.codec == _INTEGERS)
+        return _decode_coded(encoded, rows)
+    except ModuleNotFoundError as error:
+        raise DamagedChunkError(
+            f"chunks need {error.name}, which is missing: {_HOW_TO_INSTALL}"
+        ) from None
+    except DamagedChunkError:
+        raise
+    except Exception as error:  # whatever a library says of bytes that it did not make
+        raise DamagedChunkError(f"damaged: {error}") from error
+
+
+def _decode_coded(encoded: Encoded, rows: int) -> Decoded:
+    assert encoded.codes is not None
+    raw = zlib.decompress(encoded.codes)
+    width: Any = np.uint8 if len(raw) == rows else np.uint16
+    codes = np.frombuffer(raw, width).astype(np.intp)
+    labels = _labels(encoded.labels)
+    if len(codes) != rows or codes.max(initial=0) >= len(labels) + FIRST_LABEL:
+        raise DamagedChunkError("damaged: its codes are not those of its rows")
+    numbers = np.full(rows, np.nan)
+    held = codes == IS_NUMBER
+    if held.any():
+        found = np.empty(int(held.sum()))
+        _decompress(encoded, found)
+        numbers[held] = found
+    _fill_flags(numbers, codes, labels)
+    return Decoded(numbers, codes, labels, encoded.codec == _INTEGERS)
+
+
+def _labels(text: str | None) -> list[Value | Replaced]:
+    listed: Any = json.loads(text or "[]")
+    if not isinstance(listed, list):
+        raise DamagedChunkError("damaged: its labels are no list")
+    return [_label(each) for each in cast("list[Any]", listed)]
+
+
+def _label(label: Any) -> Value | Replaced:
+    if label is None or isinstance(label, str | bool):
+        return label
+    match label:
+        case [str(why)]:
+            return Replaced(why)
+        case _:
+            raise DamagedChunkError("damaged: its labels are not those of values")
+
+
+def _fill_flags(numbers: Array, codes: Indexes, labels: Sequence[Value | Replaced]) -> None:
+    for code, label in enumerate(labels, FIRST_LABEL):
+        if isinstance(label, bool):
+            numbers[codes == code] = label
+
+
+def _coded(values: Sequence[Recorded]) -> tuple[Indexes, list[Value | Replaced]]:
+    """The code of each row, and the labels."""
+    labels: list[Value | Replaced] = []
+    known: dict[object, int] = {}  # a flag equals a number, so that the type is in the key
+    codes = np.empty(len(values), np.intp)
+    for row, value in enumerate(values):
+        if type(value) in _NUMBERS:
+            codes[row] = IS_NUMBER
+        elif isinstance(value, Absent):
+            codes[row] = IS_ABSENT
+        else:
+            code = known.get(value)
+            if code is None:
+                label = value[:MAX_TEXT] if isinstance(value, str) else value
+                code = known[value] = len(labels) + FIRST_LABEL
+                labels.append(label)  # pyright: ignore[reportArgumentType]
+            codes[row] = code
+    return codes, labels
+
+
+def _numbers(values: Sequence[Any]) -> Array:
+    """As floats; an integer that is too large for one becomes infinite."""
+    try:
+        return np.array(values, np.float64)
+    except OverflowError:
+        return np.array([_float(value) for value in values], np.float64)
+
+
+def _float(value: float) -> float:
+    try:
+        return float(value)
+    except OverflowError:
+        return float("inf") if value > 0 else float("-inf")
+
+
+@functools.cache
+def _pcodec(module: str = "pcodec.standalone") -> Any:
+    """The library, which has no types; imported where the first chunk is made or read."""
+    return import_module(module)
+
+
+def _is_exact(numbers: Array) -> bool:
+    """Whether these integers are the same as floats."""
+    return bool(np.abs(numbers).max(initial=0) < EXACT_INTEGERS)
+
+
+def _compressed(numbers: Any, is_whole: bool) -> tuple[str, bytes | None]:
+    if not len(numbers):
+        return _NOTHING, None
+    codec = _INTEGERS if is_whole else _FLOATS
+    config = _pcodec("pcodec").ChunkConfig(compression_level=_LEVEL)
+    numbers = numbers.astype(np.int64) if is_whole else numbers
+    packed = bytes(_pcodec().simple_compress(numbers, config))
+    return codec, zlib.crc32(packed).to_bytes(_CHECKSUM_BYTES, "little") + packed
+
+
+def _decompress(encoded: Encoded, into: Array) -> None:
+    if encoded.codec not in (_FLOATS, _INTEGERS):
+        raise DamagedChunkError(
+            f"compressed by {encoded.codec!r}, which this version of webots-mcp does not know"
+        )
+    if encoded.numbers is None:
+        raise DamagedChunkError("damaged: its numbers are missing")
+    checksum, packed = encoded.numbers[:_CHECKSUM_BYTES], encoded.numbers[_CHECKSUM_BYTES:]
+    if zlib.crc32(packed) != int.from_bytes(checksum, "little"):
+        raise DamagedChunkError("damaged: its bytes do not match their checksum")
+    whole: Any = into if encoded.codec == _FLOATS else np.empty(len(into), np.int64)
+    progress = _pcodec().simple_decompress_into(packed, whole)
+    if progress.n_processed != len(into) or not progress.finished:
+        raise DamagedChunkError("damaged: it holds fewer numbers than its rows")
+    if whole is not into:
+        into[:] = whole
+
+
+# What the numbers of one signal in one chunk come to, so that a reader can leave it closed.
+
+
+LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
+
+
+class Statistics(NamedTuple):
+    """Columns of the table `chunk`; None where there is no number, as of texts.
+
+    Attributes:
+        row_count: Rows whose state has the signal.
+        value_count: Of them with a value that is not null; of numbers, with a usable one: not NaN,
+            and not beyond 1e100.
+        change_count: Values unlike the one before.
+        squared_deviations: Sum of squared deviations from the mean.
+        largest_step: Largest difference of values that follow each other; 0 of a single one.
+    """
+
+    row_count: int
+    value_count: int
+    change_count: int = 0
+    first: float | None = None
+    last: float | None = None
+    min: float | None = None
+    max: float | None = None
+    sum: float | None = None
+    squared_deviations: float | None = None
+    largest_step: float | None = None
+
+
+def statistics_of(values: Decoded) -> Statistics:
+    """What the values of one signal in some rows come to."""
+    rows = len(values.numbers)
+    if values.codes is not None:
+        rows -= int(np.count_nonzero(values.codes == IS_ABSENT))
+    usable = np.abs(values.numbers) <= LARGEST
+    numbers = values.numbers if usable.all() else values.numbers[usable]
+    if not len(numbers):
+        return _without_numbers(values, rows)
+    mean = float(numbers.sum()) / len(numbers)
+    deviations, steps = numbers - mean, np.diff(numbers)
+    return Statistics(
+        rows,
+        len(numbers),
+        int(np.count_nonzero(steps)),
+        float(numbers[0]),
+        float(numbers[-1]),
+        float(numbers.min()),
+        float(numbers.max()),
+        float(numbers.sum()),
+        inner(deviations, deviations),
+        float(np.abs(steps).max(initial=0.0)),
+    )
+
+
+def _without_numbers(values: Decoded, rows: int) -> Statistics:
+    """Of texts: how many there are, and how often they change."""
+    if values.codes is None:
+        return Statistics(rows, 0)
+    texts = [
+        code for code, label in enumerate(values.labels, FIRST_LABEL) if isinstance(label, str)
+    ]
+    codes = values.codes[np.isin(values.codes, texts)]
+    return Statistics(rows, len(codes), int(np.count_nonzero(np.diff(codes))))
+
+
+# State rows turned into columns: the values of each signal, one for each row.
+
+
+STATE_COLUMNS: Final = "id, sim_time_s, wall_time_s, data, replaced"
+
+
+@dataclass
+class StateColumns:
+    """Rows of one run in order.
+
+    Attributes:
+        values: Of each signal its value in each row: `ABSENT` where the state lacks it, `Replaced`
+            where it held what JSON cannot hold.
+        texts: The states as they were recorded, JSON.
+    """
+
+    ids: list[int] = field(default_factory=list[int])
+    times: list[float] = field(default_factory=list[float])
+    wall_times: list[float] = field(default_factory=list[float])
+    texts: list[str] = field(default_factory=list[str])
+    values: dict[str, list[Recorded]] = field(default_factory=dict[str, "list[Recorded]"])
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def add(self, rows: Sequence[tuple[Any, ...]]) -> None:
+        """Add rows of `STATE_COLUMNS`; one whose data is no JSON object has no signals.
+
+        Raises:
+            TypeError: Another program wrote what no bridge writes.
+        """
+        if not rows:
+            return
+        before = len(self.ids)
+        ids, times, walls, texts, replaced = zip(*rows, strict=True)
+        if not _NUMBERS.issuperset(map(type, times + walls)) or {*map(type, texts)} != {str}:
+            raise TypeError("a state row has a time that is no number, or data that is no text")
+        self.ids += ids
+        self.times += times
+        self.wall_times += walls
+        self.texts += texts
+        columns = _transposed([flatten(parse(text)) for text in texts])
+        for name in [name for name in columns if name not in self.values]:
+            self.values[name] = [ABSENT] * before
+        for name, values in self.values.items():
+            values += columns.get(name) or [ABSENT] * len(rows)
+        for row, why in enumerate(replaced, before):
+            if why is not None:
+                self._note_replaced(row, why)
+
+    def _note_replaced(self, row: int, text: str) -> None:
+        reasons = replaced_names(text)
+        for name in reasons.keys() & self.values.keys():
+            values = self.values[name]
+            value: Any = values[row]
+            if value is not ABSENT and is_replaced(reasons, name, value) and value is None:
+                values[row] = Replaced(reasons[name])
+
+    def part(self, start: int, rows: int) -> StateColumns:
+        """Some of the rows."""
+        inside = slice(start, start + rows)
+        values = {name: values[inside] for name, values in self.values.items()}
+        places = (self.ids[inside], self.times[inside], self.wall_times[inside])
+        return StateColumns(*places, self.texts[inside], values)
+
+
+def _transposed(states: Sequence[dict[str, Value]]) -> dict[str, list[Recorded]]:
+    """Of each name its value in each state; states mostly have the same names in the same order."""
+    names = list(states[0])
+    if names and all(list(state) == names for state in states):
+        columns = zip(*(state.values() for state in states), strict=True)
+        return {name: list(values) for name, values in zip(names, columns, strict=True)}
+    every = dict.fromkeys(name for state in states for name in state)
+    return {name: [state.get(name, ABSENT) for state in states] for name in every}
+
+
+# The chunks of a run as they are stored: which groups of rows there are, and what is in them.
+
+
+SIM_TIMES: Final = 0  # in the place of a signal's id
+WALL_TIMES: Final = -1
+STATE_IDS: Final = -2
+
+_GROUPS: Final = (
+    "SELECT id, start_sim_time_s, end_sim_time_s, last_state_id, max_state_id, row_count "
+    "FROM row_group WHERE run_id = ? AND is_complete = 1 AND start_sim_time_s < ? "
+    "AND end_sim_time_s >= ? ORDER BY start_sim_time_s, end_sim_time_s, id"
+)
+_IN_CHUNKS: Final = (
+    "SELECT max(end_sim_time_s), max(max_state_id) FROM row_group WHERE run_id = :run "
+    "AND is_complete = 1"
+)
+_LAST_AT: Final = (
+    "SELECT max(last_state_id) FROM row_group WHERE run_id = ? AND is_complete = 1 "
+    "AND end_sim_time_s = ?"
+)
+IS_MARK: Final = (  # no other program's value, beyond which no row would be looked at
+    "typeof(state_id) = 'integer' AND state_id >= 0 AND state_id <= "
+    "(SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = 'state')"
+)
+_WATERMARK: Final = f"SELECT state_id FROM watermark WHERE name = 'chunk' AND {IS_MARK}"
+_OF_SIGNAL: Final = "FROM chunk WHERE run_id = ? AND signal_id = ? AND group_id BETWEEN ? AND ?"
+_PLACES: Final = (
+    "SELECT id, start_sim_time_s, end_sim_time_s, row_count, max_state_id FROM row_group "
+    "WHERE run_id = ? AND is_complete = 1 AND start_sim_time_s < ? AND end_sim_time_s >= ? "
+    "ORDER BY start_sim_time_s"
+)
+_STATISTICS: Final = f"SELECT group_id, {', '.join(Statistics._fields)} {_OF_SIGNAL}"
+_LONG_STEPS: Final = f"SELECT group_id {_OF_SIGNAL} AND largest_step > ?"
+_VALUES: Final = f"SELECT group_id, codec, numbers, codes, labels {_OF_SIGNAL}"
+_FEW_VALUES: Final = f"{_VALUES} AND group_id IN (SELECT value FROM json_each(?))"
+_FEW: Final = 0.25  # of the groups between two: they are asked for one by one
+_SIGNALS_IN: Final = "SELECT DISTINCT signal_id FROM chunk WHERE run_id = ? AND signal_id > 0"
+
+
+class Group(NamedTuple):
+    """Rows that follow each other, of which each signal has a chunk. Columns of `row_group`."""
+
+    id: int
+    start_s: float
+    end_s: float
+    last_state_id: int
+    max_state_id: int
+    row_count: int
+
+
+class Reached(NamedTuple):
+    """Which rows of a run are in chunks: those up to a place, but for rows that came later.
+
+    Attributes:
+        end_s: Simulation time of the last of them; -inf before the first chunk.
+        last_state_id: Its id; rows of one time are in the order of their ids.
+        max_state_id: Rows up to that place with greater ids came late and are in none.
+        max_in_groups: The greatest id of a row that is in a chunk.
+    """
+
+    end_s: float
+    last_state_id: int
+    max_state_id: int
+    max_in_groups: int
+
+
+def groups_in(
+    connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
+) -> list[Group]:
+    """The groups of a run that reach into [start_s, end_s), in order of time."""
+    rows = connection.execute(_GROUPS, (run_id, end_s, start_s)).fetchall()
+    return list(map(Group._make, rows))
+
+
+def groups_as_array(
+    connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
+) -> Array:
+    """The same as columns: id, times of the first and last row in s, how many rows, greatest id."""
+    rows = connection.execute(_PLACES, (run_id, end_s, start_s)).fetchall()
+    table: Array = np.reshape(np.array(rows, np.float64), (-1, 5))
+    return table[np.lexsort((table[:, 0], table[:, 2], table[:, 1]))]
+
+
+def reached(connection: sqlite3.Connection, run_id: int) -> Reached:
+    """Up to where a run is in chunks."""
+    end_s, max_id = connection.execute(_IN_CHUNKS, {"run": run_id}).fetchone()
+    if end_s is None:
+        return Reached(float("-inf"), 0, 0, 0)
+    (last_id,) = connection.execute(_LAST_AT, (run_id, end_s)).fetchone()
+    return Reached(end_s, last_id, max(max_id, watermark(connection)), max_id)
+
+
+def watermark(connection: sqlite3.Connection) -> int:
+    """Rows with ids up to it have been looked at, of all runs: none of them comes late any more."""
+    row = connection.execute(_WATERMARK).fetchone()
+    return int(row[0]) if row else 0
+
+
+def signals_in(connection: sqlite3.Connection, run_id: int) -> set[int]:
+    """The ids of the signals that have chunks in a run."""
+    return {signal_id for (signal_id,) in connection.execute(_SIGNALS_IN, (run_id,))}
+
+
+def statistics_in(
+    connection: sqlite3.Connection, run_id: int, signal_id: int, between: tuple[int, int]
+) -> Array:
+    """What a signal comes to in the groups between two ids: a row for each that has it.
+
+    The first column is the id of the group, the others are the fields of `Statistics`.
+    """
+    rows = connection.execute(_STATISTICS, (run_id, signal_id, *between)).fetchall()
+    return np.reshape(np.array(rows, np.float64), (-1, 1 + len(Statistics._fields)))
+
+
+def groups_with_steps(
+    connection: sqlite3.Connection, run_id: int, signal_id: int, between: tuple[int, int], by: float
+) -> list[int]:
+    """The groups between two ids in which a signal once changes by more than that."""
+    asked = (run_id, signal_id, *between, by)
+    return [group_id for (group_id,) in connection.execute(_LONG_STEPS, asked)]
+
+
+def values_in(
+    connection: sqlite3.Connection, run_id: int, signal_id: int, wanted: Mapping[int, int]
+) -> Iterator[tuple[int, Decoded | DamagedChunkError]]:
+    """The values of a signal in some groups, by their ids, in no order; none of those that lack it.
+
+    Of a chunk that cannot be read comes the error that says why.
+
+    Args:
+        connection: Any.
+        run_id: Of which run.
+        signal_id: Of which signal; or times or ids.
+        wanted: How many rows each group has, by its id.
+    """
+    query, asked = _VALUES, [run_id, signal_id, min(wanted, default=0), max(wanted, default=-1)]
+    if len(wanted) < _FEW * (asked[3] - asked[2]):
+        query, asked = _FEW_VALUES, [*asked, json.dumps([*wanted])]
+    for group_id, *encoded in connection.execute(query, asked):
+        rows = wanted.get(group_id)
+        if rows is None:
+            continue
+        try:
+            yield group_id, decode(Encoded(*encoded), rows)
+        except DamagedChunkError as error:
+            yield group_id, error
+
+
+# Chunks of a recording that is not to be written: in a temporary file of this process, made once.
+#
+# The file is a recording without states, which are read from the other one; a reader sees its
+# groups, chunks and signals in the place of those of the recording. It goes when the process ends.
+
+
+_SEEN: Final = ("signal", "row_group", "chunk", "watermark")
+_COPIED: Final = ("robot", "session", "run", *_SEEN)
+_OTHERS: Final = (
+    "SELECT type, name FROM main.sqlite_master WHERE type = 'view' OR type = 'table' AND name "
+    f"NOT IN {_COPIED} AND name NOT LIKE 'sqlite_%'"
+)
+_LAST_IDS: Final = (
+    "DELETE FROM main.sqlite_sequence WHERE name = 'state'",
+    "INSERT INTO main.sqlite_sequence SELECT * FROM recorded.sqlite_sequence WHERE name = 'state'",
+)
+
+_UUID: Final = "SELECT uuid FROM {}.recording"  # a new file may have the number of a deleted one
+_MARK: Final = f"SELECT state_id FROM main.watermark WHERE name = 'chunk' AND {IS_MARK}"
+_LAST_ID: Final = "SELECT coalesce(max(max_state_id), 0) FROM row_group WHERE is_complete = 1"
+
+
+class _Made(NamedTuple):
+    file: Path
+    uuid: str  # of the recording
+    last_id: int  # up to which its rows are in chunks
+
+
+_made: dict[tuple[int, int], _Made] = {}
+
+
+def is_chunked_aside(connection: sqlite3.Connection, database: Path) -> bool:
+    """Whether this process has chunks of its own of a recording, which has not got as far.
+
+    A server that has begun to maintain it meanwhile deletes rows after it put them into chunks.
+    """
+    made = _made.get(_key(database))
+    if made is None or connection.execute(_UUID.format("main")).fetchone() != (made.uuid,):
+        return False
+    (mark,) = connection.execute(_MARK).fetchone() or (0,)
+    return mark < made.last_id
+
+
+def show_chunks_aside(connection: sqlite3.Connection, database: Path) -> None:
+    """Let a reader see the chunks that this process has of its recording, if it has any."""
+    if not is_chunked_aside(connection, database):
+        return
+    file = _made[_key(database)].file
+    connection.execute("ATTACH DATABASE ? AS aside", (f"{file.as_uri()}?mode=ro",))
+    connection.execute("PRAGMA query_only=OFF")  # for views of this connection alone
+    for table in _SEEN:
+        connection.execute(f"CREATE TEMP VIEW {table} AS SELECT * FROM aside.{table}")
+    connection.execute("PRAGMA query_only=ON")
+
+
+@contextmanager
+def chunks_aside(database: Path, *, frozen: bool) -> Generator[sqlite3.Connection]:
+    """A connection on which `make_chunks` writes into the temporary file; readers see it after.
+
+    Args:
+        database: The recording.
+        frozen: No process writes to it, nor can one.
+    """
+    key = _key(database)
+    file = _made[key].file if key in _made else _new_file()
+    with closing(sqlite3.connect(file, isolation_level=None)) as connection:
+        immutable = "&immutable=1" if frozen else ""
+        address = f"{database.absolute().as_uri()}?mode=ro{immutable}"
+        connection.execute("ATTACH DATABASE ? AS recorded", (address,))
+        (uuid,) = connection.execute(_UUID.format("recorded")).fetchone()
+        if key not in _made or _made[key].uuid != uuid:
+            for table in _COPIED:
+                connection.execute(f"DELETE FROM main.{table}")
+                connection.execute(f"INSERT INTO main.{table} SELECT * FROM recorded.{table}")
+        for statement in _LAST_IDS:  # up to which a watermark is believed
+            connection.execute(statement)
+        try:
+            yield connection
+        finally:
+            (last_id,) = connection.execute(_LAST_ID).fetchone()  # also of work that broke off
+            _made[key] = _Made(file, uuid, max(last_id, watermark(connection)))
+
+
+def _new_file() -> Path:
+    """One in which whatever is not copied is missing, so that it is read from the recording."""
+    folder = tempfile.mkdtemp(prefix="webots-mcp-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    file = Path(folder) / DATABASE_NAME
+    with closing(connect(file, "writer", create=True)) as connection:
+        create_schema(connection)
+        connection.execute("PRAGMA foreign_keys=OFF")
+        connection.execute("PRAGMA journal_mode=DELETE")
+        for kind, name in connection.execute(_OTHERS).fetchall():
+            connection.execute(f"DROP {kind} {name}")
+    return file
+
+
+def _key(database: Path) -> tuple[int, int]:
+    status = database.stat()
+    return status.st_dev, status.st_ino

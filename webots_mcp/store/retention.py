@@ -1,0 +1,359 @@
+"""How much of a recording is kept: the limits of each kind of row, and how a person writes them."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import sqlite3
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, Final, NamedTuple
+
+from webots_mcp.connection import transaction
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.liveness import process_alive
+from webots_mcp.store.run_rows import fetch_run
+
+# A run that a person named, described or marked is not retention's to judge.
+# Trials are labelled by the hundred without anybody's having judged them: their scores stay.
+KEPT: Final = (
+    "(keep <> 0 OR coalesce(note, '') <> '' "
+    "OR (coalesce(label, '') <> '' AND label NOT GLOB 'trial [0-9]* of set [0-9]*: *'))"
+)
+_MARK: Final = "UPDATE run SET keep = ? WHERE id = ?"
+
+
+@dataclass(frozen=True)
+class Limit:
+    """How much of one kind is kept; None is not a limit. What is oldest goes first.
+
+    Attributes:
+        size_bytes: So much on the disk, with the free room on the pages and the indexes. Of
+            pictures their files.
+        rows: So many rows; of chunks so many states that they stand for.
+        age_s: So long after they were written, in wall time.
+        spared_rows: So many of the newest rows, of all runs together, do not go because of their
+            age: runs of abandoned work do not all vanish. Size and rows always hold.
+    """
+
+    size_bytes: int | None = None
+    rows: int | None = None
+    age_s: float | None = None
+    spared_rows: int = 10_000
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value is not None and not 0 <= value < math.inf:
+                raise InvalidInputError(f"{field.name}={value} must be 0 or more, and finite")
+
+    @property
+    def limits(self) -> bool:
+        """Whether it states any limit."""
+        return (self.size_bytes, self.rows, self.age_s) != (None, None, None)
+
+    def is_exceeded(
+        self, *, size_bytes: float, rows: float, age_s: float = 0, times: float = 1
+    ) -> bool:
+        """Whether one of these is more than so many times its limit."""
+        found = ((size_bytes, self.size_bytes), (rows, self.rows), (age_s, self.age_s))
+        return any(limit is not None and value > times * limit for value, limit in found)
+
+
+@dataclass(frozen=True)
+class Retention:
+    """The limits of each kind of row.
+
+    They hold for the whole database, over all robots: rows go in the order in which they were
+    recorded, whatever their run, about a thousand of a run at once. Runs with a label (but that of
+    a trial), a note or `keep` lose nothing and do not count.
+
+    Attributes:
+        state: The full rows. They go only after their values were put into chunks.
+        chunk: The values of each signal, compressed, of about 1,024 states at once. They go only
+            after those states, and with them what their run still says of that time.
+        log: Log lines.
+        event: Events; its age also holds for finished commands.
+        image: Pictures, with their files.
+        outlive: When this many times the limits of `chunk` and of `state` was recorded after a run,
+            or it ended that many times their age ago (and as many states as an age spares were
+            recorded since), all that is left of it goes, and with the last run of that time the
+            commands. 0 keeps runs for ever.
+        kept_state: Rows of kept stretches: those that the throttle dropped, and those that went
+            from `state`. A stretch that loses a row is none any more.
+        unshipped: What is beyond these limits stays until it is shipped to a pool; of more than
+            this size the oldest goes all the same.
+    """
+
+    state: Limit = Limit(size_bytes=1_000_000_000, spared_rows=50_000)
+    chunk: Limit = Limit(size_bytes=1_000_000_000)
+    log: Limit = Limit(size_bytes=100_000_000)
+    event: Limit = Limit(size_bytes=100_000_000)
+    image: Limit = Limit(size_bytes=1_000_000_000, spared_rows=50)
+    outlive: float = 10.0
+    kept_state: Limit = Limit(size_bytes=100_000_000)
+    unshipped: Limit = Limit(size_bytes=0)
+
+    def __post_init__(self) -> None:
+        if not (self.outlive == 0 or 1 <= self.outlive < math.inf):
+            raise InvalidInputError(f"outlive={self.outlive} must be 1 or more, or 0 for ever")
+        waiting = self.unshipped
+        if waiting.size_bytes is None or (waiting.rows, waiting.age_s) != (None, None):
+            raise InvalidInputError(
+                "rows that wait to be shipped are kept up to a size, so that an unreachable pool "
+                "does not fill the disk: --keep-until-shipped 2GB"
+            )
+
+
+DEFAULT: Final = Retention()
+
+
+def mark_kept(connection: sqlite3.Connection, run_ids: Sequence[int], *, keep: bool = True) -> None:
+    """Let retention keep these runs for good, or no longer; all of them or, on an error, none.
+
+    Raises:
+        UnknownRunError: There is no such run.
+    """
+    with transaction(connection):
+        for run_id in run_ids:
+            fetch_run(connection, run_id)
+        connection.executemany(_MARK, [(int(keep), run_id) for run_id in run_ids])
+
+
+# The limits of a database belong to it, not to who maintains it: set once, they hold for all.
+#
+# `prune` and `retain` set what a person asks for. A server sets limits that are not set yet, or
+# that a server set which no longer runs; while another server runs, it reports the limits in
+# force.
+
+
+Asked = Mapping[str, "Limit | float | None"]
+"""Limits by the names that they have in `Retention`; None is back to the default."""
+
+SERVE: Final = "serve"
+KINDS: Final = ("state", "kept_state", "chunk", "log", "event", "image", "unshipped")
+_KIND_OF: Final = {**{kind: kind for kind in KINDS}, "outlive": "run"}
+_NAME_OF: Final = {kind: name for name, kind in _KIND_OF.items()}
+_SHOWN: Final = {"unshipped": "until_shipped"}  # only where it was set
+_READ: Final = (
+    "SELECT kind, size_bytes, row_count, age_s, outlive_factor, set_by, set_wall_time_s "
+    "FROM retention_limit"
+)
+_SET: Final = (
+    "INSERT OR REPLACE INTO retention_limit "
+    "(kind, size_bytes, row_count, age_s, outlive_factor, set_by, set_wall_time_s) "
+    "VALUES (?, ?, ?, ?, ?, ?, ?)"
+)
+_RESET: Final = "DELETE FROM retention_limit WHERE kind = ?"
+_SERVER: Final = (
+    "SELECT CAST(holder AS BLOB) FROM lease WHERE name = 'maintainer' AND holder LIKE 'server %' "
+    "AND typeof(until_wall_time_s) IN ('real', 'integer') AND until_wall_time_s > ?"
+)
+
+
+class Setting(NamedTuple):
+    """A limit that was set, and when."""
+
+    value: Limit | float
+    set_by: str
+    set_wall_time_s: float
+
+
+def read_settings(connection: sqlite3.Connection) -> dict[str, Setting]:
+    """What was set, by the names that it has in `Retention`; of the others the defaults hold.
+
+    Raises:
+        InvalidInputError: The table holds something that is not a limit.
+    """
+    settings: dict[str, Setting] = {}
+    for kind, size_bytes, rows, age_s, factor, set_by, set_s in connection.execute(_READ):
+        try:
+            name = _NAME_OF[kind]
+            if name == "outlive":
+                value = replace(DEFAULT, outlive=factor).outlive
+            else:
+                of_kind = getattr(DEFAULT, name)
+                value = replace(of_kind, size_bytes=size_bytes, rows=rows, age_s=age_s)
+        except (KeyError, TypeError, InvalidInputError) as error:
+            raise InvalidInputError(
+                f"the row {kind!r} of the table retention_limit is not a limit ({error}): set it "
+                "again with 'webots-mcp retain'"
+            ) from error
+        settings[name] = Setting(value, set_by, set_s)
+    return settings
+
+
+def in_force(connection: sqlite3.Connection, asked: Asked | None = None) -> Retention:
+    """The limits of a database; with `asked` as they would be after `set_limits`."""
+    values: dict[str, Any] = {
+        name: setting.value for name, setting in read_settings(connection).items()
+    }
+    for name, value in (asked or {}).items():
+        values[name] = getattr(DEFAULT, name) if value is None else value
+    return replace(DEFAULT, **values)
+
+
+def set_limits(connection: sqlite3.Connection, asked: Asked, set_by: str) -> None:
+    """Put these limits in force, whichever process maintains the database."""
+    if not asked:
+        return
+    now_s = time.time()
+    with transaction(connection):
+        for name, value in asked.items():
+            kind = _KIND_OF[name]
+            if value is None:
+                connection.execute(_RESET, (kind,))
+            elif isinstance(value, Limit):
+                limit = (value.size_bytes, value.rows, value.age_s, None)
+                connection.execute(_SET, (kind, *limit, set_by, now_s))
+            else:
+                connection.execute(_SET, (kind, None, None, None, value, set_by, now_s))
+
+
+def ask_at_start(connection: sqlite3.Connection, asked: Asked) -> list[str]:
+    """Set what a starting server may set; returns for each limit that it may not what holds."""
+    if not _another_server(connection):
+        settings = read_settings(connection)
+        mine = {
+            name: value
+            for name, value in asked.items()
+            if name not in settings or settings[name].set_by == SERVE
+        }
+        set_limits(connection, _changed(mine, settings), SERVE)
+    return unheeded(connection, asked)
+
+
+def ask_where_unset(connection: sqlite3.Connection, asked: Asked) -> None:
+    """Set limits that are not set: of a database created after the server started."""
+    settings = read_settings(connection)
+    if new := {name: value for name, value in asked.items() if name not in settings}:
+        set_limits(connection, new, SERVE)
+
+
+def unheeded(connection: sqlite3.Connection, asked: Asked) -> list[str]:
+    """What was asked for and does not hold: what does, who set it, and how to change it."""
+    settings = read_settings(connection)
+    found: list[str] = []
+    for name, value in asked.items():
+        setting = settings.get(name)
+        if setting is None or value is None or _text(setting.value) == _text(value):
+            continue
+        option = option_of(_KIND_OF[name])
+        found.append(
+            f"{option} {_text(value)} is not in force: the database keeps {_said(setting)}; "
+            f"'webots-mcp retain {option} ...' changes it"
+        )
+    return found
+
+
+def described(connection: sqlite3.Connection) -> dict[str, str]:
+    """Each limit in force as a person reads it, with who set it and when."""
+    settings, retention = read_settings(connection), in_force(connection)
+    return {
+        _SHOWN.get(kind, f"{kind}s"): _said(settings[name])
+        if name in settings
+        else f"{_text(getattr(retention, name))} (default)"
+        for name, kind in _KIND_OF.items()
+        if kind not in _SHOWN or name in settings
+    }
+
+
+def _changed(asked: Asked, settings: Mapping[str, Setting]) -> Asked:
+    return {
+        name: value
+        for name, value in asked.items()
+        if name not in settings or value is None or _text(settings[name].value) != _text(value)
+    }
+
+
+def _said(setting: Setting) -> str:
+    when = time.strftime("%Y-%m-%d %H:%M", time.localtime(setting.set_wall_time_s))
+    return f"{_text(setting.value)} (set by {setting.set_by}, {when})"
+
+
+def _text(value: Limit | float) -> str:
+    if isinstance(value, Limit):
+        return limit_text(value)
+    return f"{value:g} times as long as chunks" if value else NO_LIMIT
+
+
+def _another_server(connection: sqlite3.Connection) -> bool:
+    """Whether a server that runs maintains the database; one that was killed holds its lease on."""
+    now_s = time.time()
+    holders: Iterable[tuple[bytes]] = connection.execute(_SERVER, (now_s,)).fetchall()
+    pids = [pid for (holder,) in holders for pid in holder.split()[1:2]]
+    return any(pid.isdigit() and _lives(int(pid), now_s) for pid in pids)
+
+
+def _lives(pid: int, now_s: float) -> bool:
+    return pid != os.getpid() and process_alive(pid, None, now_s)
+
+
+# Limits as a person writes them: `500MB,30d`, `100000rows`, `all`.
+
+
+_PART: Final = re.compile(r"(\d+(?:\.\d+)?)\s*([a-z]+)", re.IGNORECASE)
+_BYTES: Final = {"b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12}
+_SECONDS: Final = {"s": 1, "min": 60, "h": 3600, "d": 86_400, "w": 604_800}
+NO_LIMIT: Final = "all"  # is kept
+_OPTIONS: Final = {"kept_state": "--keep-stretches", "unshipped": "--keep-until-shipped"}
+_ROWS: Final = {"row": 1, "rows": 1}
+
+
+def option_of(kind: str) -> str:
+    """The option of the command line that limits a kind of row."""
+    return _OPTIONS.get(kind, f"--keep-{kind}s")
+
+
+def parse_limit(text: str, default: Limit) -> Limit:
+    """A limit from its parts, separated by commas; what is not named has no limit.
+
+    Args:
+        text: Sizes (kB, MB, GB), ages (min, h, d, w) and rows; or `all`, without any limit.
+        default: What a current run is spared comes from here.
+
+    Raises:
+        InvalidInputError: A part is none of these, or named twice.
+    """
+    limit: dict[str, Any] = {"size_bytes": None, "rows": None, "age_s": None}
+    for part in [] if text.strip().lower() == NO_LIMIT else text.split(","):
+        name, value = _parse_part(part.strip(), text)
+        if limit[name] is not None:
+            raise InvalidInputError(f"{text!r} limits the same thing twice")
+        limit[name] = value
+    return replace(default, **limit)
+
+
+def _parse_part(part: str, text: str) -> tuple[str, float]:
+    found = _PART.fullmatch(part)
+    if found is not None:
+        number, unit = float(found[1]), found[2].lower()
+        if unit in _BYTES:
+            return "size_bytes", round(number * _BYTES[unit])
+        if unit in _SECONDS:
+            return "age_s", number * _SECONDS[unit]
+        if unit in _ROWS:
+            return "rows", round(number)
+    raise InvalidInputError(
+        f"{part!r} in {text!r} is not a limit: write a size (500MB), an age (30d), a number of "
+        f"rows (100000rows), several of them with commas between, or {NO_LIMIT} to keep everything"
+    )
+
+
+def limit_text(limit: Limit) -> str:
+    """A limit as `parse_limit` reads it; a size is rounded."""
+    parts = [size_text(limit.size_bytes)] if limit.size_bytes is not None else []
+    parts += [f"{limit.age_s:g}s"] if limit.age_s is not None else []
+    parts += [f"{limit.rows}rows"] if limit.rows is not None else []
+    return ",".join(parts) or NO_LIMIT
+
+
+def size_text(size_bytes: float) -> str:
+    """A size as a person reads it, in the units that `parse_limit` takes."""
+    for unit in ("B", "kB", "MB"):
+        if size_bytes < 1000:
+            return f"{size_bytes:.0f} {unit}" if unit == "B" else f"{size_bytes:.1f} {unit}"
+        size_bytes /= 1000
+    return f"{size_bytes:.2f} GB"

@@ -10,12 +10,12 @@ from typing import Any, Final, TypeVar
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
 from webots_mcp.naming import listed
 from webots_mcp.questions.answers import Answer, Table
-from webots_mcp.questions.declaring import is_for_a_person
 from webots_mcp.questions.shortening import (
     DETAIL_BUDGET_TOKENS,
     Limits,
     compact_json,
     cut_text,
+    is_for_a_person,
     round_number,
     shorten,
     tokens_of,

@@ -38,9 +38,9 @@ from webots_mcp.questions.budget import (
     shown,
     without_empty,
 )
-from webots_mcp.questions.declaring import READS, SETS, is_for_a_person, question
+from webots_mcp.questions.declaring import READS, SETS, question
 from webots_mcp.questions.history_answers import ComparisonAnswer, RunsAnswer
-from webots_mcp.questions.shortening import DETAIL_BUDGET_TOKENS, WHOLE, shorten
+from webots_mcp.questions.shortening import DETAIL_BUDGET_TOKENS, WHOLE, is_for_a_person, shorten
 from webots_mcp.store.analysis.spread import MIN_EFFECT_SD, Spread
 from webots_mcp.store.detection.event import EventOptions, both_of
 from webots_mcp.store.questions.compare import (

@@ -10,17 +10,28 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
-from contextvars import ContextVar
-from dataclasses import dataclass
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, get_type_hints
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Final,
+    Literal,
+    NamedTuple,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from anyio import to_thread
-from pydantic import BaseModel, ConfigDict, create_model
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 from pydantic.fields import FieldInfo
+from pydantic.json_schema import SkipJsonSchema
 
 from webots_mcp.errors import (
+    InvalidInputError,
     MalformedRowError,
     NoDatabaseError,
     NothingRecordedError,
@@ -28,7 +39,8 @@ from webots_mcp.errors import (
 )
 from webots_mcp.questions.answers import Answer, ShownPicture
 from webots_mcp.questions.argument_types import SCOPE
-from webots_mcp.questions.shortening import compact_json
+from webots_mcp.questions.faults import faults_of
+from webots_mcp.questions.shortening import Client, compact_json, reader
 from webots_mcp.store.invalid_rows import past_invalid_rows
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.recording import Recording
@@ -37,7 +49,6 @@ if TYPE_CHECKING:
     from webots_mcp.steering.launcher import Companions
 
 Report = Callable[[float, float | None, str], Awaitable[None]]
-Client = Literal["mcp", "cli"]
 
 
 @dataclass(frozen=True)
@@ -55,6 +66,7 @@ class Effect:
     repeats: bool = False
 
 
+_NOT_GIVEN: Final = inspect.Parameter.empty
 READS: Final = Effect(reads=True, repeats=True)
 CHANGES: Final = Effect()
 SETS: Final = Effect(repeats=True)  # what it sets is the same, however often
@@ -209,14 +221,14 @@ class Question:
             given[scope] = Scope(**{name: given.pop(name, None) for name in SCOPE})
         if asker := self._parameter_of(Caller):
             given[asker] = caller
-        client = _client.set(caller.client if caller else "cli")
+        client = reader.set(caller.client if caller else "cli")
         try:
             if inspect.iscoroutinefunction(self.function):
                 answer = await self.function(recording, **given)
             else:
                 answer = await to_thread.run_sync(lambda: self.function(recording, **given))
         finally:
-            _client.reset(client)
+            reader.reset(client)
         return _reply(answer)
 
     def _parameter_of(self, kind: type) -> str | None:
@@ -253,9 +265,6 @@ def _with_left_out(reply: Reply, left_out: Sequence[str]) -> Reply:
     return _in_text(reply.data | {"left_out": whole}, reply.shown[1:])
 
 
-_client: Final[ContextVar[Client]] = ContextVar("client", default="mcp")
-
-
 def question(
     title: str,
     effect: Effect,
@@ -279,6 +288,155 @@ def questions_in(module: ModuleType) -> Iterator[Question]:
     return (each for each in found if each.function.__module__ == module.__name__)
 
 
-def is_for_a_person() -> bool:
-    """Whether the answer is read in a terminal, where nothing is cut to save a model's context."""
-    return _client.get() == "cli"
+@dataclass(frozen=True, eq=False)
+class MergedQuestion(Question):
+    """Several questions as one.
+
+    Attributes:
+        choice: The argument that says which of them is asked.
+        meaning: What that argument means.
+        parts: The questions by its values. The first is asked where it is left out, unless
+            `must_choose`.
+        unlisted: Arguments that are taken, and stand in no schema: another says the same.
+    """
+
+    choice: str = ""
+    meaning: str = ""
+    parts: Mapping[str, Question] = field(default_factory=dict[str, Question])
+    must_choose: bool = False
+    unlisted: tuple[str, ...] = ()
+
+    @functools.cached_property
+    def parameters(self) -> list[inspect.Parameter]:
+        """The choice, and each argument of a part once, in the words of the first that has it."""
+        chosen = Annotated[Literal[tuple(self.parts)], Field(description=self.meaning)]
+        default = _NOT_GIVEN if self.must_choose else next(iter(self.parts))
+        common = [
+            each.replace(annotation=SkipJsonSchema[each.annotation])
+            if each.name in self.unlisted
+            else each
+            for each in self._common()
+        ]
+        return [_keyword(self.choice, chosen, default), *common]
+
+    def _common(self) -> Iterable[inspect.Parameter]:
+        declared: dict[str, list[inspect.Parameter]] = {}
+        for part in self.parts.values():
+            for each in part.parameters:
+                declared.setdefault(each.name, []).append(each)
+        for name, those in declared.items():
+            defaults = [each.default for each in those]
+            kind = those[0].annotation
+            if any(default != defaults[0] for default in defaults) or (
+                defaults[0] is _NOT_GIVEN and len(those) < len(self.parts)
+            ):
+                yield _keyword(name, _or_none(kind), None)
+            else:
+                yield _keyword(name, kind, defaults[0])
+
+    async def ask(
+        self, recording: Recording, arguments: Mapping[str, Any], caller: Caller | None
+    ) -> Reply:
+        """The answer of the part that was chosen.
+
+        Raises:
+            InvalidInputError: An argument is not one of that part, or it lacks one.
+            WebotsMCPError: As the part says.
+        """
+        chosen = arguments[self.choice]
+        part = self.parts[chosen]
+        own = {each.name for each in part.parameters}
+        defaults = {each.name: each.default for each in self.parameters}
+        given = {
+            name: value
+            for name, value in arguments.items()
+            if name != self.choice and not (name in defaults and value == defaults[name])
+        }
+        for name in given.keys() - own:
+            raise InvalidInputError(
+                f"{name} has no meaning with {self.choice}={chosen!r}: there is "
+                f"{', '.join(each.name for each in part.parameters)}"
+            )
+        try:
+            valid = part.arguments.model_validate(given)
+        except ValidationError as error:
+            raise InvalidInputError(f"{self.choice}={chosen!r}: {faults_of(error)}") from error
+        return await part.ask(recording, {name: getattr(valid, name) for name in own}, caller)
+
+
+def merged(
+    first: Question,
+    *,
+    choice: str,
+    meaning: str,
+    parts: Mapping[str, Question],
+    text: str,
+    name: str | None = None,
+    title: str | None = None,
+    unlisted: tuple[str, ...] = (),
+) -> MergedQuestion:
+    """Merge questions that all read, or that all change something.
+
+    Args:
+        first: Whose name and title it takes, unless others are given.
+        choice: The argument that says which is asked.
+        meaning: What it means.
+        parts: The questions by its values.
+        text: What the tool does.
+        name: Its own name; then nothing is asked by default.
+        title: Its own title.
+        unlisted: Arguments that stand in no schema.
+    """
+    effects = [part.effect for part in parts.values()]
+    if len({effect.reads for effect in effects}) != 1:
+        raise ValueError(f"{', '.join(parts)}: some of them read, others change something")
+    effect = Effect(
+        reads=effects[0].reads,
+        destroys=any(effect.destroys for effect in effects),
+        repeats=all(effect.repeats for effect in effects),
+    )
+
+    def function() -> Answer:
+        raise NotImplementedError  # its parts are asked
+
+    function.__name__ = name or first.name
+    function.__doc__ = text
+    kinds = tuple(dict.fromkeys(part.answer or Answer for part in parts.values()))
+    answer = create_model(f"{function.__name__}_answer", __base__=kinds)
+    function.__annotations__["return"] = answer
+    return MergedQuestion(
+        function,
+        title or first.title,
+        effect,
+        core=first.core,
+        choice=choice,
+        meaning=meaning,
+        parts=parts,
+        must_choose=name is not None,
+        unlisted=unlisted,
+    )
+
+
+def listed(questions: Iterable[Question]) -> list[Question]:
+    """Those that a client sees: each merged one in place of its first part, the others gone."""
+    every = list(questions)
+    merges = [each for each in every if isinstance(each, MergedQuestion)]
+    first = {next(iter(each.parts.values())): each for each in merges}
+    hidden = {part for each in merges for part in each.parts.values()}
+    kept = [each for each in every if each not in merges]
+    return [first.get(each, each) for each in kept if each in first or each not in hidden]
+
+
+def _keyword(name: str, kind: Any, default: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+
+
+def _or_none(kind: Any) -> Any:
+    """The annotation of an argument that may be left out."""
+    if get_origin(kind) is not Annotated:
+        return kind | None
+    plain, *metadata = get_args(kind)
+    described = [each for each in metadata if getattr(each, "description", None)]
+    others = [each for each in metadata if each not in described]
+    inner = Annotated[(plain, *others)] if others else plain
+    return Annotated[(inner | None, *described)]

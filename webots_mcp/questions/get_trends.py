@@ -23,9 +23,9 @@ from webots_mcp.questions.budget import (
     some,
     table,
 )
-from webots_mcp.questions.declaring import READS, is_for_a_person, question
+from webots_mcp.questions.declaring import READS, question
 from webots_mcp.questions.history_answers import RunTrendTables, TrendsAnswer
-from webots_mcp.questions.shortening import compact_json, tokens_of
+from webots_mcp.questions.shortening import compact_json, is_for_a_person, tokens_of
 from webots_mcp.store.questions.trend import Trend
 from webots_mcp.store.questions.trends import RunTrends, StateTrend, trends
 from webots_mcp.store.reading.ranges import Scope, TimeRange

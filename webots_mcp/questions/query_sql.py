@@ -23,9 +23,9 @@ from webots_mcp.questions.budget import (
     header_of_only,
     room_tokens,
 )
-from webots_mcp.questions.declaring import READS, is_for_a_person, question
+from webots_mcp.questions.declaring import READS, question
 from webots_mcp.questions.history_answers import SqlAnswer
-from webots_mcp.questions.shortening import tokens_of
+from webots_mcp.questions.shortening import is_for_a_person, tokens_of
 from webots_mcp.store.questions.sql import Cell, Result, require_select
 from webots_mcp.store.questions.sql_process import FOLDER, LINE, Statement, as_file, decode
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S

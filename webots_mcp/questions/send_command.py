@@ -12,8 +12,14 @@ from webots_mcp.contract import BUILT_IN_ACTIONS, CommandStatus
 from webots_mcp.questions.answers import CommandAnswer, CommandsAnswer
 from webots_mcp.questions.argument_types import Cursor, Id, RobotName, TimeoutS
 from webots_mcp.questions.budget import condensed, fitting, short_name
-from webots_mcp.questions.declaring import DESTROYS, READS, Caller, is_for_a_person, question
-from webots_mcp.questions.shortening import DETAIL_BUDGET_TOKENS, cut_text, shorten, tokens_of
+from webots_mcp.questions.declaring import DESTROYS, READS, Caller, question
+from webots_mcp.questions.shortening import (
+    DETAIL_BUDGET_TOKENS,
+    cut_text,
+    is_for_a_person,
+    shorten,
+    tokens_of,
+)
 from webots_mcp.queue import Command, list_commands
 from webots_mcp.steering.dispatch import Dispatcher, shown_result
 from webots_mcp.store.recording import Recording, View

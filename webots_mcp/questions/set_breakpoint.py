@@ -64,7 +64,7 @@ def webots_list_breakpoints(recording: Recording, robot: RobotName = None) -> Br
         none = "this robot has none: webots_breakpoint sets one"
         return BreakpointsAnswer(
             **view.header(),
-            breakpoints=table(arming.COLUMNS, shown),
+            breakpoints=table(arming.BREAKPOINT_COLUMNS, shown),
             hint=more if len(shown) < len(rows) else None if rows else none,
         )
 

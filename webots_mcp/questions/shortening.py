@@ -6,9 +6,12 @@ import json
 import re
 import sys
 from collections.abc import Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, Final, Literal, NamedTuple, cast
 
+Client = Literal["mcp", "cli"]
+reader: Final[ContextVar[Client]] = ContextVar("reader", default="mcp")
 STATE_BUDGET_TOKENS: Final = 1_500
 RESULT_BUDGET_TOKENS: Final = 1_200
 DETAIL_BUDGET_TOKENS: Final = 120
@@ -66,6 +69,11 @@ class Shortened(NamedTuple):
 
     value: Any
     rule: str | None
+
+
+def is_for_a_person() -> bool:
+    """Whether the answer is read in a terminal, where nothing is cut to save a model's context."""
+    return reader.get() == "cli"
 
 
 def shorten(

@@ -11,8 +11,8 @@ from webots_mcp.liveness import dead_sessions
 from webots_mcp.questions.answers import RobotsAnswer, Table, WorldAnswer
 from webots_mcp.questions.argument_types import RobotName, RunId
 from webots_mcp.questions.budget import cut_for_a_model, fitting, room_tokens
-from webots_mcp.questions.declaring import READS, is_for_a_person, question
-from webots_mcp.questions.shortening import cut_text, round_number, shorten
+from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.shortening import cut_text, is_for_a_person, round_number, shorten
 from webots_mcp.store.recording import GETTING_STARTED, Recording, View, name_of, storage, view_of
 from webots_mcp.store.retention.limits import described, unheeded
 from webots_mcp.store.retention.usage import file_sizes

@@ -20,7 +20,7 @@ from webots_mcp.errors import WebotsMCPError, warn
 from webots_mcp.liveness import reap_if_dead
 from webots_mcp.maintenance import Maintainer
 from webots_mcp.questions import all_questions
-from webots_mcp.questions.merged_questions import listed
+from webots_mcp.questions.declaring import listed
 from webots_mcp.server.prompts import add_prompts
 from webots_mcp.server.resources import add_resources
 from webots_mcp.server.tools import ToolServer, tool_of

@@ -20,7 +20,7 @@ from webots_mcp.store.reading.subject import Subject
 from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.signals.catalogue import catalogue
 
-COLUMNS: Final = (
+BREAKPOINT_COLUMNS: Final = (
     "id", "condition", "action", "after_hits", "hit_count", "newest_hit_run_id", "newest_hit_s",
     "set_by", "off_because",
 )  # fmt: skip
@@ -84,7 +84,7 @@ async def remove_breakpoint(
 
 
 def breakpoint_rows(view: View) -> list[list[Any]]:
-    """The robot's breakpoints, under `COLUMNS`."""
+    """The robot's breakpoints, under `BREAKPOINT_COLUMNS`."""
     listed = stored.list_breakpoints(view.connection, view.robot.id)
     return [_row(view.connection, each) for each in listed]
 

@@ -17,8 +17,8 @@ from webots_mcp.bridge.printed_lines import MOST_LINES_PER_S
 from webots_mcp.cli import names
 from webots_mcp.connection import OLDEST_SQLITE
 from webots_mcp.contract import BUILT_IN_ACTIONS, KEEP_AFTER_S
-from webots_mcp.questions.argument_types import MAX_WAIT_S
 from webots_mcp.questions.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS
+from webots_mcp.questions.declaring import MAX_WAIT_S
 from webots_mcp.schema import SCHEMA_FILE
 from webots_mcp.server import create_server
 from webots_mcp.store.detection.registry import kind_names

@@ -38,7 +38,7 @@ from webots_mcp.plotting.signal_axes import paint_signals
 from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plotting.trajectory_axes import paint_trajectory
-from webots_mcp.questions.argument_types import RunIds
+from webots_mcp.questions.declaring import RunIds
 from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.reading.ranges import Scope, find_range
 
@@ -295,7 +295,7 @@ def test_pictures_can_be_drawn_at_the_same_time(rover: sqlite3.Connection) -> No
         assert len(set(pool.map(picture, range(4)))) == 1
 
 
-@pytest.mark.parametrize("module", ["webots_mcp.server.app", "webots_mcp.plotting", "webots_mcp"])
+@pytest.mark.parametrize("module", ["webots_mcp.server", "webots_mcp.plotting", "webots_mcp"])
 def test_matplotlib_waits_for_the_first_picture(module: str) -> None:
     code = (
         f"import sys, {module}\n"

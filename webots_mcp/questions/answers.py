@@ -224,3 +224,283 @@ class BreakpointsAnswer(Answer):
     """The breakpoints of a robot."""
 
     breakpoints: Table | None = None
+
+
+class NotedAnswer(Answer):
+    """An answer about a range of time, with what there is to know about that range."""
+
+    notes: list[str] | None = Field(
+        default=None, description="Limits of the range, of sampling, and similar remarks."
+    )
+
+
+class SignalsAnswer(NotedAnswer):
+    """The signals of a run."""
+
+    signals: Table | None = Field(
+        default=None, description="missing: rows of the run without a value of it."
+    )
+    total: int | None = Field(default=None, description="How many match.")
+    cursor: int | None = Field(default=None, description="Ask again with this cursor for more.")
+
+
+class NumberSeries(Part):
+    """A numeric signal: one item per bucket in each list, null where it has no value."""
+
+    unit: str | None = None
+    value: list[float | None] | None = Field(
+        default=None, description="Where every bucket is one row; then there is nothing else."
+    )
+    constant: float | None = Field(
+        default=None, description="The same in every bucket; then there is nothing else."
+    )
+    min: list[float | None] | None = None
+    max: list[float | None] | None = None
+    mean: list[float | None] | None = None
+    last: list[float | None] | None = None
+    count: list[int] | None = Field(
+        default=None, description="Values per bucket, where they are not those of the run."
+    )
+    whole: dict[str, float | None] | None = Field(default=None, description="Over the range.")
+    without_value: bool | None = Field(default=None, description="True: no value in the range.")
+    replaced: dict[str, int] | None = Field(
+        default=None, description="How often nan, inf, ... or too large a number stood there."
+    )
+
+
+class ChangeSeries(Part):
+    """A text or boolean signal: its values, each with the time from which on it had it."""
+
+    since_s: list[float | None] = Field(
+        description="First null: it began earlier; there was no time to find when."
+    )
+    value: list[str | bool | None]
+    total: int | None = Field(default=None, description="How many changes, if not all are shown.")
+    time_by_value_s: dict[str, float]
+
+
+class RunSeries(Part):
+    """The part of an answer that is about one run."""
+
+    run_id: int
+    start_s: float | None
+    end_s: float | None
+    step_s: float | None = Field(
+        default=None, description="Length of a bucket, s; missing where each bucket is one row."
+    )
+    sim_time_s: list[float | None] | None = Field(default=None, description="Begin of each bucket.")
+    count: list[int] | None = Field(default=None, description="Values per bucket.")
+    numbers: dict[str, NumberSeries] | None = None
+    states: dict[str, ChangeSeries] | None = None
+    row_count: int | None = None
+    recording_gaps: list[list[float | None]] | None = Field(
+        default=None, description="[from, to] where no row was recorded."
+    )
+    recording_gap_count: int | None = Field(
+        default=None, description="How many, if not all are shown."
+    )
+    rows_missing_from_s: float | None = Field(
+        default=None, description="Reading took too long: from here on rows are missing."
+    )
+
+
+class RowColumns(Part):
+    """Rows as they were recorded, as columns."""
+
+    run_id: list[int] | None = Field(default=None, description="Where it is not the header's.")
+    sim_time_s: list[float | None]
+    signals: dict[str, list[Any]]
+    replaced: dict[str, dict[str, int]] | None = None
+
+
+class HistoryAnswer(NotedAnswer):
+    """Signals over a range."""
+
+    runs: list[RunSeries] | None = None
+    raw: RowColumns | None = None
+    cursor: int | None = Field(
+        default=None, description="With raw: ask again with this cursor for the next rows."
+    )
+
+
+class RunTrendTables(Part):
+    """The trends of one run."""
+
+    run_id: int
+    start_s: float | None
+    end_s: float | None
+    row_count: int
+    resolution_s: float | None = Field(
+        default=None, description="Shapes and slopes come from means over this many seconds."
+    )
+    numbers: Table | None = Field(default=None, description="What changed most is first.")
+    states: Table | None = Field(default=None, description="Text and flags that changed.")
+    constant: str | None = Field(default=None, description="What never changed, with its value.")
+    without_value: str | None = Field(
+        default=None, description="Signals without a value in the range."
+    )
+    not_shown: str | None = Field(default=None, description="Of those that changed.")
+    rows_missing_from_s: float | None = Field(
+        default=None, description="Reading took too long: from here on rows are missing."
+    )
+
+
+class TrendsAnswer(NotedAnswer):
+    """What each signal did over a range."""
+
+    runs: list[RunTrendTables] | None = None
+
+
+class KindVerdicts(Part):
+    """What became of each kind that was asked for."""
+
+    found: dict[str, int] | None = Field(
+        default=None, description="How many there are in the range, shown or not."
+    )
+    not_found: str | None = Field(default=None, description="Searched for and not found.")
+    nearest: dict[str, str] | None = Field(
+        default=None, description="Not found either; what came nearest."
+    )
+    not_searched: dict[str, str] | None = Field(
+        default=None,
+        description="Not searched for, or only in part: why, and what to ask instead.",
+    )
+
+
+class EventsAnswer(NotedAnswer):
+    """What happened in a range, in order of time."""
+
+    events: Table | None = Field(
+        default=None, description="Columns with @ hold that signal's value when the event began."
+    )
+    verdicts: KindVerdicts | None = None
+    not_shown: dict[str, str] | None = Field(
+        default=None,
+        description="How many of each kind there are beside these, and when they began.",
+    )
+    cursor: str | None = Field(
+        default=None, description="Ask again with this cursor for those that are not shown."
+    )
+
+
+class TimelineAnswer(NotedAnswer):
+    """A page of what happened, in order of time."""
+
+    events: Table | None = None
+    verdicts: KindVerdicts | None = None
+    cursor: str | None = Field(
+        default=None, description="Ask again with this cursor for later ones."
+    )
+
+
+class MonitorAnswer(NotedAnswer):
+    """What was recorded in a window of wall time: of exactly those rows."""
+
+    window_s: float | None = Field(default=None, description="Wall time that was looked at.")
+    row_count: int | None = Field(default=None, description="States recorded in the window.")
+    movement: dict[str, Any] | None = None
+    trends: list[RunTrendTables] | None = Field(
+        default=None, description="More than one: time went back in between."
+    )
+    events: Table | None = Field(
+        default=None, description="Columns with @ hold that signal's value when the event began."
+    )
+    verdicts: KindVerdicts | None = None
+    not_shown: dict[str, str] | None = Field(
+        default=None,
+        description="How many of each kind there are beside these, and when they began.",
+    )
+
+
+class TrialsAnswer(NotedAnswer):
+    """How far a trial set is, and its parameters ranked."""
+
+    trial_set: int | None = None
+    state: str | None = Field(default=None, description="under way, done, stopped and why, ...")
+    trials: int | None = None
+    over: int | None = None
+    pruned: int | None = Field(default=None, description="Ended early, as the plan says.")
+    failed: int | None = None
+    score: str | None = None
+    ranked: Table | None = Field(
+        default=None,
+        description="The best first; score is the mean, range least and greatest of repeats.",
+    )
+    noise: float | None = Field(
+        default=None, description="Standard deviation of the scores of like trials."
+    )
+    is_best_confirmed: bool | None = Field(
+        default=None, description="By more than the spread of repeats; null: unknown."
+    )
+    verdict: str | None = None
+
+
+class RunAnswer(CommandAnswer):
+    """What came of a `run` command."""
+
+    stopped: str | None = Field(
+        default=None,
+        description="condition held, simulation time reached, run ended, interrupted, or "
+        "wall time limit reached.",
+    )
+    stop_reason: str | None = None
+    ran: dict[str, Any] | None = Field(default=None, description="How far simulation time came.")
+    values: dict[str, Any] | None = Field(default=None, description="Of the condition's signals.")
+    mode: str | None = None
+    state: Any = Field(default=None, description="As published at the step where it stopped.")
+    state_at_s: float | None = None
+    shortened: str | None = None
+    movement: dict[str, Any] | None = None
+    trends: RunTrendTables | None = None
+    events: Table | None = None
+    not_shown: dict[str, str] | None = None
+    rows: Table | None = Field(default=None, description="The last rows, of its signals.")
+    picture: dict[str, Any] | None = None
+
+
+class SqlAnswer(Answer):
+    """What a SELECT returned."""
+
+    result: Table | None = None
+    truncated: str | None = Field(default=None, description="Why rows or parts are missing.")
+
+
+class RunsAnswer(Answer):
+    """Runs, the newest first."""
+
+    runs: Table | None = None
+    run: dict[str, Any] | None = Field(default=None, description="The one that was annotated.")
+    total: int | None = None
+    cursor: int | None = Field(
+        default=None, description="Ask again with this cursor for older ones."
+    )
+
+
+class ComparisonAnswer(NotedAnswer):
+    """Runs beside each other; the first group is the reference."""
+
+    groups: Table | None = None
+    compared_s: float | None = Field(
+        default=None, description="All figures are about the first seconds of each run, this many."
+    )
+    measures: Table | None = Field(
+        default=None,
+        description="Each run as a whole: median over the runs of each group, and their range. "
+        "Of each group but the first: different; null where it cannot be told, then runs_wanted: "
+        "this many runs of each would tell, if they went on like these. interval: of the "
+        "difference of the means, 90 %.",
+    )
+    unknown: dict[str, str] | None = Field(
+        default=None, description="Figures that are null, or not of everything: why; what to do."
+    )
+    differences: Table | None = Field(
+        default=None,
+        description="Signals, most different first; lists are in the order of the groups. Of each "
+        "group but the first (a list where there are several): effect, how far the mean is from "
+        "the first group's, in standard deviations (0.8 is large, null: unequal constants), "
+        "deviation_ratio, different, interval of the mean. min and max where signals were named.",
+    )
+    total: int | None = Field(default=None, description="Numeric signals that all groups have.")
+    only_in: dict[str, list[str]] | None = Field(
+        default=None, description="Signals that not every group has."
+    )

@@ -1,16 +1,34 @@
-"""Tools that look at the scene tree of a world, and change it."""
+"""The scene tree of a world: looking at it, and changing it."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+import sqlite3
+import time
+from collections.abc import Mapping
+from typing import Annotated, Any, Final, NamedTuple
 
+from anyio import to_thread
 from pydantic import Field, WithJsonSchema
 
+from webots_mcp.contract import OBSERVER
+from webots_mcp.errors import AmbiguousRobotError, CommandRefusedError, InvalidInputError
 from webots_mcp.questions.answers import CommandAnswer
-from webots_mcp.questions.argument_types import AnyNames, Cursor, RobotName
-from webots_mcp.questions.declaring import CHANGES, DESTROYS, READS, Caller, question
-from webots_mcp.steering.scene_requests import ask_scene
-from webots_mcp.store.recording import Recording
+from webots_mcp.questions.declaring import (
+    CHANGES,
+    DESTROYS,
+    READS,
+    AnyNames,
+    Caller,
+    Cursor,
+    RobotName,
+    merged,
+    question,
+)
+from webots_mcp.steering.dispatch import Dispatcher, Report
+from webots_mcp.store.recording import Recording, look
+from webots_mcp.store.robots import list_robots
+from webots_mcp.store.sessions import Session
+from webots_mcp.store.status import find_holder
 
 Path = Annotated[
     str,
@@ -112,3 +130,127 @@ async def webots_remove_node(
     """Remove a node with all in it; a reset brings it back if the answer says so."""
     params = {"path": path}
     return await ask_scene(recording, caller.report, "remove_node", params, robot=robot)
+
+
+# -- asking any live Supervisor of the simulation --
+
+_WAIT_S: Final = 15.0  # of wall time
+_NO_SUPERVISOR: Final = (
+    "no live controller can read the scene of {}: set the field 'supervisor' of a Robot node to "
+    "TRUE and create that robot with Supervisor(), or open the world with an observer in it, made "
+    "by webots-mcp init --observer WORLD"
+)
+
+
+class _Supervisor(NamedTuple):
+    name: str
+    kind: str
+    session: Session
+
+
+async def ask_scene(
+    recording: Recording,
+    report: Report,
+    action: str,
+    params: Mapping[str, Any],
+    *,
+    robot: str | None = None,
+) -> CommandAnswer:
+    """Let a Supervisor of the simulation read its scene, or change it.
+
+    Args:
+        recording: Where its bridge records.
+        report: Called with the time that it has waited.
+        action: A built-in action, such as `get_field`.
+        params: The parameters of the action; those that are None are left out.
+        robot: A robot of the simulation; None where there is only one simulation.
+
+    Raises:
+        InvalidInputError: There is no such robot, several simulations are possible, or this server
+            is read-only.
+        CommandRefusedError: No live controller can read the scene.
+        NothingRecordedError: No robot was ever recorded.
+    """
+    if recording.read_only:
+        raise InvalidInputError(
+            "reading the scene needs a command to a controller, and a --read-only server sends "
+            "none; webots_get_world_info has what was recorded"
+        )
+    name = await to_thread.run_sync(_find_supervisor, recording, robot)
+    given = {key: value for key, value in params.items() if value is not None}
+    return await Dispatcher(recording, report).ask(name, action, _WAIT_S, given)
+
+
+def _find_supervisor(recording: Recording, robot: str | None) -> str:
+    with recording.reader() as connection:
+        session = look(connection, robot).session if robot is not None else None
+        found = _supervisors(connection, session)
+        if not found:
+            look(connection, robot)  # raises where nothing is recorded, and says how to record
+            where = "this simulation" if robot is None else f"the simulation of robot {robot!r}"
+            raise CommandRefusedError(_NO_SUPERVISOR.format(where))
+        if len({each.session.instance for each in found}) > 1:
+            listed = ", ".join(repr(each.name) for each in found)
+            raise AmbiguousRobotError(
+                f"Supervisors of several simulations are live: {listed}; choose a simulation with "
+                "robot=..."
+            )
+        return _best(connection, found, robot).name
+
+
+def _supervisors(connection: sqlite3.Connection, session: Session | None) -> list[_Supervisor]:
+    """The live Supervisors of the session's simulation, or without a session of any."""
+    robots = list_robots(connection, time.time())
+    return [
+        _Supervisor(each.name, each.kind, each.session)
+        for each in robots
+        if each.live and each.session is not None and each.session.supervisor
+        if session is None or each.session.instance == session.instance
+    ]
+
+
+def _best(
+    connection: sqlite3.Connection, found: list[_Supervisor], robot: str | None
+) -> _Supervisor:
+    """The Supervisor to ask: the one that has paused the simulation, as no other loop runs then.
+
+    Else one with a fresh heartbeat, the named one, an observer (which has no other work), or the
+    first, in this order.
+    """
+    now_s = time.time()
+    holder = find_holder(connection, found[0].session, now_s)
+
+    def rank(each: _Supervisor) -> tuple[bool, ...]:
+        return (
+            holder is None or each.session.id != holder.id,
+            not each.session.heartbeat_is_fresh(now_s),
+            each.name != robot,
+            each.kind != OBSERVER,
+        )
+
+    return min(found, key=rank)
+
+
+SCENE: Final = merged(
+    webots_get_scene,
+    choice="what",
+    meaning="field: the value at path, of a node all its fields.",
+    parts={"nodes": webots_get_scene, "field": webots_get_field},
+    text="""\
+What stands in the world now: solids, robots, joints, devices, and the paths to them.
+
+With types, such as Robot or PBRAppearance, any node. Asked of a live Supervisor or observer.""",
+)
+EDIT: Final = merged(
+    webots_set_field,
+    name="webots_edit_scene",
+    title="Edit the scene",
+    choice="action",
+    meaning="set: path, value; add: vrml, path; remove: path.",
+    parts={"set": webots_set_field, "add": webots_add_node, "remove": webots_remove_node},
+    text="""\
+Set a field (a place, colour, mass, friction), add a node, or remove one with all in it.
+
+Answers with the old value and what the field holds a step later, or the new node's path. A reset
+undoes it, a removal if the answer says so. A PROTO has to be an IMPORTABLE EXTERNPROTO.""",
+)

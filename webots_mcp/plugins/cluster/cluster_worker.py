@@ -11,11 +11,10 @@ from typing import Final
 
 from webots_mcp.errors import CommandRefusedError, LeaseLostError, WebotsMCPError
 from webots_mcp.plugins.cluster.dask_cluster import cluster
+from webots_mcp.steering.trial_plan import WorldPlan
+from webots_mcp.steering.trial_run import SetRun, StoppedError, run_taken_up, taken_up
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.trials import Result, Trial
-from webots_mcp.trials.plan import WorldPlan
-from webots_mcp.trials.set_runner import SetRun, run_taken_up, taken_up
-from webots_mcp.trials.trial_run import StoppedError
 
 ALLOWED_VARIABLE: Final = "DASK_SCHEDULER_ADDRESS"  # Dask's own name for the one to use
 _END_PATIENCE_S: Final = 5.0

@@ -31,11 +31,8 @@ from webots_mcp.contract import DATABASE_NAME, host_name
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 from webots_mcp.plugins.pool.engines import open_pool, open_target
 from webots_mcp.requirements import explain_extra
-from webots_mcp.store.bundle import pack, unpack
-from webots_mcp.store.recording import Recording
-from webots_mcp.store.trials import Result
-from webots_mcp.trials.plan import WorldPlan
-from webots_mcp.trials.trial_run import (
+from webots_mcp.steering.trial_plan import WorldPlan
+from webots_mcp.steering.trial_run import (
     Command,
     StoppedError,
     TrialAttempt,
@@ -43,6 +40,9 @@ from webots_mcp.trials.trial_run import (
     stand_in,
     webots,
 )
+from webots_mcp.store.bundle import pack, unpack
+from webots_mcp.store.recording import Recording
+from webots_mcp.store.trials import Result
 
 RESOURCE: Final = "simulator"
 MOST_BYTES: Final = 100_000_000  # of a recording as it is returned, packed: it passes the scheduler

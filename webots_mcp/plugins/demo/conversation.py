@@ -21,8 +21,7 @@ import anyio
 from mcp import Client, StdioServerParameters
 from mcp.types import CallToolResult, ImageContent, TextContent
 
-from webots_mcp.cli.rendering import answer_lines, print_json
-from webots_mcp.cli.terminal import rewrite
+from webots_mcp.cli.terminal import answer_lines, print_json, rewrite
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, whole_file
 from webots_mcp.errors import NothingRecordedError, WebotsMCPError

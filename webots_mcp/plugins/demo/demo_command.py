@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from webots_mcp.cli.recordings import Json
-from webots_mcp.cli.values import Parameter
+from webots_mcp.cli.options import Json, Parameter
 
 
 def demo(

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final
 
-from webots_mcp.cli.values import Parameter
+from webots_mcp.cli.options import Parameter
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.naming import nearest_first
 from webots_mcp.plugins.pool.target import Pool, PooledRun, PooledTrialSet

@@ -10,10 +10,9 @@ from pydantic import Field
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.report.making import make_report
 from webots_mcp.plugins.report.report_file import file_name, require_free, write_report
-from webots_mcp.questions.argument_types import AnyNames, RobotName, RunIds
+from webots_mcp.questions.answers import NotedAnswer
 from webots_mcp.questions.budget import notes_of
-from webots_mcp.questions.declaring import DESTROYS, question
-from webots_mcp.questions.history_answers import NotedAnswer
+from webots_mcp.questions.declaring import DESTROYS, AnyNames, RobotName, RunIds, question
 from webots_mcp.store.recording import Recording
 
 FOLDER: Final = "reports"  # in the data folder

@@ -16,7 +16,7 @@ from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
 from webots_mcp.naming import listed
 from webots_mcp.questions.answers import Answer, Table
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, shown_time
-from webots_mcp.store.recording import View, look, storage
+from webots_mcp.store.recording import Recording, View, look, storage
 
 # -- values, made short enough to be read whole by rules that are stated in the answer --
 
@@ -250,6 +250,12 @@ def answer_about(view: View, model: type[_A], find: Callable[[], dict[str, Any]]
     except NothingRecordedError as error:
         answer["hint"] = str(error)
     return model(**answer)
+
+
+def header_of(recording: Recording, robot: str | None) -> dict[str, Any]:
+    """The header of a robot, now."""
+    with recording.view(robot) as view:
+        return view.header()
 
 
 def header_of_only(connection: sqlite3.Connection) -> dict[str, Any]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import sqlite3
 import time
-from collections.abc import Mapping
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Annotated, Any, Final
 
 from anyio import to_thread
 from pydantic import Field, WithJsonSchema
@@ -24,10 +22,9 @@ from webots_mcp.questions.declaring import (
     merged,
     question,
 )
-from webots_mcp.steering.dispatch import Dispatcher, Report
+from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.recording import Recording, look
 from webots_mcp.store.robots import list_robots
-from webots_mcp.store.sessions import Session
 from webots_mcp.store.status import find_holder
 
 Path = Annotated[
@@ -67,9 +64,8 @@ async def webots_get_scene(
 
     With types, such as Robot or PBRAppearance, any node. Asked of a live Supervisor or observer.
     """
-    wanted = {"path": path, "depth": depth, "types": types, "names": names, "fields": fields}
-    params = wanted | {"cursor": cursor}
-    return await ask_scene(recording, caller.report, "get_scene", params, robot=robot)
+    asked = {"path": path, "depth": depth, "types": types, "names": names, "fields": fields}
+    return await _ask(recording, caller, robot, "get_scene", cursor=cursor, **asked)
 
 
 @question("Get a field", READS)
@@ -81,8 +77,7 @@ async def webots_get_field(
     robot: RobotName = None,
 ) -> CommandAnswer:
     """The value of a field of the scene tree now, or of a node all its fields."""
-    params = {"path": path, "start": start}
-    return await ask_scene(recording, caller.report, "get_field", params, robot=robot)
+    return await _ask(recording, caller, robot, "get_field", path=path, start=start)
 
 
 @question("Set a field", CHANGES)
@@ -101,8 +96,9 @@ async def webots_set_field(
     The answer has the old value, and what the field holds a step later. Recorded as an event; a
     reset puts it back.
     """
-    params = {"path": path, "value": value, "stop": stop or None}
-    return await ask_scene(recording, caller.report, "set_field", params, robot=robot)
+    return await _ask(
+        recording, caller, robot, "set_field", path=path, value=value, stop=stop or None
+    )
 
 
 @question("Add a node", CHANGES)
@@ -119,8 +115,7 @@ async def webots_add_node(
 
     A PROTO has to be declared in the world as IMPORTABLE EXTERNPROTO. A reset removes the node.
     """
-    params = {"vrml": vrml, "path": path}
-    return await ask_scene(recording, caller.report, "add_node", params, robot=robot)
+    return await _ask(recording, caller, robot, "add_node", vrml=vrml, path=path)
 
 
 @question("Remove a node", DESTROYS)
@@ -128,8 +123,7 @@ async def webots_remove_node(
     recording: Recording, caller: Caller, path: Path, robot: RobotName = None
 ) -> CommandAnswer:
     """Remove a node with all in it; a reset brings it back if the answer says so."""
-    params = {"path": path}
-    return await ask_scene(recording, caller.report, "remove_node", params, robot=robot)
+    return await _ask(recording, caller, robot, "remove_node", path=path)
 
 
 # -- asking any live Supervisor of the simulation --
@@ -142,28 +136,10 @@ _NO_SUPERVISOR: Final = (
 )
 
 
-class _Supervisor(NamedTuple):
-    name: str
-    kind: str
-    session: Session
-
-
-async def ask_scene(
-    recording: Recording,
-    report: Report,
-    action: str,
-    params: Mapping[str, Any],
-    *,
-    robot: str | None = None,
+async def _ask(
+    recording: Recording, caller: Caller, robot: str | None, action: str, **params: Any
 ) -> CommandAnswer:
-    """Let a Supervisor of the simulation read its scene, or change it.
-
-    Args:
-        recording: Where its bridge records.
-        report: Called with the time that it has waited.
-        action: A built-in action, such as `get_field`.
-        params: The parameters of the action; those that are None are left out.
-        robot: A robot of the simulation; None where there is only one simulation.
+    """Let a Supervisor read the scene, or change it; parameters that are None are left out.
 
     Raises:
         InvalidInputError: There is no such robot, several simulations are possible, or this server
@@ -178,57 +154,45 @@ async def ask_scene(
         )
     name = await to_thread.run_sync(_find_supervisor, recording, robot)
     given = {key: value for key, value in params.items() if value is not None}
-    return await Dispatcher(recording, report).ask(name, action, _WAIT_S, given)
+    return await Dispatcher(recording, caller.report).ask(name, action, _WAIT_S, given)
 
 
 def _find_supervisor(recording: Recording, robot: str | None) -> str:
-    with recording.reader() as connection:
-        session = look(connection, robot).session if robot is not None else None
-        found = _supervisors(connection, session)
-        if not found:
-            look(connection, robot)  # raises where nothing is recorded, and says how to record
-            where = "this simulation" if robot is None else f"the simulation of robot {robot!r}"
-            raise CommandRefusedError(_NO_SUPERVISOR.format(where))
-        if len({each.session.instance for each in found}) > 1:
-            listed = ", ".join(repr(each.name) for each in found)
-            raise AmbiguousRobotError(
-                f"Supervisors of several simulations are live: {listed}; choose a simulation with "
-                "robot=..."
-            )
-        return _best(connection, found, robot).name
-
-
-def _supervisors(connection: sqlite3.Connection, session: Session | None) -> list[_Supervisor]:
-    """The live Supervisors of the session's simulation, or without a session of any."""
-    robots = list_robots(connection, time.time())
-    return [
-        _Supervisor(each.name, each.kind, each.session)
-        for each in robots
-        if each.live and each.session is not None and each.session.supervisor
-        if session is None or each.session.instance == session.instance
-    ]
-
-
-def _best(
-    connection: sqlite3.Connection, found: list[_Supervisor], robot: str | None
-) -> _Supervisor:
     """The Supervisor to ask: the one that has paused the simulation, as no other loop runs then.
 
     Else one with a fresh heartbeat, the named one, an observer (which has no other work), or the
     first, in this order.
     """
     now_s = time.time()
-    holder = find_holder(connection, found[0].session, now_s)
-
-    def rank(each: _Supervisor) -> tuple[bool, ...]:
-        return (
-            holder is None or each.session.id != holder.id,
-            not each.session.heartbeat_is_fresh(now_s),
+    with recording.reader() as connection:
+        own = look(connection, robot).session if robot is not None else None
+        found = [
+            (each, each.session)
+            for each in list_robots(connection, now_s)
+            if each.live and each.session is not None and each.session.supervisor
+            if own is None or each.session.instance == own.instance
+        ]
+        if not found:
+            look(connection, robot)  # raises where nothing is recorded, and says how to record
+            where = "this simulation" if robot is None else f"the simulation of robot {robot!r}"
+            raise CommandRefusedError(_NO_SUPERVISOR.format(where))
+        if len({session.instance for _, session in found}) > 1:
+            listed = ", ".join(repr(each.name) for each, _ in found)
+            raise AmbiguousRobotError(
+                f"Supervisors of several simulations are live: {listed}; choose a simulation with "
+                "robot=..."
+            )
+        holder = find_holder(connection, found[0][1], now_s)
+    ranked = [
+        (
+            holder is None or session.id != holder.id,
+            not session.heartbeat_is_fresh(now_s),
             each.name != robot,
             each.kind != OBSERVER,
         )
-
-    return min(found, key=rank)
+        for each, session in found
+    ]
+    return found[ranked.index(min(ranked))][0].name
 
 
 SCENE: Final = merged(

@@ -186,61 +186,129 @@ def _begin(
     scheduler: str | None,
     asked: dict[str, Any],
 ) -> int:
-    if scheduler is None:
-        number = begin_set(recording, parameters, robot, **asked)
-        workers.begin(number)
-        return number
-    plan = planned_for_cluster(recording, parameters, robot, **asked)
-    return workers.begin_on_cluster(
-        scheduler, plan, lambda: enter_cluster_set(recording, plan, scheduler)
-    )
+    """Enter a set of trials, after checking that they can be run, and begin it; returns its id.
+
+    Raises:
+        InvalidInputError: The controller does not declare a parameter or not with such a value,
+            a signal of the score or of `until` was never recorded, or the plan contradicts itself.
+        CommandRefusedError: No live controller could run them, or another set of the robot is not
+            over.
+    """
+    sets = combinations(parameters) if isinstance(parameters, dict) else parameters
+    if scheduler is not None:
+        return _begin_on_cluster(recording, workers, sets, robot, scheduler, asked)
+    require_possible(recording, robot, asked["until"], asked["for_s"], reset=True)
+    if asked["prune"] is not None:
+        require_possible(recording, robot, asked["prune"], None, reset=True)
+    checked = _as_declared(settable(recording, robot), sets)
+    with recording.reader() as connection:
+        view = find_target(connection, robot, ACTION)
+        plan = TrialPlan(parameters=checked, robot=view.robot.name, **asked)
+        _require_scorable(connection, plan, view)
+    with recording.writer() as connection:
+        set_id = create_trial_set(connection, plan.text, plan.trials, view.robot.id)
+    workers.begin(set_id)
+    return set_id
+
+
+def _begin_on_cluster(
+    recording: Recording,
+    workers: TrialWorkers,
+    sets: list[dict[str, Any]],
+    robot: str | None,
+    scheduler: str,
+    asked: dict[str, Any],
+) -> int:
+    """The same in the world of a robot's newest run; the robot need not be live."""
+    with recording.reader() as connection:
+        view = look(connection, robot)
+        run = view.require_run()
+        if run.world is None:
+            raise InvalidInputError(f"the world file of run {run.id} is not recorded")
+        checked = _as_declared(declared_for(connection, view.robot.id), sets)
+        plan = WorldPlan(world=run.world, parameters=checked, robot=view.robot.name, **asked)
+        _require_scorable(connection, plan, view)
+    text = json.dumps({SCHEDULER: scheduler, **json.loads(plan.text)}, sort_keys=True)
+
+    def enter() -> int:
+        with recording.writer() as connection:
+            return create_trial_set(connection, text, plan.trials)
+
+    return workers.begin_on_cluster(scheduler, plan, enter)
+
+
+def _require_scorable(connection: sqlite3.Connection, plan: TrialPlan, view: View) -> None:
+    score = parse_score(plan.score)
+    require_kinds(connection, score, view.require_run().id)
+    if known := known_names(view):
+        score.require_known(known)
+
+
+def _as_declared(
+    declared: Mapping[str, Declared], sets: Sequence[Mapping[str, Any]]
+) -> list[dict[str, Any]]:
+    """The values in the types of the declared parameters."""
+    require_known(list({name: None for values in sets for name in values}), list(declared))
+    return [
+        {name: declared[name].declaration.checked(value) for name, value in values.items()}
+        for values in sets
+    ]
 
 
 def _take_up(
     recording: Recording, workers: TrialWorkers, set_id: int, scheduler: str | None, cancel: bool
 ) -> None:
-    """Go on with a set, or end it, unless somebody is at it already."""
+    """Continue a set, or end it, unless somebody works on it already.
+
+    Raises:
+        InvalidInputError: It cannot be continued here, or there is no such set.
+    """
     with recording.reader() as connection:
         found = fetch_trial_set(connection, set_id)
         at_work = is_at_work(connection, found)
-    if names_world(found.plan):
-        _take_up_elsewhere(recording, workers, found, scheduler, at_work=at_work, cancel=cancel)
-        return
-    if scheduler is not None:
+    elsewhere = _names_world(found)
+    if scheduler is not None and not elsewhere:
         raise InvalidInputError(f"trial set {set_id} runs in a robot's simulation, on no cluster")
-    require_ours(recording, set_id)
+    if found.robot_id is None and not (elsewhere and (cancel or at_work or scheduler)):
+        why = f"has simulators of its own: {_goes_on(found)}" if elsewhere else _FROM_ELSEWHERE
+        raise InvalidInputError(
+            f'trial set {set_id} {why}; webots_list_runs(what="trials", trial_set={set_id}) has '
+            "its trials"
+        )
     if cancel:
-        cancel_set(recording, set_id)
-    elif not at_work:
-        go_on(recording, set_id)
-    if not at_work:
-        workers.begin(set_id)
-
-
-def _take_up_elsewhere(
-    recording: Recording,
-    workers: TrialWorkers,
-    found: TrialSet,
-    scheduler: str | None,
-    *,
-    at_work: bool,
-    cancel: bool,
-) -> None:
-    """The same with one whose trials have simulators of their own."""
-    if cancel:
-        cancel_set(recording, found.id)
-    elif at_work:
+        _stop(recording, set_id, CANCELLED)
+    if at_work:
         return
-    elif scheduler is None:
-        require_ours(recording, found.id)
-    else:
+    if not elsewhere:
+        if not cancel:
+            _stop(recording, set_id, None)
+        workers.begin(set_id)  # also to restore the parameters of one that is cancelled
+    elif scheduler is not None and not cancel:
         plan, is_stand_in = stored_world_plan(found.plan)
-        workers.begin_on_cluster(scheduler, plan, lambda: found.id, is_stand_in=is_stand_in)
+        workers.begin_on_cluster(scheduler, plan, lambda: set_id, is_stand_in=is_stand_in)
+
+
+def _names_world(found: TrialSet) -> bool:
+    """Whether the trials of a set each have a simulator of their own."""
+    return "world" in json.loads(found.plan)
+
+
+def _goes_on(found: TrialSet) -> str:
+    """How to continue a set whose trials have simulators of their own."""
+    scheduler = json.loads(found.plan).get(SCHEDULER)
+    again = f"webots_run_trials(trial_set={found.id}, scheduler={scheduler or 'tcp://...'!r})"
+    return f"{again} continues it" if scheduler else f"{_GOES_ON}, or {again} on a cluster"
+
+
+def _stop(recording: Recording, set_id: int, reason: str | None) -> None:
+    """Let a set stop after its current trial; without a reason, let a stopped one continue."""
+    with recording.writer() as connection:
+        stop_trial_set(connection, set_id, reason)
 
 
 def _end(recording: Recording, workers: TrialWorkers, set_id: int) -> None:
     """The client has cancelled the call: no other trial begins, and the one that runs here ends."""
-    cancel_set(recording, set_id)
+    _stop(recording, set_id, CANCELLED)
     workers.end(set_id)
 
 
@@ -262,6 +330,7 @@ _TABLE_TOKENS: Final = 1_250
 _GOES_ON: Final = "the command 'webots-mcp trials PLAN' continues it"
 _FROM_ELSEWHERE: Final = "came from another recording, and its robot did not: begin a new set"
 _LONGEST_WHY: Final = 120
+_RANK_LOWER: Final = "that rank lower are not shown: webots_query_sql has all in table trial"
 _FIGURES: Final = ("score", "range", "scored", "pruned", "failed", "why", "runs")
 _MOST_NAMED_RUNS: Final = 5
 _STANDING_DEADLINE_S: Final = 1.0
@@ -272,140 +341,6 @@ _BEFORE: Final = (
     "SELECT id FROM run WHERE robot_id = ? AND id < ? "
     "ORDER BY start_reason = 'reset', id DESC LIMIT 5"
 )
-
-
-# -- before anything is begun -----------------------------------------------------------------
-
-
-def begin_set(
-    recording: Recording,
-    parameters: Sequence[Mapping[str, Any]] | Mapping[str, Sequence[Any]],
-    robot: str | None,
-    **asked: Any,
-) -> int:
-    """Enter a set of trials, after checking that they can be run; returns its id.
-
-    Args:
-        recording: The recording of the robot.
-        parameters: Sets of values, or a grid of which every combination is tried.
-        robot: The robot's name; None for the only live one.
-        asked: The other fields of a `TrialPlan`.
-
-    Raises:
-        InvalidInputError: The controller does not declare a parameter or not with such a value,
-            a signal of the score or of `until` was never recorded, or the plan contradicts itself.
-        CommandRefusedError: No live controller could run them, or another set of the robot is not
-            over.
-    """
-    sets = combinations(dict(parameters)) if isinstance(parameters, Mapping) else parameters
-    require_possible(recording, robot, asked.get("until"), asked.get("for_s"), reset=True)
-    if asked.get("prune") is not None:
-        require_possible(recording, robot, asked["prune"], None, reset=True)
-    checked = _as_declared(settable(recording, robot), sets)
-    with recording.reader() as connection:
-        view = find_target(connection, robot, ACTION)
-        plan = TrialPlan(parameters=checked, robot=view.robot.name, **asked)
-        _require_scorable(connection, plan, view)
-    with recording.writer() as connection:
-        return create_trial_set(connection, plan.text, plan.trials, view.robot.id)
-
-
-def planned_for_cluster(
-    recording: Recording,
-    parameters: Sequence[Mapping[str, Any]] | Mapping[str, Sequence[Any]],
-    robot: str | None,
-    **asked: Any,
-) -> WorldPlan:
-    """A plan in the world of a robot's newest run; the robot need not be live.
-
-    Args:
-        recording: The recording of the robot.
-        parameters: As in `begin_set`.
-        robot: The robot's name; None for the only one.
-        asked: As in `begin_set`.
-
-    Raises:
-        InvalidInputError: As in `begin_set`, or the world has no file.
-        NothingRecordedError: The robot has no run.
-    """
-    sets = combinations(dict(parameters)) if isinstance(parameters, Mapping) else parameters
-    with recording.reader() as connection:
-        view = look(connection, robot)
-        run = view.require_run()
-        if run.world is None:
-            raise InvalidInputError(f"the world file of run {run.id} is not recorded")
-        checked = _as_declared(declared_for(connection, view.robot.id), sets)
-        plan = WorldPlan(world=run.world, parameters=checked, robot=view.robot.name, **asked)
-        _require_scorable(connection, plan, view)
-    return plan
-
-
-def enter_cluster_set(recording: Recording, plan: WorldPlan, scheduler: str) -> int:
-    """Enter the set of such a plan; returns its id."""
-    text = json.dumps({SCHEDULER: scheduler, **json.loads(plan.text)}, sort_keys=True)
-    with recording.writer() as connection:
-        return create_trial_set(connection, text, plan.trials)
-
-
-def _require_scorable(connection: sqlite3.Connection, plan: TrialPlan, view: View) -> None:
-    score = parse_score(plan.score)
-    require_kinds(connection, score, view.require_run().id)
-    if known := known_names(view):
-        score.require_known(known)
-
-
-def _as_declared(
-    declared: Mapping[str, Declared], sets: Sequence[Mapping[str, Any]]
-) -> list[dict[str, Any]]:
-    """The values in the types of the declared parameters."""
-    require_known(list({name: None for values in sets for name in values}), list(declared))
-    return [
-        {name: declared[name].declaration.checked(value) for name, value in values.items()}
-        for values in sets
-    ]
-
-
-def names_world(plan: str) -> bool:
-    """Whether the trials of a plan each have a simulator of their own."""
-    return "world" in json.loads(plan)
-
-
-def require_ours(recording: Recording, set_id: int) -> None:
-    """Refuse a set that this server cannot continue.
-
-    Raises:
-        InvalidInputError: It cannot be continued here, or there is no such set.
-    """
-    with recording.reader() as connection:
-        found = fetch_trial_set(connection, set_id)
-        if found.robot_id is None:
-            why = f"has simulators of its own: {_goes_on(found)}"
-            raise InvalidInputError(
-                f"trial set {set_id} {why if names_world(found.plan) else _FROM_ELSEWHERE}; "
-                f'webots_list_runs(what="trials", trial_set={set_id}) has its trials'
-            )
-
-
-def _goes_on(found: TrialSet) -> str:
-    """How to continue a set whose trials have simulators of their own."""
-    scheduler = json.loads(found.plan).get(SCHEDULER)
-    again = f"webots_run_trials(trial_set={found.id}, scheduler={scheduler or 'tcp://...'!r})"
-    return f"{again} continues it" if scheduler else f"{_GOES_ON}, or {again} on a cluster"
-
-
-def go_on(recording: Recording, set_id: int) -> None:
-    """Let a stopped set continue."""
-    _stop(recording, set_id, None)
-
-
-def cancel_set(recording: Recording, set_id: int) -> None:
-    """Let a set stop after its current trial."""
-    _stop(recording, set_id, CANCELLED)
-
-
-def _stop(recording: Recording, set_id: int, reason: str | None) -> None:
-    with recording.writer() as connection:
-        stop_trial_set(connection, set_id, reason)
 
 
 # -- answers ----------------------------------------------------------------------------------
@@ -462,7 +397,7 @@ def _facts(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
         "notes": notes_of(
             [
                 *_standing(connection, found, trials),
-                *_left_out(left_out),
+                *[f"{left_out} sets {_RANK_LOWER}"] * (left_out > 0),
                 *_gone(connection, trials),
                 *unseen(connection, (each.run_id for each in trials if each.score is not None)),
             ]
@@ -484,7 +419,7 @@ def _state(found: TrialSet, left: int, *, at_work: bool) -> tuple[str, str | Non
     if not left:
         return "done", None
     if found.robot_id is None:
-        return "left", _goes_on(found) if names_world(found.plan) else _FROM_ELSEWHERE
+        return "left", _goes_on(found) if _names_world(found) else _FROM_ELSEWHERE
     return why, f"{again} continues with the {left} that are left"
 
 
@@ -546,11 +481,6 @@ def _standing(
                 "its controller does once, before its loop (docs/trials.md: motors after a reset)"
             ]
     return []
-
-
-def _left_out(count: int) -> list[str]:
-    more = f"{count} sets that rank lower are not shown: webots_query_sql has all in table trial"
-    return [more] if count > 0 else []
 
 
 def _gone(connection: sqlite3.Connection, trials: Sequence[Trial]) -> list[str]:

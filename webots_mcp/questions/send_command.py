@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import sqlite3
 from collections.abc import Mapping
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Annotated, Any, Final, Literal
 
@@ -31,6 +29,7 @@ from webots_mcp.questions.budget import (
     condensed,
     cut_text,
     fitting,
+    header_of,
     is_for_a_person,
     seconds,
     short_name,
@@ -61,9 +60,14 @@ from webots_mcp.store.reading.subject import Subject
 from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.signals.catalogue import catalogue
 
-# -- breakpoints --
+# -- breakpoints: stored for the robot, and read again by its controller --
 
-BreakpointId = Annotated[Id, Field(description="From webots_breakpoint.")]
+BREAKPOINT_COLUMNS: Final = (
+    "id", "condition", "action", "after_hits", "hit_count", "newest_hit_run_id", "newest_hit_s",
+    "set_by", "off_because",
+)  # fmt: skip
+_ARMING_WAIT_S: Final = 5.0
+_LONGEST_CONDITION: Final = 300
 
 
 @question("Set a breakpoint", CHANGES)
@@ -92,14 +96,22 @@ async def webots_breakpoint(
     Each hit is an event with the values and the simulation time of that very step. It is stored,
     and armed again after a reset or reload.
     """
-    return await set_breakpoint(
-        recording,
-        caller.report,
-        condition,
+    parsed = parse_condition(condition)
+    name, number, notes = await to_thread.run_sync(
+        _store, recording, robot, parsed, action, after_hits, caller.client
+    )
+    reply, why_not = await _arm(recording, caller, name)
+    if action == "pause" and reply.get("cannot_pause"):
+        notes.append(f"it will record its hits, but not pause: {reply['cannot_pause']}")
+    armed = number in reply.get("armed", ())
+    return BreakpointAnswer(
+        **await to_thread.run_sync(header_of, recording, name),
+        breakpoint_id=number,
+        condition=parsed.text,
         action=action,
-        after_hits=after_hits,
-        robot=robot,
-        set_by=caller.client,
+        armed=armed,
+        notes=notes or None,
+        hint=None if armed else f"it is stored, but not armed yet: {why_not}",
     )
 
 
@@ -107,7 +119,8 @@ async def webots_breakpoint(
 def webots_list_breakpoints(recording: Recording, robot: RobotName = None) -> BreakpointsAnswer:
     """The robot's breakpoints, how often each was hit, and when last."""
     with recording.view(robot) as view:
-        rows = breakpoint_rows(view)
+        listed = stored.list_breakpoints(view.connection, view.robot.id)
+        rows = [_breakpoint_row(view, each) for each in listed]
         shown = fitting(rows)
         more = f"{len(shown)} of {len(rows)}: webots_query_sql has all in table breakpoint"
         none = "this robot has none: webots_breakpoint sets one"
@@ -121,13 +134,79 @@ def webots_list_breakpoints(recording: Recording, robot: RobotName = None) -> Br
 @question("Remove a breakpoint", CHANGES)
 async def webots_remove_breakpoint(
     recording: Recording,
-    breakpoint_id: BreakpointId,
+    breakpoint_id: Annotated[Id, Field(description="From webots_breakpoint.")],
     caller: Caller,
     robot: RobotName = None,
 ) -> BreakpointAnswer:
     """Remove a breakpoint. The events of its hits stay; a paused simulation stays paused."""
-    report = caller.report
-    return await remove_breakpoint(recording, report, breakpoint_id, robot=robot)
+    name = await to_thread.run_sync(_remove, recording, robot, breakpoint_id)
+    reply, why_not = await _arm(recording, caller, name)
+    return BreakpointAnswer(
+        **await to_thread.run_sync(header_of, recording, name),
+        breakpoint_id=breakpoint_id,
+        armed=breakpoint_id in reply.get("armed", ()),
+        hint=f"removed; {why_not}" if why_not else None,
+    )
+
+
+def _store(
+    recording: Recording, robot: str | None, condition: Condition, *asked: Any
+) -> tuple[str, int, list[str]]:
+    """Name of the robot, id of the breakpoint, and notes on its signals."""
+    with recording.view(robot) as view:
+        name, robot_id, notes = view.robot.name, view.robot.id, _notes(view, condition)
+    with recording.writer() as connection:
+        return name, stored.set_breakpoint(connection, robot_id, condition, *asked), notes
+
+
+def _notes(view: View, condition: Condition) -> list[str]:
+    if view.run is None:
+        return condition.describe_unknown(())
+    subject = Subject(view.robot.id, view.robot.name, view.run.id)
+    notes = condition.describe_unknown(catalogue(view.connection, subject))
+    try:
+        holds_since(view.connection, view.run.id, condition)
+    except InvalidInputError as error:
+        notes.append(f"it will be turned off by the next state like the last ones: {error}")
+    return notes
+
+
+def _remove(recording: Recording, robot: str | None, breakpoint_id: int) -> str:
+    with recording.view(robot) as view:
+        name, robot_id = view.robot.name, view.robot.id
+    with recording.writer() as connection:
+        stored.remove_breakpoint(connection, robot_id, breakpoint_id)
+    return name
+
+
+async def _arm(recording: Recording, caller: Caller, robot: str) -> tuple[dict[str, Any], str]:
+    """Let the controller read its breakpoints again; its reply, or why there is none."""
+    dispatcher = Dispatcher(recording, caller.report)
+    try:
+        answer = await dispatcher.ask(robot, "arm_breakpoints", _ARMING_WAIT_S)
+    except CommandRefusedError as refused:
+        return {}, f"{refused}. A controller of this robot reads them when it starts"
+    if answer.outcome != "done":
+        reason = answer.error or answer.hint or f"the controller's answer was {answer.outcome}"
+        return {}, f"{reason}. It will read them at the next reset in any case"
+    return answer.result, ""
+
+
+def _breakpoint_row(view: View, each: stored.StoredBreakpoint) -> list[Any]:
+    """A breakpoint as a row under `BREAKPOINT_COLUMNS`."""
+    hit = stored.newest_hit(view.connection, each.robot_id, each.id) if each.hit_count else None
+    run_id, time_s = hit or (None, None)
+    return [
+        each.id,
+        cut_text(each.condition, _LONGEST_CONDITION),
+        each.action,
+        each.after_hits,
+        each.hit_count,
+        run_id,
+        time_s if time_s is None else round(time_s, 3),
+        each.created_by,
+        cut_text(each.error, _LONGEST_CONDITION) if each.error else None,
+    ]
 
 
 COMMAND_COLUMNS: Final = (
@@ -260,7 +339,7 @@ def _shown_actions(actions: Mapping[str, str]) -> dict[str, str]:
     return dict(fitting(named, _ACTIONS_TOKENS))
 
 
-# -- parameters: refused before anything is sent, or sent and awaited --
+# -- parameters --
 
 When = Literal["now", "reset"]
 
@@ -278,14 +357,6 @@ async def set_parameters(
     timeout_s: float = SET_WAIT_S,
 ) -> CommandAnswer:
     """Set parameters, all or none, and wait for the outcome.
-
-    Args:
-        recording: Where the robot records.
-        report: Called with the time that it has waited.
-        values: The values by name.
-        when: Now, or from the next reset of the world on.
-        robot: The robot's name; None for the only live robot.
-        timeout_s: How long to wait, in wall seconds.
 
     Raises:
         InvalidInputError: A name is unknown, or a value is out of bounds or of another type.
@@ -311,18 +382,11 @@ def settable(recording: Recording, robot: str | None) -> dict[str, Declared]:
         return declared_by(connection, session.id) if session else {}
 
 
-# -- parameters --
-
 _MOST_NEAR: Final = 5
 _NONE: Final = (
     'this run has none: declare one in the controller with kp = bridge.parameter("kp", 2.0, '
     "low=0.0, high=10.0) and read kp.value in its loop"
 )
-
-Values = Annotated[
-    dict[str, Value],
-    Field(min_length=1, max_length=MOST_PARAMETERS, description='{"kp": 3.0, "gait": "trot"}'),
-]
 
 
 @question("Get the parameters", READS)
@@ -355,7 +419,10 @@ def webots_get_parameters(
 @question("Set parameters", SETS, core=True)
 async def webots_set_parameters(
     recording: Recording,
-    values: Values,
+    values: Annotated[
+        dict[str, Value],
+        Field(min_length=1, max_length=MOST_PARAMETERS, description='{"kp": 3.0, "gait": "trot"}'),
+    ],
     caller: Caller,
     when: Annotated[When, Field(description="reset: from the next one on.")] = "now",
     robot: RobotName = None,
@@ -383,9 +450,9 @@ def _shown_rows(view: View, names: list[str] | None) -> list[list[Any]]:
 
 def _shown(column: str, value: Any) -> Any:
     """Times as everywhere; values and bounds as they are, for they may be sent back."""
-    return (
-        seconds(value) if column == "since_s" else shorten(value, DETAIL_BUDGET_TOKENS, WHOLE).value
-    )
+    if column == "since_s":
+        return seconds(value)
+    return shorten(value, DETAIL_BUDGET_TOKENS, WHOLE).value
 
 
 def _meant(patterns: list[str] | None, known: list[str]) -> set[str]:
@@ -402,165 +469,6 @@ def _meant(patterns: list[str] | None, known: list[str]) -> set[str]:
             raise InvalidInputError(f"no parameter {pattern!r:.80}; the nearest are: {near}")
         meant |= found
     return meant
-
-
-# -- breakpoints: stored for the robot, and read again by its controller --
-
-BREAKPOINT_COLUMNS: Final = (
-    "id", "condition", "action", "after_hits", "hit_count", "newest_hit_run_id", "newest_hit_s",
-    "set_by", "off_because",
-)  # fmt: skip
-_ARM: Final = "arm_breakpoints"
-_ARMING_WAIT_S: Final = 5.0
-_LONGEST_CONDITION: Final = 300
-
-
-async def set_breakpoint(
-    recording: Recording,
-    report: Report,
-    condition: str,
-    *,
-    action: BreakpointAction = "pause",
-    after_hits: int = 1,
-    robot: str | None = None,
-    set_by: str = "mcp",
-) -> BreakpointAnswer:
-    """Store a breakpoint, let the controller arm it, and report whether it did.
-
-    Raises:
-        InvalidInputError: The condition is not in the language, or there are too many already.
-        NothingRecordedError: There is no robot.
-    """
-    parsed = parse_condition(condition)
-    name, number, notes = await to_thread.run_sync(
-        _store, recording, robot, parsed, action, after_hits, set_by
-    )
-    reply = await _arm(recording, report, name)
-    armed = number in reply.armed
-    if action == "pause" and reply.cannot_pause:
-        notes.append(f"it will record its hits, but not pause: {reply.cannot_pause}")
-    return BreakpointAnswer(
-        **await to_thread.run_sync(_header, recording, name),
-        breakpoint_id=number,
-        condition=parsed.text,
-        action=action,
-        armed=armed,
-        notes=notes or None,
-        hint=None if armed else f"it is stored, but not armed yet: {reply.why_not}",
-    )
-
-
-async def remove_breakpoint(
-    recording: Recording, report: Report, breakpoint_id: int, *, robot: str | None = None
-) -> BreakpointAnswer:
-    """Remove a breakpoint, and let the controller disarm it.
-
-    Raises:
-        InvalidInputError: The robot has no breakpoint of that id.
-        NothingRecordedError: There is no robot.
-    """
-    name = await to_thread.run_sync(_remove, recording, robot, breakpoint_id)
-    reply = await _arm(recording, report, name)
-    return BreakpointAnswer(
-        **await to_thread.run_sync(_header, recording, name),
-        breakpoint_id=breakpoint_id,
-        armed=breakpoint_id in reply.armed,
-        hint=f"removed; {reply.why_not}" if reply.why_not else None,
-    )
-
-
-def breakpoint_rows(view: View) -> list[list[Any]]:
-    """The robot's breakpoints, under `BREAKPOINT_COLUMNS`."""
-    listed = stored.list_breakpoints(view.connection, view.robot.id)
-    return [_row(view.connection, each) for each in listed]
-
-
-@dataclass(frozen=True)
-class _Reply:
-    """The controller's reply to `arm_breakpoints`.
-
-    Attributes:
-        armed: The ids of the armed breakpoints.
-        cannot_pause: Why the controller cannot pause; None where it can.
-        why_not: Why it has not read its breakpoints again; empty where it has.
-    """
-
-    armed: tuple[int, ...] = ()
-    cannot_pause: str | None = None
-    why_not: str = ""
-
-
-def _store(
-    recording: Recording,
-    robot: str | None,
-    condition: Condition,
-    action: BreakpointAction,
-    after_hits: int,
-    set_by: str,
-) -> tuple[str, int, list[str]]:
-    """Name of the robot, id of the breakpoint, and notes on its signals."""
-    with recording.view(robot) as view:
-        name, robot_id, notes = view.robot.name, view.robot.id, _notes(view, condition)
-    with recording.writer() as connection:
-        number = stored.set_breakpoint(connection, robot_id, condition, action, after_hits, set_by)
-    return name, number, notes
-
-
-def _notes(view: View, condition: Condition) -> list[str]:
-    if view.run is None:
-        return condition.describe_unknown(())
-    subject = Subject(view.robot.id, view.robot.name, view.run.id)
-    notes = condition.describe_unknown(catalogue(view.connection, subject))
-    try:
-        holds_since(view.connection, view.run.id, condition)
-    except InvalidInputError as error:
-        notes.append(f"it will be turned off by the next state like the last ones: {error}")
-    return notes
-
-
-def _remove(recording: Recording, robot: str | None, breakpoint_id: int) -> str:
-    with recording.view(robot) as view:
-        name, robot_id = view.robot.name, view.robot.id
-    with recording.writer() as connection:
-        stored.remove_breakpoint(connection, robot_id, breakpoint_id)
-    return name
-
-
-async def _arm(recording: Recording, report: Report, robot: str) -> _Reply:
-    """Let the controller read its breakpoints again."""
-    try:
-        answer = await Dispatcher(recording, report).ask(robot, _ARM, _ARMING_WAIT_S)
-    except CommandRefusedError as refused:
-        return _Reply(why_not=f"{refused}. A controller of this robot reads them when it starts")
-    if answer.outcome != "done":
-        return _Reply(why_not=f"{_reason(answer)}. It will read them at the next reset in any case")
-    result: dict[str, Any] = answer.result
-    return _Reply(tuple(result.get("armed", ())), result.get("cannot_pause"))
-
-
-def _reason(answer: CommandAnswer) -> str:
-    return answer.error or answer.hint or f"the controller's answer was {answer.outcome}"
-
-
-def _header(recording: Recording, robot: str) -> dict[str, Any]:
-    with recording.view(robot) as view:
-        return view.header()
-
-
-def _row(connection: sqlite3.Connection, each: stored.StoredBreakpoint) -> list[Any]:
-    hit = stored.newest_hit(connection, each.robot_id, each.id) if each.hit_count else None
-    run_id, time_s = hit or (None, None)
-    return [
-        each.id,
-        cut_text(each.condition, _LONGEST_CONDITION),
-        each.action,
-        each.after_hits,
-        each.hit_count,
-        run_id,
-        time_s if time_s is None else round(time_s, 3),
-        each.created_by,
-        cut_text(each.error, _LONGEST_CONDITION) if each.error else None,
-    ]
 
 
 COMMANDS: Final = merged(

@@ -49,21 +49,20 @@ STDLIB = {
 ALLOWED["bridge"] = STDLIB | {"bridge", "__version__"}
 ALLOWED["observer"] = STDLIB | {"bridge", "observer"}
 ALLOWED["store"] = STDLIB | {"plugins", "requirements", "store"}
-ALLOWED["trials"] = STDLIB | {"requirements", "store", "trials", "webots", "__version__"}
 ALLOWED["diagnosis"] = STDLIB | {"requirements", "store", "diagnosis", "setup", "webots"}
 ALLOWED["launch"] = STDLIB | {"console", "store", "setup", "webots"}
 ALLOWED["plotting"] = STDLIB | {"store", "plotting"}
 ALLOWED["console"] = STDLIB | {"console", "store", "webots"}
 ALLOWED["server"] = STDLIB | {
-    "console", "store", "plotting", "diagnosis", "trials", "server", "webots",
+    "console", "store", "plotting", "diagnosis", "server", "webots",
     "launch", "plugins", "questions", "__version__",
 }  # fmt: skip
-ALLOWED["server"] |= {"steering"}
+ALLOWED["server"] |= {"requirements", "steering"}
 ALLOWED["questions"] = ALLOWED["steering"] = ALLOWED["server"] - {"server"}
-ALLOWED["cli"] = ALLOWED["server"] | {"cli", "observer", "requirements", "setup"}
+ALLOWED["cli"] = ALLOWED["server"] | {"cli", "observer", "setup"}
 ON_ALL = ALLOWED["cli"]
 ALLOWED["plugins"] = set[str]()
-ALLOWED["plugins.cluster"] = ALLOWED["trials"] | {"plugins", "plugins.cluster", "plugins.pool"}
+ALLOWED["plugins.cluster"] = ALLOWED["steering"] | {"plugins.cluster", "plugins.pool"}
 ALLOWED["plugins.demo"] = ON_ALL | {"standin", "plugins.demo"}
 ALLOWED["plugins.formats"] = ALLOWED["store"] | {"plugins.formats"}
 ALLOWED["plugins.pool"] = ALLOWED["store"] | {"cli", "plugins.pool"}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from webots_mcp.cli.rendering import answer_lines, table_lines
+from webots_mcp.cli.terminal import answer_lines, table_lines
 
 HEAD = {"robot": "rover", "run_id": 3, "sim_time_s": 1.5, "age_s": 0.02, "status": "running"}
 

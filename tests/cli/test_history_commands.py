@@ -14,7 +14,7 @@ import pytest
 from tests.recordings.rows import Recorded
 from tests.server.story import write_story
 from webots_mcp.cli import main
-from webots_mcp.cli.rendering import print_table
+from webots_mcp.cli.terminal import print_table
 
 Say = Callable[..., str]
 

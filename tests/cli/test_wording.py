@@ -12,7 +12,7 @@ import pytest
 from tests.recordings.rows import Recorded
 from webots_mcp.cli import main, names
 from webots_mcp.cli.commands import app_for, described
-from webots_mcp.cli.wording import BY_TOOL, as_typed
+from webots_mcp.cli.terminal import BY_TOOL, as_typed
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plotting.trial_scores import compose_trials
 from webots_mcp.plugins.report.making import make_report
 from webots_mcp.questions import all_questions
-from webots_mcp.questions.merged_questions import MergedQuestion
+from webots_mcp.questions.declaring import MergedQuestion
 from webots_mcp.server import create_server
 from webots_mcp.store.export import TrialTable, export, export_for_viewers
 from webots_mcp.store.reading.ranges import Scope, find_range

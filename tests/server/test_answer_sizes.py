@@ -19,9 +19,8 @@ from tests.server.conftest import text_of
 from tests.server.story import client_on
 from webots_mcp.connection import connect
 from webots_mcp.questions import all_questions
-from webots_mcp.questions.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS
-from webots_mcp.questions.merged_questions import MergedQuestion
-from webots_mcp.questions.shortening import tokens_in
+from webots_mcp.questions.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS, tokens_in
+from webots_mcp.questions.declaring import MergedQuestion
 
 pytestmark = pytest.mark.anyio
 

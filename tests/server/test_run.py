@@ -15,9 +15,8 @@ from tests.recordings.rows import Recorded, insert
 from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail, pictures_of, text_of
 from tests.server.story import rows_of
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.steering.dispatch import Dispatcher
-from webots_mcp.steering.request import CLAIMING_S
-from webots_mcp.steering.running import require_possible
+from webots_mcp.steering.dispatch import Dispatcher, require_possible
+from webots_mcp.steering.routes import CLAIMING_S
 from webots_mcp.store.recording import Recording
 
 pytestmark = pytest.mark.anyio

@@ -19,7 +19,7 @@ import pytest
 from tests.processes.stopping import stop_between_writes
 from tests.trials.conftest import Run, command, rows, wait_for_trial
 from webots_mcp.liveness import process_identity
-from webots_mcp.trials.trial_run import TrialSimulator
+from webots_mcp.steering.trial_run import TrialSimulator
 from webots_mcp.webots.starting import CommandLine
 
 Write = Callable[[str], Path]
@@ -37,7 +37,7 @@ time.sleep(600)
 # Dies between the start of the simulator's process and the note of its pid, or after that.
 RUNNER = """
 import os, pathlib, signal, sys, time
-from webots_mcp.trials.trial_run import TrialSimulator
+from webots_mcp.steering.trial_run import TrialSimulator
 from webots_mcp.webots.starting import CommandLine
 command = CommandLine([sys.executable, "simulator.py"], [])
 simulator = TrialSimulator(command, pathlib.Path(), {})

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.trials.conftest import Run, command, rows, wait_for_trial
-from webots_mcp.trials.plan import read_plan
+from webots_mcp.steering.trial_plan import read_plan
 
 Plan = Callable[[str], Path]
 

@@ -15,9 +15,14 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
-from webots_mcp.cli.ending import ended_by, ending_by_signals
-from webots_mcp.cli.terminal import spelling_out
-from webots_mcp.cli.wording import Typed, as_typed, speak_of
+from webots_mcp.cli.terminal import (
+    Typed,
+    as_typed,
+    ended_by,
+    ending_by_signals,
+    speak_of,
+    spelling_out,
+)
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.naming import spelled_out
 

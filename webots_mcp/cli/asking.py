@@ -18,16 +18,32 @@ import anyio
 from pydantic import ValidationError
 from pydantic.json_schema import SkipJsonSchema
 
-from webots_mcp.cli.recordings import Json, Range, Where, make_chunks_first
-from webots_mcp.cli.rendering import print_answer, text_of
-from webots_mcp.cli.terminal import line_of_progress, show_progress, wait
-from webots_mcp.cli.values import Parameter, refuse_options, settings_of, value_of, whole_number
-from webots_mcp.cli.wording import Typed, as_typed, running, speak_of, value_name
+from webots_mcp.cli.options import (
+    Json,
+    Parameter,
+    Range,
+    Where,
+    make_chunks_first,
+    refuse_options,
+    settings_of,
+    value_of,
+    whole_number,
+)
+from webots_mcp.cli.terminal import (
+    Typed,
+    as_typed,
+    line_of_progress,
+    print_answer,
+    running,
+    show_progress,
+    speak_of,
+    text_of,
+    value_name,
+    wait,
+)
 from webots_mcp.contract import LOOPING
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
-from webots_mcp.questions.argument_types import FOR_A_PERSON, SCOPE
-from webots_mcp.questions.declaring import Caller, Question, Reply
-from webots_mcp.questions.faults import faults_of
+from webots_mcp.questions.declaring import FOR_A_PERSON, SCOPE, Caller, Question, Reply, faults_of
 from webots_mcp.store.recording import Recording
 
 # How options are called whose argument has another name in all questions.
@@ -174,7 +190,7 @@ def _caller(question: Question, recording: Recording) -> Generator[Caller | None
     if not question.has_caller:
         yield None
         return
-    from webots_mcp.steering.launcher import Companions, Launcher
+    from webots_mcp.steering.routes import Companions, Launcher
     from webots_mcp.steering.trial_worker import TrialWorkers
 
     companions = Companions(TrialWorkers(recording), Launcher(recording))

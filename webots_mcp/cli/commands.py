@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 
 from cyclopts import App, Argument, Group, Parameter
 
-from webots_mcp.cli.wording import value_name
+from webots_mcp.cli.terminal import value_name
 from webots_mcp.plugins import plugin_commands
 
 
@@ -44,16 +44,16 @@ GROUPS: Final = (SETUP, NOW, PAST, STEER, DATA)
 _Q: Final = "webots_mcp.questions"
 _STEERING: Final = "webots_mcp.cli.steering"
 _OF_THE_CORE: Final = {
-    "events": Command(PAST, f"{_Q}.find_events", "webots_find_events"),
+    "events": Command(PAST, f"{_Q}.events", "webots_find_events"),
     "compare": Command(PAST, f"{_Q}.compare_runs", "webots_compare_runs"),
     "logs": Command(PAST, f"{_Q}.get_logs", "webots_get_logs"),
-    "history": Command(PAST, f"{_Q}.query_history", "webots_query_history"),
+    "history": Command(PAST, f"{_Q}.history", "webots_query_history"),
     "label": Command(DATA, f"{_Q}.compare_runs", "webots_annotate_run"),
     "runs": Command(PAST, f"{_Q}.compare_runs", "webots_list_runs"),
-    "signals": Command(PAST, f"{_Q}.list_signals", "webots_list_signals"),
+    "signals": Command(PAST, f"{_Q}.history", "webots_list_signals"),
     "sql": Command(PAST, f"{_Q}.query_sql", "webots_query_sql"),
-    "status": Command(NOW, f"{_Q}.world_info", "webots_list_robots"),
-    "trends": Command(PAST, f"{_Q}.get_trends", "webots_get_trends"),
+    "status": Command(NOW, f"{_Q}.robot_state", "webots_list_robots"),
+    "trends": Command(PAST, f"{_Q}.history", "webots_get_trends"),
     "export": Command(DATA, "webots_mcp.cli.data", "export"),
     "import": Command(DATA, "webots_mcp.cli.data", "import_"),
     "prune": Command(DATA, "webots_mcp.cli.data", "prune"),
@@ -63,7 +63,7 @@ _OF_THE_CORE: Final = {
     "init": Command(SETUP, "webots_mcp.cli.setting_up", "init"),
     "observe": Command(SETUP, "webots_mcp.cli.serving", "observe"),
     "serve": Command(SETUP, "webots_mcp.cli.serving", "serve"),
-    "run": Command(STEER, f"{_Q}.run_simulation", "webots_run"),
+    "run": Command(STEER, f"{_Q}.control_simulation", "webots_run"),
     "send": Command(STEER, f"{_Q}.send_command", "webots_send_command"),
     "wait": Command(STEER, f"{_Q}.send_command", "webots_wait_for_command"),
     "scene": Command(NOW, f"{_Q}.edit_scene", "webots_get_scene"),
@@ -75,10 +75,10 @@ _OF_THE_CORE: Final = {
     "step": Command(STEER, _STEERING, "step"),
     "keep": Command(STEER, _STEERING, "keep"),
     "breakpoint": Command(STEER, _STEERING, "breakpoint_"),
-    "trials": Command(STEER, "webots_mcp.cli.trials", "trials"),
-    "launch": Command(SETUP, "webots_mcp.cli.launching", "launch"),
-    "plot": Command(PAST, "webots_mcp.cli.looking", "plot"),
-    "tail": Command(NOW, "webots_mcp.cli.looking", "tail"),
+    "trials": Command(STEER, "webots_mcp.cli.steering", "trials"),
+    "launch": Command(SETUP, "webots_mcp.cli.serving", "launch"),
+    "plot": Command(PAST, "webots_mcp.cli.data", "plot"),
+    "tail": Command(NOW, "webots_mcp.cli.data", "tail"),
 }
 COMMANDS: Final[dict[str, Command]] = _OF_THE_CORE | {
     each.name: Command(each.group, *each.function.split(":")) for each in plugin_commands()

@@ -9,15 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from webots_mcp.cli.recordings import HERE, Json, Where
-from webots_mcp.cli.rendering import (
-    print_json,
-    print_notes,
-    printable,
-    terminal_width,
-)
-from webots_mcp.cli.values import Parameter
-from webots_mcp.cli.wording import as_typed
+from webots_mcp.cli.options import HERE, Json, Parameter, Where
+from webots_mcp.cli.terminal import as_typed, print_json, print_notes, printable, terminal_width
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 
 if TYPE_CHECKING:

@@ -10,8 +10,28 @@ from typing import Annotated, Any, Final
 from pydantic import Field
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.questions.answers import Table
-from webots_mcp.questions.argument_types import (
+from webots_mcp.questions.answers import ComparisonAnswer, RunsAnswer, Table
+from webots_mcp.questions.budget import (
+    DETAIL_BUDGET_TOKENS,
+    WHOLE,
+    answer_about,
+    condensed,
+    figure,
+    figures,
+    fitting,
+    header_of_only,
+    is_for_a_person,
+    notes_of,
+    room_tokens,
+    seconds,
+    short_name,
+    shorten,
+    shown,
+    without_empty,
+)
+from webots_mcp.questions.declaring import (
+    READS,
+    SETS,
     AnyNames,
     Cursor,
     Limit,
@@ -23,24 +43,8 @@ from webots_mcp.questions.argument_types import (
     ShownLimit,
     TrialSetId,
     Value,
+    question,
 )
-from webots_mcp.questions.budget import (
-    answer_about,
-    condensed,
-    figure,
-    figures,
-    fitting,
-    header_of_only,
-    notes_of,
-    room_tokens,
-    seconds,
-    short_name,
-    shown,
-    without_empty,
-)
-from webots_mcp.questions.declaring import READS, SETS, is_for_a_person, question
-from webots_mcp.questions.history_answers import ComparisonAnswer, RunsAnswer
-from webots_mcp.questions.shortening import DETAIL_BUDGET_TOKENS, WHOLE, shorten
 from webots_mcp.store.analysis.spread import MIN_EFFECT_SD, Spread
 from webots_mcp.store.detection.kinds import EventOptions, both_of
 from webots_mcp.store.questions.compare import (

@@ -1,22 +1,43 @@
-"""Tools that steer the simulation and wait for what comes of it."""
+"""Steering the simulation and Webots, and waiting for what comes of it."""
 
 from __future__ import annotations
 
-from typing import Annotated, Final
+import time
+from typing import Annotated, Any, Final, Literal, cast
 
+import anyio
 from anyio import to_thread
 from pydantic import Field
 from pydantic.json_schema import SkipJsonSchema
 
-from webots_mcp.contract import MAX_STEPS
-from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
-from webots_mcp.questions.answers import CommandAnswer
-from webots_mcp.questions.argument_types import MAX_WAIT_S, RobotName, TimeoutS, WaitS
-from webots_mcp.questions.declaring import DESTROYS, Caller, question
-from webots_mcp.steering.dispatch import Dispatcher
-from webots_mcp.steering.routes import Attempt
-from webots_mcp.steering.target_robot import find_target
+from webots_mcp.contract import MAX_RUN_S, MAX_STEPS, Pace, Then
+from webots_mcp.errors import (
+    CommandRefusedError,
+    InvalidInputError,
+    NothingRecordedError,
+    WebotsMCPError,
+)
+from webots_mcp.launch import Launch, SessionStart, require_world
+from webots_mcp.questions.answers import CommandAnswer, RunAnswer, ShownPicture
+from webots_mcp.questions.budget import cut_text, seconds
+from webots_mcp.questions.declaring import (
+    CHANGES,
+    DESTROYS,
+    MAX_WAIT_S,
+    Caller,
+    RobotName,
+    TimeoutS,
+    Value,
+    WaitS,
+    merged,
+    question,
+)
+from webots_mcp.questions.pictures import load_picture
+from webots_mcp.steering.dispatch import ACTION, Dispatcher, find_target, require_possible
+from webots_mcp.steering.routes import Attempt, WorldRequest, project_of
+from webots_mcp.store.images import camera_frames, inside
 from webots_mcp.store.recording import Recording, look
+from webots_mcp.webots.starting import Mode, Start, free_port
 from webots_mcp.webots.stream import Order
 
 Port = Annotated[
@@ -119,3 +140,254 @@ def _usual_wait_s(recording: Recording, command: Order, steps: int, robot: str |
             run = None
         step_ms = (run.basic_time_step_ms if run else None) or 32.0  # Webots' default
     return min(_WAIT_S + 2 * steps * step_ms / 1000, MAX_WAIT_S)
+
+
+# -- Webots itself: started on a world, another world in it, ended --
+
+_STARTING_S: Final = 60.0  # Webots downloads what it has not cached
+_WORLD_WAIT_S: Final = 30.0
+_LOOK_EVERY_S: Final = 0.2
+_LONGEST_LINE: Final = 200
+
+World = Annotated[str, Field(max_length=1000, description="A .wbt file.")]
+
+
+@question("Launch Webots on a world", CHANGES)
+async def webots_launch_world(
+    recording: Recording,
+    world: World,
+    caller: Caller,
+    mode: Annotated[Mode | None, Field(description="To begin with; else as it prefers.")] = None,
+    headless: Annotated[bool, Field(description="Without its window and 3D view.")] = False,
+    stream: Annotated[
+        bool, Field(description="Obey without a controller; opens the project to the net.")
+    ] = False,
+    timeout_wall_s: TimeoutS = _STARTING_S,
+) -> CommandAnswer:
+    """Start Webots and wait until the first controller records, or say why none does.
+
+    It ends with this server, or when it is quit. One at a time.
+    """
+    launcher = caller.companions.webots
+    project = await to_thread.run_sync(project_of, recording)
+    file, _ = await to_thread.run_sync(require_world, world, project)
+    port = await to_thread.run_sync(free_port)
+    start = Start(file, mode, headless, stream, port)
+    started_s = time.monotonic()
+    launched = await to_thread.run_sync(launcher.begin, start)
+    first = await _wait(launched, caller, started_s + timeout_wall_s)
+    return await to_thread.run_sync(_answer, recording, launched, first, started_s)
+
+
+@question("Load another world", DESTROYS)
+async def webots_load_world(
+    recording: Recording,
+    world: World,
+    caller: Caller,
+    robot: RobotName = None,
+    timeout_wall_s: TimeoutS = _WORLD_WAIT_S,
+) -> CommandAnswer:
+    """Open another world in the running Webots; all controllers end.
+
+    By a controller that is a Supervisor, else by Webots if started with --stream.
+    """
+    project = await to_thread.run_sync(project_of, recording)
+    file, _ = await to_thread.run_sync(require_world, world, project)
+    return await _request(recording, caller, robot, timeout_wall_s).load(file)
+
+
+@question("Quit Webots", DESTROYS)
+async def webots_quit(
+    recording: Recording,
+    caller: Caller,
+    robot: RobotName = None,
+    timeout_wall_s: TimeoutS = _WORLD_WAIT_S,
+) -> CommandAnswer:
+    """End Webots: the one of webots_launch_world; another only by a robot that is a Supervisor."""
+    return await _request(recording, caller, robot, timeout_wall_s).quit()
+
+
+def _request(
+    recording: Recording, caller: Caller, robot: str | None, timeout_wall_s: float
+) -> WorldRequest:
+    dispatcher = Dispatcher(recording, caller.report)
+    return WorldRequest(recording, dispatcher, robot, timeout_wall_s, caller.companions.webots)
+
+
+async def _wait(launched: Launch, caller: Caller, until_s: float) -> SessionStart | None:
+    """Until a controller records; None where the time was over first.
+
+    Raises:
+        CommandRefusedError: Webots has ended.
+    """
+    begun_s = time.monotonic()
+    while True:
+        is_over = launched.webots.is_over  # before the look: what came last is seen
+        first = await to_thread.run_sync(launched.first_record)
+        if first is not None or time.monotonic() > until_s:
+            return first
+        if is_over:
+            await to_thread.run_sync(launched.webots.end)
+            await to_thread.run_sync(launched.record_last_words)
+            raise CommandRefusedError(await to_thread.run_sync(launched.silence))
+        lines = launched.webots.lines
+        said = cut_text(lines[-1].text, _LONGEST_LINE) if lines else "Webots starts"
+        await caller.report(time.monotonic() - begun_s, until_s - begun_s, said)
+        await anyio.sleep(_LOOK_EVERY_S)
+
+
+def _answer(
+    recording: Recording, launched: Launch, first: SessionStart | None, started_s: float
+) -> CommandAnswer:
+    header: dict[str, Any] = {}
+    if first is not None:
+        with recording.view(first.robot) as view:
+            header = view.header()
+    return CommandAnswer(
+        **header,
+        action="launch",
+        outcome="done" if first else "claimed",
+        waited_s=round(time.monotonic() - started_s, 3),
+        result=_described(launched),
+        route="process",
+        evidence=f"{first.robot} records: run {first.run_id}" if first else None,
+        hint=None if first else f"Webots runs, but {launched.silence()}{_then(launched)}",
+    )
+
+
+def _then(launched: Launch) -> str:
+    """How a start in pause goes on."""
+    if launched.start.mode != "pause":
+        return ""
+    by_us = 'webots_simulation_control("resume") plays it'
+    alone = "press play in its window, or quit it and start it in another mode or with stream"
+    return f". {by_us if launched.start.streams else alone}"
+
+
+def _described(launched: Launch) -> dict[str, Any]:
+    address = launched.webots.address
+    return {
+        "world": str(launched.world),
+        "port": address.port if address else launched.start.port,
+        "pid": launched.webots.pid,
+    }
+
+
+# -- running until something is the case --
+
+_RUN_WAIT_S: Final = 60.0
+_PICTURE_WAIT_S: Final = 8.0
+_SAME_S: Final = 0.001  # times are told to the millisecond
+
+
+@question(
+    "Run until",
+    DESTROYS,
+    command="run",
+    options={"parameters": "--set"},
+    core=True,
+    example="--until 'front_m < 0.1' --for 20 --reset --set kp=2",
+)
+async def webots_run(
+    recording: Recording,
+    caller: Caller,
+    until: Annotated[
+        str | None,
+        Field(max_length=500, description="A condition, as of webots_breakpoint."),
+    ] = None,
+    for_s: Annotated[
+        float | None,
+        Field(gt=0, le=MAX_RUN_S, description="Simulated seconds; at most, with until."),
+    ] = None,
+    reset: Annotated[
+        bool, Field(description="Reset the world first; for_s counts from there.")
+    ] = False,
+    pace: Annotated[Literal[Pace, "as_it_is"], Field(description="Of this run.")] = "fast",
+    parameters: Annotated[
+        dict[str, Value] | None,
+        Field(description="Set these first, all or none."),
+    ] = None,
+    then: Annotated[Then, Field(description="At that step; go_on: at the old pace.")] = "pause",
+    picture: Annotated[bool, Field(description="A screenshot of the end, too.")] = False,
+    robot: RobotName = None,
+    timeout_wall_s: TimeoutS = _RUN_WAIT_S,
+) -> RunAnswer:
+    """Let the simulation run until a condition holds or a simulated time is over, then pause it.
+
+    Says why it stopped, how far it came, the state at that step, and what happened meanwhile. Out
+    of wall time it goes on: webots_list_commands(what="outcome") waits. Needs a Supervisor.
+    """
+    await to_thread.run_sync(lambda: require_possible(recording, robot, until, for_s, reset=reset))
+    params = {
+        "until": until,
+        "for_s": for_s,
+        "reset": reset,
+        "pace": None if pace == "as_it_is" else pace,
+        "parameters": parameters,
+        "then": then,
+    }
+    dispatcher = Dispatcher(recording, caller.report)
+    asked = {name: value for name, value in params.items() if value is not None}
+    answer = cast("RunAnswer", await dispatcher.ask(robot, ACTION, timeout_wall_s, asked))
+    if picture and answer.outcome == "done":
+        await _add_picture(recording, dispatcher, answer)
+    return answer
+
+
+async def _add_picture(recording: Recording, dispatcher: Dispatcher, answer: RunAnswer) -> None:
+    """A screenshot beside the data, or a camera frame of that step, or why there is neither."""
+    try:
+        shot = await dispatcher.ask(answer.robot, "screenshot", _PICTURE_WAIT_S, {"quality": 90})
+        if shot.outcome != "done":
+            raise CommandRefusedError(
+                shot.error or shot.hint or f"the screenshot is {shot.outcome}"
+            )
+        file = inside(recording.data_dir, str(cast("dict[str, Any]", shot.result)["path"]))
+        facts: dict[str, Any] = {"file": str(file), "sim_time_s": shot.sim_time_s}
+        image, note = await to_thread.run_sync(load_picture, file)
+    except WebotsMCPError as error:
+        await to_thread.run_sync(_add_frame, recording, answer, str(error))
+        return
+    _attach(answer, image, facts, note, "webots_take_screenshot")
+
+
+def _add_frame(recording: Recording, answer: RunAnswer, why: str) -> None:
+    """What a camera saw at the step at which the run ended, where that was recorded."""
+    ran = answer.ran or {}
+    frame = None
+    if ran.get("run_id") is not None:
+        with recording.reader() as connection:
+            found = camera_frames(connection, ran["run_id"], at_s=ran["to_s"])
+        frame = next((each for each in found if abs(each.sim_time_s - ran["to_s"]) < _SAME_S), None)
+    if frame is None:
+        answer.picture = {"missing": why}
+        return
+    try:
+        image, note = load_picture(frame.file(recording.data_dir))
+    except WebotsMCPError as error:
+        answer.picture = {"missing": f"{why}; {error}"}
+        return
+    file = str(recording.data_dir / frame.path)
+    facts = {"camera": frame.device, "file": file, "sim_time_s": seconds(frame.sim_time_s)}
+    _attach(answer, image, facts | {"no_screenshot": why}, note, "webots_get_camera")
+
+
+def _attach(
+    answer: RunAnswer, image: ShownPicture, facts: dict[str, Any], note: str, again: str
+) -> None:
+    answer.pictures.append(image)
+    answer.picture = facts | ({"note": note} if note else {})
+    answer.picture["see"] = f"beside this answer; if your client drops it, {again}"
+
+
+WORLD: Final = merged(
+    webots_launch_world,
+    choice="action",
+    meaning="load: another world in the Webots that runs; quit: end it.",
+    parts={"launch": webots_launch_world, "load": webots_load_world, "quit": webots_quit},
+    text="""\
+Start Webots on a world and wait until the first controller records.
+
+It ends with this server, or by quit. One at a time. Another Webots obeys by a Supervisor, or if
+started with --stream.""",
+)

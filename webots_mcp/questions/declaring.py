@@ -2,41 +2,65 @@
 
 A question is a function whose annotated parameters are its arguments and whose answer is an
 `Answer`. It knows neither MCP nor a terminal: the server and the command line ask it through
-`Question.ask`, and show what it answers. A new question is one module, and its name in
+`Question.ask`, and show what it answers. A module with questions has its name in
 `questions.MODULES`.
 """
 
 from __future__ import annotations
 
+import difflib
 import functools
 import inspect
-from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
-from contextvars import ContextVar
-from dataclasses import dataclass
-from types import ModuleType
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, get_type_hints
+import re
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Final,
+    Literal,
+    NamedTuple,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from anyio import to_thread
-from pydantic import BaseModel, ConfigDict, create_model
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    WithJsonSchema,
+    create_model,
+)
 from pydantic.fields import FieldInfo
+from pydantic.json_schema import SkipJsonSchema
+from pydantic_core import ErrorDetails
 
+from webots_mcp import contract
 from webots_mcp.errors import (
+    InvalidInputError,
     MalformedRowError,
     NoDatabaseError,
     NothingRecordedError,
     WebotsMCPError,
 )
+from webots_mcp.naming import same_in_meaning
 from webots_mcp.questions.answers import Answer, ShownPicture
-from webots_mcp.questions.argument_types import SCOPE
-from webots_mcp.questions.shortening import compact_json
+from webots_mcp.questions.budget import Client, compact_json, reader
+from webots_mcp.store.invalid_rows import past_invalid_rows
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.recording import Recording, past_invalid_rows
 
 if TYPE_CHECKING:
-    from webots_mcp.steering.launcher import Companions
+    from webots_mcp.steering.routes import Companions
 
 Report = Callable[[float, float | None, str], Awaitable[None]]
-Client = Literal["mcp", "cli"]
 
 
 @dataclass(frozen=True)
@@ -54,6 +78,7 @@ class Effect:
     repeats: bool = False
 
 
+_NOT_GIVEN: Final = inspect.Parameter.empty
 READS: Final = Effect(reads=True, repeats=True)
 CHANGES: Final = Effect()
 SETS: Final = Effect(repeats=True)  # what it sets is the same, however often
@@ -208,14 +233,14 @@ class Question:
             given[scope] = Scope(**{name: given.pop(name, None) for name in SCOPE})
         if asker := self._parameter_of(Caller):
             given[asker] = caller
-        client = _client.set(caller.client if caller else "cli")
+        client = reader.set(caller.client if caller else "cli")
         try:
             if inspect.iscoroutinefunction(self.function):
                 answer = await self.function(recording, **given)
             else:
                 answer = await to_thread.run_sync(lambda: self.function(recording, **given))
         finally:
-            _client.reset(client)
+            reader.reset(client)
         return _reply(answer)
 
     def _parameter_of(self, kind: type) -> str | None:
@@ -252,9 +277,6 @@ def _with_left_out(reply: Reply, left_out: Sequence[str]) -> Reply:
     return _in_text(reply.data | {"left_out": whole}, reply.shown[1:])
 
 
-_client: Final[ContextVar[Client]] = ContextVar("client", default="mcp")
-
-
 def question(
     title: str,
     effect: Effect,
@@ -272,12 +294,314 @@ def question(
     )
 
 
-def questions_in(module: ModuleType) -> Iterator[Question]:
-    """What a module declares, without what it imports."""
-    found = (each for each in tuple(vars(module).values()) if isinstance(each, Question))
-    return (each for each in found if each.function.__module__ == module.__name__)
+@dataclass(frozen=True, eq=False)
+class MergedQuestion(Question):
+    """Several questions as one.
+
+    Attributes:
+        choice: The argument that says which of them is asked.
+        meaning: What that argument means.
+        parts: The questions by its values. The first is asked where it is left out, unless
+            `must_choose`.
+        unlisted: Arguments that are taken, and stand in no schema: another says the same.
+    """
+
+    choice: str = ""
+    meaning: str = ""
+    parts: Mapping[str, Question] = field(default_factory=dict[str, Question])
+    must_choose: bool = False
+    unlisted: tuple[str, ...] = ()
+
+    @functools.cached_property
+    def parameters(self) -> list[inspect.Parameter]:
+        """The choice, and each argument of a part once, in the words of the first that has it."""
+        chosen = Annotated[Literal[tuple(self.parts)], Field(description=self.meaning)]
+        default = _NOT_GIVEN if self.must_choose else next(iter(self.parts))
+        common = [
+            each.replace(annotation=SkipJsonSchema[each.annotation])
+            if each.name in self.unlisted
+            else each
+            for each in self._common()
+        ]
+        return [_keyword(self.choice, chosen, default), *common]
+
+    def _common(self) -> Iterable[inspect.Parameter]:
+        declared: dict[str, list[inspect.Parameter]] = {}
+        for part in self.parts.values():
+            for each in part.parameters:
+                declared.setdefault(each.name, []).append(each)
+        for name, those in declared.items():
+            defaults = [each.default for each in those]
+            kind = those[0].annotation
+            if any(default != defaults[0] for default in defaults) or (
+                defaults[0] is _NOT_GIVEN and len(those) < len(self.parts)
+            ):
+                yield _keyword(name, _or_none(kind), None)
+            else:
+                yield _keyword(name, kind, defaults[0])
+
+    async def ask(
+        self, recording: Recording, arguments: Mapping[str, Any], caller: Caller | None
+    ) -> Reply:
+        """The answer of the part that was chosen.
+
+        Raises:
+            InvalidInputError: An argument is not one of that part, or it lacks one.
+            WebotsMCPError: As the part says.
+        """
+        chosen = arguments[self.choice]
+        part = self.parts[chosen]
+        own = {each.name for each in part.parameters}
+        defaults = {each.name: each.default for each in self.parameters}
+        given = {
+            name: value
+            for name, value in arguments.items()
+            if name != self.choice and not (name in defaults and value == defaults[name])
+        }
+        for name in given.keys() - own:
+            raise InvalidInputError(
+                f"{name} has no meaning with {self.choice}={chosen!r}: there is "
+                f"{', '.join(each.name for each in part.parameters)}"
+            )
+        try:
+            valid = part.arguments.model_validate(given)
+        except ValidationError as error:
+            raise InvalidInputError(f"{self.choice}={chosen!r}: {faults_of(error)}") from error
+        return await part.ask(recording, {name: getattr(valid, name) for name in own}, caller)
 
 
-def is_for_a_person() -> bool:
-    """Whether the answer is read in a terminal, where nothing is cut to save a model's context."""
-    return _client.get() == "cli"
+def merged(
+    first: Question,
+    *,
+    choice: str,
+    meaning: str,
+    parts: Mapping[str, Question],
+    text: str,
+    name: str | None = None,
+    title: str | None = None,
+    unlisted: tuple[str, ...] = (),
+) -> MergedQuestion:
+    """Merge questions that all read, or that all change something.
+
+    Args:
+        first: Whose name and title it takes, unless others are given.
+        choice: The argument that says which is asked.
+        meaning: What it means.
+        parts: The questions by its values.
+        text: What the tool does.
+        name: Its own name; then nothing is asked by default.
+        title: Its own title.
+        unlisted: Arguments that stand in no schema.
+    """
+    effects = [part.effect for part in parts.values()]
+    if len({effect.reads for effect in effects}) != 1:
+        raise ValueError(f"{', '.join(parts)}: some of them read, others change something")
+    effect = Effect(
+        reads=effects[0].reads,
+        destroys=any(effect.destroys for effect in effects),
+        repeats=all(effect.repeats for effect in effects),
+    )
+
+    def function() -> Answer:
+        raise NotImplementedError  # its parts are asked
+
+    function.__name__ = name or first.name
+    function.__doc__ = text
+    kinds = tuple(dict.fromkeys(part.answer or Answer for part in parts.values()))
+    answer = create_model(f"{function.__name__}_answer", __base__=kinds)
+    function.__annotations__["return"] = answer
+    return MergedQuestion(
+        function,
+        title or first.title,
+        effect,
+        core=first.core,
+        choice=choice,
+        meaning=meaning,
+        parts=parts,
+        must_choose=name is not None,
+        unlisted=unlisted,
+    )
+
+
+def listed(questions: Iterable[Question]) -> list[Question]:
+    """Those that a client sees: each merged one in place of its first part, the others gone."""
+    every = list(questions)
+    merges = [each for each in every if isinstance(each, MergedQuestion)]
+    first = {next(iter(each.parts.values())): each for each in merges}
+    hidden = {part for each in merges for part in each.parts.values()}
+    kept = [each for each in every if each not in merges]
+    return [first.get(each, each) for each in kept if each in first or each not in hidden]
+
+
+def _keyword(name: str, kind: Any, default: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+
+
+def _or_none(kind: Any) -> Any:
+    """The annotation of an argument that may be left out."""
+    if get_origin(kind) is not Annotated:
+        return kind | None
+    plain, *metadata = get_args(kind)
+    described = [each for each in metadata if getattr(each, "description", None)]
+    others = [each for each in metadata if each not in described]
+    inner = Annotated[(plain, *others)] if others else plain
+    return Annotated[(inner | None, *described)]
+
+
+# -- arguments that several questions share: the same name, bounds and words everywhere --
+
+# Clients put a call aside after two minutes; some of this time is for a busy database.
+MAX_WAIT_S: Final = 90
+FOR_A_PERSON: Final = "person"  # the context of a validation: whoever waits can press Ctrl-C
+LONGEST_NAME: Final = 200
+
+
+def _as_id(value: int) -> int:
+    if value >= 2**63:  # what SQLite can compare with
+        raise ValueError("be an id from an earlier answer")
+    return value
+
+
+def _as_seconds(value: float) -> float:
+    if abs(value) > 1e12:
+        raise ValueError("be a number of seconds")
+    return value
+
+
+def _as_wait(value: float, info: ValidationInfo) -> float:
+    if info.context != FOR_A_PERSON and value > MAX_WAIT_S:
+        raise ValueError(f"be less than or equal to {MAX_WAIT_S}")
+    return _as_seconds(value)
+
+
+# Bounds that only an absurd value meets stay out of the schemas, which every client carries along:
+# `CheckedTool` leaves the lengths of texts out, a validator has the others. The bounds beside a
+# validator stand before it: behind it pydantic does not know JSON Schema's words.
+Id = Annotated[int, Field(ge=1), AfterValidator(_as_id)]
+_Place = Annotated[int, Field(ge=0), AfterValidator(_as_id)]
+Seconds = Annotated[float, AfterValidator(_as_seconds)]
+_Duration = Annotated[float, Field(gt=0), AfterValidator(_as_seconds)]
+RobotName = Annotated[
+    Annotated[str, Field(max_length=LONGEST_NAME)] | None,
+    Field(description="If several."),
+]
+RunId = Annotated[Id | None, Field(description="Else the current run.")]
+TrialSetId = Annotated[Id | None, Field(description="From webots_run_trials.")]
+LastS = Annotated[
+    _Duration | None,
+    Field(description="The last simulated seconds."),
+]
+StartS = Annotated[Seconds | None, Field(description="From this simulation time.")]
+EndS = Annotated[Seconds | None, Field(description="Before this simulation time.")]
+WaitS = Annotated[
+    float,
+    Field(ge=0.1, json_schema_extra={"maximum": MAX_WAIT_S}),
+    AfterValidator(_as_wait),
+]
+TimeoutS = Annotated[WaitS, Field(description="At most.")]
+_CURSOR: Final = "From the last answer."
+Cursor = Annotated[_Place | None, Field(description=_CURSOR)]
+TextCursor = Annotated[str, Field(max_length=2000, description=_CURSOR)]
+# A number is as good; one type that holds both is shorter than two.
+_WallTime = Annotated[float | str | None, WithJsonSchema({"type": "string"})]
+Since = Annotated[_WallTime, Field(description="From, ISO 8601 with zone.")]
+Until = Annotated[_WallTime, Field(description="Before.")]
+Names = Annotated[
+    list[str],
+    Field(
+        min_length=1,
+        max_length=50,
+        description="Their names; 'pose' is all below it, '*' any text.",
+    ),
+]
+AnyNames = Annotated[
+    list[str] | None,
+    Field(max_length=50, description="'*' is any text."),
+]
+# Of a parameter. A whole number is a number as well, and stays one. What it may be is the
+# parameter's to say, and would take as much room as all else.
+Value = Annotated[float | int | bool | str, WithJsonSchema({})]
+MaxPoints = Annotated[
+    int | None,
+    Field(
+        ge=1,
+        le=500,
+        description="The most buckets, or rows with raw.",
+    ),
+]
+ShownLimit = Annotated[
+    int | None,
+    Field(ge=1, le=500, description="Most shown."),
+]
+LogLevel = Annotated[contract.LogLevel, Field(description="Of log lines: from this level.")]
+Limit = Annotated[int, Field(ge=1, le=500, description="Most shown.")]
+RunIds = Annotated[
+    list[Id] | None,
+    Field(max_length=10, description="From webots_list_runs."),
+]
+Position = Annotated[
+    list[str] | None,
+    Field(min_length=2, max_length=2, description="Signals of x and y, if not found."),
+]
+Mode = Annotated[
+    str | None,
+    Field(max_length=LONGEST_NAME, description="Signal of the mode, if not found."),
+]
+# What a client gives for a `Scope`, which tools take whole.
+SCOPE: Final = {
+    "last_s": LastS,
+    "start_s": StartS,
+    "end_s": EndS,
+    "since_wall_time": Since,
+    "until_wall_time": Until,
+    "robot": RobotName,
+    "run_id": RunId,
+}
+
+
+# -- what is wrong with an argument, in words that a model or a person can act on --
+
+_MOST_FAULTS: Final = 3
+_LONGEST_VALUE: Final = 80
+_AS_DECLARED: Final[Mapping[str, str]] = MappingProxyType({})
+
+
+def faults_of(error: ValidationError, typed: Mapping[str, str] = _AS_DECLARED) -> str:
+    """The first things that are wrong: the argument, what is asked of it, and its value.
+
+    Args:
+        error: What pydantic said.
+        typed: How the arguments are called where they were typed, if not by their names.
+    """
+    faults = {str(each["loc"][0]): _fault(each, typed) for each in reversed(error.errors())}
+    return "; ".join(list(faults.values())[:_MOST_FAULTS])
+
+
+def _fault(error: ErrorDetails, typed: Mapping[str, str]) -> str:
+    """One thing that is wrong: the parameter, what is asked of it, and what came."""
+    first, *inside = error["loc"]  # a name after it is a type that the value might have had
+    if str(first) in typed:
+        first, inside = typed[str(first)], []  # each item of a list has been typed by itself
+    name = ".".join(map(str, (first, *(item for item in inside if isinstance(item, int)))))
+    if error["type"] == "missing":
+        return f"{name} is missing"
+    if error["type"] == "unexpected_keyword_argument":
+        return f"there is no argument {shown_value(name)}"
+    asked = re.sub(r"^(Value error, |\w+ should )", "must ", error["msg"])
+    asked = re.sub(r", unable to parse .*| after validation, not \d+", "", asked)
+    if error["type"] == "int_parsing_size":
+        asked = "must be a smaller number"
+    return f"{name} {asked}, not {shown_value(error['input'])}{_near(error)}"
+
+
+def _near(error: ErrorDetails) -> str:
+    """What was perhaps meant."""
+    choices = re.findall(r"'([^']+)'", error["msg"])
+    given = str(error["input"])[:_LONGEST_VALUE]
+    near = same_in_meaning(given, choices) or difflib.get_close_matches(given, choices, n=1)
+    return f"; did you mean {' or '.join(map(repr, near))}?" if near else ""
+
+
+def shown_value(value: object) -> str:
+    """A value as it was given, if not too long."""
+    return repr(value)[:_LONGEST_VALUE]

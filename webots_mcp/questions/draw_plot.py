@@ -21,14 +21,8 @@ from webots_mcp.plotting import (
     plot_trials,
 )
 from webots_mcp.questions.answers import ShownPicture
-from webots_mcp.questions.argument_types import (
-    AnyNames,
-    RunIds,
-    TrialSetId,
-)
-from webots_mcp.questions.budget import notes_of
-from webots_mcp.questions.declaring import READS, question
-from webots_mcp.questions.shortening import compact_json
+from webots_mcp.questions.budget import compact_json, notes_of
+from webots_mcp.questions.declaring import READS, AnyNames, RunIds, TrialSetId, question
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.recording import Recording, View
 

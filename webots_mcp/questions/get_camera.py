@@ -11,11 +11,18 @@ from pydantic import Field
 from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.questions.answers import CommandAnswer, ShownPicture
-from webots_mcp.questions.argument_types import RobotName, RunId, Seconds, TimeoutS
-from webots_mcp.questions.budget import seconds, some
-from webots_mcp.questions.declaring import CHANGES, READS, Caller, question
+from webots_mcp.questions.budget import compact_json, seconds, some
+from webots_mcp.questions.declaring import (
+    CHANGES,
+    READS,
+    Caller,
+    RobotName,
+    RunId,
+    Seconds,
+    TimeoutS,
+    question,
+)
 from webots_mcp.questions.pictures import load_picture, load_sheet
-from webots_mcp.questions.shortening import compact_json
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.images import StoredImage, camera_frames, cameras, inside
 from webots_mcp.store.reading.segment import just_after, kept_stretches

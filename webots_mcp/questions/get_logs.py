@@ -12,10 +12,17 @@ from webots_mcp.console import console_state
 from webots_mcp.contract import LogLevel, LogSource
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
 from webots_mcp.questions.answers import LogsAnswer, Table
-from webots_mcp.questions.argument_types import Cursor, EndS, LastS, RobotName, RunId, StartS
-from webots_mcp.questions.budget import fitting
-from webots_mcp.questions.declaring import READS, is_for_a_person, question
-from webots_mcp.questions.shortening import cut_text
+from webots_mcp.questions.budget import cut_text, fitting, is_for_a_person
+from webots_mcp.questions.declaring import (
+    READS,
+    Cursor,
+    EndS,
+    LastS,
+    RobotName,
+    RunId,
+    StartS,
+    question,
+)
 from webots_mcp.store.logs import (
     COUNT_LIMIT,
     OF_CONSOLE,

@@ -14,29 +14,20 @@ from anyio.lowlevel import RunVar
 from pydantic import Field
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.questions.answers import Table
-from webots_mcp.questions.argument_types import ShownLimit
+from webots_mcp.questions.answers import SqlAnswer, Table
 from webots_mcp.questions.budget import (
     LONGEST_NAME,
     cut_for_a_model,
     fitting,
     header_of_only,
+    is_for_a_person,
     room_tokens,
+    tokens_of,
 )
-from webots_mcp.questions.declaring import READS, is_for_a_person, question
-from webots_mcp.questions.history_answers import SqlAnswer
-from webots_mcp.questions.shortening import tokens_of
-from webots_mcp.store.questions.sql import (
-    FOLDER,
-    LINE,
-    Cell,
-    Result,
-    Statement,
-    as_file,
-    decode,
-    require_select,
-)
-from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
+from webots_mcp.questions.declaring import READS, ShownLimit, question
+from webots_mcp.store.questions.sql import Cell, Result, require_select
+from webots_mcp.store.questions.sql_process import FOLDER, LINE, Statement, as_file, decode
+from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
 from webots_mcp.store.recording import Recording
 
 DEFAULT_ROWS: Final = 100

@@ -18,7 +18,7 @@ from tests.benchmarks.registry import Bench, benchmark
 from tests.benchmarks.table import Line, Target
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME
-from webots_mcp.questions.shortening import tokens_in
+from webots_mcp.questions.budget import tokens_in
 from webots_mcp.server import create_server
 from webots_mcp.standin import Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD

@@ -16,7 +16,7 @@ from tests.server.story import rows_of
 from tests.server.trials.conftest import SPEEDS, TunableDriver, trials, value_of
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect as database
-from webots_mcp.questions.shortening import tokens_of
+from webots_mcp.questions.budget import tokens_of
 from webots_mcp.server import create_server
 from webots_mcp.standin import InProcessSupervisor, Mode, Simulation
 

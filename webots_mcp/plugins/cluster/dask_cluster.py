@@ -47,6 +47,9 @@ from webots_mcp.trials.trial_run import (
     stand_in,
     webots,
 )
+from webots_mcp.store.bundle import pack, unpack
+from webots_mcp.store.recording import Recording
+from webots_mcp.store.trials import Result
 
 RESOURCE: Final = "simulator"
 MOST_BYTES: Final = 100_000_000  # of a recording as it is returned, packed: it passes the scheduler

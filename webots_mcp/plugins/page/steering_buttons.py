@@ -7,9 +7,9 @@ from typing import Any, Final, NamedTuple
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.parameter import Value
 from webots_mcp.questions.answers import CommandAnswer
+from webots_mcp.questions.send_command import set_parameters
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.steering.routes import Attempt
-from webots_mcp.steering.tuning import set_parameters
 from webots_mcp.store.recording import Recording
 from webots_mcp.webots.stream import Order
 

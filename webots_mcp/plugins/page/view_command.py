@@ -7,11 +7,9 @@ from typing import Annotated, Final
 
 from cyclopts.validators import Number
 
-from webots_mcp.cli.ending import ending_in_time
-from webots_mcp.cli.launching import MAX_PORT
-from webots_mcp.cli.recordings import HERE, Json, Where
-from webots_mcp.cli.rendering import print_json
-from webots_mcp.cli.values import Parameter, whole_number
+from webots_mcp.cli.options import HERE, Json, Parameter, Where, whole_number
+from webots_mcp.cli.serving import MAX_PORT
+from webots_mcp.cli.terminal import ending_in_time, print_json
 
 _PORT: Final = 5006
 

@@ -5,10 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from webots_mcp.cli.recordings import HERE, Json, Robot, Where, make_chunks_first, only_reading
-from webots_mcp.cli.rendering import print_json, print_notes, printable
-from webots_mcp.cli.terminal import shown_progress
-from webots_mcp.cli.values import Id, Parameter
+from webots_mcp.cli.options import (
+    HERE,
+    Id,
+    Json,
+    Parameter,
+    Robot,
+    Where,
+    make_chunks_first,
+    only_reading,
+)
+from webots_mcp.cli.terminal import print_json, print_notes, printable, shown_progress
 
 
 @only_reading

@@ -11,8 +11,7 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.report.making import file_name, make_report, require_free, write_report
 from webots_mcp.questions.argument_types import AnyNames, RobotName, RunIds
 from webots_mcp.questions.budget import notes_of
-from webots_mcp.questions.declaring import DESTROYS, question
-from webots_mcp.questions.history_answers import NotedAnswer
+from webots_mcp.questions.declaring import DESTROYS, AnyNames, RobotName, RunIds, question
 from webots_mcp.store.recording import Recording
 
 FOLDER: Final = "reports"  # in the data folder

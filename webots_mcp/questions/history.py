@@ -1,4 +1,4 @@
-"""The tool that shows signals over time."""
+"""The signals of a run: which there are, their values over time, and what each did in words."""
 
 from __future__ import annotations
 
@@ -9,46 +9,141 @@ from typing import Annotated, Any, Final
 from pydantic import Field
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.questions.answers import Part
-from webots_mcp.questions.argument_types import (
-    Cursor,
-    MaxPoints,
-    Names,
+from webots_mcp.questions.answers import (
+    ChangeSeries,
+    HistoryAnswer,
+    NumberSeries,
+    Part,
+    RowColumns,
+    RunSeries,
+    RunTrendTables,
+    SignalsAnswer,
+    TrendsAnswer,
 )
-from webots_mcp.questions.bounds import range_in
 from webots_mcp.questions.budget import (
     answer_about,
+    compact_json,
+    cut_for_a_model,
     figure,
     figures,
     fitting,
+    is_for_a_person,
     notes_of,
+    range_in,
     room_tokens,
     seconds,
     short_name,
     shown,
     some,
+    table,
+    tokens_of,
+    without_empty,
 )
-from webots_mcp.questions.declaring import READS, question
-from webots_mcp.questions.history_answers import (
-    ChangeSeries,
-    HistoryAnswer,
-    NumberSeries,
-    RowColumns,
-    RunSeries,
+from webots_mcp.questions.declaring import (
+    READS,
+    AnyNames,
+    Cursor,
+    Limit,
+    MaxPoints,
+    Names,
+    RobotName,
+    RunId,
+    ShownLimit,
+    merged,
+    question,
 )
-from webots_mcp.questions.shortening import tokens_of
 from webots_mcp.store.questions.series import (
     DEFAULT_POINTS,
     ChangeColumns,
     NumberColumns,
-    Page,
     RunHistory,
     query_history,
-    query_rows,
 )
-from webots_mcp.store.reading.catalogue import signals_of
+from webots_mcp.store.questions.trend import Trend
+from webots_mcp.store.questions.trends import RunTrends, StateTrend, trends
+from webots_mcp.store.reading.pages import Page, query_rows
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.signals.catalogue import SignalInfo, list_signals, signals_of
+
+SIGNAL_COLUMNS: Final = ("signal", "kind", "unit", "last", "min", "max", "missing")
+
+
+@question("List the signals", READS, command="signals", positional=("pattern",), example="'front*'")
+def webots_list_signals(
+    recording: Recording,
+    pattern: Annotated[
+        str, Field(max_length=200, description="Of signals; '*' is any text.")
+    ] = "*",
+    limit: Limit = 100,
+    cursor: Cursor = None,
+    robot: RobotName = None,
+    run_id: RunId = None,
+) -> SignalsAnswer:
+    """The dotted names of all that was published in a run: kind, last value, range, missing values.
+
+    Arrays of more than 16 items are kept as .count, .min, .max, .mean and .argmin.
+    """
+    with recording.view(robot, run_id) as view:
+        return answer_about(view, SignalsAnswer, lambda: _found(view, pattern, limit, cursor or 0))
+
+
+def _signal_row(info: SignalInfo, rows: int) -> list[Any]:
+    """A signal of a run of that many rows, as a row under `SIGNAL_COLUMNS`."""
+    return [
+        short_name(info.name),
+        info.kind,
+        info.unit,
+        *(_value(info, each) for each in (shown(info.last), figure(info.min), figure(info.max))),
+        _missing(info, rows),
+    ]
+
+
+def _value(info: SignalInfo, value: Any) -> Any:
+    return bool(value) if info.kind == "bool" and value is not None else value
+
+
+def _missing(info: SignalInfo, rows: int) -> str | None:
+    """In how many rows it has no value, and between which times it has some."""
+    if not info.missing:
+        return None
+    if info.first_s is None:
+        return f"in all {rows} rows"
+    told = f"in {info.missing} of {rows} rows; values"
+    return f"{told} from {seconds(info.first_s)} to {seconds(info.last_s)} s"
+
+
+def _found(view: View, pattern: str, limit: int, start: int) -> dict[str, Any]:
+    found = list_signals(
+        view.connection,
+        robot=view.robot.name,
+        run_id=view.require_run().id,
+        pattern=pattern,
+        limit=start + limit,
+    )
+    rows = fitting([_signal_row(info, found.rows) for info in found.signals[start:]])
+    end = start + len(rows)
+    more = end < found.total
+    return {
+        "signals": without_empty(SIGNAL_COLUMNS, rows),
+        "total": found.total,
+        "cursor": end if more else None,
+        "notes": notes_of(found.notes),
+        "hint": _hint(start, end, found.total),
+    }
+
+
+def _hint(start: int, end: int, total: int) -> str | None:
+    if total == 0:
+        return "no state row with values was recorded in this run yet"
+    if start >= total:
+        return f"there are only {total}: leave cursor out"
+    return (
+        f"{end - start} of {total}: go on with cursor, or narrow pattern" if end < total else None
+    )
+
+
+# -- signals over time --
 
 _SHOWN_GAPS: Final = 10
 _CELL_TOKENS: Final = 15  # of a bucket of a numeric signal: min, max, mean and last
@@ -274,3 +369,159 @@ def _row_columns(page: Page, rows: int, view: View) -> RowColumns:
         },
         replaced=page.replaced or None,
     )
+
+
+# -- what each signal did, in words --
+
+TREND_COLUMNS: Final = ("signal", "says", "last", "mean", "deviation")
+STATE_COLUMNS: Final = ("signal", "changes", "last", "since_s", "time_by_value_s")
+DEFAULT_LIMIT: Final = 20
+MOST_SIGNALS: Final = 500
+_STATES_SHARE: Final = 0.25  # of the budget, at most
+_LONGEST_SAYING: Final = 200
+_ASK_FOR_OTHERS: Final = "signals=['...'] asks for others, limit for more"
+EMPTY: Final = '""'  # a name without a character
+_SHOWN_VALUES: Final = 6
+_SHOWN_CONSTANTS: Final = 20
+
+
+@question(
+    "Get the trends",
+    READS,
+    command="trends",
+    positional=("signals",),
+    options={"signals": "SIGNAL"},
+    core=True,
+)
+def webots_get_trends(
+    recording: Recording,
+    scope: Scope,
+    signals: AnyNames = None,
+    limit: ShownLimit = None,
+) -> TrendsAnswer:
+    """What each signal did, in words, by default over the whole run; values: webots_query_history.
+
+    What changed most comes first: rises, falls, swings (period, amplitude), rests since when,
+    spikes, missing values; of modes and flags the time in each value.
+    """
+    with recording.view(scope.robot, scope.run_id) as view:
+        return answer_about(
+            view,
+            TrendsAnswer,
+            lambda: _trends(view, range_in(view, scope), signals or ["*"], limit),
+        )
+
+
+def _trends(
+    view: View, asked: TimeRange, names: Sequence[str], limit: int | None
+) -> dict[str, Any]:
+    found = trends(view.connection, asked, names, limit=MOST_SIGNALS)
+    budget_tokens = room_tokens(limit) // max(len(found.runs), 1)
+    recorded = [run for run in found.runs if run.rows or run.cut_at_s is not None]
+    runs = [trend_tables(run, limit or DEFAULT_LIMIT, budget_tokens) for run in recorded]
+    return {
+        "runs": runs or None,
+        "notes": notes_of(found.notes),
+        "hint": _hint_of_trends(runs),
+    }
+
+
+def trend_tables(run: RunTrends, limit: int, budget_tokens: int) -> RunTrendTables:
+    """The trends of a run as tables that fit the budget."""
+    changed = [state for state in run.states if state.changes]
+    states = fitting([_state_row(state) for state in changed], int(budget_tokens * _STATES_SHARE))
+    moving = _moving(run)
+    constant, without_value = some(_constants(run), _SHOWN_CONSTANTS), some(run.without_value)
+    left_tokens = budget_tokens - tokens_of([states, constant, without_value])
+    rows = fitting([_trend_row(trend) for trend in moving[:limit]], left_tokens)
+    return RunTrendTables(
+        run_id=run.run_id,
+        start_s=seconds(run.start_s),
+        end_s=seconds(run.end_s if run.cut_at_s is None else run.cut_at_s),
+        row_count=run.rows,
+        resolution_s=run.resolution_s,
+        numbers=table(TREND_COLUMNS, rows),
+        states=table(STATE_COLUMNS, states),
+        constant=constant or None,
+        without_value=without_value or None,
+        not_shown=_not_shown(run, len(rows), len(states)),
+        rows_missing_from_s=seconds(run.cut_at_s),
+    )
+
+
+def _moving(run: RunTrends) -> list[Trend]:
+    """Those that changed, or lost their value: no constant is dead."""
+    return [trend for trend in run.numbers if trend.shape != "constant" or trend.is_lacking]
+
+
+def _constants(run: RunTrends) -> list[str]:
+    """What never changed, each with its value."""
+    numbers = [
+        f"{trend.name or EMPTY} {figure(trend.summary.last):g} {trend.unit or ''}".rstrip()
+        for trend in run.numbers
+        if trend.shape == "constant" and not trend.is_lacking
+    ]
+    states = [
+        f"{each.name or EMPTY} {compact_json(each.last)}" for each in run.states if not each.changes
+    ]
+    return numbers + states
+
+
+def _trend_row(trend: Trend) -> list[Any]:
+    """A number as a row under `TREND_COLUMNS`: extremes with their times are in what it says."""
+    return [
+        short_name(trend.name),
+        cut_for_a_model(trend.says, _LONGEST_SAYING),
+        figure(trend.summary.last),
+        figure(trend.mean),
+        figure(trend.deviation),
+    ]
+
+
+def _state_row(state: StateTrend) -> list[Any]:
+    """A text or a flag as a row under `STATE_COLUMNS`."""
+    longest_first = [*state.time_by_value_s.items()]
+    most = len(longest_first) if is_for_a_person() else _SHOWN_VALUES
+    times = {shown(value): round(duration_s, 3) for value, duration_s in longest_first[:most]}
+    if rest := longest_first[most:]:
+        times[f"… {len(rest)} more values"] = round(sum(duration_s for _, duration_s in rest), 3)
+    return [
+        short_name(state.name),
+        state.changes,
+        shown(state.last),
+        seconds(state.since_s),
+        times,
+    ]
+
+
+def _hint_of_trends(runs: Sequence[RunTrendTables]) -> str | None:
+    if not runs:
+        return "no row in that range: leave the range out, or see notes"
+    return _ASK_FOR_OTHERS if any(run.not_shown for run in runs) else None
+
+
+def _not_shown(run: RunTrends, numbers: int, states: int) -> str | None:
+    """How many of the signals that changed are not shown."""
+    all_states = sum(bool(state.changes) for state in run.states)
+    counts = (("numbers", numbers, _changed(run)), ("texts and flags", states, all_states))
+    others = [
+        f"{all_of - told} of {all_of} {what}" for what, told, all_of in counts if told < all_of
+    ]
+    return ", ".join(others) or None
+
+
+def _changed(run: RunTrends) -> int:
+    """How many numbers changed, also beyond those that were read."""
+    return run.total - (len(run.numbers) - len(_moving(run)))
+
+
+TRENDS: Final = merged(
+    webots_get_trends,
+    choice="what",
+    meaning="signals: names, kinds, last values, ranges.",
+    parts={"trends": webots_get_trends, "signals": webots_list_signals},
+    text="""\
+What each signal did, in words: shape, slope, when its least and greatest; what matters first.
+
+Of any length. Numbers over time: webots_query_history.""",
+)

@@ -1,4 +1,4 @@
-"""The tool that finds what happened."""
+"""What went wrong, and what was noted, in order."""
 
 from __future__ import annotations
 
@@ -8,32 +8,36 @@ from typing import Annotated, Any, Final
 from pydantic import AfterValidator, Field
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.questions.answers import Table
-from webots_mcp.questions.argument_types import (
+from webots_mcp.questions.answers import EventsAnswer, KindVerdicts, Table, TimelineAnswer
+from webots_mcp.questions.budget import (
+    DETAIL_BUDGET_TOKENS,
+    answer_about,
+    detailed,
+    notes_of,
+    range_in,
+    room_tokens,
+    seconds,
+    short_name,
+    shown,
+    tokens_of,
+    without_empty,
+)
+from webots_mcp.questions.declaring import (
+    READS,
     AnyNames,
     LogLevel,
     Mode,
     Position,
     ShownLimit,
     TextCursor,
+    merged,
+    question,
 )
-from webots_mcp.questions.bounds import range_in
-from webots_mcp.questions.budget import (
-    answer_about,
-    detailed,
-    notes_of,
-    room_tokens,
-    seconds,
-    short_name,
-    shown,
-    without_empty,
-)
-from webots_mcp.questions.declaring import READS, question
-from webots_mcp.questions.history_answers import EventsAnswer, KindVerdicts
-from webots_mcp.questions.shortening import DETAIL_BUDGET_TOKENS, tokens_of
-from webots_mcp.store.detection.condition import thresholds_on
-from webots_mcp.store.detection.events import KINDS, Events, Found, kind_names, search_events
-from webots_mcp.store.detection.kinds import Event, EventOptions, Threshold, Verdicts, both_of
+from webots_mcp.store.detection.event import Event, EventOptions, Threshold, both_of
+from webots_mcp.store.detection.registry import KINDS, kind_names, stored_kinds
+from webots_mcp.store.detection.threshold import thresholds_on
+from webots_mcp.store.detection.verdict import Verdicts
+from webots_mcp.store.questions.events import Events, Found, search_events, timeline
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import Recording, View
 
@@ -239,3 +243,68 @@ def _details_of(event: Event) -> Any:
     """What stands for many events may be longer: it stands once."""
     budget_tokens = DETAIL_BUDGET_TOKENS if event.count == 1 else _GROUP_BUDGET_TOKENS
     return detailed(event.details, budget_tokens)
+
+
+# -- what was noted, in order, page by page --
+
+
+@question("Get the timeline", READS)
+def webots_get_timeline(
+    recording: Recording,
+    scope: Scope,
+    kinds: TimelineKinds = None,
+    log_level: LogLevel = "info",
+    limit: ShownLimit = None,
+    cursor: TextCursor = "",
+) -> TimelineAnswer:
+    """Changes, commands, log lines, pictures, gaps, begin and end of runs in one order, paged.
+
+    A log of what was noted, from the start of the run on. To search for what went wrong, also what
+    nobody noted: webots_find_events.
+    """
+    if "threshold" in (kinds or ()):
+        raise InvalidInputError(
+            "a threshold has no place here: ask webots_find_events(where='pose.x > 1')"
+        )
+    options = EventOptions(kinds=tuple(kinds or stored_kinds()), log_level=log_level)
+    with recording.view(scope.robot, scope.run_id) as view:
+        return answer_about(
+            view,
+            TimelineAnswer,
+            lambda: _timeline(view, range_in(view, scope), options, limit, cursor),
+        )
+
+
+def _timeline(
+    view: View, asked: TimeRange, options: EventOptions, limit: int | None, cursor: str
+) -> dict[str, Any]:
+    """A page; a shorter one where it would be too long."""
+    budget_tokens = room_tokens(limit)
+    entries = limit or DEFAULT_LIMIT
+    while True:
+        page = timeline(view.connection, asked, options, limit=entries, after=cursor or None)
+        events = events_table(page.events, view)
+        tokens = tokens_of(events.rows) if events else 0
+        if tokens <= budget_tokens or entries == 1:
+            break
+        entries = max(1, int(entries * 0.95 * budget_tokens / tokens))
+    return {
+        "events": events,
+        "verdicts": verdicts_of(page.verdicts),
+        "cursor": page.cursor,
+        "notes": notes_of(page.notes),
+        "hint": "nothing after that cursor" if cursor and not events else None,
+    }
+
+
+EVENTS: Final = merged(
+    webots_find_events,
+    choice="what",
+    meaning="timeline: all that was noted, in order.",
+    parts={"events": webots_find_events, "timeline": webots_get_timeline},
+    unlisted=("above", "below", "for_s"),
+    text="""\
+What went wrong, since when, how often: searches the values, by default of the whole run.
+
+verdicts: what was found, what was not, what was not looked for and why. cursor shows more.""",
+)

@@ -1,0 +1,400 @@
+"""The options that commands share: values, which recording, which part of it, how much is kept."""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+import re
+import sys
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated, Any, Final, ParamSpec, TypeAlias
+
+import cyclopts
+from cyclopts import Token
+from cyclopts.validators import Number
+
+from webots_mcp.errors import InvalidInputError, MalformedRowError, WebotsMCPError
+from webots_mcp.store.retention.limits import Asked
+from webots_mcp.store.retention.notation import NO_LIMIT, limit_text, option_of, parse_limit
+from webots_mcp.store.retention.policy import DEFAULT, Limit
+
+if TYPE_CHECKING:
+    import sqlite3
+
+    from webots_mcp.store.reading.ranges import Scope, TimeRange
+    from webots_mcp.store.recording import Recording
+
+if TYPE_CHECKING or hasattr(cyclopts.Parameter(), "metavar"):
+    Parameter = cyclopts.Parameter
+else:  # cyclopts 4, the last for Python 3.10: options have no words for their values
+
+    def Parameter(*names: str, metavar: str | None = None, **given: Any) -> cyclopts.Parameter:  # noqa: N802
+        """How an argument is typed, without the word for its value."""
+        return cyclopts.Parameter(*names, **given)
+
+
+_TOO_LARGE: Final = 2**63  # for SQLite, and no id that it has given
+_NO_KINDS: Final[Mapping[str, str]] = MappingProxyType({})
+
+
+def whole_number(_kind: Any, tokens: Sequence[Token]) -> int:
+    """What was typed; cyclopts by itself would round 1.5.
+
+    Raises:
+        ValueError: It is no whole number, or one that SQLite cannot hold.
+    """
+    text = tokens[0].value
+    if not re.fullmatch(r"[+-]?[0-9]+", text):
+        raise ValueError(f"{text!r} is no whole number")
+    if abs(int(text)) >= _TOO_LARGE:
+        raise ValueError(f"{text} is too large")
+    return int(text)
+
+
+def refuse_options(_kind: Any, value: Any) -> None:
+    """A hyphen alone is a value, and so is a condition such as '-x > 3'.
+
+    Raises:
+        ValueError: It is an option, and nobody knows it.
+    """
+    if isinstance(value, (str, Path)) and re.match(r"--?\w[\w-]*(=|$)", str(value)):
+        raise ValueError(f"unknown option {value}")
+
+
+def _row_id(_kind: Any, tokens: Sequence[Token]) -> int:
+    text = tokens[0].value
+    if (
+        text.isascii() and text.isdecimal() and int(text) < _TOO_LARGE
+    ):  # what SQLite could have given
+        return int(text)
+    raise ValueError(f"{text!r} is no id: it is a number from an answer")
+
+
+Id: TypeAlias = Annotated[int, Parameter(converter=_row_id)]
+Count: TypeAlias = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=1))]
+
+
+def settings_of(texts: Sequence[str], kinds: Mapping[str, str] = _NO_KINDS) -> dict[str, Any]:
+    """Values by name, of texts NAME=VALUE; a value that is no JSON is a text.
+
+    Args:
+        texts: As they were typed.
+        kinds: Of parameters, by name: the value of one of kind `str` is a text, also one that looks
+            like a number.
+
+    Raises:
+        InvalidInputError: One has no `=`.
+    """
+    values: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise InvalidInputError(f"{text!r} names no value: write {name}=VALUE")
+        values[name] = value if kinds.get(name) == "str" else value_of(value)
+    return values
+
+
+def value_of(text: str) -> Any:
+    """What was typed, as JSON; what is none is a text."""
+    try:
+        return json.loads(text, parse_constant=_no_constant)
+    except (ValueError, RecursionError):
+        return text
+
+
+def _no_constant(name: str) -> float:
+    """NaN and the infinities are Python's, and none of JSON."""
+    raise ValueError(name)
+
+
+# -- which recording, which part of it, and how it is opened --
+
+_Given = ParamSpec("_Given")
+# Not owed to a value in a row: reading past invalid rows would not help.
+_OF_NO_VALUE: Final = (WebotsMCPError, OSError, ImportError)
+
+_MAKING_CHUNKS_S: Final = 300.0  # a million rows of 40 values take 100 s
+Json: TypeAlias = Annotated[bool, Parameter("--json", negative=(), help="Print JSON.")]
+Robot: TypeAlias = Annotated[
+    str | None, Parameter("--robot", metavar="NAME", help="Only this robot.")
+]
+# Of a `Path` the shell completes the names of files.
+DataDir: TypeAlias = Annotated[
+    Path | None,
+    Parameter(
+        "--data-dir",
+        metavar="DIR",
+        help="The folder of the database and the pictures; by default mcp_data/ in the nearest "
+        "Webots project, else ~/.webots-mcp/data; also WEBOTS_MCP_DATA_DIR.",
+    ),
+]
+RunId: TypeAlias = Annotated[
+    Id | None, Parameter("--run", metavar="ID", help="That run, not the newest one.")
+]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Where:
+    """The recording of a command."""
+
+    data_dir: DataDir = None
+    database: Annotated[
+        Path | None, Parameter("--database", metavar="FILE", help="The database file itself.")
+    ] = None
+
+    def recording(self, *, read_only: bool = True) -> Recording:
+        """The recording."""
+        from webots_mcp.contract import resolve_database
+        from webots_mcp.store.recording import Recording
+
+        where = resolve_database(self.database, self.data_dir)
+        return Recording(*where, read_only=read_only, asker="cli")
+
+    def typed(self) -> list[str]:
+        """The options that name it in another command line."""
+        given = (("--data-dir", self.data_dir), ("--database", self.database))
+        return [text for option, value in given if value for text in (option, str(value))]
+
+    @contextmanager
+    def reader(self) -> Generator[sqlite3.Connection]:
+        """A connection that reads; how the file is read is said on stderr where that matters."""
+        from webots_mcp.store.recording import storage
+
+        with self.recording().reader() as connection:
+            for said in storage(connection).values():
+                print(f"webots-mcp: {said}", file=sys.stderr)
+            yield connection
+
+    @contextmanager
+    def writer(self, *, create: bool = False) -> Generator[tuple[Recording, sqlite3.Connection]]:
+        """The recording, and a connection that may write to it."""
+        recording = self.recording(read_only=False)
+        if create:
+            recording.create()
+        with recording.writer() as connection:
+            yield recording, connection
+
+
+HERE: Final = Where()
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ToRobot(Where):
+    """Whom a command asks."""
+
+    robot: Robot = None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Waiting(ToRobot):
+    """Whom a command asks, and how long it waits for the answer."""
+
+    timeout_wall_s: Annotated[
+        float | None,
+        Parameter("--timeout", metavar="S", help="Wait up to so many wall seconds (600)."),
+    ] = None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ToWebots(Waiting):
+    """The same, where Webots itself can be asked as well."""
+
+    force: Annotated[
+        bool, Parameter("--force", help="Press Webots' keys where nothing else works.")
+    ] = False
+    port: Annotated[
+        int | None,
+        Parameter(
+            "--port", metavar="PORT", converter=whole_number, help="Of a Webots of another project."
+        ),
+    ] = None
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Range:
+    """Which run of which robot, and which stretch of it: the options that commands share."""
+
+    robot: Robot = None
+    run_id: RunId = None
+    last_s: Annotated[
+        float | None,
+        Parameter("--last", metavar="S", help="The last so many seconds of simulation time."),
+    ] = None
+    start_s: Annotated[
+        float | None, Parameter("--start", metavar="S", help="From this simulation time on.")
+    ] = None
+    end_s: Annotated[
+        float | None,
+        Parameter("--end", metavar="S", help="Up to, not including, this simulation time."),
+    ] = None
+    since_wall_time: Annotated[
+        str | None,
+        Parameter(
+            "--since", metavar="TIME", help="From this wall time on (ISO 8601 or Unix seconds)."
+        ),
+    ] = None
+    until_wall_time: Annotated[
+        str | None,
+        Parameter("--until", metavar="TIME", help="Up to, not including, this wall time."),
+    ] = None
+
+    def scope(self) -> Scope:
+        """What is asked for."""
+        from webots_mcp.store.reading.ranges import Scope
+
+        return Scope(**vars(self))
+
+    def in_recording(self, connection: sqlite3.Connection) -> TimeRange:
+        """What the options mean in a recording."""
+        from webots_mcp.store.reading.ranges import find_range
+
+        return find_range(connection, self.scope())
+
+
+def only_reading(command: Callable[_Given, None]) -> Callable[_Given, None]:
+    """A command that fails over a value that no bridge has written reads again past such rows."""
+
+    @functools.wraps(command)
+    def read(*arguments: _Given.args, **options: _Given.kwargs) -> None:
+        past_wrong_values(functools.partial(command, *arguments, **options))
+
+    return read
+
+
+def past_wrong_values(run: Callable[[], None]) -> None:
+    """Run what only reads; where it fails over a value, again past invalid rows."""
+    try:
+        return run()
+    except Exception as error:
+        if isinstance(error, _OF_NO_VALUE) and not isinstance(error, MalformedRowError):
+            raise
+    past_invalid_rows(run)
+
+
+def past_invalid_rows(run: Callable[[], None]) -> None:
+    """Run what only reads past invalid rows, which are named on stderr."""
+    from webots_mcp.store import invalid_rows
+
+    with invalid_rows.past_invalid_rows() as invalid:
+        run()
+    for said in invalid.described():
+        print(f"webots-mcp: left out: {said}", file=sys.stderr)
+
+
+def make_chunks_first(recording: Recording) -> None:
+    """Put into chunks what no server has, so that a question of any length is answered."""
+    from webots_mcp.cli.terminal import shown_progress
+    from webots_mcp.store.chunks.on_demand import make_missing_chunks
+
+    with shown_progress("making chunks of what was recorded") as progress:
+        left = make_missing_chunks(recording, progress, limit_s=_MAKING_CHUNKS_S)
+    if left:
+        print(f"webots-mcp: {left}", file=sys.stderr)
+
+
+# -- how much is kept --
+
+_BACK: Final = "default"
+_RUNS: Final = "outlive"
+_SIZE: Final = "unshipped"  # whose size alone can be given
+
+
+def _option(name: str, text: str) -> Parameter:
+    """The option of a limit, with what holds where nobody has set one."""
+    value = getattr(DEFAULT, name)
+    default = f"{value:g}" if name == _RUNS else limit_text(value)
+    if isinstance(value, Limit) and value.limits and name != _SIZE:
+        default += f"; an age spares the newest {value.spared_rows:,}"
+    shown = {_RUNS: "TIMES", _SIZE: "SIZE"}.get(name, "LIMIT")
+    return Parameter(_name_of(name), metavar=shown, help=text.format(default))
+
+
+def _name_of(name: str) -> str:
+    return option_of("run" if name == _RUNS else name)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Limits:
+    """How much is kept of what, as it was typed; by the names of `Retention`."""
+
+    state: Annotated[str | None, _option("state", "Keep so much of recorded states ({}).")] = None
+    kept_state: Annotated[
+        str | None,
+        _option(
+            "kept_state", "Keep so much of what is kept at full rate, the kept stretches ({})."
+        ),
+    ] = None
+    chunk: Annotated[
+        str | None,
+        _option("chunk", "Keep so much of the values in chunks, which outlive states ({})."),
+    ] = None
+    log: Annotated[str | None, _option("log", "Keep so much of log lines ({}).")] = None
+    event: Annotated[
+        str | None,
+        _option("event", "Keep so much of events; its age also holds for commands ({})."),
+    ] = None
+    image: Annotated[
+        str | None, _option("image", "Keep so much of pictures with their files ({}).")
+    ] = None
+    unshipped: Annotated[
+        str | None,
+        _option(
+            "unshipped",
+            "Of what is beyond these limits, keep this size until 'webots-mcp ship' has shipped it "
+            "({}).",
+        ),
+    ] = None
+    outlive: Annotated[
+        str | None,
+        _option(
+            _RUNS,
+            "Keep what is left of a run this many times longer than its states ({}), or for ever: "
+            "all.",
+        ),
+    ] = None
+
+    def asked(self) -> Asked:
+        """The limits that were given; None goes back to the default.
+
+        Raises:
+            InvalidInputError: A text is not a limit, or a number is below 1.
+        """
+        given = {name: text for name, text in vars(self).items() if text is not None}
+        return {name: _value(name, text) for name, text in given.items()}
+
+
+def _value(name: str, text: str) -> Limit | float | None:
+    if text == _BACK:
+        return None
+    try:
+        if name == _RUNS:
+            return _times_of(text)
+        limit = parse_limit(text, getattr(DEFAULT, name))
+        replace(DEFAULT, **{name: limit})  # refuses one that has to be a size
+    except InvalidInputError as error:
+        raise InvalidInputError(f"{_name_of(name)}: {error}") from error
+    return limit
+
+
+def _times_of(text: str) -> float:
+    """How many times; 0 for ever, which a person might take for the opposite, and writes as all."""
+    if text == NO_LIMIT:
+        return 0.0
+    try:
+        times = float(text)
+    except ValueError:
+        times = math.nan
+    if not 1 <= times < math.inf:
+        raise InvalidInputError(f"{text!r} must be a number, 1 or more, or {NO_LIMIT}")
+    return times

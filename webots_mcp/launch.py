@@ -18,12 +18,12 @@ from webots_mcp.contract import (
     require_world_of,
 )
 from webots_mcp.errors import InvalidInputError, NoDatabaseError
-from webots_mcp.setup.webots_project import controllers_in, has_bridge
+from webots_mcp.setup import controllers_in, has_bridge
 from webots_mcp.store.console_lines import ConsoleRows
 from webots_mcp.store.recording import Recording
 from webots_mcp.transactions import transaction
+from webots_mcp.webots.orders import WebotsAddress, WebotsLine, address_of
 from webots_mcp.webots.starting import LaunchedWebots, Show, Start
-from webots_mcp.webots.stream import WebotsAddress, WebotsLine, address_of
 
 _SHOWN_LINES: Final = 3
 _EXTERN: Final = "<extern>"

@@ -20,7 +20,7 @@ from webots_mcp.plugins import stand_in_simulator
 if TYPE_CHECKING:
     from webots_mcp.launch import Launch, SessionStart
     from webots_mcp.store.recording import Recording
-    from webots_mcp.webots.stream import WebotsLine
+    from webots_mcp.webots.orders import WebotsLine
 
 _LOOK_EVERY_S: Final = 0.2
 _EXTERN_HERE: Final = "python -m webots_mcp.standin --robot runs one"

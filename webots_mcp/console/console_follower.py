@@ -22,8 +22,8 @@ from webots_mcp.leases import give_back, holder_of, lease_of, take
 from webots_mcp.store.console_lines import ConsoleRows, Said
 from webots_mcp.store.jobs import Job
 from webots_mcp.store.recording import Recording
-from webots_mcp.webots.instances import Instance
-from webots_mcp.webots.stream import (
+from webots_mcp.webots import Instance
+from webots_mcp.webots.orders import (
     ANSWER_S,
     Message,
     Stream,

@@ -15,7 +15,7 @@ from webots_mcp.contract import find_project, full_path
 from webots_mcp.errors import NoDatabaseError
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.robots import list_robots
-from webots_mcp.webots.instances import Instance, instances
+from webots_mcp.webots import Instance, instances
 
 _WORLD: Final = "SELECT EXISTS (SELECT 1 FROM run WHERE world = ?)"
 

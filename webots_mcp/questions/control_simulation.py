@@ -17,7 +17,7 @@ from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.steering.routes import Attempt
 from webots_mcp.steering.target_robot import find_target
 from webots_mcp.store.recording import Recording, look
-from webots_mcp.webots.stream import Order
+from webots_mcp.webots.orders import Order
 
 Port = Annotated[
     Annotated[int, Field(ge=1, le=65535)] | None,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from webots_mcp.diagnosis.doctor import Checked, diagnose, subject_of, worst
+from webots_mcp.diagnosis import Checked, diagnose, subject_of, worst
 from webots_mcp.questions.answers import DiagnosisAnswer
 from webots_mcp.questions.declaring import READS, question
 from webots_mcp.questions.shortening import cut_text, tokens_in

@@ -11,8 +11,8 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.launch import Launch
 from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.recording import Recording
+from webots_mcp.webots.orders import WebotsLine
 from webots_mcp.webots.starting import Start
-from webots_mcp.webots.stream import WebotsLine
 
 
 class Launcher:

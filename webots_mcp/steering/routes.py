@@ -29,16 +29,17 @@ from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.robots import list_robots, live_observer
 from webots_mcp.store.sessions import Session
 from webots_mcp.store.status import find_holder
-from webots_mcp.webots.instances import Instance, instance_at, instances
-from webots_mcp.webots.key_presses import KEYS, press
-from webots_mcp.webots.stream import (
+from webots_mcp.webots import Instance, instance_at, instances
+from webots_mcp.webots.orders import (
     ANSWER_S,
+    KEYS,
     RESTARTING,
     Order,
     OrderReply,
     WebotsAddress,
     address_of,
     give_order,
+    press,
     why_not_obeyed,
 )
 

@@ -17,8 +17,8 @@ from webots_mcp.questions.answers import CommandAnswer
 from webots_mcp.steering.launcher import Launcher
 from webots_mcp.steering.request import CLAIMING_S, LEAST_S, UNCLAIMED, Request
 from webots_mcp.steering.routes import Situation, assess, find_webots, why_no_reply
-from webots_mcp.webots.instances import instance_at
-from webots_mcp.webots.stream import ANSWER_S, WebotsAddress, address_of, load_world
+from webots_mcp.webots import instance_at
+from webots_mcp.webots.orders import ANSWER_S, WebotsAddress, address_of, load_world
 
 _POLL_S: Final = 0.1
 _GONE_S: Final = 5.0  # from the end of its controllers to that of Webots

@@ -23,7 +23,6 @@ from webots_mcp.setup.webots_project import controllers_in, has_bridge
 from webots_mcp.store.logs import ConsoleRows
 from webots_mcp.store.recording import Recording
 from webots_mcp.webots.starting import LaunchedWebots, Show, Start
-from webots_mcp.webots.stream import WebotsAddress, WebotsLine, address_of
 
 _SHOWN_LINES: Final = 3
 _EXTERN: Final = "<extern>"

@@ -12,26 +12,38 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Final
 
-from tests.benchmarks.registry import Bench, Benchmark, all_benchmarks
-from tests.benchmarks.table import Section, render
+from tests.benchmarks import answers, commands, history, in_loop, kills, pool, starting
+from tests.benchmarks.core import Bench, Benchmark, Section, render
 
-_QUICK = 0.1
+BENCHMARKS: Final[tuple[Benchmark, ...]] = (
+    *in_loop.BENCHMARKS,
+    *starting.BENCHMARKS,
+    *commands.BENCHMARKS,
+    *kills.BENCHMARKS,
+    *history.BENCHMARKS,
+    *answers.BENCHMARKS,
+    *pool.BENCHMARKS,
+)
+_QUICK: Final = 0.1
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Returns 0 however fast or slow everything was; 2 for a name that does not exist."""
-    benchmarks = all_benchmarks()
-    options = _parser([b.name for b in benchmarks]).parse_args(arguments)
-    chosen = [b for b in benchmarks if not options.only or b.name in options.only]
+    options = _parser().parse_args(arguments)
+    chosen = [each for each in BENCHMARKS if not options.only or each.name in options.only]
     started_s, load = time.monotonic(), _load()
     sections = [
-        _run(benchmark, options, f"{number}/{len(chosen)}")
-        for number, benchmark in enumerate(chosen, 1)
+        _run(each, options, f"{number}/{len(chosen)}") for number, each in enumerate(chosen, 1)
     ]
     _show("")
     lasted = f"{time.monotonic() - started_s:.0f} s" + (", --quick" if options.quick else "")
-    _print(f"{render(sections)}\n\n{_machine()}; load {load} before, {_load()} after\n{lasted}")
+    try:
+        print(f"{render(sections)}\n\n{_machine()}; load {load} before, {_load()} after\n{lasted}")
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader of the pipe has seen enough: Python does not try again
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0
 
 
@@ -45,13 +57,6 @@ def _run(benchmark: Benchmark, options: argparse.Namespace, number: str) -> Sect
         return benchmark.run(Bench(Path(folder), effort, say, options.rows, options.kills))
 
 
-def _print(text: str) -> None:
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:  # the reader of the pipe has seen enough: Python does not try again
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
 def _show(text: str) -> None:
     """Progress in one line of a terminal; nothing in a pipe."""
     if sys.stderr.isatty():
@@ -59,10 +64,10 @@ def _show(text: str) -> None:
 
 
 def _machine() -> str:
-    encoder = "orjson installed" if importlib.util.find_spec("orjson") else "no orjson"
+    orjson = "orjson installed" if importlib.util.find_spec("orjson") else "no orjson"
     python = f"{platform.python_implementation()} {platform.python_version()}"
     system = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
-    return f"{python}, SQLite {sqlite3.sqlite_version}, {encoder}; {system}"
+    return f"{python}, SQLite {sqlite3.sqlite_version}, {orjson}; {system}"
 
 
 def _load() -> str:
@@ -70,22 +75,14 @@ def _load() -> str:
     return f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
 
 
-def _parser(names: list[str]) -> argparse.ArgumentParser:
+def _parser() -> argparse.ArgumentParser:
+    names = [each.name for each in BENCHMARKS]
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="smaller counts: under a minute")
-    parser.add_argument(
-        "--rows", type=int, metavar="ROWS", help="length of the long recording (1000000)"
-    )
-    parser.add_argument(
-        "--kills", type=int, metavar="KILLS", help="controllers killed beside others (60)"
-    )
-    parser.add_argument(
-        "--only",
-        action="append",
-        choices=names,
-        metavar="NAME",
-        help=f"only this one, may be repeated: {', '.join(names)}",
-    )
+    parser.add_argument("--rows", type=int, help="length of the long recording (1000000)")
+    parser.add_argument("--kills", type=int, help="controllers killed with others around (60)")
+    only = f"only this one, may be repeated: {', '.join(names)}"
+    parser.add_argument("--only", action="append", choices=names, metavar="NAME", help=only)
     return parser
 
 

@@ -1,4 +1,4 @@
-"""Programs of the benchmarks in processes of their own, spoken to line by line."""
+"""Programs of the benchmarks in processes of their own, and the servers that are compared."""
 
 from __future__ import annotations
 
@@ -6,24 +6,30 @@ import json
 import os
 import subprocess
 import sys
+import threading
+from collections.abc import Callable, Generator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any, Final
 
-ROOT: Final = Path(__file__).parents[2]
-"""The checkout: programs import `tests.benchmarks` from there."""
-PROGRAMS: Final = Path(__file__).parent / "programs"
-_PACKAGE: Final = "tests.benchmarks.programs"
+import anyio
+from mcp import Client, StdioServerParameters
+
+_ROOT: Final = Path(__file__).parents[2]
+_PROGRAMS: Final = ("-m", "tests.benchmarks.programs")
+_LOOK_INTERVAL_S: Final = 1.0
+_LOOK: Final = {"robot": "rover 0", "lookback_wall_s": 60}
 
 
 class Program:
-    """A module of `tests.benchmarks.programs` that runs; use it in a `with` statement.
+    """A program of `tests.benchmarks.programs` that runs; use it in a `with` statement.
 
     It answers each line that it is sent with one line of JSON.
     """
 
     def __init__(self, name: str, *arguments: object) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-m", f"{_PACKAGE}.{name}", *map(str, arguments)],
+            program_line(name, *arguments),
             env=environment(),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -39,16 +45,16 @@ class Program:
         self.process.communicate()
 
     def send(self, line: str) -> None:
-        """Tell it something."""
+        """Send it a line."""
         assert self.process.stdin is not None
         self.process.stdin.write(line + "\n")
         self.process.stdin.flush()
 
-    def hear(self) -> Any:
+    def receive(self) -> Any:
         """Wait for what it says.
 
         Raises:
-            RuntimeError: It ended instead; its stderr has told why.
+            RuntimeError: It ended instead; its stderr shows why.
         """
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
@@ -56,15 +62,26 @@ class Program:
             raise RuntimeError(f"{self.process.args} ended with {self.process.wait()}")
         return json.loads(line)
 
-    def ask(self, line: str) -> Any:
-        """Tell it something and wait for the answer."""
-        self.send(line)
-        return self.hear()
+
+def driving(
+    robots: list[Program],
+    order: str,
+    around: Callable[[], AbstractContextManager[None]] = nullcontext,
+) -> Callable[[], list[Any]]:
+    """A block in which all robots obey an order at once, within a `with` block of its own."""
+
+    def run_block() -> list[Any]:
+        with around():
+            for robot in robots:
+                robot.send(order)
+            return [robot.receive() for robot in robots]
+
+    return run_block
 
 
-def say(value: object) -> None:
-    """Answer, from inside a program."""
-    print(json.dumps(value), flush=True)
+def program_line(name: str, *arguments: object) -> list[str]:
+    """The command line of a program."""
+    return [sys.executable, *_PROGRAMS, name, *map(str, arguments)]
 
 
 def environment() -> dict[str, str]:
@@ -72,23 +89,52 @@ def environment() -> dict[str, str]:
 
     Compiled modules are kept, as in any installation: else each start would compile them again.
     """
-    path = [str(ROOT), os.environ.get("PYTHONPATH", "")]
+    path = [str(_ROOT), os.environ.get("PYTHONPATH", "")]
     changed = {**os.environ, "PYTHONPATH": os.pathsep.join(part for part in path if part)}
     changed.pop("PYTHONDONTWRITEBYTECODE", None)
     return changed
 
 
-def run_python(code: str) -> str:
-    """What a fresh interpreter prints for that code."""
-    return _run("-c", code)
-
-
-def run_module(name: str, *arguments: object) -> str:
-    """What a module of `tests.benchmarks.programs` prints."""
-    return _run("-m", f"{_PACKAGE}.{name}", *map(str, arguments))
-
-
-def _run(*arguments: str) -> str:
-    line = [sys.executable, *arguments]
+def output_of(line: list[str]) -> str:
+    """What a program prints until it ends."""
     done = subprocess.run(line, stdout=subprocess.PIPE, text=True, check=True, env=environment())
     return done.stdout
+
+
+def our_server(database: Path) -> StdioServerParameters:
+    """`webots-mcp serve`."""
+    return _started_by("-m", "webots_mcp", "serve", "--database", str(database))
+
+
+def one_tool_server() -> StdioServerParameters:
+    """The smallest server of the same library."""
+    return _started_by(*_PROGRAMS, "one_tool_server")
+
+
+def _started_by(*arguments: str) -> StdioServerParameters:
+    return StdioServerParameters(command=sys.executable, args=[*arguments], env=environment())
+
+
+@contextmanager
+def running_server(database: Path) -> Generator[None]:
+    """`webots-mcp serve` with a client that asks each second what `rover 0` did in a minute."""
+    over, ready = threading.Event(), threading.Event()
+
+    async def be_client() -> None:
+        try:
+            async with Client(our_server(database)) as client:
+                await client.list_tools()
+                ready.set()
+                while not await anyio.to_thread.run_sync(over.wait, _LOOK_INTERVAL_S):
+                    await client.call_tool("webots_monitor", _LOOK)
+        finally:
+            ready.set()
+
+    thread = threading.Thread(target=lambda: anyio.run(be_client))
+    thread.start()
+    ready.wait()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()

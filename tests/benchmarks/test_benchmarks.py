@@ -10,15 +10,24 @@ from pathlib import Path
 
 import pytest
 
-from tests.benchmarks.measuring import Samples, alternate, ratio
-from tests.benchmarks.registry import Bench, Benchmark, all_benchmarks
-from tests.benchmarks.states import make_states
-from tests.benchmarks.table import Line, Section, Target, render
+from tests.benchmarks.__main__ import BENCHMARKS
+from tests.benchmarks.core import (
+    Bench,
+    Benchmark,
+    Line,
+    Samples,
+    Section,
+    Target,
+    alternate,
+    ratio,
+    render,
+)
 
+pytestmark = pytest.mark.slow
 TINY = 0.001
 
 
-@pytest.mark.parametrize("benchmark", all_benchmarks(), ids=lambda benchmark: benchmark.name)
+@pytest.mark.parametrize("benchmark", BENCHMARKS, ids=lambda benchmark: benchmark.name)
 def test_a_benchmark_yields_lines_with_figures(benchmark: Benchmark, tmp_path: Path) -> None:
     section = benchmark.run(Bench(tmp_path, TINY, lambda text: None))
     assert section.lines or section.skipped
@@ -57,18 +66,3 @@ def test_a_line_says_whether_its_target_is_met_or_by_how_much_it_is_missed() -> 
     ]
     ends = [line.rsplit("  ", 1)[1] for line in render([Section("t", lines)]).splitlines()[4:]]
     assert ends == ["met", "missed by 100 %", "missed by 5.88 %", "missed by 2"]
-
-
-def test_the_state_has_39_leaves_and_about_740_bytes() -> None:
-    import json
-
-    def leaves(value: object) -> int:
-        if isinstance(value, dict):
-            return sum(leaves(item) for item in value.values())  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
-        if isinstance(value, list):
-            return sum(leaves(item) for item in value)  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
-        return 1
-
-    states = make_states()
-    assert {leaves(state) for state in states} == {39}
-    assert all(730 < len(json.dumps(state, separators=(",", ":"))) < 760 for state in states)

@@ -1,16 +1,17 @@
-"""The ways to record that are compared: the bridge, JSON files, and sqlite3 by hand."""
+"""The robot that records, its states, and the ways to record that are compared."""
 
 from __future__ import annotations
 
 import json
+import random
 import sqlite3
 import time
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from tests.benchmarks.registry import NotMeasurableError
-from tests.benchmarks.rover import Rover
-from tests.benchmarks.states import State
+from tests.benchmarks.core import NotMeasurableError
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import encoding
 
@@ -19,10 +20,6 @@ ORJSON: Final[Any] = encoding.orjson
 
 class Way(Protocol):
     """What a controller's loop calls."""
-
-    def begin(self) -> None:
-        """The next calls are this way's."""
-        ...
 
     def publish(self, state: State) -> object:
         """Record a state."""
@@ -38,43 +35,33 @@ class Way(Protocol):
 
 
 class BridgeWay:
-    """The bridge, with the standard library's JSON or with orjson.
-
-    Raises:
-        NotMeasurableError: orjson is wanted and not installed.
-    """
+    """The bridge; it records one call in `every`, and may hold the last seconds in memory."""
 
     def __init__(
-        self,
-        robot: Rover,
-        folder: Path,
-        *,
-        orjson: bool = False,
-        every: int = 1,
-        keep_last_s: float = 0.0,
+        self, robot: Rover, folder: Path, *, every: int = 1, keep_last_s: float = 0.0
     ) -> None:
-        if orjson and ORJSON is None:
-            raise NotMeasurableError("orjson is not installed")
-        self._encoder = ORJSON if orjson else None
         self.bridge = MCPBridge(
             robot, data_dir=folder, throttle_interval=every, keep_last_s=keep_last_s
         )
         self.publish = self.bridge.publish
         self.get_command = self.bridge.get_command
-
-    def begin(self) -> None:
-        """Set the encoder, which bridges of one process share."""
-        use_encoder(self._encoder)
-
-    def close(self) -> None:
-        """Close the bridge, and set the encoder back."""
-        self.bridge.close()
-        use_encoder(ORJSON)
+        self.close = self.bridge.close
 
 
-def use_encoder(orjson: Any) -> None:
-    """Let the bridges of this process use the module orjson, or None: the standard library."""
-    encoding.orjson = orjson
+@contextmanager
+def encoder(*, orjson: bool) -> Generator[str]:
+    """Let the bridges of this process use orjson or the standard library; gives its name.
+
+    Raises:
+        NotMeasurableError: orjson is wanted and not installed.
+    """
+    if orjson and ORJSON is None:
+        raise NotMeasurableError("orjson is not installed")
+    encoding.orjson = ORJSON if orjson else None
+    try:
+        yield "orjson" if orjson else "standard library JSON"
+    finally:
+        encoding.orjson = ORJSON
 
 
 class JsonFiles:
@@ -84,22 +71,14 @@ class JsonFiles:
     indent, `close`; and `exists`, `open`, `json.load` to see whether a command is there.
     """
 
-    def __init__(self, folder: Path, *, every: int = 1) -> None:
+    def __init__(self, folder: Path) -> None:
         self._status = folder / "status.json"
         self._commands = folder / "commands.json"
         self._commands.write_text(json.dumps({"id": 3, "action": "resume", "params": {}}))
         self._done = 3
-        self._every = every
-        self._calls = 0
-
-    def begin(self) -> None:
-        """Nothing to prepare."""
 
     def publish(self, state: State) -> None:
-        """Write the state, every so many calls."""
-        self._calls += 1
-        if self._calls % self._every:
-            return
+        """Write the state."""
         with open(self._status, "w") as file:  # noqa: PTH123
             json.dump(state, file, indent=2)
 
@@ -129,9 +108,6 @@ class RawSqlite:
             "CREATE INDEX command_pending ON command (id) WHERE status = 'pending';"
         )
 
-    def begin(self) -> None:
-        """Nothing to prepare."""
-
     def publish(self, state: State) -> None:
         """Insert the state."""
         now = time.time()
@@ -148,3 +124,84 @@ class RawSqlite:
     def close(self) -> None:
         """Close the file."""
         self._connection.close()
+
+
+STEP_S: Final = 0.008
+
+
+class Rover:
+    """What a bridge asks of a Webots `Robot`, without a simulator.
+
+    `step` only counts simulation time; `pace` also lets the wall time of a step pass, asleep, as a
+    controller does that waits for Webots.
+    """
+
+    def __init__(self, name: str = "rover", step_s: float = STEP_S) -> None:
+        self.devices: dict[str, Any] = {}
+        self._name = name
+        self._step_s = step_s
+        self._time_s = 0.0
+        self._due_s = time.perf_counter()
+
+    def step(self, duration_ms: int) -> int:
+        """Let simulation time pass."""
+        self._time_s += duration_ms / 1000
+        return 0
+
+    def reset(self) -> None:
+        """Simulation time begins again."""
+        self._time_s = 0.0
+
+    def pace(self) -> None:
+        """Let one step pass in real time."""
+        self._time_s += self._step_s
+        now = time.perf_counter()
+        self._due_s = max(self._due_s + self._step_s, now)  # a late step is not caught up with
+        time.sleep(self._due_s - now)
+
+    def getTime(self) -> float:
+        return self._time_s
+
+    def getName(self) -> str:
+        return self._name
+
+    def getBasicTimeStep(self) -> float:
+        return self._step_s * 1000
+
+    def getWorldPath(self) -> str:
+        return ""
+
+    def getSupervisor(self) -> bool:
+        return False
+
+
+STATES: Final = 64
+
+State = dict[str, Any]
+
+
+def make_states(count: int = STATES) -> list[State]:
+    """States of 39 leaves, about 740 bytes of compact JSON; all numbers differ between them."""
+    numbers = random.Random(7)
+    return [_state(numbers) for _ in range(count)]
+
+
+def _state(numbers: random.Random) -> State:
+    def some(count: int, digits: int) -> list[float]:
+        return [round(numbers.uniform(-9.99, 9.99), digits) for _ in range(count)]
+
+    return {
+        "mode": "following_wall",
+        "goal_reached": False,
+        "pose": dict(zip(("x_m", "y_m", "yaw_rad"), some(3, 8), strict=True)),
+        "velocity": dict(zip(("linear_m_s", "angular_rad_s"), some(2, 8), strict=True)),
+        "imu": dict(zip(("roll_rad", "pitch_rad", "yaw_rad"), some(3, 8), strict=True)),
+        "accelerometer": some(3, 8),
+        "gyro": some(3, 8),
+        "wheels": {"left_rad": some(1, 8)[0], "right_rad": some(1, 8)[0]},
+        "motors": {"left_rad_s": some(1, 6)[0], "right_rad_s": some(1, 6)[0]},
+        "distance": {f"ds{i}": value for i, value in enumerate(some(8, 6))},
+        "lidar": {"min_m": some(1, 6)[0], "sectors_m": some(8, 6)},
+        "battery_j": round(numbers.uniform(1e4, 9e4), 3),
+        "step": numbers.randrange(10_000, 99_999),
+    }

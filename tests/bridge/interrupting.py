@@ -14,7 +14,7 @@ from types import FrameType
 from typing import Any, NamedTuple
 
 import webots_mcp
-from tests.benchmarks.rover import Rover
+from tests.benchmarks.ways import Rover
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME

@@ -26,7 +26,7 @@ from webots_mcp.console import follow_console, job_of
 from webots_mcp.contract import host_name
 from webots_mcp.liveness import holder_of
 from webots_mcp.store.recording import Recording
-from webots_mcp.webots.instances import Instance
+from webots_mcp.webots import Instance
 
 
 @pytest.fixture

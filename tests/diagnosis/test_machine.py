@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from tests.diagnosis.conftest import Look
-from webots_mcp.diagnosis.machine_checks import has_wal_reset_bug, judge_sqlite
+from webots_mcp.diagnosis.recording_checks import has_wal_reset_bug, judge_sqlite
 
 
 def test_the_python_that_runs_is_named(look: Look) -> None:

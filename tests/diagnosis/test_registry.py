@@ -7,7 +7,7 @@ from pathlib import Path
 
 from tests.diagnosis.conftest import found
 from webots_mcp.contract import MemoryDatabase
-from webots_mcp.diagnosis.doctor import (
+from webots_mcp.diagnosis import (
     PAGE,
     Check,
     Examined,

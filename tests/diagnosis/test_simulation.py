@@ -23,7 +23,7 @@ from tests.webots.conftest import (
     write_project,
 )
 from webots_mcp.contract import ENDED_BY, SEE_STEPS, UNMOVED, UNSEEN, host_name
-from webots_mcp.diagnosis.doctor import Finding
+from webots_mcp.diagnosis import Finding
 from webots_mcp.liveness import process_identity
 
 WAITS = "import sys; print('ready', flush=True); sys.stdin.read()"

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from tests.observer.conftest import STEP_MS
-from webots_mcp.observer import observe
-from webots_mcp.observer.observe import StepPace
+from webots_mcp import observer
+from webots_mcp.observer import StepPace
 
 
 class Simulator:
@@ -55,7 +55,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> None:
         def sleep(_: float) -> None:
             now[0] += 0.5
 
-    monkeypatch.setattr(observe, "time", Time)
+    monkeypatch.setattr(observer, "time", Time)
 
 
 def rounds(simulator: Any, count: int = 10) -> list[int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from webots_mcp.conditions.compiler import parse_condition
-from webots_mcp.observer.bodies import word_of
+from webots_mcp.observer import word_of
 
 
 @pytest.mark.parametrize(

@@ -89,6 +89,6 @@ def _tests_of(file: Path) -> list[str]:
 
 @cache
 def _benchmarks() -> set[str]:
-    families = (CHECKOUT / "tests" / "benchmarks" / "families").glob("*.py")
-    entered = r'(?m)^@benchmark\(\s*"(\w+)"'  # of tests/benchmarks/registry
-    return {name for file in families for name in re.findall(entered, file.read_text("utf-8"))}
+    modules = (CHECKOUT / "tests" / "benchmarks").glob("*.py")
+    declared = r'(?m)^@benchmark\(\s*"(\w+)"'
+    return {name for file in modules for name in re.findall(declared, file.read_text("utf-8"))}

@@ -27,7 +27,7 @@ from webots_mcp import console
 from webots_mcp.console import belongs
 from webots_mcp.server import create_server
 from webots_mcp.store.recording import Recording
-from webots_mcp.webots.instances import instances
+from webots_mcp.webots import instances
 
 pytestmark = pytest.mark.anyio
 

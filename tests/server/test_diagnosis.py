@@ -9,7 +9,7 @@ import pytest
 
 from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, Driver, ask
-from webots_mcp.diagnosis.doctor import all_checks
+from webots_mcp.diagnosis import all_checks
 
 pytestmark = pytest.mark.anyio
 

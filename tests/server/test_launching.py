@@ -24,8 +24,8 @@ from tests.webots.conftest import (
     write_project,
 )
 from webots_mcp.server import create_server
-from webots_mcp.setup.file_changes import apply
-from webots_mcp.setup.observed_world import controller_change, with_observer
+from webots_mcp.setup import apply
+from webots_mcp.setup.project_edits import controller_change, with_observer
 
 pytestmark = pytest.mark.anyio
 

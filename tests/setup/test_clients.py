@@ -11,6 +11,7 @@ import pytest
 
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.requirements import checkout
+from webots_mcp.setup import apply
 from webots_mcp.setup.client_entries import (
     Client,
     ClientEntry,
@@ -20,7 +21,6 @@ from webots_mcp.setup.client_entries import (
     server_command,
     server_hindrance,
 )
-from webots_mcp.setup.file_changes import apply
 
 LINE = [sys.executable, "-m", "webots_mcp", "serve", "--data-dir", "/p/mcp_data"]
 

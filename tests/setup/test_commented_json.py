@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.setup.file_changes import CommentedJSON
+from webots_mcp.setup.client_entries import CommentedJSON
 
 ENTRY = {"command": "/a b/python", "args": ["serve"]}
 VALUES = st.recursive(

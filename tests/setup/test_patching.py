@@ -7,13 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.setup.controller_patch import (
-    IMPORT,
-    AlreadyPatchedError,
-    attach_line,
-    patch,
-    unpatch,
-)
+from webots_mcp.setup.project_edits import IMPORT, AlreadyPatchedError, attach_line, patch, unpatch
 
 PLAIN = """from controller import Robot
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.setup.webots_project import controllers_of, project_of
+from webots_mcp.setup import controllers_of, project_of
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import pytest
 from tests.webots.server import WebotsServer
 from webots_mcp.contract import host_name
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.webots.stream import (
+from webots_mcp.webots.orders import (
     MAX_FRAME_BYTES,
     FrameTrimmer,
     Order,

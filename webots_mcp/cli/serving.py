@@ -182,8 +182,8 @@ def observe(
     --extern Webots starts the observer itself, and this command is not needed. It ends when Webots
     reloads the world or ends; with --json it says then where it has recorded.
     """
+    from webots_mcp import observer
     from webots_mcp.contract import resolve_data_dir
-    from webots_mcp.observer import observe as observer
 
     period_ms = observer.checked_period(observer.PERIOD_MS if period_ms is None else period_ms)
     address = _connect_to(url, robot)
@@ -200,8 +200,7 @@ def _connect_to(url: str | None, robot: str) -> str:
     Raises:
         CommandRefusedError: There is no such library.
     """
-    from webots_mcp.webots.installations import HOME_VARIABLE, installations
-    from webots_mcp.webots.instances import DEFAULT_PORT
+    from webots_mcp.webots import DEFAULT_PORT, HOME_VARIABLE, installations
 
     url = url or os.environ.get(_URL) or f"ipc://{DEFAULT_PORT}"
     os.environ[_URL] = f"{url.rstrip('/')}/{robot}" if url.count("/") == 2 else url

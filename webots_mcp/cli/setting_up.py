@@ -16,10 +16,9 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPE
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from webots_mcp.diagnosis.doctor import Checked, Examined
+    from webots_mcp.diagnosis import Checked, Examined
+    from webots_mcp.setup import FileChange, ProjectController
     from webots_mcp.setup.client_entries import Client
-    from webots_mcp.setup.file_changes import FileChange
-    from webots_mcp.setup.webots_project import ProjectController
 
 _WRONG: Final = 1  # the exit code
 _LEAST_COLUMN: Final = 30  # characters that a line of a folded text has at least
@@ -68,7 +67,7 @@ class Writing:
 
     def apply(self, change: FileChange) -> dict[str, str]:
         """Write a file unless it holds that already; what was done."""
-        from webots_mcp.setup.file_changes import apply
+        from webots_mcp.setup import apply
 
         if not change.is_needed:
             return {"file": str(change.file), "outcome": "unchanged"}
@@ -159,7 +158,7 @@ def init(
 
         webots-mcp init --observer worlds/arena.wbt
     """
-    from webots_mcp.setup import controller_patch
+    from webots_mcp.setup import project_edits
 
     if sum(each is not None for each in (patch, undo, observer)) > 1:
         raise InvalidInputError("--patch, --observer and --undo exclude each other")
@@ -170,16 +169,16 @@ def init(
     elif undo is not None and undo.suffix == ".wbt":
         _remove_observer(undo, writing)
     elif undo is not None:
-        _change_controller(undo, controller_patch.unpatch, writing)
+        _change_controller(undo, project_edits.unpatch, writing)
     elif patch is not None:
-        _change_controller(patch, controller_patch.patch, writing)
+        _change_controller(patch, project_edits.patch, writing)
     else:
         _make_ready(project, name, writing, claude_desktop=claude_desktop)
 
 
 def _change_controller(file: Path, changed: Callable[[bytes], bytes], writing: Writing) -> None:
-    from webots_mcp.setup.controller_patch import AlreadyPatchedError
-    from webots_mcp.setup.file_changes import FileChange, read
+    from webots_mcp.setup import FileChange, read
+    from webots_mcp.setup.project_edits import AlreadyPatchedError
 
     if file.is_dir():
         raise InvalidInputError(f"{file} is a folder: name the controller's file in it")
@@ -199,8 +198,8 @@ def _change_controller(file: Path, changed: Callable[[bytes], bytes], writing: W
 
 def _add_observer(world: Path, writing: Writing, *, in_place: bool, extern: bool) -> None:
     """Put the observer into a copy of a world, or into the world itself."""
-    from webots_mcp.setup.observed_world import controller_change, world_change
-    from webots_mcp.setup.webots_project import project_of
+    from webots_mcp.setup import project_of
+    from webots_mcp.setup.project_edits import controller_change, world_change
 
     change = world_change(world, in_place=in_place, extern=extern)
     project = project_of(str(world.resolve().parent))
@@ -218,8 +217,8 @@ def _add_observer(world: Path, writing: Writing, *, in_place: bool, extern: bool
 
 def _python_for(controller: Path, writing: Writing) -> list[dict[str, str]]:
     """The Python that can run the observer, where the one that Webots takes cannot."""
-    from webots_mcp.setup.observed_world import python_change
-    from webots_mcp.setup.webots_project import look_into
+    from webots_mcp.setup import look_into
+    from webots_mcp.setup.project_edits import python_change
 
     found = look_into(controller)
     if found.error is None:
@@ -234,7 +233,7 @@ def _python_for(controller: Path, writing: Writing) -> list[dict[str, str]]:
 def _remove_observer(world: Path, writing: Writing) -> None:
     """Take the observer out of a world, or delete the copy that was made for it."""
     from webots_mcp.contract import find_project
-    from webots_mcp.setup.observed_world import undo, unused_controller
+    from webots_mcp.setup.project_edits import undo, unused_controller
 
     change = undo(world)
     writing.require_yes(world)
@@ -269,8 +268,7 @@ def _outcome(file: dict[str, str]) -> str:
 def _make_ready(folder: str | None, name: str, writing: Writing, *, claude_desktop: bool) -> None:
     """Tell clients of the server, and say what the controllers need."""
     from webots_mcp.contract import PROJECT_DATA_FOLDER
-    from webots_mcp.setup import client_entries
-    from webots_mcp.setup.webots_project import controllers_of, project_of
+    from webots_mcp.setup import client_entries, controllers_of, project_of
 
     project = project_of(folder)
     data_dir = project / PROJECT_DATA_FOLDER
@@ -323,8 +321,8 @@ def _described(controller: ProjectController, project: Path) -> dict[str, Any]:
     """A controller, the lines that it needs, and the Python that it is started with."""
     from dataclasses import asdict
 
-    from webots_mcp.setup.controller_patch import IMPORT, AlreadyPatchedError, attach_line
-    from webots_mcp.setup.webots_project import look_into
+    from webots_mcp.setup import look_into
+    from webots_mcp.setup.project_edits import IMPORT, AlreadyPatchedError, attach_line
 
     file = controller.file.relative_to(project)
     described: dict[str, Any] = {"file": file.as_posix(), "language": controller.language}
@@ -396,7 +394,7 @@ def doctor(
     Nothing is changed. Exit code 0: nothing is wrong (there may be warnings). 1: something is
     wrong. 2: it could not look.
     """
-    from webots_mcp.diagnosis.doctor import all_checks, diagnose
+    from webots_mcp.diagnosis import all_checks, diagnose
 
     checked = diagnose(_examined(recorded), all_checks(with_server=not no_server))
     if as_json:
@@ -408,7 +406,7 @@ def doctor(
 
 def _examined(recorded: Where) -> Examined:
     from webots_mcp.contract import choose_data_dir
-    from webots_mcp.diagnosis.doctor import subject_of
+    from webots_mcp.diagnosis import subject_of
 
     try:
         recording = recorded.recording()

@@ -1,1 +1,210 @@
-"""Why nothing works: what `webots-mcp doctor` and a client's diagnosis look at."""
+"""Checks of each link between a controller and its client, and how they are run.
+
+A check is one function of what is `Examined` that returns a `Finding`, declared by `@check(NAME)`
+in one of the modules of this package. Its finding is explained in docs/troubleshooting.md, under a
+heading of its name. A diagnosis changes nothing.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+
+from webots_mcp.contract import PROJECT_DATA_FOLDER, full_path
+from webots_mcp.errors import WebotsMCPError
+from webots_mcp.store.recording import Recording, View, view_of
+from webots_mcp.store.robots import list_robots
+from webots_mcp.transactions import is_damage, text_of
+
+if TYPE_CHECKING:
+    from webots_mcp.webots import Instance
+
+Verdict = Literal["ok", "warning", "wrong", "not checked"]
+
+_WORST_FIRST: Final[tuple[Verdict, ...]] = ("wrong", "warning", "not checked", "ok")
+PAGE: Final = "docs/troubleshooting.md"
+_RECOVER: Final = (
+    "stop what records there, save rows with 'sqlite3 FILE .recover', and move the file away"
+)
+# From the controller's machine to the client; within a module the order is that of its functions.
+_IN_ORDER: Final = ("recording_checks", "webots_checks")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was seen, and what mends it where it is not as it should be."""
+
+    verdict: Verdict
+    seen: str
+    fix: str | None = None
+
+
+@dataclass(frozen=True)
+class Examined:
+    """What is looked at.
+
+    Attributes:
+        recording: Read only: a diagnosis changes nothing.
+        chosen_by: The rule that chose its folder.
+        project: The folder in which the files of clients are looked for.
+        connection: To the recording; None where it cannot be read.
+        unread: Why it cannot be read.
+        server: The command that starts this package's own server.
+    """
+
+    recording: Recording
+    chosen_by: str
+    project: Path
+    connection: sqlite3.Connection | None = None
+    unread: WebotsMCPError | None = None
+    server: Sequence[str] = (sys.executable, "-m", "webots_mcp", "serve", "--read-only")
+    now_s: float = field(default_factory=time.time)
+
+    @property
+    def file(self) -> Path | None:
+        """The database's file; None for one in memory."""
+        return self.recording.database if isinstance(self.recording.database, Path) else None
+
+    @property
+    def opened(self) -> sqlite3.Connection:
+        """The connection, for a check that needs the recording."""
+        assert self.connection is not None
+        return self.connection
+
+    @cached_property
+    def views(self) -> list[View]:
+        """All robots that were ever seen."""
+        robots = list_robots(self.opened, self.now_s)
+        return [view_of(self.opened, robot, self.now_s) for robot in robots]
+
+    @cached_property
+    def live(self) -> list[View]:
+        """The robots whose controllers live."""
+        return [view for view in self.views if view.robot.live]
+
+    @cached_property
+    def running_webots(self) -> list[Instance]:
+        """The Webots that run on this machine."""
+        from webots_mcp.webots import instances
+
+        return instances()
+
+
+@dataclass(frozen=True)
+class Check:
+    """A link of the chain.
+
+    Attributes:
+        name: In one word or a few; the heading of its part of the page.
+        look: Looks at it.
+        needs_recording: It is not looked at where there is no recording that can be read.
+        starts_process: It takes seconds: a server does not ask it of itself.
+    """
+
+    name: str
+    look: Callable[[Examined], Finding]
+    needs_recording: bool = False
+    starts_process: bool = False
+
+    @property
+    def page(self) -> str:
+        """Where it is explained further."""
+        return f"{PAGE}#{self.name.lower().replace(' ', '-')}"
+
+
+class Checked(NamedTuple):
+    """A check and what it found."""
+
+    check: Check
+    finding: Finding
+
+    @property
+    def is_well(self) -> bool:
+        """Whether there is nothing to mend."""
+        return self.finding.verdict == "ok"
+
+
+def check(
+    name: str, *, needs_recording: bool = False, starts_process: bool = False
+) -> Callable[[Callable[[Examined], Finding]], Check]:
+    """Declare a function as a check; a `Check` has what is to be given."""
+    return lambda look: Check(name, look, needs_recording, starts_process)
+
+
+def all_checks(*, with_server: bool = False) -> list[Check]:
+    """All that the modules declare, in the order of the chain.
+
+    Args:
+        with_server: Those as well that start a process of their own.
+    """
+    modules = [import_module(f"{__package__}.{name}") for name in _IN_ORDER]
+    declared = [each for module in modules for each in vars(module).values()]
+    checks = [each for each in declared if isinstance(each, Check)]
+    return [each for each in checks if with_server or not each.starts_process]
+
+
+def worst(findings: Sequence[Finding]) -> Finding:
+    """Several findings of one check as one; what is well is left out where something is not."""
+    verdict = _WORST_FIRST[min(_WORST_FIRST.index(finding.verdict) for finding in findings)]
+    shown = [finding for finding in findings if verdict == "ok" or finding.verdict != "ok"]
+    fixes = list(dict.fromkeys(finding.fix for finding in shown if finding.fix))
+    seen = "; ".join(dict.fromkeys(finding.seen for finding in shown))
+    return Finding(verdict, seen, "; ".join(fixes) or None)
+
+
+def last_seen_s(view: View) -> float:
+    """When a robot last gave a sign of life, Unix time."""
+    seen_s = view.robot.last_seen_wall_time_s
+    return max(seen_s, view.session.last_seen_wall_time_s) if view.session else seen_s
+
+
+def ago(seconds: float) -> str:
+    """How long ago something was, in the unit in which a person thinks of it."""
+    for size, unit in ((86_400, "days"), (3_600, "hours"), (120, "minutes")):
+        if seconds >= 2 * size or (unit == "minutes" and seconds >= size):
+            return f"{seconds / (60 if unit == 'minutes' else size):.0f} {unit} ago"
+    return f"{max(seconds, 0.0):.1f} s ago"
+
+
+def diagnose(subject: Examined, checks: Sequence[Check] | None = None) -> list[Checked]:
+    """Run the checks, all but those that start a process; what cannot be looked at says why."""
+    with ExitStack() as stack:
+        try:
+            connection = stack.enter_context(subject.recording.reader())
+            subject = replace(subject, connection=connection)
+        except WebotsMCPError as error:
+            subject = replace(subject, unread=error)
+        return [Checked(each, _look(each, subject)) for each in checks or all_checks()]
+
+
+def _look(check: Check, subject: Examined) -> Finding:
+    """Run one check; one that fails reports that, and the others still run."""
+    if check.needs_recording and subject.connection is None:
+        return Finding("not checked", "there is no recording that can be read")
+    try:
+        return check.look(subject)
+    except ModuleNotFoundError as error:
+        return Finding("not checked", f"the Python package {error.name!r} is missing")
+    except Exception as error:  # noqa: BLE001  (it is reported)
+        if is_damage(error):
+            return Finding("wrong", f"the database is damaged: {text_of(error)}", _RECOVER)
+        return Finding("not checked", f"{type(error).__name__}: {error}")
+
+
+def subject_of(recording: Recording, chosen_by: str) -> Examined:
+    """What is looked at of a recording: also the folder that the asker is in."""
+    return Examined(replace(recording, read_only=True), chosen_by, _project(recording))
+
+
+def _project(recording: Recording) -> Path:
+    """The folder above `mcp_data/`, where a project's recording lies, else the current one."""
+    folder = full_path(recording.data_dir)
+    return folder.parent if folder.name == PROJECT_DATA_FOLDER else Path.cwd()

@@ -1,25 +1,224 @@
-"""What is in the recording: whether it can be read, who writes it, and what waits."""
+"""What this machine brings along, where a recording lies, who writes it, and what waits in it."""
 
 from __future__ import annotations
 
+import os
+import platform
+import shutil
+import sqlite3
+import sys
+import tempfile
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from webots_mcp.connection import (
-    FrozenConnection,
-    connect,
-    is_there,
-    journal_mode,
-    require_current,
-    schema_version,
-)
-from webots_mcp.contract import HEARTBEAT_LATE_S, SCHEMA_VERSION
-from webots_mcp.diagnosis.doctor import Examined, Finding, ago, check, last_seen_s, worst
+from webots_mcp.connection import OLDEST_SQLITE, FrozenConnection, connect, is_there, journal_mode
+from webots_mcp.contract import DATA_DIR_VARIABLE, HEARTBEAT_LATE_S, SCHEMA_VERSION
+from webots_mcp.diagnosis import Examined, Finding, ago, check, last_seen_s, worst
 from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
+from webots_mcp.requirements import install_line, missing_requirements, package_of
+from webots_mcp.schema import require_current, schema_version
 from webots_mcp.store.recording import GETTING_STARTED, View, name_of
 from webots_mcp.store.robots import Session, fetch_session, handler_at_work, rows_waiting
 from webots_mcp.waiting_file import count_rows, waiting_paths
+
+_OLDEST_PYTHON: Final = (3, 10)
+_NEWEST_PYTHON: Final = (3, 13)  # that it was tried with
+# Two connections that write or checkpoint at once could damage a file before these versions
+# (sqlite.org/wal.html, "The WAL-reset bug"); the two older branches were mended as well.
+_WAL_RESET_MENDED: Final = (3, 51, 3)
+_WAL_RESET_MENDED_IN_BRANCH: Final = {(3, 44): 6, (3, 50): 7}
+
+
+@check("Python")
+def python(_: Examined) -> Finding:
+    """The Python that runs this; `Recording now` has that of the controllers."""
+    seen = f"{platform.python_version()} at {sys.executable}"
+    if sys.version_info[:2] < _OLDEST_PYTHON:
+        return Finding("wrong", seen, "use Python 3.10 or newer")
+    if sys.version_info[:2] > _NEWEST_PYTHON:
+        return Finding("warning", f"{seen}: newer than what this was tried with", "use Python 3.13")
+    return Finding("ok", seen)
+
+
+@check("Packages")
+def packages(_: Examined) -> Finding:
+    """What the server and most commands need; a bridge does without."""
+    missing = missing_requirements()
+    if not missing:
+        return Finding("ok", "all that the server needs are installed")
+    seen = f"missing: {', '.join(map(package_of, missing))} (a bridge does without)"
+    return Finding("wrong", seen, f"run {install_line(missing)}")
+
+
+@check("SQLite")
+def sqlite(_: Examined) -> Finding:
+    """The SQLite of this Python."""
+    return judge_sqlite(sqlite3.sqlite_version_info)
+
+
+def judge_sqlite(version: tuple[int, ...]) -> Finding:
+    """Whether a version can be used."""
+    seen = ".".join(map(str, version))
+    if version < OLDEST_SQLITE:
+        return Finding(
+            "wrong",
+            f"{seen} is too old: 3.38 is needed",
+            "use a Python with a newer one (python.org, conda and Debian 12 have it)",
+        )
+    if has_wal_reset_bug(version):
+        seen += (
+            ", which has the WAL-reset bug: webots-mcp checkpoints so that it cannot strike; let "
+            "no other program write to the file while a robot records"
+        )
+    return Finding("ok", seen)
+
+
+def has_wal_reset_bug(version: tuple[int, ...]) -> bool:
+    """Whether a checkpoint during a commit can damage a file."""
+    mended = _WAL_RESET_MENDED_IN_BRANCH.get((version[0], version[1]))
+    return version < _WAL_RESET_MENDED and (mended is None or version[2] < mended)
+
+
+# Names of file systems as the operating systems have them; in none does SQLite share memory.
+_NETWORK: Final = (
+    "nfs", "nfs4", "cifs", "smb2", "smb3", "smbfs", "afpfs", "webdav", "ncpfs", "afs", "ceph",
+    "glusterfs", "lustre", "beegfs", "fuse.sshfs", "fuse.glusterfs", "fuse.s3fs", "fuse.rclone",
+)  # fmt: skip
+_SHARED_WITH_HOST: Final = ("vboxsf", "prl_fs", "fuse.vmhgfs-fuse", "vmhgfs")
+_WINDOWS_FROM_WSL: Final = ("9p", "drvfs")
+_WSL_FROM_WINDOWS: Final = ("//wsl$/", "//wsl.localhost/")
+_FULL_BYTES: Final = 50_000_000
+_LOW_BYTES: Final = 1_000_000_000
+_LOCAL: Final = (
+    f"record in a folder of this machine's own disk: {DATA_DIR_VARIABLE}, --data-dir, or "
+    "MCPBridge(robot, data_dir=...), the same for controllers and server"
+)
+
+
+class Mount(NamedTuple):
+    """A file system and its mount point, as psutil lists them."""
+
+    point: str
+    kind: str
+    is_remote: bool = False
+
+
+@check("Data folder")
+def data_folder(subject: Examined) -> Finding:
+    """Whether it is there, and may be written."""
+    if subject.file is None:
+        return Finding("ok", "the recording is in memory")
+    folder = subject.file.parent
+    seen = f"{folder}, chosen by: {subject.chosen_by}"
+    if not folder.exists():
+        return Finding(
+            "warning",
+            f"{seen}; it is not there yet",
+            "start a controller with an MCPBridge, which makes it; if it records elsewhere, name "
+            "that folder with --data-dir",
+        )
+    if not folder.is_dir():
+        return Finding("wrong", f"{seen}; it is a file", "name the folder with --data-dir")
+    if why := _why_unwritable(folder):
+        return Finding(
+            "wrong",
+            f"{seen}; it cannot be written: {why}",
+            "give this user the right to write there, or name another with --data-dir; a recording "
+            "that only has to be read can: webots-mcp serve --read-only",
+        )
+    return Finding("ok", seen)
+
+
+def _why_unwritable(folder: Path) -> str | None:
+    """Whether a folder can be written, by trying: a read-only file system ignores its rights."""
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            return None
+    except OSError as error:
+        return error.strerror or str(error)
+
+
+@check("File system")
+def file_system(subject: Examined) -> Finding:
+    """Whether processes can share memory there, which WAL needs."""
+    if subject.file is None:
+        return Finding("ok", "the recording is in memory")
+    import psutil
+
+    mounts = [
+        Mount(part.mountpoint, part.fstype, "remote" in part.opts.split(","))
+        for part in psutil.disk_partitions(all=True)
+    ]
+    is_wsl = "microsoft" in platform.release().lower()
+    return judge_file_system(str(subject.file.parent), mounts, is_wsl=is_wsl)
+
+
+def judge_file_system(folder: str, mounts: Iterable[Mount], *, is_wsl: bool) -> Finding:
+    """Whether a recording may lie in a folder, on a machine with these file systems."""
+    path = folder.replace("\\", "/")
+    if path.lower().startswith(_WSL_FROM_WINDOWS):
+        return _across_the_border(folder, "a folder of WSL, seen from Windows")
+    if path.startswith("//"):
+        return _on_the_network(folder, "a network drive")
+    mount = _mount_of(path, mounts)
+    if mount is None:
+        return Finding("not checked", f"the system does not show on which drive {folder} is")
+    kind = mount.kind.lower()
+    if is_wsl and kind in _WINDOWS_FROM_WSL:
+        return _across_the_border(folder, f"a drive of Windows, seen from WSL ({kind})")
+    if mount.is_remote or kind in _NETWORK:
+        return _on_the_network(folder, f"a network drive ({mount.kind} at {mount.point})")
+    if kind in (*_SHARED_WITH_HOST, *_WINDOWS_FROM_WSL):
+        seen = f"{folder} is shared with a virtual machine's host ({mount.kind} at {mount.point})"
+        return Finding("warning", f"{seen}: both at once would not see each other's locks", _LOCAL)
+    return Finding("ok", f"{mount.kind or 'of an unnamed kind'} at {mount.point}")
+
+
+def _across_the_border(folder: str, what: str) -> Finding:
+    seen = (
+        f"{folder} is {what}: SQLite cannot share memory across that border, so that controllers "
+        "and server lock each other out or damage the file"
+    )
+    return Finding("wrong", seen, f"run both on one side of it, and {_LOCAL}")
+
+
+def _on_the_network(folder: str, what: str) -> Finding:
+    seen = (
+        f"{folder} is on {what}: SQLite's log needs memory that processes share, which network "
+        "file systems do not have"
+    )
+    return Finding("wrong", seen, _LOCAL)
+
+
+def _mount_of(path: str, mounts: Iterable[Mount]) -> Mount | None:
+    """The one that begins nearest above the path."""
+    above = [mount for mount in mounts if _is_in(path, mount.point.replace("\\", "/"))]
+    return max(above, key=lambda mount: len(mount.point), default=None)
+
+
+def _is_in(path: str, point: str) -> bool:
+    if os.name == "nt" or point[1:2] == ":":
+        path, point = path.lower(), point.lower()
+    return f"{path}/".startswith(f"{point.rstrip('/')}/")
+
+
+@check("Free space")
+def free_space(subject: Examined) -> Finding:
+    """Whether there is room for what will be recorded."""
+    if subject.file is None:
+        return Finding("ok", "the recording is in memory")
+    folder = next(folder for folder in subject.file.parents if folder.exists())
+    free = shutil.disk_usage(folder).free
+    seen = f"{free / 1e9:.1f} GB free"
+    fix = "make room: 'webots-mcp prune --dry-run' lists what could be deleted"
+    if free < _FULL_BYTES:
+        return Finding("wrong", f"{seen}: the disk is full", fix)
+    return Finding(
+        "warning" if free < _LOW_BYTES else "ok", seen, fix * (free < _LOW_BYTES) or None
+    )
+
 
 _GET_COMMAND: Final = (
     "call bridge.get_command() in every round of the controller's loop, or use "

@@ -1,4 +1,4 @@
-"""Which Webots run, and why a simulation does not advance.
+"""Which Webots run, why a simulation does not advance, and whether MCP clients reach the server.
 
 The reason for a status is narrowed down from outside. A loop that is silent inside `step` looks the
 same whatever keeps it there. The machine shows more: which controller's process is computing, and
@@ -7,27 +7,43 @@ how many robots of the world wait for a controller that a person has to start.
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from webots_mcp.contract import UNSEEN, host_name
-from webots_mcp.diagnosis.doctor import Examined, Finding, check, last_seen_s, worst
-from webots_mcp.errors import CommandRefusedError
+from webots_mcp.diagnosis import Examined, Finding, check, last_seen_s, worst
+from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.pauses import PAUSED, SEEN_PAUSED, SEEN_RUNNING
+from webots_mcp.setup.client_entries import (
+    Client,
+    CommentedJSON,
+    can_be_started,
+    claude_desktop,
+    clients_of,
+    is_ours,
+    words_of,
+)
 from webots_mcp.store.recording import View
-from webots_mcp.store.robots import SILENT, Session, companions
-from webots_mcp.webots.installations import Installation, find_webots, installations
-from webots_mcp.webots.stream import address_of
+from webots_mcp.store.sessions import Session, companions
+from webots_mcp.store.status import SILENT
+from webots_mcp.webots import Installation, find_webots, installations
+from webots_mcp.webots.orders import address_of
 
 if TYPE_CHECKING:
+    from typing import TextIO
+
     import psutil
 
-    from webots_mcp.webots.instances import Instance
+    from webots_mcp.webots import Instance
 
 _WATCHED_S: Final = 0.3
 _LOOKS: Final = 6
@@ -283,3 +299,124 @@ def _reachable(webots: Instance) -> Finding:
         )
     obeys = "obeys" if webots.streams else "was started without --stream and does not obey"
     return Finding("ok", f"{seen} {obeys} orders from outside")
+
+
+_PLACES: Final = ("--data-dir", "--database")
+_INIT: Final = "run 'webots-mcp init' in the project"
+
+
+@check("Clients")
+def clients(subject: Examined) -> Finding:
+    """Each file that is there, and whether its server can start on this recording."""
+    known = [*clients_of(subject.project), claude_desktop()]
+    there = [client for client in known if client.file.exists()]
+    findings = [found for client in there for found in _look(subject, client)]
+    if findings:
+        return worst(findings)
+    names = ", ".join(client.name for client in known)
+    seen = f"no file of {names} for {subject.project} names webots-mcp"
+    return Finding("warning", seen, f"{_INIT}; other clients have files of their own")
+
+
+def _look(subject: Examined, client: Client) -> list[Finding]:
+    """What a file says of our server: nothing where it names only others."""
+    try:
+        text = client.file.read_text("utf-8-sig")
+        servers = CommentedJSON(text.strip() or "{}").value.get(client.servers)
+    except (OSError, UnicodeDecodeError, InvalidInputError) as error:
+        seen = f"{client.file} ({client.name}) cannot be read: {error}"
+        return [Finding("wrong", seen, f"mend that file: {client.name} cannot read it either")]
+    entries = cast("dict[str, Any]", servers) if isinstance(servers, dict) else {}
+    return [
+        _entry(subject, f"{client.name}, server {name!r}", entry)
+        for name, entry in entries.items()
+        if is_ours(entry)
+    ]
+
+
+def _entry(subject: Examined, name: str, entry: dict[str, Any]) -> Finding:
+    command, *arguments = words_of(entry)
+    if shutil.which(command) is None:
+        return Finding("wrong", f"{name}: there is no program {command!r}", _INIT)
+    if (other := _other_place(subject, arguments)) is not None:
+        seen = f"{name} serves {other}, which is not what is looked at here"
+        return Finding("warning", seen, "name the folder in which the controllers record")
+    if not can_be_started(entry):
+        seen = f"{name}: {command!r} is found by the PATH alone, which programs with windows lack"
+        return Finding("ok", seen)
+    return Finding("ok", f"{name} starts {command}")
+
+
+def _other_place(subject: Examined, arguments: list[str]) -> str | None:
+    """The recording that the arguments name, if it is another one."""
+    words = [part for word in arguments for part in word.split("=", 1)]
+    for option, value in pairwise(words):
+        if option in _PLACES and "$" not in value:
+            ours = subject.recording.data_dir if option == "--data-dir" else subject.file
+            same = ours is not None and (subject.project / value).resolve() == ours.resolve()
+            return None if same else value
+    return None
+
+
+_TIMEOUT_S: Final = 30.0
+_SHOWN_CHARACTERS: Final = 300
+_FIX: Final = (
+    "run the same command in a shell, see what it prints, and install webots-mcp again where a "
+    "package is missing or broken"
+)
+
+
+@check("Server", starts_process=True)
+def server(subject: Examined) -> Finding:
+    """Whether a server starts, names its tools and answers."""
+    if subject.file is None:
+        return Finding("not checked", "a recording in memory belongs to one process")
+    import anyio
+
+    line = [*subject.server, "--database", str(subject.file)]
+    started_s = time.monotonic()
+    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as complaints:
+        try:
+            tools, refused = anyio.run(_converse, line, complaints)
+        except Exception as error:  # noqa: BLE001  (it is reported)
+            seen = f"'{' '.join(line)}' did not answer: {_why(error)}{_last_line(complaints)}"
+            return Finding("wrong", seen, _FIX)
+    started = f"started over stdio, {tools} tools that only read"  # by --read-only
+    if refused:
+        seen = f"{started}, and answers: {refused[:_SHOWN_CHARACTERS]}"
+        return Finding("warning", seen, "mend the recording: see Database and Schema")
+    took_s = time.monotonic() - started_s
+    return Finding("ok", f"{started}, one answer, {took_s:.1f} s in all")
+
+
+async def _converse(line: list[str], complaints: TextIO) -> tuple[int, str]:
+    """How many tools it has, and why it refuses a question; empty where it answers it."""
+    import anyio
+    from mcp import Client, StdioServerParameters
+    from mcp.client.stdio import stdio_client
+
+    command, *arguments = line
+    parameters = StdioServerParameters(command=command, args=arguments, env=dict(os.environ))
+    with anyio.fail_after(_TIMEOUT_S):
+        async with Client(stdio_client(parameters, complaints)) as client:
+            tools = (await client.list_tools()).tools
+            answer = await client.call_tool("webots_list_robots", {})
+    text = "".join(getattr(block, "text", "") for block in answer.content)
+    return len(tools), text.partition(": ")[2] or text if answer.is_error else ""
+
+
+def _why(error: BaseException) -> str:
+    """Of a group of errors the first one."""
+    parts: tuple[BaseException, ...] = getattr(error, "exceptions", ())
+    if parts:
+        return _why(parts[0])
+    if isinstance(error, TimeoutError):
+        return f"nothing came within {_TIMEOUT_S:g} s"
+    return f"{error or type(error).__name__}"[:_SHOWN_CHARACTERS]
+
+
+def _last_line(complaints: TextIO) -> str:
+    """What it wrote on stderr last."""
+    complaints.seek(0)
+    lines = complaints.read().strip().splitlines()
+    return f"; it wrote: {lines[-1][:_SHOWN_CHARACTERS]}" if lines else ""

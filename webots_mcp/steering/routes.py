@@ -42,6 +42,7 @@ from webots_mcp.webots.key_presses import KEYS, press
 from webots_mcp.webots.starting import Start
 from webots_mcp.webots.stream import (
     ANSWER_S,
+    KEYS,
     RESTARTING,
     Order,
     OrderReply,

@@ -23,10 +23,8 @@ from typing import IO, TYPE_CHECKING, Final, Literal, NamedTuple
 
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.liveness import process_alive
-from webots_mcp.webots import program_keeper
-from webots_mcp.webots.installations import find_webots
-from webots_mcp.webots.instances import DEFAULT_PORT, Instance, instances
-from webots_mcp.webots.stream import WebotsAddress, WebotsLine
+from webots_mcp.webots import DEFAULT_PORT, Instance, find_webots, instances, program_keeper
+from webots_mcp.webots.orders import WebotsAddress, WebotsLine
 
 if TYPE_CHECKING:
     import psutil

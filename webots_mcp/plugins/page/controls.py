@@ -14,7 +14,7 @@ from webots_mcp.naming import spelled_out
 from webots_mcp.parameter import Value
 from webots_mcp.plugins.page.style import STATUS, sheet
 from webots_mcp.plugins.page.tab_data import Look, Surroundings, run_title
-from webots_mcp.webots.stream import Order
+from webots_mcp.webots.orders import Order
 
 NEWEST: Final = "newest"
 NONE: Final = "none"

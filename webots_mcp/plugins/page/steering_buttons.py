@@ -11,7 +11,7 @@ from webots_mcp.questions.send_command import set_parameters
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.steering.routes import Attempt
 from webots_mcp.store.recording import Recording
-from webots_mcp.webots.stream import Order
+from webots_mcp.webots.orders import Order
 
 ORDERS: Final[tuple[Order, ...]] = ("pause", "resume", "step", "reset")
 _WAIT_S: Final = 10.0

@@ -66,7 +66,7 @@ from webots_mcp.plugins.page.tab_data import (
 )
 from webots_mcp.plugins.report.charts import SignalsChart, WayChart, draw_signals, draw_way
 from webots_mcp.store.recording import Recording
-from webots_mcp.webots.stream import Order
+from webots_mcp.webots.orders import Order
 
 if TYPE_CHECKING:
     from webots_mcp.plugins.page.steering_buttons import Told

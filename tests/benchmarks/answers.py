@@ -13,9 +13,8 @@ import anyio
 from mcp import Client
 from mcp.types import ImageContent, TextContent, Tool
 
+from tests.benchmarks.core import Bench, Line, Target, benchmark
 from tests.benchmarks.processes import environment
-from tests.benchmarks.registry import Bench, benchmark
-from tests.benchmarks.table import Line, Target
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME
 from webots_mcp.questions.budget import tokens_in
@@ -123,3 +122,6 @@ def _line(answer: _Answer) -> Line:
     beside = f"all rows as JSON {answer.recorded_bytes:,} bytes"
     tokens = tokens_in(answer.text)
     return Line(answer.tool, ours, beside, tokens, "tokens", Target(_TOKENS))
+
+
+BENCHMARKS = (measure_answers,)

@@ -1,12 +1,10 @@
-"""What is lost when controllers are killed: rows, files, commands."""
+"""What kills and interrupts (Ctrl-C) cost a controller: rows, files, commands."""
 
 from __future__ import annotations
 
-import json
 import random
 import sqlite3
 import subprocess
-import sys
 import time
 from collections import Counter
 from collections.abc import Generator, Iterable
@@ -14,16 +12,14 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.benchmarks.processes import environment
-from tests.benchmarks.registry import Bench, benchmark
-from tests.benchmarks.servers import our_server
-from tests.benchmarks.table import Line, Target
+from tests.benchmarks.core import Bench, Line, Target, benchmark
+from tests.benchmarks.processes import environment, our_server, program_line
+from tests.bridge.interrupting import Interrupter, Outcome, drive, make_template, places
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.queue import CommandQueue
 from webots_mcp.waiting_file import adopt, waiting_paths
 
-_KILLS = 60
 _LONGEST_LIFE_S = 0.3
 _COMMANDS = 5  # for each life
 _ROWS_OF = (
@@ -65,7 +61,7 @@ class _Toll:
 def measure_kills(bench: Bench) -> Iterable[Line]:
     tolls = [_Toll(1, 0.008), _Toll(3, 0.0005, True), _Toll(3, 0.008, True), _Toll(4, 0.0)]
     for number, toll in enumerate(tolls):
-        kills = bench.kills if bench.kills and toll.served else bench.count(_KILLS)
+        kills = bench.kills if bench.kills and toll.served else bench.count(60)
         place = bench.place(f"{number}")
         with _serving(place / DATABASE_NAME, toll.served):
             for life in range(-(-kills // toll.robots)):
@@ -73,13 +69,9 @@ def measure_kills(bench: Bench) -> Iterable[Line]:
                 _kill_bridges(place, toll, random.Random(life))
         _inspect(place, toll)
         yield toll.line()
-    bench.say("JSON files")
-    files = _Toll(1, 0.0)
-    _kill_files(bench.place("files"), files, bench.count(_KILLS))
     damaged, twice = sum(toll.damaged for toll in tolls), sum(toll.twice for toll in tolls)
-    torn = f"JSON files torn: {files.damaged} of {files.kills}"
     kills = f"{sum(toll.kills for toll in tolls)} kills"
-    yield Line("databases damaged, or out of order", kills, torn, damaged, "files", Target(0))
+    yield Line("databases damaged, or out of order", kills, "", damaged, "files", Target(0))
     ran = f"{sum(toll.ran for toll in tolls)} ran"
     yield Line("commands run twice", ran, f"{_COMMANDS} for each life", twice, "twice", Target(0))
 
@@ -99,7 +91,7 @@ def _serving(database: Path, served: bool) -> Generator[None]:
 
 def _kill_bridges(folder: Path, toll: _Toll, lives: random.Random) -> None:
     """One life of each robot: they end at different moments, the others record meanwhile."""
-    victims = [_start("bridge", folder, f"rover {n}", toll) for n in range(toll.robots)]
+    victims = [_start(folder, f"rover {n}", toll) for n in range(toll.robots)]
     first = [_first_line(victim) for victim in victims]
     _send_commands(folder / DATABASE_NAME, toll.robots)
     for victim in lives.sample(victims, len(victims)):
@@ -140,21 +132,6 @@ def _inspect(folder: Path, toll: _Toll) -> None:
     toll.twice += sum(count > 1 for count in runs.values())
 
 
-def _kill_files(folder: Path, toll: _Toll, kills: int) -> None:
-    lives = random.Random(0)
-    for _ in range(kills):
-        victim = _start("files", folder, "rover", toll)
-        _first_line(victim)
-        time.sleep(lives.uniform(0, _LONGEST_LIFE_S))
-        victim.kill()
-        _rest(victim)
-        toll.kills += 1
-        try:
-            json.loads((folder / "status.json").read_text())
-        except ValueError:
-            toll.damaged += 1
-
-
 def _send_commands(database: Path, robots: int) -> None:
     with closing(connect(database, "writer")) as connection:
         queue = CommandQueue(connection)
@@ -165,9 +142,8 @@ def _send_commands(database: Path, robots: int) -> None:
                 queue.enqueue(found[0], "tally")
 
 
-def _start(way: str, folder: Path, name: str, toll: _Toll) -> subprocess.Popen[str]:
-    module = "tests.benchmarks.programs.victim"
-    line = [sys.executable, "-m", module, way, str(folder), name, str(toll.pause_s)]
+def _start(folder: Path, name: str, toll: _Toll) -> subprocess.Popen[str]:
+    line = program_line("victim", folder, name, toll.pause_s)
     return subprocess.Popen(line, stdout=subprocess.PIPE, text=True, env=environment())
 
 
@@ -180,3 +156,29 @@ def _rest(victim: subprocess.Popen[str]) -> list[str]:
     """What it had still told; a last line that was cut off is left out."""
     text, _ = victim.communicate()
     return [line for line in text.splitlines(keepends=True) if line.endswith("\n")]
+
+
+@benchmark("interrupts", "controllers interrupted (Ctrl-C) inside the bridge")
+def measure_interrupts(bench: Bench) -> Iterable[Line]:
+    template = make_template(bench.folder)
+    found = places(bench.folder / "look", instructions=True)
+    wanted = min(bench.count(2000), len(found))
+    chosen = random.Random(1).sample(found, wanted)
+    outcomes: list[Outcome] = []
+    for number, at in enumerate(chosen):
+        bench.say(f"{number} of {wanted}")
+        interrupter = Interrupter(instructions=True, at=at, template=template)
+        outcomes.append(drive(bench.folder / f"{number}", interrupter))
+    reached = [outcome for outcome in outcomes if outcome.interrupted]
+    for name, what in (
+        ("missing", "rows missing"),
+        ("doubled", "rows written twice"),
+        ("blocked", "other writers locked out"),
+        ("held", "recorder held, or in a transaction"),
+    ):
+        count = sum(int(getattr(outcome, name)) for outcome in reached)
+        ours = f"{len(reached):,} interrupts"
+        yield Line(what, ours, f"{len(found):,} places", count, "times", Target(0))
+
+
+BENCHMARKS = (measure_kills, measure_interrupts)

@@ -1,0 +1,277 @@
+"""What the bridge costs a controller's loop, between steps in which the controller waits.
+
+A call in a row of equal calls costs less: all that it needs lies in the processor's caches.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack, closing
+from functools import partial
+from pathlib import Path
+from statistics import fmean, median
+from typing import Any
+
+from tests.benchmarks.core import (
+    Bench,
+    Line,
+    Samples,
+    Target,
+    added,
+    alternate,
+    benchmark,
+    compared,
+    duration,
+    processor_s,
+    ratio,
+)
+from tests.benchmarks.ways import (
+    BridgeWay,
+    JsonFiles,
+    RawSqlite,
+    Rover,
+    State,
+    Way,
+    encoder,
+    make_states,
+)
+from webots_mcp import MCPBridge
+from webots_mcp.bridge.frames import scale_down
+from webots_mcp.bridge.picture_files import encode_png
+from webots_mcp.conditions import parse_condition
+from webots_mcp.contract import KEEP_LAST_S
+from webots_mcp.standin import InProcessSupervisor
+
+_NEVER = 1_000_000_000  # is a call recorded
+_STEPS = 125  # in a block: about a second
+_SENSORS = ("ds_left", "ds_right", "gps", "inertial unit", "lidar")
+_CONDITIONS = {
+    "a threshold": "battery_j < 0.1",
+    "for half a second": "distance.ds1 < 0.1 for 0.5",
+    "arithmetic in a chain": "0 < abs(gyro[0] - 1) < step",
+    "a changed text": "changed(mode)",
+    "a rate": "rate(battery_j) < -1",
+    "a signal that is missing": "absent.front < 1",
+    "displacement": "displacement(3) < 0.05",
+    "three in one": "mode == 'drive' and (displacement(3) < 0.05 for 2)",
+}
+
+Call = Callable[[State], object]
+
+
+def _between_steps(bench: Bench, calls: Mapping[str, Call]) -> dict[str, Samples]:
+    """Seconds of each call, in blocks of steps of 8 ms in which the process sleeps."""
+    steps, states = min(_STEPS, bench.count(5 * _STEPS, least=5)), make_states()
+
+    def block(call: Call) -> list[float]:
+        robot, durations = Rover(), list[float]()
+        for i in range(steps):
+            robot.pace()
+            started_s = time.perf_counter()
+            call(states[i % len(states)])
+            durations.append(time.perf_counter() - started_s)
+        return durations
+
+    bench.say(", ".join(calls))
+    blocks = {name: partial(block, call) for name, call in calls.items()}
+    return {name: Samples(found) for name, found in alternate(blocks, bench.count(12)).items()}
+
+
+@benchmark("loop", "publish() and get_command() in every step of a real 8 ms loop")
+def measure_loop(bench: Bench) -> Iterable[Line]:
+    with encoder(orjson=False) as name:
+        yield from _ways(bench, name)
+    with encoder(orjson=True) as name:
+        yield from _ways(bench, name)
+
+
+def _ways(bench: Bench, encoding: str) -> Iterable[Line]:
+    with ExitStack() as stack:
+        robot, place = Rover(), bench.place(encoding)
+        ways: dict[str, Way] = {
+            "bridge": stack.enter_context(closing(BridgeWay(robot, place))),
+            "files": JsonFiles(place),
+            "raw": stack.enter_context(closing(RawSqlite(place))),
+        }
+        taken = _between_steps(bench, {name: _both(robot, way) for name, way in ways.items()})
+    ours, files, raw = taken["bridge"], taken["files"], taken["raw"]
+    step = f"publish and get_command, {encoding}"
+    yield compared(f"{step}, p50", ours.p50, "raw sqlite3", raw.p50, ratio(ours, raw), 2)
+    yield compared(f"{step}, p50", ours.p50, "JSON files", files.p50, ratio(ours, files), 0.35)
+    mean = ratio(ours, files, fmean)
+    yield compared(f"{step}, mean", ours.mean, "JSON files", files.mean, mean)
+    rare = ours.p999 / files.p999
+    yield compared(f"{step}, p99.9", ours.p999, "JSON files", files.p999, rare)
+
+
+def _both(robot: Rover, way: Way) -> Call:
+    def step(state: State) -> None:
+        robot.step(8)
+        way.publish(state)
+        way.get_command()
+
+    return step
+
+
+@benchmark("throttled", "publish(), a call that is not recorded, of 39 values, in an 8 ms loop")
+def measure_throttled(bench: Bench) -> Iterable[Line]:
+    robot, places = Rover(), [bench.place(name) for name in ("dropped", "held")]
+    with ExitStack() as stack:
+        dropped, held = (
+            stack.enter_context(closing(BridgeWay(robot, place, every=_NEVER, keep_last_s=last_s)))
+            for place, last_s in zip(places, (0, KEEP_LAST_S), strict=True)
+        )
+
+        def call(publish: Call) -> Call:
+            return lambda state: (robot.step(8), publish(state))
+
+        calls = {"none": call(lambda _: None), "dropped": dropped.publish, "held": held.publish}
+        taken = _between_steps(bench, {name: call(publish) for name, publish in calls.items()})
+    none = taken["none"].p50
+    yield added("p50, held nowhere", taken["dropped"].p50, "the empty call", none, "us", 2)
+    more = taken["dropped"].p50
+    yield added("p50, the ring buffer", taken["held"].p50, "held nowhere", more, "us", 5)
+
+
+@benchmark("attach", "a step of an attached robot of ten devices, one of five recorded")
+def measure_attach(bench: Bench) -> Iterable[Line]:
+    steps = bench.count(500, least=20)
+    with ExitStack() as stack:
+        robots = {name: _equipped() for name in ("attached", "plain")}
+        stack.enter_context(closing(MCPBridge.attach(robots["attached"], data_dir=bench.folder)))
+
+        def block(robot: Any) -> list[float]:
+            return [processor_s(lambda: [robot.step(16) for _ in range(steps)]) / steps]
+
+        blocks = {name: partial(block, robot) for name, robot in robots.items()}
+        taken = {name: Samples(found) for name, found in alternate(blocks, bench.count(12)).items()}
+    plain = taken["plain"].p50
+    yield added("mean, processor time", taken["attached"].p50, "no bridge", plain, "us", 40)
+
+
+def _equipped() -> InProcessSupervisor:
+    """A rover with its five sensors enabled, each of them by two names."""
+    robot = InProcessSupervisor("rover")
+    for name in _SENSORS:
+        device = robot.getDevice(name)
+        device.enable(16)
+        robot.devices[f"{name} 2"] = device
+    return robot
+
+
+@benchmark("fast", "steps per second kept in fast mode, one of five steps recorded")
+def measure_fast_mode(bench: Bench) -> Iterable[Line]:
+    states = make_states()
+    for step_us in (100, 500, 2000):
+        steps = bench.count(200_000 // step_us, least=10)
+        with closing(BridgeWay(Rover(), bench.place(f"{step_us} us"), every=5)) as way:
+
+            def block(call: Call | None, *, step_us: int = step_us, steps: int = steps) -> float:
+                started_s = time.perf_counter()
+                for i in range(steps):
+                    until_s = time.perf_counter() + step_us / 1e6
+                    while time.perf_counter() < until_s:  # as a simulator that computes
+                        pass
+                    if call is not None:
+                        call(states[i % len(states)])
+                return steps / (time.perf_counter() - started_s)
+
+            blocks = {"ours": partial(block, _both(Rover(), way)), "none": partial(block, None)}
+            taken = alternate(blocks, bench.count(20, least=2))
+        ours, none = Samples.of(taken["ours"]), Samples.of(taken["none"])
+        beside = f"no bridge {none.p50:.0f}/s"
+        yield Line(f"{step_us} us a step", f"{ours.p50:.0f}/s", beside, ratio(ours, none))
+
+
+@benchmark("frames", "publish(), what small camera frames (keep_camera) add to a call")
+def measure_frames(bench: Bench) -> Iterable[Line]:
+    """Processor time, with steps of 8 ms: one call in 25 takes a frame."""
+    for width, height in ((160, 120), (640, 480)):
+        camera, calls = _Camera(width, height), bench.count(1000, least=10)
+        blocks = {
+            name: _filming(bench.place(f"{name} {width}"), of, calls)
+            for name, of in (("camera", camera), ("none", None))
+        }
+        taken = {
+            name: median(found)
+            for name, found in alternate(blocks, bench.count(30, least=2)).items()
+        }
+        what = f"mean, {width} x {height}"
+        yield added(what, taken["camera"], "without camera", taken["none"], "us", 15)
+        yield _writing(*scale_down(camera.getImage(), width, height), bench.count(50))
+
+
+def _writing(width: int, height: int, bgra: bytes, pictures: int) -> Line:
+    taken_s = processor_s(lambda: [encode_png(bgra, width, height) for _ in range(pictures)])
+    return added("mean, a frame as PNG, when kept", taken_s / pictures, "", 0, "ms")
+
+
+class _Camera:
+    """Copies its image with each call, as that of Webots does; noise, which packs worst."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self._width, self._height = width, height
+        self._image = os.urandom(4 * width * height)
+
+    def getName(self) -> str:
+        return "camera"
+
+    def getSamplingPeriod(self) -> int:
+        return 8
+
+    def getWidth(self) -> int:
+        return self._width
+
+    def getHeight(self) -> int:
+        return self._height
+
+    def getImage(self) -> bytes:
+        return bytes(bytearray(self._image))
+
+
+def _filming(folder: Path, camera: _Camera | None, calls: int) -> Callable[[], float]:
+    robot, state = Rover(), make_states(1)[0]
+    bridge = MCPBridge(robot, data_dir=folder, throttle_interval=_NEVER)
+    if camera is not None:
+        bridge.keep_camera(camera)
+    return lambda: (
+        processor_s(lambda: [(robot.step(8), bridge.publish(state)) for _ in range(calls)]) / calls
+    )
+
+
+@benchmark("conditions", "a condition, evaluated with each published state (processor time)")
+def measure_conditions(bench: Bench) -> Iterable[Line]:
+    """Each kind by itself, and 32 at once as a robot may have."""
+    calls = bench.count(2000, least=100)
+    contenders = {name: _evaluating([text], calls) for name, text in _CONDITIONS.items()}
+    contenders["32 of these kinds"] = _evaluating(list(_CONDITIONS.values()) * 4, calls)
+    for name, blocks in alternate(contenders, bench.count(15, least=2)).items():
+        count = 32 if name.startswith("32") else 1
+        cost_s = median(blocks) / calls / count
+        target = None if name == "three in one" else Target(2)
+        yield Line(name, duration(cost_s), "each", 1e6 * cost_s, "us", target)
+
+
+def _evaluating(texts: list[str], calls: int) -> Callable[[], float]:
+    """Seconds of the processor for so many states."""
+    states = make_states()
+
+    def evaluate() -> None:
+        evaluators = [parse_condition(text).evaluator() for text in texts]
+        for i in range(calls):
+            for evaluator in evaluators:
+                evaluator.holds(states[i % len(states)], i * 0.008)
+
+    return partial(processor_s, evaluate)
+
+
+BENCHMARKS = (
+    measure_loop,
+    measure_throttled,
+    measure_attach,
+    measure_fast_mode,
+    measure_frames,
+    measure_conditions,
+)

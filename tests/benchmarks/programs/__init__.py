@@ -1,1 +1,0 @@
-"""What has to run in a process of its own."""

@@ -18,6 +18,7 @@ from webots_mcp.cli import names
 from webots_mcp.connection import OLDEST_SQLITE, SCHEMA_FILE
 from webots_mcp.contract import BUILT_IN_ACTIONS, KEEP_AFTER_S
 from webots_mcp.questions.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS
+from webots_mcp.questions.declaring import MAX_WAIT_S
 from webots_mcp.server import create_server
 from webots_mcp.store.detection.events import kind_names
 

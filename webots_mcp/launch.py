@@ -19,9 +19,10 @@ from webots_mcp.contract import (
     require_world_of,
 )
 from webots_mcp.errors import InvalidInputError, NoDatabaseError
-from webots_mcp.setup.webots_project import controllers_in, has_bridge
+from webots_mcp.setup import controllers_in, has_bridge
 from webots_mcp.store.logs import ConsoleRows
 from webots_mcp.store.recording import Recording
+from webots_mcp.webots.orders import WebotsAddress, WebotsLine, address_of
 from webots_mcp.webots.starting import LaunchedWebots, Show, Start
 
 _SHOWN_LINES: Final = 3

@@ -27,7 +27,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple, TypeAlias
 
 from webots_mcp.bridge.mcp_bridge import MCPBridge
-from webots_mcp.bridge.scene_tree import MOST_NODES, SceneNode, read_value, walk
+from webots_mcp.bridge.scene import MOST_NODES, SceneNode, read_value, walk
 from webots_mcp.contract import LOOK_AT, MODE_EVENT, OBSERVER, WORLD_EVENT
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.naming import SEEN_SPEED, SOLIDS, WORLD
@@ -114,16 +114,16 @@ class ObserverBridge(MCPBridge):
 
     def record_world(self, world: dict[str, object]) -> None:
         """Record what there is: an event, as it changes seldom."""
-        self._session.context.journal.event(WORLD_EVENT, world)
+        self._session.journal.event(WORLD_EVENT, world)
 
     def count_steps_by_time(self) -> None:
         """Count steps by time, since the world advances between two rounds of this loop."""
-        self._session.context.clock.step_s = self._session.context.simulation.basic_time_step_s
+        self._session.clock.step_s = self._session.simulation.basic_time_step_s
 
     def record_mode(self) -> None:
         """Record in which mode the simulation is seen to be: an event."""
-        mode = self._session.context.simulation.mode_name
-        self._session.context.journal.event(MODE_EVENT, {"mode": mode})
+        mode = self._session.simulation.mode_name
+        self._session.journal.event(MODE_EVENT, {"mode": mode})
 
     def failed(self, error: Exception) -> None:
         """Count what could not be seen, and say it once on stderr."""

@@ -41,8 +41,8 @@ from mcp.types import (
 from pydantic import Field, ValidationError
 
 from webots_mcp import __version__
-from webots_mcp.connection import connect
-from webots_mcp.console.console_follower import ConsoleWatch
+from webots_mcp.connection import connect, create_schema
+from webots_mcp.console import ConsoleWatch
 from webots_mcp.contract import Database, MemoryDatabase
 from webots_mcp.errors import NoDatabaseError, WebotsMCPError, warn
 from webots_mcp.liveness import reap_if_dead
@@ -61,15 +61,13 @@ from webots_mcp.questions.declaring import (
     listed,
     shown_value,
 )
-from webots_mcp.schema import create_schema
 from webots_mcp.steering.routes import Companions, Launcher
 from webots_mcp.steering.trial_worker import TrialWorkers
-from webots_mcp.store.chunks.making import make_chunks
-from webots_mcp.store.chunks.on_demand import make_missing_chunks
-from webots_mcp.store.questions.schema_text import describe_schema
+from webots_mcp.store.chunk_making import make_chunks, make_missing_chunks
+from webots_mcp.store.purge import Upkeep
+from webots_mcp.store.questions.sql import describe_schema
 from webots_mcp.store.recording import OpenReaders, Recording
-from webots_mcp.store.retention.limits import Asked, ask_where_unset
-from webots_mcp.store.retention.upkeep import Upkeep
+from webots_mcp.store.retention import Asked, ask_where_unset
 
 INSTRUCTIONS: Final = (
     "A flight recorder and remote control for Webots robot simulations. Begin with "

@@ -43,20 +43,19 @@ from webots_mcp.standin import (
 from webots_mcp.standin.controllers import Controller
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 from webots_mcp.store.analysis.summary import LARGEST
-from webots_mcp.store.detection.event import Event as FoundEvent
-from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.events import find_events
+from webots_mcp.store.detection.kinds import Event as FoundEvent
+from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.export_rows import Source
 from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines
 from webots_mcp.store.parameters import parameters_of
-from webots_mcp.store.questions.events import find_events
-from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.catalogue import resolve_signals, signals_of_frame
 from webots_mcp.store.reading.frame import Frame, read_frame
-from webots_mcp.store.reading.ranges import Scope, find_range, whole_run
-from webots_mcp.store.reading.subject import Subject, find_subject
+from webots_mcp.store.reading.ranges import Scope, find_range, find_subject, whole_run
+from webots_mcp.store.reading.segment import Deadline, Subject
 from webots_mcp.store.robots import resolve_robot
 from webots_mcp.store.run_rows import Event, State, newest_events, runs_of
-from webots_mcp.store.signals.catalogue import resolve_signals, signals_of_frame
-from webots_mcp.store.signals.registry import cleaned, registered
+from webots_mcp.store.signals import cleaned, registered
 
 if TYPE_CHECKING:
     from controller.wire import Message
@@ -383,7 +382,7 @@ class RobotRecording:
         Args:
             kinds: `standstill`, `stuck`, `jump`, `oscillation`, `missing`, `gap`, ...; none for all
                 but pictures.
-            options: More fields of `webots_mcp.store.detection.event.EventOptions`.
+            options: More fields of `webots_mcp.store.detection.kinds.EventOptions`.
 
         Raises:
             InvalidInputError: There is no such kind.

@@ -27,18 +27,14 @@ from tests.benchmarks.history import record
 from tests.benchmarks.ways import make_states
 from tests.postgres import NoServerError, Server, running_server
 from webots_mcp.connection import connect as connect_recording
+from webots_mcp.connection import create_schema
 from webots_mcp.contract import DATABASE_NAME, new_uuid
-from webots_mcp.plugins.pool.engines import open_pool, open_target
 from webots_mcp.plugins.pool.fetching import fetch
-from webots_mcp.plugins.pool.pool_contents import Choice, meant
-from webots_mcp.plugins.pool.postgres.connecting import Connection, connect
-from webots_mcp.plugins.pool.postgres.postgres_schema import prepare
-from webots_mcp.plugins.pool.postgres.postgres_writing import PostgresShipment
-from webots_mcp.plugins.pool.report import Report
-from webots_mcp.plugins.pool.row_batch import Batch, batches
-from webots_mcp.plugins.pool.shipped_tables import table
-from webots_mcp.plugins.pool.shipping import Order, ship
-from webots_mcp.schema import create_schema
+from webots_mcp.plugins.pool.pool_contents import Choice, meant, open_pool, open_target
+from webots_mcp.plugins.pool.pool_interface import Batch, batches, table
+from webots_mcp.plugins.pool.postgres_pool import PostgresShipment
+from webots_mcp.plugins.pool.postgres_schema import Connection, connect, prepare
+from webots_mcp.plugins.pool.shipping import Order, Report, ship
 from webots_mcp.store.recording import Recording
 
 _RESOLUTION_S: Final = 0.01  # of a process's times

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -212,7 +211,7 @@ def test_contact_points_and_balance_are_told_where_webots_tells_them(
         return floor
 
     crate, floor = watching.observer.world.bodies["CRATE"], watching.robot.getFromDef("FLOOR")
-    crate.scene = replace(crate.scene, node=Touching(crate.scene.node))
+    crate.scene = crate.scene._replace(node=Touching(crate.scene.node))
     monkeypatch.setattr(watching.robot, "getFromId", find_floor)
     told = watching.observer.look_at({"params": {"of": "CRATE"}})
     assert told["contacts"] == [[0.1, 0.2, 0.0, "FLOOR"]]

@@ -35,7 +35,7 @@ from webots_mcp.plotting.signal_axes import paint_signals
 from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plotting.trajectory_axes import paint_trajectory
-from webots_mcp.questions.argument_types import RunIds
+from webots_mcp.questions.declaring import RunIds
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading.ranges import Scope, find_range
 
@@ -386,10 +386,10 @@ def test_a_picture_of_what_was_not_read_whole_says_so_and_marks_no_end(
     (track,) = way.tracks
     cut = replace(way, tracks=[replace(track, path=replace(track.path, is_whole=False))])
     unread = replace(signals, unread=[Interval("", 60, 120)])
-    named = [
-        {text for text, _ in texts_of(paint(plot, 900, 500)[0])}
-        for paint, plot in ((paint_signals, signals), (paint_signals, unread),
-                            (paint_trajectory, way), (paint_trajectory, cut))
+    shown: list[tuple[Any, Any]] = [
+        (paint_signals, signals), (paint_signals, unread), (paint_trajectory, way),
+        (paint_trajectory, cut),
     ]  # fmt: skip
+    named = [{text for text, _ in texts_of(paint(plot, 900, 500)[0])} for paint, plot in shown]
     assert ["not all was read" in each for each in named] == [False, True, False, False]
     assert ["end" in each for each in named] == [False, False, True, False]

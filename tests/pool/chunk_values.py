@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 
 from webots_mcp.plugins.pool.pool_interface import Row, table
-from webots_mcp.store.chunks.codec import Encoded, decode
-from webots_mcp.store.chunks.statistics import Statistics
-from webots_mcp.store.chunks.stored import SIM_TIMES
+from webots_mcp.store.chunks import SIM_TIMES, Encoded, Statistics, decode
 
 NAMES = table("chunk").columns
 

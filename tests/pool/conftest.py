@@ -21,8 +21,7 @@ from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.plugins.pool.pool_contents import open_pool, open_target
 from webots_mcp.plugins.pool.shipping import Order, Report, ship
-from webots_mcp.schema import create_schema
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.recording import Recording
 
 

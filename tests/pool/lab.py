@@ -15,7 +15,7 @@ from webots_mcp.plugins.pool.fetching import Fetched, fetch
 from webots_mcp.plugins.pool.pool_contents import Choice, meant
 from webots_mcp.plugins.pool.pool_interface import Pool, Target
 from webots_mcp.plugins.pool.shipping import Order, Report, ship
-from webots_mcp.schema import create_schema
+from webots_mcp.store.parameters import Result, create_trial_set, finish_trial, trials_of
 from webots_mcp.store.recording import Recording
 
 

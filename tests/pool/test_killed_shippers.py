@@ -24,7 +24,7 @@ from webots_mcp.connection import connect
 from webots_mcp.plugins.pool.pool_contents import open_pool, open_target
 from webots_mcp.plugins.pool.pool_interface import Row, Table, tables
 from webots_mcp.plugins.pool.shipping import Order, Report, follow, ship
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.recording import Recording
 
 KILLS = {"postgresql": 20, "parquet": 8}

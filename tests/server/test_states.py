@@ -12,7 +12,7 @@ from tests.server.conftest import DATA_TOOLS, Connect, ask, fail
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.questions.budget import tokens_of
 from webots_mcp.questions.robot_state import unnamed_devices
-from webots_mcp.store.chunks.making import chunk_whole_run
+from webots_mcp.store.chunk_making import chunk_whole_run
 
 pytestmark = pytest.mark.anyio
 TOKENS = 2_000

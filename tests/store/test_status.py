@@ -264,7 +264,7 @@ def test_where_the_database_takes_no_rows_it_says_in_which_file_they_wait_and_si
 ) -> None:
     file = tmp_path / "webots.db"
     with MCPBridge(InProcessSupervisor("rover"), database=file, throttle_interval=1) as bridge:
-        writer = bridge._session.context.recorder.session.connection  # pyright: ignore[reportPrivateUsage]
+        writer = bridge._session.recorder.connection  # pyright: ignore[reportPrivateUsage]
         assert writer is not None
         (pages,) = writer.execute("PRAGMA page_count").fetchone()
         writer.execute(f"PRAGMA max_page_count={pages}")

@@ -16,8 +16,8 @@ from tests.trials.conftest import Run, command, rows, wait_for_trial
 from webots_mcp.questions.run_trials import set_facts
 from webots_mcp.steering.trial_plan import Range, Search, TrialPlan
 from webots_mcp.steering.trial_run import next_parameters
+from webots_mcp.store.parameters import Trial
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.trials import Trial
 
 Write = Callable[[str], Path]
 PARAMETERS = "SELECT parameters FROM trial ORDER BY number"

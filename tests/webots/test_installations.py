@@ -8,7 +8,7 @@ import pytest
 
 from webots_mcp import webots as module
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.trials.trial_run import webots
+from webots_mcp.steering.trial_run import webots
 from webots_mcp.webots import find_webots, installations
 
 LAYOUTS = {

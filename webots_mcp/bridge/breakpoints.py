@@ -18,8 +18,7 @@ from webots_mcp.errors import (
     InvalidConditionError,
     InvalidInputError,
 )
-from webots_mcp.pauses import Cause
-from webots_mcp.stored_breakpoints import ARMED, OF_CONTROLLER, SET
+from webots_mcp.pauses import ARMED, OF_CONTROLLER, SET, Cause
 
 if TYPE_CHECKING:
     from webots_mcp.bridge.session import Session

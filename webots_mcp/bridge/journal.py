@@ -14,13 +14,21 @@ from webots_mcp.bridge.error_report import cut, storable
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.simulation import Clock
 from webots_mcp.contract import HEARTBEAT_INTERVAL_S
-from webots_mcp.entries import Kind as EntryKind
-from webots_mcp.entries import Values
 from webots_mcp.liveness import LoopStatus
 from webots_mcp.naming import flatten
 from webots_mcp.pauses import PAUSED
-from webots_mcp.signal_kinds import Kind, ends_pose, kind_of, places, widen
-from webots_mcp.signal_register import ADDED_AT_ONCE, MAX_SIGNALS, Seen
+from webots_mcp.signal_register import (
+    ADDED_AT_ONCE,
+    MAX_SIGNALS,
+    Kind,
+    Seen,
+    ends_pose,
+    kind_of,
+    places,
+    widen,
+)
+from webots_mcp.waiting_file import Kind as EntryKind
+from webots_mcp.waiting_file import Values
 
 MOST_LOG_CHARACTERS: Final = 10_000
 _MOST_LOGGER_CHARACTERS: Final = 200

@@ -38,9 +38,22 @@ from webots_mcp.bridge.registration import (
     register,
 )
 from webots_mcp.bridge.simulation import Clock, Run
-from webots_mcp.connection import connect, identify_files, journal_mode
+from webots_mcp.connection import (
+    FAILURES,
+    connect,
+    create_schema,
+    identify_files,
+    in_transaction,
+    is_busy,
+    is_damage,
+    journal_mode,
+    never_wait,
+    require_current,
+    roll_back,
+    schema_version,
+    text_of,
+)
 from webots_mcp.contract import DATABASE_NAME, Database, new_uuid
-from webots_mcp.entries import STATEMENTS, Kind, Values, bind
 from webots_mcp.errors import (
     ForeignDatabaseError,
     ForkedProcessError,
@@ -49,18 +62,18 @@ from webots_mcp.errors import (
     SessionGoneError,
 )
 from webots_mcp.liveness import LoopStatus, RecordingStatus, write_heartbeat
-from webots_mcp.schema import create_schema, require_current, schema_version
 from webots_mcp.signal_register import Seen, find_changes, write_changes
-from webots_mcp.transactions import (
-    FAILURES,
-    in_transaction,
-    is_busy,
-    is_damage,
-    never_wait,
-    roll_back,
-    text_of,
+from webots_mcp.waiting_file import (
+    STATEMENTS,
+    Kind,
+    Values,
+    WaitingFile,
+    adopt,
+    bind,
+    is_unfit,
+    take_in,
+    waiting_path,
 )
-from webots_mcp.waiting_file import WaitingFile, adopt, is_unfit, take_in, waiting_path
 
 _LOCK_PATIENCE_S: Final = 0.001  # how long to wait for another thread of this process
 _WRITER_PATIENCE_S: Final = 0.001  # and for another writer, whose commit takes 50 us

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from webots_mcp import liveness
+from webots_mcp.connection import transaction
 from webots_mcp.contract import host_name
 from webots_mcp.liveness import process_identity
 from webots_mcp.pauses import PAUSED

@@ -41,6 +41,8 @@ from webots_mcp.cli.terminal import (
 from webots_mcp.contract import whole_file
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins import export_formats
+from webots_mcp.store.merging import write_bundle
+from webots_mcp.store.purge import Purged
 
 if TYPE_CHECKING:
     import sqlite3

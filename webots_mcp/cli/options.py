@@ -19,9 +19,15 @@ from cyclopts import Token
 from cyclopts.validators import Number
 
 from webots_mcp.errors import InvalidInputError, MalformedRowError, WebotsMCPError
-from webots_mcp.store.retention.limits import Asked
-from webots_mcp.store.retention.notation import NO_LIMIT, limit_text, option_of, parse_limit
-from webots_mcp.store.retention.policy import DEFAULT, Limit
+from webots_mcp.store.retention import (
+    DEFAULT,
+    NO_LIMIT,
+    Asked,
+    Limit,
+    limit_text,
+    option_of,
+    parse_limit,
+)
 
 if TYPE_CHECKING:
     import sqlite3
@@ -283,7 +289,7 @@ def past_wrong_values(run: Callable[[], None]) -> None:
 
 def past_invalid_rows(run: Callable[[], None]) -> None:
     """Run what only reads past invalid rows, which are named on stderr."""
-    from webots_mcp.store import invalid_rows
+    from webots_mcp.store import recording as invalid_rows
 
     with invalid_rows.past_invalid_rows() as invalid:
         run()
@@ -294,7 +300,7 @@ def past_invalid_rows(run: Callable[[], None]) -> None:
 def make_chunks_first(recording: Recording) -> None:
     """Put into chunks what no server has, so that a question of any length is answered."""
     from webots_mcp.cli.terminal import shown_progress
-    from webots_mcp.store.chunks.on_demand import make_missing_chunks
+    from webots_mcp.store.chunk_making import make_missing_chunks
 
     with shown_progress("making chunks of what was recorded") as progress:
         left = make_missing_chunks(recording, progress, limit_s=_MAKING_CHUNKS_S)

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from webots_mcp.contract import Database
     from webots_mcp.launch import Launch, SessionStart
     from webots_mcp.store.recording import Recording
-    from webots_mcp.store.retention.limits import Asked
-    from webots_mcp.webots.stream import WebotsLine
+    from webots_mcp.store.retention import Asked
+    from webots_mcp.webots.orders import WebotsLine
 
 _AS_BEFORE: Final = Limits()
 _URL: Final = "WEBOTS_CONTROLLER_URL"
@@ -391,7 +391,7 @@ class _Recorder(ExitStack):
 
     def begin(self) -> None:
         """Unless it has begun, or Webots does not listen yet."""
-        from webots_mcp.console.console_follower import follow_console
+        from webots_mcp.console import follow_console
 
         instance = None if self._begun else self._launched.webots.instance
         if instance is not None:

@@ -36,9 +36,9 @@ if TYPE_CHECKING:
     from webots_mcp.questions.declaring import Question
     from webots_mcp.steering.trial_plan import WorldPlan
     from webots_mcp.steering.trial_run import Simulators
-    from webots_mcp.store.analysis.ranking import Ranking
+    from webots_mcp.store.analysis.spread import Ranking
+    from webots_mcp.store.parameters import Result, Trial
     from webots_mcp.store.recording import Recording
-    from webots_mcp.store.trials import Result, Trial
 
 _ROBOT: Final = ToRobot()
 _WAITING: Final = Waiting()
@@ -376,7 +376,7 @@ def _picture_of(file: Path | None) -> Callable[[Recording, int], None] | None:
 
 def _set_of(recording: Recording, plan: WorldPlan, options: _Options) -> int:
     """The set that was begun with this plan, or a new one."""
-    from webots_mcp.store.trials import create_trial_set, find_trial_set
+    from webots_mcp.store.parameters import create_trial_set, find_trial_set
 
     text = _text_of(plan, options)
     with recording.writer() as connection:
@@ -390,7 +390,7 @@ def _begun_set(recording: Recording, file: Path, plan: WorldPlan, options: _Opti
     Raises:
         NothingRecordedError: There is none.
     """
-    from webots_mcp.store.trials import find_trial_set
+    from webots_mcp.store.parameters import find_trial_set
 
     with recording.reader() as connection:
         known = find_trial_set(connection, _text_of(plan, options))
@@ -408,7 +408,7 @@ class _Progress:
     """A line on stderr for each trial that is over, and for each set that takes the lead."""
 
     def __init__(self, recording: Recording, set_id: int, plan: WorldPlan) -> None:
-        from webots_mcp.store.trials import trials_of
+        from webots_mcp.store.parameters import trials_of
 
         with recording.reader() as connection:
             known = trials_of(connection, set_id)
@@ -432,7 +432,7 @@ class _Progress:
             self._ranked_s = time.monotonic()
 
     def _tell_leader(self) -> None:
-        from webots_mcp.store.trials import ranking_of, trials_of
+        from webots_mcp.store.parameters import ranking_of, trials_of
 
         with self._recording.reader() as connection:
             first = ranking_of(trials_of(connection, self._set_id), self._plan.best).sets[0]
@@ -443,8 +443,8 @@ class _Progress:
 
 
 def _show_trials(recording: Recording, set_id: int, plan: WorldPlan, *, as_json: bool) -> None:
-    from webots_mcp.store.questions.score import unseen
-    from webots_mcp.store.trials import ranking_of, trials_of
+    from webots_mcp.store.parameters import ranking_of, trials_of
+    from webots_mcp.store.questions.outcomes import unseen
 
     with recording.reader() as connection:
         found = trials_of(connection, set_id)

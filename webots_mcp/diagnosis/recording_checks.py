@@ -13,12 +13,19 @@ from contextlib import closing
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from webots_mcp.connection import OLDEST_SQLITE, FrozenConnection, connect, is_there, journal_mode
+from webots_mcp.connection import (
+    OLDEST_SQLITE,
+    FrozenConnection,
+    connect,
+    is_there,
+    journal_mode,
+    require_current,
+    schema_version,
+)
 from webots_mcp.contract import DATA_DIR_VARIABLE, HEARTBEAT_LATE_S, SCHEMA_VERSION
 from webots_mcp.diagnosis import Examined, Finding, ago, check, last_seen_s, worst
 from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
 from webots_mcp.requirements import install_line, missing_requirements, package_of
-from webots_mcp.schema import require_current, schema_version
 from webots_mcp.store.recording import GETTING_STARTED, View, name_of
 from webots_mcp.store.robots import Session, fetch_session, handler_at_work, rows_waiting
 from webots_mcp.waiting_file import count_rows, waiting_paths

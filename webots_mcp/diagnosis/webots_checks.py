@@ -33,8 +33,7 @@ from webots_mcp.setup.client_entries import (
     words_of,
 )
 from webots_mcp.store.recording import View
-from webots_mcp.store.sessions import Session, companions
-from webots_mcp.store.status import SILENT
+from webots_mcp.store.robots import SILENT, Session, companions
 from webots_mcp.webots import Installation, find_webots, installations
 from webots_mcp.webots.orders import address_of
 

@@ -10,12 +10,10 @@ from typing import Final
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plotting.canvas import short
 from webots_mcp.plotting.intervals import Interval, Lane
-from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.detection.events import Events, drawn_kinds, find_events
+from webots_mcp.store.detection.kinds import Event, EventOptions, Verdicts
 from webots_mcp.store.detection.motion import find_motion
-from webots_mcp.store.detection.registry import drawn_kinds
-from webots_mcp.store.detection.verdict import Verdicts
 from webots_mcp.store.parameters import differing, parameters_of
-from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.questions.series import MOST_POINTS, History, RunHistory, query_history
 from webots_mcp.store.reading.catalogue import one_signal, signals_of
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds

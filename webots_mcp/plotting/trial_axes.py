@@ -34,7 +34,7 @@ from webots_mcp.plotting.legend import (
 from webots_mcp.plotting.palette import INK, LINES, scaled
 from webots_mcp.plotting.signal_axes import line_through
 from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.analysis.ranking import Ranked
+from webots_mcp.store.analysis.spread import Ranked
 
 _MOST_TOLD_CELLS: Final = 60  # more texts in a grid would not fit
 _DARK: Final = 0.5  # of the colour scale: on darker cells texts are white

@@ -12,7 +12,7 @@ from webots_mcp.naming import listed, nearest_first
 from webots_mcp.plotting.canvas import Picture, Sheet
 from webots_mcp.plotting.trial_axes import TrialAxes, paint_trials
 from webots_mcp.store.analysis.spread import Outcome, rank
-from webots_mcp.store.trials import Trial, best_of, fetch_trial_set, trials_of
+from webots_mcp.store.parameters import Trial, best_of, fetch_trial_set, trials_of
 
 
 def plot_trials(

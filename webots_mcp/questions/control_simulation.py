@@ -35,10 +35,10 @@ from webots_mcp.questions.declaring import (
 from webots_mcp.questions.pictures import load_picture
 from webots_mcp.steering.dispatch import ACTION, Dispatcher, find_target, require_possible
 from webots_mcp.steering.routes import Attempt, WorldRequest, project_of
-from webots_mcp.store.images import camera_frames, inside
 from webots_mcp.store.recording import Recording, look
+from webots_mcp.store.run_rows import camera_frames, inside
+from webots_mcp.webots.orders import Order
 from webots_mcp.webots.starting import Mode, Start, free_port
-from webots_mcp.webots.stream import Order
 
 Port = Annotated[
     Annotated[int, Field(ge=1, le=65535)] | None,

@@ -53,7 +53,6 @@ from webots_mcp.errors import (
 from webots_mcp.naming import same_in_meaning
 from webots_mcp.questions.answers import Answer, ShownPicture
 from webots_mcp.questions.budget import Client, compact_json, reader
-from webots_mcp.store.invalid_rows import past_invalid_rows
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.recording import Recording, past_invalid_rows
 

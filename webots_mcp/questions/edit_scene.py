@@ -24,8 +24,7 @@ from webots_mcp.questions.declaring import (
 )
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.recording import Recording, look
-from webots_mcp.store.robots import list_robots
-from webots_mcp.store.status import find_holder
+from webots_mcp.store.robots import find_holder, list_robots
 
 Path = Annotated[
     str,

@@ -33,11 +33,17 @@ from webots_mcp.questions.declaring import (
     merged,
     question,
 )
-from webots_mcp.store.detection.event import Event, EventOptions, Threshold, both_of
-from webots_mcp.store.detection.registry import KINDS, kind_names, stored_kinds
-from webots_mcp.store.detection.threshold import thresholds_on
-from webots_mcp.store.detection.verdict import Verdicts
-from webots_mcp.store.questions.events import Events, Found, search_events, timeline
+from webots_mcp.store.detection.condition import thresholds_on
+from webots_mcp.store.detection.events import (
+    KINDS,
+    Events,
+    Found,
+    kind_names,
+    search_events,
+    stored_kinds,
+    timeline,
+)
+from webots_mcp.store.detection.kinds import Event, EventOptions, Threshold, Verdicts, both_of
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import Recording, View
 

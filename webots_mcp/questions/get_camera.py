@@ -24,7 +24,6 @@ from webots_mcp.questions.declaring import (
 )
 from webots_mcp.questions.pictures import load_picture, load_sheet
 from webots_mcp.steering.dispatch import Dispatcher
-from webots_mcp.store.images import StoredImage, camera_frames, cameras, inside
 from webots_mcp.store.reading.segment import just_after, kept_stretches
 from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.run_rows import StoredImage, camera_frames, cameras, inside

@@ -56,15 +56,15 @@ from webots_mcp.store.questions.series import (
     DEFAULT_POINTS,
     ChangeColumns,
     NumberColumns,
+    Page,
     RunHistory,
     query_history,
+    query_rows,
 )
-from webots_mcp.store.questions.trend import Trend
-from webots_mcp.store.questions.trends import RunTrends, StateTrend, trends
-from webots_mcp.store.reading.pages import Page, query_rows
+from webots_mcp.store.questions.trends import RunTrends, StateTrend, Trend, trends
+from webots_mcp.store.reading.catalogue import SignalInfo, list_signals, signals_of
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import Recording, View
-from webots_mcp.store.signals.catalogue import SignalInfo, list_signals, signals_of
 
 SIGNAL_COLUMNS: Final = ("signal", "kind", "unit", "last", "min", "max", "missing")
 

@@ -27,18 +27,16 @@ from webots_mcp.questions.budget import (
 from webots_mcp.questions.declaring import MAX_WAIT_S, READS, Caller, RobotName, question
 from webots_mcp.questions.events import fitting_events, not_shown_of, verdicts_of
 from webots_mcp.questions.history import MOST_SIGNALS, trend_tables
-from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.detection.events import asked_kinds, search_events
+from webots_mcp.store.detection.kinds import Event, EventOptions, Verdicts
 from webots_mcp.store.detection.motion import doubt_of_length, doubt_of_unit, motion_in
-from webots_mcp.store.detection.registry import asked_kinds
-from webots_mcp.store.detection.verdict import Verdicts
-from webots_mcp.store.questions.events import search_events
 from webots_mcp.store.questions.outcomes import Way, way_in
 from webots_mcp.store.questions.trends import RunTrends, trends
-from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
+from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range, row_before
+from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.recording import Recording, View
-from webots_mcp.store.signals.catalogue import known_signals
 
 USUAL_DURATION_S: Final = 10.0
 _REPORT_INTERVAL_S: Final = 1.0

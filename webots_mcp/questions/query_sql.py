@@ -25,9 +25,17 @@ from webots_mcp.questions.budget import (
     tokens_of,
 )
 from webots_mcp.questions.declaring import READS, ShownLimit, question
-from webots_mcp.store.questions.sql import Cell, Result, require_select
-from webots_mcp.store.questions.sql_process import FOLDER, LINE, Statement, as_file, decode
-from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
+from webots_mcp.store.questions.sql import (
+    FOLDER,
+    LINE,
+    Cell,
+    Result,
+    Statement,
+    as_file,
+    decode,
+    require_select,
+)
+from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
 from webots_mcp.store.recording import Recording
 
 DEFAULT_ROWS: Final = 100

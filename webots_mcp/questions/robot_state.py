@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final, cast
 
 from pydantic import Field
 
-from webots_mcp.diagnosis.doctor import Checked, diagnose, subject_of, worst
+from webots_mcp.diagnosis import Checked, diagnose, subject_of, worst
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.liveness import dead_sessions
 from webots_mcp.questions.answers import (
@@ -42,11 +42,19 @@ from webots_mcp.questions.budget import (
     tokens_of,
 )
 from webots_mcp.questions.declaring import READS, RobotName, RunId, question
-from webots_mcp.store.reading.kept import newest_kept
+from webots_mcp.store.reading.segment import newest_kept
 from webots_mcp.store.recording import GETTING_STARTED, Recording, View, name_of, storage, view_of
-from webots_mcp.store.retention.limits import described, unheeded
-from webots_mcp.store.retention.usage import file_sizes
-from webots_mcp.store.robots import WorldSeen, list_robots, world_seen
+from webots_mcp.store.retention import described, unheeded
+from webots_mcp.store.retention_plan import file_sizes
+from webots_mcp.store.robots import (
+    Session,
+    WorldSeen,
+    companions,
+    fetch_session,
+    list_robots,
+    rows_waiting,
+    world_seen,
+)
 from webots_mcp.store.run_rows import (
     Run,
     State,
@@ -55,8 +63,6 @@ from webots_mcp.store.run_rows import (
     real_time_factor,
     select,
 )
-from webots_mcp.store.sessions import Session, companions, fetch_session
-from webots_mcp.store.status import rows_waiting
 
 # -- which robots there are, and in which world --
 

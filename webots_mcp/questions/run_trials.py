@@ -49,21 +49,15 @@ from webots_mcp.steering.trial_plan import (
     stored_world_plan,
 )
 from webots_mcp.steering.trial_worker import TrialWorkers
-from webots_mcp.store.analysis.ranking import Best, Ranked, Ranking
-from webots_mcp.store.parameters import Declared, declared_for
-from webots_mcp.store.questions.outcomes import way_of_run
-from webots_mcp.store.questions.score import require_kinds, unseen
-from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.snapshot import in_one_snapshot
-from webots_mcp.store.reading.subject import Subject
-from webots_mcp.store.recording import Recording, View, look
-from webots_mcp.store.robots import robot_name
-from webots_mcp.store.trials import (
+from webots_mcp.store.analysis.spread import Best, Ranked, Ranking
+from webots_mcp.store.parameters import (
+    Declared,
     Trial,
     TrialSet,
     best_of,
     count_planned,
     create_trial_set,
+    declared_for,
     fetch_trial_set,
     find_trial_set,
     is_at_work,
@@ -72,6 +66,10 @@ from webots_mcp.store.trials import (
     stop_trial_set,
     trials_of,
 )
+from webots_mcp.store.questions.outcomes import require_kinds, unseen, way_of_run
+from webots_mcp.store.reading.segment import Deadline, Subject, in_one_snapshot
+from webots_mcp.store.recording import Recording, View, look
+from webots_mcp.store.robots import robot_name
 
 _WAIT_S: Final = 60.0
 _TRIAL_S: Final = 300.0

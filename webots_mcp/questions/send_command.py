@@ -10,7 +10,7 @@ from typing import Annotated, Any, Final, Literal
 from anyio import to_thread
 from pydantic import Field
 
-from webots_mcp import stored_breakpoints as stored
+from webots_mcp import pauses as stored
 from webots_mcp.conditions import Condition, parse_condition
 from webots_mcp.contract import BUILT_IN_ACTIONS, BreakpointAction, CommandStatus
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
@@ -56,9 +56,9 @@ from webots_mcp.questions.declaring import (
 from webots_mcp.queue import Command, list_commands
 from webots_mcp.steering.dispatch import Dispatcher, Report, find_target, holds_since, shown_result
 from webots_mcp.store.parameters import COLUMNS, Declared, declared_by, described
-from webots_mcp.store.reading.subject import Subject
+from webots_mcp.store.reading.catalogue import catalogue
+from webots_mcp.store.reading.segment import Subject
 from webots_mcp.store.recording import Recording, View
-from webots_mcp.store.signals.catalogue import catalogue
 
 # -- breakpoints: stored for the robot, and read again by its controller --
 

@@ -49,18 +49,25 @@ from webots_mcp.questions.events import fitting_events, not_shown_of
 from webots_mcp.questions.history import MOST_SIGNALS, trend_tables
 from webots_mcp.questions.monitor import movement
 from webots_mcp.queue import Command, CommandQueue, fetch_command
-from webots_mcp.store.detection.event import Event
-from webots_mcp.store.questions.events import search_events
+from webots_mcp.store.detection.events import search_events
+from webots_mcp.store.detection.kinds import Event
 from webots_mcp.store.questions.runs import pace
 from webots_mcp.store.questions.trends import trends
+from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, whole_run
-from webots_mcp.store.reading.subject import Subject
+from webots_mcp.store.reading.segment import Subject
 from webots_mcp.store.recording import Recording, View, look
-from webots_mcp.store.robots import list_robots, robot_name, without_observers
+from webots_mcp.store.robots import (
+    Session,
+    companions,
+    fetch_session,
+    find_holder,
+    handler_at_work,
+    list_robots,
+    robot_name,
+    without_observers,
+)
 from webots_mcp.store.run_rows import State, state_at
-from webots_mcp.store.sessions import Session, companions, fetch_session
-from webots_mcp.store.signals.catalogue import known_signals
-from webots_mcp.store.status import find_holder, handler_at_work
 
 Report = Callable[[float, float | None, str], Awaitable[None]]
 

@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple
 import anyio
 from anyio import to_thread
 
-from webots_mcp.console.ownership import belongs
+from webots_mcp.console import belongs
 from webots_mcp.contract import (
     DATA_DIR_VARIABLE,
     DATABASE_NAME,
@@ -37,10 +37,8 @@ from webots_mcp.steering.dispatch import Dispatcher, find_target
 from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.robots import Session, find_holder, list_robots, live_observer
-from webots_mcp.webots.instances import Instance, instance_at, instances
-from webots_mcp.webots.key_presses import KEYS, press
-from webots_mcp.webots.starting import Start
-from webots_mcp.webots.stream import (
+from webots_mcp.webots import Instance, instance_at, instances
+from webots_mcp.webots.orders import (
     ANSWER_S,
     KEYS,
     RESTARTING,
@@ -51,8 +49,10 @@ from webots_mcp.webots.stream import (
     address_of,
     give_order,
     load_world,
+    press,
     why_not_obeyed,
 )
+from webots_mcp.webots.starting import Start
 
 CLAIMING_S: Final = HEARTBEAT_LATE_S + 0.5  # a loop that has just stopped is detected within it
 UNCLAIMED: Final = ("cancelled", "expired")

@@ -47,14 +47,10 @@ from webots_mcp.errors import (
 )
 from webots_mcp.requirements import explain_extra
 from webots_mcp.steering.trial_plan import Range, TrialPlan, WorldPlan
-from webots_mcp.store.jobs import Job
+from webots_mcp.store.chunks import parse
 from webots_mcp.store.logs import LogFilter, Window, newest_lines
 from webots_mcp.store.merging import merge, settled
-from webots_mcp.store.questions.runs import run_info
-from webots_mcp.store.questions.score import score_run
-from webots_mcp.store.recording import Recording
-from webots_mcp.store.signals.flatten import parse
-from webots_mcp.store.trials import (
+from webots_mcp.store.parameters import (
     Result,
     Trial,
     add_trial,
@@ -67,6 +63,9 @@ from webots_mcp.store.trials import (
     take_up,
     trials_of,
 )
+from webots_mcp.store.questions.outcomes import score_run
+from webots_mcp.store.questions.runs import run_info
+from webots_mcp.store.recording import Job, Recording
 from webots_mcp.webots.starting import CommandLine, KeptProgram, Start, any_port, end_left_over
 
 if TYPE_CHECKING:

@@ -20,12 +20,7 @@ from webots_mcp.plugins import cluster_offered, load
 from webots_mcp.queue import Command, CommandQueue, fetch_command, find_command
 from webots_mcp.steering.dispatch import ACTION, find_target
 from webots_mcp.steering.trial_plan import TrialPlan, WorldPlan, stored_plan
-from webots_mcp.store.jobs import Job
-from webots_mcp.store.parameters import described, parameters_of
-from webots_mcp.store.questions.outcomes import score_run
-from webots_mcp.store.recording import Recording, View
-from webots_mcp.store.robots import robot_name
-from webots_mcp.store.trials import (
+from webots_mcp.store.parameters import (
     Result,
     Trial,
     TrialSet,
@@ -42,6 +37,9 @@ from webots_mcp.store.trials import (
     take_up,
     trials_of,
 )
+from webots_mcp.store.questions.outcomes import score_run
+from webots_mcp.store.recording import Job, Recording, View
+from webots_mcp.store.robots import robot_name
 
 _LOOK_EVERY_S: Final = 0.02
 # Long enough that simulation time visibly goes back at the next reset, by which it is detected.

@@ -25,6 +25,7 @@ from webots_mcp.store.chunks import (
     ABSENT,
     EXACT_INTEGERS,
     IS_MARK,
+    MAX_TEXT,
     SIM_TIMES,
     STATE_COLUMNS,
     STATE_IDS,
@@ -41,8 +42,7 @@ from webots_mcp.store.chunks import (
 )
 from webots_mcp.store.recording import Recording, is_over_a_value, valid_rows
 from webots_mcp.store.robots import list_robots
-from webots_mcp.store.signals.flatten import MAX_TEXT
-from webots_mcp.store.signals.registry import Signal, enter_signals, registered, seen_in, tell_more
+from webots_mcp.store.signals import Signal, enter_signals, registered, seen_in, tell_more
 
 GROUP_ROWS: Final = 1024
 LEAST_AT_END: Final = 256  # fewer rows, with which a run ended, are read as they are

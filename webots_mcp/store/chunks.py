@@ -24,10 +24,11 @@ from typing import Any, Final, NamedTuple, TypeAlias, cast
 from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.errors import DatabaseError
-from webots_mcp.naming import Value, flatten
+from webots_mcp.naming import LONGEST_SPREAD_ARRAY, REDUCTIONS, Value, flatten
 from webots_mcp.store.analysis.arrays import Array, Indexes, inner, np
-from webots_mcp.store.signals.flatten import MAX_TEXT, is_replaced, parse, replaced_names
 
+MAX_TEXT: Final = 200  # characters of a text value that are kept and compared
+ANY_ITEM: Final = "*"
 IS_NUMBER: Final = 0  # codes
 IS_ABSENT: Final = 1
 FIRST_LABEL: Final = 2  # and those above: the place of a label, counted from it on
@@ -655,3 +656,43 @@ def _new_file() -> Path:
 def _key(database: Path) -> tuple[int, int]:
     status = database.stat()
     return status.st_dev, status.st_ino
+
+
+def parse(text: str) -> dict[str, Any]:
+    """A state row's JSON text; empty where it is no JSON object (rows of foreign origin)."""
+    try:
+        state = json.loads(text)
+    except (ValueError, RecursionError):
+        return {}
+    return cast("dict[str, Any]", state) if isinstance(state, dict) else {}
+
+
+def shown(value: Value) -> str | None:
+    """A value of a text or boolean signal as change points have it."""
+    if value is None or isinstance(value, str):
+        return value[:MAX_TEXT] if value else value
+    return json.dumps(value)
+
+
+def replaced_names(replaced: str | None) -> dict[str, str]:
+    """What was replaced (nan, inf, ...) by signal: by its own name, or by an item of its array.
+
+    Of an array in which all nulls are of one kind it is named for every item, and under `name.*`.
+    """
+    if replaced is None:
+        return {}
+    reasons: dict[str, str] = {}
+    for path, reason in cast("dict[str, str]", parse(replaced)).items():
+        array, _, item = path.rpartition(".")
+        if item == ANY_ITEM:
+            reasons.update((f"{array}.{index}", reason) for index in range(LONGEST_SPREAD_ARRAY))
+        if item == ANY_ITEM or item.isdecimal():
+            reasons.update((f"{array}.{reduction}", reason) for reduction in REDUCTIONS)
+        reasons[path] = reason
+    return reasons
+
+
+def is_replaced(reasons: dict[str, str], name: str, value: Value) -> bool:
+    """Whether a value is what the reasons of its row are about: of `name.*` only the nulls are."""
+    array, _, item = name.rpartition(".")
+    return not item.isdecimal() or value is None or f"{array}.{ANY_ITEM}" not in reasons

@@ -30,16 +30,16 @@ from webots_mcp.store.chunks import (
     Group,
     Replaced,
     groups_in,
+    parse,
     signals_in,
     values_in,
 )
 from webots_mcp.store.reading.frame import deleted_part
 from webots_mcp.store.reading.frame_source import Unread
-from webots_mcp.store.reading.kept import kept_parts
 from webots_mcp.store.reading.ranges import Segment
+from webots_mcp.store.reading.segment import kept_parts
 from webots_mcp.store.run_rows import put_back
-from webots_mcp.store.signals.flatten import parse
-from webots_mcp.store.signals.registry import Signal, registered
+from webots_mcp.store.signals import Signal, registered
 
 _PURGED: Final = (
     "SELECT id, row_count - stored_row_count, lost_value_count FROM row_group WHERE run_id = ? "

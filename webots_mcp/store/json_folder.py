@@ -39,7 +39,7 @@ from webots_mcp.contract import (
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.chunks import StateColumns
 from webots_mcp.store.run_rows import opened
-from webots_mcp.store.signals.registry import enter_signals, seen_in
+from webots_mcp.store.signals import enter_signals, seen_in
 
 __all__ = ["Imported", "import_folder", "read_folder"]
 

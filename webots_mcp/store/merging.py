@@ -53,7 +53,7 @@ from webots_mcp.store.export_rows import Progress
 from webots_mcp.store.parameters import fetch_trial_set, is_at_work
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.run_rows import MAX_FILE_BYTES, PICTURES, inside
-from webots_mcp.store.signals.registry import enter_signals
+from webots_mcp.store.signals import enter_signals
 from webots_mcp.waiting_file import adopt
 
 _SESSIONS: Final = (

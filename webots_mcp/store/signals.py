@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
-import json
 import sqlite3
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final
 
-from webots_mcp.naming import LONGEST_SPREAD_ARRAY, REDUCTIONS, Value, find_mode
-from webots_mcp.signal_kinds import Kind, Place, ends_pose, kind_of, places, turn_of, unit_of, widen
-from webots_mcp.signal_register import MOST_CHOICES, Seen, find_changes, write_changes
-from webots_mcp.signal_roles import decide_roles
-from webots_mcp.store.chunks.codec import ABSENT, MAX_TEXT, Absent, Replaced
+from webots_mcp.naming import Value, find_mode
+from webots_mcp.signal_register import (
+    MOST_CHOICES,
+    Kind,
+    Place,
+    Seen,
+    decide_roles,
+    ends_pose,
+    find_changes,
+    kind_of,
+    places,
+    turn_of,
+    unit_of,
+    widen,
+    write_changes,
+)
+from webots_mcp.store.chunks import ABSENT, Absent, Replaced, parse, shown
 
 if TYPE_CHECKING:
-    from webots_mcp.store.chunks.columns import StateColumns
+    from webots_mcp.store.chunks import StateColumns
 
 _OF_ROBOT: Final = (
     "SELECT id, robot_id, name, kind, unit, path, reduction, role FROM signal "
@@ -185,46 +196,3 @@ def cleaned(signal: Signal, values: Sequence[Any]) -> list[Value]:
 
 
 # -- a state row's JSON text, and how values of it are reduced and shown ---------------------------
-
-
-ANY_ITEM: Final = "*"
-
-
-def parse(text: str) -> dict[str, Any]:
-    """A state row's JSON text; empty where it is no JSON object (rows of foreign origin)."""
-    try:
-        state = json.loads(text)
-    except (ValueError, RecursionError):
-        return {}
-    return cast("dict[str, Any]", state) if isinstance(state, dict) else {}
-
-
-def shown(value: Value) -> str | None:
-    """A value of a text or boolean signal as change points have it."""
-    if value is None or isinstance(value, str):
-        return value[:MAX_TEXT] if value else value
-    return json.dumps(value)
-
-
-def replaced_names(replaced: str | None) -> dict[str, str]:
-    """What was replaced (nan, inf, ...) by signal: by its own name, or by an item of its array.
-
-    Of an array in which all nulls are of one kind it is named for every item, and under `name.*`.
-    """
-    if replaced is None:
-        return {}
-    reasons: dict[str, str] = {}
-    for path, reason in cast("dict[str, str]", parse(replaced)).items():
-        array, _, item = path.rpartition(".")
-        if item == ANY_ITEM:
-            reasons.update((f"{array}.{index}", reason) for index in range(LONGEST_SPREAD_ARRAY))
-        if item == ANY_ITEM or item.isdecimal():
-            reasons.update((f"{array}.{reduction}", reason) for reduction in REDUCTIONS)
-        reasons[path] = reason
-    return reasons
-
-
-def is_replaced(reasons: dict[str, str], name: str, value: Value) -> bool:
-    """Whether a value is what the reasons of its row are about: of `name.*` only the nulls are."""
-    array, _, item = name.rpartition(".")
-    return not item.isdecimal() or value is None or f"{array}.{ANY_ITEM}" not in reasons

@@ -15,7 +15,7 @@ from tests.recordings.rows import Recorded
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.plugins.pool.parquet_pool import ParquetTarget
 from webots_mcp.plugins.pool.shipping import Order, Report, ship
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.recording import Recording
 
 RECORDINGS: Final = 50

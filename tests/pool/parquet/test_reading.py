@@ -22,8 +22,8 @@ from webots_mcp.plugins.pool.parquet_files import Storage
 from webots_mcp.plugins.pool.parquet_pool import ParquetPool
 from webots_mcp.plugins.pool.pool_contents import pooled_runs, pooled_trial_sets
 from webots_mcp.plugins.pool.pool_interface import table
-from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.detection.events import find_events
+from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.questions.runs import list_runs
 from webots_mcp.store.questions.sql import FOLDER
 from webots_mcp.store.questions.trends import trends

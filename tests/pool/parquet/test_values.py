@@ -18,7 +18,7 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.pool.parquet_pool import ParquetPool, ParquetTarget
 from webots_mcp.plugins.pool.pool_interface import Batch, table
 from webots_mcp.plugins.pool.shipping import Order, Report, ship
-from webots_mcp.store.chunks.making import chunk_whole_run
+from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.recording import Recording
 
 STATES: list[tuple[dict[str, Any], dict[str, str] | None]] = [

@@ -46,7 +46,7 @@ from webots_mcp.plugins.pool import parquet_pool
 from webots_mcp.plugins.pool.parquet_files import LEASE_S
 from webots_mcp.plugins.pool.parquet_pool import PART_BYTES, ParquetPool, ParquetTarget
 from webots_mcp.plugins.pool.pool_interface import Batch, Row, SQLValue, table, tables
-from webots_mcp.store.chunks.making import chunk_whole_run
+from webots_mcp.store.chunk_making import chunk_whole_run
 
 DAY_S = 86_400.0
 MIDNIGHT_S = 19_700 * DAY_S

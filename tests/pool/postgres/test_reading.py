@@ -20,7 +20,7 @@ from webots_mcp.plugins.pool import postgres_pool as reading
 from webots_mcp.plugins.pool.pool_contents import pooled_runs, pooled_trial_sets
 from webots_mcp.plugins.pool.pool_interface import Table, table, tables
 from webots_mcp.plugins.pool.postgres_pool import PostgresPool
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 
 # What jsonb has not, or has otherwise; each comes back as it was, also where it is no JSON object.
 ODD_OBJECTS = ["", "no JSON", '{"a":', '{"a": "\\u0000"}', '"\\ud800"', "NaN", "[1, 2.50]", "-0.0"]

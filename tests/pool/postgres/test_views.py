@@ -27,7 +27,7 @@ from tests.store.test_views import (
 )
 from webots_mcp.connection import connect
 from webots_mcp.plugins.pool.postgres_schema import VIEWS
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 
 # Whole states, each other than those of `tests/store/test_views.py`.
 STATES: list[dict[str, Any]] = [

@@ -31,7 +31,7 @@ from webots_mcp.errors import PoolBusyError, PoolError, PoolUnavailableError
 from webots_mcp.plugins.pool import postgres_pool as writing
 from webots_mcp.plugins.pool.pool_interface import Batch, Row, table, tables
 from webots_mcp.plugins.pool.postgres_pool import PostgresShipment, PostgresTarget
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 
 SECRET = "quite-a-secret-7"
 OTHER = "00000000-0000-4000-8000-00000000000a"

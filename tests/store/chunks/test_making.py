@@ -14,7 +14,6 @@ from tests.recordings.rover import Recorder, start_run
 from webots_mcp.connection import connect, create_schema
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import GROUP_ROWS, chunk_whole_run, make_chunks
-from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import whole_run
 from webots_mcp.store.reading.segment import Deadline

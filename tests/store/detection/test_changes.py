@@ -8,7 +8,7 @@ import sqlite3
 import pytest
 
 from tests.recordings.rover import start_run
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.detection.events import Events, find_events
 from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.detection.motion import find_motion

@@ -13,7 +13,7 @@ import pytest
 
 from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.detection.events import find_events
 from webots_mcp.store.detection.kinds import Event, EventOptions, Threshold
 from webots_mcp.store.reading.ranges import Scope, find_range

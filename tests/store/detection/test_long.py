@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import Recorder, start_run
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.detection.events import asked_kinds, find_events
 from webots_mcp.store.detection.kinds import EventOptions, Ledger
 from webots_mcp.store.detection.search import Search, events_touching

@@ -11,8 +11,7 @@ import pytest
 
 import webots_mcp
 from tests.recordings.rover import Recorder
-from webots_mcp.plotting.event_lanes import event_lanes
-from webots_mcp.plotting.parts import parts_of
+from webots_mcp.plotting.parts import event_lanes, parts_of
 from webots_mcp.store.detection import events
 from webots_mcp.store.detection.events import find_events, timeline
 from webots_mcp.store.detection.kinds import Event, EventKind, EventOptions

@@ -13,7 +13,7 @@ import pytest
 
 from tests.recordings.rover import start_run
 from webots_mcp.errors import UnknownSignalError
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.detection.events import Events, find_events
 from webots_mcp.store.detection.kinds import Event, EventOptions
 from webots_mcp.store.questions.trends import trends

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp.errors import InvalidConditionError, InvalidInputError, UnknownSignalError
-from webots_mcp.store.chunks import making
-from webots_mcp.store.chunks.making import chunk_whole_run
+from webots_mcp.store import chunk_making
+from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.detection.events import Events, find_events
 from webots_mcp.store.detection.kinds import EventOptions, Threshold
 from webots_mcp.store.reading.ranges import Scope, find_range

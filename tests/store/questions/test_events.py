@@ -13,7 +13,7 @@ import pytest
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from tests.store.questions.asking import ask, spans
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.detection.events import asked_kinds, find_events
 from webots_mcp.store.detection.jump import find_jumps
 from webots_mcp.store.detection.kinds import Event, EventOptions, Ledger, Threshold

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import Recorder
-from webots_mcp.store.chunks.making import chunk_whole_run
+from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.questions.compare import Comparison, compare_runs
 from webots_mcp.store.questions.outcomes import Measure

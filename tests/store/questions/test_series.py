@@ -10,7 +10,7 @@ import pytest
 
 from tests.recordings.rover import start_run
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.questions.series import NumberColumns, query_history, query_rows
 from webots_mcp.store.reading.ranges import Scope, find_range
 

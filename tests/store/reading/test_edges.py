@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.detection.events import find_events, timeline
 from webots_mcp.store.detection.kinds import Event, EventOptions
 from webots_mcp.store.logs import window_of

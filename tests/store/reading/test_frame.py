@@ -14,12 +14,10 @@ from hypothesis import strategies as st
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
-from webots_mcp.connection import connect
-from webots_mcp.schema import create_schema
-from webots_mcp.store.chunks import making
-from webots_mcp.store.chunks.codec import decoded_of
-from webots_mcp.store.chunks.making import make_chunks
-from webots_mcp.store.chunks.statistics import statistics_of
+from webots_mcp.connection import connect, create_schema
+from webots_mcp.store import chunk_making
+from webots_mcp.store.chunk_making import make_chunks
+from webots_mcp.store.chunks import decoded_of, statistics_of
 from webots_mcp.store.reading.frame import Frame, Zones, read_frame
 from webots_mcp.store.reading.ranges import whole_run
 from webots_mcp.store.reading.segment import Deadline, Segment

@@ -18,9 +18,9 @@ from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.detection.events import EventOptions, find_events
-from webots_mcp.store.export.export_rows import Source
+from webots_mcp.store.export_rows import Source
 from webots_mcp.store.questions.series import query_history, query_rows
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.frame import read_frame

@@ -10,9 +10,10 @@ import pytest
 
 from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S, start_run
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.detection.events import Events, find_events
 from webots_mcp.store.detection.kinds import EventOptions
+from webots_mcp.store.purge import prune
 from webots_mcp.store.questions.compare import compare_runs
 from webots_mcp.store.questions.series import RunHistory, query_history
 from webots_mcp.store.questions.trends import trends

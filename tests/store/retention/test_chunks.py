@@ -18,12 +18,12 @@ from webots_mcp import signal_register
 from webots_mcp.connection import connect, create_schema
 from webots_mcp.store.chunk_making import GROUP_ROWS, make_chunks
 from webots_mcp.store.purge import prune
-from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.catalogue import list_signals
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import Segment, whole_run
+from webots_mcp.store.reading.segment import Deadline
 from webots_mcp.store.retention import Limit, Retention
 from webots_mcp.store.retention_plan import plan
-from webots_mcp.store.signals.catalogue import list_signals
 
 NO_STATES = Limit(rows=0, spared_rows=0)
 

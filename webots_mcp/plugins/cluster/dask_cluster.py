@@ -33,23 +33,21 @@ from webots_mcp.contract import DATABASE_NAME, host_name
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, LeaseLostError, WebotsMCPError
 from webots_mcp.plugins.pool.pool_contents import open_pool, open_target
 from webots_mcp.requirements import explain_extra
-from webots_mcp.store.merging import pack, unpack
-from webots_mcp.store.parameters import Result
-from webots_mcp.store.recording import Recording
-from webots_mcp.store.trials import Result, Trial
-from webots_mcp.trials.plan import WorldPlan
-from webots_mcp.trials.set_runner import SetRun, run_taken_up, taken_up
-from webots_mcp.trials.trial_run import (
+from webots_mcp.steering.trial_plan import WorldPlan
+from webots_mcp.steering.trial_run import (
     Command,
+    SetRun,
     StoppedError,
     TrialAttempt,
     run_attempt,
+    run_taken_up,
     stand_in,
+    taken_up,
     webots,
 )
-from webots_mcp.store.bundle import pack, unpack
+from webots_mcp.store.merging import pack, unpack
+from webots_mcp.store.parameters import Result, Trial
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.trials import Result
 
 RESOURCE: Final = "simulator"
 MOST_BYTES: Final = 100_000_000  # of a recording as it is returned, packed: it passes the scheduler

@@ -17,10 +17,8 @@ from collections.abc import AsyncGenerator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from webots_mcp.cli.recordings import Json
-from webots_mcp.cli.rendering import answer_lines, print_json
-from webots_mcp.cli.terminal import rewrite
-from webots_mcp.cli.values import Parameter
+from webots_mcp.cli.options import Json, Parameter
+from webots_mcp.cli.terminal import answer_lines, print_json, rewrite
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, full_path, whole_file
 from webots_mcp.errors import NothingRecordedError, WebotsMCPError

@@ -21,7 +21,7 @@ from webots_mcp.store.logs import LogLine
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import Segment
-from webots_mcp.store.run_rows import Event, columns_of
+from webots_mcp.store.run_rows import MAX_FILE_BYTES, Event, StoredImage, columns_of
 from webots_mcp.store.signals import Signal
 
 # What there is to count, in the order in which it is told.

@@ -24,15 +24,13 @@ from typing import Any, BinaryIO, Final, cast
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.formats.contents import KINDS, Contents, PlacedCommand, Pose, Way
 from webots_mcp.requirements import explain_extra
-from webots_mcp.store.export import Exported, placed
-from webots_mcp.store.export.export_rows import Progress, Recorded, value_at
-from webots_mcp.store.export.text_formats import json_text
-from webots_mcp.store.images import StoredImage
+from webots_mcp.store.chunks import parse
+from webots_mcp.store.export import Exported, json_text, placed
+from webots_mcp.store.export_rows import Progress, Recorded, value_at
 from webots_mcp.store.logs import LogLine
 from webots_mcp.store.reading.ranges import TimeRange
-from webots_mcp.store.run_rows import Event
-from webots_mcp.store.signals.flatten import parse
-from webots_mcp.store.signals.registry import Signal
+from webots_mcp.store.run_rows import Event, StoredImage
+from webots_mcp.store.signals import Signal
 
 WORLD_FRAME: Final = "world"
 _PROFILE: Final = ""  # of no middleware

@@ -34,7 +34,7 @@ from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 from webots_mcp.store.reading.segment import Deadline, Segment
 from webots_mcp.store.recording import Recording, View, view_of
 from webots_mcp.store.robots import list_robots, without_observers
-from webots_mcp.store.run_rows import Run, current_run, fetch_run
+from webots_mcp.store.run_rows import Run, StoredImage, current_run, fetch_run, newest_image
 from webots_mcp.store.signals import Signal
 
 Axes = TypeVar("Axes", SignalAxes, TrajectoryAxes)

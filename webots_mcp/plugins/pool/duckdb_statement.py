@@ -19,16 +19,19 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.pool.parquet_files import CHUNK, Storage, files_of, name_of, package
 from webots_mcp.plugins.pool.pool_interface import Table, tables
 from webots_mcp.store.questions.sql import (
+    FOLDER,
     MAX_BYTES,
     MAX_COLUMNS,
     MAX_TEXT,
     Budget,
     Cell,
     Result,
+    Statement,
+    decode,
     fetch_rows,
+    main,
     require_max_rows,
 )
-from webots_mcp.store.questions.sql_process import FOLDER, Statement, decode, main
 
 DEADLINE_S: Final = 60.0
 _MEMORY: Final = "2GB"

@@ -82,7 +82,7 @@ def schema_of(table: Table) -> Any:
         )
         for name, kind in zip(table.columns, table.types, strict=True)
     ]
-    about = {"webots_mcp.table": table.name, "webots_mcp.schema": str(SCHEMA_VERSION)}
+    about = {"webots_mcp.table": table.name, "webots_mcp.connection": str(SCHEMA_VERSION)}
     return arrow.schema(fields, metadata=about)
 
 

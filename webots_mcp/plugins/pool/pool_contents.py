@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Annotated, Final
 
-from webots_mcp.cli.values import Parameter
+from webots_mcp.cli.options import Parameter
 from webots_mcp.errors import InvalidInputError, PoolError
 from webots_mcp.naming import nearest_first
 from webots_mcp.plugins.pool.pool_interface import (
@@ -22,7 +22,7 @@ from webots_mcp.plugins.pool.pool_interface import (
     require_no_secret,
 )
 from webots_mcp.requirements import explain_extra
-from webots_mcp.store.reading.wall_time import parse_wall_time
+from webots_mcp.store.reading.ranges import parse_wall_time
 
 _MOST_OFFERED: Final = 3
 _OF_RUN: Final = (

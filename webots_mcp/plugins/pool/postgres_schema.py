@@ -20,11 +20,11 @@ import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql
 from sqlmodel import SQLModel
 
+from webots_mcp.connection import shipped_objects
 from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.errors import PoolError, PoolUnavailableError
 from webots_mcp.naming import METRES
 from webots_mcp.plugins.pool.pool_interface import Table, tables
-from webots_mcp.schema import shipped_objects
 from webots_mcp.store.models import STATISTICS
 
 OWNER: Final = "recording_uuid"

@@ -45,12 +45,12 @@ from webots_mcp.plugins.pool.pool_interface import (
     tables,
     whole_runs,
 )
-from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
-from webots_mcp.store.chunks.stored import reached
-from webots_mcp.store.images import MAX_FILE_BYTES, PICTURES, inside
+from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
+from webots_mcp.store.chunks import reached
 from webots_mcp.store.merging import settled
 from webots_mcp.store.recording import Recording, name_of
-from webots_mcp.store.retention.shipped import Shipped, read_shipped, write_shipped
+from webots_mcp.store.retention_plan import Shipped, read_shipped, write_shipped
+from webots_mcp.store.run_rows import MAX_FILE_BYTES, PICTURES, inside
 
 MOST_BATCHES: Final = 8  # of a table in a round, before the others get their turn
 _HANDOVER_S: Final = (0.02, 0.1, 0.3, 0.6)

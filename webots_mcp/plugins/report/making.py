@@ -18,8 +18,8 @@ from webots_mcp.plugins.report.comparison import Beside, beside
 from webots_mcp.plugins.report.figures import Figures, figures_of, library, moment_key
 from webots_mcp.plugins.report.run_pictures import Pictures, pictures_of
 from webots_mcp.plugins.report.words import clock, counted, size
-from webots_mcp.store.invalid_rows import left_out_so_far
 from webots_mcp.store.reading.segment import in_one_snapshot
+from webots_mcp.store.recording import left_out_so_far
 from webots_mcp.store.run_rows import fetch_run
 
 MAX_MB: Final = 10.0

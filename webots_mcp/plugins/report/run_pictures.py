@@ -13,7 +13,6 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plugins.report.words import time_at
 from webots_mcp.store.detection.events import search_events
 from webots_mcp.store.detection.kinds import Event, EventOptions
-from webots_mcp.store.images import inside, opened
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.run_rows import inside, opened
 

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.report.making import file_name, make_report, require_free, write_report
-from webots_mcp.questions.argument_types import AnyNames, RobotName, RunIds
+from webots_mcp.questions.answers import NotedAnswer
 from webots_mcp.questions.budget import notes_of
 from webots_mcp.questions.declaring import DESTROYS, AnyNames, RobotName, RunIds, question
 from webots_mcp.store.recording import Recording

@@ -14,6 +14,7 @@ from typing import Any, Final
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.liveness import dead_sessions
 from webots_mcp.naming import flatten
+from webots_mcp.store.chunks import parse
 from webots_mcp.store.detection import condition, jump, sensors, standstill, stored
 from webots_mcp.store.detection import condition as threshold
 from webots_mcp.store.detection import jump as oscillation
@@ -37,7 +38,7 @@ from webots_mcp.store.reading.segment import (
     in_one_snapshot,
     just_after,
 )
-from webots_mcp.store.signals import Signal, parse
+from webots_mcp.store.signals import Signal
 
 _ERRORS: Final = ("error", "critical")  # levels of log lines
 MOST_AROUND: Final = 6  # values that are reported with an event

@@ -13,12 +13,13 @@ from webots_mcp.signal_register import first_in, pair_in
 from webots_mcp.store.analysis.arrays import Array, Indexes, median, noise_of, np
 from webots_mcp.store.analysis.summary import LARGEST
 from webots_mcp.store.analysis.track import PathLength, Track, tracks_of
+from webots_mcp.store.chunks import shown
 from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.reading.catalogue import one_signal
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import recorded_bounds
 from webots_mcp.store.reading.segment import Deadline, Segment, just_after
-from webots_mcp.store.signals import Signal, roles_of, shown, stored_roles
+from webots_mcp.store.signals import Signal, roles_of, stored_roles
 
 TRUE_WITHIN: Final = 0.05  # a distance that may be short by less, or by less than so many metres,
 TRUE_WITHIN_M: Final = 0.1  # is reported without a doubt

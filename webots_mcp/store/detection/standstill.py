@@ -17,6 +17,7 @@ from webots_mcp.store.analysis.standstill import (
     shortest_seen_s,
 )
 from webots_mcp.store.analysis.track import Track, track_of
+from webots_mcp.store.chunks import shown
 from webots_mcp.store.detection.kinds import (
     Alike,
     Event,
@@ -34,7 +35,6 @@ from webots_mcp.store.detection.motion import (
 )
 from webots_mcp.store.detection.search import NO_TIME, Search
 from webots_mcp.store.reading.frame import Frame
-from webots_mcp.store.signals import shown
 
 # -- whether it should have moved: what shows it, and what speaks against it -----------------------
 #

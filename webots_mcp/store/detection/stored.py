@@ -19,7 +19,6 @@ from webots_mcp.store.detection.kinds import (
     but_for_numbers,
 )
 from webots_mcp.store.detection.search import Search
-from webots_mcp.store.images import count_kept_frames
 from webots_mcp.store.reading.frame_summary import (
     MOST_VALUES,
     Point,
@@ -29,6 +28,7 @@ from webots_mcp.store.reading.frame_summary import (
 )
 from webots_mcp.store.reading.ranges import frame_of_purged
 from webots_mcp.store.reading.segment import Segment, kept_stretches
+from webots_mcp.store.run_rows import count_kept_frames
 
 MOST_OF_A_KIND: Final = 2000  # newest rows of a table that are looked at, per run
 AROUND_S: Final = 10.0  # before and after: what changes all the time there, measures

@@ -17,18 +17,17 @@ from webots_mcp.store.analysis.spread import MIN_EFFECT_SD, Spread, spread_of, v
 from webots_mcp.store.analysis.summary import Summary
 from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.detection.motion import motion_in
-from webots_mcp.store.parameters import differing, parameters_of
+from webots_mcp.store.parameters import differing, parameters_of, scored_runs
 from webots_mcp.store.questions.outcomes import OUT_OF_TIME, Measure, RunPart, outcomes_of
 from webots_mcp.store.questions.runs import RunInfo, run_infos
 from webots_mcp.store.reading.catalogue import catalogue, resolve_signals
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.frame_summary import summary_of
-from webots_mcp.store.reading.ranges import Subject, whole_run
-from webots_mcp.store.reading.segment import Deadline, in_one_snapshot
+from webots_mcp.store.reading.ranges import whole_run
+from webots_mcp.store.reading.segment import Deadline, Subject, in_one_snapshot
 from webots_mcp.store.robots import resolve_robot
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.signals import Signal
-from webots_mcp.store.trials import scored_runs
 
 # -- how a signal differs between groups of runs ---------------------------------------------------
 

@@ -39,8 +39,8 @@ from webots_mcp.store.reading.catalogue import catalogue, known_signals
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.frame_source import Unread
 from webots_mcp.store.reading.frame_summary import change_points
-from webots_mcp.store.reading.ranges import Subject, TimeRange, unrecorded, whole_run
-from webots_mcp.store.reading.segment import Deadline, Segment, in_one_snapshot, kept_parts
+from webots_mcp.store.reading.ranges import TimeRange, unrecorded, whole_run
+from webots_mcp.store.reading.segment import Deadline, Segment, Subject, in_one_snapshot, kept_parts
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.signals import Signal
 

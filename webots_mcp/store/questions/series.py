@@ -15,6 +15,7 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.naming import Value, flatten, listed
 from webots_mcp.store.analysis.arrays import Array, Gap, np
 from webots_mcp.store.analysis.summary import LARGEST, Summary
+from webots_mcp.store.chunks import parse
 from webots_mcp.store.reading.catalogue import signals_of
 from webots_mcp.store.reading.frame import Frame, read_frame, read_kept
 from webots_mcp.store.reading.frame_summary import (
@@ -29,7 +30,7 @@ from webots_mcp.store.reading.frame_summary import (
 )
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline, Segment, in_one_snapshot
-from webots_mcp.store.signals import Signal, cleaned, parse
+from webots_mcp.store.signals import Signal, cleaned
 
 DEFAULT_POINTS: Final = 50
 MOST_POINTS: Final = 500

@@ -26,10 +26,9 @@ from pathlib import Path
 from typing import Final
 
 import webots_mcp
-from webots_mcp.connection import connect
+from webots_mcp.connection import connect, shipped_objects
 from webots_mcp.contract import DATABASE_NAME, Database
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
-from webots_mcp.schema import shipped_objects
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 
 MOST_ROWS: Final = 1000

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
 from webots_mcp.naming import words_of
+from webots_mcp.store import chunk_making
 from webots_mcp.store.analysis.arrays import Array, Indexes, np
 from webots_mcp.store.analysis.summary import (
     FLAT_BAND,
@@ -35,7 +36,6 @@ from webots_mcp.store.analysis.swings import (
     Swing,
     find_swings,
 )
-from webots_mcp.store.chunks import making
 from webots_mcp.store.questions.series import STATES_SHARE, signals_left
 from webots_mcp.store.reading import frame_summary
 from webots_mcp.store.reading.catalogue import signals_of

@@ -13,12 +13,17 @@ from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.naming import REDUCTIONS, Value, nearest_first
 from webots_mcp.signal_register import MAX_SIGNALS, Kind
 from webots_mcp.store.analysis.arrays import Indexes, np
-from webots_mcp.store.chunks.columns import STATE_COLUMNS, StateColumns
-from webots_mcp.store.chunks.stored import reached, signals_in
+from webots_mcp.store.chunks import STATE_COLUMNS, StateColumns, reached, signals_in
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.frame_source import has_few_new_rows, rows_in_no_chunk
-from webots_mcp.store.reading.ranges import Subject, TimeRange, find_subject
-from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline, Segment, in_one_snapshot
+from webots_mcp.store.reading.ranges import TimeRange, find_subject
+from webots_mcp.store.reading.segment import (
+    QUESTION_DEADLINE_S,
+    Deadline,
+    Segment,
+    Subject,
+    in_one_snapshot,
+)
 from webots_mcp.store.signals import Signal, cleaned, registered, seen_with
 
 SAMPLED_ROWS: Final = 200  # in no chunk yet, that are searched for new names and kinds

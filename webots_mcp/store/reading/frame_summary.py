@@ -29,9 +29,10 @@ from webots_mcp.store.analysis.summary import (
     summarise_numbers,
     with_extremes,
 )
+from webots_mcp.store.chunks import shown
 from webots_mcp.store.reading.frame import Frame, Unread, Zones, read_frame
 from webots_mcp.store.reading.segment import Deadline, Segment, just_after, kept_parts
-from webots_mcp.store.signals import Signal, shown
+from webots_mcp.store.signals import Signal
 
 FULL_ROWS: Final = 120_000  # of which every value is looked at; of more there are 100 chunks
 _SAMPLE_ROWS: Final = 2000

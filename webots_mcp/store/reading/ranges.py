@@ -28,20 +28,21 @@ from typing import Final, Literal
 
 from webots_mcp.errors import InvalidRangeError, NothingRecordedError
 from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.chunks.stored import WALL_TIMES
+from webots_mcp.store.chunks import WALL_TIMES
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.segment import (
     HAS_LOST_ROWS,
     Deadline,
     Segment,
+    Subject,
+    choose,
     is_at_full_rate,
     just_after,
     kept_notes,
     moment_of,
+    require_run,
     shown_time,
 )
-from webots_mcp.store.robots import Robot, resolve_robot, robot_name
-from webots_mcp.store.run_rows import Run, current_run, fetch_run
 
 _LAST_BEFORE: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s < ?"
 _FIRST_FROM: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s >= ?"
@@ -611,48 +612,6 @@ def _turning_point(
 
 
 # -- which robot and which run a question is about -------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Subject:
-    """A robot, and the run that is meant unless a question is about all of them."""
-
-    robot_id: int
-    robot: str
-    run_id: int
-
-
-def choose(
-    connection: sqlite3.Connection, robot: str | None, run_id: int | None, now_s: float
-) -> tuple[Robot, Run | None]:
-    """The run that was named, or the newest run of the robot that was named or is the only one.
-
-    Without a run the robot's controller has never recorded.
-
-    Raises:
-        UnknownRobotError, AmbiguousRobotError: As they say.
-        UnknownRunError: There is no such run, or it is another robot's.
-        NothingRecordedError: No robot has been recorded.
-    """
-    if robot is None and run_id is not None:
-        robot = robot_name(connection, fetch_run(connection, run_id).robot_id)
-    chosen = resolve_robot(connection, robot, now_s)
-    if run_id is not None:
-        return chosen, fetch_run(connection, run_id, chosen.id)
-    return chosen, current_run(connection, chosen.id)
-
-
-def require_run(robot: Robot, run: Run | None) -> Run:
-    """The run.
-
-    Raises:
-        NothingRecordedError: The robot's controller has begun none.
-    """
-    if run is None:
-        raise NothingRecordedError(
-            f"robot {robot.name!r} has no run yet: its controller never recorded"
-        )
-    return run
 
 
 def find_subject(

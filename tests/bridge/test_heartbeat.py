@@ -2,23 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 import pytest
 
 from tests.bridge.conftest import Recording, eager
 from webots_mcp import MCPBridge
-
-
-def age(bridge: MCPBridge) -> None:
-    """As if the simulation had stood still for a minute."""
-    bridge._session.clock.moved_s = time.monotonic() - 60  # pyright: ignore[reportPrivateUsage]
-
-
-def standing_for_s(recording: Recording) -> float:
-    (moved_s,) = recording.rows("SELECT moved_wall_time_s FROM session")
-    return time.time() - moved_s
 
 
 def test_a_handler_that_steps_by_itself_shows_its_robot_as_moving(

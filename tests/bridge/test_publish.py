@@ -201,13 +201,6 @@ class Sullen:
         raise MuteError
 
 
-class Unreadable(dict[str, int]):
-    def items(self) -> Any:
-        raise RuntimeError("no items")
-
-    __iter__ = keys = values = items
-
-
 BROKEN = (Broken(), Unconnected(), Picture(), Sullen(), 10**5000, Mode)
 
 

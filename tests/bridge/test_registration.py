@@ -14,8 +14,6 @@ from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 
-DAY_S = 86_400.0
-
 
 def change(recording: Recording, sql: str, *values: object) -> None:
     connection = connect(recording.database, "writer")

@@ -5,14 +5,13 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
 from PIL import Image
 
 from tests.bridge.conftest import STEP_MS, Recording, eager
-from webots_mcp import MCPBridge, MemoryDatabase
+from webots_mcp import MCPBridge
 from webots_mcp.bridge.pictures import encode_png, take_picture
 from webots_mcp.standin import InProcessSupervisor
 
@@ -23,10 +22,6 @@ BLACK, WHITE = (0, 0, 0), (255, 255, 255)
 
 def shown(picture: Any) -> Image.Image:
     return Image.open(io.BytesIO(encode_png(picture.bgra, picture.width, picture.height)))
-
-
-def files(database: MemoryDatabase, result: dict[str, Any]) -> Image.Image:
-    return Image.open(io.BytesIO((Path(database.data_dir) / result["path"]).read_bytes()))
 
 
 def test_each_frame_of_a_pause_is_taken_while_it_lasts(

@@ -223,6 +223,18 @@ def test_what_is_no_name_of_a_world_is_refused_in_words(
 
 
 def test_each_action_that_the_server_offers_is_one_that_bridges_run() -> None:
-    for name in BUILT_IN_ACTIONS:
-        assert actions.action_of(name).__name__ == name
-    assert list(actions._known) == list(BUILT_IN_ACTIONS)  # pyright: ignore[reportPrivateUsage]
+    known = actions._known  # pyright: ignore[reportPrivateUsage]
+    assert {name: action.__name__ for name, action in known.items()} == {
+        name: name for name in BUILT_IN_ACTIONS
+    }
+
+
+@pytest.mark.parametrize("steps", [0, -1, 2.5, "three", True, 1_000_000])
+def test_a_step_count_out_of_bounds_is_refused(
+    bridge: MCPBridge, recording: Recording, steps: object
+) -> None:
+    sent = recording.send("step", steps=steps)
+    eager(bridge)
+    status, _, error = recording.fate(sent)
+    assert status == "failed"
+    assert error is not None and "steps must be a whole number from 1 to 100000" in error

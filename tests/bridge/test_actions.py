@@ -59,6 +59,62 @@ def test_step_runs_the_users_own_loop_so_often_and_pauses_again(
     assert [recording.fate(c)[0] for c in (pause, resume)] == ["done", "done"]
 
 
+@pytest.mark.parametrize(("asked", "in_a_round", "of_rounds"), [(4, 2, 1), (3, 1, 5)])
+def test_steps_are_those_of_the_simulation_however_often_the_loop_asks(
+    robot: InProcessSupervisor,
+    bridge: MCPBridge,
+    recording: Recording,
+    asked: int,
+    in_a_round: int,
+    of_rounds: int,
+) -> None:
+    step = recording.send("step", steps=asked)
+    eager(bridge)
+    from_s = robot.getTime()
+    resume: int | None = None
+    for i in range(1, 11):
+        robot.step(STEP_MS)
+        bridge.publish({"n": i})
+        if i >= asked and resume is None:
+            resume = recording.send("resume")  # or the hold would last for ever
+        if i % of_rounds == 0:
+            for _ in range(in_a_round):
+                bridge.get_command()
+        if recording.fate(step)[0] == "done":
+            break
+    _, result, error = recording.fate(step)
+    assert error is None
+    assert result["steps"] == (asked if of_rounds == 1 else of_rounds)
+    assert result["advanced_s"] == pytest.approx(result["steps"] * STEP_MS / 1000)
+    assert result["sim_time_s"] == pytest.approx(from_s + result["advanced_s"])
+
+
+def test_a_pause_in_the_middle_of_steps_says_that_they_were_interrupted(
+    bridge: MCPBridge, recording: Recording, drive: Callable[[int], None]
+) -> None:
+    step = recording.send("step", steps=100)
+    drive(3)
+    pause = recording.send("pause")
+    recording.send("resume")
+    drive(1)
+    status, _, error = recording.fate(step)
+    assert (status, error) == (
+        "failed",
+        f"interrupted by command {pause} (pause) after 3 of 100 steps",
+    )
+
+
+@pytest.mark.parametrize("steps", [0, -1, 2.5, "three", True, 1_000_000])
+def test_a_step_count_out_of_bounds_is_refused(
+    bridge: MCPBridge, recording: Recording, steps: object
+) -> None:
+    sent = recording.send("step", steps=steps)
+    eager(bridge)
+    status, _, error = recording.fate(sent)
+    assert status == "failed"
+    assert error is not None and "steps must be a whole number from 1 to 100000" in error
+
+
 def test_a_person_pressing_play_ends_the_hold(
     robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
 ) -> None:
@@ -108,6 +164,23 @@ def test_a_loop_that_publishes_after_its_commands_sees_one_reset(
     eager(bridge)
     assert recording.fate(sent)[0] == "done"
     assert recording.rows("SELECT start_reason FROM run ORDER BY id") == ["start", "reset"]
+
+
+@pytest.mark.parametrize("asked_again", [False, True])
+def test_a_reset_at_the_first_step_begins_the_run_with_the_first_state_after_it(
+    bridge: MCPBridge, recording: Recording, drive: Callable[[int], None], asked_again: bool
+) -> None:
+    drive(1)
+    sent = recording.send("reset")
+    eager(bridge)
+    if asked_again:
+        eager(bridge)  # in the same round: no step has been made
+        bridge.publish({"mode": "before the reset"})
+    drive(2)
+    assert recording.fate(sent)[0] == "done"
+    times = "SELECT sim_time_s FROM state WHERE run_id = ? ORDER BY id"
+    assert recording.rows(times, 1) == pytest.approx([0.016] * (2 if asked_again else 1))
+    assert recording.rows(times, 2) == pytest.approx([0.016, 0.032])
 
 
 def test_reset_state_runs_the_callbacks_or_says_that_there_are_none(
@@ -226,15 +299,4 @@ def test_each_action_that_the_server_offers_is_one_that_bridges_run() -> None:
     known = actions._known  # pyright: ignore[reportPrivateUsage]
     assert {name: action.__name__ for name, action in known.items()} == {
         name: name for name in BUILT_IN_ACTIONS
-    }
-
-
-@pytest.mark.parametrize("steps", [0, -1, 2.5, "three", True, 1_000_000])
-def test_a_step_count_out_of_bounds_is_refused(
-    bridge: MCPBridge, recording: Recording, steps: object
-) -> None:
-    sent = recording.send("step", steps=steps)
-    eager(bridge)
-    status, _, error = recording.fate(sent)
-    assert status == "failed"
-    assert error is not None and "steps must be a whole number from 1 to 100000" in error
+    }  # pyright: ignore[reportPrivateUsage]

@@ -117,6 +117,17 @@ def test_a_plain_robot_records_and_says_that_it_cannot_pause(
     assert "supervisor" in data["not_paused"]
 
 
+def test_it_is_hit_each_time_that_it_begins_to_hold(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
+) -> None:
+    bridge.breakpoint("near", "log", after_hits=2)
+
+    drive(robot, bridge, [{"near": near} for near in (True, True, False, True, False, True)])
+
+    assert [data["hit_count"] for _, _, data in hits(recording)] == [2, 3]
+    assert recording.rows("SELECT hit_count FROM breakpoint") == [3]
+
+
 def test_a_stored_one_is_armed_by_command_and_goes_on_where_it_is_armed_already(
     robot: InProcessSupervisor, bridge: MCPBridge, database: MemoryDatabase, recording: Recording
 ) -> None:
@@ -208,6 +219,19 @@ def test_a_signal_that_is_never_published_is_told_once_with_the_nearest(
 
     (told,) = warnings(recording)
     assert "fornt_m is missing" in told and "there is front_m" in told
+
+
+def test_devices_are_asked_in_every_call(
+    robot: InProcessSupervisor, throttled: MCPBridge, recording: Recording
+) -> None:
+    throttled.breakpoint("time > 0.1", "log")
+
+    for _ in range(9):
+        robot.step(STEP_MS)
+        throttled.auto_publish()
+
+    ((time_s, _, data),) = hits(recording)
+    assert time_s == data["values"]["time"] == pytest.approx(0.112)
 
 
 def test_what_cannot_be_set_is_refused_where_it_is_set(bridge: MCPBridge) -> None:

@@ -123,6 +123,30 @@ def test_nothing_is_written_before_something_is_kept(
     assert not list(data_dir.glob("camera/*"))
 
 
+def test_frames_are_written_one_with_each_call(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
+) -> None:
+    drive(robot, bridge, range(400))
+    bridge.keep("a look")
+    for number in range(5):
+        assert len(recording.rows(FRAMES)) == number
+        bridge.get_command()
+
+
+def test_a_reset_begins_without_frames_of_the_run_before(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
+) -> None:
+    drive(robot, bridge, range(200))
+    robot.simulationReset()
+    drive(robot, bridge, range(60))
+    bridge.keep("a look")
+    drive(robot, bridge, range(60, 100))
+
+    rows = recording.rows("SELECT run_id, sim_time_s FROM image WHERE kind = 'kept'")
+    assert {run_id for run_id, _ in rows} == {2}
+    assert len(rows) == pytest.approx(100 * STEP_S / INTERVAL_S, abs=2)
+
+
 def test_memory_holds_a_bounded_number_of_frames(
     robot: InProcessSupervisor, make: Make, camera: Any, recording: Recording
 ) -> None:

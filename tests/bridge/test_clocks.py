@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from tests.bridge.conftest import STEP_MS, Recording, heartbeat_now
+from tests.bridge.conftest import STEP_MS, Recording, eager, heartbeat_now
 from tests.bridge.test_registration import change, start_again
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.connection import connect
@@ -73,3 +73,30 @@ def test_another_process_of_the_same_pid_is_not_the_one_that_recorded(
         )
         assert start_again(database) == "rover"
         process.communicate(b"\n")
+
+
+def test_a_session_that_writes_again_is_alive_again_and_takes_commands(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
+) -> None:
+    robot.step(STEP_MS)
+    bridge.publish({"n": 1})
+    change(recording, "UPDATE session SET end_reason = 'crashed', ended_wall_time_s = 1e9")
+    change(recording, "UPDATE run SET end_reason = 'crashed', ended_wall_time_s = 1e9")
+    heartbeat_now(bridge)
+    assert recording.rows("SELECT end_reason, ended_wall_time_s FROM session") == [(None, None)]
+    assert recording.rows("SELECT end_reason, ended_wall_time_s FROM run") == [(None, None)]
+    bridge.register_command("greet", lambda _: "hello")
+    sent = recording.send("greet")
+    eager(bridge)
+    assert recording.fate(sent)[:2] == ("done", "hello")
+
+
+def test_a_session_that_another_has_followed_stays_ended(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording, database: MemoryDatabase
+) -> None:
+    robot.step(STEP_MS)
+    bridge.publish({"n": 1})
+    change(recording, "UPDATE session SET end_reason = 'crashed', ended_wall_time_s = 1e9")
+    start_again(database)
+    heartbeat_now(bridge)
+    assert recording.rows("SELECT end_reason FROM session WHERE id = 1") == ["crashed"]

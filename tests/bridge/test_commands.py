@@ -130,6 +130,18 @@ def test_a_handler_that_closes_the_bridge_is_answered_before(
     assert recording.rows("SELECT end_reason FROM session") == ["finished"]
 
 
+def test_a_long_reason_is_cut_and_says_so(bridge: MCPBridge, recording: Recording) -> None:
+    def fail(command: dict[str, Any]) -> None:
+        raise ValueError("x" * 1_000_000)
+
+    bridge.register_command("grip", fail)
+    sent = recording.send("grip")
+    eager(bridge)
+    error = recording.fate(sent)[2]
+    assert error is not None and len(error) < 3000
+    assert "... (cut: it had 1000000 characters) (test_commands.py, line " in error
+
+
 def test_a_large_result_is_cut_and_says_what(bridge: MCPBridge, recording: Recording) -> None:
     bridge.register_command("map", lambda _: {"n": 1, "grid": [[0] * 1000 for _ in range(1000)]})
     sent = recording.send("map")
@@ -197,6 +209,20 @@ def test_whatever_stands_in_a_command_it_gets_a_final_status(
     assert error is not None and error.startswith("params must be a JSON object, got ")
 
 
+def test_an_action_that_is_no_text_is_refused_like_an_unknown_one(
+    bridge: MCPBridge, recording: Recording, database: MemoryDatabase
+) -> None:
+    bridge.register_command("move", lambda _: pytest.fail("another command ran"))
+    sent = recording.send("move")
+    connection = connect(database, "writer")
+    connection.execute("UPDATE command SET action = CAST(? AS TEXT)", (b"mo\xffve",))
+    connection.close()
+    eager(bridge)
+    status, _, error = recording.fate(sent)
+    assert status == "failed"
+    assert error is not None and "no action 'mo\ufffdve'; this robot has move" in error
+
+
 @pytest.mark.parametrize("name", [b"x", 5, None, ("a", "b")])
 def test_a_name_that_is_no_text_is_refused(
     bridge: MCPBridge, recording: Recording, name: Any
@@ -215,6 +241,21 @@ def test_a_name_that_cannot_be_sent_is_refused(
         bridge.register_command(name, lambda _: None)
     bridge.register_command("größe", lambda _: None)
     assert recording.rows("SELECT actions FROM session") == ['{"größe": ""}']
+
+
+@pytest.mark.parametrize(
+    ("doc", "told"),
+    [("lone \udcff", "lone ?"), (5, ""), ("x" * 5000, "x" * 4000 + "... (cut: it had 5000")],
+)
+def test_a_handlers_docstring_never_stops_the_registration(
+    bridge: MCPBridge, recording: Recording, doc: Any, told: str
+) -> None:
+    def wave(command: dict[str, Any]) -> None: ...
+
+    wave.__doc__ = doc
+    bridge.register_command("wave", wave)
+    (actions,) = recording.rows("SELECT actions FROM session")
+    assert json.loads(actions)["wave"].startswith(told)
 
 
 def test_a_function_for_what_is_built_in_is_never_called_which_is_said_once_and_stops_no_loop(

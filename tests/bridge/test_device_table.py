@@ -192,6 +192,11 @@ def test_a_device_that_nobody_enabled_is_asked_for_no_measurement(kind: str) -> 
     assert published(device_of(kind, answers, enabled=False)) == expected
 
 
+def test_a_camera_is_no_reason_to_read_its_picture() -> None:
+    camera = device_of("Camera", {**ENABLED, "hasRecognition": False})
+    assert published(camera) == {}
+
+
 def test_what_nobody_recognises_has_no_objects_behind_its_pointer() -> None:
     answers = TABLE["Camera"][0] | {"getRecognitionNumberOfObjects": 0}
     del answers["getRecognitionObjects"]
@@ -219,6 +224,17 @@ def test_of_many_objects_the_nearest_are_told_and_all_are_counted(kind: str) -> 
     assert said["min_m"] == distances[0]
 
 
+def test_a_linear_motor_gives_its_force_in_newtons() -> None:
+    answers = {
+        "getType": 1,
+        "getTargetPosition": 0.1,
+        "getVelocity": 0.2,
+        "getForceFeedbackSamplingPeriod": 32,
+        "getForceFeedback": 4.0,
+    }
+    assert published(device_of("Motor", answers))["motors"]["force_feedback_n"] == 4.0
+
+
 def test_a_device_that_cannot_be_read_is_named_and_the_others_are_read() -> None:
     failures: list[str] = []
     robot = SimpleNamespace(
@@ -242,6 +258,15 @@ def test_the_battery_is_read_where_its_sensor_is_enabled() -> None:
 
     assert read_devices(robot(64), raising)["battery_j"] == 99.5
     assert "battery_j" not in read_devices(robot(0), raising)
+
+
+@pytest.mark.parametrize(("system", "pose"), [(0, [1.0, 2.0, 3.0]), (1, None)])
+def test_degrees_of_latitude_are_no_pose(system: int, pose: list[float] | None) -> None:
+    devices = {
+        "gps": device_of("GPS", TABLE["GPS"][0] | {"getCoordinateSystem": system}),
+        "imu": device_of("InertialUnit", TABLE["InertialUnit"][0]),
+    }
+    assert read_devices(SimpleNamespace(devices=devices), raising).get("pose") == pose
 
 
 def test_keyboard_and_mouse_keep_their_events(

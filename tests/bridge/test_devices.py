@@ -6,6 +6,7 @@ The classes answer as those of Webots' package do (R2023b and R2025a).
 from __future__ import annotations
 
 import ctypes
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -67,8 +68,19 @@ def raising(_name: str, error: Exception) -> None:
     raise error
 
 
+def test_a_force_3d_sensor_gives_a_bare_pointer_to_three_numbers() -> None:
+    memory = (ctypes.c_double * 3)(0.5, -1.5, 9.75)
+    force = ctypes.cast(memory, Doubles)
+    assert read(TouchSensor(TouchSensor.FORCE3D, force)) == [0.5, -1.5, 9.75]
+    assert read(TouchSensor(TouchSensor.FORCE3D, [0.5, -1.5, 9.75])) == [0.5, -1.5, 9.75]
+
+
 def test_a_force_3d_sensor_without_a_value_is_not_read() -> None:
     assert read(TouchSensor(TouchSensor.FORCE3D, Doubles())) is None
+
+
+def test_a_bumper_gives_a_number() -> None:
+    assert read(TouchSensor(TouchSensor.BUMPER, Doubles())) == 1.0
 
 
 @pytest.mark.parametrize("kind", [Lidar, RangeFinder])
@@ -87,6 +99,15 @@ def test_ten_directions_make_eight_sectors_that_leave_none_out() -> None:
     ranges = [float(i) for i in range(10, 20)]
     sectors = read(Lidar(ranges, 10))["sector_min_m"]
     assert sectors == [10.0, 11.0, 12.0, 13.0, 15.0, 16.0, 17.0, 18.0]
+
+
+def test_a_lidar_of_three_beams_has_three_sectors() -> None:
+    assert read(Lidar([3.0, math.inf, 2.0], 3))["sector_min_m"] == [3.0, math.inf, 2.0]
+
+
+def test_a_lidar_that_sees_nothing_says_so() -> None:
+    summary = read(Lidar([math.inf] * 8, 8))
+    assert (summary["min_m"], summary["min_index"]) == (math.inf, None)
 
 
 def test_a_lidar_without_data_is_not_read() -> None:

@@ -66,6 +66,12 @@ def test_a_level_that_is_none_counts_as_info_and_is_said(
     assert "is not one of debug, info, warning, error, critical" in capfd.readouterr().err
 
 
+def test_a_long_line_is_cut_and_says_so(bridge: MCPBridge, recording: Recording) -> None:
+    bridge.log("ab" * 1_000_000)
+    (message,) = recording.rows("SELECT message FROM log")
+    assert message == "ab" * 5000 + "... (cut: it had 2000000 characters)"
+
+
 def test_a_message_that_would_never_end_is_cut(bridge: MCPBridge, recording: Recording) -> None:
     node: Any = [0.5]
     for _ in range(60):
@@ -91,6 +97,11 @@ def test_pythons_logging_lands_with_its_level_and_the_name_of_its_logger(
     assert error[:2] == ("error", "arm.gripper")
     assert error[2].startswith("failed\nTraceback")
     assert error[2].endswith("ZeroDivisionError: division by zero")
+
+
+def test_a_line_of_the_bridge_itself_has_no_logger(bridge: MCPBridge, recording: Recording) -> None:
+    bridge.log("text")
+    assert recording.rows(LINES) == [("info", None, "text")]
 
 
 class Silent:

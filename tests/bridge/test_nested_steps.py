@@ -56,6 +56,22 @@ class Environment(InProcessSupervisor):
         return super().step(STEP_MS)
 
 
+def test_both_halves_of_a_step_work_in_a_handler(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
+) -> None:
+    def halves(_: object) -> int:
+        robot.stepBegin(STEP_MS)
+        return robot.stepEnd()
+
+    bridge.register_command("halves", halves)
+    recording.send("pause")
+    sent = recording.send("halves")
+    recording.send("resume")
+    eager(bridge)
+    assert recording.fate(sent) == ("done", 0, None)
+    assert robot.getTime() == pytest.approx(0.016)
+
+
 def test_a_handler_with_a_loop_of_its_own_is_held_in_it_and_resumed(
     robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
 ) -> None:
@@ -79,6 +95,21 @@ def test_a_handler_with_a_loop_of_its_own_is_held_in_it_and_resumed(
     assert recording.fate(sent) == ("done", 5, None)
     assert recording.fate(step)[0] == "done"
     assert robot.getTime() == pytest.approx(5 * 0.016)
+
+
+def test_steps_of_a_handler_go_on_where_a_person_pressed_play_meanwhile(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
+) -> None:
+    def play_and_step(_: object) -> int:
+        robot.simulation.resume()
+        robot.step(STEP_MS)
+        return robot.simulationGetMode()
+
+    bridge.register_command("play_and_step", play_and_step)
+    recording.send("pause")
+    sent = recording.send("play_and_step")
+    eager(bridge)
+    assert recording.fate(sent)[1] == robot.SIMULATION_MODE_REAL_TIME
 
 
 def test_an_error_of_a_step_in_a_handler_leaves_the_simulation_paused(

@@ -17,6 +17,7 @@ import pytest
 
 from tests.bridge.conftest import STEP_MS, Recording
 from webots_mcp import MCPBridge, MemoryDatabase
+from webots_mcp.bridge import encoding
 from webots_mcp.standin import InProcessSupervisor
 
 
@@ -161,6 +162,15 @@ def test_a_huge_array_costs_itself_and_not_the_row(bridge: MCPBridge, recording:
     assert json.loads(replaced) == {"image": "array[921600]", "list": "array[400000]"}
 
 
+@pytest.mark.usefixtures("encoder")
+def test_a_picture_as_nested_lists_costs_itself_and_not_the_row(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    bridge.publish({"x": 1, "depth": [[0.123456] * 640 for _ in range(480)]})
+    assert recording.states() == [{"x": 1, "depth": None}]
+    assert recording.rows("SELECT replaced FROM state") == ['{"depth":"array[307200]"}']
+
+
 def test_a_state_that_contains_itself_is_cut(bridge: MCPBridge, recording: Recording) -> None:
     state: dict[str, Any] = {"x": 1}
     state["self"] = state
@@ -201,6 +211,13 @@ class Sullen:
         raise MuteError
 
 
+class Unreadable(dict[str, int]):
+    def items(self) -> Any:
+        raise RuntimeError("no items")
+
+    __iter__ = keys = values = items
+
+
 BROKEN = (Broken(), Unconnected(), Picture(), Sullen(), 10**5000, Mode)
 
 
@@ -225,6 +242,31 @@ def test_a_key_without_text_costs_itself(bridge: MCPBridge, recording: Recording
     bridge.publish({"x": 1, "by key": {Key(): 2, 3: 4}})
     assert recording.states() == [{"x": 1, "by key": {"<Key>": 2, "3": 4}}]
     assert recording.rows("SELECT replaced FROM state") == ['{"by key.<Key>":"key"}']
+
+
+def test_a_state_that_cannot_be_read_at_all_is_a_row_that_says_why(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(encoding, "orjson", None)
+    text, replaced, _ = encoding.encode(Unreadable(x=1))
+    assert (text, replaced) == ("{}", {"": "type Unreadable: no items"})
+
+
+@pytest.mark.usefixtures("encoder")
+def test_an_array_of_another_library_is_stored_whatever_its_size_means(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    class Tensor:
+        shape = (2,)
+
+        def size(self) -> tuple[int]:
+            return (2,)
+
+        def tolist(self) -> list[int]:
+            return [1, 2]
+
+    bridge.publish({"tensor": Tensor()})
+    assert recording.states() == [{"tensor": [1, 2]}]
 
 
 @pytest.mark.usefixtures("encoder")
@@ -252,6 +294,30 @@ def test_both_encoders_store_the_same(bridge: MCPBridge, recording: Recording) -
         }
     ]
     assert recording.rows("SELECT replaced FROM state") == [None]
+
+
+@pytest.mark.usefixtures("encoder")
+def test_an_integer_beyond_64_bits_is_read_as_the_nearest_float(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    bridge.publish({"id": 2**100, "gap": math.nan})
+    assert recording.rows("SELECT data ->> '$.id' FROM state") == [float(2**100)]
+    assert recording.states()[0]["id"] == 2**100
+
+
+@pytest.mark.usefixtures("encoder")
+def test_a_scan_with_several_kinds_of_gaps_names_each(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    bridge.publish({"scan": [0.5, math.inf, math.nan]})
+    assert recording.states() == [{"scan": [0.5, None, None]}]
+    (replaced,) = recording.rows("SELECT replaced FROM state")
+    assert json.loads(replaced) == {"scan.1": "inf", "scan.2": "nan"}
+
+
+def test_a_dataclass_may_be_the_whole_state(bridge: MCPBridge, recording: Recording) -> None:
+    bridge.publish(Pose(1.0, 2.0))  # type: ignore[arg-type]
+    assert recording.states() == [{"x": 1.0, "y": 2.0}]
 
 
 def test_a_state_that_is_no_dict_is_counted_and_does_not_stop_the_loop(

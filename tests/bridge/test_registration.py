@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -13,6 +14,8 @@ from tests.bridge.conftest import Recording
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.connection import connect
 from webots_mcp.standin import InProcessSupervisor
+
+DAY_S = 86_400.0
 
 
 def change(recording: Recording, sql: str, *values: object) -> None:
@@ -46,6 +49,15 @@ def start_again(database: MemoryDatabase) -> str:
         return bridge.robot_name
 
 
+@pytest.mark.skipif(sys.platform == "darwin", reason="macOS does not tell when a process started")
+def test_a_crashed_session_whose_pid_another_process_has_by_now_frees_its_name(
+    database: MemoryDatabase, recording: Recording, another_process: int
+) -> None:
+    leave_open(database, recording, another_process, time.time() - DAY_S)
+    assert start_again(database) == "rover"
+    assert recording.rows("SELECT end_reason FROM session ORDER BY id") == ["crashed", "finished"]
+
+
 def test_a_controller_that_lives_keeps_its_name_however_it_is_called_by_others(
     database: MemoryDatabase, recording: Recording, another_process: int
 ) -> None:
@@ -53,8 +65,29 @@ def test_a_controller_that_lives_keeps_its_name_however_it_is_called_by_others(
     assert start_again(database) == "rover#2"
 
 
+@pytest.mark.skipif(not Path("/proc/1/stat").exists(), reason="needs a process of long ago")
+def test_a_controller_that_was_silent_for_long_but_lives_keeps_its_name(
+    database: MemoryDatabase, recording: Recording
+) -> None:
+    since_boot_s = time.clock_gettime(time.CLOCK_BOOTTIME)
+    leave_open(database, recording, 1, time.time() - min(since_boot_s / 100, DAY_S))
+    assert start_again(database) == "rover#2"
+
+
 def begun(recording: Recording) -> list[str]:
     return recording.rows("SELECT start_reason FROM run ORDER BY id")
+
+
+def test_a_start_a_day_later_is_no_reload(database: MemoryDatabase, recording: Recording) -> None:
+    start_again(database)
+    change(
+        recording,
+        "UPDATE session SET ended_wall_time_s = ended_wall_time_s - ?, "
+        "last_seen_wall_time_s = last_seen_wall_time_s - ?",
+        *(DAY_S, DAY_S),
+    )
+    start_again(database)
+    assert begun(recording) == ["start", "start"]
 
 
 @pytest.mark.parametrize(("instance", "told"), [(None, "start"), ("webots-1", "reload")])

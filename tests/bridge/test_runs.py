@@ -74,6 +74,15 @@ def test_a_reset_fires_callbacks_once_and_is_detected_once(
     assert calls == ["reset"]
 
 
+def test_detect_reload_alone_notices_a_reset(robot: InProcessSupervisor, bridge: MCPBridge) -> None:
+    for _ in range(3):
+        robot.step(STEP_MS)
+        assert not bridge.detect_reload()
+    robot.simulationReset()
+    robot.step(STEP_MS)
+    assert bridge.detect_reload()
+
+
 def test_a_callback_that_fails_does_not_stop_the_loop_or_the_next_callback(
     robot: InProcessSupervisor, database: MemoryDatabase, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -132,6 +141,16 @@ def test_a_robot_that_webots_starts_again_was_ended_by_the_reload(
         assert ends == ["reload", "finished"]
 
 
+def test_a_successor_in_another_webots_is_a_start(
+    database: MemoryDatabase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WEBOTS_INSTANCE_PATH", "first")
+    MCPBridge(InProcessSupervisor("rover"), database=database).close()
+    monkeypatch.setenv("WEBOTS_INSTANCE_PATH", "second")
+    with MCPBridge(InProcessSupervisor("rover"), database=database) as bridge:
+        assert not bridge.detect_reload()
+
+
 def test_two_live_robots_of_one_name_get_names_of_their_own(
     database: MemoryDatabase, recording: Recording
 ) -> None:
@@ -151,6 +170,13 @@ def test_a_second_bridge_on_the_same_robot_takes_over(
         assert second.robot_name == first.robot_name
     sql = "SELECT end_reason FROM session ORDER BY id"
     assert recording.rows(sql) == ["superseded", "finished"]
+
+
+def test_a_session_says_which_code_ran_where(bridge: MCPBridge, recording: Recording) -> None:
+    sql = "SELECT pid > 0, length(host) > 0, supervisor, versions ->> 'webots_mcp' FROM session"
+    assert recording.rows(sql) == [(1, 1, 1, "0.1.0")]
+    assert bridge.robot_name == "rover"
+    assert "Lidar" in recording.rows("SELECT devices FROM robot")[0]
 
 
 def test_an_exception_that_leaves_the_block_ends_the_session_as_crashed(
@@ -199,6 +225,16 @@ def test_a_quit_during_a_held_pause_reaches_the_loop_of_a_subclass_and_of_no_oth
         assert environment.step("forward") == (0.5, True)
         assert environment.step("forward") == (0.5, True)
     assert kind("rover").step("forward") == (0.5, False)
+
+
+def test_an_object_that_owns_the_robot_is_refused_with_the_way_to_its_robot(
+    database: MemoryDatabase,
+) -> None:
+    class Owner:
+        robot = InProcessSupervisor("rover")
+
+    with pytest.raises(TypeError, match=r"MCPBridge\(x\.robot\)"):
+        MCPBridge(Owner(), database=database)
 
 
 class Wrapper:

@@ -42,6 +42,15 @@ def test_a_walk_is_bounded_and_gives_what_is_near_the_root_first(
     assert "turret" not in robots([*walk(root, inside=False)])
 
 
+def test_shapes_and_appearances_are_given_only_where_they_are_asked_for(
+    referee: InProcessSupervisor,
+) -> None:
+    types = {node.base_type for node in walk(referee.getRoot())}
+    assert not types & {"Shape", "PBRAppearance", "Box", "WorldInfo"}
+    everything = {node.base_type for node in walk(referee.getRoot(), everything=True)}
+    assert everything >= {"WorldInfo", "Viewpoint", "HingeJointParameters"} | types
+
+
 def test_the_inside_of_a_proto_node_is_read_by_either_name_of_its_method(
     referee: InProcessSupervisor,
 ) -> None:

@@ -142,6 +142,13 @@ def test_a_reset_leaves_what_somebody_else_has_set_since(scene: Scene) -> None:
     assert scene.get("BALL.physics.mass") == 7.0
 
 
+def test_the_pose_that_a_reset_brings_is_never_that_of_the_middle_of_a_run(scene: Scene) -> None:
+    scene.ask("set_field", path="ROVER.translation", value=[1, 1, 0.04])
+    scene.ask("set_field", path="ROVER.translation", value=[-1.2, 0, 0.04])
+    scene.reset()
+    assert scene.get("ROVER.translation") == [-1.2, 0.0, 0.04]
+
+
 def test_a_node_is_added_with_a_path_that_leads_to_it_until_a_reset(scene: Scene) -> None:
     named = scene.ask("add_node", vrml=PILL)
     assert (named["path"], named["parent"], named["a_reset"]) == (
@@ -192,6 +199,12 @@ def test_a_node_that_cannot_be_added_is_said_to_be_none(
 ) -> None:
     assert said in scene.fail("add_node", **params)
     assert not scene.events("add_node")
+
+
+def test_brackets_in_texts_and_comments_are_no_brackets(scene: Scene) -> None:
+    odd = 'DEF ODD Solid { # { in a comment\n name "a { and a \\" [" }'
+    assert scene.ask("add_node", vrml=odd)["path"] == "ODD"
+    assert scene.get("ODD.name") == 'a { and a " ['
 
 
 def test_a_node_that_was_removed_is_brought_back_by_each_reset(scene: Scene) -> None:

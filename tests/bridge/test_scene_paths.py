@@ -99,6 +99,45 @@ def test_a_name_that_several_nodes_have_is_answered_with_their_numbers(crowd: Sc
     assert "give the number of one of them" in said
 
 
+def test_a_long_field_is_read_in_parts(crowd: Scene) -> None:
+    crowd.ask("set_field", path="WorldInfo.info", value=[f"line {i}" for i in range(120)])
+    seen: list[str] = []
+    start: int | None = 0
+    while start is not None:
+        part = crowd.ask("get_field", path="WorldInfo.info", start=start)
+        assert part["count"] == 120
+        seen += part["values"]
+        start = part.get("next_start")
+    assert seen == [f"line {i}" for i in range(120)]
+    assert crowd.get("WorldInfo.info[-1]") == "line 119"
+
+
+def test_the_scene_shows_what_stands_where_with_paths_that_lead_there(crowd: Scene) -> None:
+    scene = crowd.ask("get_scene", depth=5, fields=["translation"])
+    assert scene["columns"] == ["depth", "path", "type", "name", "translation"]
+    rows = {row[1]: row for row in scene["rows"]}
+    assert rows["ROVER"] == [2, "ROVER", "Robot", "rover", [1.0, 2.0, 0.0]]
+    assert rows["CRATE"][2] == "WoodenBox (Solid)"
+    paths = [row[1] for row in scene["rows"]]
+    assert paths.index("ROVER") < paths.index("RIDER") < paths.index("CRATE"), "as in the tree"
+    assert scene["also_at_the_top"] == ["WorldInfo", "Viewpoint"]
+    for _, path, _, name, _ in scene["rows"]:
+        if name:
+            assert crowd.get(f"{path}.name") == name
+
+
+def test_the_scene_is_asked_for_types_and_names_at_any_depth(crowd: Scene) -> None:
+    robots = crowd.ask("get_scene", types=["Robot"])["rows"]
+    assert {row[3] for row in robots} == {
+        "rover", "rider", "2nd.robot", "e-puck", "turret", "referee",
+    }  # fmt: skip
+    named = crowd.ask("get_scene", names=["ro*", "RIDER"])["rows"]
+    assert {row[3] for row in named} == {"rover", "rider"}
+    inside = crowd.ask("get_scene", path="CRATE", types=["Box"])
+    assert inside["below"] == "CRATE"
+    assert inside["rows"][0][2] == "Box, inside a PROTO"
+
+
 def test_types_and_names_are_found_whatever_their_case_and_else_the_nearest_are_told(
     crowd: Scene,
 ) -> None:

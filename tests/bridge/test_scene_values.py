@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from webots_mcp.bridge.scene import is_same
+from webots_mcp.bridge.scene import is_nearer, is_same
 
 
 @pytest.mark.parametrize(
@@ -32,3 +32,11 @@ def test_values_mean_the_same_within_what_webots_rounds(
 ) -> None:
     assert is_same(type_name, one, other) is same
     assert is_same(type_name, other, one) is same
+
+
+@pytest.mark.parametrize(
+    ("value", "nearer"),
+    [([1.0, 0, 0], True), ([0.9, 0, 0.1], True), ([0.0, 0, 0], False), ([0.1, 0, 0], False)],
+)
+def test_what_was_moved_on_since_is_nearer_to_where_it_was_put(value: Any, nearer: bool) -> None:
+    assert is_nearer("SFVec3f", value, [1.0, 0, 0], [0.0, 0, 0]) is nearer

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.bridge.conftest import STEP_MS, Recording
+from tests.bridge.conftest import STEP_MS, Recording, write_lock
 from webots_mcp import MCPBridge
 from webots_mcp.signal_register import ADDED_AT_ONCE, MAX_SIGNALS
 from webots_mcp.standin import InProcessSupervisor
@@ -37,6 +37,25 @@ def test_a_recording_that_no_server_has_opened_shows_how_the_robot_moves(
     assert filed.rows("SELECT min, max FROM signal WHERE name = 'velocity'") == [(None, None)]
 
 
+def test_a_better_name_takes_the_role_when_it_comes(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    bridge.publish({"x": 1, "y": 2, "state": "driving"})
+    assert dict(recording.rows(ROLES)) == {"x": "x", "y": "y", "state": "mode"}
+    bridge.publish({"x": 1, "y": 2, "state": "driving", "pose": [3, 4, 0.5], "mode": "home"})
+    assert recording.rows(MOTION)[0][:4] == (3, 4, 0.5, "home")
+    bridge.publish({"x": 5, "y": 6, "state": "driving"})
+    assert recording.rows(MOTION)[0][:4] == (5, 6, None, "driving")
+
+
+def test_a_number_is_a_mode_while_it_is_whole(bridge: MCPBridge, recording: Recording) -> None:
+    bridge.publish({"phase": 3})
+    assert recording.rows("SELECT mode FROM robot_now") == [3]
+    bridge.publish({"phase": 3.5})
+    bridge.publish({"phase": 4, "other": 1})
+    assert recording.rows("SELECT mode FROM robot_now") == [None]
+
+
 def test_many_names_are_entered_some_with_each_row_and_never_too_many(
     bridge: MCPBridge, recording: Recording
 ) -> None:
@@ -50,6 +69,16 @@ def test_many_names_are_entered_some_with_each_row_and_never_too_many(
     for _ in range(1500 // ADDED_AT_ONCE):
         bridge.publish(second)
     assert recording.rows(count) == [MAX_SIGNALS]
+
+
+def test_names_wait_while_another_process_writes(robot: InProcessSupervisor, file: Path) -> None:
+    state = {"pose": [1, 2, 0.5]}
+    with MCPBridge(robot, throttle_interval=1, database=file) as bridge:
+        with write_lock(file):
+            bridge.publish(state)
+        bridge.publish(state)
+        bridge.publish(state)
+    assert Recording(file).rows("SELECT x_m, y_m FROM robot_now") == [(1, 2)]
 
 
 @pytest.mark.parametrize(

@@ -59,6 +59,16 @@ def test_a_successor_is_held_in_its_first_step_until_a_resume(
     assert recording.rows("SELECT pause_state FROM session WHERE id = 2") == [None]
 
 
+def test_where_a_person_pressed_play_meanwhile_there_is_nothing_to_take_over(
+    simulation: InProcessSimulation, database: MemoryDatabase, recording: Recording
+) -> None:
+    leave_held(simulation, database)
+    simulation.resume()
+    with succeed(simulation, database) as bridge:
+        assert bridge.robot.step(STEP_MS) == 0
+        assert recording.rows("SELECT pause_state FROM session WHERE id = 2") == [None]
+
+
 def test_the_hold_of_a_controller_that_was_killed_is_taken_over_as_well(
     simulation: InProcessSimulation, database: MemoryDatabase, recording: Recording
 ) -> None:

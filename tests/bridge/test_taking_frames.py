@@ -163,6 +163,20 @@ def test_from_above_left_is_left_and_ahead_is_up() -> None:
     assert max(y for _, y in of_ahead) < 100
 
 
+def test_rings_are_round_numbers_that_reach_beyond_the_farthest_point() -> None:
+    picture = take_picture(Lidar([3.1] * 360, 360))
+    assert picture.scale == "from above, up is ahead; a ring each 1 m, the last 4 m"
+    far: set[float] = {math.dist(at, (180, 180)) for at in places_of(shown(picture), WHITE)}
+    assert min(far) == pytest.approx(3.1 / 4 * 172, abs=3)
+    assert max(far) == pytest.approx(3.1 / 4 * 172, abs=3)
+
+
+def test_a_lidar_that_sees_nothing_is_drawn_with_its_range() -> None:
+    picture = take_picture(Lidar([math.inf] * 8, 8))
+    assert str(picture.scale).endswith("a ring each 5 m, the last 10 m")
+    assert not places_of(shown(picture), WHITE)
+
+
 def test_a_lidar_of_a_million_points_is_drawn_from_some_of_them() -> None:
     picture = take_picture(Lidar([2.0] * 1_000_000, 20_000))
     assert places_of(shown(picture), WHITE)

@@ -93,6 +93,17 @@ def test_steps_that_are_seen_are_no_cause_for_a_warning(
     assert not warnings(recording)
 
 
+def test_a_loop_that_steps_and_never_calls_its_bridge_is_told_at_the_end(
+    robot: InProcessSupervisor, database: MemoryDatabase, recording: Recording
+) -> None:
+    with MCPBridge(robot, database=database):
+        for _ in range(100):
+            robot.step(STEP_MS)
+
+    (told,) = warnings(recording)
+    assert "so far it has missed 1.6 s of simulation time" in told
+
+
 def test_while_no_call_comes_by_the_log_says_what_may_be_and_asks_webots_for_nothing(
     robot: InProcessSupervisor,
     file: Path,

@@ -65,3 +65,34 @@ def test_slow_devices_are_read_for_the_ring_no_more_than_100_us_per_call(
     bridge.keep("another look")
     slow.drive(robot, bridge, range(700, 701))
     assert recording.rows(STRETCHES)[-1][3] == "another look"
+
+
+def test_one_slow_reading_among_fast_ones_slows_nothing(
+    robot: InProcessSupervisor,
+    make: Make,
+    recording: Recording,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    slow, bridge = SlowDevices(robot, monkeypatch), make()
+    slow.cost_us = 40
+    slow.drive(robot, bridge, range(20))
+    slow.cost_us = 20_000
+    slow.drive(robot, bridge, range(20, 21))
+    slow.cost_us = 40
+    assert slow.drive(robot, bridge, range(21, 60)) == 39
+    assert recording.rows("SELECT message FROM log") == []
+
+
+def test_slow_devices_are_read_in_every_call_where_a_breakpoint_is_armed(
+    robot: InProcessSupervisor,
+    make: Make,
+    recording: Recording,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    slow, bridge = SlowDevices(robot, monkeypatch), make()
+    slow.cost_us = 5000
+    bridge.breakpoint("n == 50", "keep")
+    assert slow.drive(robot, bridge, range(60)) == 60
+    ((*_, reason),) = recording.rows(STRETCHES)
+    assert "one call in" not in reason
+    assert kept_numbers(recording) == [list(range(60))]

@@ -196,6 +196,22 @@ def test_0_seconds_hold_and_keep_nothing_and_a_hit_says_so(
     assert "keep_last_s" in json.loads(data)["not_kept"]
 
 
+def test_the_environment_decides_how_many_seconds_are_held(
+    robot: InProcessSupervisor,
+    make: Make,
+    recording: Recording,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("WEBOTS_MCP_KEEP_LAST_S", "0.5")
+    bridge = make(keep_last_s=60)
+    drive(robot, bridge, range(200))
+    bridge.keep("a look")
+    drive(robot, bridge, range(200, 201))
+    (kept,) = kept_numbers(recording)
+    assert kept == list(range(kept[0], 201))
+    assert len(kept) == pytest.approx(0.5 / STEP_S, abs=3)
+
+
 @pytest.mark.parametrize("seconds", [-1, math.nan, 1e9])
 def test_seconds_that_cannot_be_held_are_refused(make: Make, seconds: float) -> None:
     with pytest.raises(ValueError, match="keep_last_s"):

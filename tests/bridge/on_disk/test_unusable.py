@@ -120,6 +120,18 @@ def test_a_database_that_is_damaged_in_mid_run_is_moved_aside_and_a_new_one_begu
     assert capfd.readouterr().err.count("was damaged") == 1
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be moved there")
+def test_a_schema_whose_text_is_no_text_is_damage_at_the_start_as_well(
+    robot: InProcessSupervisor, file: Path, filed: Recording
+) -> None:
+    MCPBridge(robot, data_dir=file.parent).close()
+    damage_schema(file, b"CREATE \xff\xfe")
+    with MCPBridge(robot, data_dir=file.parent, throttle_interval=1) as bridge:
+        bridge.publish({"n": 1})
+    assert numbers(filed) == [1]
+    assert len(list(file.parent.glob(f"{DATABASE_NAME}.damaged-*"))) >= 1
+
+
 def test_a_damaged_database_is_moved_aside_at_the_start(
     robot: InProcessSupervisor, file: Path, filed: Recording
 ) -> None:
@@ -204,6 +216,12 @@ def test_an_sqlite_that_is_too_old_is_said_and_the_robot_drives_on(
     assert "3.38 is needed" in capfd.readouterr().err
 
 
+def test_a_relative_path_is_opened_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    connect(Path("here.db"), "writer", create=True).close()
+    assert (tmp_path / "here.db").exists()
+
+
 def test_strict_mode_raises_instead(
     robot: InProcessSupervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -274,6 +292,13 @@ def test_after_close_nothing_raises(bridge: MCPBridge, method: str) -> None:
     arguments = {"publish": ({"n": 1},), "log": ("late",)}.get(method, ())
     answer = getattr(bridge, method)(*arguments)
     assert answer is None or method == "auto_publish"  # which returns the state all the same
+
+
+def test_a_log_line_may_hold_any_text(bridge: MCPBridge, filed: Recording) -> None:
+    bridge.log("null \0 and \ud800 surrogate", level="warning")
+    bridge.log(42, level="loud")
+    sql = "SELECT level, message FROM log ORDER BY id"
+    assert filed.rows(sql) == [("warning", "null \\0 and ? surrogate"), ("info", "42")]
 
 
 def test_importing_the_bridge_needs_nothing_but_the_standard_library(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from typing import Any
 
@@ -78,6 +79,29 @@ def test_a_wrong_value_fails_the_command_and_none_is_set(
     assert recording.rows("SELECT count(*) FROM parameter_value") == [4]
 
 
+@pytest.mark.parametrize("text", ['{"values": {"kp": NaN}}', '{"values": {"kp": Infinity}}'])
+def test_a_command_that_brings_no_finite_number_fails(
+    bridge: MCPBridge, recording: Recording, text: str
+) -> None:
+    kp = bridge.parameter("kp", 2.0)
+    connection_params = json.loads(text)
+    assert ask(recording, bridge, **connection_params)[0] == "failed"
+    assert kp.value == 2.0
+
+
+def test_a_whole_number_may_come_as_a_float(bridge: MCPBridge, recording: Recording) -> None:
+    n = bridge.parameter("n", 3)
+    ask(recording, bridge, values={"n": 4.0})
+    assert (type(n.value), n.value) == (int, 4)
+
+
+def test_a_value_that_stays_the_same_is_no_change(bridge: MCPBridge, recording: Recording) -> None:
+    bridge.parameter("kp", 2.0)
+    status, result, _ = ask(recording, bridge, values={"kp": 2})
+    assert (status, result["values"]) == ("done", {"kp": {"old": 2.0, "new": 2.0}})
+    assert recording.rows("SELECT count(*) FROM parameter_value") == [1]
+
+
 def test_it_is_set_while_the_simulation_is_paused(
     robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording, drive: Drive
 ) -> None:
@@ -136,6 +160,28 @@ def test_values_that_wait_for_the_reset_come_with_it_and_stay(
     assert recording.rows(
         "SELECT sim_time_s FROM parameter_value WHERE run_id = 2 ORDER BY id"
     ) == [pytest.approx(time_s) for time_s in (0.016, 0.016, 0.032)]
+
+
+def test_a_reset_finds_the_new_values_when_its_callbacks_run(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording, drive: Drive
+) -> None:
+    kp = bridge.parameter("kp", 2.0)
+    seen: list[float] = []
+    bridge.on_reload(lambda: seen.append(kp.value))
+    drive(3)
+    ask(recording, bridge, values={"kp": 3.0}, when="reset")
+    robot.simulationReset()
+    drive(1)
+    assert seen == [3.0]
+
+
+def test_a_wrong_value_for_the_next_reset_is_refused_at_once(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    bridge.parameter("kp", 2.0, high=10)
+    assert ask(recording, bridge, values={"kp": 11}, when="reset")[0] == "failed"
+    assert ask(recording, bridge, values={"kp": 1}, when="later")[0] == "failed"
+    assert recording.rows("SELECT next_value FROM parameter") == [None]
 
 
 def test_a_new_process_begins_with_the_code_again(

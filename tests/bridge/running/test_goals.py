@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from tests.bridge.conftest import Recording
+from tests.bridge.conftest import STEP_MS, Recording, eager
 from tests.bridge.running.conftest import STEP_S, Rounds, let_go_when_paused
+from webots_mcp import MCPBridge
+from webots_mcp.standin import InProcessSupervisor
 
 MODES = ("real_time", "fast")
 
@@ -44,6 +46,32 @@ def test_it_pauses_at_the_step_that_reaches_the_time(
     assert result["ended"] == "simulation time reached"
     assert result["advanced_s"] == pytest.approx(100 * STEP_S)
     assert began + 100 in [state["n"] for state in recording.states()]
+
+
+@pytest.mark.parametrize("publish_each", [2, 9])
+def test_the_time_is_exact_where_the_loop_does_not_publish_in_each_round(
+    rounds: Rounds, recording: Recording, publish_each: int
+) -> None:
+    paused = let_go_when_paused(rounds)
+    recording.send("run", for_s=50 * STEP_S)
+    rounds.drive(80, publish_each)
+    assert paused == [pytest.approx(51 * STEP_S)]
+
+
+def test_the_time_is_exact_where_the_loop_asks_for_commands_now_and_then(
+    robot: InProcessSupervisor, sparse: MCPBridge, recording: Recording
+) -> None:
+    rounds = Rounds(robot, sparse, recording, "published first")
+    paused = let_go_when_paused(rounds)
+    sent = recording.send("run", for_s=20 * STEP_S)
+    rounds.drive(1)
+    for n in range(60):
+        robot.step(STEP_MS)
+        if n % 25 == 0:
+            sparse.publish({"n": n})
+            eager(sparse)
+    assert paused == [pytest.approx(21 * STEP_S)]
+    assert recording.fate(sent)[1]["advanced_s"] == pytest.approx(20 * STEP_S)
 
 
 def test_a_reset_counts_the_time_from_zero_and_asks_the_first_state_after_it(
@@ -91,6 +119,17 @@ def test_at_the_end_it_goes_on_or_is_as_it_was(
     assert recording.rows("SELECT count(*) FROM event WHERE kind = 'pause'") == [0]
 
 
+def test_what_was_paused_goes_on_at_the_pace_that_it_had_before(
+    rounds: Rounds, recording: Recording
+) -> None:
+    robot = rounds.robot
+    robot.simulationSetMode(robot.SIMULATION_MODE_REAL_TIME)
+    recording.send("pause")
+    sent = recording.send("run", until="n >= 10", pace="fast", then="go_on")
+    rounds.drive(12)
+    assert recording.fate(sent)[1]["mode"] == "real_time"
+
+
 @pytest.mark.parametrize("ended_by", ["its goal", "a breakpoint", "pause", "reset", "close"])
 @pytest.mark.parametrize("mode_before", ["real_time", "fast"])
 def test_the_pace_of_a_run_ends_with_it_however_it_ends(
@@ -133,3 +172,18 @@ def test_parameters_are_set_before_it_runs(
     assert gain.value == 4.0
     of_run = "run_id = (SELECT max(id) FROM run) ORDER BY since_s, utc"
     assert recording.rows(f"SELECT value FROM robot_parameter WHERE {of_run}")[-1] == 4.0
+
+
+def test_auto_publish_is_asked_at_every_call(
+    robot: InProcessSupervisor, sparse: MCPBridge, recording: Recording
+) -> None:
+    rounds = Rounds(robot, sparse, recording, "nothing is published")
+    paused = let_go_when_paused(rounds)
+    sent = recording.send("run", until="n >= 12", for_s=10)
+    for n in range(20):
+        robot.step(STEP_MS)
+        sparse.auto_publish({"n": n})
+        eager(sparse)
+    assert recording.fate(sent)[1]["values"] == {"n": 12}
+    assert paused == [pytest.approx(13 * STEP_S)]
+    assert 12 in [state["n"] for state in recording.states()]

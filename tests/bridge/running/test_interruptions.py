@@ -59,6 +59,18 @@ def test_a_reset_by_a_person_ends_it(rounds: Rounds, recording: Recording) -> No
     assert paused[0] <= 2 * STEP_S
 
 
+def test_a_quit_ends_it(rounds: Rounds, recording: Recording) -> None:
+    sent = recording.send("run", until="n > 1000")
+    rounds.drive(10)
+    rounds.robot.simulation.quit()
+    rounds.drive(5)
+    rounds.bridge.close()
+    _, result, error = recording.fate(sent)
+    assert error is None
+    assert result["ended"] == "run ended"
+    assert result["sim_time_s"] == pytest.approx(10 * STEP_S)
+
+
 def test_a_condition_that_cannot_be_asked_ends_it_as_it_was_told_to_end(
     rounds: Rounds, recording: Recording
 ) -> None:

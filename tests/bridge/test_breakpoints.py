@@ -105,24 +105,6 @@ def test_it_pauses_at_the_very_step_until_it_is_resumed(
     assert json.loads(data)["condition"] == "n == 3"
 
 
-def test_steps_end_at_a_breakpoint(
-    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
-) -> None:
-    bridge.breakpoint("n == 3")
-    step, resume = recording.send("step", steps=50), None
-    for number in range(6):
-        robot.step(STEP_MS)
-        bridge.publish({"n": number})
-        if number == 3:
-            resume = recording.send("resume", time_to_live_s=60)
-        eager(bridge)
-
-    status, result, _ = recording.fate(step)
-    assert (status, result["steps"]) == ("done", 3)
-    assert "breakpoint" in result["why"]
-    assert resume is not None and recording.fate(resume)[0] == "done"
-
-
 def test_a_plain_robot_records_and_says_that_it_cannot_pause(
     database: MemoryDatabase, recording: Recording
 ) -> None:

@@ -133,36 +133,6 @@ def test_frames_are_written_one_with_each_call(
         bridge.get_command()
 
 
-def test_all_frames_are_written_before_a_pause(
-    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
-) -> None:
-    bridge.breakpoint("n == 300", "pause")
-    drive(robot, bridge, range(300))
-    robot.step(STEP_MS)
-    bridge.publish({"n": 300})
-
-    times = [row[0] for row in recording.rows(FRAMES)]
-    assert len(times) == pytest.approx(300 * STEP_S / INTERVAL_S, abs=3)
-    assert times[-1] == pytest.approx(robot.getTime())
-    recording.send("resume")
-    eager(bridge)
-
-
-def test_saved_frames_and_kept_ones_do_not_replace_each_other(
-    robot: InProcessSupervisor, bridge: MCPBridge, camera: Any, recording: Recording
-) -> None:
-    for number in range(300):
-        drive(robot, bridge, range(number, number + 1))
-        if number % 50 == 0:
-            bridge.save_camera_frame(camera, max_frames=2)
-    bridge.keep("a look")
-    drive(robot, bridge, range(300, 400))
-    bridge.save_camera_frame(camera, max_frames=2)
-
-    assert recording.rows("SELECT count(*) FROM image WHERE kind = 'camera'") == [2]
-    assert len(recording.rows(FRAMES)) > 20
-
-
 def test_a_reset_begins_without_frames_of_the_run_before(
     robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
 ) -> None:
@@ -215,25 +185,6 @@ def test_auto_publish_takes_frames_too(
     bridge.close()
 
     assert len(recording.rows(FRAMES)) == pytest.approx(200 * STEP_S / INTERVAL_S, abs=2)
-
-
-def test_a_disabled_camera_is_counted_and_told_once_until_it_is_enabled(
-    robot: InProcessSupervisor, make: Make, recording: Recording, capfd: pytest.CaptureFixture[str]
-) -> None:
-    bridge, camera = make(), robot.getDevice("camera")
-    bridge.keep_camera(camera)
-    drive(robot, bridge, range(100))
-    missed = bridge.stats().frames_missed
-    camera.enable(STEP_MS)
-    drive(robot, bridge, range(100, 200))
-    bridge.keep("a look")
-    bridge.close()
-
-    assert missed == pytest.approx(100 * STEP_S / INTERVAL_S, abs=2)
-    (told,) = recording.rows(WARNINGS)
-    assert "camera 'camera' is disabled: call its enable(time_step)" in told
-    assert len(recording.rows(FRAMES)) == pytest.approx(100 * STEP_S / INTERVAL_S, abs=2)
-    assert capfd.readouterr().err == ""
 
 
 class Broken:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import time
@@ -74,13 +73,6 @@ def test_another_process_of_the_same_pid_is_not_the_one_that_recorded(
         )
         assert start_again(database) == "rover"
         process.communicate(b"\n")
-
-
-def test_a_process_that_ended_but_was_not_waited_for_has_no_identity() -> None:
-    process = subprocess.Popen([sys.executable, "-c", ""])
-    os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)  # ended, and still to be waited for
-    assert process_identity(process.pid) is None
-    process.wait()
 
 
 def test_a_session_that_writes_again_is_alive_again_and_takes_commands(

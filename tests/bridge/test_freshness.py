@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 from tests.bridge.conftest import STEP_MS, Recording, eager, numbers
 from webots_mcp import MCPBridge, MemoryDatabase
-from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.standin import InProcessSimulation, InProcessSupervisor
 
 
@@ -41,16 +37,6 @@ def test_a_pause_shows_the_state_that_it_holds(
     (newest,) = recording.rows("SELECT max(sim_time_s) FROM state")
     assert newest == pytest.approx(result["sim_time_s"])
     assert numbers(recording)[-1] == 9
-
-
-def test_a_pause_of_a_loop_that_records_every_state_holds_at_once(
-    robot: InProcessSupervisor, database: MemoryDatabase, recording: Recording
-) -> None:
-    with MCPBridge(robot, throttle_interval=1, database=database) as bridge:
-        pause = recording.send("pause")
-        recording.send("resume")
-        come_round(robot, bridge, 1)
-        assert recording.fate(pause)[0] == "done"
 
 
 def test_every_state_of_single_steps_is_recorded(
@@ -85,18 +71,3 @@ def test_a_loop_that_was_quit_while_held_may_say_its_last_words(
     assert numbers(recording) == [1, 2]
     assert recording.rows("SELECT message FROM log WHERE source = 'controller'") == ["last words"]
     assert recording.rows("SELECT end_reason, row_count FROM run") == [("finished", 2)]
-
-
-def test_what_is_published_after_the_bridge_ended_with_the_process_is_said(tmp_path: Path) -> None:
-    program = (
-        "import atexit\n"
-        "from webots_mcp import MCPBridge\n"
-        "from webots_mcp.standin import InProcessSupervisor\n"
-        "atexit.register(lambda: bridge.publish({'n': 2}, force=True))\n"
-        f"bridge = MCPBridge(InProcessSupervisor('rover'), {str(tmp_path)!r})\n"
-        "bridge.publish({'n': 1}, force=True)\n"
-    )
-    line = [sys.executable, "-c", program]
-    done = subprocess.run(line, capture_output=True, text=True, check=True)
-    assert done.stderr == "webots-mcp: rows are being dropped: the bridge is closed\n"
-    assert numbers(Recording(tmp_path / DATABASE_NAME)) == [1]

@@ -8,6 +8,8 @@ import pytest
 
 from tests.bridge.interrupting import Interrupter, drive, make_template, places
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.filterwarnings(  # Python closes the file that was just being opened, and says so
     "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"

@@ -162,15 +162,6 @@ def test_a_handler_passes_on_its_level_and_above(bridge: MCPBridge, recording: R
     assert recording.rows(LINES) == [("error", "name", "text")]
 
 
-def test_logging_after_the_bridge_was_closed_raises_nothing(
-    robot: InProcessSupervisor, database: MemoryDatabase
-) -> None:
-    with MCPBridge(robot, database=database) as bridge:
-        logger = logging.Logger("arm.gripper")
-        logger.addHandler(bridge.log_handler())
-    logger.error("late")
-
-
 def test_logging_is_imported_only_for_its_handler() -> None:
     program = (
         "import sys\n"

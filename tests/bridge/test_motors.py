@@ -76,19 +76,6 @@ def test_a_motor_that_was_sent_to_an_angle_is_left_to_the_controller(
     assert "left wheel motor" not in logged
 
 
-def test_what_a_callback_asks_of_a_motor_after_the_reset_counts(
-    robot: InProcessSupervisor, bridge: MCPBridge
-) -> None:
-    turn_without_end(robot, 3.0, 3.0)
-    bridge.on_reload(lambda: turn_without_end(robot, 0.0, 0.0))
-    drive(robot, bridge)
-    robot.simulationReset()
-    drive(robot, bridge, 2)
-    after_reset = place_of(robot)
-    drive(robot, bridge)
-    assert place_of(robot) == after_reset
-
-
 def test_a_motor_that_cannot_be_asked_again_is_told_and_the_other_turns_on(
     robot: InProcessSupervisor, database: MemoryDatabase, recording: Recording
 ) -> None:

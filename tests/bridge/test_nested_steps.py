@@ -56,21 +56,6 @@ class Environment(InProcessSupervisor):
         return super().step(STEP_MS)
 
 
-def test_a_subclass_with_a_step_of_its_own_may_step_in_a_handler(
-    database: MemoryDatabase, recording: Recording
-) -> None:
-    robot = Environment("rover")
-    with MCPBridge(robot, database=database) as bridge:
-        bridge.register_command("act", lambda _: robot.step("left"))
-        robot.step("right")
-        recording.send("pause")
-        act = recording.send("act")
-        recording.send("resume")
-        eager(bridge)
-        assert recording.fate(act) == ("done", 0, None)
-        assert robot.getTime() == pytest.approx(2 * 0.016)
-
-
 def test_both_halves_of_a_step_work_in_a_handler(
     robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
 ) -> None:
@@ -85,17 +70,6 @@ def test_both_halves_of_a_step_work_in_a_handler(
     eager(bridge)
     assert recording.fate(sent) == ("done", 0, None)
     assert robot.getTime() == pytest.approx(0.016)
-
-
-def test_a_callback_may_step_during_a_hold(
-    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
-) -> None:
-    bridge.on_reload(lambda: robot.step(STEP_MS))
-    recording.send("pause")
-    sent = recording.send("reset_state")
-    recording.send("resume")
-    eager(bridge)
-    assert recording.fate(sent) == ("done", {"callbacks": 1}, None)
 
 
 def test_a_handler_with_a_loop_of_its_own_is_held_in_it_and_resumed(

@@ -194,18 +194,6 @@ class Environment(InProcessSupervisor):
         return 0.5, super().step(STEP_MS) == -1  # type: ignore[misc]
 
 
-def test_a_subclass_with_another_step_can_be_paused_and_resumed(
-    database: MemoryDatabase, recording: Recording
-) -> None:
-    environment = Environment("rover")
-    with MCPBridge(environment, throttle_interval=1, database=database) as bridge:
-        assert environment.step("forward") == (0.5, False)
-        pause, resume = recording.send("pause"), recording.send("resume")
-        bridge.get_command()
-        assert environment.step("forward") == (0.5, False)
-    assert [recording.fate(c)[0] for c in (pause, resume)] == ["done", "done"]
-
-
 class Plain(InProcessSupervisor):
     """Its step() calls that of a class by name, without a look at what the instance has."""
 

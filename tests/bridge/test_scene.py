@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -35,14 +33,6 @@ def test_robots_are_found_in_groups_on_other_robots_and_in_the_slots_of_proto_no
     assert (by_name["rider"].parent.name, by_name["rider"].definition) == ("platform", "RIDER")
 
 
-def test_each_node_says_where_it_stands(referee: InProcessSupervisor) -> None:
-    by_name = {node.name: node for node in walk(referee.getRoot())}
-    platform, sensor = by_name["platform"], by_name["turned"]
-    assert (platform.field, platform.entry, platform.depth) == ("endPoint", None, 3)
-    assert (sensor.field, sensor.entry, sensor.base_type) == ("device", 1, "PositionSensor")
-    assert (platform.is_solid, sensor.is_solid) == (True, False)
-
-
 def test_a_walk_is_bounded_and_gives_what_is_near_the_root_first(
     referee: InProcessSupervisor,
 ) -> None:
@@ -59,22 +49,6 @@ def test_shapes_and_appearances_are_given_only_where_they_are_asked_for(
     assert not types & {"Shape", "PBRAppearance", "Box", "WorldInfo"}
     everything = {node.base_type for node in walk(referee.getRoot(), everything=True)}
     assert everything >= {"WorldInfo", "Viewpoint", "HingeJointParameters"} | types
-
-
-def test_a_walk_asks_only_for_what_is_taken_from_it(
-    referee: InProcessSupervisor, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    requests: list[str] = []
-    session: Any = referee._session  # pyright: ignore[reportPrivateUsage]
-    real = session._ask
-
-    def ask(*of: Any) -> Any:
-        requests.append(of[0])
-        return real(*of)
-
-    monkeypatch.setattr(session, "_ask", ask)
-    assert len([*islice(walk(referee.getRoot()), 2)]) == 2
-    assert len(requests) == 6  # the root, its children, and the first four of them
 
 
 def test_the_inside_of_a_proto_node_is_read_by_either_name_of_its_method(

@@ -55,15 +55,6 @@ def test_a_path_leads_to_a_field_however_one_would_write_it(
     assert crowd.get(path) == value
 
 
-def test_a_node_is_found_by_its_number_and_shows_its_fields(crowd: Scene) -> None:
-    pillar = crowd.ask("get_field", path="PILLAR")
-    fields = {name: (kind, value) for name, kind, value in pillar["rows"]}
-    assert pillar["node"] == "Solid PILLAR"
-    assert fields["translation"] == ("SFVec3f", [3.0, 3.0, 0.0])
-    assert fields["children"] == ("MFNode", "0 nodes")
-    assert crowd.get(f"#{pillar['id']}.name") == "pillar"
-
-
 def test_what_is_inside_a_proto_is_read_and_said_to_be_so(crowd: Scene) -> None:
     inside = crowd.ask("get_field", path="CRATE.boundingObject")
     assert inside["value"].endswith("Pose")

@@ -71,15 +71,6 @@ def test_many_names_are_entered_some_with_each_row_and_never_too_many(
     assert recording.rows(count) == [MAX_SIGNALS]
 
 
-def test_keys_that_are_others_in_every_state_cost_little(
-    bridge: MCPBridge, recording: Recording
-) -> None:
-    for number in range(200):
-        bridge.publish({f"key{number}": number})
-    (entered,) = recording.rows("SELECT count(*) FROM signal")
-    assert 64 <= entered < 80
-
-
 def test_names_wait_while_another_process_writes(robot: InProcessSupervisor, file: Path) -> None:
     state = {"pose": [1, 2, 0.5]}
     with MCPBridge(robot, throttle_interval=1, database=file) as bridge:

@@ -59,21 +59,6 @@ def test_a_successor_is_held_in_its_first_step_until_a_resume(
     assert recording.rows("SELECT pause_state FROM session WHERE id = 2") == [None]
 
 
-def test_a_successor_makes_the_steps_that_a_command_asks_for_and_is_held_again(
-    simulation: InProcessSimulation, database: MemoryDatabase, recording: Recording
-) -> None:
-    leave_held(simulation, database)
-    with succeed(simulation, database) as bridge:
-        step = recording.send("step", steps=2)
-        bridge.robot.step(STEP_MS)
-        eager(bridge)
-        bridge.robot.step(STEP_MS)
-        resume = recording.send("resume")
-        eager(bridge)
-        assert recording.fate(step)[1]["steps"] == 2
-        assert recording.fate(resume)[1]["mode"] == "real_time"
-
-
 def test_where_a_person_pressed_play_meanwhile_there_is_nothing_to_take_over(
     simulation: InProcessSimulation, database: MemoryDatabase, recording: Recording
 ) -> None:

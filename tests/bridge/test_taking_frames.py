@@ -5,16 +5,15 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
 from PIL import Image
 
 from tests.bridge.conftest import STEP_MS, Recording, eager
-from webots_mcp import MCPBridge, MemoryDatabase
+from webots_mcp import MCPBridge
 from webots_mcp.bridge.pictures import encode_png, take_picture
-from webots_mcp.standin import InProcessRobot, InProcessSupervisor
+from webots_mcp.standin import InProcessSupervisor
 
 Drive = Callable[[int], None]
 Pixel = tuple[int, int, int]
@@ -23,29 +22,6 @@ BLACK, WHITE = (0, 0, 0), (255, 255, 255)
 
 def shown(picture: Any) -> Image.Image:
     return Image.open(io.BytesIO(encode_png(picture.bgra, picture.width, picture.height)))
-
-
-def files(database: MemoryDatabase, result: dict[str, Any]) -> Image.Image:
-    return Image.open(io.BytesIO((Path(database.data_dir) / result["path"]).read_bytes()))
-
-
-def test_a_frame_is_taken_of_an_enabled_camera_that_nobody_saves(
-    robot: InProcessSupervisor,
-    bridge: MCPBridge,
-    recording: Recording,
-    database: MemoryDatabase,
-    drive: Drive,
-) -> None:
-    robot.devices["camera"].enable(STEP_MS)  # type: ignore[attr-defined]
-    drive(2)
-    sent = recording.send("take_frame", camera="camera")
-    eager(bridge)
-    result = recording.fate(sent)[1]
-    assert (result["camera"], result["sim_time_s"]) == ("camera", pytest.approx(0.032))
-    assert result["scale"] is None
-    assert files(database, result).size == (result["width"], result["height"])
-    rows = recording.rows("SELECT kind, device, path FROM image")
-    assert rows == [("camera", "camera", result["path"])]
 
 
 def test_each_frame_of_a_pause_is_taken_while_it_lasts(
@@ -60,23 +36,6 @@ def test_each_frame_of_a_pause_is_taken_while_it_lasts(
     assert [recording.fate(each)[0] for each in sent] == ["done", "done"]
     paths = {recording.fate(each)[1]["path"] for each in sent}
     assert len(paths) == 2
-
-
-def test_a_robot_that_is_no_supervisor_gives_frames_too(
-    database: MemoryDatabase, recording: Recording
-) -> None:
-    robot = InProcessRobot("rover")
-    robot.devices["lidar"].enable(STEP_MS)  # type: ignore[attr-defined]
-    with MCPBridge(robot, database=database) as bridge:
-        robot.step(STEP_MS)
-        sent = recording.send("take_frame")
-        eager(bridge)
-    result = recording.fate(sent)[1]
-    assert result["camera"] == "lidar"
-    assert "from above, up is ahead; a ring each 1 m" in result["scale"]
-    picture = files(database, result).convert("RGB")
-    assert picture.getpixel((180, 180)) not in (BLACK, WHITE)  # the lidar itself
-    assert WHITE in {pixel for _, pixel in picture.getcolors() or []}
 
 
 @pytest.mark.parametrize("camera", ["camera", ""])

@@ -11,14 +11,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Final, cast
 
 from webots_mcp.bridge.breakpoints import Goal, read_goal
-from webots_mcp.bridge.commands import ClaimedCommand, Handlers, Progress
+from webots_mcp.bridge.commands import ClaimedCommand, Handlers, Progress, whole_number
 from webots_mcp.bridge.error_report import describe
 from webots_mcp.bridge.parameters import SETTERS, Setter
 from webots_mcp.bridge.pause import PUMP_INTERVAL_S
 from webots_mcp.bridge.pictures import complete_png_size, find_pictured, take_picture
+from webots_mcp.bridge.scene import get_field, get_scene
+from webots_mcp.bridge.scene_changes import add_node, remove_node, set_field
 from webots_mcp.contract import (
     BUILT_IN_ACTIONS,
     ENDING,
@@ -50,7 +52,13 @@ _RELOAD_TIMEOUT_S: Final = 30.0
 _DIALOG: Final = "a dialog may be open in Webots (start it with --batch)"
 _HIGHEST_STATUS: Final = 255
 
-_known: Final[dict[str, Action]] = {}
+_known: Final[dict[str, Action]] = {
+    "get_scene": get_scene,
+    "get_field": get_field,
+    "set_field": set_field,
+    "add_node": add_node,
+    "remove_node": remove_node,
+}
 
 
 def begin(session: Session, command: ClaimedCommand) -> Progress:
@@ -61,22 +69,7 @@ def begin(session: Session, command: ClaimedCommand) -> Progress:
     """
     if BUILT_IN_ACTIONS[command.action].needs_supervisor:
         session.simulation.require_supervisor(command.action)
-    return action_of(command.action)(session, command)
-
-
-def action_of(name: str) -> Action:
-    """The function of a built-in action."""
-    if name not in _known:  # the scene's: seldom used, and not worth their import at every start
-        from webots_mcp.bridge import scene, scene_changes
-
-        _known.update(
-            get_scene=scene.get_scene,
-            get_field=scene.get_field,
-            set_field=scene_changes.set_field,
-            add_node=scene_changes.add_node,
-            remove_node=scene_changes.remove_node,
-        )
-    return _known[name]
+    return _known[command.action](session, command)
 
 
 def _built_in(action: Action) -> Action:
@@ -126,7 +119,7 @@ def step(session: Session, command: ClaimedCommand) -> Progress:
     made. A world that does not wait for the robot (`synchronization` FALSE) runs in real time
     meanwhile, so that it can be stopped in time.
     """
-    return _step(session, command, _whole_number(command.params, "steps", 1, MAX_STEPS))
+    return _step(session, command, whole_number(command.params, "steps", 1, MAX_STEPS, default=1))
 
 
 def _step(session: Session, command: ClaimedCommand, steps: int) -> Progress:
@@ -244,7 +237,7 @@ def _world_of_project(session: Session, world: object) -> Path:
 @_built_in
 def quit(session: Session, command: ClaimedCommand) -> Progress:  # noqa: A001  (the action's name)
     """Ask Webots to end; this process ends with it."""
-    status = _whole_number(command.params, "status", 0, _HIGHEST_STATUS, default=0)
+    status = whole_number(command.params, "status", 0, _HIGHEST_STATUS, default=0)
     return _quit(session, command, status)
 
 
@@ -271,7 +264,7 @@ def _until_ended(asked: str) -> Progress:
 @_built_in
 def screenshot(session: Session, command: ClaimedCommand) -> Progress:
     """Ask for the picture; Webots writes the file some time later, or never."""
-    quality = _whole_number(command.params, "quality", 1, 100, default=100)
+    quality = whole_number(command.params, "quality", 1, 100, default=100)
     path = f"{SCREENSHOT_FOLDER}/command-{command.id:06d}.png"
     file = session.album.make_room(path)
     session.simulation.robot.exportImage(str(file), quality)
@@ -425,17 +418,6 @@ def _wait_for_picture(file: Path) -> Generator[None, None, tuple[int, int, int]]
             )
         yield
     return size
-
-
-def _whole_number(
-    params: dict[str, Any], name: str, least: int, most: int, default: int = 1
-) -> int:
-    value = params.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-        raise InvalidInputError(
-            f"{name} must be a whole number from {least} to {most}, not {value!r}"
-        )
-    return value
 
 
 # -- serving the queue -----------------------------------------------------------------------------

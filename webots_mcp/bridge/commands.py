@@ -15,7 +15,7 @@ from webots_mcp.bridge.error_report import cut, storable
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
 from webots_mcp.contract import BUILT_IN_ACTIONS
-from webots_mcp.errors import CommandRefusedError
+from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.naming import nearest_first, same_in_meaning
 from webots_mcp.queue import CLAIM, CLAIMED_SINCE, PEEK, SUCCESSOR_PID
 
@@ -29,6 +29,20 @@ Progress = Generator[None, None, object]
 _MOST_NAMED: Final = 10
 
 _INTERRUPTED: Final = "the controller was interrupted before the command began; it was not run"
+
+
+def whole_number(params: dict[str, Any], name: str, least: int, most: int, *, default: int) -> int:
+    """A parameter of a command; missing or null it is the default.
+
+    Raises:
+        InvalidInputError: It is no whole number from `least` to `most`.
+    """
+    value = default if params.get(name) is None else params[name]
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+        raise InvalidInputError(
+            f"{name} must be a whole number from {least} to {most}, not {value!r}"
+        )
+    return value
 
 
 class ClaimedCommand:

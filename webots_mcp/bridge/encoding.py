@@ -48,18 +48,15 @@ from __future__ import annotations
 import io
 import json
 import pickle
-import time
-from collections import Counter, OrderedDict, defaultdict, deque
-from collections.abc import Callable, Iterable
-from typing import Any, Final, NamedTuple, TypeVar, cast
+from collections import deque
+from collections.abc import Iterable
+from typing import Any, Final, NamedTuple
 
 from webots_mcp.bridge.cleaning import (
-    LONGEST_S,
     MAX_DEPTH,
     MAX_ROOM,
     ROOM_OF_A_VALUE,
     Cleaner,
-    convert,
     failure,
     is_number_array,
     item_count,
@@ -82,15 +79,10 @@ _MOST_SHORT_KEYS: Final = 10_000
 # Types that take the room of one value and need no further check.
 _LEAVES: Final = frozenset((float, bool, type(None)))
 _SHORT_ARRAY: Final = 16
-_CONTAINERS: Final[tuple[Any, ...]] = (dict, list, tuple)
 _MANY: Final = (dict, list, tuple, set, frozenset, deque)
-_PLAIN_DICTS: Final = (OrderedDict, defaultdict, Counter)
 
 # Keys that were checked before: every row has the same ones, so most checks are one set operation.
 _short_keys: set[object] = set()
-
-
-_Taken = TypeVar("_Taken")
 
 
 class Encoded(NamedTuple):
@@ -114,28 +106,13 @@ class _NotPlainError(Exception):
     """The value is too large, or of a type that only the slow path can encode."""
 
 
-class _Converted(dict[int, object]):
-    """The plain counterpart of each object, by its id.
-
-    Attributes:
-        began_s: When the first one was converted, as processor time of the thread.
-        others: Whether a value was met whose type is not one of JSON's own.
-    """
-
-    began_s: float | None = None
-    others = False
-
-    def require_time(self) -> None:
-        """Raise _NotPlainError where the objects have taken too long already."""
-        if self.began_s is None:
-            self.began_s = time.thread_time()
-        elif time.thread_time() > self.began_s + LONGEST_S:
-            raise _NotPlainError
-
-
 def encode(state: object) -> Encoded:
     """Encode a state, as fast as its content allows; the state itself is never changed."""
-    return _when_plain(state, _encode_ordinary)
+    try:
+        _look((state,), MAX_PLAIN_VALUES, 0)
+        return _encode_looked_at(state)
+    except Exception:  # noqa: BLE001  (the slow path finds and names what cannot be encoded)
+        return _encode_replacing(state)
 
 
 def copy_or_encode(state: object) -> bytes | Encoded:
@@ -143,7 +120,15 @@ def copy_or_encode(state: object) -> bytes | Encoded:
 
     To copy costs less than to encode; only dicts of plain values are copied.
     """
-    return _when_plain(state, _copy_or_encode)
+    if state.__class__ is not dict:
+        return encode(state)
+    file = io.BytesIO()
+    try:
+        _look((state,), MAX_PLAIN_VALUES, 0)
+        _Copier(file, pickle.HIGHEST_PROTOCOL).dump(state)
+    except Exception:  # noqa: BLE001  (whatever an object of the user's does)
+        return encode(state)
+    return file.getvalue()
 
 
 def encode_copy(copy: bytes) -> Encoded:
@@ -162,7 +147,7 @@ def plain(value: Any) -> Any:
 def _is_small(value: object) -> bool:
     """Whether a look at all of it, as `str` takes, ends soon."""
     try:
-        _look((value,), MAX_PLAIN_VALUES, 0, _Converted())
+        _look((value,), MAX_PLAIN_VALUES, 0)
     except Exception:  # noqa: BLE001  (whatever an object of the user's does)
         return False
     return True
@@ -179,24 +164,13 @@ def text_of(value: object) -> str:
 # -- the fast path: plain states ---------------------------------------------------------------
 
 
-def _when_plain(state: object, take: Callable[[object, _Converted], _Taken]) -> _Taken | Encoded:
-    """Take a plain state on the fast path; any other one is encoded with replacements."""
-    converted = _Converted()
-    try:
-        _look((state,), MAX_PLAIN_VALUES, 0, converted)
-        return take(state, converted)
-    except Exception:  # noqa: BLE001  (the slow path finds and names what cannot be encoded)
-        return _encode_replacing(state)
-
-
-def _look(values: Iterable[Any], left: int, depth: int, converted: _Converted) -> int:
+def _look(values: Iterable[Any], left: int, depth: int) -> int:
     """Check size and types before encoding, since the encoder has no bounds of its own.
 
     Args:
         values: The items of one container.
         left: How many more values there may be.
         depth: How deep these are nested.
-        converted: Receives the plain counterpart of each object, by its id.
 
     Returns:
         How many more there may be after these.
@@ -216,7 +190,7 @@ def _look(values: Iterable[Any], left: int, depth: int, converted: _Converted) -
             if left < 0 or not (_short_keys.issuperset(value) or _has_short_keys(value)):
                 raise _NotPlainError
             if not _LEAVES.issuperset(map(type, items := value.values())):
-                left = _look(items, left, depth + 1, converted)
+                left = _look(items, left, depth + 1)
         elif kind is list or kind is tuple:
             left -= len(value)
             if left < 0:
@@ -224,7 +198,7 @@ def _look(values: Iterable[Any], left: int, depth: int, converted: _Converted) -
             if len(value) > _SHORT_ARRAY and type(value[0]) is float and _adds_up(value):
                 continue
             if not _LEAVES.issuperset(map(type, value)):
-                left = _look(value, left, depth + 1, converted)
+                left = _look(value, left, depth + 1)
         elif kind is str:
             if len(value) >= _CHARACTERS_OF_A_VALUE:
                 left -= len(value) // _CHARACTERS_OF_A_VALUE
@@ -232,7 +206,7 @@ def _look(values: Iterable[Any], left: int, depth: int, converted: _Converted) -
             if not -(2**63) <= value < 2**63:
                 raise _NotPlainError
         elif kind is not bool and value is not None:
-            left = _look_at_object(value, left, depth, converted)
+            left = _look_at_number(value, left)
     if left < 0:
         raise _NotPlainError
     return left
@@ -265,60 +239,24 @@ def _is_plain_key(key: object) -> bool:
     return key is None or type(key) in (bool, float)
 
 
-def _look_at_object(value: Any, left: int, depth: int, converted: _Converted) -> int:
-    converted.others = True
-    if isinstance(value, float):
+def _look_at_number(value: Any, left: int) -> int:
+    """Check a number or a text of a subclass, or an array of numbers."""
+    if isinstance(value, int) and -(2**63) <= value < 2**63:
         return left
-    if isinstance(value, int):
-        return _look((int(value),), left, depth, converted)
     if isinstance(value, str):
         return left - len(value) // _CHARACTERS_OF_A_VALUE
-    if isinstance(value, _CONTAINERS):
-        return _look_at_container(value, left, depth, converted)
     if is_number_array(value):
-        converted[id(value)] = value
-        return _look((), left - item_count(value), depth, converted)
-    converted.require_time()
-    converted[id(value)] = plain = convert(value)
-    return _look((plain,), left - 1, depth + 1, converted)
-
-
-def _look_at_container(value: Any, left: int, depth: int, converted: _Converted) -> int:
-    """Check a subclass of a container as its base class, if it does not override iteration.
-
-    The encoders call an overridden iteration for some subclasses and ignore it for others.
-    """
-    kind = cast("Any", type(value))
-    base = next(base for base in _CONTAINERS if issubclass(kind, base))
-    plain = kind in _PLAIN_DICTS or (base is not dict and kind.__iter__ is base.__iter__)
-    if not plain or cast("Any", base).__len__(value) > left:
+        return left - item_count(value)
+    if not isinstance(value, float):
         raise _NotPlainError
-    return _look((cast("Any", base)(value),), left, depth, converted)
+    return left
 
 
-def _encode_ordinary(state: object, converted: _Converted) -> Encoded:
-    text = _encode_looked_at(state, converted)
+def _encode_looked_at(state: object) -> Encoded:
+    text = _encode_with_orjson(state) or _encode_plain(state)
     if (len(text) if text.isascii() else len(text.encode())) > MAX_ROW_BYTES:
         raise _NotPlainError
     return Encoded(text, {})
-
-
-def _encode_looked_at(state: object, converted: dict[int, object]) -> str:
-    counterpart = _Counterparts(converted) if converted else None
-    if orjson is not None and (text := _encode_with_orjson(state, counterpart)) is not None:
-        return text
-    return _encode_plain(state) if counterpart is None else _encoder(counterpart)(state)
-
-
-def _copy_or_encode(state: object, converted: _Converted) -> bytes | Encoded:
-    if converted.others or type(state) is not dict:
-        return _encode_ordinary(state, converted)
-    file = io.BytesIO()
-    try:
-        _Copier(file, pickle.HIGHEST_PROTOCOL).dump(cast("object", state))
-    except _NotPlainError:
-        return _encode_ordinary(cast("object", state), converted)
-    return file.getvalue()
 
 
 class _Copier(pickle.Pickler):
@@ -332,42 +270,32 @@ class _Copier(pickle.Pickler):
         raise _NotPlainError
 
 
-class _Counterparts:
-    """Gives the encoder the counterpart of a value that it does not know."""
-
-    def __init__(self, converted: dict[int, object]) -> None:
-        self._converted = converted
-
-    def __call__(self, value: Any) -> object:
-        plain = self._converted[id(value)]
-        return value.tolist() if plain is value else plain
+def _listed(value: Any) -> object:
+    """The values of an array of numbers, for an encoder that does not know it."""
+    if not is_number_array(value):
+        raise _NotPlainError
+    return value.tolist()
 
 
-def _encode_with_orjson(state: object, counterpart: Callable[[Any], object] | None) -> str | None:
+def _encode_with_orjson(state: object) -> str | None:
     """None where orjson cannot, or may have turned a NaN silently into null."""
+    if orjson is None:
+        return None
     try:
-        text = orjson.dumps(state, counterpart, _ORJSON_OPTIONS)
+        text = orjson.dumps(state, _listed, orjson.OPT_SERIALIZE_NUMPY)
     except Exception:  # noqa: BLE001  (the user's objects may raise anything; `json` comes next)
         return None
     return None if b"null" in text else text.decode()
 
 
-def _encoder(counterpart: Callable[[Any], object] | None = None) -> Callable[[object], str]:
-    # Nesting is bounded before, so nothing contains itself; without this check it is 8 % faster.
-    return json.JSONEncoder(
-        check_circular=False,
-        allow_nan=False,
-        ensure_ascii=False,
-        separators=(",", ":"),
-        default=counterpart,
-    ).encode
-
-
-_encode_plain: Final = _encoder()
-# orjson's own encoding of a dataclass would lose the fields that begin with an underscore.
-_ORJSON_OPTIONS: Final[int] = (
-    orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_PASSTHROUGH_DATACLASS if orjson is not None else 0
-)
+# Nesting is bounded before, so nothing contains itself; without this check it is 8 % faster.
+_encode_plain: Final = json.JSONEncoder(
+    check_circular=False,
+    allow_nan=False,
+    ensure_ascii=False,
+    separators=(",", ":"),
+    default=_listed,
+).encode
 
 
 # -- the slow path: everything else ------------------------------------------------------------

@@ -17,7 +17,7 @@ from collections import deque
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from webots_mcp.bridge.encoding import copy_or_encode, encode_copy
+from webots_mcp.bridge.encoding import copy_or_encode, encode, encode_copy
 from webots_mcp.bridge.error_report import cut, describe, storable
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.pictures import image_of
@@ -105,15 +105,19 @@ class Keeper:
 
     # -- the loop ------------------------------------------------------------------------------
 
-    def add(self, state: object) -> None:
-        """Add a call of `publish` that is not recorded."""
-        clock = self._clock
-        held, replaced = copy_or_encode(state), None
-        if not isinstance(held, bytes):
-            held, replaced = held.text, held.replaced_text
-            if not held.startswith("{"):
-                return  # not a dict: the next recorded call reports that
-        row = RingRow(self._throttle.calls, clock.sim_time_s, time.time(), held, replaced)
+    def add(self, state: object, own_bytes: int = 0) -> None:
+        """Add a call of `publish` that is not recorded.
+
+        Args:
+            state: Is copied, unless it is known that nothing will change it.
+            own_bytes: The memory that such a state takes, about; 0 where it has to be copied.
+        """
+        held, replaced = (state, None) if own_bytes else _copied(state)
+        if held is None:
+            return  # not a dict: the next recorded call reports that
+        clock, size_bytes = self._clock, own_bytes or sys.getsizeof(held)
+        times = (clock.sim_time_s, time.time())
+        row = RingRow(self._throttle.calls, *times, held, replaced, _ROW_BYTES + size_bytes)
         with self._lock:
             if clock.run is not self._run:
                 self._begin_run()
@@ -291,13 +295,13 @@ class Keeper:
 
         They are forgotten after it: rows that an interrupt lets be written twice do no harm.
         """
-        rows = list[RingRow]()
+        rows = list[tuple[int, float, float, str, str | None]]()
         room, until_s = _CHARACTERS_AT_ONCE, time.thread_time() + _ENCODING_AT_ONCE_S
         for run, row in islice(self._unwritten, _ROWS_AT_ONCE):
             if run is not self._unwritten[0][0] or room <= 0 or time.thread_time() > until_s:
                 break
             rows.append(row.encode())
-            room -= len(rows[-1].data)
+            room -= len(rows[-1][3])
         if rows:
             self._recorder.record_together("kept state", self._unwritten[0][0], rows)
         for _ in rows:
@@ -313,28 +317,33 @@ class RingRow(NamedTuple):
 
     Attributes:
         call: Its number in the session.
-        data: The text that would have been recorded, or a copy of the state to encode later.
+        data: The text that would have been recorded, or the state or its copy, to encode later.
         replaced: The value of the column `replaced`, where `data` is a text.
+        size_bytes: The memory that it takes, about.
     """
 
     call: int
     sim_time_s: float
     wall_time_s: float
-    data: str | bytes
+    data: object
     replaced: str | None
+    size_bytes: int
 
-    @property
-    def size_bytes(self) -> int:
-        """The approximate memory that it takes."""
-        replaced_bytes = sys.getsizeof(self.replaced) if self.replaced else 0
-        return _ROW_BYTES + sys.getsizeof(self.data) + replaced_bytes
-
-    def encode(self) -> RingRow:
+    def encode(self) -> tuple[int, float, float, str, str | None]:
         """The row as it would have been recorded."""
         if isinstance(self.data, str):
-            return self
-        encoded = encode_copy(self.data)
-        return RingRow(*self[:3], encoded.text, encoded.replaced_text)
+            return (*self[:3], self.data, self.replaced)
+        data = self.data
+        encoded = encode_copy(data) if isinstance(data, bytes) else encode(data)
+        return (*self[:3], encoded.text, encoded.replaced_text)
+
+
+def _copied(state: object) -> tuple[str | bytes | None, str | None]:
+    """A copy of a state, or its text with what was replaced; None of what is no dict."""
+    held = copy_or_encode(state)
+    if isinstance(held, bytes):
+        return held, None
+    return (held.text, held.replaced_text) if held.text.startswith("{") else (None, None)
 
 
 class Ring:

@@ -110,7 +110,8 @@ class MCPBridge:
         simulation = Simulation(robot)
         # After the check of the robot, before the new session: a refused construction leaves the
         # former bridge as it is, and two sessions of one robot never overlap.
-        close_former(robot)
+        if (former := _bridges.get(id(robot))) is not None:
+            former.close("superseded")
         where = (self.database, self.data_dir)
         self._session = Session(
             simulation, *where, throttle, keep_last_s, self._errors, kind=self._kind
@@ -119,7 +120,7 @@ class MCPBridge:
         self._session.begin()
         self._capture = self._capture_output() if capture_output else None
         self._attachment: Attachment | None = None
-        enter(robot, OpenBridge(self, self.close, self._leave_to_parent))
+        _bridges[id(robot)] = self
         atexit.register(self._close_at_exit)
 
     # -- attaching -----------------------------------------------------------------------------
@@ -154,8 +155,8 @@ class MCPBridge:
         Raises:
             ValueError: Options are given and the robot has a bridge already.
         """
-        bridge = find(robot)
-        if not isinstance(bridge, MCPBridge):
+        bridge = _bridges.get(id(robot))
+        if bridge is None:
             bridge = cls(robot, **options)
         elif options:
             raise ValueError(
@@ -505,7 +506,7 @@ class MCPBridge:
             self._session.let_go()
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("close", error)
-        leave(self.robot)
+        _bridges.pop(id(self.robot), None)
         if self._capture is not None:
             self._capture.close()
         self._session.close(reason)
@@ -584,49 +585,12 @@ def _seconds(given: float | str) -> float:
 # dropped.
 
 
-class OpenBridge(NamedTuple):
-    """A bridge, and how to close it.
-
-    Attributes:
-        bridge: The bridge itself.
-        close: Ends its session, for a reason.
-        abandon: In a forked child: leaves the session to the parent.
-    """
-
-    bridge: object
-    close: Callable[[str], object]
-    abandon: Callable[[], object]
-
-
-_bridges: dict[int, OpenBridge] = {}
-
-
-def enter(robot: object, bridge: OpenBridge) -> None:
-    """Register a robot's bridge."""
-    _bridges[id(robot)] = bridge
-
-
-def find(robot: object) -> object | None:
-    """The open bridge of a robot, or None."""
-    open_bridge = _bridges.get(id(robot))
-    return None if open_bridge is None else open_bridge.bridge
-
-
-def leave(robot: object) -> None:
-    """Remove a robot's closed bridge."""
-    _bridges.pop(id(robot), None)
-
-
-def close_former(robot: object) -> None:
-    """Close the robot's previous bridge, if it has one."""
-    former = _bridges.get(id(robot))
-    if former is not None:
-        former.close("superseded")
+_bridges: dict[int, MCPBridge] = {}
 
 
 def _leave_to_parent() -> None:
     for bridge in _bridges.values():
-        bridge.abandon()
+        bridge._leave_to_parent()  # pyright: ignore[reportPrivateUsage]
     _bridges.clear()
 
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
-from webots_mcp.bridge.commands import ClaimedCommand, Progress
+from webots_mcp.bridge.commands import ClaimedCommand, Progress, whole_number
 from webots_mcp.bridge.error_report import cut
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.naming import nearest_first
@@ -549,9 +549,9 @@ def get_scene(session: Session, command: ClaimedCommand) -> Progress:
     types, names = _patterns(params, "types"), _patterns(params, "names")
     seen: dict[str, None] = {}
     wanted = [each for each in _patterns(params, "fields") if each != "name"]  # shown anyway
-    after = _whole(params, "cursor", 0, 0, 10**9)
+    after = whole_number(params, "cursor", 0, 10**9, default=0)
     usual = DEEPEST if types or names else _USUAL_DEPTH
-    depth = _whole(params, "depth", usual, 1, DEEPEST)
+    depth = whole_number(params, "depth", 1, DEEPEST, default=usual)
     path = params.get("path")
     place = (yield from find_node(robot, path)) if path else None
     around = robot.getRoot() if place is None else place.node
@@ -643,7 +643,7 @@ def _any_match(texts: Iterable[str], patterns: list[str]) -> bool:
 def get_field(session: Session, command: ClaimedCommand) -> Progress:
     """The value of the field, or all fields of the node, at a `path`."""
     place = yield from find(session.simulation.robot, command.params.get("path"))
-    start = _whole(command.params, "start", 0, 0, 10**9)
+    start = whole_number(command.params, "start", 0, 10**9, default=0)
     facts: dict[str, Any] = {"path": place.path}
     if place.is_hidden:
         facts["read_only"] = "it is inside a PROTO"
@@ -726,17 +726,6 @@ def _patterns(params: dict[str, Any], name: str) -> list[str]:
             f"{name} has {len(texts)} texts; at most {_MOST_PATTERNS} may be given"
         )
     return texts
-
-
-def _whole(params: dict[str, Any], name: str, usual: int, least: int, most: int) -> int:
-    value = params.get(name)
-    if value is None:
-        return usual
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-        raise InvalidInputError(
-            f"{name} must be a whole number from {least} to {most}, not {value!r}"
-        )
-    return value
 
 
 # -- values of fields ------------------------------------------------------------------------------

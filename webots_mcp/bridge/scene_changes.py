@@ -353,90 +353,6 @@ class Removal(NamedTuple):
         return 0 < len(self.text) <= _MOST_EXPORTED_CHARACTERS
 
 
-class Restoration:
-    """Undoes the changes of one run, after its reset.
-
-    Args:
-        robot: The Supervisor.
-        failed: Receives each error of a call to Webots.
-    """
-
-    def __init__(self, robot: Any, failed: Callable[[str, Exception], None]) -> None:
-        self._robot = robot
-        self._failed = failed
-        self._set: list[FieldEdit] = []
-        self._outcomes: dict[str, list[str]] = {"by_webots": [], "by_bridge": [], "not": []}
-
-    def put_back(
-        self, fields: list[FieldEdit], added: dict[int, str], removed: list[Removal]
-    ) -> list[Removal]:
-        """Restore fields, remove added nodes, and add removed nodes again.
-
-        Returns:
-            The removed nodes with their new numbers. They have to be remembered: to Webots they
-            are added nodes, so the next reset will remove them again.
-        """
-        for edit in reversed(fields):
-            self._try(edit.path, self._set_back, edit)
-        for node_id, path in added.items():
-            self._try(path, self._take_away, node_id, path)
-        in_order = sorted(removed, key=lambda each: each.entry or 0)
-        return [self._try(each.path, self._bring_back, each) or each for each in in_order]
-
-    def outcome(self) -> dict[str, object]:
-        """What was put back by Webots, what by the bridge, and what was not; a step later."""
-        for edit in self._set:
-            self._try(edit.path, self._check_set, edit)
-        return {how: paths for how, paths in self._outcomes.items() if paths}
-
-    def _try(self, path: str, restore: Callable[..., Any], *arguments: Any) -> Any:
-        try:
-            return restore(*arguments)
-        except Exception as error:  # noqa: BLE001  (the robot comes first)
-            self._failed(f"putting {path} back", error)
-            self._outcomes["not"].append(path)
-            return None
-
-    def _set_back(self, edit: FieldEdit) -> None:
-        field = find_again(self._robot, edit.node_id, edit.name)
-        if field is None:
-            self._outcomes["not"].append(f"{edit.path}: its node does not exist any more")
-        elif edit.name in _MOVED_BY_PHYSICS or not self._holds(edit, edit.value):
-            self._outcomes["by_webots"].append(edit.path)
-        else:
-            write(field, edit.before, edit.entry)
-            self._set.append(edit)
-
-    def _check_set(self, edit: FieldEdit) -> None:
-        self._note(edit.path, done=self._holds(edit, edit.before))
-
-    def _holds(self, edit: FieldEdit, value: Any) -> bool:
-        field = find_again(self._robot, edit.node_id, edit.name)
-        return field is not None and is_same(edit.type_name, read(field, edit.entry), value)
-
-    def _take_away(self, node_id: int, path: str) -> None:
-        node = self._robot.getFromId(node_id)
-        if node is None:
-            self._outcomes["by_webots"].append(f"{path} (added)")
-            return
-        node.remove()
-        self._note(f"{path} (added)", done=self._robot.getFromId(node_id) is None)
-
-    def _bring_back(self, removal: Removal) -> Removal:
-        if self._robot.getFromId(removal.node_id) is not None:
-            return removal
-        parent = self._robot.getRoot()
-        if removal.parent_id is not None:
-            parent = self._robot.getFromId(removal.parent_id)
-        field = None if parent is None else parent.getField(removal.field)
-        node = None if field is None else import_node(field, removal.text, removal.entry)
-        self._note(f"{removal.path} (removed)", done=node is not None)
-        return removal if node is None else removal._replace(node_id=int(node.getId()))
-
-    def _note(self, path: str, *, done: bool) -> None:
-        self._outcomes["by_bridge" if done else "not"].append(path)
-
-
 def find_again(robot: Any, node_id: int, name: str) -> Any | None:
     """The field of that name, of a node that may not exist any more."""
     node = robot.getFromId(node_id)
@@ -500,8 +416,9 @@ class SceneEdits:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._restoration: Restoration | None = None
-        self._restored_at_step = 0
+        self._restored_at_step: int | None = None  # None: what was put back is recorded
+        self._set: list[FieldEdit] = []
+        self._outcomes: dict[str, list[str]] = {}
         self.fields: dict[tuple[int, str, int | None], FieldEdit] = {}
         self.added: dict[int, str] = {}
         self.removed: list[Removal] = []
@@ -539,16 +456,75 @@ class SceneEdits:
         """The world was reset: undo the changes that Webots has not undone."""
         if not (self.fields or self.added or self.removed):
             return
-
-        self._restoration = Restoration(self._session.simulation.robot, self._session.errors.failed)
         self._restored_at_step = self._session.clock.steps_seen
-        fields, self.fields = [*self.fields.values()], {}
-        added, self.added = self.added, {}
-        self.removed = self._restoration.put_back(fields, added, self.removed)
+        self._set, self._outcomes = [], {"by_webots": [], "by_bridge": [], "not": []}
+        for edit in reversed(self.fields.values()):
+            self._try(edit.path, self._set_back, edit)
+        for node_id, path in self.added.items():
+            self._try(path, self._take_away, node_id, path)
+        self.fields, self.added = {}, {}
+        # Nodes that are brought back get new numbers, and have to be remembered: to Webots they
+        # are added nodes, so the next reset removes them again.
+        in_order = sorted(self.removed, key=lambda each: each.entry or 0)
+        self.removed = [self._try(e.path, self._bring_back, e) or e for e in in_order]
 
     def look(self) -> None:
         """Record what was put back, after the step with which Webots sets the fields."""
-        restoration = self._restoration
-        if restoration is not None and self._session.clock.steps_seen != self._restored_at_step:
-            self._restoration = None
-            self._session.journal.event("put_back", restoration.outcome())
+        if self._restored_at_step in (None, self._session.clock.steps_seen):
+            return
+        self._restored_at_step = None
+        for edit in self._set:
+            self._try(edit.path, self._check_set, edit)
+        outcomes = {how: paths for how, paths in self._outcomes.items() if paths}
+        self._session.journal.event("put_back", dict[str, object](outcomes))
+
+    @property
+    def _robot(self) -> Any:
+        return self._session.simulation.robot
+
+    def _try(self, path: str, restore: Callable[..., Any], *arguments: Any) -> Any:
+        try:
+            return restore(*arguments)
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            self._session.errors.failed(f"putting {path} back", error)
+            self._outcomes["not"].append(path)
+            return None
+
+    def _set_back(self, edit: FieldEdit) -> None:
+        field = find_again(self._robot, edit.node_id, edit.name)
+        if field is None:
+            self._outcomes["not"].append(f"{edit.path}: its node does not exist any more")
+        elif edit.name in _MOVED_BY_PHYSICS or not self._holds(edit, edit.value):
+            self._outcomes["by_webots"].append(edit.path)
+        else:
+            write(field, edit.before, edit.entry)
+            self._set.append(edit)
+
+    def _check_set(self, edit: FieldEdit) -> None:
+        self._note(edit.path, done=self._holds(edit, edit.before))
+
+    def _holds(self, edit: FieldEdit, value: Any) -> bool:
+        field = find_again(self._robot, edit.node_id, edit.name)
+        return field is not None and is_same(edit.type_name, read(field, edit.entry), value)
+
+    def _take_away(self, node_id: int, path: str) -> None:
+        node = self._robot.getFromId(node_id)
+        if node is None:
+            self._outcomes["by_webots"].append(f"{path} (added)")
+            return
+        node.remove()
+        self._note(f"{path} (added)", done=self._robot.getFromId(node_id) is None)
+
+    def _bring_back(self, removal: Removal) -> Removal:
+        if self._robot.getFromId(removal.node_id) is not None:
+            return removal
+        parent = self._robot.getRoot()
+        if removal.parent_id is not None:
+            parent = self._robot.getFromId(removal.parent_id)
+        field = None if parent is None else parent.getField(removal.field)
+        node = None if field is None else import_node(field, removal.text, removal.entry)
+        self._note(f"{removal.path} (removed)", done=node is not None)
+        return removal if node is None else removal._replace(node_id=int(node.getId()))
+
+    def _note(self, path: str, *, done: bool) -> None:
+        self._outcomes["by_bridge" if done else "not"].append(path)

@@ -28,6 +28,7 @@ from webots_mcp.maintenance import Maintainer
 
 _IDLE_S: Final = 0.5  # a loop that recorded nothing for so long is blocked or waiting
 _UNSEEN_S: Final = 1.0  # of simulation time; less may be one step whose end an interrupt hid
+_BYTES_OF_A_CHARACTER: Final = 6  # of JSON: a number of 10 characters and its key take 100 bytes
 _UNMOVED_S: Final = 10.0  # of wall time
 
 
@@ -230,10 +231,11 @@ class Publisher:
         self._names = SignalNames(session.recorder)
         self.devices = DeviceReader(session)
         self._run = session.clock.run
+        self._own_bytes = 0  # that a state of the devices takes in memory, about
         self.recorded = 0
         self.total_s = self.longest_s = 0.0
 
-    def publish(self, state: Mapping[Any, Any], force: bool) -> None:
+    def publish(self, state: Mapping[Any, Any], force: bool, own_bytes: int = 0) -> None:
         """Record the state if this call is due, a breakpoint is hit or a goal is reached."""
         if self._clock.look():
             self._session.begin_run()
@@ -246,7 +248,7 @@ class Publisher:
         if self._throttle.admits(wanted or hit or self._heartbeat.loop):
             self._record(state)
         elif keeper.fills:
-            keeper.add(state)
+            keeper.add(state, own_bytes)
         if keeper.frames.cameras:
             self._look_at_cameras(at_once=bool(hit))
         if hit:
@@ -272,7 +274,8 @@ class Publisher:
         due = keeper.fills and (throttle.calls + 1) % self.devices.ring_interval == 0
         if due or self._breakpoints.ask_states() or self._watch.asks_states:
             state = self._read(extra, include_time)
-            self.publish(state, force)
+            # What the devices say is made anew each time: nothing else can change it.
+            self.publish(state, force, own_bytes=0 if extra else self._own_bytes)
             return state
         if throttle.admits(force or self._heartbeat.loop is not None):
             state = self._read(extra, include_time)
@@ -307,6 +310,7 @@ class Publisher:
         self._session.journal.state(encoded)
         if isinstance(state, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
             self._record_changes(state)
+        self._own_bytes = _BYTES_OF_A_CHARACTER * len(encoded.text)
         self._names.look(state, encoded.text)
         self._heartbeat.beat_if_due()
         self._count(time.perf_counter() - started_s)

@@ -104,18 +104,6 @@ def test_a_loop_that_steps_and_never_calls_its_bridge_is_told_at_the_end(
     assert "so far it has missed 1.6 s of simulation time" in told
 
 
-def test_a_loop_that_published_and_goes_on_without_is_not_told(
-    robot: InProcessSupervisor, database: MemoryDatabase, recording: Recording
-) -> None:
-    with MCPBridge(robot, database=database) as bridge:
-        robot.step(STEP_MS)
-        bridge.publish({"n": 1})
-        for _ in range(100):
-            robot.step(STEP_MS)
-
-    assert not warnings(recording)
-
-
 def test_while_no_call_comes_by_the_log_says_what_may_be_and_asks_webots_for_nothing(
     robot: InProcessSupervisor,
     file: Path,

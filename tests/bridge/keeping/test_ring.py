@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import tracemalloc
 from collections.abc import Callable
 from typing import Any
@@ -17,7 +18,7 @@ from tests.bridge.conftest import STEP_MS, Recording
 from tests.bridge.keeping.conftest import State, rows
 from tests.bridge.monsters import MONSTERS, EndlessDict
 from webots_mcp import MCPBridge
-from webots_mcp.bridge import cleaning, encoding
+from webots_mcp.bridge import cleaning
 from webots_mcp.bridge.encoding import copy_or_encode, encode, encode_copy
 from webots_mcp.bridge.keeping import Ring, RingRow
 from webots_mcp.standin import InProcessSupervisor
@@ -81,8 +82,7 @@ def test_any_state_that_is_held_is_kept_as_it_would_be_recorded(state: State) ->
 def test_a_monster_that_is_held_is_kept_as_it_would_be_recorded(
     make: Callable[[], Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for module in (encoding, cleaning):  # a busy machine changes nothing
-        monkeypatch.setattr(module, "LONGEST_S", math.inf)
+    monkeypatch.setattr(cleaning, "LONGEST_S", math.inf)
     EndlessDict.asked = 0
     held = copy_or_encode({"monster": make()})
     kept = encode_copy(held) if isinstance(held, bytes) else held
@@ -112,7 +112,7 @@ def test_a_ring_never_takes_more_memory_or_time_than_it_may_and_holds_the_newest
     ring, now_s, given_rows = Ring(last_s, most_bytes), 0.0, list[RingRow]()
     for call, (step_s, text) in enumerate(rows):
         now_s += step_s
-        given_rows.append(RingRow(call, now_s, 0.0, text, None))
+        given_rows.append(RingRow(call, now_s, 0.0, text, None, 400 + len(text)))
         ring.add(given_rows[-1])
         assert ring.size_bytes <= most_bytes
     held = ring.take()
@@ -149,7 +149,8 @@ def test_what_a_ring_holds_takes_no_more_memory_than_it_says(
             held, replaced = copy_or_encode(make_state(number)), None
             if not isinstance(held, bytes):
                 held, replaced = held.text, held.replaced_text
-            ring.add(RingRow(number, number / 100, number + 0.5, held, replaced))
+            size_bytes = 400 + sys.getsizeof(held)
+            ring.add(RingRow(number, number / 100, number + 0.5, held, replaced, size_bytes))
         taken, _ = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()

@@ -116,26 +116,6 @@ def test_a_reset_ends_the_stretch_and_the_new_run_has_none_of_the_old_one(
     assert new_kept == list(range(1000, 1060))
 
 
-def test_robots_of_one_database_keep_what_is_theirs(
-    make: Make, database: MemoryDatabase, recording: Recording
-) -> None:
-    robots = [InProcessSupervisor(name) for name in ("left", "right")]
-    bridges = [make(robot) for robot in robots]
-    bridges[1].breakpoint("n == 300", "keep")
-    for number in range(500):
-        for robot, bridge in zip(robots, bridges, strict=True):
-            robot.step(STEP_MS)
-            bridge.publish({"n": number})
-
-    ((run_id, *_),) = recording.rows(STRETCHES)
-    assert recording.rows("SELECT DISTINCT run_id FROM kept_state") == [run_id]
-    assert recording.rows("SELECT robot, states FROM robot_kept") == [
-        ("right", len(kept_numbers(recording)[0]))
-    ]
-    (kept,) = kept_numbers(recording)
-    assert kept == list(range(kept[0], kept[-1] + 1))
-
-
 @pytest.mark.parametrize(("action", "keeps"), [("pause", True), ("keep", True), ("log", False)])
 def test_who_pauses_or_keeps_has_the_seconds_before_at_once(
     robot: InProcessSupervisor, make: Make, recording: Recording, action: Any, keeps: bool
@@ -152,34 +132,6 @@ def test_who_pauses_or_keeps_has_the_seconds_before_at_once(
     assert len(recording.rows(STRETCHES)) == keeps
     recording.send("resume")
     eager(bridge)
-
-
-@pytest.mark.parametrize("sent", [("pause", {}), ("run", {"until": "n >= 405"})])
-def test_what_is_kept_is_there_while_a_command_pauses(
-    robot: Any, make: Make, recording: Recording, sent: tuple[str, State]
-) -> None:
-    bridge, seen = make(throttle_interval=1000), list[list[list[int]]]()
-    set_mode = robot.simulationSetMode
-
-    def noticed(mode: int) -> None:
-        set_mode(mode)
-        if mode == robot.SIMULATION_MODE_PAUSE:
-            seen.append(kept_numbers(recording))
-            recording.send("resume")
-
-    vars(robot)["simulationSetMode"] = noticed
-    drive(robot, bridge, range(404))
-    recording.send(sent[0], **sent[1])
-    for number in (404, 405, 406):
-        robot.step(STEP_MS)
-        bridge.publish({"n": number})
-        bridge.log("the gear is gone", "error")
-        eager(bridge)
-
-    ((kept,),) = seen
-    assert kept == list(range(kept[0], kept[-1] + 1))
-    assert kept[-1] == 405
-    assert kept[-1] - kept[0] > 300
 
 
 def test_an_error_that_any_thread_logs_keeps_and_a_warning_does_not(
@@ -217,17 +169,6 @@ def test_threads_may_publish_while_others_keep(robot: InProcessSupervisor, make:
     finally:
         sys.setswitchinterval(before_s)
     assert (bridge.stats().failures, bridge.stats().last_error) == (0, None)
-
-
-def test_a_handler_keeps(
-    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
-) -> None:
-    bridge.register_command("look", lambda command: bridge.keep("asked for"))
-    drive(robot, bridge, range(50))
-    command = recording.send("look")
-    drive(robot, bridge, range(50, 60))
-    assert recording.fate(command)[0] == "done"
-    assert kept_numbers(recording) == [list(range(60))]
 
 
 def test_an_exception_that_leaves_the_with_block_keeps_the_last_call(
@@ -287,19 +228,6 @@ def test_where_each_call_is_recorded_a_stretch_is_marked_and_no_row_comes_twice(
     assert recording.rows("SELECT id FROM kept_state") == []
     ((_, start_s, _, _),) = recording.rows(STRETCHES)
     assert start_s == pytest.approx(robot.getTime() - STEP_S - KEEP_LAST_S)
-
-
-def test_auto_publish_holds_each_call(
-    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
-) -> None:
-    for number in range(45):
-        robot.step(STEP_MS)
-        bridge.auto_publish({"n": number})
-    bridge.keep("a look")
-    for number in range(45, 60):
-        robot.step(STEP_MS)
-        bridge.auto_publish({"n": number})
-    assert kept_numbers(recording) == [list(range(60))]
 
 
 def test_what_is_kept_while_the_database_is_locked_comes_once_and_in_order(

@@ -13,10 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.bridge.conftest import (
-    Recording,
-    numbers,
-)
+from tests.bridge.conftest import Recording, numbers
 from tests.bridge.on_disk.conftest import POSIX, adopt_into
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
@@ -25,6 +22,8 @@ from webots_mcp.liveness import reap
 from webots_mcp.maintenance import Maintainer
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.waiting_file import adopt, waiting_paths
+
+pytestmark = pytest.mark.slow
 
 KILLED = """
 import json, os, signal, sys

@@ -23,7 +23,7 @@ from tests.bridge.conftest import (
     numbers,
     write_lock,
 )
-from webots_mcp import MCPBridge, MemoryDatabase
+from webots_mcp import MCPBridge
 from webots_mcp.bridge import backlog
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
@@ -79,25 +79,6 @@ def test_a_run_counts_the_rows_that_are_in_the_database(
     heartbeat_now(bridge)
     assert numbers(filed) == [6, 7, 8]
     assert filed.rows("SELECT row_count FROM run") == [3]
-
-
-def test_what_is_told_of_dropped_rows_is_stamped_with_the_time_of_now(
-    robot: InProcessSupervisor,
-    bridge: MCPBridge,
-    file: Path,
-    filed: Recording,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(backlog, "MAX_WAITING_ROWS", 1)
-    keep_in_memory(bridge)
-    with write_lock(file):
-        for n in range(5):
-            robot.step(STEP_MS)
-            bridge.publish({"n": n})
-    bridge.publish({"n": 5})
-    catch_up(bridge)
-    told = filed.rows("SELECT sim_time_s FROM event WHERE kind = 'dropped'")
-    assert told == [pytest.approx(5 * STEP_MS / 1000)]
 
 
 @POSIX
@@ -256,15 +237,6 @@ def test_a_forked_child_that_ends_leaves_the_session_of_its_parent_alone(tmp_pat
     recording = Recording(tmp_path / DATABASE_NAME)
     assert recording.rows("SELECT end_reason FROM session") == [None]
     assert numbers(recording) == [0, 1]
-
-
-def test_a_database_in_memory_has_no_files_that_could_vanish(
-    robot: InProcessSupervisor, database: MemoryDatabase
-) -> None:
-    with MCPBridge(robot, throttle_interval=1, database=database) as bridge:
-        bridge.publish({"n": 0})
-        heartbeat_now(bridge)
-        assert bridge.stats().rows_dropped == 0
 
 
 FORKED = """

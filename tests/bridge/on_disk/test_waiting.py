@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import sqlite3
 import stat
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -40,23 +39,6 @@ def test_the_file_of_a_living_session_is_left_to_it(bridge: MCPBridge, file: Pat
     bridge.publish({"n": 0})
     assert adopt_into(file) == 0
     assert waiting_file(bridge).exists()
-
-
-def test_rows_that_waited_are_followed_by_later_ones_and_the_file_goes_with_the_bridge(
-    robot: InProcessSupervisor, file: Path, filed: Recording
-) -> None:
-    with MCPBridge(robot, data_dir=file.parent, throttle_interval=1) as bridge:
-        for n in range(0, 60, 3):
-            bridge.publish({"n": n})
-            with write_lock(file):
-                bridge.publish({"n": n + 1})
-                bridge.publish({"n": n + 2})
-        catch_up(bridge)
-        path = waiting_file(bridge)
-        assert path.exists()
-    assert not path.exists()
-    assert numbers(filed) == list(range(60))
-    assert filed.rows("SELECT row_count FROM run") == [60]
 
 
 def test_what_waits_when_a_bridge_closes_is_kept_and_said(
@@ -251,14 +233,3 @@ def test_a_signals_handler_that_logs_in_the_middle_of_a_row_deadlocks_nothing(
     catch_up(bridge)
     assert numbers(filed) == [0, 1]
     assert filed.rows("SELECT message FROM log") == ["from within"]
-
-
-@pytest.mark.usefixtures("locked")
-def test_the_status_tells_how_many_rows_wait_and_where(bridge: MCPBridge, file: Path) -> None:
-    for n in range(3):
-        bridge.publish({"n": n})
-    line = [sys.executable, "-m", "webots_mcp", "status", "--json", "--database", str(file)]
-    done = subprocess.run(line, check=True, capture_output=True, text=True)
-    robots = json.loads(done.stdout)["robots"]
-    told = dict(zip(robots["columns"], robots["rows"][0], strict=True))
-    assert (told["rows_waiting"], told["waiting_in"]) == (3, waiting_file(bridge).name)

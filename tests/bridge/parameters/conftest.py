@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 from collections.abc import Iterator
 from typing import Any
 
@@ -15,10 +14,6 @@ from webots_mcp.standin import InProcessSupervisor
 VALUES = (
     "SELECT run_id, name, value, is_default, set_by, command_id FROM parameter_value ORDER BY id"
 )
-
-
-class Gait(enum.Enum):
-    TROT = "trot"
 
 
 @pytest.fixture

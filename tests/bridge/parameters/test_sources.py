@@ -71,18 +71,6 @@ def test_what_the_environment_says_wrong_is_warned_of_once_and_the_code_counts(
     assert PARAMETERS_VARIABLE in lines[0] and said in lines[0]
 
 
-def test_a_controller_without_parameters_does_not_mind_the_environment(
-    robot: InProcessSupervisor,
-    database: MemoryDatabase,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setenv(PARAMETERS_VARIABLE, "no JSON")
-    with MCPBridge(robot, database=database) as bridge:
-        bridge.get_command()
-    assert capfd.readouterr().err == ""
-
-
 def test_robots_of_one_process_have_parameters_of_their_own(
     database: MemoryDatabase, recording: Recording
 ) -> None:

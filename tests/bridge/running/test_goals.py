@@ -30,35 +30,6 @@ def test_it_pauses_at_the_very_step_at_which_the_condition_holds(
     assert notes == [sent]
 
 
-@pytest.mark.parametrize("steps", [0.01, 0.0001])
-def test_a_time_shorter_than_a_step_runs_one(
-    rounds: Rounds, recording: Recording, steps: float
-) -> None:
-    rounds.drive(3)
-    paused = let_go_when_paused(rounds)
-    sent = recording.send("run", for_s=steps * STEP_S)
-    rounds.drive(5)
-    _, result, error = recording.fate(sent)
-    assert error is None
-    assert (result["ended"], result["advanced_s"]) == (
-        "simulation time reached",
-        pytest.approx(STEP_S),
-    )
-    assert len(paused) == 1
-
-
-def test_a_condition_that_holds_in_the_first_state_after_a_reset_at_the_first_step_is_met_there(
-    rounds: Rounds, recording: Recording
-) -> None:
-    let_go_when_paused(rounds)
-    rounds.drive(1)
-    sent = recording.send("run", until="n > 0", for_s=1.0, reset=True)
-    eager(rounds.bridge)
-    rounds.drive(5)
-    _, result, _ = recording.fate(sent)
-    assert (result["ended"], result["advanced_s"]) == ("condition held", pytest.approx(STEP_S))
-
-
 @pytest.mark.parametrize("steps", [100, 99.5, 99.1])
 def test_it_pauses_at_the_step_that_reaches_the_time(
     rounds: Rounds, recording: Recording, steps: float
@@ -188,25 +159,6 @@ def test_the_pace_of_a_run_ends_with_it_however_it_ends(
     rounds.drive(2)
     _, result, _ = recording.fate(resumed)
     assert ("it ran fast before" in result["why"]) is (mode_before == "fast")
-
-
-def test_as_before_pauses_what_was_paused(rounds: Rounds, recording: Recording) -> None:
-    paused: list[float] = []
-    recording.send("pause")
-    sent = recording.send("run", until="n >= 10", then="as_before")
-    robot, set_mode = rounds.robot, rounds.robot.simulationSetMode
-
-    def noticed(mode: int) -> None:
-        set_mode(mode)
-        if mode == robot.SIMULATION_MODE_PAUSE:
-            paused.append(robot.getTime())
-            if len(paused) > 1:
-                recording.send("resume")
-
-    vars(robot)["simulationSetMode"] = noticed
-    rounds.drive(12)
-    assert recording.fate(sent)[1]["mode"] == "pause"
-    assert paused[1:] == [pytest.approx(10 * STEP_S)]
 
 
 @pytest.mark.parametrize("reset", [False, True])

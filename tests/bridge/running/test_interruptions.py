@@ -6,10 +6,8 @@ from typing import Any
 
 import pytest
 
-from tests.bridge.conftest import Recording, eager
+from tests.bridge.conftest import Recording
 from tests.bridge.running.conftest import STEP_S, Rounds, let_go_when_paused
-from webots_mcp import MCPBridge, MemoryDatabase
-from webots_mcp.standin import InProcessRobot
 
 
 @pytest.mark.parametrize("by", ["pause", "resume", "fast", "step", "reset"])
@@ -101,21 +99,6 @@ def test_a_cancelled_one_ends_as_it_was_told_to_end(rounds: Rounds, recording: R
     assert len(paused) == 1
 
 
-def test_one_that_is_cancelled_before_its_reset_came_has_advanced_nothing(
-    rounds: Rounds, recording: Recording
-) -> None:
-    rounds.drive(10)
-    before_s = rounds.robot.getTime()
-    sent = recording.send("run", for_s=1, reset=True, then="go_on")
-    eager(rounds.bridge)
-    recording.send("cancel_run", command_id=sent)
-    eager(rounds.bridge)
-    rounds.drive(3)
-    _, result, error = recording.fate(sent)
-    assert (error, result["ended"], result["advanced_s"]) == (None, "interrupted", 0.0)
-    assert result["from_s"] == result["sim_time_s"] == pytest.approx(before_s)
-
-
 def test_two_at_once_are_refused_and_the_first_goes_on(
     rounds: Rounds, recording: Recording
 ) -> None:
@@ -177,12 +160,3 @@ def test_what_makes_no_sense_is_refused_and_nothing_is_done(
     rounds.robot.simulationReset()
     rounds.drive(3)
     assert gain.value == 2.0
-
-
-def test_a_plain_robot_is_told_that_it_takes_a_supervisor(database: MemoryDatabase) -> None:
-    robot = InProcessRobot("rover")
-    with MCPBridge(robot, database=database) as bridge:
-        recording = Recording(database)
-        sent = recording.send("run", for_s=1)
-        eager(bridge)
-        assert "run needs a Supervisor" in (recording.fate(sent)[2] or "")

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, Final, cast
 
-from controller.wire import Message
+from controller.session import Message
 
 from webots_mcp.standin.arena import Body
+from webots_mcp.standin.devices import FetchedSensor
 from webots_mcp.standin.pictures import Label
 from webots_mcp.standin.protos import shown_definitions
 from webots_mcp.standin.simulator import Mode, Robot, Simulator, Wanted
@@ -57,7 +58,8 @@ def answer(simulator: Simulator, robot: Robot, message: Message) -> Message | No
     if kind == "step":
         return _step(simulator, robot, *rest)
     if kind == "fetch":
-        return ("fetched", robot.devices[rest[0]].fetch())
+        device = robot.devices[rest[0]]
+        return ("fetched", device.fetch() if isinstance(device, FetchedSensor) else None)
     operation, arguments, field_sets = rest
     requests = SupervisorRequests(simulator, robot)
     requests.set_fields(field_sets)

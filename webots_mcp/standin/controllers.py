@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Final
 
-from controller.wire import Inbox, Message, pack
+from controller.session import Inbox, Message, pack
 
 from webots_mcp.standin.simulator import Robot, Simulator
 from webots_mcp.standin.vrml import StandInError

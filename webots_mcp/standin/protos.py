@@ -63,7 +63,8 @@ def e_puck(fields: Mapping[str, Any]) -> str:
           width {fields["camera_width"]} height {fields["camera_height"]} }}
         Accelerometer {{ lookupTable [ -100 -100 0.003 100 100 0.003 ] }}
         Gyro {{ lookupTable [ -13.315805 -100000 0.003 13.315805 100000 0.003 ] }}
-        Receiver {{ }} Emitter {{ }} Speaker {{ }}
+        Receiver {{ channel {fields["receiver_channel"]} }}
+        Emitter {{ channel {fields["emitter_channel"]} }} Speaker {{ }}
         DEF turretSlot Pose {{ translation -0.0095 0 0.0486 }}
         DEF groundSensorsSlot Pose {{ translation 0.03 0 0.0003 }}
         Pose {{ translation 0 0 0.025 children Shape {{

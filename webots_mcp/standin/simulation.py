@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, TypeVar, cast
 
-from controller.wire import ADDRESS_FILE, Message
+from controller.session import ADDRESS_FILE, Message
 
 from webots_mcp.standin.controller_answers import answer, description, step_over
 from webots_mcp.standin.controller_path import LIBRARY

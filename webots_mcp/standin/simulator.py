@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 from webots_mcp.standin.arena import Arena, Body, Vehicle, joints_in
-from webots_mcp.standin.devices import Device, devices_in
+from webots_mcp.standin.devices import Device, Emitter, Receiver, devices_in
 from webots_mcp.standin.pictures import Label, Picture, save_picture
 from webots_mcp.standin.vrml import Node, WorldError
 from webots_mcp.standin.world import World
@@ -138,6 +138,9 @@ class Simulator:
             log(warning)
         if not self.robots and world.left_out:
             raise WorldError(self.no_robot())
+        devices = [device for robot in self.robots for device in robot.devices.values()]
+        self._emitters = [device for device in devices if isinstance(device, Emitter)]
+        self._receivers = [device for device in devices if isinstance(device, Receiver)]
         self.time_ms = 0.0
         self.wanted: Wanted | None = None
         self.labels: dict[int, Label] = {}
@@ -211,6 +214,8 @@ class Simulator:
         for robot in self.robots:
             robot.vehicle.drive(self.arena, basic / 1000.0)
         self.arena.glide(basic / 1000.0)
+        for emitter in self._emitters:
+            emitter.transmit(self._receivers)
         self.time_ms += basic
         if self._reset_asked:
             self.reset()
@@ -224,7 +229,7 @@ class Simulator:
     def _measure(self, robot: Robot, passed_ms: float) -> None:
         for device in robot.devices.values():
             if device.is_due(passed_ms):
-                robot.fresh[device.tag] = device.measure(device.period_ms)
+                device.put_value(robot.fresh)
 
     def _let_pass(self, robot: Robot, passed_ms: float) -> bool:
         if robot.remaining_ms is None:

@@ -379,6 +379,18 @@ InertialUnit {
   SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
   SFString name "inertial unit"  SFString model ""  SFFloat noise 0
 }
+Emitter {
+  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
+  SFString name "emitter"  SFString model ""  SFString type "radio"
+  SFFloat range -1  SFFloat maxRange -1  SFFloat aperture -1  SFInt32 channel 0
+  SFInt32 baudRate -1  SFInt32 byteSize 8  SFInt32 bufferSize -1
+}
+Receiver {
+  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
+  SFString name "receiver"  SFString model ""  SFString type "radio"
+  SFFloat aperture -1  SFInt32 channel 0  SFInt32 baudRate -1  SFInt32 byteSize 8
+  SFInt32 bufferSize -1  SFFloat signalStrengthNoise 0  SFFloat directionNoise 0
+}
 Lidar {
   SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
   SFString name "lidar"  SFString model ""
@@ -436,23 +448,10 @@ def _default(words: list[str]) -> Value:
 NODE_TYPES: Final = definitions_in(_DEFINITIONS)
 """Fields by node type."""
 
-DEVICE_TYPES: Final = (
-    *(
-        "RotationalMotor",
-        "LinearMotor",
-        "PositionSensor",
-        "DistanceSensor",
-        "Camera",
-        "GPS",
-        "InertialUnit",
-    ),
-    *("Lidar", "Accelerometer", "Compass", "Gyro", "LED", "LightSensor", "TouchSensor"),
-)
-
 DEFAULT_NAME_OF: Final = {
     **{"Altimeter": "altimeter", "Brake": "brake", "Connector": "connector"},
-    **{"Display": "display", "Emitter": "emitter", "Pen": "pen"},
-    **{"Radar": "radar", "RangeFinder": "range-finder", "Receiver": "receiver", "Skin": "skin"},
+    **{"Display": "display", "Pen": "pen"},
+    **{"Radar": "radar", "RangeFinder": "range-finder", "Skin": "skin"},
     **{"Speaker": "speaker", "VacuumGripper": "vacuum gripper"},
 }
 """What devices that the stand-in does not have are called, unless the world gives them a name."""

@@ -39,7 +39,7 @@ from webots_mcp.store.robots import resolve_robot
 from webots_mcp.testing.robot_recording import RobotRecording
 
 if TYPE_CHECKING:
-    from controller.wire import Message
+    from controller.session import Message
 
 HOLD_LIMIT_S: Final = 2.0
 _CONSOLE_LINES: Final = 30

@@ -10,7 +10,7 @@ import controller
 from controller.surface import MEMBERS, Lacking, lacking
 
 from webots_mcp.standin.devices import DEVICES
-from webots_mcp.standin.protos import PROTOS
+from webots_mcp.standin.protos import BUILT_IN
 from webots_mcp.standin.vrml import NODE_TYPES
 
 PAGE = (Path(__file__).parents[2] / "docs" / "standin.md").read_text(encoding="utf-8")
@@ -23,7 +23,7 @@ def names_between(start: str, end: str) -> set[str]:
 
 def test_it_lists_every_node() -> None:
     assert names_between("### Nodes\n", "\n### ") == set(NODE_TYPES) - set(DEVICES)
-    assert names_between("### PROTO nodes\n", "\n### ") == set(PROTOS)
+    assert names_between("### PROTO nodes\n", "\n### ") == set(BUILT_IN)
 
 
 def test_it_lists_every_device() -> None:

@@ -223,5 +223,27 @@ def test_a_world_whose_only_robot_is_unknown_is_refused_with_what_to_do(
     assert str(caught.value) == (
         "foreign_robot_r2023b.wbt, line 10: the stand-in has no Pioneer3dx nodes. If that is the "
         "robot: in Webots, right-click it, choose 'Convert Root to Base Node(s)' and save the "
-        "world; docs/standin.md lists what the stand-in has"
+        "world, or let WEBOTS_HOME name an installed Webots, whose PROTO files are read then; "
+        "docs/standin.md lists what the stand-in has"
     )
+
+
+@pytest.mark.parametrize(
+    ("nodes", "suspects"),
+    [
+        ("TexturedBackground { } Oven { } Nao { supervisor FALSE }", "Nao"),
+        ("TexturedBackground { } Oven { } Pioneer3at { }", "Pioneer3at"),  # by its URL
+        ("TexturedBackground { } Parquetry { } Oven { } Nao { }", "Nao"),
+        ("TexturedBackground { } Barrel { } Nao { }", "Barrel or Nao"),
+        ("TexturedBackground { }", "TexturedBackground"),
+    ],
+)
+def test_a_world_without_a_robot_names_what_looks_most_like_one(
+    nodes: str, suspects: str, tmp_path: Path
+) -> None:
+    world = tmp_path / "own.wbt"
+    urls = ("robots/adept/pioneer3/Pioneer3at", "objects/kitchen/Oven", "objects/floors/Parquetry")
+    externs = "\n".join(f'EXTERNPROTO "webots://projects/{url}.proto"' for url in urls)
+    world.write_text(f"#VRML_SIM R2025a utf8\n{externs}\nWorldInfo {{ }}\n{nodes}")
+    with pytest.raises(WorldError, match=f"line 6: the stand-in has no {suspects} nodes"):
+        InProcessSimulation(world)

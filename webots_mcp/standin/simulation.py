@@ -129,6 +129,14 @@ class Simulation:
         """The status given to `simulationQuit`; None while it runs."""
         return self._runner.exit_status
 
+    @property
+    def failure(self) -> int | None:
+        """The exit status of the first controller that ended with an error by itself.
+
+        128 and its number for a signal; None if there is none.
+        """
+        return self._launch.failure
+
     # What is the case ----------------------------------------------------------------------------
 
     @property

@@ -118,6 +118,7 @@ def test_what_a_world_puts_into_a_slot_stands_there_once(tmp_path: Path) -> None
     slot = 'extensionSlot [ DEF MINE Pose { translation 0 0 1 children GPS { name "top" } } ]'
     robot = InProcessSupervisor(world=world_of(tmp_path, f"Cart {{ supervisor TRUE {slot} }}"))
     assert [*robot.devices] == ["top", "left", "right"]
+    assert robot.getNumberOfDevices() == 3
     gps = robot.getDevice("top")
     gps.enable(10)
     robot.step(10)

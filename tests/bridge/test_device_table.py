@@ -1,7 +1,7 @@
 """What auto_publish reads of each class of devices that Webots has, and what it never does to one.
 
 The devices have the methods of Webots' package, R2023b and R2025a alike, and no others
-(tests/standin/real_surface.txt); they answer in the shapes that it answers in.
+(surface.txt of the stand-in); they answer in the shapes that it answers in.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import ctypes
 import re
 from collections.abc import Callable
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,9 +17,9 @@ import pytest
 from tests.bridge.conftest import STEP_MS
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.bridge.devices import MOST_OBJECTS, RULES, read_devices
-from webots_mcp.standin import InProcessSupervisor
+from webots_mcp.standin import LIBRARY, InProcessSupervisor
 
-SURFACE = (Path(__file__).parents[1] / "standin" / "real_surface.txt").read_text("utf-8")
+SURFACE = (LIBRARY / "controller" / "surface.txt").read_text("utf-8")
 PERIODS = re.compile(r"get\w*SamplingPeriod")
 
 

@@ -276,6 +276,34 @@ def test_the_stand_in_says_why_no_controller_records(
     assert "(attach one: webots-mcp init --patch " in _told(process, "no controller has recorded")
 
 
+def test_the_stand_in_runs_a_file_for_an_extern_robot(
+    launch: Launch, project: Callable[..., Path], tmp_path: Path
+) -> None:
+    world, file = project(), tmp_path / "mine.py"
+    text = world.read_text(encoding="utf-8")
+    assert 'controller "rover"' in text
+    world.write_text(text.replace('controller "rover"', 'controller "<extern>"'), encoding="utf-8")
+    file.write_text("from controller import Supervisor\nSupervisor().simulationQuit(3)\n")
+    process = launch(world, "--stand-in", "--mode", "fast", "--robot", f"rover={file}")
+    process.communicate(timeout=60)
+    assert process.returncode == 3
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        (["--robot", "rover=x.py"], "--robot is for --stand-in"),
+        (["--stand-in", "--robot", "rover"], "--robot 'rover' is not NAME=FILE"),
+    ],
+)
+def test_a_file_for_a_robot_is_refused_where_it_cannot_be_run(
+    launch: Launch, project: Callable[..., Path], options: list[str], why: str
+) -> None:
+    process = launch(project(), *options)
+    _, told = process.communicate(timeout=60)
+    assert (process.returncode, why in told) == (2, True)
+
+
 def test_what_only_webots_has_is_refused_for_the_stand_in(
     launch: Launch, project: Callable[..., Path]
 ) -> None:

@@ -50,6 +50,27 @@ def test_it_runs_for_a_while_and_ends_cleanly(
     assert "[rover] ended" in done.stdout
 
 
+@pytest.mark.parametrize(
+    ("ending", "status"),
+    [
+        ("raise RuntimeError('broken')", 1),
+        ("import sys; sys.exit(5)", 5),
+        pytest.param(
+            "import os; os.kill(os.getpid(), 9)",
+            137,
+            marks=pytest.mark.skipif(os.name != "posix", reason="signals"),
+        ),
+        ("robot.simulationQuit(7)", 7),
+    ],
+)
+def test_its_exit_status_is_that_of_its_controllers(
+    ending: str, status: int, world: Path, write_controller: WriteController
+) -> None:
+    file = write_controller(f"robot.step(160)\n{ending}", LOOP, name="other")
+    arguments = [str(world), "--mode=fast", "--duration=60", f"--robot=rover={file}"]
+    assert subprocess.run([*COMMAND, *arguments], check=False).returncode == status
+
+
 def test_a_bad_world_or_option_is_said_on_stderr(world: Path) -> None:
     for arguments, message in (
         (["missing.wbt"], "cannot read the world"),

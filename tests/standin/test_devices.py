@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from math import inf, isnan, nan
 from pathlib import Path
 from typing import Any
@@ -45,16 +44,6 @@ def test_devices_come_in_the_order_of_the_scene_tree(robot: InProcessSupervisor)
     assert {type(device).__module__.split(".")[0] for device in robot.devices.values()} == {
         "controller"
     }
-
-
-def test_a_missing_device_is_none_and_a_line(
-    robot: InProcessSupervisor, capfd: pytest.CaptureFixture[str]
-) -> None:
-    assert robot.getDevice("missing") is None
-    assert '"missing"' in capfd.readouterr().err
-    with pytest.raises(KeyError, match="rover"):
-        robot.getDeviceByIndex(99)
-    assert capfd.readouterr().err
 
 
 def test_the_first_value_comes_when_the_period_has_passed(robot: InProcessSupervisor) -> None:
@@ -205,18 +194,6 @@ def test_motors_tell_what_was_commanded(
         motor.setVelocity("1")  # type: ignore[arg-type]
 
 
-def test_integers_have_to_be_integers_and_texts_texts(robot: InProcessSupervisor) -> None:
-    assert isinstance(robot.getBasicTimeStep(), float)
-    with pytest.raises(ctypes.ArgumentError):
-        robot.step(robot.getBasicTimeStep())  # type: ignore[arg-type]
-    with pytest.raises(ctypes.ArgumentError):
-        robot.getDevice("gps").enable(16.0)
-    with pytest.raises(TypeError):
-        robot.exportImage(Path("x.png"), 90)  # type: ignore[arg-type]
-    assert robot.step() == 0
-    assert robot.getTime() == robot.time == 0.016
-
-
 def test_nobody_types_on_the_keyboard(
     robot: InProcessSupervisor, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -244,13 +221,3 @@ def test_the_points_of_a_lidar_have_layers_and_places(
     assert (middle.x, middle.y, middle.z) == pytest.approx((0.0, 2.0, 0.0), abs=0.02)
     assert (middle.layer, middle.time) == (0, pytest.approx(0.016))
     assert not isinstance(middle, tuple)
-
-
-def test_a_camera_without_zoom_keeps_its_field_of_view(
-    robot: InProcessSupervisor, capfd: pytest.CaptureFixture[str]
-) -> None:
-    camera: Camera = enabled(robot, "camera")
-    fov = camera.getFov()
-    camera.setFov(fov / 2.0)
-    assert camera.fov == camera.min_fov == camera.max_fov == fov
-    assert "out of zoom range" in capfd.readouterr().err

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import controller
-from controller.lacking import CLASSES, lacking
+from controller.surface import MEMBERS, Lacking, lacking
 
-from webots_mcp.standin.protos import PROTOS
-from webots_mcp.standin.vrml import DEVICE_TYPES, NODE_TYPES
+from webots_mcp.standin.devices import DEVICES
+from webots_mcp.standin.protos import BUILT_IN
+from webots_mcp.standin.vrml import NODE_TYPES
 
 PAGE = (Path(__file__).parents[2] / "docs" / "standin.md").read_text(encoding="utf-8")
 HAD = {had.__name__ for had in controller.__all__}
@@ -21,22 +22,22 @@ def names_between(start: str, end: str) -> set[str]:
 
 
 def test_it_lists_every_node() -> None:
-    assert names_between("### Nodes\n", "\n### ") == set(NODE_TYPES) - set(DEVICE_TYPES)
-    assert names_between("### PROTO nodes\n", "\n### ") == set(PROTOS)
+    assert names_between("### Nodes\n", "\n### ") == set(NODE_TYPES) - set(DEVICES)
+    assert names_between("### PROTO nodes\n", "\n### ") == set(BUILT_IN)
 
 
 def test_it_lists_every_device() -> None:
-    assert set(re.findall(r"^\| `(\w+)` \|", PAGE, re.M)) == set(DEVICE_TYPES)
+    assert set(re.findall(r"^\| `(\w+)` \|", PAGE, re.M)) == set(DEVICES)
 
 
 def test_it_lists_every_class_and_what_each_lacks() -> None:
     assert names_between("but for the names listed:\n", "\n- ") == HAD
-    assert names_between("and fail when used:\n", "\nThe package") == set(CLASSES)
+    assert names_between("and fail when used:\n", "\nThe package") == set(MEMBERS) - HAD
     listed = dict(re.findall(r"^- `(\w+)`: ((?:`\w+`,?\s+)+)", PAGE, re.M))
     for name in HAD:
         had: Any = getattr(controller, name)
         own: dict[str, Any] = {**vars(had)}
-        marks = {member for member, value in own.items() if type(value).__name__ == "_Lacking"}
+        marks = {member for member, value in own.items() if isinstance(value, Lacking)}
         assert set(re.findall(r"`(\w+)`", listed.get(name, ""))) == marks, name
 
 

@@ -59,7 +59,7 @@ def test_a_controller_runs_where_and_as_webots_would_run_it(
     assert "name rover UTF-8" in console
     assert "instance True True" in console
     assert "own yes" in console
-    assert "module controller.supervisor controller.sensors" in console
+    assert "module controller.robot controller.devices" in console
     assert f"paths {world} {world.parent.parent}" in console
 
 

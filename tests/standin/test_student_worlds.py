@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from controller import Node
-from controller.lacking import NotInStandInError
+from controller.surface import NotInStandInError
 
 from webots_mcp.standin import InProcessSimulation, InProcessSupervisor, Simulation, WorldError
 
@@ -46,11 +46,17 @@ def test_an_e_puck_has_the_devices_of_webots() -> None:
     robot = robot_in("e_puck_r2023b.wbt")
     names = {f"{kind}{number}" for kind in ("ps", "ls") for number in range(8)}
     names |= {f"led{number}" for number in range(10)} | {"camera", "accelerometer", "gyro"}
-    names |= {"left wheel motor", "right wheel motor", "left wheel sensor", "right wheel sensor"}
-    assert names | {"gps", "compass"} == set(robot.devices)
-    for missing in ("emitter", "receiver", "speaker"):
-        with pytest.raises(NotInStandInError, match=f"so robot 'e-puck' has no '{missing}'"):
-            robot.getDevice(missing)
+    names |= {
+        "emitter",
+        "receiver",
+        "left wheel motor",
+        "right wheel motor",
+        "left wheel sensor",
+        "right wheel sensor",
+    }
+    assert names | {"gps", "compass", "emitter", "receiver"} == set(robot.devices)
+    with pytest.raises(NotInStandInError, match="so robot 'e-puck' has no 'speaker'"):
+        robot.getDevice("speaker")
     node = InProcessSupervisor(world=WORLDS / "e_puck_r2023b.wbt").getFromDef("EPUCK")
     assert node is None  # it has no supervisor's rights
 
@@ -62,7 +68,7 @@ def test_each_type_that_is_left_out_is_warned_of_once() -> None:
         "this one is left out."
         for line, name in [
             *((26, "TexturedBackground"), (28, "TexturedBackgroundLight"), (34, "Parquetry")),
-            *((50, "Receiver"), (50, "Emitter"), (50, "Speaker"), (62, "E-puckGroundSensors")),
+            *((50, "Speaker"), (62, "E-puckGroundSensors")),
         ]
     ]
 
@@ -217,5 +223,27 @@ def test_a_world_whose_only_robot_is_unknown_is_refused_with_what_to_do(
     assert str(caught.value) == (
         "foreign_robot_r2023b.wbt, line 10: the stand-in has no Pioneer3dx nodes. If that is the "
         "robot: in Webots, right-click it, choose 'Convert Root to Base Node(s)' and save the "
-        "world; docs/standin.md lists what the stand-in has"
+        "world, or let WEBOTS_HOME name an installed Webots, whose PROTO files are read then; "
+        "docs/standin.md lists what the stand-in has"
     )
+
+
+@pytest.mark.parametrize(
+    ("nodes", "suspects"),
+    [
+        ("TexturedBackground { } Oven { } Nao { supervisor FALSE }", "Nao"),
+        ("TexturedBackground { } Oven { } Pioneer3at { }", "Pioneer3at"),  # by its URL
+        ("TexturedBackground { } Parquetry { } Oven { } Nao { }", "Nao"),
+        ("TexturedBackground { } Barrel { } Nao { }", "Barrel or Nao"),
+        ("TexturedBackground { }", "TexturedBackground"),
+    ],
+)
+def test_a_world_without_a_robot_names_what_looks_most_like_one(
+    nodes: str, suspects: str, tmp_path: Path
+) -> None:
+    world = tmp_path / "own.wbt"
+    urls = ("robots/adept/pioneer3/Pioneer3at", "objects/kitchen/Oven", "objects/floors/Parquetry")
+    externs = "\n".join(f'EXTERNPROTO "webots://projects/{url}.proto"' for url in urls)
+    world.write_text(f"#VRML_SIM R2025a utf8\n{externs}\nWorldInfo {{ }}\n{nodes}")
+    with pytest.raises(WorldError, match=f"line 6: the stand-in has no {suspects} nodes"):
+        InProcessSimulation(world)

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
-from controller.wire import ADDRESS_FILE
+from controller.session import ADDRESS_FILE
 
 from tests.webots.server import WebotsServer
 from webots_mcp.standin import Simulation

@@ -72,8 +72,8 @@ class Plugin(NamedTuple):
         questions: Modules that declare questions (`questions.declaring`), which are MCP tools.
         formats: Of exports.
         cluster: Where else trials can run.
-        stand_in: Runs a world without Webots, in the foreground: `run(world, mode)`, which returns
-            the exit code.
+        stand_in: Runs a world without Webots, in the foreground: `run(world, mode, duration_s,
+            controllers)`, which returns the exit code.
     """
 
     commands: tuple[PluginCommand, ...] = ()
@@ -115,6 +115,6 @@ def cluster_offered() -> Cluster:
     return next(plugin.cluster for plugin in plugins() if plugin.cluster is not None)
 
 
-def stand_in_simulator() -> Callable[[Path, str], int]:
+def stand_in_simulator() -> Callable[[Path, str, float | None, dict[str, str]], int]:
     """What runs a world where no Webots is."""
     return load(next(each.stand_in for each in plugins() if each.stand_in))

@@ -17,7 +17,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run until the time is over, a supervisor quits, or Ctrl-C or SIGTERM arrives.
 
     Returns:
-        The exit status: that of `simulationQuit`, 0 otherwise, 2 for a world that cannot be used.
+        The exit status of `run_world`.
     """
     options = _parser().parse_args(arguments)
     return run_world(options.world, options.mode, options.duration, dict(options.robot))
@@ -38,7 +38,8 @@ def run_world(
         controllers: Files that control robots, by name, instead of what the world says.
 
     Returns:
-        The exit status: that of `simulationQuit`, 0 otherwise, 2 for a world that cannot be used.
+        The exit status: that of `simulationQuit`, else that of the first controller that ended with
+        an error (128 and the number for a signal), else 0; 2 for a world that cannot be used.
     """
     stopped = threading.Event()
 
@@ -56,8 +57,7 @@ def run_world(
         return 2
     with simulation:
         _wait(simulation, stopped, duration_s)
-        status = simulation.exit_status
-    return status or 0
+    return simulation.exit_status or simulation.failure or 0
 
 
 def _wait(simulation: Simulation, stopped: threading.Event, duration_s: float | None) -> None:

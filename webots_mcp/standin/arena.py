@@ -193,12 +193,12 @@ class Arena:
         """All shapes but those of one body: what that one can see."""
         return [shape for body in self.bodies if body is not without for shape in body.shapes]
 
-    def obstacles(self, without: Body) -> list[Shape]:
-        """The shapes that have a bounding object, but for those of one body."""
+    def obstacles(self, *without: Body) -> list[Shape]:
+        """The shapes that have a bounding object, but for those of some bodies."""
         return [
             shape
             for body in self.bodies
-            if body is not without and body.is_obstacle
+            if body not in without and body.is_obstacle
             for shape in body.solid_shapes
         ]
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, Final, cast
 
-from controller.wire import Message
+from controller.session import Message
 
 from webots_mcp.standin.arena import Body
+from webots_mcp.standin.devices import FetchedSensor
 from webots_mcp.standin.pictures import Label
-from webots_mcp.standin.protos import shown_definitions
 from webots_mcp.standin.simulator import Mode, Robot, Simulator, Wanted
 from webots_mcp.standin.vrml import (
     NODE_TYPES,
@@ -57,7 +57,8 @@ def answer(simulator: Simulator, robot: Robot, message: Message) -> Message | No
     if kind == "step":
         return _step(simulator, robot, *rest)
     if kind == "fetch":
-        return ("fetched", robot.devices[rest[0]].fetch())
+        device = robot.devices[rest[0]]
+        return ("fetched", device.fetch() if isinstance(device, FetchedSensor) else None)
     operation, arguments, field_sets = rest
     requests = SupervisorRequests(simulator, robot)
     requests.set_fields(field_sets)
@@ -162,7 +163,7 @@ class SupervisorRequests:
     def on_node_get_field(self, node_id: int, name: str) -> Any:
         """Type and number of entries of a field; None if the node has no such field."""
         node = self._node(node_id)
-        return _described(node, name, shown_definitions(node))
+        return _described(node, name, self._world.protos.shown_definitions(node))
 
     def on_node_get_base_node_field(self, node_id: int, name: str) -> Any:
         """The same of the node that a PROTO node is made of."""
@@ -175,7 +176,7 @@ class SupervisorRequests:
 
     def on_node_get_field_names(self, node_id: int) -> list[str]:
         """The names of all fields of a node."""
-        return [*shown_definitions(self._node(node_id))]
+        return [*self._world.protos.shown_definitions(self._node(node_id))]
 
     def on_field_get(self, field: FieldReference, index: int | None) -> Any:
         """The value of a field or of one entry of it; None beyond its end."""
@@ -270,7 +271,7 @@ class SupervisorRequests:
 
     def on_node_export_string(self, node_id: int) -> str:
         """A node and all in it, as written in a world file."""
-        return as_text(self._node(node_id))
+        return as_text(self._node(node_id), self._world.protos)
 
     def _follow(self, node: Node, name: str, value: Any) -> None:
         if node.type_name == "Robot" and name == "customData":

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Final
 
-from controller.wire import Inbox, Message, pack
+from controller.session import Inbox, Message, pack
 
 from webots_mcp.standin.simulator import Robot, Simulator
 from webots_mcp.standin.vrml import StandInError
@@ -48,6 +48,8 @@ class ControllerProcess:
             start_new_session=os.name == "posix",  # Ctrl-C is for the simulator alone
         )
         self.pid = self._process.pid
+        self.was_ended = False
+        """Whether it had to be ended by force."""
         self._on_line = on_line
         self._on_exit = on_exit
         self._readers = [self._reader(self._process.stdout), self._reader(self._process.stderr)]
@@ -66,6 +68,7 @@ class ControllerProcess:
     def end(self) -> None:
         """Terminate the process, the hard way if need be, and wait until it is gone."""
         if self.exit_code is None:
+            self.was_ended = True
             self._process.terminate()
         try:
             self._process.wait(_TERMINATION_S)
@@ -153,6 +156,8 @@ class Launch:
     on_exit: Callable[[], None]
     address: Address | None = None
     """None before the simulator has started."""
+    failure: int | None = None
+    """The exit status of the first controller that ended with an error, but not by force."""
 
     def file_of(self, robot: Robot, simulator: Simulator) -> Path | None:
         """The controller's file; None if the robot has none or it is started by a person.
@@ -257,8 +262,9 @@ class Controller:
 
     @property
     def is_leaving(self) -> bool:
-        """Whether it was asked to quit and is still running."""
-        return self._was_told and (self.is_running or self.connection is not None)
+        """Whether it was asked to quit, or has left, and is still running."""
+        is_going = self._was_told or self.has_left
+        return is_going and (self.is_running or self.connection is not None)
 
     def start(self) -> None:
         """Start a process, if the robot has a controller file."""
@@ -314,6 +320,9 @@ class Controller:
         self.process.end()
 
     def _exited(self, process: ControllerProcess) -> None:
+        code = process.exit_code or 0
+        if code > 0 or (code < 0 and not process.was_ended):
+            self.launch.failure = self.launch.failure or (code if code > 0 else 128 - code)
         if process.exit_code == 0:
             self.launch.print_line(f"INFO: '{self.name}' controller exited successfully.")
         else:

@@ -1,4 +1,7 @@
-"""What all devices of a simulated robot have in common."""
+"""The devices of a simulated robot: what they measure, and what they let a controller set.
+
+Constants of a device are the fields of its node: the controller receives them when it connects.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +12,15 @@ from itertools import pairwise, product
 from math import acos, atan2, cos, hypot, inf, nan, pi, sin
 from typing import Any, Final
 
-from webots_mcp.standin import pictures as camera
+from webots_mcp.standin import pictures
 from webots_mcp.standin.arena import Arena, Body, Joint, Part, Vehicle, bounding_parts
 from webots_mcp.standin.geometry import Frame, Shape, Vector, nearest_m, targets_from
-from webots_mcp.standin.vrml import DEVICE_TYPES, Node, children_of
+from webots_mcp.standin.vrml import Node, children_of
 from webots_mcp.standin.world import World, own_frame
+
+_SUN_M: Final = 1000.0
+"""How far away a DirectionalLight is, where something may stand in its light."""
+_NOT_SENT: Final = ("children", "boundingObject", "physics")
 
 
 @dataclass(frozen=True)
@@ -42,14 +49,29 @@ class Site:
         yaw = body.yaw_rad + self.frame.yaw_rad
         return body.x + c * x - s * y, body.y + s * x + c * y, body.z + z, yaw
 
+    def axis(self) -> Vector:
+        """Where the device's x axis points."""
+        r = self.pose().rotation
+        return r[0], r[3], r[6]
+
+    def is_blocked(self, way: Vector, distance_m: float, *others: Body) -> bool:
+        """Whether an obstacle stands in the way, but for the robot itself and other bodies."""
+        x, y, z = self.pose().translation
+        level = hypot(way[0], way[1])
+        if level < 1e-9:  # straight above
+            return False
+        dx, dy, reach_m = way[0] / level, way[1] / level, distance_m * level
+        obstacles = self.arena.obstacles(self.body, *others)
+        for target in targets_from(obstacles, x, y, None, reach_m):
+            away_m = target.distance_m(dx, dy)
+            height_m = z + away_m * way[2] / level if away_m <= reach_m else -1.0
+            if target.shape.bottom_m <= height_m <= target.shape.top_m:
+                return True
+        return False
+
 
 class Device:
     """One device; subclasses measure or set something."""
-
-    kind = "Device"
-    """The class of the `controller` package that stands for it."""
-    fetched = False
-    """Whether a sample stays here until the controller looks at it (pictures and scans)."""
 
     def __init__(self, tag: int, node: Node, site: Site) -> None:
         self.tag = tag
@@ -61,13 +83,12 @@ class Device:
 
     def description(self) -> dict[str, Any]:
         """The data about the device that the controller receives when it connects."""
+        joint, joints = self.site.joint, self.site.vehicle.joints
         return {
             "tag": self.tag,
-            "kind": self.kind,
-            "name": self.name,
-            "model": self.node.fields.get("model", ""),
             "node_type": self.node.type_name,
-            "fetched": self.fetched,
+            "joint": joints.index(joint) if joint else None,
+            "fields": _sent(self.node),
         }
 
     def configure(self, setting: str, value: Any) -> None:
@@ -89,18 +110,22 @@ class Device:
         self._wait_ms += self.period_ms
         return True
 
+    def put_value(self, fresh: dict[int, Any]) -> None:
+        """Measure, and put the value where those are that the controller has not been sent yet."""
+        fresh[self.tag] = self.measure(self.period_ms)
+
     def measure(self, period_ms: float) -> Any:
         """What the sensor shows now, as the wire carries it."""
-        raise AttributeError(f"{self.kind} {self.name!r} measures nothing")
-
-    def fetch(self) -> Any:
-        """What the last sample shows, for devices with `fetched`."""
-        raise AttributeError(f"{self.kind} {self.name!r} has no pictures")
+        raise AttributeError(f"{self.node.type_name} {self.name!r} measures nothing")
 
 
-def table_of(node: Node) -> dict[str, Any]:
-    """The data about a sensor's lookup table that the controller receives."""
-    return {"lookup_table": [number for row in node.fields["lookupTable"] for number in row]}
+def _sent(node: Node) -> dict[str, Any]:
+    """The fields of a device and of what belongs to it, as a Zoom."""
+    return {
+        name: _sent(value) if isinstance(value, Node) else value
+        for name, value in node.fields.items()
+        if name not in _NOT_SENT
+    }
 
 
 def looked_up(table: Sequence[Sequence[float]], measured: float) -> float:
@@ -121,15 +146,65 @@ def resolved(node: Node, measured: float) -> float:
     return round(value / resolution) * resolution if resolution > 0.0 else value
 
 
-# Sensors that feel how the robot moves and turns.
+# Joints ------------------------------------------------------------------------------------------
+
+
+class Motor(Device):
+    """Turns a joint."""
+
+    def configure(self, setting: str, value: Any) -> None:
+        """Take a setting from the controller."""
+        joint = self.site.joint
+        if joint is None:
+            return
+        if setting == "position":
+            joint.target_rad = value
+        elif setting == "velocity":
+            joint.target_radps = value
+        elif setting == "acceleration":
+            joint.acceleration_radps2 = value
+
+
+class PositionSensor(Device):
+    """Says how far a joint has turned or slid, in radians or metres."""
+
+    def measure(self, period_ms: float) -> float:
+        """The angle of the joint in radians."""
+        return self.site.joint.position_rad if self.site.joint else nan
+
+
+# Where the robot is and how it moves -------------------------------------------------------------
+
+
+class Gps(Device):
+    """Where the sensor is, and how fast it moved since its last sample."""
+
+    _last: tuple[float, float, float] | None = None
+
+    def make_due(self) -> None:
+        """Forget the last place as well."""
+        super().make_due()
+        self._last = None
+
+    def measure(self, period_ms: float) -> list[list[float]]:
+        """Position in metres and velocity in metres a second."""
+        here = self.site.place()[:3]
+        before = self._last or here
+        self._last = here
+        seconds = period_ms / 1000.0
+        return [[*here], [(a - b) / seconds for a, b in zip(here, before, strict=True)]]
+
+
+class InertialUnit(Device):
+    """Roll, pitch and yaw in radians; the floor is flat, so only yaw ever changes."""
+
+    def measure(self, period_ms: float) -> list[float]:
+        """Roll, pitch and yaw, yaw between -pi and pi."""
+        return [0.0, 0.0, _turn(self.site.place()[3])]
 
 
 class MotionSensor(Device, ABC):
     """Three numbers along the sensor's own axes; a disabled axis shows NaN."""
-
-    def description(self) -> dict[str, Any]:
-        """Add what the device's getters tell."""
-        return super().description() | table_of(self.node)
 
     def measure(self, period_ms: float) -> list[float]:
         """What is felt along x, y and z of the sensor."""
@@ -147,11 +222,7 @@ class MotionSensor(Device, ABC):
 class Accelerometer(MotionSensor):
     """The change of the sensor's velocity since its last sample, and what carries its weight."""
 
-    kind = "Accelerometer"
-
-    def __init__(self, tag: int, node: Node, site: Site) -> None:
-        super().__init__(tag, node, site)
-        self._last_mps: tuple[float, float] | None = None
+    _last_mps: tuple[float, float] | None = None
 
     def make_due(self) -> None:
         """Forget the last velocity as well."""
@@ -174,8 +245,6 @@ class Accelerometer(MotionSensor):
 class Gyro(MotionSensor):
     """How fast the robot turns, radians a second."""
 
-    kind = "Gyro"
-
     def feel(self, period_s: float) -> Vector:
         """On a flat floor it turns about the vertical axis only."""
         return 0.0, 0.0, self.site.body.yaw_rate_radps
@@ -184,108 +253,9 @@ class Gyro(MotionSensor):
 class Compass(MotionSensor):
     """Where north is: the direction of the world's y axis."""
 
-    kind = "Compass"
-
     def feel(self, period_s: float) -> Vector:
         """A unit vector."""
         return 0.0, 1.0, 0.0
-
-
-# The light sensor: what falls on it from the lights of the world.
-
-
-_SUN_M = 1000.0
-"""How far away a DirectionalLight is, where something may stand in its light."""
-
-
-class LightSensor(Device):
-    """Adds up the irradiance of all lights, as Webots does; nothing reflects light."""
-
-    kind = "LightSensor"
-
-    def description(self) -> dict[str, Any]:
-        """Add what the device's getters tell."""
-        return super().description() | table_of(self.node)
-
-    def measure(self, period_ms: float) -> float:
-        """The looked-up value of the irradiance."""
-        world = self.site.arena.world
-        irradiance = sum(self._from(light, world) for light in self.site.arena.lights)
-        return resolved(self.node, irradiance)
-
-    def _from(self, light: Node, world: World) -> float:
-        fields, seen_through = light.fields, self.node.fields["colorFilter"]
-        if not fields["on"]:
-            return 0.0
-        way, distance_m = self._way_to(light, world)
-        direct = fields["intensity"] * max(_dot(self._axis(), way), 0.0) * _spot(light, way, world)
-        if direct and self.node.fields["occlusion"] and self._is_dark(way, distance_m):
-            direct = 0.0
-        color = _dot(fields["color"], seen_through) / 3.0
-        return color * _attenuation(light, distance_m) * (fields["ambientIntensity"] + direct)
-
-    def _axis(self) -> Vector:
-        r = self.site.pose().rotation
-        return r[0], r[3], r[6]
-
-    def _way_to(self, light: Node, world: World) -> tuple[Vector, float]:
-        """The direction of a light, a unit vector, and its distance in metres."""
-        frame = world.frame_around(light)
-        if light.type_name == "DirectionalLight":
-            x, y, z = frame.turned(light.fields["direction"])
-            return _unit((-x, -y, -z)), _SUN_M
-        here, there = self.site.pose().translation, frame.point(light.fields["location"])
-        way = (there[0] - here[0], there[1] - here[1], there[2] - here[2])
-        return _unit(way), hypot(*way)
-
-    def _is_dark(self, way: Vector, distance_m: float) -> bool:
-        x, y, z = self.site.pose().translation
-        level = hypot(way[0], way[1])
-        if level < 1e-9:  # straight above
-            return False
-        dx, dy, reach_m = way[0] / level, way[1] / level, distance_m * level
-        obstacles = self.site.arena.obstacles(without=self.site.body)
-        for target in targets_from(obstacles, x, y, None, reach_m):
-            away_m = target.distance_m(dx, dy)
-            height_m = z + away_m * way[2] / level if away_m <= reach_m else -1.0
-            if target.shape.bottom_m <= height_m <= target.shape.top_m:
-                return True
-        return False
-
-
-def _attenuation(light: Node, distance_m: float) -> float:
-    if light.type_name == "DirectionalLight":
-        return 1.0
-    a, b, c = light.fields["attenuation"]
-    return 1.0 / max(a + b * distance_m + c * distance_m**2, 1e-9)
-
-
-def _spot(light: Node, way: Vector, world: World) -> float:
-    """How much of a SpotLight's beam goes this way, 0 to 1."""
-    if light.type_name != "SpotLight":
-        return 1.0
-    beam = _unit(world.frame_around(light).turned(light.fields["direction"]))
-    angle = acos(min(max(-_dot(beam, way), -1.0), 1.0))
-    cut_off, full = light.fields["cutOffAngle"], light.fields["beamWidth"]
-    if angle > cut_off:
-        return 0.0
-    return 1.0 if angle <= full else (angle - cut_off) / (full - cut_off)
-
-
-def _dot(a: Vector, b: Vector) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _unit(vector: Vector) -> Vector:
-    x, y, z = vector
-    length = hypot(x, y, z) or 1.0
-    return x / length, y / length, z / length
-
-
-# The touch sensor: bumpers and force sensors.
-
-
-_TYPES: Final = {"bumper": 0, "force": 1, "force-3d": 2}
 
 
 class TouchSensor(Device):
@@ -295,18 +265,11 @@ class TouchSensor(Device):
     bounding object covers, seen from the middle.
     """
 
-    kind = "TouchSensor"
-
     def __init__(self, tag: int, node: Node, site: Site) -> None:
         super().__init__(tag, node, site)
         disc = site.body.footprint
         parts = bounding_parts(node, site.frame)
         self._sides = [side for part in parts for side in _sides(part, disc.ahead_m, disc.left_m)]
-
-    def description(self) -> dict[str, Any]:
-        """Add what the device's getters tell."""
-        kind = _TYPES.get(self.node.fields["type"], 0)
-        return super().description() | {"type": kind} | table_of(self.node)
 
     def measure(self, period_ms: float) -> float | list[float]:
         """Of a bumper 0 or 1, else the force in newtons, looked up."""
@@ -356,156 +319,48 @@ def _turn(angle_rad: float) -> float:
     return angle_rad - 2.0 * pi * round(angle_rad / (2.0 * pi))
 
 
-# The devices of a simulated robot: what they measure, and what they let a controller set.
-
-
-_DISTANCE_SENSOR_TYPES: Final = {"generic": 0, "infra-red": 1, "sonar": 2, "laser": 3}
-
-
-class Motor(Device):
-    """Turns a joint."""
-
-    kind = "Motor"
-
-    def description(self) -> dict[str, Any]:
-        """Add what the device's getters tell."""
-        fields = self.node.fields
-        sensors: list[Node] = self.site.joint.node.fields["device"] if self.site.joint else []
-        names = [node.fields["name"] for node in sensors if node.type_name == "PositionSensor"]
-        return super().description() | {
-            "min_position": fields["minPosition"],
-            "max_position": fields["maxPosition"],
-            "max_velocity": fields["maxVelocity"],
-            "is_linear": self.node.type_name == "LinearMotor",
-            "max_torque": fields.get("maxTorque", 0.0),
-            "acceleration": fields["acceleration"],
-            "multiplier": fields["multiplier"],
-            "position_sensor": names[0] if names else None,
-        }
-
-    def configure(self, setting: str, value: Any) -> None:
-        """Take a setting from the controller."""
-        joint = self.site.joint
-        if joint is None:
-            return
-        if setting == "position":
-            joint.target_rad = value
-        elif setting == "velocity":
-            joint.target_radps = value
-        elif setting == "acceleration":
-            joint.acceleration_radps2 = value
-
-
-class PositionSensor(Device):
-    """Says how far a joint has turned or slid, in radians or metres."""
-
-    kind = "PositionSensor"
-
-    def measure(self, period_ms: float) -> float:
-        """The angle of the joint in radians."""
-        return self.site.joint.position_rad if self.site.joint else nan
+# What the robot sees -----------------------------------------------------------------------------
 
 
 class DistanceSensor(Device):
     """One ray along the sensor's x axis, translated by the lookup table; noise is left out."""
 
-    kind = "DistanceSensor"
-
-    def __init__(self, tag: int, node: Node, site: Site) -> None:
-        super().__init__(tag, node, site)
-        self.table: list[list[float]] = node.fields["lookupTable"] or [[0.0, 0.0, 0.0]]
-
-    def description(self) -> dict[str, Any]:
-        """Add what the device's getters tell."""
-        values = [row[1] for row in self.table]
-        return super().description() | {
-            "min_value": min(values),
-            "max_value": max(values),
-            "aperture": self.node.fields["aperture"],
-            "type": _DISTANCE_SENSOR_TYPES.get(self.node.fields["type"], 0),
-            **table_of(self.node),
-        }
-
     def measure(self, period_ms: float) -> float:
         """The looked-up value of the distance."""
         x, y, z, yaw = self.site.place()
-        obstacles = self.site.arena.obstacles(without=self.site.body)
-        targets = targets_from(obstacles, x, y, z, reach_m=self.table[-1][0])
-        return looked_up(self.table, nearest_m(targets, cos(yaw), sin(yaw)))
+        table = self.node.fields["lookupTable"] or [[0.0, 0.0, 0.0]]
+        targets = targets_from(self.site.arena.obstacles(self.site.body), x, y, z, table[-1][0])
+        return looked_up(table, nearest_m(targets, cos(yaw), sin(yaw)))
 
 
-class Gps(Device):
-    """Where the sensor is, and how fast it moved since its last sample."""
+class FetchedSensor(Device, ABC):
+    """A sensor of pictures or scans: its value is their number, they stay here until asked for."""
 
-    kind = "GPS"
-
-    def __init__(self, tag: int, node: Node, site: Site) -> None:
-        super().__init__(tag, node, site)
-        self._last: tuple[float, float, float] | None = None
-
-    def make_due(self) -> None:
-        """Forget the last place as well."""
-        super().make_due()
-        self._last = None
-
-    def measure(self, period_ms: float) -> list[list[float]]:
-        """Position in metres and velocity in metres a second."""
-        here = self.site.place()[:3]
-        before = self._last or here
-        self._last = here
-        seconds = period_ms / 1000.0
-        return [[*here], [(a - b) / seconds for a, b in zip(here, before, strict=True)]]
-
-
-class InertialUnit(Device):
-    """Roll, pitch and yaw in radians; the floor is flat, so only yaw ever changes."""
-
-    kind = "InertialUnit"
-
-    def description(self) -> dict[str, Any]:
-        """Add what the device's getters tell."""
-        return super().description() | {"noise": self.node.fields["noise"]}
-
-    def measure(self, period_ms: float) -> list[float]:
-        """Roll, pitch and yaw, yaw between -pi and pi."""
-        yaw = self.site.place()[3]
-        return [0.0, 0.0, yaw - 2.0 * pi * round(yaw / (2.0 * pi))]
-
-
-class Lidar(Device):
-    """A level fan of rays from left to right; inf where nothing is in range."""
-
-    kind = "Lidar"
-    fetched = True
-
-    def __init__(self, tag: int, node: Node, site: Site) -> None:
-        super().__init__(tag, node, site)
-        self._samples = 0
-        self._seen: tuple[tuple[float, float, float, float], list[Shape]] | None = None
-        self.resolution: int = node.fields["horizontalResolution"]
-        self.field_of_view_rad: float = node.fields["fieldOfView"]
-
-    def description(self) -> dict[str, Any]:
-        """Add what the device's getters tell."""
-        fields = self.node.fields
-        return super().description() | {
-            "resolution": self.resolution,
-            "layers": fields["numberOfLayers"],
-            "fov": self.field_of_view_rad,
-            "vertical_fov": fields["verticalFieldOfView"],
-            "min_range": fields["minRange"],
-            "max_range": fields["maxRange"],
-            "near": fields["near"],
-            "frequency": fields["defaultFrequency"],
-            "min_frequency": fields["minFrequency"],
-            "max_frequency": fields["maxFrequency"],
-        }
+    _samples = 0
 
     def measure(self, period_ms: float) -> int:
-        """The number of the scan; `fetch` gives the scan itself."""
-        self._seen = (self.site.place(), self.site.arena.scene(without=self.site.body))
+        """Note what there is to see; the number of the sample."""
+        self.look()
         self._samples += 1
         return self._samples
+
+    @abstractmethod
+    def look(self) -> None:
+        """Note what there is to see now."""
+
+    @abstractmethod
+    def fetch(self) -> Any:
+        """The picture or scan of the last sample."""
+
+
+class Lidar(FetchedSensor):
+    """A level fan of rays from left to right; inf where nothing is in range."""
+
+    _seen: tuple[tuple[float, float, float, float], list[Shape]] | None = None
+
+    def look(self) -> None:
+        """Note where everything stands."""
+        self._seen = (self.site.place(), self.site.arena.scene(without=self.site.body))
 
     def fetch(self) -> list[float]:
         """Distances in metres, layer after layer."""
@@ -516,38 +371,23 @@ class Lidar(Device):
         return layer * self.node.fields["numberOfLayers"]
 
     def _ranges(self, targets: Any, yaw_rad: float) -> list[float]:
-        low, high = self.node.fields["minRange"], self.node.fields["maxRange"]
-        step = self.field_of_view_rad / max(self.resolution - 1, 1)
-        first = yaw_rad + self.field_of_view_rad / 2.0
-        angles = [first - i * step for i in range(self.resolution)]
+        fields = self.node.fields
+        low, high, fov_rad = fields["minRange"], fields["maxRange"], fields["fieldOfView"]
+        resolution: int = fields["horizontalResolution"]
+        step = fov_rad / max(resolution - 1, 1)
+        angles = [yaw_rad + fov_rad / 2.0 - i * step for i in range(resolution)]
         ranges = [nearest_m(targets, cos(angle), sin(angle)) for angle in angles]
         return [distance if low <= distance <= high else inf for distance in ranges]
 
 
-class Camera(Device):
+class Camera(FetchedSensor):
     """Renders its image when the picture is read."""
 
-    kind = "Camera"
-    fetched = True
+    _seen: pictures.View | None = None
 
     def __init__(self, tag: int, node: Node, site: Site) -> None:
         super().__init__(tag, node, site)
-        self._samples = 0
-        self._seen: camera.View | None = None
         self.field_of_view_rad: float = node.fields["fieldOfView"]
-
-    def description(self) -> dict[str, Any]:
-        """Add what the device's getters tell."""
-        fields, fov = self.node.fields, self.field_of_view_rad
-        zoom: dict[str, Any] = fields["zoom"].fields if fields["zoom"] else {}
-        return super().description() | {
-            "width": fields["width"],
-            "height": fields["height"],
-            "fov": fov,
-            "min_fov": zoom.get("minFieldOfView", fov),
-            "max_fov": zoom.get("maxFieldOfView", fov),
-            "near": fields["near"],
-        }
 
     def configure(self, setting: str, value: Any) -> None:
         """Take a setting from the controller."""
@@ -555,31 +395,163 @@ class Camera(Device):
         if setting == "fov":
             self.field_of_view_rad = value
 
-    def measure(self, period_ms: float) -> int:
-        """The number of the picture; `fetch` gives the picture itself."""
-        arena, fields = self.site.arena, self.node.fields
-        self._seen = camera.View(
+    def look(self) -> None:
+        """Note where everything stands."""
+        self._seen = pictures.View(
             *self.site.place(),
-            width=fields["width"],
-            height=fields["height"],
+            width=self.node.fields["width"],
+            height=self.node.fields["height"],
             field_of_view_rad=self.field_of_view_rad,
-            shapes=tuple(arena.scene(without=self.site.body)),
+            shapes=tuple(self.site.arena.scene(without=self.site.body)),
         )
-        self._samples += 1
-        return self._samples
 
     def fetch(self) -> bytes:
         """The picture: blue, green, red and alpha of each pixel."""
-        return b"" if self._seen is None else camera.render(self._seen, self.site.arena.colors)
+        return b"" if self._seen is None else pictures.render(self._seen, self.site.arena.colors)
 
 
-class Led(Device):
-    """A lamp; what it shines is the controller's business."""
+class LightSensor(Device):
+    """Adds up the irradiance of all lights, as Webots does; nothing reflects light."""
 
-    kind = "LED"
+    def measure(self, period_ms: float) -> float:
+        """The looked-up value of the irradiance."""
+        world = self.site.arena.world
+        irradiance = sum(self._from(light, world) for light in self.site.arena.lights)
+        return resolved(self.node, irradiance)
+
+    def _from(self, light: Node, world: World) -> float:
+        fields, seen_through = light.fields, self.node.fields["colorFilter"]
+        if not fields["on"]:
+            return 0.0
+        way, distance_m = self._way_to(light, world)
+        faced = max(_dot(self.site.axis(), way), 0.0)
+        direct = fields["intensity"] * faced * _spot(light, way, world)
+        if direct and self.node.fields["occlusion"] and self.site.is_blocked(way, distance_m):
+            direct = 0.0
+        color = _dot(fields["color"], seen_through) / 3.0
+        return color * _attenuation(light, distance_m) * (fields["ambientIntensity"] + direct)
+
+    def _way_to(self, light: Node, world: World) -> tuple[Vector, float]:
+        """The direction of a light, a unit vector, and its distance in metres."""
+        frame = world.frame_around(light)
+        if light.type_name == "DirectionalLight":
+            x, y, z = frame.turned(light.fields["direction"])
+            return _unit((-x, -y, -z)), _SUN_M
+        return _way(self.site.pose().translation, frame.point(light.fields["location"]))
 
 
-_BY_NODE_TYPE: Final[dict[str, Callable[[int, Node, Site], Device]]] = {
+def _attenuation(light: Node, distance_m: float) -> float:
+    if light.type_name == "DirectionalLight":
+        return 1.0
+    a, b, c = light.fields["attenuation"]
+    return 1.0 / max(a + b * distance_m + c * distance_m**2, 1e-9)
+
+
+def _spot(light: Node, way: Vector, world: World) -> float:
+    """How much of a SpotLight's beam goes this way, 0 to 1."""
+    if light.type_name != "SpotLight":
+        return 1.0
+    beam = _unit(world.frame_around(light).turned(light.fields["direction"]))
+    angle = _angle(beam, (-way[0], -way[1], -way[2]))
+    cut_off, full = light.fields["cutOffAngle"], light.fields["beamWidth"]
+    if angle > cut_off:
+        return 0.0
+    return 1.0 if angle <= full else (angle - cut_off) / (full - cut_off)
+
+
+def _way(here: Vector, there: Vector) -> tuple[Vector, float]:
+    """From one place to another: a unit vector and metres."""
+    way = (there[0] - here[0], there[1] - here[1], there[2] - here[2])
+    return _unit(way), hypot(*way)
+
+
+def _angle(a: Vector, b: Vector) -> float:
+    """Between two unit vectors, radians."""
+    return acos(min(max(_dot(a, b), -1.0), 1.0))
+
+
+def _dot(a: Vector, b: Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _unit(vector: Vector) -> Vector:
+    x, y, z = vector
+    length = hypot(x, y, z) or 1.0
+    return x / length, y / length, z / length
+
+
+# Messages ----------------------------------------------------------------------------------------
+
+
+class Emitter(Device):
+    """Sends packets; they arrive in the basic time step after which they were sent."""
+
+    def __init__(self, tag: int, node: Node, site: Site) -> None:
+        super().__init__(tag, node, site)
+        self._packets: list[bytes] = []
+
+    def configure(self, setting: str, value: Any) -> None:
+        """Take a setting from the controller, or a packet to send."""
+        if setting == "send":
+            self._packets.append(value)
+        elif setting != "period":
+            self.node.fields[setting] = value
+
+    def transmit(self, receivers: Sequence[Receiver]) -> None:
+        """Bring what is to be sent to all receivers of other robots that can hear it."""
+        packets, self._packets = self._packets, []
+        for receiver in receivers if packets else ():
+            if receiver.site.body is not self.site.body:
+                receiver.hear(packets, self)
+
+
+class Receiver(Device):
+    """Queues packets until its controller gets them with the next sample."""
+
+    def __init__(self, tag: int, node: Node, site: Site) -> None:
+        super().__init__(tag, node, site)
+        self._arrived: list[tuple[bytes, Vector, float]] = []
+
+    def configure(self, setting: str, value: Any) -> None:
+        """Take a setting from the controller."""
+        super().configure(setting, value)
+        if setting == "channel":
+            self.node.fields["channel"] = value
+
+    def hear(self, packets: list[bytes], emitter: Emitter) -> None:
+        """Take packets from an emitter that it can hear."""
+        here, there = self.site.pose(), emitter.site.pose()
+        way, distance_m = _way(here.translation, there.translation)
+        if self.period_ms and self._can_hear(emitter, way, distance_m):
+            strength = 1.0 / distance_m**2 if distance_m else inf
+            direction = here.direction(way)
+            self._arrived.extend((packet, direction, strength) for packet in packets)
+
+    def _can_hear(self, emitter: Emitter, way: Vector, distance_m: float) -> bool:
+        mine, theirs = self.node.fields, emitter.node.fields
+        if mine["type"] != theirs["type"] or 0.0 <= theirs["range"] < distance_m:
+            return False
+        if -1 not in (mine["channel"], theirs["channel"]) and mine["channel"] != theirs["channel"]:
+            return False
+        if mine["type"] != "infra-red":
+            return True
+        back = (-way[0], -way[1], -way[2])
+        return (
+            (mine["aperture"] < 0.0 or 2.0 * _angle(self.site.axis(), way) <= mine["aperture"])
+            and (
+                theirs["aperture"] < 0.0
+                or 2.0 * _angle(emitter.site.axis(), back) <= theirs["aperture"]
+            )
+            and not self.site.is_blocked(way, distance_m, emitter.site.body)
+        )
+
+    def put_value(self, fresh: dict[int, Any]) -> None:
+        """Add the packets to those that the controller has not been sent yet."""
+        fresh.setdefault(self.tag, []).extend(self._arrived)
+        self._arrived.clear()
+
+
+DEVICES: Final[dict[str, Callable[[int, Node, Site], Device]]] = {
     "RotationalMotor": Motor,
     "LinearMotor": Motor,
     "PositionSensor": PositionSensor,
@@ -588,32 +560,32 @@ _BY_NODE_TYPE: Final[dict[str, Callable[[int, Node, Site], Device]]] = {
     "InertialUnit": InertialUnit,
     "Lidar": Lidar,
     "Camera": Camera,
-    "LED": Led,
+    "LED": Device,
     "Accelerometer": Accelerometer,
     "Compass": Compass,
     "Gyro": Gyro,
     "LightSensor": LightSensor,
     "TouchSensor": TouchSensor,
+    "Emitter": Emitter,
+    "Receiver": Receiver,
 }
+"""The devices that the stand-in has, by node type."""
 
 
 def devices_in(vehicle: Vehicle, arena: Arena) -> list[Device]:
     """All devices of a robot in the order of the scene tree; tags count from 1."""
     found: list[tuple[Node, Site]] = []
     _find(vehicle.body.node, Site(vehicle, arena, Frame(), None), found)
-    return [
-        _BY_NODE_TYPE[node.type_name](tag, node, site)
-        for tag, (node, site) in enumerate(found, start=1)
-    ]
+    return [DEVICES[node.type_name](tag, node, site) for tag, (node, site) in enumerate(found, 1)]
 
 
 def _find(node: Node, site: Site, found: list[tuple[Node, Site]]) -> None:
+    joints = {joint.node: joint for joint in site.vehicle.joints}
     for child in children_of(node):
         if child.type_name == "Robot":
             continue
-        joints = {joint.node: joint for joint in site.vehicle.joints}
         frame = site.frame.then(own_frame(child))
         here = Site(site.vehicle, site.arena, frame, joints.get(child, site.joint))
-        if child.type_name in DEVICE_TYPES:
+        if child.type_name in DEVICES:
             found.append((child, here))
         _find(child, here, found)

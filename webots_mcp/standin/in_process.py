@@ -7,9 +7,8 @@ from collections import deque
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
-from controller.robot import Robot
-from controller.supervisor import Supervisor
-from controller.wire import Message
+from controller.robot import Robot, Supervisor
+from controller.session import Message
 
 from webots_mcp.contract import bundled
 from webots_mcp.standin.controller_answers import answer, description, step_over

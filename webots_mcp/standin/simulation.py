@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, TypeVar, cast
 
-from controller.wire import ADDRESS_FILE, Message
+from controller.session import ADDRESS_FILE, Message
 
 from webots_mcp.standin.controller_answers import answer, description, step_over
 from webots_mcp.standin.controller_path import LIBRARY
@@ -128,6 +128,14 @@ class Simulation:
     def exit_status(self) -> int | None:
         """The status given to `simulationQuit`; None while it runs."""
         return self._runner.exit_status
+
+    @property
+    def failure(self) -> int | None:
+        """The exit status of the first controller that ended with an error by itself.
+
+        128 and its number for a signal; None if there is none.
+        """
+        return self._launch.failure
 
     # What is the case ----------------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 from webots_mcp.standin.arena import Arena, Body, Vehicle, joints_in
-from webots_mcp.standin.devices import Device, devices_in
+from webots_mcp.standin.devices import Device, Emitter, Receiver, devices_in
 from webots_mcp.standin.pictures import Label, Picture, save_picture
 from webots_mcp.standin.vrml import Node, WorldError
 from webots_mcp.standin.world import World
@@ -138,6 +138,9 @@ class Simulator:
             log(warning)
         if not self.robots and world.left_out:
             raise WorldError(self.no_robot())
+        devices = [device for robot in self.robots for device in robot.devices.values()]
+        self._emitters = [device for device in devices if isinstance(device, Emitter)]
+        self._receivers = [device for device in devices if isinstance(device, Receiver)]
         self.time_ms = 0.0
         self.wanted: Wanted | None = None
         self.labels: dict[int, Label] = {}
@@ -166,15 +169,23 @@ class Simulator:
     def no_robot(self, name: str | None = None) -> str:
         """Why there is no robot of this name, or none at all, in words."""
         if left_out := self.left_out_robots(name):
-            node = next((node for node in left_out if _has_controller(node)), left_out[0])
-            return (
-                f"{self.world.path.name}, line {node.line}: the stand-in has no {node.type_name} "
-                "nodes. If that is the robot: in Webots, right-click it, choose 'Convert Root to "
-                "Base Node(s)' and save the world; docs/standin.md lists what the stand-in has"
-            )
+            return f"{self.world.path.name}, {self._suspects(left_out)}"
         known = ", ".join(repr(robot.name) for robot in self.robots)
         asked = "no robot" if name is None else f"no robot {name!r}"
         return f"{asked} in {self.world.path.name}; it has {known or 'none'}"
+
+    def _suspects(self, left_out: list[Node]) -> str:
+        """What was left out and is the robot, or may be it, and what to do about it."""
+        nodes = self.world.likeliest_robots(left_out)
+        first, types = nodes[0], [*dict.fromkeys(node.type_name for node in nodes)]
+        if_robot = "that" if len(types) == 1 else "one of them"
+        return (
+            f"line {first.line}: the stand-in has no {' or '.join(types)} nodes"
+            f"{self.world.why_not(first.type_name)}. "
+            f"If {if_robot} is the robot: in Webots, right-click it, choose 'Convert Root to Base "
+            "Node(s)' and save the world, or let WEBOTS_HOME name an installed Webots, whose PROTO "
+            "files are read then; docs/standin.md lists what the stand-in has"
+        )
 
     def left_out_robots(self, name: str | None = None) -> list[Node]:
         """What was left out of the world and may be this robot, or any."""
@@ -211,6 +222,8 @@ class Simulator:
         for robot in self.robots:
             robot.vehicle.drive(self.arena, basic / 1000.0)
         self.arena.glide(basic / 1000.0)
+        for emitter in self._emitters:
+            emitter.transmit(self._receivers)
         self.time_ms += basic
         if self._reset_asked:
             self.reset()
@@ -224,7 +237,7 @@ class Simulator:
     def _measure(self, robot: Robot, passed_ms: float) -> None:
         for device in robot.devices.values():
             if device.is_due(passed_ms):
-                robot.fresh[device.tag] = device.measure(device.period_ms)
+                device.put_value(robot.fresh)
 
     def _let_pass(self, robot: Robot, passed_ms: float) -> bool:
         if robot.remaining_ms is None:

@@ -1,52 +1,47 @@
-"""Reads the VRML dialect of .wbt files into a tree of nodes; knows nothing of what nodes mean."""
+"""Reads the VRML dialect of .wbt and .proto files into trees of nodes with typed fields.
+
+StandInError
+├── WorldError            the world file cannot be used; names the line
+├── WouldBlockError       the call would wait for ever: the simulation is paused
+└── ControllerEndedError  the API was used after `step` had returned -1
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias, cast
 
-# What can go wrong with the stand-in, as one small tree of exceptions.
-#
-# StandInError
-# ├── WorldError            the world file cannot be used; names the line
-# ├── WouldBlockError       the call would wait for ever: the simulation is paused
-# └── ControllerEndedError  the API was used after `step` had returned -1
-
-
-class StandInError(Exception):
-    """Anything the stand-in refuses to do."""
-
-
-class WorldError(StandInError):
-    """A world file that the stand-in cannot use."""
-
-    def __init__(self, message: str, line: int | None = None) -> None:
-        super().__init__(message if line is None else f"line {line}: {message}")
-        self.line = line
-
-
-class WouldBlockError(StandInError):
-    """An in-process `step` that would never return, because the simulation is paused."""
-
-
-class ControllerEndedError(StandInError):
-    """The API was used after `step` had returned -1.
-
-    A controller process would end here without a word (C `exit`); in process that would end the
-    whole test run, hence an exception.
-    """
-
+DATA: Final = Path(__file__).with_name("data")
+"""The folder of the node types and of the PROTO nodes that are built in."""
 
 Value: TypeAlias = "bool | str | Node | list[float] | list[Value] | None"
 """A field as written: numbers are always a list of floats, `[...]` is a list of anything."""
+NUMBERS_IN: Final = {"Vec2f": 2, "Vec3f": 3, "Color": 3, "Rotation": 4}
+"""How many numbers make one value of a type; all other types take one."""
+
+_FIELD_KEYWORDS: Final = ("field", "vrmlField", "exposedField", "unconnectedField", "hiddenField")
+_FIRST_RELEASE: Final = "R2022"
+"""The oldest one with the axes of today."""
 
 _TOKEN: Final = re.compile(r'[\s,]+|#[^\n]*|(?P<token>"(?:[^"\\]|\\.)*"|[\[\]{}]|[^\s\[\]{}",#]+)')
 _NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\Z")
 _NAME: Final = re.compile(r"[A-Za-z_][^\s\"'#,.\[\]\\{}]*\Z")
 _WORDS: Final[dict[str, bool | None]] = {"TRUE": True, "FALSE": False, "NULL": None}
+
+
+class FieldDefinition(NamedTuple):
+    """What a node type says about one of its fields."""
+
+    type_name: str
+    """`SFVec3f`, `MFNode` and so on."""
+    default: Value
+    """As written."""
+    is_hidden: bool = False
+    """Whether only the PROTO itself uses it."""
 
 
 class Token(NamedTuple):
@@ -66,11 +61,15 @@ class Node:
     fields: dict[str, Any] = field(default_factory=lambda: {})
     proto_name: str = ""
     """Of a PROTO node that was built: its own name; its type is that of what it is made of."""
+    parameters: frozenset[str] = frozenset()
+    """Fields that a PROTO node has and its base node has not; the nodes in them stand in that."""
 
 
 def children_of(node: Node) -> Iterator[Node]:
     """The nodes in the fields of a node, in the order of the file."""
-    for value in node.fields.values():
+    for name, value in node.fields.items():
+        if name in node.parameters:
+            continue
         if isinstance(value, Node):
             yield value
         elif isinstance(value, list):
@@ -98,13 +97,53 @@ def tokens_of(text: str) -> Iterator[Token]:
         position = match.end()
 
 
-class Parser:
-    """Recursive descent over the words of one world."""
+class StandInError(Exception):
+    """Anything the stand-in refuses to do."""
 
-    def __init__(self, text: str) -> None:
-        self._tokens = [*tokens_of(text)]
+
+class WorldError(StandInError):
+    """A world file that the stand-in cannot use."""
+
+    def __init__(self, message: str, line: int | None = None) -> None:
+        super().__init__(message if line is None else f"line {line}: {message}")
+        self.line = line
+
+
+class WouldBlockError(StandInError):
+    """An in-process `step` that would never return, because the simulation is paused."""
+
+
+class ControllerEndedError(StandInError):
+    """The API was used after `step` had returned -1.
+
+    A controller process would end here without a word (C `exit`); in process that would end the
+    whole test run, hence an exception.
+    """
+
+
+class Parser:
+    """Recursive descent over the words of one file."""
+
+    def __init__(
+        self,
+        text: str | Sequence[Token],
+        given: Mapping[str, Value] | None = None,
+        line: int | None = None,
+    ) -> None:
+        """Begin at the first word.
+
+        Args:
+            text: The text, or the words of a PROTO's body.
+            given: Of a PROTO's body the values of its fields, for `IS`.
+            line: Where the PROTO node stands in the world: that of all nodes in the body.
+        """
+        self._tokens = [*tokens_of(text)] if isinstance(text, str) else text
+        self._given = given
+        self._line = line
         self._next = 0
         self._defined: dict[str, Node] = {}
+        self.urls: dict[str, str] = {}
+        """Where the file says that PROTOs come from, by their names."""
         self._last_line = self._tokens[-1].line if self._tokens else 1
 
     def nodes(self) -> list[Node]:
@@ -121,7 +160,7 @@ class Parser:
         return nodes
 
     def _takes_externproto(self) -> bool:
-        """Read over `EXTERNPROTO "url"`: it only says where a PROTO comes from."""
+        """Read `EXTERNPROTO "url"`, if that comes next."""
         if self._peek().text == "IMPORTABLE":
             self._take()
         if self._peek().text != "EXTERNPROTO":
@@ -129,8 +168,52 @@ class Parser:
         token = self._take()
         if not self._peek().text.startswith('"'):
             raise WorldError("EXTERNPROTO has no URL", token.line)
-        self._take()
+        url = self._take().text.strip('"')
+        self.urls[url.rpartition("/")[2].removesuffix(".proto")] = url
         return True
+
+    def definitions(self, end: str) -> dict[str, FieldDefinition]:
+        """The fields of a node type, up to a closing bracket."""
+        found: dict[str, FieldDefinition] = {}
+        while (token := self._take()).text != end:
+            keyword = token.text if token.text in _FIELD_KEYWORDS else ""
+            type_token = self._take() if keyword else token
+            if self._peek().text == "{":  # the values that are allowed
+                self._skip_braces()
+            name = self._name("a field name")
+            found[name.text] = FieldDefinition(
+                type_token.text, self._value(name), keyword == "hiddenField"
+            )
+        return found
+
+    def _skip_braces(self) -> None:
+        depth = 0
+        while True:
+            depth += {"{": 1, "}": -1}.get(self._take().text, 0)
+            if depth == 0:
+                return
+
+    def types(self) -> dict[str, dict[str, FieldDefinition]]:
+        """Fields by node type, from a text as Webots writes its node files."""
+        known: dict[str, dict[str, FieldDefinition]] = {}
+        while self._next < len(self._tokens):
+            name = self._take().text
+            self._take()
+            known[name] = self.definitions("}")
+        return known
+
+    def proto(self) -> tuple[str, dict[str, FieldDefinition], Sequence[Token]]:
+        """The definition of a PROTO: its name, its fields and the words of its body."""
+        while self._takes_externproto():
+            pass
+        if self._take().text != "PROTO":
+            raise WorldError("there is no PROTO definition", self._last_line)
+        name = self._name("the name of a PROTO").text
+        self._take()
+        fields = self.definitions("]")
+        start = self._next + 1
+        self._skip_braces()
+        return name, fields, self._tokens[start : self._next - 1]
 
     def _peek(self) -> Token:
         if self._next == len(self._tokens):
@@ -166,7 +249,9 @@ class Parser:
         return self._defined[token.text]
 
     def _body(self, type_token: Token, def_name: str) -> Node:
-        node = Node(type_token.text, def_name, type_token.line)
+        is_inner = self._line is not None  # in a PROTO: not to be found from outside
+        line = type_token.line if self._line is None else self._line
+        node = Node(type_token.text, "" if is_inner else def_name, line)
         brace = self._take()
         if brace.text != "{":
             raise WorldError(
@@ -185,6 +270,8 @@ class Parser:
 
     def _value(self, owner: Token) -> Value:
         token = self._peek()
+        if token.text == "IS" and self._given is not None:
+            return self._is_value()
         if token.text == "[":
             return self._list(owner)
         if _NUMBER.match(token.text):
@@ -194,6 +281,14 @@ class Parser:
         if token.text in "]{}":
             raise WorldError(f"field {owner.text} has no value", token.line)
         return self._node()
+
+    def _is_value(self) -> Value:
+        self._take()
+        name = self._name("a field of the PROTO")
+        if self._given is None or name.text not in self._given:
+            raise WorldError(f"the PROTO has no field {name.text}", name.line)
+        value = self._given[name.text]
+        return [*value] if isinstance(value, list) else value  # pyright: ignore[reportReturnType]
 
     def _numbers(self) -> list[float]:
         numbers: list[float] = []
@@ -225,240 +320,26 @@ def _word(token: Token) -> bool | str | None:
     return re.sub(r"\\(.)", r"\1", token.text[1:-1])
 
 
-def parse(text: str) -> list[Node]:
-    """Read the text of a .wbt file.
-
-    Args:
-        text: The whole file.
-
-    Returns:
-        The nodes at the top of the scene tree. A `USE` gives the very node that its `DEF` named.
+def require_release(text: str, what: str = "world") -> None:
+    """Read the first line of a file.
 
     Raises:
-        WorldError: The text is not a world; the message names the line.
+        WorldError: It is none of Webots', or of a release with other axes.
     """
-    first_line = text.partition("\n")[0]
+    first, first_line = "#VRML_SIM R2023b utf8", text.partition("\n")[0]
     release = re.match(r"#VRML_SIM (R20\d\d)[ab]?\S* utf8", first_line)
     if release is None:
-        raise WorldError(f'a world begins with "#VRML_SIM R2023b utf8", not {first_line[:40]!r}', 1)
-    if release[1] < "R2022":
+        raise WorldError(f'a {what} begins with "{first}", not {first_line[:40]!r}', 1)
+    if release[1] < _FIRST_RELEASE:
         raise WorldError(
-            f"worlds of {release[1]} have other axes: open and save it with Webots R2022a or newer",
+            f"{what}s of {release[1]} have other axes: "
+            "open and save it with Webots R2022a or newer",
             1,
         )
-    return Parser(text).nodes()
 
 
-# The node types that the stand-in knows: their fields, types and default values.
-
-
-_DEFINITIONS: Final = """
-WorldInfo {
-  MFString info []  SFString title ""  SFString window "<none>"
-  SFFloat gravity 9.81  SFFloat basicTimeStep 32  SFFloat FPS 60
-  SFInt32 optimalThreadCount 1  SFInt32 randomSeed 0
-  SFString coordinateSystem "ENU"  SFString gpsCoordinateSystem "local"
-  MFNode contactProperties []
-}
-ContactProperties {
-  SFString material1 "default"  SFString material2 "default"
-  MFFloat coulombFriction 1  SFFloat bounce 0.5
-}
-Viewpoint {
-  SFRotation orientation 0 0 1 0  SFVec3f position -10 0 0  SFFloat fieldOfView 0.785398
-}
-Background { MFColor skyColor 0 0 0  SFFloat luminosity 1 }
-DirectionalLight {
-  SFFloat ambientIntensity 0  SFColor color 1 1 1  SFVec3f direction 0 0 -1  SFFloat intensity 1
-  SFBool on TRUE
-}
-PointLight {
-  SFFloat ambientIntensity 0  SFVec3f attenuation 1 0 0  SFColor color 1 1 1  SFFloat intensity 1
-  SFVec3f location 0 0 0  SFBool on TRUE
-}
-SpotLight {
-  SFFloat ambientIntensity 0  SFVec3f attenuation 1 0 0  SFColor color 1 1 1  SFFloat intensity 1
-  SFVec3f location 0 0 10  SFVec3f direction 0 0 -1  SFFloat cutOffAngle 0.785398
-  SFFloat beamWidth 1.570796  SFBool on TRUE
-}
-Group { MFNode children [] }
-Pose { SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children [] }
-Transform {
-  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  SFVec3f scale 1 1 1  MFNode children []
-}
-Solid {
-  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
-  SFString name "solid"  SFString model ""  SFString description ""
-  SFString contactMaterial "default"  SFNode boundingObject NULL  SFNode physics NULL
-  SFBool locked FALSE
-}
-Robot {
-  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
-  SFString name "robot"  SFString model ""  SFString description ""
-  SFString contactMaterial "default"  SFNode boundingObject NULL  SFNode physics NULL
-  SFBool locked FALSE
-  SFString controller "<generic>"  MFString controllerArgs []  SFString customData ""
-  SFBool supervisor FALSE  SFBool synchronization TRUE  MFFloat battery []
-  SFBool selfCollision FALSE  SFString window "<generic>"
-}
-Shape { SFNode appearance NULL  SFNode geometry NULL }
-PBRAppearance {
-  SFColor baseColor 1 1 1  SFFloat transparency 0  SFFloat roughness 0  SFFloat metalness 1
-}
-Appearance { SFNode material NULL }
-Material { SFColor diffuseColor 0.8 0.8 0.8 }
-Plane { SFVec2f size 1 1 }
-Box { SFVec3f size 0.1 0.1 0.1 }
-Cylinder { SFFloat height 0.2  SFFloat radius 0.1  SFInt32 subdivision 32 }
-Capsule { SFFloat height 0.2  SFFloat radius 0.1  SFInt32 subdivision 24 }
-Sphere { SFFloat radius 0.1  SFInt32 subdivision 1  SFBool ico TRUE }
-Physics { SFFloat density 1000  SFFloat mass -1  MFVec3f centerOfMass [] }
-HingeJoint { SFNode jointParameters NULL  MFNode device []  SFNode endPoint NULL }
-HingeJointParameters { SFFloat position 0  SFVec3f axis 1 0 0  SFVec3f anchor 0 0 0 }
-SliderJoint { SFNode jointParameters NULL  MFNode device []  SFNode endPoint NULL }
-JointParameters { SFFloat position 0  SFVec3f axis 0 0 1 }
-LinearMotor {
-  SFString name "linear motor"  SFFloat acceleration -1  SFVec3f controlPID 10 0 0
-  SFFloat minPosition 0  SFFloat maxPosition 0  SFFloat maxVelocity 10  SFFloat maxForce 10
-  SFFloat multiplier 1
-}
-RotationalMotor {
-  SFString name "rotational motor"  SFFloat acceleration -1  SFVec3f controlPID 10 0 0
-  SFFloat minPosition 0  SFFloat maxPosition 0  SFFloat maxVelocity 10  SFFloat maxTorque 10
-  SFFloat multiplier 1
-}
-PositionSensor { SFString name "position sensor"  SFFloat noise 0  SFFloat resolution -1 }
-DistanceSensor {
-  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
-  SFString name "distance sensor"  SFString model ""
-  MFVec3f lookupTable [0 0 0 0.1 1000 0]
-  SFString type "generic"  SFInt32 numberOfRays 1  SFFloat aperture 1.5708
-}
-Camera {
-  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
-  SFString name "camera"  SFString model ""
-  SFFloat fieldOfView 0.7854  SFInt32 width 64  SFInt32 height 64  SFFloat near 0.01
-  SFNode zoom NULL
-}
-Zoom { SFFloat maxFieldOfView 1.5  SFFloat minFieldOfView 0.5 }
-Accelerometer {
-  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
-  SFString name "accelerometer"  SFString model ""  MFVec3f lookupTable []
-  SFBool xAxis TRUE  SFBool yAxis TRUE  SFBool zAxis TRUE  SFFloat resolution -1
-}
-Compass {
-  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
-  SFString name "compass"  SFString model ""  MFVec3f lookupTable []
-  SFBool xAxis TRUE  SFBool yAxis TRUE  SFBool zAxis TRUE  SFFloat resolution -1
-}
-Gyro {
-  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
-  SFString name "gyro"  SFString model ""  MFVec3f lookupTable []
-  SFBool xAxis TRUE  SFBool yAxis TRUE  SFBool zAxis TRUE  SFFloat resolution -1
-}
-LED {
-  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
-  SFString name "led"  SFString model ""  MFColor color [1 0 0]  SFBool gradual FALSE
-}
-LightSensor {
-  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
-  SFString name "light sensor"  SFString model ""  MFVec3f lookupTable [0 0 0 1 1000 0]
-  SFColor colorFilter 1 1 1  SFBool occlusion FALSE  SFFloat resolution -1
-}
-TouchSensor {
-  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
-  SFString name "touch sensor"  SFString model ""  SFNode boundingObject NULL
-  SFNode physics NULL  SFString type "bumper"  MFVec3f lookupTable [0 0 0 5000 50000 0]
-  SFFloat resolution -1
-}
-GPS {
-  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
-  SFString name "gps"  SFString model ""  SFString type "satellite"  SFFloat accuracy 0
-}
-InertialUnit {
-  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
-  SFString name "inertial unit"  SFString model ""  SFFloat noise 0
-}
-Lidar {
-  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
-  SFString name "lidar"  SFString model ""
-  SFInt32 horizontalResolution 512  SFFloat fieldOfView 1.5708  SFFloat verticalFieldOfView 0.2
-  SFInt32 numberOfLayers 4  SFFloat near 0.01  SFFloat minRange 0.01  SFFloat maxRange 1
-  SFString type "fixed"  SFFloat defaultFrequency 10
-  SFFloat minFrequency 1  SFFloat maxFrequency 25
-}
-"""
-
-NUMBERS_IN: Final = {"Vec2f": 2, "Vec3f": 3, "Color": 3, "Rotation": 4}
-"""How many numbers make one value of a type; all other types take one."""
-
-
-@dataclass(frozen=True)
-class FieldDefinition:
-    """What a node type says about one of its fields."""
-
-    type_name: str
-    """`SFVec3f`, `MFNode` and so on."""
-    default: Value
-    """As the parser would have read it from a file."""
-
-
-def definitions_in(text: str) -> dict[str, dict[str, FieldDefinition]]:
-    """Fields by node type, from a text as Webots writes its node files, without comments."""
-    words = [token.text for token in tokens_of(text)]
-    known: dict[str, dict[str, FieldDefinition]] = {}
-    start = 0
-    while start < len(words):
-        end = words.index("}", start)
-        known[words[start]] = dict(_fields(words[start + 2 : end]))
-        start = end + 1
-    return known
-
-
-def _fields(words: list[str]) -> list[tuple[str, FieldDefinition]]:
-    starts = [i for i, word in enumerate(words) if word[:2] in ("SF", "MF")]
-    return [
-        (words[start + 1], FieldDefinition(words[start], _default(words[start + 2 : end])))
-        for start, end in zip(starts, [*starts[1:], len(words)], strict=True)
-    ]
-
-
-def _default(words: list[str]) -> Value:
-    if words[0] in ("TRUE", "FALSE"):
-        return words[0] == "TRUE"
-    if words[0] == "NULL":
-        return None
-    if words[0].startswith('"'):
-        return words[0][1:-1]
-    return [float(word) for word in words if word not in "[]"]
-
-
-NODE_TYPES: Final = definitions_in(_DEFINITIONS)
+NODE_TYPES: Final = Parser((DATA / "nodes.txt").read_text(encoding="utf-8")).types()
 """Fields by node type."""
-
-DEVICE_TYPES: Final = (
-    *(
-        "RotationalMotor",
-        "LinearMotor",
-        "PositionSensor",
-        "DistanceSensor",
-        "Camera",
-        "GPS",
-        "InertialUnit",
-    ),
-    *("Lidar", "Accelerometer", "Compass", "Gyro", "LED", "LightSensor", "TouchSensor"),
-)
-
-DEFAULT_NAME_OF: Final = {
-    **{"Altimeter": "altimeter", "Brake": "brake", "Connector": "connector"},
-    **{"Display": "display", "Emitter": "emitter", "Pen": "pen"},
-    **{"Radar": "radar", "RangeFinder": "range-finder", "Receiver": "receiver", "Skin": "skin"},
-    **{"Speaker": "speaker", "VacuumGripper": "vacuum gripper"},
-}
-"""What devices that the stand-in does not have are called, unless the world gives them a name."""
-
-
-# From fields as they are written to values of the types that a node's type asks for.
 
 
 def give_types(node: Node, definitions: Mapping[str, FieldDefinition]) -> None:
@@ -479,7 +360,7 @@ def _typed(value: Value, name: str, definition: FieldDefinition, node: Node) -> 
     try:
         if not many:
             return _single(value, kind)
-        if kind in ("String", "Node"):
+        if kind in ("String", "Node", "Bool"):
             values: list[Any] = value if isinstance(value, list) else [value]
             return [_single(item, kind) for item in values]
         return _several_numbers(value, kind)
@@ -514,10 +395,13 @@ def _several_numbers(value: Value, kind: str) -> Value:
     return [numbers[i : i + size] for i in range(0, len(numbers), size)]
 
 
-def _numbers(value: Value) -> list[float]:
-    if not isinstance(value, list) or not all(isinstance(item, float) for item in value):
+def _numbers(value: Any) -> list[float]:
+    """Numbers one after the other; those of a field that was given its type already, too."""
+    if isinstance(value, list):
+        return [number for item in cast("list[Any]", value) for number in _numbers(item)]
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise TypeError("numbers")
-    return [*cast("list[float]", value)]
+    return [float(value)]
 
 
 def _shown(value: Value) -> str:

@@ -2,23 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final, cast
 
 from webots_mcp.standin.geometry import Frame, frame_of
-from webots_mcp.standin.protos import PROTOS, build, shown_definitions
+from webots_mcp.standin.protos import Protos
 from webots_mcp.standin.vrml import (
-    DEFAULT_NAME_OF,
     NODE_TYPES,
     Node,
+    Parser,
     WorldError,
     children_of,
     descendants_of,
     give_types,
-    parse,
+    require_release,
 )
 
+_NAME_OF_LACKING: Final = {
+    **{"Altimeter": "altimeter", "Brake": "brake", "Connector": "connector", "Pen": "pen"},
+    **{"Display": "display", "Radar": "radar", "RangeFinder": "range-finder", "Skin": "skin"},
+    **{"Speaker": "speaker", "VacuumGripper": "vacuum gripper"},
+}
+"""What devices that the stand-in does not have are called, unless the world gives them a name."""
+_OF_ROBOTS: Final = {"controller", "controllerArgs", "supervisor", "synchronization"}
+_IS_NO_ROBOT: Final = re.compile(r"Background|Light|Floor|Appearance|/(objects|appearances)/")
 _UNSCALED: Final = [1.0, 1.0, 1.0]
 
 
@@ -30,8 +39,9 @@ class World:
     of those for MF fields.
     """
 
-    def __init__(self, path: Path, top: list[Node]) -> None:
+    def __init__(self, path: Path, top: list[Node], protos: Protos) -> None:
         self.path = path
+        self.protos = protos
         self.root = Node("Group", "", 1, {"children": [*top]})
         self.nodes: list[Node] = []
         """Every node once, in the order of the scene tree; what was added comes last."""
@@ -55,10 +65,10 @@ class World:
     def _register(self, node: Node, parent: Node | None) -> None:
         if node in self._ids:  # a USE: stands where its DEF stands
             return
-        if node.type_name in PROTOS:
-            build(node)
-        else:
+        if node.type_name in NODE_TYPES:
             give_types(node, NODE_TYPES[node.type_name])
+        else:
+            self.protos.build(node)
         self._ids[node], self._by_id[self._next_id] = self._next_id, node
         self._next_id += 1
         self.nodes.append(node)
@@ -70,8 +80,11 @@ class World:
 
     def _leave_out_unknown(self, node: Node) -> None:
         for child in [*children_of(node)]:
-            if child.type_name not in NODE_TYPES and child.type_name not in PROTOS:
+            if not self._is_known(child):
                 self._leave_out(child, node)
+
+    def _is_known(self, node: Node) -> bool:
+        return node.type_name in NODE_TYPES or self.protos.find(node.type_name) is not None
 
     def _leave_out(self, child: Node, parent: Node) -> None:
         if child not in self.left_out:
@@ -96,7 +109,8 @@ class World:
             by_type.setdefault(node.type_name, []).append(node)
         lines = [
             f"line {nodes[0].line}: the stand-in has no {type_name} nodes; "
-            f"{'this one is' if len(nodes) == 1 else f'these {len(nodes)} are'} left out."
+            f"{'this one is' if len(nodes) == 1 else f'these {len(nodes)} are'} left out"
+            f"{self.why_not(type_name)}."
             for type_name, nodes in by_type.items()
         ]
         scaled = [node for node in self.nodes if node.fields.get("scale", _UNSCALED) != _UNSCALED]
@@ -107,13 +121,30 @@ class World:
             )
         return [f"WARNING: {self.path.name}, {line}" for line in lines]
 
+    def why_not(self, type_name: str) -> str:
+        """Why the file of a PROTO cannot be used, in brackets; empty where there is none."""
+        why = self.protos.why_not.get(type_name)
+        return f" ({why})" if why else ""
+
+    def likeliest_robots(self, nodes: list[Node]) -> list[Node]:
+        """Of nodes that were left out those most like robots, by their fields or their URLs."""
+        signs: tuple[Callable[[Node], bool], ...] = (
+            lambda node: bool(_OF_ROBOTS & node.fields.keys()),
+            lambda node: "/robots/" in self.protos.urls.get(node.type_name, ""),
+            lambda node: (
+                not _IS_NO_ROBOT.search(node.type_name + self.protos.urls.get(node.type_name, ""))
+            ),
+        )
+        found = ([node for node in nodes if sign(node)] for sign in signs)
+        return next((likely for likely in found if likely), nodes)
+
     def left_out_in(self, robot: Node) -> dict[str, str]:
         """Devices that the world gives a robot and the stand-in does not: names and node types."""
         names: dict[str, str] = {}
         for node in self.left_out:
             if any(around is robot for around in self._around(node)):
                 for device in (node, *descendants_of(node)):
-                    name = device.fields.get("name", DEFAULT_NAME_OF.get(device.type_name))
+                    name = device.fields.get("name", _NAME_OF_LACKING.get(device.type_name))
                     if isinstance(name, str):
                         names.setdefault(name, node.type_name)
         return names
@@ -142,7 +173,7 @@ class World:
         Raises:
             WorldError: It is of a type that is not known here, or a value in it is of another.
         """
-        if node.type_name not in NODE_TYPES and node.type_name not in PROTOS:
+        if not self._is_known(node):
             raise WorldError(f"the stand-in has no {node.type_name} nodes")
         there = len(self.nodes)
         try:
@@ -230,9 +261,14 @@ def load_world(path: str | Path) -> World:
     except (OSError, ValueError) as error:  # a NUL in its name, and what is not UTF-8
         raise WorldError(f"cannot read the world {str(path)!r}: {error}") from error
     try:
-        return World(path, parse(text))
+        require_release(text)
+        parser = Parser(text)
+        top = parser.nodes()
+        return World(path, top, Protos(path, parser.urls))
     except WorldError as error:
         raise WorldError(f"{path.name}: {error}") from None
+    except RecursionError:
+        raise WorldError(f"{path.name}: its PROTO nodes hold each other without an end") from None
 
 
 def own_frame(node: Node) -> Frame:
@@ -245,18 +281,18 @@ def own_frame(node: Node) -> Frame:
 # Nodes as text, as they would stand in a world file.
 
 
-def as_text(node: Node) -> str:
+def as_text(node: Node, protos: Protos) -> str:
     """A node and all in it, without the fields that have their default values."""
-    return _node(node, set())
+    return _node(node, protos, set())
 
 
-def _node(node: Node, written: set[Node]) -> str:
+def _node(node: Node, protos: Protos, written: set[Node]) -> str:
     if node.def_name and node in written:
         return f"USE {node.def_name}"
     written.add(node)
     fields = [
-        f"{name} {_value(node.fields[name], definition.type_name[2:], written)}"
-        for name, definition in shown_definitions(node).items()
+        f"{name} {_value(node.fields[name], definition.type_name[2:], protos, written)}"
+        for name, definition in protos.shown_definitions(node).items()
         if node.fields[name] != _typed_default(definition.default, definition.type_name)
     ]
     name = f"DEF {node.def_name} " if node.def_name else ""
@@ -270,9 +306,9 @@ def _typed_default(default: Any, type_name: str) -> object:
     return cast("object", default)
 
 
-def _value(value: Any, kind: str, written: set[Node]) -> str:
+def _value(value: Any, kind: str, protos: Protos, written: set[Node]) -> str:
     if isinstance(value, Node):
-        return _node(value, written)
+        return _node(value, protos, written)
     if isinstance(value, str):
         quoted = value.replace("\\", "\\\\").replace('"', '\\"')
         return f'"{quoted}"'
@@ -281,7 +317,7 @@ def _value(value: Any, kind: str, written: set[Node]) -> str:
     if not isinstance(value, list):
         return repr(value).removesuffix(".0")
     values = cast("list[Any]", value)
-    texts = [_value(each, kind, written) for each in values]
+    texts = [_value(each, kind, protos, written) for each in values]
     is_single = kind in ("Vec2f", "Vec3f", "Rotation", "Color") and all(
         isinstance(each, float) for each in values
     )

@@ -4,30 +4,27 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from .camera import Camera
-from .field import Field
-from .keyboard import Keyboard
-from .lacking import CLASSES
-from .led import LED
-from .lidar import Lidar
-from .lidar_point import LidarPoint
-from .motor import Motor
-from .node import Node
-from .robot import Robot
-from .sensors import (
+from .devices import (
     GPS,
+    LED,
     Accelerometer,
+    Camera,
     Compass,
     DistanceSensor,
+    Emitter,
     Gyro,
     InertialUnit,
+    Lidar,
+    LidarPoint,
     LightSensor,
+    Motor,
     PositionSensor,
+    Receiver,
     TouchSensor,
 )
-from .supervisor import Supervisor
+from .robot import Keyboard, Robot, Supervisor
+from .scene import Field, Node
+from .surface import MEMBERS, complete, lacking_class
 
 __all__ = [  # noqa: PLE0604, RUF100 - as in Webots, where it makes `import *` fail
     GPS,
@@ -36,6 +33,7 @@ __all__ = [  # noqa: PLE0604, RUF100 - as in Webots, where it makes `import *` f
     Camera,
     Compass,
     DistanceSensor,
+    Emitter,
     Field,
     Gyro,
     InertialUnit,
@@ -46,14 +44,14 @@ __all__ = [  # noqa: PLE0604, RUF100 - as in Webots, where it makes `import *` f
     Motor,
     Node,
     PositionSensor,
+    Receiver,
     Robot,
     Supervisor,
     TouchSensor,
 ]
 
-
-def __getattr__(name: str) -> Any:
-    """A class that Webots has and the stand-in has not: to import, not to use."""
-    if name in CLASSES:
-        return CLASSES[name]
-    raise AttributeError(f"module 'controller' has no attribute {name!r}")
+for _name in MEMBERS:
+    if _name in globals():
+        complete(globals()[_name])
+    else:
+        globals()[_name] = lacking_class(_name)

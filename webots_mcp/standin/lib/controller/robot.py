@@ -1,6 +1,6 @@
-"""The robot: stepping, devices, and what the world says about it."""
+"""The robot: stepping, devices, what the world says about it; the supervisor that may change it."""
 
-# ruff: noqa: N802, N815 - the names are those of Webots
+# ruff: noqa: N802 - the names are those of Webots
 
 from __future__ import annotations
 
@@ -12,36 +12,12 @@ from collections.abc import Callable
 from typing import Any, ClassVar, Final
 
 from . import session as library
-from .arguments import integer, text
-from .camera import Camera
-from .console import say
-from .device import Device
-from .keyboard import Keyboard
-from .lacking import lacking, lacks
-from .led import LED
-from .lidar import Lidar
-from .motor import Motor
-from .sensors import (
-    GPS,
-    Accelerometer,
-    Compass,
-    DistanceSensor,
-    Gyro,
-    InertialUnit,
-    LightSensor,
-    PositionSensor,
-    TouchSensor,
-)
-from .session import Link, Session
-from .socket_link import SocketLink
+from .devices import CLASS_OF, Device
+from .scene import Node, node_of
+from .session import Link, Session, SocketLink
+from .surface import Completed, integer, lacking, number, say, text
 
-_DEVICE_CLASSES: Final[dict[str, type[Device]]] = {
-    device_class.__name__: device_class
-    for device_class in (
-        *(Motor, PositionSensor, DistanceSensor, GPS, InertialUnit, Lidar, Camera, LED),
-        *(Accelerometer, Compass, Gyro, LightSensor, TouchSensor),
-    )
-}
+_NULL_NODE: Final = (0, "", "", "")
 _DEADLY_SIGNALS: Final = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
 
 
@@ -56,19 +32,50 @@ def _deprecated(getter: str) -> Callable[[Robot, str], Any]:
     return get
 
 
-@lacks(
-    "EVENT_JOYSTICK_AXIS EVENT_JOYSTICK_BUTTON EVENT_JOYSTICK_POV EVENT_KEYBOARD "
-    "EVENT_MOUSE_CLICK EVENT_MOUSE_MOVE EVENT_NO_EVENT EVENT_QUIT "
-    "batterySensorDisable batterySensorEnable batterySensorGetSamplingPeriod "
-    "batterySensorGetValue battery_sensor_sampling_period getAltimeter getBrake getConnector "
-    "getDisplay getEmitter getJoystick getMouse getPen getRadar getRangeFinder "
-    "getReceiver getSkin getSpeaker getUrdf joystick mouse setMode "
-    "waitForUserInputEvent wwiReceiveText wwiSendText"
-)
-class Robot:
-    """The robot that this process controls; a process has one."""
+class Keyboard(Completed):
+    """A keyboard without a person: no key is ever pressed."""
 
-    MODE_SIMULATION, MODE_CROSS_COMPILATION, MODE_REMOTE_CONTROL = range(3)
+    def __init__(self, sampling_period: int | None = None) -> None:
+        self._period_ms = 0
+        self.enable(sampling_period or 0)
+
+    def enable(self, p: int) -> None:
+        """Look at the keyboard every so many milliseconds; 0 disables."""
+        self._period_ms = integer(p)
+
+    def disable(self) -> None:
+        """Look at the keyboard no longer."""
+        self.enable(0)
+
+    def getSamplingPeriod(self) -> int:
+        """The sampling period in milliseconds, 0 if disabled."""
+        return self._period_ms
+
+    @property
+    def sampling_period(self) -> int:
+        """The sampling period in milliseconds, 0 if disabled."""
+        return self.getSamplingPeriod()
+
+    @sampling_period.setter
+    def sampling_period(self, p: int | None) -> None:
+        self.enable(p or 0)
+
+    def getKey(self) -> int:
+        """-1: no key is pressed."""
+        if not self._period_ms:
+            say(
+                "Error: wb_keyboard_get_key() called for a disabled device! "
+                "Please use: wb_keyboard_enable()."
+            )
+        return -1
+
+    def getKeyCode(self) -> int:
+        """-1: no key is pressed."""
+        return self.getKey()
+
+
+class Robot(Completed):
+    """The robot that this process controls; a process has one."""
 
     created: ClassVar[Robot | None] = None
     """The first robot that was made."""
@@ -76,6 +83,7 @@ class Robot:
     _session: Session
     devices: dict[str, Device]
     """All devices by name."""
+    keyboard: Keyboard
 
     def __init__(self) -> None:
         link = self._connect()
@@ -84,7 +92,7 @@ class Robot:
         Robot.created = self
         self._session = library.current = Session(link)
         described = self._session.robot["devices"]
-        self._by_tag = {d["tag"]: _DEVICE_CLASSES[d["kind"]](d["tag"]) for d in described}
+        self._by_tag = {d["tag"]: CLASS_OF[d["node_type"]](d["tag"]) for d in described}
         self.keyboard = Keyboard()
         self.devices = {device.name: device for device in self._by_tag.values()}
 
@@ -131,19 +139,9 @@ class Robot:
         """Simulated time in seconds, as of the last step."""
         return self._session.time_s
 
-    @property
-    def time(self) -> float:
-        """Simulated time in seconds, as of the last step."""
-        return self.getTime()
-
     def getBasicTimeStep(self) -> float:
         """The world's `basicTimeStep` in milliseconds: a float, so `step(int(...))`."""
         return float(self._session.robot["basic_time_step"])
-
-    @property
-    def basic_time_step(self) -> float:
-        """The world's `basicTimeStep` in milliseconds."""
-        return self.getBasicTimeStep()
 
     # Devices -------------------------------------------------------------------------------------
 
@@ -161,20 +159,6 @@ class Robot:
             say(f'Device "{name}" was not found on robot "{self.getName()}"')
         return device
 
-    getAccelerometer = _deprecated("getAccelerometer")
-    getCamera = _deprecated("getCamera")
-    getCompass = _deprecated("getCompass")
-    getDistanceSensor = _deprecated("getDistanceSensor")
-    getGPS = _deprecated("getGPS")
-    getGyro = _deprecated("getGyro")
-    getInertialUnit = _deprecated("getInertialUnit")
-    getLED = _deprecated("getLED")
-    getLidar = _deprecated("getLidar")
-    getLightSensor = _deprecated("getLightSensor")
-    getMotor = _deprecated("getMotor")
-    getPositionSensor = _deprecated("getPositionSensor")
-    getTouchSensor = _deprecated("getTouchSensor")
-
     def getKeyboard(self) -> Keyboard:
         """The keyboard, on which no keys are pressed."""
         return self.keyboard
@@ -182,11 +166,6 @@ class Robot:
     def getNumberOfDevices(self) -> int:
         """How many devices the robot has."""
         return len(self._by_tag)
-
-    @property
-    def number_of_devices(self) -> int:
-        """How many devices the robot has."""
-        return self.getNumberOfDevices()
 
     def getDeviceByIndex(self, index: int) -> Any:
         """The device at a place in the scene tree's order.
@@ -206,19 +185,9 @@ class Robot:
         """The `name` field."""
         return self._session.robot["name"]
 
-    @property
-    def name(self) -> str:
-        """The `name` field."""
-        return self.getName()
-
     def getModel(self) -> str:
         """The `model` field."""
         return self._session.robot["model"]
-
-    @property
-    def model(self) -> str:
-        """The `model` field."""
-        return self.getModel()
 
     def getCustomData(self) -> str:
         """The `customData` field."""
@@ -228,59 +197,25 @@ class Robot:
         """Set the `customData` field with the next step."""
         self._session.set_custom_data(text(data))
 
-    @property
-    def custom_data(self) -> str:
-        """The `customData` field."""
-        return self.getCustomData()
-
-    @custom_data.setter
-    def custom_data(self, data: str) -> None:
-        self.setCustomData(data)
-
     def getSupervisor(self) -> bool:
         """Whether the world gives this robot a supervisor's rights."""
         return self._session.robot["supervisor"]
-
-    @property
-    def supervisor(self) -> bool:
-        """Whether the world gives this robot a supervisor's rights."""
-        return self.getSupervisor()
 
     def getSynchronization(self) -> bool:
         """Whether the world waits for this controller."""
         return self._session.robot["synchronization"]
 
-    @property
-    def synchronization(self) -> bool:
-        """Whether the world waits for this controller."""
-        return self.getSynchronization()
-
     def getWorldPath(self) -> str:
         """The world file."""
         return self._session.robot["world_path"]
-
-    @property
-    def world_path(self) -> str:
-        """The world file."""
-        return self.getWorldPath()
 
     def getProjectPath(self) -> str:
         """The folder that holds `worlds` and `controllers`."""
         return self._session.robot["project_path"]
 
-    @property
-    def project_path(self) -> str:
-        """The folder that holds `worlds` and `controllers`."""
-        return self.getProjectPath()
-
     def getMode(self) -> int:
         """0: simulation. This is about remote control, not about pause."""
         return 0
-
-    @property
-    def mode(self) -> int:
-        """0: simulation. This is about remote control, not about pause."""
-        return self.getMode()
 
 
 def _restore_signals() -> None:
@@ -294,3 +229,112 @@ def _restore_signals() -> None:
     elif threading.current_thread() is threading.main_thread():  # Python lets no other do this
         for number in numbers:
             signal.signal(number, signal.SIG_DFL)
+
+
+for _device in {*CLASS_OF.values()}:
+    setattr(Robot, f"get{_device.__name__}", _deprecated(f"get{_device.__name__}"))
+
+
+class Supervisor(Robot):
+    """A robot with more methods; the world decides whether it may use them."""
+
+    SIMULATION_MODE_PAUSE = 0
+    SIMULATION_MODE_REAL_TIME = 1
+    SIMULATION_MODE_FAST = 2
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._nodes: dict[str, Any] = {}
+
+    # Nodes ---------------------------------------------------------------------------------------
+
+    def getRoot(self) -> Node:
+        """The node around everything; its `children` are the top of the scene tree."""
+        return self._known("node_get_root")
+
+    def getSelf(self) -> Node:
+        """The robot's own node."""
+        return self._known("node_get_self")
+
+    def _known(self, operation: str) -> Node:
+        """A node that is asked for once; after that it can be had between requests too."""
+        found = self._nodes.get(operation) or self._session.ask(operation)
+        if found is not None:
+            self._nodes[operation] = found
+        return node_of(self._session, found or _NULL_NODE)
+
+    def getFromDef(self, d: str) -> Node | None:
+        """The node with this DEF name (`A.B`: B inside A); None if there is none."""
+        return self._node(self._session.ask("node_get_from_def", text(d)))
+
+    def getFromId(self, id: int) -> Node | None:  # noqa: A002 - Webots' name
+        """The node with this number; None if there is none."""
+        return self._node(self._session.ask("node_get_from_id", integer(id)))
+
+    def getFromDevice(self, tag: int) -> Node | None:
+        """The node of a device: wants the number `device._tag`, not the device."""
+        return self._node(self._session.ask("node_get_from_device", integer(tag)))
+
+    def getSelected(self) -> Node | None:
+        """None: there is no window to select a node in."""
+        return None
+
+    def _node(self, found: Any) -> Node | None:
+        return None if found is None else node_of(self._session, found)
+
+    # The simulation ------------------------------------------------------------------------------
+
+    def simulationGetMode(self) -> int:
+        """The mode as of the last answer of the simulator."""
+        return self._session.mode
+
+    def simulationSetMode(self, mode: int) -> None:
+        """Pause, run in real time or run fast; any other number pauses."""
+        self._session.ask("simulation_set_mode", integer(mode))
+
+    def simulationReset(self) -> None:
+        """Reset the world at the end of the next physics step; controllers go on."""
+        self._session.ask("simulation_reset")
+
+    def simulationResetPhysics(self) -> None:
+        """Stop everything that moves."""
+        self._session.ask("simulation_reset_physics")
+
+    def simulationQuit(self, status: int) -> None:
+        """End the simulation with an exit status."""
+        self._session.ask("simulation_quit", integer(status))
+
+    def worldReload(self) -> None:
+        """Read the world from its file again; the next step returns -1."""
+        self._session.ask("world_reload")
+
+    def worldLoad(self, filename: str) -> None:
+        """Load another world after the next physics step."""
+        self._session.ask("world_load", text(filename))
+
+    # Pictures ------------------------------------------------------------------------------------
+
+    def exportImage(self, filename: str, quality: int) -> None:
+        """Have the simulator write a .png or .jpg picture, with the next rendering."""
+        filename, quality = text(filename), integer(quality)
+        if not 1 <= quality <= 100:
+            say(f"Error: wb_supervisor_export_image(): quality {quality} is not between 1 and 100.")
+            return
+        self._session.ask("export_image", filename, quality)
+
+    def setLabel(
+        self,
+        id: int,  # noqa: A002 - Webots' name
+        label: str,
+        x: float,
+        y: float,
+        size: float,
+        color: int,
+        transparency: float = 0.0,
+        font: str = "Arial",
+    ) -> None:
+        """Write a text over the picture; ids are 0 to 99; x, y and size from 0 to 1."""
+        number(transparency)
+        text(font)
+        place = (number(x), number(y), number(size))
+        self._session.ask("set_label", integer(id), text(label), *place, integer(color))

@@ -1,18 +1,68 @@
-"""The state of the controller library: what it received, and what it has yet to send."""
+"""How a controller talks to the simulator: messages, the socket, and what it knows meanwhile.
+
+A message is a length and a marshalled value. `marshal` rather than JSON because pictures are bytes
+and ranges are hundreds of floats; version 2 because every Python 3 reads it. It is read only from a
+peer that has shown the simulation's token.
+"""
 
 from __future__ import annotations
 
+import marshal
 import os
+import socket
+import struct
 import threading
-from typing import Any, Final, NoReturn, Protocol
+from collections import deque
+from pathlib import Path
+from typing import Any, Final, NoReturn, Protocol, TypeAlias
 
-from .console import say
-from .wire import Message
+from .surface import say
 
+Message: TypeAlias = tuple[Any, ...]
+
+ADDRESS_FILE: Final = "address"
+"""File in the instance folder: the port on this machine, a space, the token."""
+
+_LENGTH: Final = struct.Struct("!I")
 CUSTOM_DATA_TAG: Final = 0
 """Stands for the robot itself where devices have their tags."""
 PoseKey = tuple[int, int | None]
 """The ids of a node and of the one that it is seen from; None is the world."""
+
+
+def pack(message: Message) -> bytes:
+    """A message as it goes over the wire."""
+    body = marshal.dumps(message, 2)
+    return _LENGTH.pack(len(body)) + body
+
+
+class Inbox:
+    """Puts messages together from what arrives."""
+
+    def __init__(self) -> None:
+        self._arrived = bytearray()
+
+    def feed(self, data: bytes) -> None:
+        """Take what the socket gave."""
+        self._arrived += data
+
+    def take(self) -> Message | None:
+        """The next whole message; None if it has not arrived yet."""
+        if len(self._arrived) < _LENGTH.size:
+            return None
+        end = _LENGTH.size + _LENGTH.unpack_from(self._arrived)[0]
+        if len(self._arrived) < end:
+            return None
+        message = marshal.loads(self._arrived[_LENGTH.size : end])
+        del self._arrived[:end]
+        return message
+
+
+def connect(port: int) -> socket.socket:
+    """A connection to the simulator on this machine."""
+    connection = socket.create_connection(("127.0.0.1", port))
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return connection
 
 
 class Link(Protocol):
@@ -38,6 +88,67 @@ class Link(Protocol):
         ...
 
 
+def exit_process(status: int) -> NoReturn:
+    """End the process as C `exit` ends it: no exception, no `finally`, no atexit, no flush."""
+    os._exit(status)
+
+
+class SocketLink:
+    """Talks to the simulator that the `WEBOTS_...` environment variables name."""
+
+    def __init__(self) -> None:
+        port, token, robot_name = _address()
+        self._socket = connect(port)
+        self._inbox = Inbox()
+        self.send(("hello", token, robot_name))
+        kind, answer = self.receive()
+        if kind != "welcome":
+            raise ConnectionRefusedError(f"the simulation refused this controller: {answer}")
+        self.description: dict[str, Any] = answer
+
+    def send(self, message: Message) -> None:
+        """Send a request; if the simulator is gone, so is this process."""
+        try:
+            self._socket.sendall(pack(message))
+        except OSError:
+            exit_process(1)
+
+    def receive(self) -> Message:
+        """Wait for an answer; if the simulator goes away meanwhile, so does this process."""
+        while (message := self._inbox.take()) is None:
+            try:
+                data = self._socket.recv(1 << 20)
+            except OSError:
+                data = b""
+            if not data:
+                exit_process(1)
+            self._inbox.feed(data)
+        return message
+
+    def exit(self) -> NoReturn:
+        """The API was used after the end."""
+        exit_process(0)
+
+    def close(self) -> None:
+        """Let the simulator know that this controller is done."""
+        self._socket.close()
+
+
+def _address() -> tuple[int, str, str]:
+    """Port, token and robot name; the real library looks in this order, too."""
+    name, folder = os.environ.get("WEBOTS_ROBOT_NAME"), os.environ.get("WEBOTS_INSTANCE_PATH")
+    if name and folder:
+        port, token = (Path(folder) / ADDRESS_FILE).read_text(encoding="utf-8").split()
+        return int(port), token, name
+    if url := os.environ.get("WEBOTS_CONTROLLER_URL"):
+        place, _, name = url.partition("://")[2].partition("/")
+        return int(place.rpartition(":")[2]), os.environ.get("WEBOTS_STANDIN_TOKEN", ""), name
+    raise ConnectionError(
+        "no simulation has started this process. Run the controller from a world: "
+        "python -m webots_mcp.standin WORLD; in a test use webots_mcp.standin.InProcessRobot"
+    )
+
+
 class Session:
     """What the library knows between two requests.
 
@@ -56,6 +167,13 @@ class Session:
         self.lock = threading.RLock()
         self._values: dict[Any, Any] = {}
         self._changes: dict[tuple[Any, str], Any] = {}
+        self._sent: list[tuple[int, str, bytes]] = []
+        self.packets: dict[int, deque[Any]] = {
+            device["tag"]: deque()
+            for device in self.robot["devices"]
+            if device["node_type"] == "Receiver"
+        }
+        """What receivers have by tag: bytes, direction and strength of each packet."""
         self.counts: dict[tuple[int, str], int] = {}
         """The number of entries of each field that was asked for, by node and name."""
         self._tracked: set[PoseKey] = set()
@@ -81,6 +199,11 @@ class Session:
         """Set a sampling period; 0 disables."""
         self.change(tag, "period", period_ms)
         self.periods_ms[tag] = period_ms
+
+    def send_packet(self, tag: int, packet: bytes) -> None:
+        """Note a packet of an emitter that goes out with the next step."""
+        with self.lock:
+            self._sent.append((tag, "send", packet))
 
     def track(self, pose: PoseKey, period_ms: int) -> None:
         """Have a pose sent with the steps, once in a period; 0 ends that."""
@@ -112,8 +235,9 @@ class Session:
             self._exit_if_over()
             if self._quitting:
                 return
-            changes = [(*key, value) for key, value in self._changes.items()]
+            changes = [*((*key, value) for key, value in self._changes.items()), *self._sent]
             self._changes.clear()
+            self._sent.clear()
             self.link.send(("step", duration_ms & 0xFFFFFFFF, changes, self._take_field_sets()))
             self._in_step = True
 
@@ -127,6 +251,8 @@ class Session:
                 return -1
             _, self.time_s, self.mode, delay_ms, values = reply
             self._values.update(values)
+            for tag, queue in self.packets.items():
+                queue.extend(self._values.pop(tag, ()))
             self.custom_data = self._values.pop(CUSTOM_DATA_TAG, self.custom_data)
             return delay_ms
 
@@ -207,8 +333,3 @@ class Session:
 
 current: Session | None = None
 """The session of the process's one robot; devices made by name belong to it."""
-
-
-def exit_process(status: int) -> NoReturn:
-    """End the process as C `exit` ends it: no exception, no `finally`, no atexit, no flush."""
-    os._exit(status)

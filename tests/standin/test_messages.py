@@ -1,0 +1,171 @@
+"""Emitters and receivers: who hears whom, when, and what of."""
+
+from __future__ import annotations
+
+from math import isnan, pi
+from pathlib import Path
+
+import pytest
+from controller import Emitter, Receiver
+
+from webots_mcp.standin import InProcessSimulation, InProcessSupervisor, Simulation
+
+STEP_MS = 16
+
+
+class Team:
+    """Two robots two metres apart on the x axis, facing east."""
+
+    def __init__(
+        self, tmp_path: Path, emitter: str = "", receiver: str = "", between: str = ""
+    ) -> None:
+        self.world = tmp_path / "team.wbt"
+        robot = """Robot {{ name "{0}" translation {1} 0 0 supervisor TRUE children [ {2} ] }}"""
+        text = (
+            "#VRML_SIM R2025a utf8\nWorldInfo { basicTimeStep 16 }\n"
+            + robot.format("sender", -1, f"Emitter {{ {emitter} }} Receiver {{ }}")
+            + robot.format("listener", 1, f"Receiver {{ {receiver} }}")
+            + between
+        )
+        self.world.write_text(text.replace("'", '"'), encoding="utf-8")
+        simulation = InProcessSimulation(self.world)
+        self.sender = InProcessSupervisor("sender", world=simulation)
+        self.listener = InProcessSupervisor("listener", world=simulation)
+        self.emitter: Emitter = self.sender.getDevice("emitter")
+        self.receiver: Receiver = self.listener.getDevice("receiver")
+        self.receiver.enable(STEP_MS)
+        self.step()
+
+    def step(self, count: int = 1) -> None:
+        for _ in range(count):
+            assert self.sender.step(STEP_MS) == self.listener.step(STEP_MS) == 0
+
+    def heard(self, *messages: str) -> list[str]:
+        """What arrives of messages that are sent."""
+        for message in messages:
+            self.emitter.send(message)
+        self.step(2)
+        arrived: list[str] = []
+        while self.receiver.getQueueLength():
+            arrived.append(self.receiver.getString())
+            self.receiver.nextPacket()
+        return arrived
+
+
+def test_packets_arrive_in_order_with_direction_and_strength(tmp_path: Path) -> None:
+    team = Team(tmp_path, receiver=f"rotation 0 0 1 {pi / 2}")
+    own: Receiver = team.sender.getDevice("receiver")
+    own.enable(STEP_MS)
+    team.emitter.send("first")
+    team.emitter.send([1.5, -2.0])
+    team.emitter.send([3, 4])
+    team.emitter.send(b"\x01\x00\x01", 2)
+    team.step(2)
+    receiver = team.receiver
+    assert (receiver.getQueueLength(), own.queue_length) == (4, 0)
+    assert receiver.string == "first"
+    assert receiver.getSignalStrength() == pytest.approx(1.0 / 4.0)
+    assert receiver.getEmitterDirection() == pytest.approx([0.0, 1.0, 0.0])  # it looks north
+    receiver.nextPacket()
+    assert (receiver.getFloats(), receiver.getDataSize()) == ((1.5, -2.0), 16)
+    receiver.nextPacket()
+    assert receiver.getInts() == (3, 4)
+    receiver.nextPacket()
+    assert receiver.getBools() == (True, False)
+    assert receiver.data[:2] == [1, 0]
+
+
+def test_an_empty_queue_says_so_and_gives_nothing(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    receiver = Team(tmp_path).receiver
+    assert (receiver.getQueueLength(), receiver.getBytes(), receiver.data_size) == (0, b"", -1)
+    assert isnan(receiver.signal_strength)
+    receiver.nextPacket()
+    assert capfd.readouterr().err.count("called while the receiver queue is empty") == 3
+
+
+@pytest.mark.parametrize(
+    ("emitter", "receiver", "between", "arrives"),
+    [
+        ("channel 2", "channel 2", "", True),
+        ("channel 2", "channel 3", "", False),
+        ("channel -1", "channel 3", "", True),
+        ("channel 2", "channel -1", "", True),
+        ("range 1.9", "", "", False),
+        ("range 2.1", "", "", True),
+        ("", "type 'infra-red'", "", False),
+        ("type 'infra-red' aperture 1", "type 'infra-red'", "", True),
+        (f"type 'infra-red' aperture 1 rotation 0 0 1 {pi}", "type 'infra-red'", "", False),
+        ("type 'infra-red'", "type 'infra-red' aperture 1", "", False),  # it looks away
+        ("type 'infra-red'", "type 'infra-red'", "Wall { translation 0 0 -1 }", False),
+        ("", "", "Wall { translation 0 0 -1 }", True),
+    ],
+)
+def test_a_packet_arrives_where_it_can_be_heard(
+    emitter: str, receiver: str, between: str, arrives: bool, tmp_path: Path
+) -> None:
+    team = Team(tmp_path, emitter, receiver, between)
+    assert team.heard("hello") == (["hello"] if arrives else [])
+
+
+def test_channel_and_range_can_be_set_while_it_runs(tmp_path: Path) -> None:
+    team = Team(tmp_path, "maxRange 1.5 range 1")
+    team.emitter.setChannel(7)
+    team.receiver.channel = 7
+    team.emitter.setRange(5.0)
+    assert (team.emitter.range, team.emitter.channel, team.receiver.getChannel()) == (1.5, 7, 7)
+    assert team.heard("too far") == []
+    place = team.listener.getSelf().getField("translation")
+    assert place is not None
+    place.setSFVec3f([0.4, 0.0, 0.0])
+    team.step()
+    assert team.heard("near") == ["near"]
+
+
+def test_a_slow_receiver_gets_all_with_its_next_sample_and_a_disabled_one_nothing(
+    tmp_path: Path,
+) -> None:
+    team = Team(tmp_path)
+    team.receiver.enable(4 * STEP_MS)
+    team.step()
+    lengths: list[int] = []
+    for _ in range(8):
+        team.emitter.send("x")
+        team.step()
+        lengths.append(team.receiver.getQueueLength())
+    assert lengths[-1] in (4, 8) and {*lengths} <= {lengths[0], lengths[0] + 4, lengths[0] + 8}
+    team.receiver.disable()
+    team.heard("y")
+    assert team.heard("z") == []
+
+
+def test_a_message_that_is_none_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    team = Team(tmp_path)
+    team.emitter.send(1.0)
+    team.emitter.send([])
+    assert capsys.readouterr().err.splitlines() == [
+        "Emitter.send(): unsupported data type",
+        "Emitter.send(): empty list",
+    ]
+
+
+def test_controller_processes_talk_to_each_other(tmp_path: Path) -> None:
+    sender, listener = tmp_path / "sender.py", tmp_path / "listener.py"
+    sender.write_text(
+        "from controller import Robot\nrobot = Robot()\nemitter = robot.getDevice('emitter')\n"
+        "while robot.step(16) != -1:\n    emitter.send(f'at {robot.getTime():.3f}')\n"
+    )
+    listener.write_text(
+        "from controller import Robot\nrobot = Robot()\nreceiver = robot.getDevice('receiver')\n"
+        "receiver.enable(16)\nwhile robot.step(16) != -1:\n"
+        "    while receiver.getQueueLength():\n"
+        "        print(receiver.getString(), f'at {robot.getTime():.3f}', flush=True)\n"
+        "        receiver.nextPacket()\n"
+    )
+    world = Team(tmp_path).world
+    controllers = {"sender": sender, "listener": listener}
+    with Simulation(world, mode="fast", controllers=controllers) as simulation:
+        simulation.wait_for(lambda: "[listener] at 0.032 at 0.048" in simulation.console)

@@ -1,0 +1,749 @@
+"""The devices of a robot.
+
+A device's getters of constants are those of the fields of its node, which the simulator sends.
+"""
+
+# ruff: noqa: N802, N815 - the names are those of Webots
+
+from __future__ import annotations
+
+import ctypes
+import struct
+import sys
+from collections import deque
+from collections.abc import Callable
+from math import cos, hypot, isinf, isnan, nan, sin, tan
+from pathlib import Path
+from typing import Any, Final, cast
+
+from . import session as library
+from .surface import Completed, integer, number, say, text, type_number
+
+_POINT: Final = struct.Struct("fffif")
+_MEMORY: Final = [0.4375, -0.0625, 1.2890625, 0.734375]
+"""What stands in the memory that Webots reads before an InertialUnit's first value: any numbers."""
+_UNKNOWN: Final = [nan, nan, nan]
+_NO_GPS: Final = [_UNKNOWN, _UNKNOWN]
+_DISTANCE_SENSOR_TYPES: Final = ("generic", "infra-red", "sonar", "laser")
+_TOUCH_SENSOR_TYPES: Final = ("bumper", "force", "force-3d")
+
+
+def _field(name: str, default: Any = None) -> Callable[[Any], Any]:
+    """A getter of a field of the device's node."""
+
+    def get(self: Any) -> Any:
+        with self._session.lock:
+            return self._fields.get(name, default)
+
+    return get
+
+
+class Device(Completed):
+    """A device of the robot.
+
+    `GPS("gps")` finds the device by name; the robot itself makes its devices by tag.
+    """
+
+    _c_name = "device"
+    """As in the names of the C functions, for messages."""
+
+    def __init__(self, name: int | str) -> None:
+        session = library.current
+        if session is None:
+            raise RuntimeError("there are no devices before Robot() was made")
+        self._session = session
+        self._description = self._found(name)
+        self._tag: int = self._description.get("tag", 0)
+        self._fields: dict[str, Any] = self._description.get("fields", {})
+
+    def _found(self, name: int | str) -> dict[str, Any]:
+        for description in self._session.robot["devices"]:
+            if name in (description["tag"], description["fields"]["name"]):
+                return description
+        say(f'Warning: "{name}" device not found.')
+        return {}
+
+    def _complain(self, what: str, complaint: str) -> None:
+        say(f"Error: wb_{self._c_name}_{what}(){complaint}")
+
+    getName = _field("name", "")
+    getModel = _field("model", "")
+
+    def getNodeType(self) -> int:
+        """The number of the node type, to compare with `Node.GPS` and the like."""
+        return type_number("Node", self._description.get("node_type", ""))
+
+
+class Sensor(Device):
+    """A device that measures something every so often, once it is enabled."""
+
+    def __init__(self, name: int | str, sampling_period: int | None = None) -> None:
+        super().__init__(name)
+        if isinstance(name, str):  # by name: enables, as the real package does
+            basic_ms = int(self._session.robot["basic_time_step"])
+            self.enable(basic_ms if sampling_period is None else sampling_period)
+
+    def enable(self, p: int) -> None:
+        """Measure every so many milliseconds, from the next step on; 0 disables."""
+        if integer(p, position=2) < 0:
+            self._complain("enable", " called with negative sampling period.")
+        elif not self._tag:
+            self._complain("enable", ": invalid device tag.")
+        else:
+            self._session.enable(self._tag, p)
+
+    def disable(self) -> None:
+        """Measure no longer; the last value stays."""
+        self.enable(0)
+
+    def getSamplingPeriod(self) -> int:
+        """The sampling period in milliseconds, 0 if disabled."""
+        with self._session.lock:
+            return self._session.periods_ms.get(self._tag, 0)
+
+    @property
+    def sampling_period(self) -> int:
+        """The sampling period in milliseconds, 0 if disabled."""
+        return self.getSamplingPeriod()
+
+    @sampling_period.setter
+    def sampling_period(self, p: int | None) -> None:
+        self.enable(0 if p is None else p)
+
+    def _value(self, default: Any, what: str = "get_value") -> Any:
+        if not self.getSamplingPeriod():
+            use = f"Please use: wb_{self._c_name}_enable()."
+            self._complain(what, f" called for a disabled device! {use}")
+        return self._session.value(self._tag, default)
+
+
+class _NumberSensor(Sensor):
+    """A sensor that gives one number; NaN before the first one."""
+
+    def getValue(self) -> float:
+        """The measured value; NaN before the first one."""
+        return self._value(nan)
+
+
+class _LookupTable(Sensor):
+    """A sensor that translates what it measures by a lookup table."""
+
+    def getLookupTable(self) -> list[float]:
+        """What is measured, the value that comes of it, and the noise, one after the other."""
+        return [value for row in self._fields["lookupTable"] for value in row]
+
+
+class _VectorSensor(_LookupTable):
+    """A sensor that gives three numbers along its own axes."""
+
+    def getValues(self) -> list[float]:
+        """Along x, y and z of the sensor; NaN before the first value."""
+        return [*self._value(_UNKNOWN, "get_values")]
+
+
+class Accelerometer(_VectorSensor):
+    """Acceleration in metres a second squared; standing still it shows g, upwards."""
+
+    _c_name = "accelerometer"
+
+
+class Gyro(_VectorSensor):
+    """Turning speed in radians a second."""
+
+    _c_name = "gyro"
+
+
+class Compass(_VectorSensor):
+    """The direction of north, which is the world's y axis."""
+
+    _c_name = "compass"
+
+
+class LightSensor(_NumberSensor, _LookupTable):
+    """How much light falls on it, translated by the lookup table."""
+
+    _c_name = "light_sensor"
+
+
+class DistanceSensor(_NumberSensor, _LookupTable):
+    """The distance to the next obstacle, translated by the lookup table."""
+
+    _c_name = "distance_sensor"
+
+    getAperture = _field("aperture")  # radians; the stand-in looks along one ray
+
+    def getMaxValue(self) -> float:
+        """The largest value of the lookup table."""
+        return max((row[1] for row in self._fields["lookupTable"]), default=0.0)
+
+    def getMinValue(self) -> float:
+        """The smallest value of the lookup table."""
+        return min((row[1] for row in self._fields["lookupTable"]), default=0.0)
+
+    def getType(self) -> int:
+        """The `type` field, as `DistanceSensor.SONAR`."""
+        return _place(self._fields["type"], _DISTANCE_SENSOR_TYPES)
+
+
+class TouchSensor(_LookupTable):
+    """Whether, or how hard, the robot runs into something where the sensor is."""
+
+    _c_name = "touch_sensor"
+    BUMPER, FORCE, FORCE3D = range(3)
+
+    def getValue(self) -> float:
+        """Of a bumper 1 or 0, of a force sensor newtons, translated by the lookup table."""
+        if self.getType() == self.FORCE3D:
+            self._complain(
+                "get_value",
+                " can only be used with the 'bumper' or 'force' types of TouchSensor. "
+                "Please use wb_touch_sensor_get_values().",
+            )
+            return nan
+        return self._value(nan)
+
+    def getValues(self) -> Any:
+        """Newtons along x, y and z of a force-3d sensor: a `ctypes` pointer, so take `[:3]`."""
+        values = _UNKNOWN
+        if self.getType() == self.FORCE3D:
+            values = self._value(_UNKNOWN, "get_values")
+        else:
+            self._complain("get_values", " can only be used with a device of type 'force-3d'.")
+        return ctypes.cast((ctypes.c_double * 3)(*values), ctypes.POINTER(ctypes.c_double))
+
+    def getType(self) -> int:
+        """`TouchSensor.BUMPER`, `FORCE` or `FORCE3D`."""
+        return _place(self._fields["type"], _TOUCH_SENSOR_TYPES)
+
+
+class PositionSensor(_NumberSensor):
+    """How far a joint has turned, in radians, or slid, in metres."""
+
+    _c_name = "position_sensor"
+    ROTATIONAL = 0
+
+    def getType(self) -> int:
+        """`PositionSensor.ROTATIONAL`."""
+        return self.ROTATIONAL
+
+    def getMotor(self) -> Device | None:
+        """None and a line on stderr: broken in Webots' Python package."""
+        say("Error: wb_brake_get_motor(): invalid device tag.")
+        return None
+
+    def getBrake(self) -> None:
+        """None: the stand-in has no brakes."""
+
+
+class GPS(Sensor):
+    """Where the sensor is: metres and metres a second; NaN before the first value."""
+
+    _c_name = "gps"
+    LOCAL = 0
+
+    def getValues(self) -> list[float]:
+        """x, y and z."""
+        return [*self._value(_NO_GPS, "get_values")[0]]
+
+    def getSpeedVector(self) -> list[float]:
+        """Velocity since the last sample."""
+        return [*self._value(_NO_GPS, "get_speed_vector")[1]]
+
+    def getSpeed(self) -> float:
+        """Speed since the last sample."""
+        return hypot(*self._value(_NO_GPS, "get_speed")[1])
+
+    def getCoordinateSystem(self) -> int:
+        """`GPS.LOCAL`."""
+        return self.LOCAL
+
+
+class InertialUnit(Sensor):
+    """Which way the sensor is turned; before the first value plausible, wrong numbers."""
+
+    _c_name = "inertial_unit"
+
+    getNoise = _field("noise")  # the stand-in measures exactly all the same
+
+    def getRollPitchYaw(self) -> list[float]:
+        """Roll, pitch and yaw in radians."""
+        return [*self._value(_MEMORY[:3], "get_roll_pitch_yaw")]
+
+    def getQuaternion(self) -> list[float]:
+        """x, y, z and w."""
+        angles = self._value(None, "get_quaternion")
+        return [*_MEMORY] if angles is None else _quaternion(*angles)
+
+
+class LED(Device):
+    """A lamp; it is not rendered, but it stores its value."""
+
+    _c_name = "led"
+
+    def __init__(self, name: int | str) -> None:
+        super().__init__(name)
+        self._state = 0
+
+    def set(self, v: int) -> None:
+        """Switch on, with 1 or the number or RGB value of a color, or off with 0."""
+        self._state = integer(v, position=2)
+
+    def get(self) -> int:
+        """The value that was set last."""
+        return self._state
+
+
+class Motor(Device):
+    """Turns a joint, or slides it. The getters give what was commanded, not what is measured.
+
+    Positions in radians or metres, speeds and accelerations by seconds.
+    """
+
+    _c_name = "motor"
+    ROTATIONAL, LINEAR = range(2)
+
+    getMaxVelocity = _field("maxVelocity", 0.0)
+    getMinPosition = _field("minPosition")  # 0 like getMaxPosition(): no limits
+    getMaxPosition = _field("maxPosition")
+    getMaxTorque = _field("maxTorque", 0.0)
+    getMultiplier = _field("multiplier")  # the stand-in couples no motors
+
+    def __init__(self, name: int | str) -> None:
+        super().__init__(name)
+        self._position = 0.0
+        self._velocity: float = self.getMaxVelocity()
+        self._acceleration: float = self._fields.get("acceleration", -1.0)
+
+    def setPosition(self, position: float) -> None:
+        """Turn there; inf lets the motor run with `setVelocity`."""
+        if isnan(position := number(position)):
+            self._complain("set_position", " called with an invalid 'position' argument (NaN).")
+            return
+        self._position = position
+        self._session.change(self._tag, "position", position)
+
+    def setVelocity(self, velocity: float) -> None:
+        """Set the speed; the motor keeps within its `maxVelocity`."""
+        if isnan(velocity := number(velocity)):
+            self._complain("set_velocity", " called with an invalid 'velocity' argument.(NaN)")
+        elif velocity < 0.0 and not isinf(self._position):
+            self._complain(
+                "set_velocity",
+                " called with negative 'velocity' argument in position control mode "
+                f"({self._position:g}).",
+            )
+        else:
+            self._velocity = velocity
+            self._session.change(self._tag, "velocity", velocity)
+
+    def setAcceleration(self, acceleration: float) -> None:
+        """Limit how fast the speed changes; -1: no limit."""
+        if isnan(acceleration := number(acceleration)):
+            self._complain("set_acceleration", " called with an invalid argument (NaN).")
+            return
+        self._acceleration = acceleration
+        self._session.change(self._tag, "acceleration", acceleration)
+
+    def getTargetPosition(self) -> float:
+        """The commanded position."""
+        return self._position
+
+    def getVelocity(self) -> float:
+        """The commanded speed."""
+        return self._velocity
+
+    def getAcceleration(self) -> float:
+        """The commanded limit of acceleration; -1: none."""
+        return self._acceleration
+
+    def getForceFeedbackSamplingPeriod(self) -> int:
+        """0: the stand-in measures no force, so that is never enabled."""
+        return 0
+
+    def getTorqueFeedbackSamplingPeriod(self) -> int:
+        """0: the stand-in measures no torque, so that is never enabled."""
+        return 0
+
+    def getType(self) -> int:
+        """`Motor.ROTATIONAL` or `Motor.LINEAR`."""
+        return int(self._description["node_type"] == "LinearMotor")
+
+    def getBrake(self) -> None:
+        """None: the stand-in has no brakes."""
+
+    def getPositionSensor(self) -> PositionSensor | None:
+        """The sensor of the same joint; None if there is none."""
+        for other in self._session.robot["devices"]:
+            in_joint = other["joint"] is not None and other["joint"] == self._description["joint"]
+            if in_joint and other["node_type"] == "PositionSensor":
+                return PositionSensor(other["tag"])
+        return None
+
+
+class Camera(Sensor):
+    """Takes pictures: four bytes a pixel in the order blue, green, red, alpha."""
+
+    _c_name = "camera"
+
+    getWidth = _field("width")
+    getHeight = _field("height")
+    getNear = _field("near")
+
+    def __init__(self, name: int | str, sampling_period: int | None = None) -> None:
+        super().__init__(name, sampling_period)
+        self._fov: float = self._fields.get("fieldOfView", 0.0)
+
+    def getImage(self) -> bytes:
+        """The last picture, rows from the top left.
+
+        Raises:
+            ValueError: The camera is disabled or has not taken a picture yet.
+        """
+        picture = self._value(None, "get_image") and self._session.fetch(self._tag)
+        if picture is None or not self.getSamplingPeriod():
+            raise ValueError("NULL pointer access")
+        return picture
+
+    def getImageArray(self) -> list[list[list[int]]]:
+        """Red, green and blue by pixel, cut as Webots cuts it: `width` lists of `height` pixels."""
+        image, width, height = self.getImage(), self.getWidth(), self.getHeight()
+        pixels = [[image[i + 2], image[i + 1], image[i]] for i in range(0, len(image), 4)]
+        return [pixels[x * height : (x + 1) * height] for x in range(width)]
+
+    @staticmethod
+    def imageGetRed(image: bytes, width: int, x: int, y: int) -> int:
+        """Red of one pixel, 0 to 255."""
+        return image[4 * (y * width + x) + 2]
+
+    @staticmethod
+    def imageGetGreen(image: bytes, width: int, x: int, y: int) -> int:
+        """Green of one pixel, 0 to 255."""
+        return image[4 * (y * width + x) + 1]
+
+    @staticmethod
+    def imageGetBlue(image: bytes, width: int, x: int, y: int) -> int:
+        """Blue of one pixel, 0 to 255."""
+        return image[4 * (y * width + x)]
+
+    @staticmethod
+    def imageGetGray(image: bytes, width: int, x: int, y: int) -> float:
+        """The mean of the three colors of one pixel."""
+        start = 4 * (y * width + x)
+        return sum(image[start : start + 3]) / 3.0
+
+    def getFov(self) -> float:
+        """Horizontal field of view in radians."""
+        return self._fov
+
+    def setFov(self, f: float) -> None:
+        """Zoom: set the horizontal field of view, in radians; needs a Zoom node."""
+        low, high = self.getMinFov(), self.getMaxFov()
+        if not low <= number(f) <= high:
+            self._complain("set_fov", f" out of zoom range [{low:f}, {high:f}].")
+            return
+        self._fov = number(f)
+        self._session.change(self._tag, "fov", self._fov)
+
+    def getMinFov(self) -> float:
+        """The narrowest field of view, radians: that of the Zoom node, or the only one."""
+        return self._zoom("minFieldOfView")
+
+    def getMaxFov(self) -> float:
+        """The widest field of view, radians: that of the Zoom node, or the only one."""
+        return self._zoom("maxFieldOfView")
+
+    def _zoom(self, field: str) -> float:
+        zoom: dict[str, float] = self._fields["zoom"] or {}
+        return zoom[field] if field in zoom else self._fields["fieldOfView"]
+
+    def getFocalLength(self) -> float:
+        """The focal length in pixels."""
+        return self.getWidth() / 2.0 / tan(self._fov / 2.0)
+
+    def hasRecognition(self) -> bool:
+        """False: cameras of the stand-in recognize nothing."""
+        return False
+
+    def saveImage(self, filename: str, quality: int) -> int:
+        """Write the last picture to a .png or .jpg file: 0, or -1 if that fails."""
+        path, quality = Path(text(filename)), integer(quality, position=3)
+        if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+            return -1
+        from PIL import Image
+
+        size, image = (self.getWidth(), self.getHeight()), self.getImage()
+        try:
+            Image.frombytes("RGBA", size, image, "raw", "BGRA").convert("RGB").save(
+                path, quality=quality
+            )
+        except OSError:
+            say(f"Insufficient permissions to write file: {filename}")
+            return -1
+        return 0
+
+
+class LidarPoint:
+    """A point of the point cloud: x, y and z in metres in the frame of the lidar."""
+
+    def __init__(self, data: bytes, offset: int) -> None:
+        self.x: float
+        self.y: float
+        self.z: float
+        self.layer: int
+        self.time: float
+        self.x, self.y, self.z, self.layer, self.time = _POINT.unpack_from(
+            data, offset * _POINT.size
+        )
+
+
+class Lidar(Sensor):
+    """Measures a fan of distances from left to right, layer after layer; all layers are level."""
+
+    _c_name = "lidar"
+    _with_points = False
+
+    getHorizontalResolution = _field("horizontalResolution")
+    getNumberOfLayers = _field("numberOfLayers")
+    getFov = _field("fieldOfView")
+    getVerticalFov = _field("verticalFieldOfView")
+    getMinRange = _field("minRange")
+    getMaxRange = _field("maxRange")
+    getFrequency = _field("defaultFrequency")
+    getMinFrequency = _field("minFrequency")
+    getMaxFrequency = _field("maxFrequency")
+
+    def getRangeImage(self) -> list[float]:
+        """Distances in metres, inf where nothing is in range.
+
+        Raises:
+            ValueError: There is no scan yet. In Webots this can also be a segmentation fault.
+        """
+        ranges = self._ranges()
+        if ranges is None:
+            raise ValueError("NULL pointer access")
+        return [*ranges]
+
+    def _ranges(self) -> list[float] | None:
+        return self._value(None, "get_range_image") and self._session.fetch(self._tag)
+
+    @property
+    def range_image(self) -> Any:
+        """The distances as a raw `ctypes` pointer, which is false while there is no scan."""
+        ranges = self._ranges()
+        if ranges is None:
+            return ctypes.POINTER(ctypes.c_float)()
+        array = (ctypes.c_float * len(ranges))(*ranges)
+        return ctypes.cast(array, ctypes.POINTER(ctypes.c_float))
+
+    def getLayerRangeImage(self, layer: int) -> list[float]:
+        """Layer 0 whatever is asked for, as in Webots."""
+        return self.getRangeImage()[: self.getHorizontalResolution()]
+
+    def getRangeImageArray(self) -> list[list[float]]:
+        """As many lists as there are layers, each of them layer 0, as in Webots."""
+        return [self.getLayerRangeImage(i) for i in range(self.getNumberOfLayers())]
+
+    def enablePointCloud(self) -> None:
+        """Let `getPointCloud` work."""
+        self._with_points = True
+
+    def disablePointCloud(self) -> None:
+        """Let `getPointCloud` work no longer."""
+        self._with_points = False
+
+    def isPointCloudEnabled(self) -> bool:
+        """Whether `getPointCloud` works."""
+        return self._with_points
+
+    def getNumberOfPoints(self) -> int:
+        """Points in the point cloud; 0 and a line on stderr unless it is enabled."""
+        if self._has_points("get_number_of_points", "!"):
+            return self.getHorizontalResolution() * self.getNumberOfLayers()
+        return 0
+
+    def getPointCloud(self) -> list[LidarPoint]:
+        """The scan as points, layer after layer; empty and lines on stderr unless enabled."""
+        count = self.getNumberOfPoints()
+        if not self._has_points("get_point_cloud", "."):
+            return []
+        data = self._packed_points()
+        return [LidarPoint(data, offset) for offset in range(count)]
+
+    def getLayerPointCloud(self, layer: int) -> list[LidarPoint]:
+        """The points of one layer; empty and lines on stderr unless enabled."""
+        size = self.getHorizontalResolution()
+        return self.getPointCloud()[layer * size : (layer + 1) * size]
+
+    def _has_points(self, what: str, mark: str) -> bool:
+        if not self._with_points:
+            use = "Please use: wb_lidar_enable_point_cloud()."
+            self._complain(what, f" called for a lidar with point cloud disabled{mark} {use}")
+        return self._with_points
+
+    def _packed_points(self) -> bytes:
+        resolution, fov = self.getHorizontalResolution(), self.getFov()
+        step, time_s = fov / max(resolution - 1, 1), self._session.time_s
+        points: list[bytes] = []
+        for i, distance in enumerate(self.getRangeImage()):
+            layer, column = divmod(i, resolution)
+            angle = fov / 2.0 - column * step
+            x, y = distance * cos(angle), distance * sin(angle)
+            points.append(_POINT.pack(x, y, 0.0, layer, time_s))
+        return b"".join(points)
+
+
+class Emitter(Device):
+    """Sends packets to the receivers of other robots; they arrive with the next basic time step."""
+
+    _c_name = "emitter"
+
+    getBufferSize = _field("bufferSize")  # bytes; the stand-in sends what is larger all the same
+    getChannel = _field("channel")
+    getRange = _field("range")  # metres; -1: everywhere
+
+    def send(self, message: Any, length: int | None = None) -> None:
+        """Send a packet with the next step.
+
+        Args:
+            message: Text, bytes, or a list of numbers: floats if the first one is, else integers.
+            length: How many of the bytes; None: all.
+        """
+        if isinstance(message, bytes):
+            packet = message if length is None else message[:length]
+        elif isinstance(message, str):
+            packet = message.encode()[: len(message)]  # as in Webots, which counts characters
+        elif isinstance(message, (list, tuple)):
+            values = cast("list[Any]", message)
+            if not values:
+                print("Emitter.send(): empty list", file=sys.stderr)  # noqa: T201 - as Webots does
+                return
+            kind = "d" if isinstance(values[0], float) else "i"
+            packet = struct.pack(f"{len(values)}{kind}", *values)
+        else:
+            print("Emitter.send(): unsupported data type", file=sys.stderr)  # noqa: T201
+            return
+        self._session.send_packet(self._tag, packet)
+
+    def setChannel(self, channel: int) -> None:
+        """Send on this channel; `CHANNEL_BROADCAST` reaches all."""
+        self._set("channel", integer(channel, position=2))
+
+    def setRange(self, range: float) -> None:  # noqa: A002 - Webots' name
+        """Reach only receivers so near, in metres, at most `maxRange`; -1 reaches all."""
+        most = self._fields["maxRange"]
+        within = number(range) if most < 0.0 or 0.0 <= number(range) <= most else most
+        self._set("range", within)
+
+    def _set(self, field: str, value: float) -> None:
+        self._fields[field] = value
+        self._session.change(self._tag, field, value)
+
+
+class Receiver(Sensor):
+    """Queues the packets of other robots' emitters; the first one is read until `nextPacket`."""
+
+    _c_name = "receiver"
+
+    getChannel = _field("channel")
+
+    def __init__(self, name: int | str, sampling_period: int | None = None) -> None:
+        super().__init__(name, sampling_period)
+        self._queue = self._session.packets.get(self._tag, deque[Any]())
+
+    def getQueueLength(self) -> int:
+        """How many packets have arrived and are not read yet."""
+        return len(self._queue)
+
+    def _head(self, what: str, place: int, default: Any) -> Any:
+        """A part of the packet that is read: its bytes, the emitter's direction, the strength."""
+        if self._queue:
+            return self._queue[0][place]
+        self._complain(what, " called while the receiver queue is empty.")
+        return default
+
+    def nextPacket(self) -> None:
+        """Done with the first packet: the next one is read."""
+        if self._head("next_packet", 0, None) is not None:
+            self._queue.popleft()
+
+    def getBytes(self) -> bytes:
+        """The packet; without one a line on stderr and no bytes."""
+        return self._head("get_data", 0, b"")
+
+    def getString(self) -> str:
+        """The packet as text."""
+        return self.getBytes().decode()
+
+    def getData(self) -> str:
+        """The packet as text; deprecated."""
+        print(  # noqa: T201 - as Webots does
+            "DEPRECATION: Receiver.getData is deprecated, please use Receiver.getString instead.",
+            file=sys.stderr,
+        )
+        return self.getString()
+
+    @property
+    def data(self) -> Any:
+        """The packet as a raw `ctypes` pointer."""
+        packet = self.getBytes()
+        return ctypes.cast(ctypes.create_string_buffer(packet), ctypes.POINTER(ctypes.c_ubyte))
+
+    def getDataSize(self) -> int:
+        """Bytes of the packet; -1 without one."""
+        return len(self._head("get_data_size", 0, b"")) if self._queue else -1
+
+    def getFloats(self) -> tuple[float, ...]:
+        """The packet as numbers of eight bytes."""
+        return self._unpacked("d")
+
+    def getInts(self) -> tuple[int, ...]:
+        """The packet as integers of four bytes."""
+        return self._unpacked("i")
+
+    def getBools(self) -> tuple[bool, ...]:
+        """The packet as flags, one a byte."""
+        return self._unpacked("?")
+
+    def _unpacked(self, kind: str) -> Any:
+        packet = self.getBytes()
+        return struct.unpack(f"{len(packet) // struct.calcsize(kind)}{kind}", packet)
+
+    def getSignalStrength(self) -> float:
+        """One by the square of the emitter's distance in metres."""
+        return self._head("get_signal_strength", 2, nan)
+
+    def getEmitterDirection(self) -> list[float]:
+        """A unit vector to where the emitter was, seen from the receiver."""
+        return [*self._head("get_emitter_direction", 1, _UNKNOWN)]
+
+    def setChannel(self, channel: int) -> None:
+        """Listen to this channel; -1 listens to all."""
+        self._fields["channel"] = integer(channel, position=2)
+        self._session.change(self._tag, "channel", channel)
+
+
+def _place(name: str, names: tuple[str, ...]) -> int:
+    return names.index(name) if name in names else 0
+
+
+def _quaternion(roll: float, pitch: float, yaw: float) -> list[float]:
+    (cr, sr), (cp, sp), (cy, sy) = ((cos(a / 2.0), sin(a / 2.0)) for a in (roll, pitch, yaw))
+    return [
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    ]
+
+
+CLASS_OF: Final[dict[str, type[Device]]] = {
+    **{"RotationalMotor": Motor, "LinearMotor": Motor},
+    **{
+        each.__name__: each
+        for each in (
+            *(PositionSensor, DistanceSensor, GPS, InertialUnit, Lidar, Camera, LED, TouchSensor),
+            *(Accelerometer, Compass, Gyro, LightSensor, Emitter, Receiver),
+        )
+    },
+}
+"""The classes of devices by node type."""

@@ -1,0 +1,448 @@
+"""Nodes of the scene tree and their fields, as a supervisor sees them."""
+
+# ruff: noqa: N802, N803 - the names are those of Webots
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from math import nan
+from typing import Any, Final, cast
+
+from .session import Session
+from .surface import Completed, integer, lacking, number, numbers, say, text, type_number
+
+_LENGTHS: Final = {"Vec2f": 2, "Vec3f": 3, "Color": 3, "Rotation": 4}
+_TYPES: Final[dict[str, type]] = {"Bool": bool, "Int32": int, "Float": float, "String": str}
+_READ_ONLY: Final = "Error: a field inside a PROTO node is read-only."
+_BEYOND_THE_END: Final[dict[str, Any]] = {
+    **{"Bool": False, "Int32": 0, "Float": nan, "String": "", "Node": None},
+    **{kind: [nan] * length for kind, length in _LENGTHS.items()},
+}
+
+
+class Field(Completed):
+    """A field of a node. Reads are answered at once, writes go out with the next step.
+
+    `getSF...`, `setSF...`, `getMF...`, `setMF...` and `insertMF...` are made for all types below.
+    """
+
+    type: int | None
+    """The number of the type, as `Field.SF_VEC3F`."""
+    _session: Session
+    _key: tuple[int, str]
+    _type_name: str
+    _is_inner: bool
+
+    def __init__(self, ref: Any) -> None:
+        raise lacking("Field(...); ask a node for its fields")
+
+    @classmethod
+    def _of(
+        cls,
+        session: Session,
+        node_id: int,
+        name: str,
+        found: tuple[str, int],
+        *,
+        is_inner: bool = False,
+    ) -> Field:
+        field = cls.__new__(cls)
+        field._is_inner = is_inner
+        field._session, field._key = session, (node_id, name)
+        field._type_name, session.counts[field._key] = found
+        field.type = type_number("Field", field._type_name)
+        return field
+
+    def getName(self) -> str:
+        """The name of the field."""
+        return self._key[1]
+
+    def getType(self) -> int | None:
+        """The number of the type, as `Field.SF_VEC3F`."""
+        return self.type
+
+    def getTypeName(self) -> str:
+        """The type as text, as `SFVec3f`."""
+        return self._type_name
+
+    def getCount(self) -> int:
+        """The number of entries; -1 for a single field."""
+        return self._count
+
+    @property
+    def _count(self) -> int:
+        return self._session.counts[self._key]
+
+    # Single fields -------------------------------------------------------------------------------
+
+    @property
+    def value(self) -> Any:
+        """The value of a single field; None for a field with entries."""
+        if self._count >= 0:
+            return None
+        return self._as_given(self._session.read_field(self._key, None))
+
+    @value.setter
+    def value(self, value: Any) -> None:
+        if self._is_inner:
+            say(_READ_ONLY)
+        elif self._count >= 0 or not _fits(self._type_name[2:], value):
+            say("Error: new field value has wrong type or length.")
+        else:
+            self._session.set_field(self._key, None, _as_sent(value))
+
+    def _as_given(self, value: Any) -> Any:
+        if self._type_name.endswith("Node"):
+            return None if value is None else node_of(self._session, value)
+        if isinstance(value, bool):
+            return int(value)
+        return [*value] if isinstance(value, (list, tuple)) else value
+
+    def _set_numbers(self, setter: str, length: int, value: list[float]) -> None:
+        if len(value) == length:
+            self.value = value
+        else:
+            say(f"Error: {setter}(): length of 'value' argument should be {length}.")
+
+    # Fields with entries -------------------------------------------------------------------------
+
+    def _entry(self, kind: str, index: int) -> Any:
+        if self._has_entry("get", kind, integer(index, position=2)):
+            return self._as_given(self._session.read_field(self._key, index))
+        return _BEYOND_THE_END[kind]
+
+    def _set_entry(self, kind: str, index: int, value: Any) -> None:
+        if self._is_inner:
+            say(_READ_ONLY)
+        elif self._has_entry("set", kind, integer(index, position=2)):
+            self._session.set_field(self._key, index, value)
+
+    def _has_entry(self, what: str, kind: str, index: int) -> bool:
+        function = f"Error: wb_supervisor_field_{what}_mf_{kind.lower()}()"
+        if self._type_name != f"MF{kind}":
+            say(f"{function} called with a field of type {self._type_name}.")
+            return False
+        if not self._count:
+            say(f"{function} called on an empty list.")
+            return False
+        return self._is_within(function, index, -self._count, self._count - 1)
+
+    def _is_within(self, function: str, index: int, least: int, most: int) -> bool:
+        if not least <= index <= most:
+            bounds = f"(should be between {least} and {most})"
+            say(f"{function} called with an out-of-bound index: {index} {bounds}.")
+        return least <= index <= most
+
+    # More and fewer entries: at once, after the changes that were not sent yet -------------------
+
+    def _insert(self, kind: str, index: int, value: Any) -> None:
+        function = f"Error: wb_supervisor_field_insert_mf_{kind.lower()}()"
+        if self._is_inner:
+            say(_READ_ONLY)
+        elif self._type_name != f"MF{kind}":
+            say(f"{function} called with a field of type {self._type_name}.")
+        elif self._is_within(function, integer(index, 2), -self._count - 1, self._count):
+            self._change("field_insert", index, value)
+
+    def _change(self, operation: str, *arguments: Any) -> None:
+        count = self._session.change_field(operation, self._key, *arguments)
+        if count is not None and self._count >= 0:
+            self._session.counts[self._key] = count
+
+    def removeMF(self, index: int) -> None:
+        """Remove an entry; of a field of nodes the node."""
+        function = "Error: wb_supervisor_field_remove_mf()"
+        if self._is_inner:
+            say(_READ_ONLY)
+        elif self._count <= 0:
+            say(f"{function} called for an empty field.")
+        elif self._is_within(function, integer(index, 2), -self._count, self._count - 1):
+            self._change("field_remove", index)
+
+    def removeSF(self) -> None:
+        """Remove the node of a field that holds one."""
+        if self._is_inner:
+            say(_READ_ONLY)
+        elif self._type_name != "SFNode":
+            say("Error: wb_supervisor_field_remove_sf() called with wrong field type.")
+        elif self.value is None:
+            say("Error: wb_supervisor_field_remove_sf() called for an empty field.")
+        else:
+            self._change("field_remove", None)
+
+    def importMFNodeFromString(self, position: int, nodeString: str) -> None:
+        """Add a node that is written as in a world file; -1 adds it at the end."""
+        function = "Error: wb_supervisor_field_import_mf_node_from_string()"
+        if self._may_import(function, "MFNode", text(nodeString)) and self._is_within(
+            function, integer(position, 2), -self._count - 1, self._count
+        ):
+            self._change("field_import", position, nodeString)
+
+    def importSFNodeFromString(self, nodeString: str) -> None:
+        """Put a node that is written as in a world file into a field that is NULL."""
+        function = "Error: wb_supervisor_field_import_sf_node_from_string()"
+        if self._may_import(function, "SFNode", text(nodeString)):
+            if self.value is not None:
+                say(f"{function} called with a non-empty field.")
+            else:
+                self._change("field_import", None, nodeString)
+
+    def _may_import(self, function: str, kind: str, node: str) -> bool:
+        if self._is_inner:
+            say(_READ_ONLY)
+        elif self._type_name != kind:
+            say(f"{function} called with a wrong field type: {self._type_name}.")
+        elif not node:
+            say(f"{function} called with a NULL or empty 'node_string' argument.")
+        else:
+            return True
+        return False
+
+
+def _as_sent(value: Any) -> Any:
+    if not isinstance(value, list):
+        return value
+    values = cast("list[Any]", value)
+    return numbers(values, len(values))
+
+
+def _fits(kind: str, value: Any) -> bool:
+    if kind in _LENGTHS:
+        return isinstance(value, list) and len(cast("list[Any]", value)) == _LENGTHS[kind]
+    return kind in _TYPES and isinstance(value, _TYPES[kind])
+
+
+# As in Webots, each getSF... gives the value, of whatever type it is, and a setter of another type
+# refuses with a line on stderr. Entries count from 0, or from the end with negative numbers.
+
+_ENTRY_OF: Final[dict[str, Callable[[Any], Any]]] = {
+    "Bool": bool,
+    "Int32": lambda value: integer(value, position=3),
+    "Float": number,
+    "String": text,
+    **{kind: partial(numbers, count=length) for kind, length in _LENGTHS.items()},
+}
+"""What an entry is made of, by the kind of its field."""
+
+
+def _add_accessors(kind: str) -> None:
+    """Give Field the methods that get values of one kind."""
+
+    def get_single(self: Any) -> Any:
+        return self.value
+
+    def get_entry(self: Any, index: int) -> Any:
+        entry = self._entry(kind, index)
+        return bool(entry) if kind == "Bool" else entry
+
+    setattr(Field, f"getSF{kind}", get_single)
+    setattr(Field, f"getMF{kind}", get_entry)
+
+
+def _add_setters(kind: str, entry_of: Callable[[Any], Any]) -> None:
+    """Give Field the methods that set and insert values of one kind."""
+
+    def set_single(self: Any, value: Any) -> None:
+        if kind in _LENGTHS:
+            self._set_numbers(f"setSF{kind}", _LENGTHS[kind], value)
+        else:
+            self.value = value
+
+    def set_entry(self: Any, index: int, value: Any) -> None:
+        self._set_entry(kind, index, entry_of(value))
+
+    def insert(self: Any, index: int, value: Any) -> None:
+        self._insert(kind, index, entry_of(value))
+
+    setattr(Field, f"setSF{kind}", set_single)
+    setattr(Field, f"setMF{kind}", set_entry)
+    setattr(Field, f"insertMF{kind}", insert)
+
+
+for _kind in (*_ENTRY_OF, "Node"):
+    _add_accessors(_kind)
+for _kind, _entry_of in _ENTRY_OF.items():
+    _add_setters(_kind, _entry_of)
+
+field_of = Field._of  # pyright: ignore[reportPrivateUsage]
+"""Makes the object for a field that the simulator has described."""
+
+
+def inner_field_of(session: Session, node_id: int, name: str, found: tuple[str, int]) -> Field:
+    """The object for a field inside a PROTO node, which is read-only."""
+    return field_of(session, node_id, name, found, is_inner=True)
+
+
+_NO_POSE: Final = ([nan] * 9, [nan] * 3)
+
+
+class Node(Completed):
+    """A node of the scene tree; a null node (no rights) answers with defaults.
+
+    As in Webots, each call that gives a node makes another object, equal to no other: compare
+    `getId()`.
+    """
+
+    _session: Session
+    _id: int
+    _found: tuple[str, str, str]
+
+    def __init__(
+        self,
+        DEF: str | None = None,
+        tag: int | None = None,
+        id: int | None = None,  # noqa: A002 - Webots' name
+        selected: bool | None = None,
+        ref: int | None = None,
+    ) -> None:
+        raise lacking("Node(...); ask the supervisor for nodes")
+
+    @classmethod
+    def _of(cls, session: Session, found: Sequence[Any]) -> Node:
+        node = cls.__new__(cls)
+        node._session, node._id = session, found[0]
+        node._found = (found[1], found[2], found[3])
+        return node
+
+    def getId(self) -> int:
+        """A number that no other node has."""
+        return self._id
+
+    def getType(self) -> int:
+        """The number of the node type, to compare with `Node.ROBOT` and the like."""
+        return type_number("Node", self.getBaseTypeName())
+
+    def getTypeName(self) -> str:
+        """The node type, as `Robot`; of a PROTO node its own name, as `WoodenBox`."""
+        return self._found[0]
+
+    def getBaseTypeName(self) -> str:
+        """The node type; of a PROTO node what it is made of, as `Solid`."""
+        return self._found[1]
+
+    def isProto(self) -> bool:
+        """Whether it is a PROTO node."""
+        return self._found[0] != self._found[1]
+
+    def getDef(self) -> str:
+        """The DEF name, empty if there is none."""
+        return self._found[2]
+
+    def getParentNode(self) -> Node | None:
+        """The node around this one; None for the root."""
+        found = self._session.ask("node_get_parent_node", self._id)
+        return None if found is None else node_of(self._session, found)
+
+    def exportString(self) -> str:
+        """The node and all in it, as written in a world file."""
+        return self._session.ask("node_export_string", self._id, default="")
+
+    def remove(self) -> None:
+        """Take the node, and all in it, out of the world."""
+        found = self._session.ask("node_remove", self._id)
+        if found is not None:
+            node_id, name, count = found
+            self._session.counts[node_id, name] = count
+
+    # Fields --------------------------------------------------------------------------------------
+
+    def getField(self, fieldName: str) -> Field | None:
+        """A field by name; None if the node has no such field."""
+        found = self._session.ask("node_get_field", self._id, text(fieldName))
+        return None if found is None else field_of(self._session, self._id, fieldName, found)
+
+    def getNumberOfFields(self) -> int:
+        """How many fields the node has."""
+        return len(self._session.ask("node_get_field_names", self._id, default=[]))
+
+    def getFieldByIndex(self, index: int) -> Field | None:
+        """A field by its place; None beyond the last."""
+        names: list[str] = self._session.ask("node_get_field_names", self._id, default=[])
+        return self.getField(names[index]) if 0 <= integer(index, 2) < len(names) else None
+
+    def getBaseNodeField(self, fieldName: str) -> Field | None:
+        """A field of the node that a PROTO node is made of, to be read only."""
+        if not self._is_proto("getBaseNodeField"):
+            return None
+        found = self._session.ask("node_get_base_node_field", self._id, text(fieldName))
+        return None if found is None else inner_field_of(self._session, self._id, fieldName, found)
+
+    def getNumberOfBaseNodeFields(self) -> int:
+        """How many fields the node has that a PROTO node is made of."""
+        return len(self._base_node_field_names("getNumberOfBaseNodeFields"))
+
+    def getBaseNodeFieldByIndex(self, index: int) -> Field | None:
+        """A field of what a PROTO node is made of, by its place; None beyond the last."""
+        names = self._base_node_field_names("getBaseNodeFieldByIndex")
+        has_it = 0 <= integer(index, 2) < len(names)
+        return self.getBaseNodeField(names[index]) if has_it else None
+
+    def _base_node_field_names(self, asked: str) -> list[str]:
+        if not self._is_proto(asked):
+            return []
+        return self._session.ask("node_get_base_node_field_names", self._id, default=[])
+
+    def _is_proto(self, asked: str) -> bool:
+        if not self.isProto():
+            say(f"Error: {asked}() called with a node that is no PROTO node.")
+        return self.isProto()
+
+    # Places --------------------------------------------------------------------------------------
+
+    def getPosition(self) -> list[float]:
+        """x, y and z in the world, metres; NaN for a node that has no place."""
+        return [*self._pose()[1]]
+
+    def getOrientation(self) -> list[float]:
+        """The rotation matrix in the world by rows: nine numbers."""
+        return [*self._pose()[0]]
+
+    def getPose(self, fromNode: Node | None = None) -> list[float]:
+        """The 4 x 4 matrix by rows, in the world or in another node: sixteen numbers.
+
+        As in Webots only this one is answered from the last step, where the pose is tracked.
+        """
+        tracked = self._session.tracked((self._id, fromNode._id if fromNode else None))
+        r, (x, y, z) = tracked or self._pose(fromNode)
+        return [*r[0:3], x, *r[3:6], y, *r[6:9], z, 0.0, 0.0, 0.0, 1.0]
+
+    def _pose(self, seen_from: Node | None = None) -> Any:
+        node_ids = (self._id, seen_from._id if seen_from else None)
+        return self._session.ask("node_get_pose", *node_ids, default=_NO_POSE)
+
+    def getVelocity(self) -> list[float]:
+        """Linear (metres a second) and angular (radians a second) velocity: six numbers."""
+        return [*self._session.ask("node_get_velocity", self._id, default=[nan] * 6)]
+
+    def setVelocity(self, velocity: list[float]) -> None:
+        """Set linear and angular velocity; on the plane, so x, y and the turn about z count."""
+        self._session.ask("node_set_velocity", self._id, numbers(velocity, 6))
+
+    def enablePoseTracking(self, samplingPeriod: int, fromNode: Node | None = None) -> None:
+        """Have the pose sent with the steps, so that `getPose` need not ask for it."""
+        period_ms = integer(samplingPeriod, position=2)
+        self._session.track((self._id, fromNode._id if fromNode else None), period_ms)
+
+    def disablePoseTracking(self, fromNode: Node | None = None) -> None:
+        """Have it sent no more."""
+        self._session.track((self._id, fromNode._id if fromNode else None), 0)
+
+    def setJointPosition(self, position: float, index: int = 1) -> None:
+        """Turn a HingeJoint to an angle in radians at once."""
+        if integer(index, position=3) == 1:
+            self._session.ask("node_set_joint_position", self._id, number(position))
+        else:
+            say(f"Error: wb_supervisor_node_set_joint_position(): a hinge has no axis {index}.")
+
+    def restartController(self) -> None:
+        """End the controller of this Robot node and start it again."""
+        self._session.ask("node_restart_controller", self._id)
+
+    def resetPhysics(self) -> None:
+        """Take the node's speed away."""
+        self._session.ask("node_reset_physics", self._id)
+
+
+node_of = Node._of  # pyright: ignore[reportPrivateUsage]
+"""Makes the object for a node that the simulator has described."""

@@ -386,10 +386,10 @@ def test_a_picture_of_what_was_not_read_whole_says_so_and_marks_no_end(
     (track,) = way.tracks
     cut = replace(way, tracks=[replace(track, path=replace(track.path, is_whole=False))])
     unread = replace(signals, unread=[Interval("", 60, 120)])
-    named = [
-        {text for text, _ in texts_of(paint(plot, 900, 500)[0])}
-        for paint, plot in ((paint_signals, signals), (paint_signals, unread),
-                            (paint_trajectory, way), (paint_trajectory, cut))
+    shown: list[tuple[Any, Any]] = [
+        (paint_signals, signals), (paint_signals, unread), (paint_trajectory, way),
+        (paint_trajectory, cut),
     ]  # fmt: skip
+    named = [{text for text, _ in texts_of(paint(plot, 900, 500)[0])} for paint, plot in shown]
     assert ["not all was read" in each for each in named] == [False, True, False, False]
     assert ["end" in each for each in named] == [False, False, True, False]

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import sqlite3
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from webots_mcp.plotting.trajectory_axes import Obstacle
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.robots import world_seen
 from webots_mcp.store.run_rows import Run, fetch_run
@@ -21,20 +21,6 @@ if TYPE_CHECKING:
 _MOST_BYTES: Final = 1_000_000  # of a world file: reading a larger one would take seconds
 _CORNERS: Final = ((1, 1), (-1, 1), (-1, -1), (1, -1))
 _SIDES: Final = 24  # of what a circle is drawn as
-
-
-@dataclass(frozen=True)
-class Obstacle:
-    """Something that stands in a world.
-
-    Attributes:
-        outline: Its corners, seen from above, in metres; empty where its size is not known.
-    """
-
-    name: str
-    x: float
-    y: float
-    outline: tuple[tuple[float, float], ...] = ()
 
 
 def obstacles_of(

@@ -59,9 +59,8 @@ TURNS: Final[tuple[demo.Turn, ...]] = (
     ),
 )
 CHROMIUM: Final = shutil.which("chromium") or shutil.which("chromium-browser")
-# Every figure of Bokeh's has its parts.
-FIGURES_ARE_THERE: Final = """() => window.Bokeh && [...document.querySelectorAll("[data-root-id]")]
-    .every(each => each.shadowRoot || each.children.length)"""
+FIGURES_ARE_THERE: Final = """() => document.querySelector(".figure > svg")
+    && [...document.querySelectorAll(".figure > svg")].every(each => each.parentNode.figure)"""
 CONVERSATION: Final = re.compile(r"(?<=<!-- conversation -->\n```text\n).*?(?=^```$)", re.M | re.S)
 
 

@@ -8,6 +8,8 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
 
 import pytest
 
@@ -43,6 +45,11 @@ class Server:
         self.url: str = json.loads(said)["url"]
         self.path = "/" + self.url.split("/", 3)[3]
         self.port = int(self.url.split(":")[2].partition("/")[0])
+
+    def ask(self, path: str) -> dict[str, Any]:
+        """What the page is answered to a question."""
+        with urlopen(self.url + path, timeout=60) as response:
+            return json.load(response)
 
     def stop(self) -> str:
         """End it as Ctrl-C does; returns what it said on stderr."""

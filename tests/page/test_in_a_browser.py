@@ -19,13 +19,10 @@ pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 from playwright.sync_api import Page, expect
 
 PATIENCE_MS = 120_000
-# Models that are shown no more are forgotten a little later: the last one of a name is meant.
-NAMED = "name => [...Bokeh.documents[0]._all_models.values()].filter(m => m.name == name).at(-1)"
-SOURCE = f"""name => {{
-  const source = ({NAMED})(name)
-  return source ? [...source.get_array(%r)] : null
-}}"""
-RANGE = f"() => {{ const r = ({NAMED})('time'); return [r.start, r.end] }}"
+FIGURES = "[...document.querySelectorAll('.figure')].map(each => each.figure?.data)"
+CURVE = f"name => ({FIGURES})[0]?.curves?.find(each => each.name === name)"
+MODE = f"() => ({FIGURES})[0]?.lanes?.[0]?.held.map(each => each[0])"
+VIEW = "() => document.getElementById('signal-figure').figure?.frames[0].x"
 
 
 class Tab:
@@ -40,22 +37,25 @@ class Tab:
         page.on("pageerror", lambda error: self.errors.append(str(error)))
         page.goto(server.url)
 
-    def column(self, source: str, column: str) -> list[Any]:
-        self.page.wait_for_function(f"name => ({SOURCE % column})(name) !== null", arg=source)
-        return self.page.evaluate(SOURCE % column, source)
+    def column(self, curve: str, column: str) -> list[Any]:
+        self.page.wait_for_function(CURVE, arg=curve)
+        return self.page.evaluate(CURVE, curve)[column]
 
-    def until(self, source: str, column: str, least: float) -> None:
-        """Wait until a column has a number that is at least so large."""
-        has = f"([name, least]) => (({SOURCE % column})(name) ?? []).some(each => each >= least)"
-        self.page.wait_for_function(has, arg=[source, least])
+    def until(self, curve: str, least_s: float) -> None:
+        """Wait until a curve reaches so far."""
+        reaches = f"([name, least]) => ({CURVE})(name)?.t.at(-1) >= least"
+        self.page.wait_for_function(reaches, arg=[curve, least_s])
 
-    def until_it_is(self, source: str, column: str, values: list[str]) -> None:
-        same = f"([name, all]) => String(({SOURCE % column})(name)) == String(all)"
-        self.page.wait_for_function(same, arg=[source, values])
-
-    def time(self) -> tuple[float, float]:
-        start, end = self.page.evaluate(RANGE)
+    def view(self) -> tuple[float, float]:
+        """The time that the figure was drawn of."""
+        start, end = self.page.evaluate(VIEW)
         return start, end
+
+    def point(self, share: float = 0.5, y: float = 60.0) -> None:
+        """Move the pointer over the signals."""
+        box = self.page.locator("#signal-figure > svg").bounding_box()
+        assert box is not None
+        self.page.mouse.move(box["x"] + share * box["width"], box["y"] + y)
 
     def says(self, text: str) -> None:
         expect(self.page.get_by_text(text).first).to_be_visible(timeout=PATIENCE_MS)
@@ -89,17 +89,17 @@ def test_it_shows_the_values_of_the_database_and_asks_nobody_else(
     tab.choose("robot", "rover")
     tab.choose("run", "run 1 ")
     tab.choose("time", "all")
-    tab.until("curve pose.0 1", "time_s", 119)
-    places = tab.column("curve pose.0 1", "mean")
-    assert max(place for place in places if place == place) == pytest.approx(12.8, abs=0.1)
-    tab.until_it_is("ground mode 0", "value", ["cruise", "back_up", "avoid", "cruise"])
+    tab.until("pose.0", 119)
+    places = tab.column("pose.0", "high")
+    assert max(places) == pytest.approx(12.8, abs=0.1)
+    assert tab.page.evaluate(MODE) == ["cruise", "back_up", "avoid", "cruise"]
     tab.says("this is an earlier run; it ended by reset")
     assert {url.split("/")[2] for url in tab.asked} == {f"127.0.0.1:{told.port}"}
     assert tab.page.get_by_role("button", name="Pause").count() == 0
     assert tab.errors == []
 
 
-def test_two_runs_lie_over_each_other_and_all_figures_zoom_together(
+def test_two_runs_lie_over_each_other_from_their_starts(
     opened: Callable[[Server], Tab], told: Server
 ) -> None:
     tab = opened(told)
@@ -107,18 +107,85 @@ def test_two_runs_lie_over_each_other_and_all_figures_zoom_together(
     tab.choose("run", "run 1 ")
     tab.choose("over it", "run 2 ")
     tab.choose("time", "all")
-    starts = [tab.column(f"curve pose.0 {run}", "time_s")[0] for run in (2, 1)]
+    starts = [tab.column(f"pose.0, run {run}", "t")[0] for run in (2, 1)]
     assert max(starts) < 1
-    tab.page.wait_for_function(f"() => ({RANGE})()[1] > 100")
-    before = tab.time()
-    plot = tab.page.locator(".bk-Figure").first.bounding_box()
-    assert plot is not None
-    tab.page.mouse.move(plot["x"] + plot["width"] / 2, plot["y"] + plot["height"] / 2)
+
+
+def test_a_zoom_reads_what_it_shows_and_the_address_brings_the_view_back(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", "rover")
+    tab.choose("run", "run 1 ")
+    tab.choose("time", "all")
+    tab.until("pose.0", 119)
+    apart = difference_s(tab.column("pose.0", "t"))
+    tab.point()
     tab.page.keyboard.down("Control")
-    tab.page.mouse.wheel(0, -300)
+    for _ in range(6):
+        tab.page.mouse.wheel(0, -300)
     tab.page.keyboard.up("Control")
-    tab.page.wait_for_function(f"before => ({RANGE})()[1] < before - 5", arg=before[1])
-    assert tab.time()[0] > before[0]
+    tab.page.wait_for_function(f"() => {{ const x = ({VIEW})(); return x && x[1] - x[0] < 60 }}")
+    assert difference_s(tab.column("pose.0", "t")) < apart / 2
+    before = tab.view()
+    tab.page.reload()
+    tab.page.wait_for_function(VIEW)
+    assert tab.view() == pytest.approx(before)
+
+
+def difference_s(times: list[float]) -> float:
+    return times[1] - times[0]
+
+
+def test_a_signal_is_found_by_typing_and_moved_to_another_panel(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", "rover")
+    tab.choose("run", "run 1 ")
+    tab.column("pose.0", "t")
+    tab.page.get_by_label("find a signal").fill("BATT")
+    tab.page.get_by_label("battery_v").check()
+    tab.column("battery_v", "t")
+    panels = f"() => ({FIGURES})[0].panels"
+    assert ["battery_v"] in tab.page.evaluate(panels)
+    tab.page.locator('[data-hides="curve battery_v"]').hover()
+    tab.page.mouse.down()
+    tab.point(y=60)
+    tab.page.mouse.up()
+    tab.page.wait_for_function(f"() => ({panels})()[0].includes('battery_v')")
+    assert tab.page.locator("body").inner_text().count("battery_v") > 0
+
+
+def test_the_values_of_all_are_told_at_the_pointer_and_in_a_replay(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", "rover")
+    tab.choose("run", "run 1 ")
+    tab.choose("time", "all")
+    tab.until("pose.0", 119)
+    tab.point()
+    shown = tab.page.locator("#signal-figure .told")
+    for name in ("pose.0 ", "pose.1 ", "mode "):
+        expect(shown).to_contain_text(name, timeout=PATIENCE_MS)
+    tab.page.get_by_label("replay at").fill("20")
+    expect(shown).to_contain_text("20.000 s", timeout=PATIENCE_MS)
+    expect(tab.page.locator("#way-figure .overlay circle")).to_have_count(1)
+    assert "at=20" in tab.page.url
+
+
+def test_all_robots_stand_on_one_map_and_a_narrow_window_holds_the_page(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.page.set_viewport_size({"width": 390, "height": 844})
+    tab.choose("robot", "rover")
+    tab.page.get_by_label("all robots").check()
+    tracks = "() => document.getElementById('way-figure').figure?.data.tracks.map(t => t.name)"
+    tab.page.wait_for_function(f"() => String(({tracks})()) === 'rover'")
+    tab.says("still: no position was found")
+    assert tab.page.evaluate("document.documentElement.scrollWidth") <= 390
 
 
 def test_of_a_run_without_rows_it_says_so_and_stays_with_it(
@@ -139,7 +206,8 @@ def test_what_was_recorded_is_text_and_nothing_else(
     tab.choose("robot", NAME)
     tab.says(LINE)
     tab.page.get_by_label(NAME, exact=True).check()
-    tab.column(f"lane {NAME} 0", "value")
+    lanes = f"name => ({FIGURES})[0]?.lanes?.some(each => each.name === name)"
+    tab.page.wait_for_function(lanes, arg=NAME)
     assert tab.page.evaluate("window.hacked") is None
     assert tab.errors == []
 
@@ -149,13 +217,10 @@ def test_it_moves_while_the_robot_moves_and_its_buttons_steer(
 ) -> None:
     tab = opened(driven)
     tab.says("running")
-    (source,) = tab.page.evaluate_handle(
-        "() => [...Bokeh.documents[0]._all_models.values()]"
-        ".map(each => each.name).filter(name => name && name.startsWith('curve pose.'))"
-        ".slice(0, 1)"
-    ).json_value() or ["curve pose.x 1"]
-    reached = tab.column(source, "time_s")[-1]
-    tab.until(source, "time_s", reached + 1)
+    tab.page.wait_for_function(f"() => ({FIGURES})[0]?.curves?.length")
+    (name, *_) = tab.page.evaluate(f"() => ({FIGURES})[0].curves.map(each => each.name)")
+    reached = tab.column(name, "t")[-1]
+    tab.until(name, reached + 1)
     tab.page.get_by_role("button", name="Pause").click()
     tab.says("pause: done")
     tab.says("paused")
@@ -175,7 +240,7 @@ def test_it_moves_while_the_robot_moves_and_its_buttons_steer(
     tab.says("run 2, simulation time")
     tab.page.get_by_role("button", name="Resume").click()
     tab.says("running")
-    tab.column(source.replace(" 1", " 2"), "time_s")  # the new run is followed
+    tab.page.wait_for_function(f"() => ({FIGURES})[0]?.curves?.[0].t.at(-1) < {reached}")
     assert tab.errors == []
 
 
@@ -192,11 +257,11 @@ def test_it_survives_a_purge_a_database_that_goes_away_and_a_server_that_stops(
     tab.says("no controller with an MCPBridge has recorded there yet")
     write_story(tmp_path)
     tab.choose("robot", "rover")
-    tab.column("curve pose.0 3", "mean")
+    tab.column("pose.0", "mean")
     with closing(connect(tmp_path / DATABASE_NAME, "writer")) as connection:
         connection.execute("DELETE FROM state WHERE run_id = 3 AND sim_time_s < 30")
     tab.choose("time", "all")
-    tab.column("curve pose.0 3", "mean")
+    tab.column("pose.0", "mean")
     moved = shutil.move(tmp_path / DATABASE_NAME, tmp_path / "away.db")
     tab.says("no database at")
     shutil.move(moved, tmp_path / DATABASE_NAME)

@@ -1,74 +1,91 @@
-"""What a tab does where it cannot read or draw what it was asked for."""
+"""What the page is answered where it cannot read or draw what it was asked for."""
 
 from __future__ import annotations
 
+import json
 import threading
 from contextlib import closing
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import anyio
 import pytest
-from bokeh.document import Document
 
+from tests.page.conftest import Server, write_story
 from tests.recordings.long import build
-from tests.recordings.rover import start_run
-from webots_mcp.connection import connect, create_schema
+from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.plugins.page.chunk_maker import ChunkMaker
-from webots_mcp.plugins.page.tab import Tab
-from webots_mcp.store.chunk_making import LEAST_ROWS
-from webots_mcp.store.chunks import watermark
+from webots_mcp.plugins.page.page_data import choice_of, draw
+from webots_mcp.store.chunks.on_demand import LEAST_ROWS
+from webots_mcp.store.chunks.stored import watermark
 from webots_mcp.store.recording import Recording
 
 
-def record(folder: Path, robot: str, state: dict[str, Any]) -> None:
-    folder.mkdir(exist_ok=True)
-    (folder / DATABASE_NAME).unlink(missing_ok=True)
-    with closing(connect(folder / DATABASE_NAME, "writer", create=True)) as connection:
-        create_schema(connection)
-        run = start_run(connection, robot)
-        for step in range(20):
-            run.publish(step / 10, state)
-        run.insert("log", **run.at(1.0), level="info", source="controller", message="hello")
+@pytest.fixture(scope="module")
+def recording(story: Path) -> Recording:
+    return Recording(story / DATABASE_NAME, story, read_only=True)
 
 
-def opened(folder: Path) -> Tab:
-    recording = Recording(folder / DATABASE_NAME, folder, read_only=True)
-    return Tab(recording, Document(), read_only=True)
+def drawn(recording: Recording, **asked: Any) -> dict[str, Any]:
+    texts = {name: each if isinstance(each, str) else json.dumps(each)
+             for name, each in asked.items()}  # fmt: skip
+    return draw(recording, choice_of({"robot": "rover", "run": "1"} | texts))
 
 
-def go_on(tab: Tab) -> str:
-    """One look, of which the browser says that it took it in; returns the line of the status."""
-    anyio.run(tab.go_on)
-    sent, answered = tab.layout.tags
-    answered.start = sent.start
-    return "".join(tab.layout.select_one({"name": name}).text for name in ("status", "said"))
+def values(markup: str) -> dict[str, Any]:
+    return json.loads(markup.partition('application/json">')[2].removesuffix("</script>"))
 
 
-def test_a_robot_that_another_database_lacks_is_chosen_no_more(tmp_path: Path) -> None:
-    record(tmp_path, "first", {"x": 1.0})
-    tab = opened(tmp_path)
-    go_on(tab)
-    tab.layout.select_one({"name": "run"}).value = "1"
-    record(tmp_path, "other", {"y": 1.0})
-    assert "first" in go_on(tab)
-    assert "run 1" in go_on(tab)
-    assert tab.layout.select_one({"name": "robot"}).value == "other"
+def test_what_is_new_is_a_figure_of_what_was_asked_for(recording: Recording) -> None:
+    answer = drawn(recording, signals=["pose.0", "heading"])
+    assert answer["names"] == ["pose.0", "heading"]
+    assert values(answer["signals"])["panels"] == [["pose.0"], ["heading"]]
+    assert answer["bounds"] == (0.0, 119.9)
+
+
+def test_signals_stand_in_the_panels_that_they_were_moved_to(recording: Recording) -> None:
+    panels = [["pose.0", "battery_v"], ["heading"]]
+    answer = drawn(recording, panels=panels)
+    assert values(answer["signals"])["panels"] == panels
+    assert "battery_v [V]" in answer["signals"]
+
+
+def test_a_zoom_reads_each_row_of_what_it_shows(recording: Recording) -> None:
+    whole, part = (
+        values(drawn(recording, signals=["ir"], view=view)["signals"])["curves"][0]["t"]
+        for view in (None, [60.0, 70.0])
+    )
+    assert min(b - a for a, b in pairwise(part)) == pytest.approx(0.1)
+    assert whole[1] - whole[0] > 0.2
+
+
+def test_what_cannot_be_drawn_is_a_note(recording: Recording) -> None:
+    answer = drawn(recording, view=[900.0, 901.0])
+    assert answer["signals"] is None
+    assert "begins after the newest row" in answer["notes"][0]
+
+
+def test_a_robot_that_another_database_lacks_is_chosen_no_more(told: Server) -> None:
+    answer = told.ask("look?robot=nobody")
+    assert "'nobody' is not in this database" in answer["text"]
+    assert {"robot", "run"} <= set(answer["unknown"])
+
+
+def test_what_the_page_cannot_read_is_said(told: Server) -> None:
+    assert "cannot be read" in told.ask("look?run=one")["text"]
 
 
 def test_what_no_bridge_writes_is_said_on_the_page_and_logged_once(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    serve: Any, tmp_path: Path
 ) -> None:
-    record(tmp_path, "rover", {"x": 1.0})
-    tab = opened(tmp_path)
-    go_on(tab)
+    write_story(tmp_path)
+    server: Server = serve(tmp_path)
     with closing(connect(tmp_path / DATABASE_NAME, "writer")) as connection:
         connection.execute("UPDATE log SET message = x'00ff'")
-    tab.layout.select_one({"name": "window"}).value = "10"
-    assert "rows that it did not write" in go_on(tab)
-    assert "rows that it did not write" in go_on(tab)
-    assert len([each for each in caplog.records if each.exc_info]) == 1
+    for _ in range(3):
+        assert "rows that it did not write" in server.ask("look?robot=rover&run=1")["text"]
+    assert server.stop().count("Traceback") == 1
 
 
 def test_what_no_server_puts_into_chunks_is_beside_the_page(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ _VOID = {"meta", "img", "br", "link", "input"}
 
 
 class Shown(HTMLParser):
-    """What a page refers to, and the text that it shows: not that of its scripts and styles."""
+    """What a page refers to, and the text that it shows outside its figures."""
 
     def __init__(self, html: bytes) -> None:
         super().__init__()
@@ -42,7 +42,7 @@ class Shown(HTMLParser):
     def handle_data(self, data: str) -> None:
         if "style" in self._inside:
             self.styles.append(data)
-        elif "script" not in self._inside:
+        elif not {"script", "svg"} & set(self._inside):
             self.words.append(data)
 
     @property

@@ -10,15 +10,11 @@ import pytest
 
 from webots_mcp.plugins.report.making import Report
 
-DRAWN = (
-    "() => window.Bokeh && [...document.querySelectorAll('[data-figure] > div')]"
-    ".every(each => each.shadowRoot || each.children.length)"
-)
-CURVES = """() => Bokeh.documents.flatMap(d => [...d._all_models.values()])
-    .filter(m => m.type == 'ColumnDataSource' && m.data.mean && m.data.time_s)
-    .map(m => Math.max(...[...m.data.high].filter(v => !isNaN(v))))"""
-RANGES = """() => JSON.stringify(Bokeh.documents.flatMap(d => [...d._all_models.values()])
-    .filter(m => m.type == 'Figure').map(m => [m.x_range.start, m.x_range.end]))"""
+DRAWN = "() => [...document.querySelectorAll('[data-figure]')].every(each => each.figure)"
+CURVES = """() => [...document.querySelectorAll('[data-figure]')]
+    .flatMap(each => each.figure.data.curves ?? [])
+    .map(curve => Math.max(...(curve.high ?? curve.mean)))"""
+VIEW = """() => JSON.stringify(document.querySelector('[data-figure="signals 1"]').figure.view.x)"""
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +59,7 @@ def test_it_opens_without_a_network_draws_what_was_recorded_and_zooms(
     ).fetchone()
     assert any(abs(high - greatest) < 1e-9 for high in opened.evaluate(CURVES))
 
-    before = opened.evaluate(RANGES)
+    before = opened.evaluate(VIEW)
     figure = opened.locator('[data-figure="signals 1"]')
     figure.scroll_into_view_if_needed()
     box = figure.bounding_box()
@@ -71,7 +67,21 @@ def test_it_opens_without_a_network_draws_what_was_recorded_and_zooms(
     opened.keyboard.down("Control")
     opened.mouse.wheel(0, -600)
     opened.keyboard.up("Control")
-    opened.wait_for_function(f"before => ({RANGES})() != before", arg=before, timeout=30_000)
+    opened.wait_for_function(f"before => ({VIEW})() != before", arg=before, timeout=30_000)
+
+
+def test_the_values_of_all_are_told_at_the_pointer_and_a_click_hides_a_curve(opened: Any) -> None:
+    figure = opened.locator('[data-figure="signals 1"]')
+    figure.scroll_into_view_if_needed()
+    box = figure.bounding_box()
+    opened.mouse.move(box["x"] + box["width"] / 2, box["y"] + 80)
+    told = figure.locator(".told")
+    told.wait_for()
+    assert "battery_v 12." in told.inner_text()
+    figure.locator('[data-hides="curve battery_v"]').click()
+    assert not figure.locator('[data-part="curve battery_v"]').is_visible()
+    opened.mouse.move(box["x"] + box["width"] / 2, box["y"] + 80)
+    assert "battery_v" not in told.inner_text()
 
 
 def test_pictures_are_seen(opened: Any) -> None:

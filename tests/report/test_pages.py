@@ -86,7 +86,6 @@ def test_it_refers_to_nothing_outside(both: Report, page: Shown) -> None:
     assert not re.search(r"url\(|@import", " ".join(page.styles))
     (policy,) = (value for _, _, value in page.attributes if value.startswith("default-src"))
     assert "http" not in policy
-    assert b"cdn.bokeh.org" not in both.html
 
 
 def test_every_link_leads_to_a_place_in_the_page(page: Shown) -> None:
@@ -96,7 +95,7 @@ def test_every_link_leads_to_a_place_in_the_page(page: Shown) -> None:
 
 
 def test_it_says_how_large_it_is(both: Report, page: Shown) -> None:
-    assert f"It takes {len(both.html) / 1e6:.1f} MB of at most 10 MB" in page.text
+    assert f"It takes {len(both.html) / 1e6:.2f} MB of at most 10 MB" in page.text
 
 
 def test_what_was_recorded_is_shown_and_never_run(tmp_path: Path) -> None:
@@ -190,7 +189,7 @@ def test_pictures_are_scaled_down_and_thinned_evenly_where_they_have_no_room(
 ) -> None:
     recorded = Recorded(tmp_path / "webots.db")
     robot = recorded.robot()
-    for step in range(8):
+    for step in range(20):
         robot.state(step, {"x": step})
         file = tmp_path / f"{step}.png"
         Image.effect_noise((900, 700), 80).save(file)
@@ -199,9 +198,9 @@ def test_pictures_are_scaled_down_and_thinned_evenly_where_they_have_no_room(
     recorded.close()
     shown = Shown(report.html)
     sources = [value for tag, name, value in shown.attributes if (tag, name) == ("img", "src")]
-    assert 0 < len(sources) == report.holds["pictures"] < 8
+    assert 0 < len(sources) == report.holds["pictures"] < 20
     assert len(report.html) <= 2_000_000
-    assert f"{8 - len(sources)} of the pictures of run 1" in report.left_out
+    assert f"{20 - len(sources)} of the pictures of run 1" in report.left_out
     sizes = {Image.open(BytesIO(b64decode(each.partition(",")[2]))).size for each in sources}
     assert sizes == {(640, 498)}
 

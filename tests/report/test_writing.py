@@ -38,7 +38,7 @@ def test_the_command_writes_a_file_says_what_it_holds_and_never_overwrites_unask
     line = ["report", "-o", str(report), "--database", str(file)]
     assert main(line) == 0
     said = capsys.readouterr().out
-    assert f"{report}: Run 1 of rover: short, 1." in said
+    assert f"{report}: Run 1 of rover: short, 0." in said
     assert "figures 1" in said
     assert b"Run 1 of rover: short" in report.read_bytes()
 

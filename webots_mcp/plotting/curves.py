@@ -97,8 +97,9 @@ class Panel:
 
     @property
     def unit(self) -> str | None:
-        """The unit of all of them."""
-        return self.curves[0].unit
+        """The unit of all of them; None where they have none, or several."""
+        units = {curve.unit for curve in self.curves}
+        return units.pop() if len(units) == 1 else None
 
     @property
     def names(self) -> list[str]:
@@ -112,7 +113,7 @@ class Panel:
 
     def suits(self, curve: Curve) -> bool:
         """Whether it has the unit and the scale of the others."""
-        if curve.unit != self.unit:
+        if curve.unit != self.curves[0].unit:
             return False
         together = [*self.curves, curve]
         height = max(each.high for each in together) - min(each.low for each in together)
@@ -163,3 +164,16 @@ def by_signal(curves: Sequence[Curve], most_panels: int) -> tuple[list[Panel], l
         Panel([curve for curve in curves if curve.name == name]) for name in names[:most_panels]
     ]
     return panels, names[most_panels:]
+
+
+def by_choice(
+    curves: Sequence[Curve], grouped: Sequence[Sequence[str]], most_panels: int
+) -> tuple[list[Panel], list[str]]:
+    """The curves of one run in the panels that are named; others by scale in what room is left."""
+    panels = [Panel([curve for curve in curves if curve.name in names]) for names in grouped]
+    panels = [panel for panel in panels if panel.curves][:most_panels]
+    drawn = {name for panel in panels for name in panel.names}
+    others, left_out = by_scale(
+        [curve for curve in curves if curve.name not in drawn], most_panels - len(panels)
+    )
+    return [*panels, *others], left_out

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Final
 
+from webots_mcp.naming import spelled_out
 from webots_mcp.plotting.canvas import (
     ON_PAPER,
     ROW_PX,
@@ -161,12 +162,18 @@ class _Painter:
         unit = [f"[{panel.unit}]"] if panel.unit else []
         room = self._canvas.width_px - 90
         if len(panel.names) == 1:
-            return [Entry(fitted(" ".join([panel.names[0], *unit]), room))]
+            part = "" if self._plot.colour_by_run else self._part(panel.curves[0])
+            return [Entry(fitted(" ".join([panel.names[0], *unit]), room), None, part)]
         entries = [
-            Entry(short(curve.name), line_sample(*self._pen(panel, index)), curve.name)
+            Entry(_named(curve, panel), line_sample(*self._pen(panel, index)), self._part(curve))
             for index, curve in enumerate(panel.curves)
         ]
         return [*entries, *map(Entry, unit)]
+
+    def _part(self, curve: Curve) -> str:
+        """By which a page finds it: of several runs all curves of one are hidden together."""
+        run = self._plot.colour_by_run.get(curve.run_id)
+        return f"run {curve.run_id}" if run is not None else f"curve {spelled_out(curve.name)}"
 
     def _pen(self, panel: Panel, index: int) -> tuple[str, str]:
         """Colour and dashes: by run where several are overlaid, else by signal."""
@@ -205,7 +212,7 @@ class _Painter:
 
     def _curve(self, frame: Frame, curve: Curve, colour: str, dash: str, count: int) -> None:
         canvas = self._canvas
-        canvas.open(data_curve=curve.name, data_run=curve.run_id)
+        canvas.open(data_part=self._part(curve))
         rows: Any = np.array(curve.points, np.float64)
         x = frame.px(rows[:, 0])
         mean, low, high = (frame.py(rows[:, column]) for column in (1, 2, 3))
@@ -312,9 +319,10 @@ class _Painter:
         """What the legend below the axes has to tell."""
         plot = self._plot
         entries: list[Entry] = []
-        for index, name in enumerate(plot.colour_by_run.values()):
+        for index, (run_id, name) in enumerate(plot.colour_by_run.items()):
             sample = line_sample(LINES[index % len(LINES)], DASHES[index % len(DASHES)])
-            entries.append(Entry(fitted(name, self._canvas.width_px - 80), sample))
+            room = self._canvas.width_px - 80
+            entries.append(Entry(fitted(name, room), sample, f"run {run_id}"))
         if plot.gaps:
             entries.append(Entry("nothing recorded", hatch_sample("hatch-gap")))
         if plot.unread:
@@ -331,6 +339,12 @@ class _Painter:
             Entry(short(value), area_sample(self._styles[value]))
             for value in _unnamed(plot.lanes, frame)
         ]
+
+
+def _named(curve: Curve, panel: Panel) -> str:
+    """With its own unit where that of the panel is not that of all."""
+    own = f" [{curve.unit}]" if curve.unit and not panel.unit else ""
+    return short(curve.name) + own
 
 
 def line_through(x: Any, y: Any) -> str:

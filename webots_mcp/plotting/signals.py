@@ -9,7 +9,7 @@ from dataclasses import replace
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.naming import listed
 from webots_mcp.plotting.canvas import LEAST_HEIGHT_PX, Picture, Room, Sheet
-from webots_mcp.plotting.curves import Curve, by_scale, by_signal, curve_of
+from webots_mcp.plotting.curves import Curve, by_choice, by_scale, by_signal, curve_of
 from webots_mcp.plotting.intervals import Interval, Lane, lane_of, merged_notes
 from webots_mcp.plotting.parts import (
     Part,
@@ -73,11 +73,13 @@ def compose_signals(
     bands: str | None = None,
     events: bool = True,
     room: Room | None = None,
+    grouped: Sequence[Sequence[str]] | None = None,
     deadline_s: float = QUESTION_DEADLINE_S,
 ) -> tuple[SignalAxes, tuple[str, ...]]:
     """What `plot_signals` paints, and its notes; arguments and errors as there.
 
-    `room` is how much it may be; None for that of a PNG of 900 x 500 pixels. `deadline_s` is for
+    `room` is how much it may be; None for that of a PNG of 900 x 500 pixels. `grouped` are the
+    signals of each panel; None puts those of one unit and scale together. `deadline_s` is for
     what is read of a range; what is not read in it is hatched, and a note says so.
     """
     room = room or Sheet().room
@@ -87,7 +89,10 @@ def compose_signals(
     )
     overlaid = len(parts) > 1
     curves = [curve for part in parts for curve in _curves(part)]
-    panels, left_out = (by_signal if overlaid else by_scale)(curves, room.panels)
+    if grouped and not overlaid:
+        panels, left_out = by_choice(curves, grouped, room.panels)
+    else:
+        panels, left_out = (by_signal if overlaid else by_scale)(curves, room.panels)
     behind, below = _behind_and_below(parts, mode if panels else None)
     if not panels and not below:
         raise NothingRecordedError(_nothing(parts))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from webots_mcp.naming import spelled_out
 from webots_mcp.plotting.canvas import (
     ON_PAPER,
     Canvas,
@@ -174,12 +175,12 @@ class _Painter:
             if each.outline:
                 corners = np.array(each.outline)
                 d = line_through(frame.px(corners[:, 0]), frame.py(corners[:, 1])) + "Z"
-            stroke = self._canvas.look.faint
-            self._canvas.add("path", d=d, stroke=stroke, data_name=each.name, **_OBSTACLE)
+            named = {"stroke": self._canvas.look.faint, "data_name": spelled_out(each.name)}
+            self._canvas.add("path", d=d, **named, **_OBSTACLE)
 
     def _way(self, frame: Frame, track: Track, index: int) -> None:
         canvas, path = self._canvas, track.path
-        canvas.open(data_track=index)
+        canvas.open(data_part=f"track {index}")
         for at in path.breaks:  # where nothing was recorded, or it leapt: what follows what
             leap = [path.places[at - 1], path.places[at]]
             self._line(frame, [leap], canvas.look.faint, 0.8, stroke_dasharray="1 2")
@@ -233,7 +234,7 @@ class _Painter:
 
     def _marks(self, frame: Frame, track: Track, index: int) -> None:
         canvas, path, ink = self._canvas, track.path, self._ink(index)
-        canvas.open(data_track=index)
+        canvas.open(data_part=f"track {index}")
         edge = {"stroke": canvas.look.ground, "stroke_width": 0.6}
         for each in headings(path, _ARROWS):
             at = (float(frame.px(each.x)), float(frame.py(each.y)))

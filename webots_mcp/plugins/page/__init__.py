@@ -1,6 +1,6 @@
 """A live page of a recording in the browser: `webots-mcp view`.
 
-A Bokeh server on loopback. It asks the same questions as the tools, on connections that cannot
+A server on loopback. It asks the same questions as the tools, on connections that cannot
 write; what a button does goes the way that the tools' commands go.
 """
 

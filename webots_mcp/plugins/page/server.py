@@ -6,35 +6,32 @@ programs of this computer, and web sites that a browser here shows, do not know 
 
 from __future__ import annotations
 
+import json
 import logging
-import re
 import secrets
-import socket
+import threading
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any, Final
+from urllib.parse import parse_qsl, urlsplit
 
-from bokeh.application import Application
-from bokeh.application.handlers import FunctionHandler
-from bokeh.server.server import BaseServer
-from bokeh.server.tornado import BokehTornado
-from tornado.httpserver import HTTPServer
-from tornado.httputil import HTTPHeaders, HTTPServerRequest
-from tornado.ioloop import IOLoop
-from tornado.routing import AnyMatches, HostMatches, Matcher, PathMatches, Rule, RuleRouter
-from tornado.web import Application as WebApplication
-from tornado.web import OutputTransform, RequestHandler
-
-from webots_mcp.errors import InvalidInputError
+from webots_mcp.errors import InvalidInputError, WebotsMCPError
+from webots_mcp.plotting.on_a_page import figure_part
 from webots_mcp.plugins.page.chunk_maker import ChunkMaker
-from webots_mcp.plugins.page.tab import open_tab
+from webots_mcp.plugins.page.page_data import choice_of, draw, look, picture, problem
 from webots_mcp.store.recording import Recording
 
 HOST: Final = "127.0.0.1"
-_NAMES: Final = (HOST, "localhost")
-_HOSTS: Final = r"^(127\.0\.0\.1|localhost)$"
-MOST_TABS: Final = 20  # each reads the recording ten times a second
+MOST_TABS: Final = 20  # each reads the recording five times a second
+ORDERS: Final = ("pause", "resume", "step", "reset")
+_TAB_S: Final = 15.0  # for so long a tab counts as open after it asked
+_MOST_BYTES: Final = 100_000  # of a request
+_log: Final = logging.getLogger(__name__)
+_PARTS: Final = Path(__file__).parent / "parts"
+_TYPES: Final = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
 _FOREIGN: Final = (
     "This page is shown to requests for 127.0.0.1 and localhost only: another name may be one that "
     "a web site has pointed here.\n"
@@ -47,70 +44,69 @@ _FULL: Final = (
     f"{MOST_TABS} tabs of this page are open: close one, wait a quarter of a minute, and open this "
     "one again.\n"
 )
+_HEADERS: Final = {  # no other page may show it, or be told its address; it loads its own parts
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; "
+    "style-src 'self' 'unsafe-inline'; img-src data:; connect-src 'self'; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'",
+    "X-Frame-Options": "DENY",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
 
 
-class _Refusal(RequestHandler):
-    """What a request is answered with that the page is not for."""
+class PageServer(ThreadingHTTPServer):
+    """A server that listens; `run` serves until it is interrupted.
 
-    def initialize(self, status: int, why: str) -> None:
-        self._refused = status, why
+    Attributes:
+        token: Below which the page is.
+        recording: What is shown; commands go through it unless `read_only`.
+    """
 
-    def prepare(self) -> None:
-        status, why = self._refused
-        self.set_status(status)
-        self.set_header("Content-Type", "text/plain; charset=utf-8")
-        answer: Any = self
-        answer.finish(why)
+    daemon_threads = True
 
-
-class _Guarded(OutputTransform):
-    """What each answer tells the browser: no other page may show it, or be told its address."""
-
-    def transform_first_chunk(
-        self, status_code: int, headers: HTTPHeaders, chunk: bytes, finishing: bool
-    ) -> tuple[int, HTTPHeaders, bytes]:
-        headers["Content-Security-Policy"] = "frame-ancestors 'none'"
-        headers["X-Frame-Options"] = "DENY"
-        headers["Referrer-Policy"] = "no-referrer"
-        return status_code, headers, chunk
-
-
-class _OneTooMany(Matcher):
-    """Matches what would open a further tab while no more may be open."""
-
-    def __init__(self, path: str, pages: BokehTornado) -> None:
-        self._path, self._pages = path, pages
-
-    def match(self, request: HTTPServerRequest) -> dict[str, Any] | None:
-        opens = request.path.rstrip("/") == self._path
-        return {} if opens and len(self._pages.get_sessions("/")) >= MOST_TABS else None
-
-
-@dataclass(frozen=True)
-class PageServer:
-    """A server that listens; `run` serves until it is interrupted."""
-
-    server: BaseServer
-    port: int
-    token: str
-    chunk_maker: ChunkMaker
+    def __init__(self, recording: Recording, port: int, *, read_only: bool) -> None:
+        super().__init__((HOST, port), _Request)
+        self.recording, self.read_only = recording, read_only
+        self.steered = replace(recording, read_only=False)
+        self.token = secrets.token_urlsafe(18)
+        self.chunk_maker = ChunkMaker(recording)
+        self._tabs: dict[str, float] = {}  # when each has asked last, on the monotonic clock
+        self._said: set[str] = set()
+        self._lock = threading.Lock()
 
     @property
     def url(self) -> str:
         """Where the page is."""
-        return f"http://{HOST}:{self.port}/{self.token}/"
+        return f"http://{HOST}:{self.server_port}/{self.token}/"
 
     def run(self, ready: Callable[[str], object]) -> None:
         """Serve, and tell `ready` the address as soon as a browser may ask."""
-        self.server.start()
         self.chunk_maker.start()
-        loop: Any = self.server.io_loop
-        loop.add_callback(ready, self.url)
+        ready(self.url)  # what asks now waits until it is served
         try:
-            loop.start()
+            self.serve_forever(poll_interval=0.1)
         finally:
-            self.server.stop(wait=False)
             self.chunk_maker.stop()
+            self.server_close()
+
+    def has_room_for(self, tab: str) -> bool:
+        """Whether a tab is one of those that are open, or may be opened."""
+        now_s = time.monotonic()
+        with self._lock:
+            self._tabs = {each: at for each, at in self._tabs.items() if now_s - at < _TAB_S}
+            if tab not in self._tabs and len(self._tabs) >= MOST_TABS:
+                return False
+            self._tabs[tab] = now_s
+            return True
+
+    def log_once(self, error: Exception) -> None:
+        """Write more about an error that nobody foresaw: once, not at each look."""
+        with self._lock:
+            is_new = repr(error) not in self._said
+            self._said.add(repr(error))
+        if is_new:
+            _log.error("the page cannot show all", exc_info=error)
 
 
 def create_page_server(recording: Recording, port: int, *, read_only: bool = False) -> PageServer:
@@ -124,53 +120,122 @@ def create_page_server(recording: Recording, port: int, *, read_only: bool = Fal
     Raises:
         InvalidInputError: The port is taken.
     """
-    logging.getLogger("bokeh").setLevel(logging.ERROR)  # a tab that was closed is no news
-    logging.getLogger("tornado.access").setLevel(logging.ERROR)
     try:
-        listening = _listening(port)
+        return PageServer(recording, port, read_only=read_only)
     except (OSError, OverflowError) as error:
         raise InvalidInputError(
             f"port {port} of {HOST} cannot be listened on: {error}; choose another by --port, or 0 "
             "for any that is free"
         ) from error
-    chunk_maker = ChunkMaker(recording)
-    application = Application(FunctionHandler(partial(open_tab, recording, read_only, chunk_maker)))
-    port = int(listening.getsockname()[1])
-    origins = [f"{name}:{port}" for name in _NAMES]
-    token = secrets.token_urlsafe(18)
-    pages = BokehTornado(
-        {"/": application},
-        prefix=token,
-        extra_websocket_origins=origins,
-        secret_key=secrets.token_bytes(32),
-        sign_sessions=True,  # a session is begun by loading the page, and by nothing else
-        transforms=[_Guarded],
-    )
-    http = HTTPServer(_router(token, pages))
-    http.add_sockets([listening])
-    return PageServer(BaseServer(IOLoop.current(), pages, http), port, token, chunk_maker)
 
 
-def _router(token: str, pages: BokehTornado) -> RuleRouter:
-    """The page alone below its token, without what would put it into a page of others."""
-    of_page = RuleRouter([
-        Rule(PathMatches(f"/{re.escape(token)}/autoload.js"), _refusing(403, _UNTOLD)),
-        Rule(_OneTooMany(f"/{token}", pages), _refusing(503, _FULL)),
-        Rule(PathMatches(f"/{re.escape(token)}(/.*)?"), pages),
-        Rule(AnyMatches(), _refusing(403, _UNTOLD)),
-    ])  # fmt: skip
-    return RuleRouter([
-        Rule(HostMatches(_HOSTS), of_page), Rule(AnyMatches(), _refusing(403, _FOREIGN)),
-    ])  # fmt: skip
+class _Request(BaseHTTPRequestHandler):
+    """One connection of a browser."""
+
+    protocol_version = "HTTP/1.1"
+    server_version = "webots-mcp"
+
+    def do_GET(self) -> None:
+        if (path := self._path()) is None:
+            return
+        if path == "":
+            self._answer(200, (_PARTS / "page.html").read_bytes(), "text/html")
+        elif path in ("figure.js", "figure.css"):
+            self._answer(200, figure_part(path).encode(), _TYPES[Path(path).suffix])
+        elif path in ("page.js", "page.css"):
+            self._answer(200, (_PARTS / path).read_bytes(), _TYPES[Path(path).suffix])
+        elif path in _QUESTIONS:
+            self._ask(_QUESTIONS[path])
+        else:
+            self._refuse(404, "There is no such page.\n")
+
+    def do_POST(self) -> None:
+        """Steer: what the page itself sends, which no form of another page can."""
+        if (path := self._path()) is None:
+            return
+        length = int(self.headers.get("Content-Length") or 0)
+        if path != "steer" or self._page.read_only or length > _MOST_BYTES:
+            return self._refuse(403, "This page only shows.\n")
+        own = {f"http://{name}:{self._page.server_port}" for name in (HOST, "localhost")}
+        is_json = self.headers.get("Content-Type") == "application/json"
+        if not is_json or self.headers.get("Origin") not in own:
+            return self._refuse(403, "Orders are taken from the page itself only.\n")
+        body = json.loads(self.rfile.read(length))
+        self._ask(lambda server, asked: _steer(server, asked, body))
+
+    @property
+    def _page(self) -> PageServer:
+        assert isinstance(self.server, PageServer)
+        return self.server
+
+    def _path(self) -> str | None:
+        """The path below the token; None where the request was refused."""
+        host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
+        if host not in (HOST, "localhost"):
+            return self._refuse(403, _FOREIGN)
+        path = urlsplit(self.path).path.removeprefix("/")
+        token, slash, rest = path.partition("/")
+        if not slash or not secrets.compare_digest(token.encode(), self._page.token.encode()):
+            return self._refuse(403, _UNTOLD)
+        return rest
+
+    def _ask(self, question: Callable[[PageServer, dict[str, str]], dict[str, Any]]) -> None:
+        asked = dict(parse_qsl(urlsplit(self.path).query))
+        if not self._page.has_room_for(asked.get("tab", "")):
+            return self._refuse(503, _FULL)
+        try:
+            answer = question(self._page, asked)
+        except WebotsMCPError as error:
+            answer = problem(error)
+        except Exception as error:  # noqa: BLE001  (the page would stand still without a word)
+            self._page.log_once(error)
+            answer = problem(error)
+        self._answer(200, json.dumps(answer).encode(), "application/json")
+
+    def _refuse(self, status: int, why: str) -> None:
+        self.close_connection = True
+        self._answer(status, why.encode(), "text/plain")
+
+    def _answer(self, status: int, body: bytes, media_type: str) -> None:
+        self.send_response(status)
+        for name, value in _HEADERS.items():
+            self.send_header(name, value)
+        self.send_header("Content-Type", f"{media_type}; charset=utf-8")
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        try:
+            self.wfile.write(body)
+        except OSError:  # a tab that was closed is no news
+            self.close_connection = True
+
+    def log_message(self, format: str, *args: Any) -> None:  # noqa: A002
+        """Say nothing: the terminal is for what a person must know."""
 
 
-def _refusing(status: int, why: str) -> WebApplication:
-    return WebApplication(
-        [(r".*", _Refusal, {"status": status, "why": why})], transforms=[_Guarded]
-    )
+def _look(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
+    found = look(server.recording, choice_of(asked), steers=not server.read_only)
+    orders = () if server.read_only else ORDERS
+    return found | {"orders": orders, "rounds": server.chunk_maker.rounds}
 
 
-def _listening(port: int) -> socket.socket:
-    made = socket.create_server((HOST, port), backlog=128)
-    made.setblocking(False)
-    return made
+def _draw(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
+    drawn = draw(server.recording, choice_of(asked))
+    if drawn.get("is_cut") and server.chunk_maker.says:
+        drawn["notes"].insert(0, server.chunk_maker.says)
+    return drawn
+
+
+def _picture(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
+    return picture(server.recording, choice_of(asked))
+
+
+def _steer(server: PageServer, asked: dict[str, str], body: dict[str, Any]) -> dict[str, Any]:
+    from webots_mcp.plugins.page.steering_buttons import steer, tune
+
+    robot = asked.get("robot", "")
+    if body.get("order") in ORDERS:
+        return steer(server.steered, robot, body["order"])
+    return tune(server.steered, robot, str(body.get("name")), body["value"])
+
+
+_QUESTIONS: Final = {"look": _look, "draw": _draw, "picture": _picture}

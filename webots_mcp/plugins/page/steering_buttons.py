@@ -1,8 +1,11 @@
-"""What the buttons and inputs of a tab do: the way that the tools' own commands go."""
+"""What the buttons and inputs of the page do: the way that the tools' own commands go."""
 
 from __future__ import annotations
 
-from typing import Any, Final, NamedTuple
+from functools import partial
+from typing import Any, Final
+
+import anyio
 
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.parameter import Value
@@ -13,40 +16,34 @@ from webots_mcp.steering.routes import Attempt
 from webots_mcp.store.recording import Recording
 from webots_mcp.webots.orders import Order
 
-ORDERS: Final[tuple[Order, ...]] = ("pause", "resume", "step", "reset")
 _WAIT_S: Final = 10.0
 
 
-class Told(NamedTuple):
-    """What came of an order, in words, and whether it was done."""
-
-    text: str
-    is_done: bool = False
-
-
-async def steer(recording: Recording, robot: str, order: Order) -> Told:
-    """Give an order to the simulation of a robot, and say what came of it."""
+def steer(recording: Recording, robot: str, order: Order) -> dict[str, Any]:
+    """Give an order to the simulation of a robot; answers in words what came of it."""
     params = {"steps": 1} if order == "step" else {}
     dispatcher = Dispatcher(recording, _silent)
     attempt = Attempt(recording, dispatcher, robot, _WAIT_S, order, params)
-    return await _told(order, attempt.steer())
+    return _told(order, attempt.steer)
 
 
-async def tune(recording: Recording, robot: str, name: str, value: Value) -> Told:
+def tune(recording: Recording, robot: str, name: str, value: Value) -> dict[str, Any]:
     """Set one parameter of a robot's controller, and say what came of it."""
-    setting = set_parameters(recording, _silent, {name: value}, robot=robot, timeout_s=_WAIT_S)
-    return await _told(f"{name} = {value!r}", setting)
+    setting = partial(
+        set_parameters, recording, _silent, {name: value}, robot=robot, timeout_s=_WAIT_S
+    )
+    return _told(f"{name} = {value!r}", setting)
 
 
-async def _told(what: str, asked: Any) -> Told:
+def _told(what: str, ask: Any) -> dict[str, Any]:
     try:
-        answer: CommandAnswer = await asked
+        answer: CommandAnswer = anyio.run(ask)
     except WebotsMCPError as error:
-        return Told(f"{what}: {error}")
+        return {"text": f"{what}: {error}", "is_done": False}
     if answer.outcome == "done":
-        return Told(f"{what}: done", is_done=True)
+        return {"text": f"{what}: done", "is_done": True}
     why = answer.error or answer.hint or "no answer in time"
-    return Told(f"{what}: not done ({answer.outcome}): {why}")
+    return {"text": f"{what}: not done ({answer.outcome}): {why}", "is_done": False}
 
 
 async def _silent(waited_s: float, of_s: float | None, text: str) -> None:

@@ -1,6 +1,6 @@
 """Reports: one or two runs as one HTML file that needs nothing else, to read and to send.
 
-Jinja2 and Bokeh are imported with the first report.
+Jinja2 is imported with the first report.
 """
 
 from webots_mcp.plugins import Plugin, PluginCommand

@@ -1,4 +1,4 @@
-"""The interactive figures of a report, as marks for its page; Bokeh's script goes in with them."""
+"""The figures of a report, as markup for its page."""
 
 from __future__ import annotations
 
@@ -6,43 +6,35 @@ import sqlite3
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.plotting.canvas import Room
+from webots_mcp.plotting.on_a_page import Figure, signals_figure, way_figure
+from webots_mcp.plotting.signals import compose_signals
+from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plugins.report.chapter import Chapter, Moment
-from webots_mcp.store.reading.catalogue import known_signals, resolve_signals
+from webots_mcp.plugins.report.obstacles import obstacles_of
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 from webots_mcp.store.signals import Signal
 
-if TYPE_CHECKING:
-    from webots_mcp.plugins.report.charts import Chart
-
 MOST_SIGNALS: Final = 16
-_PANELS: Final = 12
-_POINTS: Final = 500
-_MOMENT_POINTS: Final = 200
-
-
-def library() -> str:
-    """Bokeh's own script, as it stands in the page."""
-    from bokeh.resources import Resources
-
-    return Resources(mode="inline", components=["bokeh"]).render_js()
+_ROOM: Final = Room(points=500, panels=12, lanes=8, rows=16)
+_ROOM_OF_A_MOMENT: Final = Room(points=200, panels=2, lanes=1, rows=0)
+_MOMENT_PX: Final = 700
 
 
 @dataclass(frozen=True)
 class Figures:
-    """Figures as marks.
+    """Figures as markup.
 
     Attributes:
-        script: What draws them all.
-        marks: Where each goes, by its key.
+        marks: Each by its key.
         titles: What each shows.
         notes: What is not in each.
         left_out: What is in none.
     """
 
-    script: str = ""
     marks: Mapping[str, str] = field(default_factory=dict[str, str])
     titles: Mapping[str, str] = field(default_factory=dict[str, str])
     notes: Mapping[str, Sequence[str]] = field(default_factory=dict[str, Sequence[str]])
@@ -51,7 +43,7 @@ class Figures:
     @property
     def size_bytes(self) -> int:
         """What they take in the page."""
-        return len(self.script.encode()) + sum(len(mark) for mark in self.marks.values())
+        return sum(len(mark.encode()) for mark in self.marks.values())
 
 
 def figures_of(
@@ -81,12 +73,12 @@ def figures_of(
     count = max(map(len, chosen.values()), default=0)
     while True:
         first = {run_id: had[:count] for run_id, had in chosen.items()}
-        charts = _charts(connection, chapters, first, both[:count], with_moments=count > 1)
+        drawn = _drawn_of(connection, chapters, first, both[:count], with_moments=count > 1)
         if not both[:count] and len([each for each in chapters if each.range is not None]) > 1:
-            charts.not_drawn.append(f"the signals of both runs: {_why_none(known, names)}")
-        made = _embedded(charts.drawn)
+            drawn.not_drawn.append(f"the signals of both runs: {_why_none(known, names)}")
+        made = _embedded(drawn.drawn)
         if made.size_bytes <= room_bytes:
-            return replace(made, left_out=[*_curves_missing(chapters, first), *charts.not_drawn])
+            return replace(made, left_out=[*_curves_missing(chapters, first), *drawn.not_drawn])
         if count <= 1:
             return Figures(left_out=("the figures: they would take more than the file may",))
         count //= 2
@@ -135,12 +127,12 @@ def _why_none(known: Sequence[dict[str, Signal]], names: Sequence[str]) -> str:
     return "they share no numeric signals"
 
 
-class _Charts:
-    """The charts of a report by their keys, and why others could not be drawn."""
+class _Drawn:
+    """The figures of a report by their keys, and why others could not be drawn."""
 
     def __init__(self, connection: sqlite3.Connection) -> None:
         self._connection = connection
-        self.drawn: dict[str, Chart] = {}
+        self.drawn: dict[str, Figure] = {}
         self.not_drawn: list[str] = []
 
     def alone(self, run_id: int, whole: TimeRange, names: Sequence[str]) -> None:
@@ -155,23 +147,18 @@ class _Charts:
             self._add("signals both", "the signals of both runs", self._signals, ranges, names)
         self._add("way both", "the ways of both runs", self._way, ranges)
 
-    def _add(self, key: str, what: str, draw: Callable[..., Chart], *asked: Any) -> None:
+    def _add(self, key: str, what: str, draw: Callable[..., Figure], *asked: Any) -> None:
         try:
             self.drawn[key] = draw(*asked)
         except (InvalidInputError, NothingRecordedError) as error:
             self.not_drawn.append(f"{what}: {error}")
 
-    def _signals(self, ranges: Sequence[TimeRange], names: Sequence[str]) -> Chart:
-        from webots_mcp.plotting.canvas import Room
-        from webots_mcp.plugins.report.charts import signals_chart
+    def _signals(self, ranges: Sequence[TimeRange], names: Sequence[str]) -> Figure:
+        return signals_figure(*compose_signals(self._connection, ranges, names, room=_ROOM))
 
-        room = Room(points=_POINTS, panels=_PANELS, lanes=8, rows=16)
-        return signals_chart(self._connection, ranges, names, room=room)
-
-    def _way(self, ranges: Sequence[TimeRange]) -> Chart:
-        from webots_mcp.plugins.report.charts import way_chart
-
-        return way_chart(self._connection, ranges)
+    def _way(self, ranges: Sequence[TimeRange]) -> Figure:
+        plot, notes = compose_trajectory(self._connection, ranges)
+        return way_figure(plot, notes, obstacles_of(self._connection, ranges))
 
     def around(self, chapter: Chapter, moment: Moment) -> None:
         """The signals that an event is about, or the usual ones, in the seconds around it."""
@@ -182,46 +169,39 @@ class _Charts:
                 self.drawn[moment_key(chapter, moment)] = self._seconds(chapter, moment, names)
                 return
 
-    def _seconds(self, chapter: Chapter, moment: Moment, names: Sequence[str]) -> Chart:
-        from webots_mcp.plotting.canvas import Room
-        from webots_mcp.plugins.report.charts import signals_chart
-
+    def _seconds(self, chapter: Chapter, moment: Moment, names: Sequence[str]) -> Figure:
         scope = Scope(run_id=chapter.info.run_id, start_s=moment.start_s, end_s=moment.end_s)
         around = find_range(self._connection, scope)
-        room = Room(points=_MOMENT_POINTS, panels=2, lanes=1, rows=0)
-        chart = signals_chart(self._connection, [around], names, events=False, room=room)
-        grid: Any = chart.layout
-        grid.toolbar_location = None  # the small figure has no room for it
-        return chart
+        composed = compose_signals(
+            self._connection, [around], names, events=False, room=_ROOM_OF_A_MOMENT
+        )
+        return signals_figure(*composed, width_px=_MOMENT_PX)
 
 
-def _charts(
+def _drawn_of(
     connection: sqlite3.Connection,
     chapters: Sequence[Chapter],
     chosen: Mapping[int, Sequence[str]],
     both: Sequence[str],
     *,
     with_moments: bool,
-) -> _Charts:
-    charts = _Charts(connection)
+) -> _Drawn:
+    drawn = _Drawn(connection)
     ranges = [each.range for each in chapters if each.range is not None]
     if len(ranges) > 1:
-        charts.overlaid(ranges, both)
+        drawn.overlaid(ranges, both)
     for chapter in chapters:
         if chapter.range is not None:
             run_id = chapter.info.run_id
-            charts.alone(run_id, chapter.range, chosen[run_id])
+            drawn.alone(run_id, chapter.range, chosen[run_id])
         for moment in chapter.moments if with_moments else ():
-            charts.around(chapter, moment)
-    return charts
+            drawn.around(chapter, moment)
+    return drawn
 
 
-def _embedded(charts: Mapping[str, Chart]) -> Figures:
-    from bokeh.embed import components
-
-    if not charts:
-        return Figures()
-    embed: Any = components
-    script, marks = embed({key: chart.layout for key, chart in charts.items()})
-    titles = {key: chart.title for key, chart in charts.items()}
-    return Figures(script, marks, titles, {key: chart.notes for key, chart in charts.items()})
+def _embedded(figures: Mapping[str, Figure]) -> Figures:
+    return Figures(
+        {key: figure.markup for key, figure in figures.items()},
+        {key: figure.title for key, figure in figures.items()},
+        {key: figure.notes for key, figure in figures.items()},
+    )

@@ -13,9 +13,10 @@ from webots_mcp import __version__
 from webots_mcp.contract import make_folder, whole_file
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.naming import spelled_out
+from webots_mcp.plotting.on_a_page import figure_part
 from webots_mcp.plugins.report.chapter import Chapter, chapter_of
 from webots_mcp.plugins.report.comparison import Beside, beside
-from webots_mcp.plugins.report.figures import Figures, figures_of, library, moment_key
+from webots_mcp.plugins.report.figures import Figures, figures_of, moment_key
 from webots_mcp.plugins.report.run_pictures import Pictures, pictures_of
 from webots_mcp.plugins.report.words import clock, counted, size
 from webots_mcp.store.reading.segment import in_one_snapshot
@@ -23,12 +24,12 @@ from webots_mcp.store.recording import left_out_so_far
 from webots_mcp.store.run_rows import fetch_run
 
 MAX_MB: Final = 10.0
-MIN_MB: Final = 2.0  # Bokeh's script takes more than half of it
+MIN_MB: Final = 2.0
 MOST_RUNS: Final = 2
 DEADLINE_S: Final = 12.0  # for all searches in values: a report may take a while
-_SHARE_OF_TEXTS: Final = 0.35  # of what Bokeh's script leaves; then the figures have
+_SHARE_OF_TEXTS: Final = 0.35  # of the room; then the figures have
 _SHARE_OF_FIGURES: Final = 0.7  # of the rest, and the pictures what remains
-_FRAME_BYTES: Final = 40_000  # style, headings, facts: all that is not shared out
+_FRAME_BYTES: Final = 60_000  # style, script, headings, facts: all that is not shared out
 
 Progress = Callable[[int, int], None]
 
@@ -78,8 +79,7 @@ def make_report(
     for run_id in run_ids:
         fetch_run(connection, run_id)
     done = _Steps(progress, 2 * len(run_ids) + 3)
-    script = library()
-    room_bytes = max_mb * 1e6 - len(script.encode()) - _FRAME_BYTES
+    room_bytes = max_mb * 1e6 - _FRAME_BYTES
     texts_bytes = _SHARE_OF_TEXTS * room_bytes
     chapters: list[Chapter] = []
     count = len(run_ids)
@@ -92,7 +92,7 @@ def make_report(
     differing = compared.differing if compared is not None else ()
     figures = figures_of(connection, chapters, names, differing, figures_bytes)
     done.step()
-    page = Page(_title(chapters), time.time(), max_mb, script, chapters, compared, figures)
+    page = Page(_title(chapters), time.time(), max_mb, chapters, compared, figures)
     rest_bytes = max_mb * 1e6 - len(render(page))
     for chapter in chapters:
         pictures = _pictures(connection, chapter, data_dir, rest_bytes / len(chapters))
@@ -169,7 +169,7 @@ def _holds(page: Page) -> dict[str, int]:
 
 
 _TEMPLATES: Final = Path(__file__).parent / "templates"
-# Nothing may be loaded, whatever a text of the recording says; Bokeh's own parts are inside.
+# Nothing may be loaded, whatever a text of the recording says; the script of the figures is inside.
 _POLICY: Final = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src data: blob:; font-src data:; base-uri 'none'; form-action 'none'"
@@ -183,7 +183,6 @@ class Page:
     Attributes:
         made_wall_time_s: When it was made.
         max_mb: What it may take.
-        library: Bokeh's script.
         beside: The comparison of two runs; None of one.
         pictures: By run.
         left_out: What is not in it.
@@ -193,7 +192,6 @@ class Page:
     title: str
     made_wall_time_s: float
     max_mb: float
-    library: str
     chapters: Sequence[Chapter]
     beside: Beside | None
     figures: Figures
@@ -210,6 +208,7 @@ def _spelled_out(value: object) -> object:
 def render(page: Page) -> bytes:
     """The file. Every text of the recording is escaped: it is shown, and never run."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup
 
     environment = Environment(
         loader=FileSystemLoader(_TEMPLATES),
@@ -227,6 +226,8 @@ def render(page: Page) -> bytes:
         "size": size(page.size_bytes or 0),
         "counted": counted,
         "moment_key": moment_key,
+        "script": Markup(figure_part("figure.js")),
+        "figure_style": Markup(figure_part("figure.css")),
     }
     return environment.get_template("report.html").render(told).encode("utf-8", "replace")
 

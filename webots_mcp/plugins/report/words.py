@@ -69,7 +69,7 @@ def clock(wall_time_s: float) -> str:
 
 def size(size_bytes: int) -> str:
     """The size of a file."""
-    return f"{size_bytes / 1e6:.1f} MB"
+    return f"{size_bytes / 1e6:.{1 if size_bytes >= 1e6 else 2}f} MB"
 
 
 def share(part: float, whole: float) -> str:

@@ -5,36 +5,22 @@ from __future__ import annotations
 import math
 import sqlite3
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from webots_mcp.plotting.trajectory_axes import Obstacle
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.robots import world_seen
 from webots_mcp.store.run_rows import Run, fetch_run
 
 if TYPE_CHECKING:
     from webots_mcp.standin.arena import Body
-    from webots_mcp.standin.geometry import Shape
+    from webots_mcp.standin.shapes import Shape
 
 _MOST_BYTES: Final = 1_000_000  # of a world file: reading a larger one would take seconds
 _CORNERS: Final = ((1, 1), (-1, 1), (-1, -1), (1, -1))
 _SIDES: Final = 24  # of what a circle is drawn as
-
-
-@dataclass(frozen=True)
-class Obstacle:
-    """Something that stands in a world.
-
-    Attributes:
-        outline: Its corners, seen from above, in metres; empty where its size is not known.
-    """
-
-    name: str
-    x: float
-    y: float
-    outline: tuple[tuple[float, float], ...] = ()
 
 
 def obstacles_of(
@@ -64,7 +50,7 @@ def _of_file(run: Run) -> tuple[Obstacle, ...]:
 @lru_cache(maxsize=8)
 def _standing(file: Path, _changed_ns: int) -> tuple[Obstacle, ...]:
     from webots_mcp.standin.arena import Arena
-    from webots_mcp.standin.vrml import WorldError
+    from webots_mcp.standin.standin_errors import WorldError
     from webots_mcp.standin.world import load_world
 
     try:
@@ -82,7 +68,7 @@ def _outlines(body: Body) -> Iterator[Obstacle]:
 
 
 def _corners(shape: Shape) -> tuple[tuple[float, float], ...]:
-    from webots_mcp.standin.geometry import Disc
+    from webots_mcp.standin.shapes import Disc
 
     if isinstance(shape, Disc):
         angles = [math.tau * side / _SIDES for side in range(_SIDES)]

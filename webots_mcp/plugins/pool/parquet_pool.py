@@ -184,7 +184,7 @@ class ParquetShipment:
             else:
                 whole = as_arrow(table, added)
                 if held is not None:
-                    whole = package("pyarrow").concat_tables([held, whole]).combine_chunks()
+                    whole = package("pyarrow").concat_tables([held, whole])
             content = encoded(table, whole)
             self._place(path, content)
             is_over |= _is_over(content, whole, counts.get(folder, 0))

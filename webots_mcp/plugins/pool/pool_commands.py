@@ -302,10 +302,8 @@ def ship(
     try:
         if follow:
             _say(f"shipping to {redacted(url)} until Ctrl-C")
-            pause_s = pause_s or (
-                2.0 if is_postgres(url) else 60.0
-            )  # of small files a pool has soon many
-            follow_recording(order, report, _say, pause_s)
+            default_s = 2.0 if is_postgres(url) else 60.0  # of small files there are soon many
+            follow_recording(order, report, _say, pause_s or default_s)
         else:
             ship_once(order, report)
             is_done = True

@@ -190,13 +190,17 @@ def fitted(batch: Batch, replaced: Counter[str]) -> Batch:
     """
     columns: list[Sequence[SQLValue]] = [*zip(*batch.rows, strict=True)]
     described = zip(batch.table.columns, batch.table.types, columns, strict=True)
-    for at, (name, kind, values) in enumerate(described):
-        if not set(map(type, values)) <= {kind, type(None)}:
-            nullable = name in batch.table.nullable
-            columns[at] = [_nearest(value, kind, nullable=nullable) for value in values]
-            pairs = zip(columns[at], values, strict=True)
-            replaced[f"{batch.table.name}.{name}"] += sum(new != old for new, old in pairs)
-    return Batch(batch.table, [*zip(*columns, strict=True)])
+    others = [
+        (at, name, kind)
+        for at, (name, kind, values) in enumerate(described)
+        if not set(map(type, values)) <= {kind, type(None)}
+    ]
+    for at, name, kind in others:
+        values, nullable = columns[at], name in batch.table.nullable
+        columns[at] = [_nearest(value, kind, nullable=nullable) for value in values]
+        pairs = zip(columns[at], values, strict=True)
+        replaced[f"{batch.table.name}.{name}"] += sum(new != old for new, old in pairs)
+    return Batch(batch.table, [*zip(*columns, strict=True)]) if others else batch
 
 
 def _nearest(value: SQLValue, kind: Kind, *, nullable: bool) -> SQLValue:

@@ -221,6 +221,15 @@ def test_a_row_replaces_the_one_of_its_key_but_what_lasts_is_not_lost(tmp_path: 
     assert found == [(1, "done", 4, None), (2, "claimed", 4, None), (3, "done", None, "e")]
 
 
+def test_what_is_listed_is_what_was_written_last(tmp_path: Path) -> None:
+    with shipping(tmp_path) as shipment:
+        for step in STEPS:
+            shipment.write(step, {})
+    with ParquetPool(str(tmp_path)) as pool:
+        found = {uuid: row[-1] for _, (_, _, uuid, *row) in pool.listed("run")}
+    assert found == {"run-1": 6, "run-2": 0}
+
+
 def test_a_row_without_a_time_is_on_no_day(tmp_path: Path) -> None:
     with shipping(tmp_path) as shipment:
         shipment.write([batch("log", {"id": 1}), logs(2, wall_time_s=1e300)], {})

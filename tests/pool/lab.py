@@ -8,6 +8,8 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from tests.recordings.runs import Recorded
 from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME, new_uuid
@@ -17,6 +19,9 @@ from webots_mcp.plugins.pool.pool_interface import Pool, Target
 from webots_mcp.plugins.pool.shipping import Order, Report, ship
 from webots_mcp.store.parameters import Result, create_trial_set, finish_trial, trials_of
 from webots_mcp.store.recording import Recording
+
+POSTGRES = pytest.param("postgres", marks=pytest.mark.slow)
+IN_EACH_POOL = pytest.mark.parametrize("lab", ["parquet", POSTGRES], indirect=True)
 
 
 class Lab:

@@ -11,12 +11,12 @@ from typing import Any
 
 from webots_mcp.errors import PoolBusyError, PoolError, PoolUnavailableError
 from webots_mcp.plugins.pool.pool_interface import (
+    LISTED,
     Batch,
     PooledSize,
     SQLValue,
     Table,
     batches,
-    table,
     tables,
 )
 from webots_mcp.store.questions.sql import Result, query_sql
@@ -164,8 +164,6 @@ def _write(table: Table) -> str:
 class SQLitePool:
     """As `open_pool` gives one, for a file that `SQLiteTarget` writes."""
 
-    keeps_order = True
-
     def __init__(self, file: Path) -> None:
         self.address = f"sqlite:{file}"
         self._connection = sqlite3.connect(file, isolation_level=None)
@@ -176,11 +174,10 @@ class SQLitePool:
     def __exit__(self, *exception: object) -> None:
         self._connection.close()
 
-    def records(self, name: str) -> Iterator[tuple[str, dict[str, Any]]]:
-        columns = table(name).columns
-        query = f"SELECT recording_uuid, {', '.join(columns)} FROM {name}"
+    def listed(self, name: str) -> Iterator[tuple[str, Sequence[Any]]]:
+        query = f"SELECT recording_uuid, {', '.join(LISTED[name])} FROM {name}"
         for owner, *row in self._connection.execute(query).fetchall():
-            yield owner, dict(zip(columns, row, strict=True))
+            yield owner, row
 
     def sizes(self) -> Iterator[PooledSize]:
         for each in tables():

@@ -16,7 +16,7 @@ from typing import Any, cast
 
 import pytest
 
-from tests.pool.lab import Lab
+from tests.pool.lab import IN_EACH_POOL, Lab
 from tests.recordings.answers import answers
 from tests.recordings.rounds import PART, record_rounds
 from tests.recordings.runs import Recorded
@@ -24,9 +24,7 @@ from tests.store.export.test_export import publish
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, new_uuid
-from webots_mcp.errors import InvalidInputError, PoolError
-from webots_mcp.plugins.pool import fetching
-from webots_mcp.plugins.pool.fetching import in_order
+from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.pool.pool_contents import open_pool, open_target, pooled_runs
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.chunk_making import make_chunks
@@ -42,8 +40,6 @@ LOCAL = {"id", "run_id", "session_id", "robot_id", "command_id", "trial_set_id",
          "is_chunked", "idempotency_key"}  # fmt: skip
 
 
-STATES = ("state", "kept_state")
-IN_EACH_POOL = pytest.mark.parametrize("lab", ["parquet", "postgres"], indirect=True)
 TIMES = "SELECT id FROM chunk WHERE run_id = 1 AND signal_id = 0 ORDER BY group_id LIMIT 1 OFFSET 1"
 KEPT = "SELECT sim_time_s, data, replaced FROM {} WHERE run_id = ? ORDER BY sim_time_s"
 
@@ -60,12 +56,6 @@ def rounds(_rounds: Path, tmp_path: Path) -> Path:
     """The recording of a long run and a short one."""
     (tmp_path / "there").mkdir()
     return Path(shutil.copy(_rounds, tmp_path / "there"))
-
-
-def test_a_state_with_half_of_a_character_comes_back_as_the_text_that_it_was() -> None:
-    text = '{"b": "\\ud800", "a": 1}'
-    assert in_order(text, {"a": {}}) == text
-    assert in_order('{"b": 2, "a": 1}', {"a": {}}) == '{"a":1,"b":2}'
 
 
 def uuid_of(database: Path, run_id: int) -> str:
@@ -91,13 +81,7 @@ def rows(connection: sqlite3.Connection, table: str, where: str) -> list[Any]:
     names = [name for (_, name, *_) in connection.execute(f"PRAGMA table_info({table})")]
     columns = ", ".join(name for name in names if name not in LOCAL)
     query = f"SELECT {columns} FROM {table} WHERE {where} ORDER BY id"
-    found = valued(connection.execute(query))
-    return [*found, *map(keys_of, connection.execute(query))] if table in STATES else found
-
-
-def keys_of(row: tuple[Any, ...]) -> list[str]:
-    """The texts of JSON without its spaces: the order of the keys counts."""
-    return [json.dumps(json.loads(cell)) for cell in row if isinstance(cell, str)]
+    return valued(connection.execute(query))
 
 
 def valued(rows: Iterable[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
@@ -384,19 +368,6 @@ def test_what_goes_on_or_is_not_wholly_shipped_is_fetched_when_it_is(
     with closing(sqlite3.connect(tmp_path / "pool")) as pool, pool:
         pool.execute("INSERT OR IGNORE INTO state SELECT * FROM state_later")
     assert list(lab.fetch(run_uuid=uuid).runs) == [uuid]
-
-
-def test_far_more_states_than_a_run_had_are_not_taken(
-    lab: Lab, runs: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lab.ship(runs.folder / DATABASE_NAME, full=True)
-    with closing(sqlite3.connect(tmp_path / "pool")) as pool, pool:
-        pool.execute("UPDATE run SET row_count = 1")
-    before = lab.everything()
-    monkeypatch.setattr(fetching, "_UNCOUNTED_ROWS", 0)
-    with pytest.raises(PoolError, match="states of runs that had"):
-        lab.fetch(robot="rover")
-    assert lab.everything() == before
 
 
 @IN_EACH_POOL

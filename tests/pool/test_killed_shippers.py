@@ -27,6 +27,8 @@ from webots_mcp.plugins.pool.shipping import Order, Report, follow, ship
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.recording import Recording
 
+pytestmark = pytest.mark.slow
+
 KILLS = {"postgresql": 20, "parquet": 8}
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.pool.lab import Lab
+from tests.pool.lab import IN_EACH_POOL, Lab
 from tests.recordings.runs import Recorded
 from webots_mcp.cli import main
 from webots_mcp.contract import DATABASE_NAME
@@ -66,7 +66,7 @@ def test_a_select_is_answered_with_its_first_rows(ask: Ask) -> None:
     assert (answer["columns"], len(answer["rows"])) == (["label", "empty"], 3)
 
 
-@pytest.mark.parametrize("lab", ["parquet", "postgres"], indirect=True)
+@IN_EACH_POOL
 def test_an_answer_has_the_limits_of_sql_and_is_json_for_strict_readers(ask: Ask) -> None:
     def refuse(constant: str) -> None:
         raise AssertionError(constant)

@@ -7,6 +7,7 @@ import json
 import pytest
 
 from tests.pool.conftest import Shipped
+from tests.pool.lab import POSTGRES
 from tests.pool.postgres.shipped import assert_equal
 from tests.postgres import Server
 from webots_mcp.cli import main
@@ -51,6 +52,7 @@ def test_programs_read_in_one_object_what_was_sent_or_why_not(
     assert json.loads(capsys.readouterr().out).keys() == {"error"}
 
 
+@pytest.mark.slow
 def test_a_recording_is_shipped_to_postgresql_as_it_is(
     shipped: Shipped, postgres: Server, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -72,6 +74,7 @@ def test_a_server_that_is_not_there_is_said(
     assert "127.0.0.1:1/pool" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_server_that_only_reads_is_said_and_nothing_is_half_done(
     shipped: Shipped, postgres: Server, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -85,7 +88,7 @@ def test_a_server_that_only_reads_is_said_and_nothing_is_half_done(
     assert said.out == ""
 
 
-@pytest.mark.parametrize("kind", ["postgres", "parquet"])
+@pytest.mark.parametrize("kind", [POSTGRES, "parquet"])
 def test_values_that_a_pool_cannot_hold_are_said(
     shipped: Shipped,
     kind: str,

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import pytest
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.pool.pool_contents import open_target
-from webots_mcp.plugins.pool.pool_interface import redacted, tables
+from webots_mcp.plugins.pool.pool_interface import Batch, fitted, redacted, table, tables
 
 SECRET = "hunter2"
 
@@ -67,3 +69,19 @@ def test_each_table_comes_after_those_that_it_refers_to() -> None:
     assert names.index("robot") < names.index("session") < names.index("run")
     assert all(names.index("run") < names.index(name) for name in ("state", "chunk", "log"))
     assert not {"lease", "watermark", "retention_limit"} & set(names)
+
+
+def test_a_value_of_another_type_becomes_what_comes_nearest_and_is_counted() -> None:
+    odd = {
+        "id": 1, "run_id": "one", "sim_time_s": "soon", "wall_time_s": 2**60 + 1, "kind": b"\xff",
+        "path": 5, "width": 3.0, "height": 2.75, "size_bytes": float("inf"), "device": None,
+    }  # fmt: skip
+    images, counts = table("image"), Counter[str]()
+    (row,) = fitted(Batch(images, [tuple(odd.get(each) for each in images.columns)]), counts).rows
+    found = dict(zip(images.columns, row, strict=True))
+    assert {name: found[name] for name in odd} == {
+        "id": 1, "run_id": 0, "sim_time_s": 0.0, "wall_time_s": float(2**60), "kind": "\ufffd",
+        "path": "5", "width": 3, "height": 2, "size_bytes": 0, "device": None,
+    }  # fmt: skip
+    wrong = ("run_id", "sim_time_s", "wall_time_s", "kind", "path", "height", "size_bytes")
+    assert +counts == {f"image.{name}": 1 for name in wrong}

@@ -15,7 +15,6 @@ import time
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -42,7 +41,6 @@ from tests.pool.parquet.rows import (
 )
 from webots_mcp.connection import connect
 from webots_mcp.errors import InvalidInputError, PoolBusyError, PoolError, PoolUnavailableError
-from webots_mcp.plugins.pool import parquet_pool
 from webots_mcp.plugins.pool.parquet_files import LEASE_S
 from webots_mcp.plugins.pool.parquet_pool import PART_BYTES, ParquetPool, ParquetTarget
 from webots_mcp.plugins.pool.pool_interface import Batch, Row, SQLValue, table, tables
@@ -223,22 +221,18 @@ def test_a_row_replaces_the_one_of_its_key_but_what_lasts_is_not_lost(tmp_path: 
     assert found == [(1, "done", 4, None), (2, "claimed", 4, None), (3, "done", None, "e")]
 
 
-def test_what_a_column_cannot_hold_becomes_what_comes_nearest_and_is_counted(
-    tmp_path: Path,
-) -> None:
-    odd = {
-        "id": 1, "run_id": "one", "sim_time_s": "soon", "wall_time_s": 2**60 + 1, "level": 5,
-        "source": b"\xff", "message": "lone \ud800", "logger": None,
-    }  # fmt: skip
+def test_what_is_listed_is_what_was_written_last(tmp_path: Path) -> None:
     with shipping(tmp_path) as shipment:
-        altered = shipment.write([batch("log", odd)], {})
-    (row,) = globbed(tmp_path, "log")
-    assert row == {
-        "id": 1, "run_id": None, "sim_time_s": None, "wall_time_s": float(2**60), "level": "5",
-        "source": "\ufffd", "message": "lone \ufffd\ufffd\ufffd", "logger": None,
-    }  # fmt: skip
-    odd_columns = ("run_id", "sim_time_s", "wall_time_s", "level", "source", "message")
-    assert altered == {f"log.{column}": 1 for column in odd_columns}
+        for step in STEPS:
+            shipment.write(step, {})
+    with ParquetPool(str(tmp_path)) as pool:
+        found = {uuid: row[-1] for _, (_, _, uuid, *row) in pool.listed("run")}
+    assert found == {"run-1": 6, "run-2": 0}
+
+
+def test_a_row_without_a_time_is_on_no_day(tmp_path: Path) -> None:
+    with shipping(tmp_path) as shipment:
+        shipment.write([batch("log", {"id": 1}), logs(2, wall_time_s=1e300)], {})
     assert [file.parent.name for file in tmp_path.rglob("table=log/*/*.parquet")] == [
         "day=__HIVE_DEFAULT_PARTITION__"
     ]
@@ -341,28 +335,6 @@ def test_what_is_damaged_is_named_and_nothing_is_written_over_it(tmp_path: Path,
         write_all(str(tmp_path), STEPS)
     assert file.read_bytes() == b"PAR1 and no more"
     with pytest.raises(PoolError, match=r"_progress .*cannot be read|is damaged"):
-        pooled(str(tmp_path), UUID, "log")
-
-
-def test_of_a_file_that_unpacks_to_far_more_only_what_was_shipped_is_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(parquet_pool, "_MOST_BYTES", 20_000_000)
-    with shipping(tmp_path) as shipment:
-        shipment.write([logs(1, 2)], {})
-    (file,) = tmp_path.glob(f"recording={UUID}/table=log/*/*.parquet")
-    own: Any = parquet.ParquetFile(file).read()
-    (more,) = logs(3, message="x" * 10_000).rows
-    one = parquet_pool.as_arrow(table("log"), [more], Counter())
-    whole: Any = import_module("pyarrow").concat_tables([own, *[one] * 100_000])
-    parquet.write_table(whole, file, use_dictionary=True)
-    assert file.stat().st_size < 1_000_000 < 1_000_000_000 < whole.nbytes
-    assert ids(pooled(str(tmp_path), UUID, "log")) == [1, 2]
-    progress = tmp_path / f"recording={UUID}" / "_progress"
-    told = json.loads(progress.read_text())
-    told["parts"]["log"]["number"] = 2  # as if that part were over: all its rows would count
-    progress.write_text(json.dumps(told))
-    with pytest.raises(PoolError, match="unpacks to more than 20,000,000 bytes"):
         pooled(str(tmp_path), UUID, "log")
 
 

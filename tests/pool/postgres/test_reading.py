@@ -22,6 +22,8 @@ from webots_mcp.plugins.pool.pool_interface import Table, table, tables
 from webots_mcp.plugins.pool.postgres_pool import PostgresPool
 from webots_mcp.store.chunk_making import make_chunks
 
+pytestmark = pytest.mark.slow
+
 # What jsonb has not, or has otherwise; each comes back as it was, also where it is no JSON object.
 ODD_OBJECTS = ["", "no JSON", '{"a":', '{"a": "\\u0000"}', '"\\ud800"', "NaN", "[1, 2.50]", "-0.0"]
 VALUES = ['"text"', '"3"', "3", "true", "null", '{"a": 1}', '"\\u0000"', '["\\u0000"]', '"\\n\\""']

@@ -58,6 +58,9 @@ END $$;
 """
 
 
+pytestmark = pytest.mark.slow
+
+
 @pytest.fixture
 def recording() -> Iterator[sqlite3.Connection]:
     with memory_connection() as connection:

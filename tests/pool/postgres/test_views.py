@@ -29,6 +29,8 @@ from webots_mcp.connection import connect
 from webots_mcp.plugins.pool.postgres_schema import VIEWS
 from webots_mcp.store.chunk_making import make_chunks
 
+pytestmark = pytest.mark.slow
+
 # Whole states, each other than those of `tests/store/test_views.py`.
 STATES: list[dict[str, Any]] = [
     {"pose": [1e400, 2e-400, -1e400]},

@@ -482,8 +482,7 @@ def _alone(plan: WorldPlan, values: dict[str, Any]) -> WorldPlan:
     return replace(plan, parameters=[values], repeats=1, ranges={}, search=None, sets=0, seed=0)
 
 
-# Hands the trials of a set out to a Dask cluster, in a thread of the server.
-
+# -- in a thread of the server ----------------------------------------------------------------
 
 ALLOWED_VARIABLE: Final = "DASK_SCHEDULER_ADDRESS"  # Dask's own name for the one to use
 _END_PATIENCE_S: Final = 5.0

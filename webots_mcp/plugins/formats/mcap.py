@@ -281,14 +281,13 @@ def _nanoseconds(time_s: float) -> int:
     return max(0, round(time_s * 1e9))
 
 
-# JSON schemas of the messages in an MCAP file.
+# -- schemas of messages, as JSON --------------------------------------------------------------
 #
 # Viewers know the ones called `foxglove.NAME` and draw them; the schema of states is made of what
 # they hold. Foxglove's and Lichtblick's readers of schemas take one type per field, and arrays of
 # one scalar type or of objects; a schema with anything else makes a whole topic unreadable. What a
 # state holds besides is therefore in the messages, but not in the schema: it is shown, not offered
 # to plot.
-
 
 Schema = dict[str, Any]
 
@@ -399,8 +398,7 @@ class Shape:
         return {"type": name}
 
 
-# An MCAP file with a layout for Foxglove and Lichtblick that shows what it holds.
-
+# -- the file, with a layout for Foxglove and Lichtblick that shows what it holds --------------
 
 # What a message path can say without quotes: others are plotted by hand.
 _PLAIN_PATH: Final = re.compile(r"\$(\.[A-Za-z_]\w*|\[\d+\])+")

@@ -1,4 +1,4 @@
-"""One SELECT over a pool of Parquet files, by DuckDB.
+"""One SELECT over a pool of Parquet files, by DuckDB; and the limits of any answer of a pool.
 
 Each table is a view of its name, with `recording_uuid` before its columns. What keeps a statement
 harmless: it is one SELECT, DuckDB may open files below the root of the pool only and write none,
@@ -11,9 +11,9 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import closing, suppress
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.pool.parquet_files import CHUNK, Storage, files_of, name_of, package
@@ -37,10 +37,7 @@ DEADLINE_S: Final = 60.0
 _MEMORY: Final = "2GB"
 _MOST_BYTES: Final = 4_000_000_000  # of the process: DuckDB counts not all that it takes
 _LINE: Final = (sys.executable, "-m", __name__)
-_NUMBERS: Final = (
-    "BOOLEAN", "TINYINT", "SMALLINT", "INTEGER", "BIGINT", "HUGEINT", "UTINYINT", "USMALLINT",
-    "UINTEGER", "UBIGINT", "UHUGEINT", "FLOAT", "DOUBLE",
-)  # fmt: skip
+_AS_THEY_ARE: Final = re.compile("BOOLEAN|U?(TINY|SMALL|BIG|HUGE)INT|U?INTEGER|FLOAT|DOUBLE|BLOB")
 _TYPES: Final = {int: "BIGINT", float: "DOUBLE", str: "VARCHAR", bytes: "BLOB"}
 
 
@@ -71,10 +68,39 @@ def select(storage: Storage, sql: str, max_rows: int) -> Result:
         try:
             _require_select(duckdb, connection, sql)
             answer = connection.sql(sql)
-            rows = _bounded(answer).limit(max_rows + 1).fetchall()
-            return answered(map(str, answer.columns), rows, max_rows)
+            shown = [_shown(at, str(kind)) for at, kind in enumerate(answer.types, 1)]
+            rows = answer.project(", ".join(shown)).limit(max_rows + 1).fetchall()
+            return answered([*map(str, answer.columns)], rows, max_rows)
         except duckdb.Error as error:
             raise InvalidInputError(f"DuckDB says: {error}") from error
+
+
+def answered(names: Sequence[str], rows: Sequence[Sequence[Any]], max_rows: int) -> Result:
+    """The first of the rows, with long values cut.
+
+    Args:
+        names: Of the columns.
+        rows: One more than `max_rows`, where there are as many; values that are no numbers and no
+            bytes are texts.
+        max_rows: The most to answer with.
+
+    Raises:
+        InvalidInputError: The columns are too many.
+    """
+    if len(names) > MAX_COLUMNS:
+        raise InvalidInputError(
+            f"{len(names)} columns are too many: name at most {MAX_COLUMNS} of them"
+        )
+    budget, taken = Budget(MAX_BYTES), list[tuple[Cell, ...]]()
+    why = fetch_rows((map(_cut, row) for row in rows), taken, max_rows, budget)
+    shortened = sum(value is not _cut(value) for row in rows[: len(taken)] for value in row)
+    return Result(tuple(names), tuple(taken), why, shortened)
+
+
+def _cut(value: Any) -> Any:
+    if not isinstance(value, str) or len(value) <= MAX_TEXT:
+        return value
+    return f"{value[:MAX_TEXT]}... ({len(value)} characters)"
 
 
 def _prepare(connection: Any, storage: Storage, sql: str) -> None:
@@ -93,17 +119,11 @@ def _prepare(connection: Any, storage: Storage, sql: str) -> None:
     connection.execute("SET lock_configuration = true")
 
 
-def _bounded(answer: Any) -> Any:
-    """The answer with long values cut, and at the end of each row how many of it are."""
-    columns = bounded([_column(at, str(kind)) for at, kind in enumerate(answer.types, 1)])
-    return answer.project(", ".join(f"{each} AS c{at}" for at, each in enumerate(columns)))
-
-
-def _column(at: int, kind: str) -> tuple[str, Kind]:
-    """A column, the first is 1, and how it is shown."""
+def _shown(at: int, kind: str) -> str:
+    """A column, the first is 1, as a number, as bytes, or as a text."""
     if kind.startswith("DECIMAL"):
-        return f"CAST(#{at} AS DOUBLE)", "number"
-    return f"#{at}", "number" if kind in _NUMBERS else "bytes" if kind == "BLOB" else "text"
+        return f"CAST(#{at} AS DOUBLE) AS c{at}"
+    return f"#{at} AS c{at}" if _AS_THEY_ARE.fullmatch(kind) else f"CAST(#{at} AS VARCHAR) AS c{at}"
 
 
 def _view(table: Table, paths: list[str]) -> str:
@@ -134,8 +154,7 @@ def _quoted(text: str) -> str:
 
 
 def _require_select(duckdb: Any, connection: Any, sql: str) -> None:
-    statements = connection.extract_statements(sql)
-    kinds = [statement.type for statement in statements]
+    kinds = [statement.type for statement in connection.extract_statements(sql)]
     if kinds != [duckdb.StatementType.SELECT]:
         raise InvalidInputError(
             "only one SELECT is allowed, this has "
@@ -149,60 +168,6 @@ def _ask(asked: Statement) -> Result:
 
         resource.setrlimit(resource.RLIMIT_DATA, (_MOST_BYTES, _MOST_BYTES))
     return select(Storage(asked.database), asked.sql, asked.max_rows)
-
-
-# The answer to one SELECT over a pool, within the limits that `query_sql` has as well.
-#
-# The engine of the pool cuts long values itself: what nobody will read is neither sent nor held
-# here.
-
-
-Kind = Literal["number", "bytes", "text"]  # text: whatever is neither of the others
-_TEXT: Final = "CAST({column} AS VARCHAR)"
-_LENGTH: Final = f"length({_TEXT})"
-_CUT: Final = (
-    f"CASE WHEN {_LENGTH} > {MAX_TEXT} THEN left({_TEXT}, {MAX_TEXT}) || '... (' || "
-    f"CAST({_LENGTH} AS VARCHAR) || ' characters)' ELSE {_TEXT} END"
-)
-_SHOWN: Final[dict[Kind, str]] = {
-    "number": "{column}",
-    "bytes": "'<blob of ' || CAST(octet_length({column}) AS VARCHAR) || ' bytes>'",
-    "text": _CUT,
-}
-
-
-def bounded(columns: Sequence[tuple[str, Kind]]) -> list[str]:
-    """The expressions, in SQL, of these columns as they are shown, and how many of them are cut.
-
-    Raises:
-        InvalidInputError: They are too many.
-    """
-    if len(columns) > MAX_COLUMNS:
-        raise InvalidInputError(
-            f"{len(columns)} columns are too many: name at most {MAX_COLUMNS} of them"
-        )
-    texts = [column for column, kind in columns if kind == "text"]
-    are_cut = [
-        f"CASE WHEN {_LENGTH.format(column=column)} > {MAX_TEXT} THEN 1 ELSE 0 END"
-        for column in texts
-    ]
-    shown = [_SHOWN[kind].format(column=column) for column, kind in columns]
-    return [*shown, " + ".join(are_cut) or "0"]
-
-
-def answered(names: Iterable[str], rows: Sequence[Sequence[Any]], max_rows: int) -> Result:
-    """The first of the rows, whose columns are those of `bounded`.
-
-    Args:
-        names: Of the columns that were asked for.
-        rows: One more than `max_rows`, where there are as many.
-        max_rows: The most to answer with.
-    """
-    budget = Budget(MAX_BYTES)
-    taken: list[tuple[Cell, ...]] = []
-    why = fetch_rows((row[:-1] for row in rows), taken, max_rows, budget)
-    shortened = sum(row[-1] for row in rows[: len(taken)])
-    return Result(tuple(names), tuple(taken), why, shortened)
 
 
 if __name__ == "__main__":

@@ -1,26 +1,41 @@
-"""Objects below the root of a pool, on a filesystem of fsspec: placed as a whole or not at all.
+"""The files of a pool of Parquet, in a folder or on any filesystem that fsspec knows.
 
-In a folder an object is written beside and moved to its place; object stores do as much with a
-single put. Other filesystems are as atomic as their rename is.
+    _pool                                       what this is, and of which version
+    _runs/UUID                                  the recording that a run belongs to
+    recording=UUID/_progress                    written last: what it says is there, is there
+    recording=UUID/_lease                       who ships this recording
+    recording=UUID/_pictures/PATH
+    recording=UUID/table=NAME/day=YYYY-MM-DD/part-NUMBER.parquet    rows that never change
+    recording=UUID/table=NAME/part-BLOCK.parquet                    rows that change
+    recording=UUID/table=value/run=ID/part-NUMBER.parquet           a column for each signal
+
+A file is replaced as a whole, by itself with more rows. So whoever reads `*.parquet` while somebody
+ships sees each row once or, for a moment, not yet. Engines pass over names that begin with `_`.
+
+Rows that never change are in the part that was open when they came, and stay there: a part is over
+once it is large. The progress says which one is open and how many rows of its files count: rows
+beyond are those of a shipper that was killed. Rows that change are in blocks of ids. The progress
+lists the runs and trial sets as well: to list those of a pool, one small file of each recording is
+read.
 """
 
 from __future__ import annotations
 
 import errno
 import json
-import math
 import os
 import posixpath
-import re
 import time
 from collections import defaultdict
-from collections.abc import Generator, Iterable, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime, timedelta, timezone
+from glob import escape
 from importlib import import_module
 from pathlib import Path, PurePosixPath
-from typing import Any, Final
+from typing import Any, Final, cast
 from uuid import uuid4
 
 from webots_mcp.contract import PRIVATE_FOLDER, SCHEMA_VERSION, host_name, make_folder
@@ -35,21 +50,61 @@ from webots_mcp.liveness import process_identity
 from webots_mcp.plugins.pool.pool_interface import Row, SQLValue, Table, redacted
 from webots_mcp.requirements import explain_extra, install_line
 
+FORMAT: Final = 2
+POOL: Final = "_pool"
+RUNS: Final = "_runs"
+PROGRESS: Final = "_progress"
+LEASE: Final = "_lease"
+CHUNK: Final = "chunk"
+VALUES: Final = "value"  # in the place of chunks a table with a column for each signal
+NO_DAY: Final = "__HIVE_DEFAULT_PARTITION__"  # read as null by engines
+LEASE_S: Final = 60.0
+
+_AT_ONCE: Final = 16
+_EXTRA: Final = ("pyarrow", "fsspec")
 _PUT_WHOLE: Final = frozenset(
     {"memory", "s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "adl", "oci", "oss", "hf"}
 )
 _INCOMING: Final = "_incoming"  # what is written, before it is moved to its place
 _NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _REFUSED: Final = (errno.EACCES, errno.EPERM, errno.EROFS)
+_NOT_A_FOLDER: Final = (errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG)
 _OTHERS: Final = (0o070, 0o007)  # the group, and everybody
 _WRITING: Final = 0o022
 _SEARCH: Final = 0o111
 _INHERITED: Final = 0o7000  # the group's sign, which a folder hands on
-_NOT_A_FOLDER: Final = (errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG)
+# One that ends later was taken before a clock was set back. It is not one lease from now: it may
+# be renewed after this host looked at its clock, and the clock of the other host may be ahead.
+_LATEST_S: Final = 2 * LEASE_S
+_RENEW_AFTER_S: Final = 15.0
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=timezone.utc)
+_IDS_IN_BLOCK: Final = 4096
+
+
+def package(name: str) -> Any:
+    """A module of a package of the extra `parquet`, or of DuckDB; they have no types.
+
+    Raises:
+        PoolError: It is not installed; the text says what to install.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        whose = name.partition(".")[0]
+        if whose in _EXTRA:
+            raise PoolError(explain_extra("a pool of Parquet files", "parquet")) from error
+        asked = f"a SELECT over a pool of Parquet files needs {whose}"
+        raise PoolError(f"{asked}: {install_line([whose])}") from error
+
+
+# -- storage ----------------------------------------------------------------------------------
 
 
 class Storage:
-    """What is below the root; paths are relative to it and have `/`.
+    """Objects below the root, placed as a whole or not at all; paths are relative to it, with `/`.
+
+    In a folder an object is written beside and moved to its place; object stores do as much with a
+    single put. Other filesystems are as atomic as their rename is.
 
     Each method raises PoolUnavailableError where the filesystem does not answer or has no room,
     and PoolError where it refuses.
@@ -63,13 +118,15 @@ class Storage:
 
     def __init__(self, url: str) -> None:
         self.files, self.root = _filesystem(url)
-        self.is_local = bool({"file", "local"} & _protocols(self.files))
+        named: str | tuple[str, ...] = self.files.protocol
+        protocols = {named} if isinstance(named, str) else set(named)
+        self.is_local = bool({"file", "local"} & protocols)
         self.address = self.root if self.is_local else redacted(url)
-        self._puts_whole = bool(_PUT_WHOLE & _protocols(self.files))
+        self._puts_whole = bool(_PUT_WHOLE & protocols)
 
-    def full(self, path: str, root: str | None = None) -> str:
+    def full(self, path: str) -> str:
         """A path as the filesystem names it."""
-        return f"{(root or self.root).rstrip('/')}/{path}" if path else self.root
+        return f"{self.root.rstrip('/')}/{path}" if path else self.root
 
     def url_of(self, path: str) -> str:
         """An object as other libraries name it."""
@@ -83,6 +140,15 @@ class Storage:
                 return self.files.cat_file(self.full(path))
             except FileNotFoundError:
                 return None
+
+    def read_all(self, paths: Iterable[str]) -> Iterator[tuple[str, bytes]]:
+        """Those of the objects that are there; most of it is waiting, so several at a time."""
+        listed = [*paths]
+        with ThreadPoolExecutor(_AT_ONCE) as workers:
+            contents = map(self.read, listed) if self.is_local else workers.map(self.read, listed)
+            for path, content in zip(listed, contents, strict=True):
+                if content is not None:
+                    yield path, content
 
     def place(self, path: str, content: bytes) -> None:
         """Put an object, in the place of another of that path."""
@@ -114,7 +180,15 @@ class Storage:
         with self._answering(path), self._written(content) as written:
             full = Path(self.full(path))
             self._make_folder(full.parent)
-            return _linked(written, full, content)
+            try:
+                full.hardlink_to(written)
+            except FileExistsError:
+                return False
+            except OSError:  # no hard links there
+                if full.exists():
+                    return False
+                written.rename(full)
+        return True
 
     def remove(self, path: str) -> None:
         """Remove an object, which may be gone already."""
@@ -124,35 +198,28 @@ class Storage:
     def find(self, pattern: str) -> list[str]:
         """The paths that match, `*` being any part of one name, in their order."""
         with self._answering(pattern):
-            found = self.files.glob(self.full(pattern, _escaped(self.root)))
-        return sorted(self._relative(each) for each in found)
+            if self.is_local:
+                found = Path(self.root).glob(pattern)
+                return sorted(each.relative_to(self.root).as_posix() for each in found)
+            full = f"{escape(self.root.rstrip('/'))}/{pattern}"
+            return sorted(map(self._relative, self.files.glob(full)))
 
-    def sizes(self, pattern: str) -> dict[str, int]:
-        """The objects that match, with their bytes."""
-        with self._answering(pattern):
-            found = self.files.glob(self.full(pattern, _escaped(self.root)), detail=True)
+    def sizes(self) -> dict[str, int]:
+        """All objects, with their bytes."""
+        with self._answering(""):
+            found = self.files.find(self.root, detail=True)
         return {self._relative(path): int(about["size"] or 0) for path, about in found.items()}
 
-    @contextmanager
-    def opened(self, path: str) -> Generator[Any]:
-        """An object as a file to read here and there."""
-        with self._answering(path), self.files.open(self.full(path), "rb") as file:
-            yield file
-
-    def is_empty(self) -> bool:
-        """Whether nothing is below the root."""
-        with self._answering(""):
-            try:
-                beside = [self._relative(each) for each in self.files.ls(self.root, detail=False)]
-            except FileNotFoundError:
-                return True
-        return not [each for each in beside if each not in ("", ".", _INCOMING)]
+    def names(self) -> list[str]:
+        """What is right below the root."""
+        with self._answering(""), suppress(FileNotFoundError):
+            found = [self._relative(each) for each in self.files.ls(self.root, detail=False)]
+            return [each for each in found if each not in ("", ".", _INCOMING)]
+        return []
 
     def clear(self, older_than_s: float) -> None:
         """Remove what killed processes left half written."""
-        if not self.is_local:
-            return
-        for file in Path(self.full(_INCOMING)).glob("*"):
+        for file in Path(self.full(_INCOMING)).glob("*") if self.is_local else ():
             with suppress(OSError):
                 if file.stat().st_mtime < older_than_s:
                     file.unlink()
@@ -195,27 +262,22 @@ class Storage:
 
     @contextmanager
     def _answering(self, path: str) -> Generator[None]:
+        where = f"{self.address} ({path})" if path else self.address
         try:
             yield
         except WebotsMCPError:  # from inside the block
             raise
         except OSError as error:
-            raise self._explained(error, path) from error
+            what = error.strerror or str(error) or type(error).__name__
+            if error.errno in _NO_ROOM:
+                raise PoolUnavailableError(f"there is no room in {where}: {what}") from error
+            if error.errno in _REFUSED or isinstance(error, PermissionError):
+                raise PoolError(f"{where} cannot be used by this user: {what}") from error
+            if error.errno in _NOT_A_FOLDER or isinstance(error, NotADirectoryError):
+                raise PoolError(f"{where} cannot be a pool: {what}") from error
+            raise PoolUnavailableError(f"{where} does not answer: {what}") from error
         except Exception as error:  # each client of an object store has its own
-            raise PoolUnavailableError(
-                f"{self.address} does not answer ({path}): {error}"
-            ) from error
-
-    def _explained(self, error: OSError, path: str) -> PoolError:
-        what = error.strerror or str(error) or type(error).__name__
-        where = f"{self.address} ({path})" if path else self.address
-        if error.errno in _NO_ROOM:
-            return PoolUnavailableError(f"there is no room in {where}: {what}")
-        if error.errno in _REFUSED or isinstance(error, PermissionError):
-            return PoolError(f"{where} cannot be used by this user: {what}")
-        if error.errno in _NOT_A_FOLDER or isinstance(error, NotADirectoryError):
-            return PoolError(f"{where} cannot be a pool: {what}")
-        return PoolUnavailableError(f"{where} does not answer: {what}")
+            raise PoolUnavailableError(f"{where} does not answer: {error}") from error
 
 
 def _filesystem(url: str) -> tuple[Any, str]:
@@ -240,39 +302,212 @@ def _filesystem(url: str) -> tuple[Any, str]:
     return files, str(root)
 
 
-def _protocols(files: Any) -> set[str]:
-    named: str | tuple[str, ...] = files.protocol
-    return {named} if isinstance(named, str) else set(named)
+# -- which file a row is in -------------------------------------------------------------------
 
 
-def _escaped(path: str) -> str:
-    """As a pattern that matches this path only."""
-    return re.sub(r"([*?\[])", r"[\1]", path)
+def folder_of(recording_uuid: str) -> str:
+    """Where a recording is in the pool."""
+    return f"recording={recording_uuid}"
 
 
-def _linked(written: Path, full: Path, content: bytes) -> bool:
-    """Whether the file is at its place now; not where another was there before it."""
+def uuid_in(path: str) -> str:
+    """The recording of a path."""
+    return path.partition("/")[0].removeprefix("recording=")
+
+
+def picture_file(path: str) -> str:
+    """A picture, by the path in its row.
+
+    Raises:
+        PoolError: The path leads out of the folder of pictures.
+    """
+    parts = PurePosixPath(path).parts
+    if not parts or ".." in parts or path.startswith(("/", "\\")) or "\\" in path:
+        raise PoolError(f"{path!r} is no path of a picture: it leads out of the recording")
+    return f"_pictures/{'/'.join(parts)}"
+
+
+def name_of(table: Table) -> str:
+    """What a table is called in a pool of files."""
+    return VALUES if table.name == CHUNK else table.name
+
+
+def is_cut(table: Table) -> bool:
+    """Whether its rows never change and are in parts, of a day or of a run."""
+    return table.name == CHUNK or table.time_column is not None
+
+
+def part_file(table: Table, folder: str, number: int) -> str:
+    """A part of a table whose rows never change."""
+    return f"table={name_of(table)}/{folder}/part-{number:06}.parquet"
+
+
+def files_of(table: Table, recording_uuid: str = "*") -> str:
+    """The pattern of all files of a table, of one recording or of all."""
+    cut = "day=*/" if table.time_column else "run=*/" if table.name == CHUNK else ""
+    return f"{folder_of(recording_uuid)}/table={name_of(table)}/{cut}part-*.parquet"
+
+
+def run_of(path: str) -> int | None:
+    """The run of a part, where it has the rows of one only."""
+    name, _, run_id = path.rpartition("/")[0].rpartition("/")[2].partition("=")
+    return int(run_id) if name == "run" else None
+
+
+def by_folder(table: Table, rows: Iterable[Row]) -> Mapping[str, list[Row]]:
+    """Rows that never change by their folders: those of a day, chunks of a run."""
+    place = table.columns.index(table.time_column or "run_id")
+    found: dict[str, list[Row]] = defaultdict(list)
+    for row in rows:
+        name = f"day={day_of(row[place])}" if table.time_column else f"run={row[place]}"
+        found[name].append(row)
+    return found
+
+
+def day_of(wall_time_s: SQLValue) -> str:
+    """The day in UTC, as it stands in a path; `NO_DAY` where the time is none."""
     try:
-        full.hardlink_to(written)
-    except FileExistsError:
-        return False
-    except OSError:  # no hard links there
-        try:
-            with full.open("xb") as sink:
-                sink.write(content)
-        except FileExistsError:
-            return False
-    return True
+        return (_EPOCH + timedelta(seconds=cast("float", wall_time_s))).date().isoformat()
+    except (TypeError, OverflowError, ValueError):  # null, or no year from 1 to 9999
+        return NO_DAY
 
 
-# The lease of a recording in a pool: one shipper at a time, on whatever host.
+def by_block(table: Table, rows: Iterable[Row]) -> Mapping[str, list[Row]]:
+    """Rows of a table that changes, by the files in which they are."""
+    found: dict[str, list[Row]] = defaultdict(list)
+    for row in rows:
+        block = cast("int", row[0]) // _IDS_IN_BLOCK if table.key == ("id",) else 0
+        found[f"table={table.name}/part-{block:09}.parquet"].append(row)
+    return found
 
 
-LEASE_S: Final = 60.0
-# One that ends later was taken before a clock was set back. It is not one lease from now: it may
-# be renewed after this host looked at its clock, and the clock of the other host may be ahead.
-_LATEST_S: Final = 2 * LEASE_S
-_RENEW_AFTER_S: Final = 15.0
+# -- what the pool holds ----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Part:
+    """The part of a table that is open: of a table whose rows never change.
+
+    Attributes:
+        number: Of the part; those before it are over.
+        rows: By the folder of its files, how many rows of each count.
+    """
+
+    number: int = 1
+    rows: Mapping[str, int] = field(default_factory=dict[str, int])
+
+    def counted(self, path: str) -> int | None:
+        """How many rows of a file count; None where all do."""
+        folder, _, name = path.rpartition("/part-")
+        number = int(name.removesuffix(".parquet"))
+        if number < self.number:
+            return None
+        return self.rows.get(folder.rpartition("/")[2], 0) if number == self.number else 0
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What the pool holds of a recording.
+
+    Attributes:
+        numbers: As the shipper gave them.
+        parts: By table.
+        listed: By table and the row's id, the columns `LISTED`.
+    """
+
+    numbers: Mapping[str, int] = field(default_factory=dict[str, int])
+    parts: Mapping[str, Part] = field(default_factory=dict[str, Part])
+    listed: Mapping[str, Mapping[str, list[Any]]] = field(
+        default_factory=dict[str, Mapping[str, list[Any]]]
+    )
+
+    def part(self, table: str) -> Part:
+        """Of a table, the first where it has no rows yet."""
+        return self.parts.get(table, Part())
+
+    def with_part(self, table: str, part: Part) -> Progress:
+        """After rows of a table have come."""
+        return replace(self, parts={**self.parts, table: part})
+
+    def with_listed(self, table: str, rows: Mapping[str, list[Any]]) -> Progress:
+        """After rows of a table that is listed have changed."""
+        return replace(self, listed={**self.listed, table: {**self.listed.get(table, {}), **rows}})
+
+
+def read_progress(storage: Storage, recording_uuid: str) -> Progress:
+    """What the pool holds of a recording: nothing where it is new.
+
+    Raises:
+        PoolError: It cannot be read.
+    """
+    path = f"{folder_of(recording_uuid)}/{PROGRESS}"
+    content = storage.read(path)
+    return Progress() if content is None else decoded_progress(storage, path, content)
+
+
+def decoded_progress(storage: Storage, path: str, content: bytes) -> Progress:
+    """The progress in a file.
+
+    Raises:
+        PoolError: It cannot be read.
+    """
+    try:
+        found: dict[str, Any] = json.loads(content)
+        parts = {str(name): Part(**part) for name, part in found["parts"].items()}
+        numbers = {str(name): int(number) for name, number in found["numbers"].items()}
+        return Progress(numbers, parts, found["listed"])
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise PoolError(f"{path} in {storage.address} cannot be read: {error}") from error
+
+
+def place_progress(storage: Storage, recording_uuid: str, progress: Progress) -> None:
+    """Say what is there: rows count from now on."""
+    content = json.dumps(asdict(progress)).encode()
+    storage.place(f"{folder_of(recording_uuid)}/{PROGRESS}", content)
+
+
+def require_pool(storage: Storage) -> None:
+    """Raise unless a pool of exactly this version is there.
+
+    Raises:
+        PoolError: There is none, or an older or a newer one.
+    """
+    content = storage.read(POOL)
+    if content is None:
+        raise PoolError(f"there is no pool in {storage.address}: ship a recording to it first")
+    try:
+        about: dict[str, Any] = json.loads(content)
+        version = int(about["format"]), int(about["schema"])
+    except (ValueError, TypeError, KeyError) as error:
+        raise PoolError(f"{POOL} in {storage.address} cannot be read: {error}") from error
+    its = f"the pool in {storage.address} has format {version[0]} and schema {version[1]}"
+    if version[0] > FORMAT or version[1] > SCHEMA_VERSION:
+        raise PoolError(
+            f"{its}, this webots-mcp knows {FORMAT} and {SCHEMA_VERSION}: update webots-mcp"
+        )
+    if version != (FORMAT, SCHEMA_VERSION):
+        raise PoolError(
+            f"{its}, of an older webots-mcp: ship the recordings anew, into another folder"
+        )
+
+
+def make_pool(storage: Storage) -> None:
+    """Make a pool where there is nothing.
+
+    Raises:
+        PoolError: Other things are there, or another version made it.
+    """
+    if storage.read(POOL) is not None:
+        return require_pool(storage)
+    if storage.names():
+        raise PoolError(
+            f"{storage.address} holds other things and is no pool: name a new or empty folder"
+        )
+    about = {"format": FORMAT, "schema": SCHEMA_VERSION}
+    storage.place(POOL, json.dumps(about).encode())
+
+
+# -- one shipper at a time --------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -285,9 +520,6 @@ class _Holder:
     token: str
     until_wall_time_s: float
 
-    def encoded(self) -> bytes:
-        return json.dumps(asdict(self)).encode()
-
     def is_gone(self, now_s: float) -> bool:
         """Whether another may take over: this host knows that the process ended, or it is silent.
 
@@ -299,11 +531,11 @@ class _Holder:
 
 
 class Lease:
-    """Held from `take` to `give_back`, as long as it is renewed."""
+    """The lease of a recording, held from `take` to `give_back`, as long as it is renewed."""
 
-    def __init__(self, storage: Storage, path: str) -> None:
+    def __init__(self, storage: Storage, recording_uuid: str) -> None:
         self._storage = storage
-        self._path = path
+        self._path = f"{folder_of(recording_uuid)}/{LEASE}"
         self._token = os.urandom(8).hex()
         self._until_s = 0.0
 
@@ -318,7 +550,7 @@ class Lease:
             return
         holder = self._holder()
         if holder is not None and not holder.is_gone(now_s):
-            raise PoolBusyError(self._taken(holder))
+            raise self._taken(holder)
         self._storage.place(self._path, self._mine(now_s))
         self.require_mine()
 
@@ -348,290 +580,22 @@ class Lease:
         """
         holder = self._holder()
         if holder is None or holder.token != self._token:
-            raise PoolBusyError(self._taken(holder))
+            raise self._taken(holder)
 
     def _mine(self, now_s: float) -> bytes:
-        self._until_s = now_s + LEASE_S
-        pid = os.getpid()
+        self._until_s, pid = now_s + LEASE_S, os.getpid()
         mine = _Holder(host_name(), pid, process_identity(pid), self._token, self._until_s)
-        return mine.encoded()
+        return json.dumps(asdict(mine)).encode()
 
     def _holder(self) -> _Holder | None:
-        content = self._storage.read(self._path)
-        if content is None:
-            return None
         try:
-            told: dict[str, Any] = json.loads(content)
-            return _Holder(**told)
+            return _Holder(**json.loads(self._storage.read(self._path) or b""))
         except (ValueError, TypeError):  # nobody's: it is taken over
             return None
 
-    def _taken(self, holder: _Holder | None) -> str:
+    def _taken(self, holder: _Holder | None) -> PoolBusyError:
         by = f"process {holder.pid} on {holder.host}" if holder else "another process"
-        return (
+        return PoolBusyError(
             f"{by} ships this recording to {self._storage.address}: end it, or wait "
             f"{LEASE_S:g} s after it is gone"
         )
-
-
-# Which file of a pool a row is in: one of them, at any moment.
-#
-#     _pool                                       what this is, and of which version
-#     _runs/UUID                                  the recording that a run belongs to
-#     recording=UUID/_progress                    written last: what it says is there, is there
-#     recording=UUID/_lease                       who ships this recording
-#     recording=UUID/_pictures/PATH
-#     recording=UUID/table=NAME/day=YYYY-MM-DD/part-NUMBER.parquet    rows that never change
-#     recording=UUID/table=NAME/part-BLOCK.parquet                    rows that change
-#     recording=UUID/table=value/run=ID/part-NUMBER.parquet           a column for each signal
-#
-# A file is replaced as a whole, by itself with more rows. So whoever reads `*.parquet` while
-# somebody ships sees each row once or, for a moment, not yet. Engines pass over names that begin
-# with `_`.
-#
-# Rows that never change are in the part that was open when they came, and stay there: a part is
-# over once it is large. The progress says which one is open and how many rows of its files count:
-# rows beyond are those of a shipper that was killed. Rows that change are in blocks of ids.
-
-
-POOL: Final = "_pool"
-RUNS: Final = "_runs"
-PROGRESS: Final = "_progress"
-LEASE: Final = "_lease"
-CHUNK: Final = "chunk"
-VALUES: Final = "value"  # in the place of chunks a table with a column for each signal
-NO_DAY: Final = "__HIVE_DEFAULT_PARTITION__"  # read as null by engines
-
-_EPOCH: Final = datetime(1970, 1, 1, tzinfo=timezone.utc)
-_IDS_IN_BLOCK: Final = 4096
-
-
-def folder_of(recording_uuid: str) -> str:
-    """Where a recording is in the pool."""
-    return f"recording={recording_uuid}"
-
-
-def day_of(wall_time_s: SQLValue) -> str:
-    """The day in UTC, as it stands in a path; `NO_DAY` where the time is none."""
-    if not isinstance(wall_time_s, int | float):
-        return NO_DAY
-    try:
-        return (_EPOCH + timedelta(seconds=wall_time_s)).date().isoformat()
-    except (OverflowError, ValueError):  # NaN, or no year from 1 to 9999
-        return NO_DAY
-
-
-def picture_file(path: str) -> str:
-    """A picture, by the path in its row.
-
-    Raises:
-        PoolError: The path leads out of the folder of pictures.
-    """
-    parts = PurePosixPath(path).parts
-    if not parts or ".." in parts or path.startswith(("/", "\\")) or "\\" in path:
-        raise PoolError(f"{path!r} is no path of a picture: it leads out of the recording")
-    return f"_pictures/{'/'.join(parts)}"
-
-
-def name_of(table: Table) -> str:
-    """What a table is called in a pool of files."""
-    return VALUES if table.name == CHUNK else table.name
-
-
-def is_cut(table: Table) -> bool:
-    """Whether its rows never change and are in parts, of a day or of a run."""
-    return table.name == CHUNK or table.time_column is not None
-
-
-def appended_file(table: Table, folder: str, number: int | str) -> str:
-    """The part of a table whose rows never change."""
-    part = f"{number:06}" if isinstance(number, int) else number
-    return f"table={name_of(table)}/{folder}/part-{part}.parquet"
-
-
-def files_of(table: Table, recording_uuid: str = "*") -> str:
-    """The pattern of all files of a table, of one recording or of all."""
-    cut = "day=*/" if table.time_column else "run=*/" if table.name == CHUNK else ""
-    return f"{folder_of(recording_uuid)}/table={name_of(table)}/{cut}part-*.parquet"
-
-
-def uuid_in(path: str) -> str:
-    """The recording of a path."""
-    return path.partition("/")[0].removeprefix("recording=")
-
-
-def part_of(path: str) -> tuple[str, int]:
-    """The folder (`day=...`, `run=...`) and the number of a part."""
-    folder, _, name = path.rpartition("/part-")
-    return folder.rpartition("/")[2], int(name.removesuffix(".parquet"))
-
-
-def run_of(path: str) -> int | None:
-    """The run of a part, where it has the rows of one only."""
-    name, _, run_id = path.rpartition("/")[0].rpartition("/")[2].partition("=")
-    return int(run_id) if name == "run" else None
-
-
-def by_folder(table: Table, rows: Iterable[Row]) -> Mapping[str, list[Row]]:
-    """Rows that never change by their folders: those of a day, chunks of a run."""
-    place = table.columns.index(table.time_column or "run_id")
-    found: dict[str, list[Row]] = defaultdict(list)
-    for row in rows:
-        name = f"day={day_of(row[place])}" if table.time_column else f"run={row[place]}"
-        found[name].append(row)
-    return found
-
-
-def by_block(table: Table, rows: Iterable[Row]) -> Mapping[str, list[Row]]:
-    """Rows of a table that changes, by the files in which they are."""
-    found: dict[str, list[Row]] = defaultdict(list)
-    for row in rows:
-        found[f"table={table.name}/part-{_block(table, row)}.parquet"].append(row)
-    return found
-
-
-def _block(table: Table, row: Row) -> str:
-    if table.key == ("id",):
-        return f"{_whole(row[table.columns.index('id')]) // _IDS_IN_BLOCK:09}"
-    return f"{0:09}"
-
-
-def _whole(value: SQLValue) -> int:
-    if not isinstance(value, int | float) or not math.isfinite(value):
-        return 0
-    return math.floor(value)
-
-
-# What a pool says of itself, and what it holds of a recording: small objects of JSON.
-
-
-FORMAT: Final = 1
-
-
-@dataclass(frozen=True)
-class Part:
-    """The part of a table that is open: of a table whose rows never change.
-
-    Attributes:
-        number: Of the part; those before it are over.
-        rows: By the folder of its files, how many rows of each count.
-    """
-
-    number: int = 1
-    rows: Mapping[str, int] = field(default_factory=dict[str, int])
-
-    def counted(self, path: str) -> int | None:
-        """How many rows of a file count; None where all do."""
-        folder, number = part_of(path)
-        if number < self.number:
-            return None
-        return self.rows.get(folder, 0) if number == self.number else 0
-
-
-@dataclass(frozen=True)
-class Progress:
-    """What the pool holds of a recording.
-
-    Attributes:
-        numbers: As the shipper gave them.
-        parts: By table.
-    """
-
-    numbers: Mapping[str, int] = field(default_factory=dict[str, int])
-    parts: Mapping[str, Part] = field(default_factory=dict[str, Part])
-
-    def part(self, table: str) -> Part:
-        """Of a table, the first where it has no rows yet."""
-        return self.parts.get(table, Part())
-
-    def with_part(self, table: str, part: Part) -> Progress:
-        """After rows of a table have come."""
-        return replace(self, parts={**self.parts, table: part})
-
-
-def read_progress(storage: Storage, recording_uuid: str) -> Progress:
-    """What the pool holds of a recording: nothing where it is new.
-
-    Raises:
-        PoolError: It cannot be read.
-    """
-    path = f"{folder_of(recording_uuid)}/{PROGRESS}"
-    content = storage.read(path)
-    if content is None:
-        return Progress()
-    try:
-        told: dict[str, Any] = json.loads(content)
-        parts = {str(name): Part(**part) for name, part in told["parts"].items()}
-        return Progress({str(name): int(n) for name, n in told["numbers"].items()}, parts)
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise PoolError(f"{path} in {storage.address} cannot be read: {error}") from error
-
-
-def place_progress(storage: Storage, recording_uuid: str, progress: Progress) -> None:
-    """Say what is there: rows count from now on."""
-    content = json.dumps(asdict(progress)).encode()
-    storage.place(f"{folder_of(recording_uuid)}/{PROGRESS}", content)
-
-
-def require_pool(storage: Storage) -> None:
-    """Raise unless a pool of exactly this version is there.
-
-    Raises:
-        PoolError: There is none, or an older or a newer one.
-    """
-    content = storage.read(POOL)
-    if content is None:
-        raise PoolError(f"there is no pool in {storage.address}: ship a recording to it first")
-    try:
-        told: dict[str, Any] = json.loads(content)
-        its_format, schema = int(told["format"]), int(told["schema"])
-    except (ValueError, TypeError, KeyError) as error:
-        raise PoolError(f"{POOL} in {storage.address} cannot be read: {error}") from error
-    if its_format > FORMAT or schema > SCHEMA_VERSION:
-        raise PoolError(
-            f"the pool in {storage.address} has format {its_format} and schema {schema}, this "
-            f"webots-mcp knows {FORMAT} and {SCHEMA_VERSION}: update webots-mcp"
-        )
-    if schema < SCHEMA_VERSION:
-        raise PoolError(
-            f"the pool in {storage.address} has schema {schema}, of an older webots-mcp: ship the "
-            "recordings anew, into another folder"
-        )
-
-
-def make_pool(storage: Storage) -> None:
-    """Make a pool where there is nothing.
-
-    Raises:
-        PoolError: Other things are there, or another version made it.
-    """
-    if storage.read(POOL) is None:
-        if not storage.is_empty():
-            raise PoolError(
-                f"{storage.address} holds other things and is no pool: name a new or empty folder"
-            )
-        about = {"format": FORMAT, "schema": SCHEMA_VERSION}
-        return storage.place(POOL, json.dumps(about).encode())
-    require_pool(storage)
-
-
-# Packages that need not be there, and have no types: what they give is `Any`.
-
-
-_EXTRA: Final = ("pyarrow", "fsspec")
-
-
-def package(name: str) -> Any:
-    """A module of a package of the extra `parquet`, or of DuckDB.
-
-    Raises:
-        PoolError: It is not installed; the text says what to install.
-    """
-    try:
-        return import_module(name)
-    except ImportError as error:
-        whose = name.partition(".")[0]
-        if whose in _EXTRA:
-            raise PoolError(explain_extra("a pool of Parquet files", "parquet")) from error
-        asked = f"a SELECT over a pool of Parquet files needs {whose}"
-        raise PoolError(f"{asked}: {install_line([whose])}") from error

@@ -223,7 +223,7 @@ def _print_sizes(pool: Pool, *, as_json: bool) -> None:
 
     found = list(pool.sizes())
     if as_json:
-        return print_json({"tables": [vars(each) for each in found]})
+        return print_json({"tables": [each._asdict() for each in found]})
     sizes = [each.size_bytes for each in found if each.size_bytes is not None]
     rows: list[list[Any]] = [
         [each.table, each.rows, None if each.size_bytes is None else size_text(each.size_bytes)]
@@ -287,7 +287,7 @@ def ship(
     with --full each state. A password comes from PGPASSWORD, ~/.pgpass or a service file, never
     from the URL.
     """
-    from webots_mcp.plugins.pool.pool_contents import open_target, pause_of
+    from webots_mcp.plugins.pool.pool_contents import is_postgres, open_target
     from webots_mcp.plugins.pool.pool_interface import redacted
     from webots_mcp.plugins.pool.shipping import Order, Report
     from webots_mcp.plugins.pool.shipping import follow as follow_recording
@@ -307,7 +307,8 @@ def ship(
     try:
         if follow:
             _say(f"shipping to {redacted(url)} until Ctrl-C")
-            follow_recording(order, report, _say, pause_s or pause_of(url))
+            default_s = 2.0 if is_postgres(url) else 60.0  # of small files there are soon many
+            follow_recording(order, report, _say, pause_s or default_s)
         else:
             ship_once(order, report)
             is_done = True

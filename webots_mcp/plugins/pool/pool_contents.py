@@ -1,4 +1,9 @@
-"""What is in a pool, and which of its runs are meant."""
+"""What pools there are, what is in one, and which of its runs are meant.
+
+`postgresql://[USER@]HOST[:PORT]/DATABASE` and `postgresql:///?service=NAME` are PostgreSQL; a
+folder, `file:///FOLDER` and any other URL that fsspec knows are a dataset of Parquet files.
+Passwords come from PGPASSWORD, ~/.pgpass or a service file: in a URL, every process would see them.
+"""
 
 from __future__ import annotations
 
@@ -14,22 +19,171 @@ from typing import Annotated, Final
 from webots_mcp.cli.options import Parameter
 from webots_mcp.errors import InvalidInputError, PoolError
 from webots_mcp.naming import nearest_first
-from webots_mcp.plugins.pool.pool_interface import (
-    Pool,
-    PooledRun,
-    PooledTrialSet,
-    Target,
-    require_no_secret,
-)
+from webots_mcp.plugins.pool.pool_interface import LISTED, Pool, Target, require_no_secret
 from webots_mcp.requirements import explain_extra
 from webots_mcp.store.reading.ranges import parse_wall_time
 
 _MOST_OFFERED: Final = 3
-_OF_RUN: Final = (
-    "label", "world", "started_wall_time_s", "last_wall_time_s", "started_sim_time_s",
-    "last_sim_time_s", "end_reason", "row_count",
-)  # fmt: skip
 _MOST_COMPARED: Final = 2000  # names or UUIDs, with one that is not there
+_CONNECTION_STRING: Final = re.compile(
+    r"(^|\s)(host|hostaddr|dbname|user|password|passfile|service)\s*=", re.IGNORECASE
+)
+_NEARLY_A_URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
+
+
+def open_target(url: str) -> Target:
+    """The pool of a URL, to ship to: not yet connected. What it needs is imported only here.
+
+    Raises:
+        InvalidInputError: The URL names no pool, or holds a secret.
+        PoolError: The packages of an extra are missing.
+    """
+    if is_postgres(url):
+        _require_psycopg()
+        from webots_mcp.plugins.pool.postgres_pool import PostgresTarget
+
+        return PostgresTarget(url)
+    from webots_mcp.plugins.pool.parquet_pool import ParquetTarget
+
+    return ParquetTarget(url)
+
+
+def open_pool(url: str) -> Pool:
+    """The pool of a URL, to read from; as `open_target`."""
+    if is_postgres(url):
+        _require_psycopg()
+        from webots_mcp.plugins.pool.postgres_pool import PostgresPool
+
+        return PostgresPool(url)
+    from webots_mcp.plugins.pool.parquet_pool import ParquetPool
+
+    return ParquetPool(url)
+
+
+def is_postgres(url: str) -> bool:
+    """Whether it is PostgreSQL rather than files.
+
+    Raises:
+        InvalidInputError: It holds a secret, or is no URL and no folder.
+    """
+    if not url.strip():
+        raise InvalidInputError("the URL is empty: give postgresql://HOST/DATABASE or a folder")
+    scheme, sign, _ = url.partition("://")
+    if sign:
+        require_no_secret(url)
+        return scheme.lower() in ("postgresql", "postgres")
+    if _CONNECTION_STRING.search(url):
+        raise InvalidInputError(
+            "a connection string of PostgreSQL is no URL: write postgresql://USER@HOST/DATABASE, "
+            "and give the password in PGPASSWORD, ~/.pgpass or a service file"
+        )
+    if _NEARLY_A_URL.match(url):
+        raise InvalidInputError(
+            f"{url!r} is neither a URL nor a folder: write postgresql://HOST/DATABASE, "
+            "s3://BUCKET/PREFIX or ./FOLDER"
+        )
+    return False
+
+
+def _require_psycopg() -> None:
+    try:
+        import_module("psycopg")
+    except ImportError as missing:  # psycopg itself, or a libpq for it
+        raise PoolError(explain_extra("a pool in PostgreSQL", "postgres")) from missing
+
+
+# -- what is there ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PooledRun:
+    """A run in a pool, with what is needed to choose it and to fetch it.
+
+    The UUID is empty where an old version recorded it.
+    """
+
+    recording_uuid: str
+    run_id: int
+    uuid: str
+    robot: str
+    label: str | None
+    world: str | None
+    started_wall_time_s: float
+    last_wall_time_s: float
+    started_sim_time_s: float
+    last_sim_time_s: float
+    end_reason: str | None
+    row_count: int
+
+
+@dataclass(frozen=True)
+class PooledTrialSet:
+    """A trial set in a pool; `runs` are those of its trials, as (recording's UUID, run's id)."""
+
+    recording_uuid: str
+    trial_set_id: int
+    uuid: str
+    created_wall_time_s: float
+    trials: int
+    runs: tuple[tuple[str, int], ...]
+
+
+@dataclass(frozen=True)
+class PooledRobot:
+    """A robot name in a pool, and what all its runs come to."""
+
+    robot: str
+    recordings: int
+    runs: int
+    row_count: int
+    started_wall_time_s: float
+    last_wall_time_s: float
+
+
+def pooled_runs(pool: Pool) -> list[PooledRun]:
+    """All runs, by when they began."""
+    robots = {(owner, robot_id): name for owner, (robot_id, name) in pool.listed("robot")}
+    found: list[PooledRun] = []
+    for owner, (run_id, robot_id, uuid, *others) in pool.listed("run"):
+        named = dict(zip(LISTED["run"][3:], others, strict=True))
+        robot = robots.get((owner, robot_id), "")
+        found.append(PooledRun(owner, run_id, uuid or "", robot, **named))
+    return sorted(found, key=lambda run: (run.started_wall_time_s, run.recording_uuid, run.run_id))
+
+
+def pooled_trial_sets(pool: Pool) -> list[PooledTrialSet]:
+    """All trial sets, by when they were made."""
+    trials = defaultdict[tuple[str, int], list[int | None]](list)
+    for owner, (_, set_id, run_id) in pool.listed("trial"):
+        trials[owner, set_id].append(run_id)
+    found: list[PooledTrialSet] = []
+    for owner, (set_id, uuid, created_s) in pool.listed("trial_set"):
+        own = trials[owner, set_id]
+        runs = tuple((owner, run_id) for run_id in own if run_id is not None)
+        found.append(PooledTrialSet(owner, set_id, uuid, created_s, len(own), runs))
+    return sorted(found, key=lambda each: (each.created_wall_time_s, each.uuid))
+
+
+def robots(runs: Iterable[PooledRun]) -> list[PooledRobot]:
+    """The robots of some runs, those that recorded last first."""
+    by_name: dict[str, list[PooledRun]] = {}
+    for run in runs:
+        by_name.setdefault(run.robot, []).append(run)
+    found = [
+        PooledRobot(
+            robot=name,
+            recordings=len({run.recording_uuid for run in own}),
+            runs=len(own),
+            row_count=sum(run.row_count for run in own),
+            started_wall_time_s=min(run.started_wall_time_s for run in own),
+            last_wall_time_s=max(run.last_wall_time_s for run in own),
+        )
+        for name, own in by_name.items()
+    ]
+    return sorted(found, key=lambda robot: -robot.last_wall_time_s)
+
+
+# -- which are meant --------------------------------------------------------------------------
 
 
 def _option(name: str, metavar: str, text: str) -> Parameter:
@@ -82,53 +236,6 @@ class Meant:
     trial_sets: Sequence[PooledTrialSet]
 
 
-@dataclass(frozen=True)
-class PooledRobot:
-    """A robot name in a pool, and what all its runs come to."""
-
-    robot: str
-    recordings: int
-    runs: int
-    row_count: int
-    started_wall_time_s: float
-    last_wall_time_s: float
-
-
-def pooled_runs(pool: Pool) -> list[PooledRun]:
-    """All runs, by when they began."""
-    robots = {(owner, row["id"]): row["name"] for owner, row in pool.records("robot")}
-    found = [
-        PooledRun(
-            recording_uuid=owner,
-            run_id=row["id"],
-            uuid=row["uuid"] or "",
-            robot=robots.get((owner, row["robot_id"]), ""),
-            **{name: row[name] for name in _OF_RUN},
-        )
-        for owner, row in pool.records("run")
-    ]
-    return sorted(found, key=lambda run: (run.started_wall_time_s, run.recording_uuid, run.run_id))
-
-
-def pooled_trial_sets(pool: Pool) -> list[PooledTrialSet]:
-    """All trial sets, by when they were made."""
-    trials = defaultdict[tuple[str, int], list[int | None]](list)
-    for owner, row in pool.records("trial"):
-        trials[owner, row["trial_set_id"]].append(row["run_id"])
-    found = [
-        PooledTrialSet(
-            recording_uuid=owner,
-            trial_set_id=row["id"],
-            uuid=row["uuid"],
-            created_wall_time_s=row["created_wall_time_s"],
-            trials=len(own := trials[owner, row["id"]]),
-            runs=tuple((owner, run_id) for run_id in own if run_id is not None),
-        )
-        for owner, row in pool.records("trial_set")
-    ]
-    return sorted(found, key=lambda each: (each.created_wall_time_s, each.uuid))
-
-
 def chosen_runs(pool: Pool, choice: Choice) -> list[PooledRun]:
     """The runs that are meant, by when they began.
 
@@ -140,17 +247,29 @@ def chosen_runs(pool: Pool, choice: Choice) -> list[PooledRun]:
         raise InvalidInputError(f"the pool {pool.address} holds no run yet")
     found = runs
     if choice.run_uuid is not None:
-        found = [_one_of(runs, choice.run_uuid)]
+        uuid = _named("run", choice.run_uuid, [run.uuid for run in runs])
+        found = [next(run for run in runs if run.uuid == uuid)]
     if choice.trials is not None:
-        sets = chosen_trial_sets(pool, choice)
-        ids = {run for each in sets for run in each.runs}
+        ids = {run for each in chosen_trial_sets(pool, choice) for run in each.runs}
         found = [run for run in found if (run.recording_uuid, run.run_id) in ids]
     if choice.robot is not None:
-        _require_known("robot", choice.robot, [run.robot for run in runs])
+        names = [run.robot for run in runs]
+        if choice.robot not in names:
+            raise _unknown("robot called", choice.robot, names)
         found = [run for run in found if run.robot == choice.robot]
-    if choice.label is not None:
-        found = _labelled(runs, found, choice.label)
-    found = _in_time(found, choice)
+    if (label := choice.label) is not None:
+        labels = [run.label for run in runs if run.label]
+        matching = {each for each in labels if each == label or fnmatch.fnmatchcase(each, label)}
+        if not matching:
+            raise _unknown("run with the label", label, labels)
+        found = [run for run in found if run.label in matching]
+    since_s = parse_wall_time(choice.since, -math.inf)
+    until_s = parse_wall_time(choice.until, math.inf)
+    found = [
+        run
+        for run in found
+        if run.last_wall_time_s >= since_s and run.started_wall_time_s < until_s
+    ]
     if not found:
         raise InvalidInputError(f"no run in {pool.address} is all of that: ask for less")
     return found
@@ -182,30 +301,6 @@ def chosen_trial_sets(pool: Pool, choice: Choice) -> list[PooledTrialSet]:
     return [each for each in sets if each.uuid == uuid]
 
 
-def robots(runs: Iterable[PooledRun]) -> list[PooledRobot]:
-    """The robots of some runs, those that recorded last first."""
-    by_name: dict[str, list[PooledRun]] = {}
-    for run in runs:
-        by_name.setdefault(run.robot, []).append(run)
-    found = [
-        PooledRobot(
-            robot=name,
-            recordings=len({run.recording_uuid for run in own}),
-            runs=len(own),
-            row_count=sum(run.row_count for run in own),
-            started_wall_time_s=min(run.started_wall_time_s for run in own),
-            last_wall_time_s=max(run.last_wall_time_s for run in own),
-        )
-        for name, own in by_name.items()
-    ]
-    return sorted(found, key=lambda robot: -robot.last_wall_time_s)
-
-
-def _one_of(runs: Sequence[PooledRun], asked: str) -> PooledRun:
-    uuid = _named("run", asked, [run.uuid for run in runs])
-    return next(run for run in runs if run.uuid == uuid)
-
-
 def _named(what: str, asked: str, uuids: Sequence[str]) -> str:
     """The only UUID that begins so.
 
@@ -224,113 +319,8 @@ def _named(what: str, asked: str, uuids: Sequence[str]) -> str:
     raise _unknown(f"{what} whose UUID begins with", asked, uuids)
 
 
-def _labelled(runs: Sequence[PooledRun], found: Sequence[PooledRun], label: str) -> list[PooledRun]:
-    labels = [run.label for run in runs if run.label]
-    if not any(_matches(each, label) for each in labels):
-        raise _unknown("run with the label", label, labels)
-    return [run for run in found if run.label and _matches(run.label, label)]
-
-
-def _matches(label: str, pattern: str) -> bool:
-    return label == pattern or fnmatch.fnmatchcase(label, pattern)
-
-
-def _in_time(runs: Sequence[PooledRun], choice: Choice) -> list[PooledRun]:
-    since_s = parse_wall_time(choice.since, -math.inf)
-    until_s = parse_wall_time(choice.until, math.inf)
-    return [
-        run for run in runs if run.last_wall_time_s >= since_s and run.started_wall_time_s < until_s
-    ]
-
-
-def _require_known(what: str, asked: str, known: Sequence[str]) -> None:
-    if asked not in known:
-        raise _unknown(f"{what} called", asked, known)
-
-
 def _unknown(what: str, asked: str, known: Sequence[str]) -> InvalidInputError:
     newest = list(dict.fromkeys(reversed(known)))[:_MOST_COMPARED]
     offered = nearest_first(asked, newest)[:_MOST_OFFERED]
     hint = f"; nearest are {', '.join(map(repr, offered))}" if offered else ""
     return InvalidInputError(f"the pool holds no {what} {asked!r}{hint}")
-
-
-# Opening the pool that a URL names: PostgreSQL, or a dataset of Parquet files.
-#
-# `postgresql://[USER@]HOST[:PORT]/DATABASE` and `postgresql:///?service=NAME` are PostgreSQL; a
-# folder, `file:///FOLDER` and any other URL that fsspec knows are a dataset of Parquet files.
-# Passwords come from PGPASSWORD, ~/.pgpass or a service file: in a URL, every process would see
-# them.
-
-
-_CONNECTION_STRING: Final = re.compile(
-    r"(^|\s)(host|hostaddr|dbname|user|password|passfile|service)\s*=", re.IGNORECASE
-)
-_NEARLY_A_URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
-_POSTGRES: Final = ("postgresql", "postgres")
-
-
-def open_target(url: str) -> Target:
-    """The pool of a URL, to ship to: not yet connected. What it needs is imported only here.
-
-    Raises:
-        InvalidInputError: The URL names no pool, or holds a secret.
-        PoolError: The packages of an extra are missing.
-    """
-    if _is_postgres(url):
-        _require_psycopg()
-        from webots_mcp.plugins.pool.postgres_pool import PostgresTarget
-
-        return PostgresTarget(url)
-    from webots_mcp.plugins.pool.parquet_pool import ParquetTarget
-
-    return ParquetTarget(url)
-
-
-def open_pool(url: str) -> Pool:
-    """The pool of a URL, to read from; as `open_target`."""
-    if _is_postgres(url):
-        _require_psycopg()
-        from webots_mcp.plugins.pool.postgres_pool import PostgresPool
-
-        return PostgresPool(url)
-    from webots_mcp.plugins.pool.parquet_pool import ParquetPool
-
-    return ParquetPool(url)
-
-
-def _require_psycopg() -> None:
-    try:
-        import_module("psycopg")
-    except ImportError as missing:  # psycopg itself, or a libpq for it
-        raise PoolError(explain_extra("a pool in PostgreSQL", "postgres")) from missing
-
-
-def pause_of(url: str) -> float:
-    """How long to wait between two looks at a recording: of small files a pool has soon many."""
-    return 2.0 if _is_postgres(url) else 60.0
-
-
-def _is_postgres(url: str) -> bool:
-    """Whether it is PostgreSQL rather than files.
-
-    Raises:
-        InvalidInputError: It holds a secret, or is no URL and no folder.
-    """
-    if not url.strip():
-        raise InvalidInputError("the URL is empty: give postgresql://HOST/DATABASE or a folder")
-    scheme, sign, _ = url.partition("://")
-    if sign:
-        require_no_secret(url)
-        return scheme.lower() in _POSTGRES
-    if _CONNECTION_STRING.search(url):
-        raise InvalidInputError(
-            "a connection string of PostgreSQL is no URL: write postgresql://USER@HOST/DATABASE, "
-            "and give the password in PGPASSWORD, ~/.pgpass or a service file"
-        )
-    if _NEARLY_A_URL.match(url):
-        raise InvalidInputError(
-            f"{url!r} is neither a URL nor a folder: write postgresql://HOST/DATABASE, "
-            "s3://BUCKET/PREFIX or ./FOLDER"
-        )
-    return False

@@ -1,14 +1,18 @@
-"""Which tables are shipped to a pool, and how: derived from the models."""
+"""What is shipped to a pool, and what the two kinds of pools do: tables, batches, protocols.
+
+Each row is keyed by its recording's UUID and the key that it has there.
+"""
 
 from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, TypeAlias, cast
 from urllib.parse import parse_qsl
 
 from webots_mcp.errors import InvalidInputError
@@ -18,7 +22,11 @@ if TYPE_CHECKING:
 
 SQLValue: TypeAlias = "int | float | str | bytes | None"
 Kind: TypeAlias = type[int] | type[float] | type[str] | type[bytes]
+Row = tuple[SQLValue, ...]
 
+BATCH_BYTES: Final = 4_000_000
+BATCH_ROWS: Final = 20_000
+_VALUE_BYTES: Final = 8
 _DATED: Final = ("state", "kept_state", "log", "event", "image", "parameter_value")
 CHUNKS: Final = ("row_group", "chunk")
 # Of one machine or one moment: who maintains it, what is kept there, and console lines that wait
@@ -33,6 +41,26 @@ _OF_TRIALS: Final = ("trial_set", "trial")
 _TYPES: Final[dict[str, Kind]] = {
     "INTEGER": int, "BIGINT": int, "FLOAT": float, "TEXT": str, "VARCHAR": str, "BLOB": bytes,
 }  # fmt: skip
+# What is needed to list the runs and trial sets of a pool: of few tables few columns.
+LISTED: Final[dict[str, tuple[str, ...]]] = {
+    "robot": ("id", "name"),
+    "run": (
+        "id", "robot_id", "uuid", "label", "world", "started_wall_time_s", "last_wall_time_s",
+        "started_sim_time_s", "last_sim_time_s", "end_reason", "row_count",
+    ),
+    "trial_set": ("id", "uuid", "created_wall_time_s"),
+    "trial": ("id", "trial_set_id", "run_id"),
+}  # fmt: skip
+_WHOLE: Final = "run.whole:{}"  # a bit for each of so many runs
+_RUNS_IN_NUMBER: Final = 60
+_SECRET: Final = re.compile(
+    "password|passwd|secret|token|credential|signature|authorization|(access|api|account)[_-]?key|"
+    "^(pass|key|sig|pwd)$",
+    re.IGNORECASE,
+)
+
+
+# -- what is shipped --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -95,59 +123,38 @@ def _table(model: Any) -> Table:
     local = _LOCAL_COLUMNS.get(name, ())
     shipped: list[Any] = [column for column in model.columns if column.name not in local]
     columns = tuple(str(column.name) for column in shipped)
+    comments: dict[str, str] = {column.name: column.comment or "" for column in shipped}
+
+    def column_of(owner: str) -> str | None:
+        named = "id" if name == owner else f"{owner}_id"
+        return named if named in columns else None
+
     return Table(
         name=name,
         key=tuple(column.name for column in model.primary_key.columns),
         columns=columns,
         types=tuple(_TYPES[str(column.type)] for column in shipped),
-        json_columns=frozenset(column.name for column in shipped if _is_json(column)),
-        json_values=frozenset(column.name for column in shipped if _is_value(column)),
+        json_columns=frozenset(
+            each for each in columns if comments[each].startswith("JSON") or each == "replaced"
+        ),
+        json_values=frozenset(each for each in columns if comments[each].startswith("JSON value")),
         nullable=frozenset(column.name for column in shipped if column.nullable),
-        lasting=frozenset(column.name for column in shipped if _is_lasting(column)),
+        lasting=frozenset(
+            column.name
+            for column in shipped
+            if any(key.ondelete == "SET NULL" for key in column.foreign_keys)
+        ),
         is_appended=name in _DATED + CHUNKS,
         time_column="wall_time_s" if name in _DATED else None,
-        run_column=_column_of("run", name, columns),
-        session_column=_column_of("session", name, columns),
+        run_column=column_of("run"),
+        session_column=column_of("session"),
         outlasts_runs=name in _OF_TRIALS,
     )
 
 
-def _column_of(owner: str, name: str, columns: tuple[str, ...]) -> str | None:
-    if name == owner:
-        return "id"
-    return f"{owner}_id" if f"{owner}_id" in columns else None
-
-
-def _is_json(column: Any) -> bool:
-    return (column.comment or "").startswith("JSON") or column.name == "replaced"
-
-
-def _is_value(column: Any) -> bool:
-    return (column.comment or "").startswith("JSON value")
-
-
-def _is_lasting(column: Any) -> bool:
-    return any(key.ondelete == "SET NULL" for key in column.foreign_keys)
-
-
-# Rows of one table that are written together, bounded in bytes: memory is bounded as well.
-
-
-BATCH_BYTES: Final = 4_000_000
-BATCH_ROWS: Final = 20_000
-_VALUE_BYTES: Final = 8
-_SIZED: Final = (str, bytes)
-
-Row = tuple[SQLValue, ...]
-
-
 @dataclass(frozen=True)
 class Batch:
-    """Rows in the order of the table's columns, with the values that SQLite holds.
-
-    JSON is text, a flag 0 or 1. SQLite may hold any type in any column: what a target cannot hold
-    it turns into what comes nearest, and counts.
-    """
+    """Rows in the order of the table's columns: JSON is text, a flag 0 or 1."""
 
     table: Table
     rows: Sequence[Row]
@@ -168,51 +175,71 @@ def batches(table: Table, rows: Iterable[Row]) -> Iterator[Batch]:
         yield Batch(table, held)
 
 
-def nearest(value: SQLValue, kind: type, *, nullable: bool) -> SQLValue:
-    """The value of a type that comes nearest to one that SQLite holds."""
-    if value is None:
-        return None if nullable else kind()
-    if kind is str:
-        text = value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
-        return text.encode("utf-8", "surrogatepass").decode("utf-8", "replace")
-    if kind is bytes:
-        return value if isinstance(value, bytes) else None
-    number = number_in(value)
-    if number is None:
-        return None if nullable else kind()
-    if kind is float:
-        return float(number)
-    if math.isfinite(number) and abs(number) < 2**63:
-        return int(number)
-    return None if nullable else 0
-
-
-def number_in(value: SQLValue) -> int | float | None:
-    """The number that it is, or says; None of what is none."""
-    if isinstance(value, int | float):
-        return value
-    try:
-        return float(value or "")
-    except ValueError:
-        return None
-
-
 def row_bytes(row: Row) -> int:
     """About how many bytes of memory a row's values take."""
-    sized = sum([len(value) for value in row if isinstance(value, _SIZED)])
+    sized = sum([len(value) for value in row if isinstance(value, (str, bytes))])
     return sized + _VALUE_BYTES * len(row)
 
 
-# What a pool can do, and how its URL may be shown.
+def fitted(batch: Batch, replaced: Counter[str]) -> Batch:
+    """The rows with values of the types of their columns, where SQLite may hold any.
+
+    Args:
+        batch: As it was read.
+        replaced: Counts by column (`log.message`) the values in whose place is what comes nearest.
+    """
+    columns: list[Sequence[SQLValue]] = [*zip(*batch.rows, strict=True)]
+    described = zip(batch.table.columns, batch.table.types, columns, strict=True)
+    others = [
+        (at, name, kind)
+        for at, (name, kind, values) in enumerate(described)
+        if not set(map(type, values)) <= {kind, type(None)}
+    ]
+    for at, name, kind in others:
+        values, nullable = columns[at], name in batch.table.nullable
+        columns[at] = [_nearest(value, kind, nullable=nullable) for value in values]
+        pairs = zip(columns[at], values, strict=True)
+        replaced[f"{batch.table.name}.{name}"] += sum(new != old for new, old in pairs)
+    return Batch(batch.table, [*zip(*columns, strict=True)]) if others else batch
 
 
-_SECRET: Final = re.compile(
-    "password|passwd|secret|token|credential|signature|authorization|(access|api|account)[_-]?key|"
-    "^(pass|key|sig|pwd)$",
-    re.IGNORECASE,
-)
-_WHOLE: Final = "run.whole:{}"  # a bit for each of so many runs
-_RUNS_TOLD: Final = 60
+def _nearest(value: SQLValue, kind: Kind, *, nullable: bool) -> SQLValue:
+    """The value of a type that comes nearest to one that SQLite holds."""
+    least = None if nullable else kind()
+    if value is None or isinstance(value, kind):
+        return value
+    if kind is str:
+        return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+    if kind is bytes:
+        return least
+    try:
+        number = float(value)
+    except ValueError:
+        return least
+    if kind is float:
+        return number
+    return int(number) if math.isfinite(number) and abs(number) < 2**63 else least
+
+
+# -- how far ----------------------------------------------------------------------------------
+
+
+def whole_runs(run_ids: Iterable[int]) -> dict[str, int]:
+    """Numbers of the progress that say of these runs: they are over, and all of them is there."""
+    numbers: dict[str, int] = {}
+    for run_id in run_ids:
+        name = _WHOLE.format(run_id // _RUNS_IN_NUMBER)
+        numbers[name] = numbers.get(name, 0) | 1 << run_id % _RUNS_IN_NUMBER
+    return numbers
+
+
+def is_whole(progress: Mapping[str, int], run_id: int) -> bool:
+    """Whether the progress says so of a run."""
+    number = progress.get(_WHOLE.format(run_id // _RUNS_IN_NUMBER), 0)
+    return bool(number >> run_id % _RUNS_IN_NUMBER & 1)
+
+
+# -- what an engine does ----------------------------------------------------------------------
 
 
 class Shipment(Protocol):
@@ -234,12 +261,12 @@ class Shipment(Protocol):
         ...
 
     def write(self, batches: Sequence[Batch], progress: Mapping[str, int]) -> Mapping[str, int]:
-        """Write rows, and change these numbers of the progress: all of it or nothing.
+        """Write fitted rows, and change these numbers of the progress: all of it or nothing.
 
-        Rows of appended tables that are there already are left alone. A row of the others replaces
-        the one of its key, but where a column of `Table.lasting` is null, the value stays; rows
-        that are not in the batch stay too, since retention at the edge deletes what a pool keeps.
-        Batches may name a table twice; what a row refers to comes before it.
+        Rows of appended tables come once. A row of the others replaces the one of its key, but
+        where a column of `Table.lasting` is null, the value stays; rows that are not in the batch
+        stay too, since retention at the edge deletes what a pool keeps. Batches may name a table
+        twice; what a row refers to comes before it.
 
         Returns:
             By column (`log.message`), how many values the pool cannot hold as they are: it has what
@@ -275,10 +302,10 @@ class Target(Protocol):
         ...
 
     def prepare(self) -> None:
-        """Make the tables, or bring them to this version.
+        """Make the tables where there are none.
 
         Raises:
-            PoolError: They are newer, none of ours, or cannot be written.
+            PoolError: They are of another version, none of ours, or cannot be written.
         """
         ...
 
@@ -291,41 +318,7 @@ class Target(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class PooledRun:
-    """A run in a pool, with what is needed to choose it and to fetch it.
-
-    The UUID is empty where an old version recorded it.
-    """
-
-    recording_uuid: str
-    run_id: int
-    uuid: str
-    robot: str
-    label: str | None
-    world: str | None
-    started_wall_time_s: float
-    last_wall_time_s: float
-    started_sim_time_s: float
-    last_sim_time_s: float
-    end_reason: str | None
-    row_count: int
-
-
-@dataclass(frozen=True)
-class PooledTrialSet:
-    """A trial set in a pool; `runs` are those of its trials, as (recording's UUID, run's id)."""
-
-    recording_uuid: str
-    trial_set_id: int
-    uuid: str
-    created_wall_time_s: float
-    trials: int
-    runs: tuple[tuple[str, int], ...]
-
-
-@dataclass(frozen=True)
-class PooledSize:
+class PooledSize(NamedTuple):
     """How much of a table is in a pool; bytes where the pool can tell."""
 
     table: str
@@ -340,17 +333,15 @@ class Pool(Protocol):
 
     Attributes:
         address: Its URL without secrets.
-        keeps_order: Whether the keys of JSON objects come in the order in which they were shipped.
     """
 
     address: str
-    keeps_order: bool
 
     def __enter__(self) -> Pool: ...
     def __exit__(self, *exception: object) -> None: ...
 
-    def records(self, name: str) -> Iterator[tuple[str, dict[str, Any]]]:
-        """All rows of a table that changes, each behind its recording's UUID."""
+    def listed(self, name: str) -> Iterator[tuple[str, Sequence[Any]]]:
+        """The columns `LISTED` of all rows of such a table, behind their recording's UUID."""
         ...
 
     def sizes(self) -> Iterator[PooledSize]:
@@ -376,18 +367,7 @@ class Pool(Protocol):
         ...
 
 
-def whole_runs(run_ids: Iterable[int]) -> dict[str, int]:
-    """Numbers of the progress that say of these runs: they are over, and all of them is there."""
-    told: dict[str, int] = {}
-    for run_id in run_ids:
-        name = _WHOLE.format(run_id // _RUNS_TOLD)
-        told[name] = told.get(name, 0) | 1 << run_id % _RUNS_TOLD
-    return told
-
-
-def is_whole(progress: Mapping[str, int], run_id: int) -> bool:
-    """Whether the progress says so of a run."""
-    return bool(progress.get(_WHOLE.format(run_id // _RUNS_TOLD), 0) >> run_id % _RUNS_TOLD & 1)
+# -- what may be shown of a URL ---------------------------------------------------------------
 
 
 def redacted(url: str) -> str:

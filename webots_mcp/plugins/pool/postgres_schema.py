@@ -1,16 +1,17 @@
-"""The tables of a pool in PostgreSQL, made from the models of those of a recording.
+"""The tables and views of a pool in PostgreSQL, and connections to it.
 
-What differs: the recording's UUID comes before every key, integers have 64 bits, JSON is jsonb, and
-appended tables are partitioned by wall time, a month each. A pool outlives what retention deletes
-at the edge, and has runs of which another recording shipped the rest: so rows may refer to what is
-not there, names may come again, and there are no foreign keys and no unique columns but the keys.
-`run_owner` holds that a run is in a pool once.
+The tables are made from the models of those of a recording. What differs: the recording's UUID
+comes before every key, integers have 64 bits, JSON is jsonb, and appended tables are partitioned by
+wall time, a month each. A pool outlives what retention deletes at the edge, and has runs of which
+another recording shipped the rest: so rows may refer to what is not there, names may come again,
+and there are no foreign keys and no unique columns but the keys. `run_owner` holds that a run is in
+a pool once. The views are those of a recording, by the same names, with its UUID.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from datetime import datetime, timezone
 from typing import Any, Final, TypeAlias
@@ -27,6 +28,106 @@ from webots_mcp.naming import METRES
 from webots_mcp.plugins.pool.pool_interface import Table, tables
 from webots_mcp.store.models import STATISTICS
 
+Connection: TypeAlias = "psycopg.Connection[tuple[Any, ...]]"
+
+# A server that went away is noticed within a minute, on both sides.
+_CLIENT: Final[dict[str, Any]] = {
+    "connect_timeout": 10, "keepalives_idle": 30, "keepalives_interval": 10, "keepalives_count": 3,
+    "tcp_user_timeout": 60_000, "client_encoding": "UTF8",
+    "fallback_application_name": "webots-mcp",
+}  # fmt: skip
+_SERVER: Final = """
+    SET tcp_keepalives_idle = 30; SET tcp_keepalives_interval = 10; SET tcp_keepalives_count = 3;
+    SET idle_in_transaction_session_timeout = '60s'; SET lock_timeout = '30s';
+    SET synchronous_commit = on"""
+# What is said of a connection that is not made for reasons that last.
+_LASTING: Final = re.compile(
+    "password|authentication|does not exist|permission denied|pg_hba|certificate|"
+    "definition of service|invalid|not allowed|no encryption",
+    re.IGNORECASE,
+)
+# Classes of SQLSTATE, and some of their members, after which the same may succeed.
+_PASSING: Final = ("08", "40", "53", "57", "58", "55P03", "25P03", "XX")
+_PRIVILEGE: Final = "42501"
+_READ_ONLY: Final = "25006"
+_FULL: Final = "53100"
+_THERE_ALREADY: Final = ("42P07", "42723")  # a table, a function
+
+
+def connect(url: str, address: str) -> Connection:
+    """Connect to the database of a URL; libpq looks for passwords where it always does.
+
+    Raises:
+        PoolUnavailableError: Nobody answers.
+        PoolError: Who answers does not let us in.
+    """
+    connection = _connected(url, address)
+    if isinstance(connection, PoolError):
+        raise connection
+    with clear_errors(address):
+        connection.execute(_SERVER.encode())
+    return connection
+
+
+def _connected(url: str, address: str) -> Connection | PoolError:
+    """A connection, or why there is none.
+
+    That is not raised here, as psycopg's error would go with it, which holds the password.
+    """
+    try:
+        return psycopg.connect(url, autocommit=True, **_CLIENT)
+    except psycopg.Error as error:
+        said = one_line(str(error))
+        if error.pgconn is not None and error.pgconn.needs_password:
+            return PoolError(
+                f"{address} asks for a password: give it in PGPASSWORD, ~/.pgpass or a service file"
+            )
+        if isinstance(error, psycopg.ProgrammingError) or _LASTING.search(said):
+            return PoolError(f"{address} refuses the connection: {said}")
+        return PoolUnavailableError(f"{address} does not answer: {said}")
+
+
+@contextmanager
+def clear_errors(address: str) -> Generator[None]:
+    """Inside the block, errors of PostgreSQL are ours; their texts hold no values of rows."""
+    try:
+        yield
+    except psycopg.Error as error:
+        raise _explained(error, address) from None
+
+
+def _explained(error: psycopg.Error, address: str) -> PoolError:
+    state = error.sqlstate or ""
+    said = one_line(error.diag.message_primary or str(error))
+    is_lost = not state and isinstance(error, psycopg.OperationalError)  # the connection
+    if state == _PRIVILEGE:
+        return PoolError(f"{address} forbids it: {said}; see docs/pool.md for what to grant")
+    if state == _READ_ONLY:
+        return PoolError(
+            f"{address} is read-only ({said}): a standby, or a database or role that is set so; "
+            "give the URL of the primary, and a role that may write"
+        )
+    if state in _THERE_ALREADY:
+        return PoolError(
+            f"{address} holds tables of something else that are called as those of a pool ({said}):"
+            " give a database of its own, or a schema of its own by "
+            "'?options=-csearch_path%3DNAME' in the URL"
+        )
+    if state == _FULL:
+        return PoolUnavailableError(f"the disk of {address} is full: {said}")
+    if state.startswith(_PASSING) or is_lost:
+        return PoolUnavailableError(f"{address} could not do it now: {said}")
+    return PoolError(f"{address} refused it: {said}")
+
+
+def one_line(text: str) -> str:
+    """A text without line breaks, and without the advice for beginners that libpq indents."""
+    lines = (line for line in text.splitlines() if not line.startswith("\t"))
+    return " ".join(" ".join(lines).split())
+
+
+# -- tables -----------------------------------------------------------------------------------
+
 OWNER: Final = "recording_uuid"
 VERSION: Final = "pool_version"
 FIRST_YEAR: Final = 2000
@@ -34,7 +135,6 @@ LAST_YEAR: Final = 2099
 FIRST_S: Final = datetime(FIRST_YEAR, 1, 1, tzinfo=timezone.utc).timestamp()
 END_S: Final = datetime(LAST_YEAR + 1, 1, 1, tzinfo=timezone.utc).timestamp()
 _LOCK: Final = 7_463_962_947  # of whoever makes tables: any number that nobody else takes
-_ENCODING: Final = "UTF8"
 
 # What a pool has beside the tables of a recording. `make_partition` belongs to the owner of the
 # tables, so that whoever ships need not own them.
@@ -106,11 +206,6 @@ _OUTER_PARTITIONS: Final = (
     f"CREATE TABLE {{0}}_after_{LAST_YEAR} PARTITION OF {{0}} "
     f"FOR VALUES FROM ({END_S}) TO (MAXVALUE)",
 )
-_TO_GRANT: Final = (
-    "GRANT USAGE ON SCHEMA {schema} TO {role}; "
-    "GRANT SELECT, INSERT, UPDATE ON ALL TABLES IN SCHEMA {schema} TO {role}; "
-    "GRANT EXECUTE ON ALL FUNCTIONS IN SCHEMA {schema} TO {role}"
-)
 
 
 def prepare(url: str, address: str) -> None:
@@ -121,19 +216,18 @@ def prepare(url: str, address: str) -> None:
         PoolError: The tables are older, newer or none of ours, or the role lacks a right.
     """
     with connect(url, address) as connection, clear_errors(address):
-        _require_usable(connection, address)
         if _is_pool(connection):
-            _require_writable(connection, address)
             return require_current(connection, address)
-        _require_create(connection, address)
-    with clear_errors(address), connect(url, address, autocommit=False) as connection:
-        connection.execute("SELECT pg_advisory_xact_lock(%s)", (_LOCK,))
-        if _is_pool(connection):  # another was faster
-            return
-        _require_nothing_foreign(connection, address)
-        for statement in (*_table_statements(), _OWN):
-            connection.execute(statement.encode())
-        make_views(connection)
+        if (encoding := _first(connection, "SHOW server_encoding")) != "UTF8":
+            raise PoolError(
+                f"the database of {address} has the encoding {encoding}, which lacks letters: "
+                "make one with CREATE DATABASE ... ENCODING 'UTF8' TEMPLATE template0"
+            )
+        with connection.transaction():
+            connection.execute("SELECT pg_advisory_xact_lock(%s)", (_LOCK,))
+            if not _is_pool(connection):  # else another was faster
+                for statement in (*_table_statements(), _OWN, _FUNCTIONS, *_view_statements()):
+                    connection.execute(statement.encode())
 
 
 def require_current(connection: Connection, address: str) -> None:
@@ -142,9 +236,14 @@ def require_current(connection: Connection, address: str) -> None:
     Raises:
         PoolError: There is none, or an older or a newer one.
     """
-    version = _version(connection)
-    if version is None:
+    if not _is_pool(connection):
         raise PoolError(f"{address} holds no pool: nothing was shipped there yet")
+    version = int(_first(connection, f"SELECT version_num FROM {VERSION}"))
+    if version > SCHEMA_VERSION:
+        raise PoolError(
+            f"the pool has schema {version}, this webots-mcp knows {SCHEMA_VERSION}: "
+            "upgrade it with 'pip install --upgrade', from where it was installed"
+        )
     if version < SCHEMA_VERSION:
         raise PoolError(
             f"{address} has schema {version}, of an older webots-mcp: ship the recordings anew, "
@@ -152,101 +251,15 @@ def require_current(connection: Connection, address: str) -> None:
         )
 
 
-def _version(connection: Connection) -> int | None:
-    """The schema version of the pool; None where there is none.
-
-    Raises:
-        PoolError: It is newer than this webots-mcp.
-    """
-    if not _is_pool(connection):
-        return None
-    version = int(_first(connection, f"SELECT version_num FROM {VERSION}"))
-    if version > SCHEMA_VERSION:
-        raise PoolError(
-            f"the pool has schema {version}, this webots-mcp knows {SCHEMA_VERSION}: "
-            "upgrade it with 'pip install --upgrade', from where it was installed"
-        )
-    return version
-
-
 def _is_pool(connection: Connection) -> bool:
-    there = "SELECT to_regclass(format('%%I.%%I', current_schema(), %s::text)) IS NOT NULL"
-    return bool(_first(connection, there, VERSION))
-
-
-def _require_usable(connection: Connection, address: str) -> None:
+    there = f"SELECT to_regclass(format('%I.{VERSION}', current_schema())) IS NOT NULL"
     if _first(connection, "SELECT current_schema()") is None:
-        raise PoolError(
-            f"no schema on the search path of {address} exists, or may be used: "
-            "GRANT USAGE ON SCHEMA public, or set another search_path"
-        )
-    if (encoding := _first(connection, "SHOW server_encoding")) != _ENCODING:
-        raise PoolError(
-            f"the database of {address} has the encoding {encoding}, which lacks letters: "
-            f"make one with CREATE DATABASE ... ENCODING '{_ENCODING}' TEMPLATE template0"
-        )
-    if _first(connection, "SHOW transaction_read_only") == "on":
-        raise PoolError(
-            f"{address} is read-only: a standby, or a database or role that is set so; "
-            "give the URL of the primary, and a role that may write"
-        )
+        raise PoolError("no schema on the search path exists, or may be used: name another one")
+    return bool(_first(connection, there))
 
 
-def _require_writable(connection: Connection, address: str) -> None:
-    """Raise unless what is there of the pool's tables may be written."""
-    lacking = connection.execute(
-        "SELECT relname FROM pg_class WHERE relnamespace = current_schema()::regnamespace "
-        "AND relname = ANY(%s) AND NOT (has_table_privilege(oid, 'SELECT') AND (relname = %s "
-        "OR has_table_privilege(oid, 'INSERT') AND has_table_privilege(oid, 'UPDATE'))) LIMIT 1",
-        (_names(), VERSION),
-    ).fetchone()
-    if lacking:
-        raise PoolError(_missing_right(connection, address, f"write {lacking[0]}", _TO_GRANT))
-
-
-def _names() -> list[str]:
-    """Of all tables of a pool."""
-    return [each.name for each in tables()] + [
-        "shipment",
-        "progress",
-        "run_owner",
-        "picture",
-        VERSION,
-    ]
-
-
-def _require_create(connection: Connection, address: str) -> None:
-    if not _first(connection, "SELECT has_schema_privilege(current_schema(), 'CREATE')"):
-        grant = "GRANT USAGE, CREATE ON SCHEMA {schema} TO {role}"
-        raise PoolError(_missing_right(connection, address, "make tables", grant))
-
-
-def _missing_right(connection: Connection, address: str, what: str, grant: str) -> str:
-    role, schema = (
-        _first(connection, f"SELECT quote_ident({each})")
-        for each in ("current_user", "current_schema()")
-    )
-    asked = grant.format(schema=schema, role=role)
-    return f"the role {role} may not {what} in {address}: let the owner of it run {asked!r}"
-
-
-def _require_nothing_foreign(connection: Connection, address: str) -> None:
-    there = connection.execute(
-        "SELECT relname FROM pg_class WHERE relnamespace = current_schema()::regnamespace "
-        "AND relname = ANY(%s) ORDER BY relname",
-        ([*_names(), *VIEWS],),
-    ).fetchall()
-    if there:
-        found = ", ".join(name for (name,) in there)
-        raise PoolError(
-            f"{address} holds tables of something else that are called as those of a pool "
-            f"({found}): give a database of its own, or a schema of its own by "
-            "'?options=-csearch_path%3DNAME' in the URL"
-        )
-
-
-def _first(connection: Connection, sql: str, *arguments: Any) -> Any:
-    row = connection.execute(sql.encode(), arguments or None).fetchone()
+def _first(connection: Connection, sql: str) -> Any:
+    row = connection.execute(sql.encode()).fetchone()
     return row[0] if row else None
 
 
@@ -301,45 +314,44 @@ def _column(column: sa.Column[Any], shipped: Table) -> sa.Column[Any]:
     )  # fmt: skip
 
 
-# The views of a pool in PostgreSQL: those of a recording, by the same names, with its UUID.
-
+# -- views ------------------------------------------------------------------------------------
 
 # From the first Julian day to 1970: SQLite adds it before it rounds, and so loses some digits.
 _JULIAN_MS: Final = "210866760000000.0::double precision"
 
 # Functions are found by name when a view is asked: so they keep the search path they were made in.
 _FUNCTIONS: Final = rf"""
-CREATE OR REPLACE FUNCTION utc_text(wall_time_s double precision) RETURNS text
+CREATE FUNCTION utc_text(wall_time_s double precision) RETURNS text
 LANGUAGE sql IMMUTABLE PARALLEL SAFE AS $$
   SELECT CASE WHEN wall_time_s BETWEEN -62135596800 AND 253402300799
     THEN to_char(timestamp '1970-01-01' + interval '1 ms' * (
       floor(wall_time_s * 1000 + {_JULIAN_MS} + 0.5) - {_JULIAN_MS}), 'YYYY-MM-DD HH24:MI:SS.MS')
     END $$;
 
-CREATE OR REPLACE FUNCTION rounded(number double precision, digits integer)
+CREATE FUNCTION rounded(number double precision, digits integer)
 RETURNS double precision LANGUAGE sql IMMUTABLE PARALLEL SAFE AS $$
   SELECT round(number::numeric, digits)::double precision $$;
 
 -- A JSON value as SQLite's json_extract gives it: true and false are 1 and 0.
-CREATE OR REPLACE FUNCTION text_of(value jsonb) RETURNS text
+CREATE FUNCTION text_of(value jsonb) RETURNS text
 LANGUAGE sql IMMUTABLE PARALLEL SAFE AS $$
   SELECT CASE jsonb_typeof(value) WHEN 'boolean' THEN CASE WHEN value::boolean THEN '1' ELSE '0' END
     ELSE value #>> '{{}}' END $$;
 
 -- JSON has numbers that are beyond all floats.
-CREATE OR REPLACE FUNCTION number_of(value jsonb) RETURNS double precision
+CREATE FUNCTION number_of(value jsonb) RETURNS double precision
 LANGUAGE sql IMMUTABLE PARALLEL SAFE AS $$
   SELECT CASE WHEN jsonb_typeof(value) <> 'number' THEN NULL
     WHEN abs(value::numeric) > 1.7e308 THEN sign(value::numeric) * 'Infinity'::double precision
     WHEN abs(value::numeric) < 1e-307 THEN 0
     ELSE value::double precision END $$;
 
-CREATE OR REPLACE FUNCTION value_at(state jsonb, path text) RETURNS jsonb
+CREATE FUNCTION value_at(state jsonb, path text) RETURNS jsonb
 LANGUAGE sql IMMUTABLE PARALLEL SAFE AS $$
   SELECT jsonb_path_query_first(state, ('strict ' || path)::jsonpath, '{{}}', true) $$;
 """
 
-_KEY: Final = "recording_uuid"
+_KEY: Final = OWNER
 _VALUE: Final = "value_at(s.data, p.path)"
 _NUMBER: Final = f"number_of({_VALUE})"
 _IS_NUMBER: Final = f"jsonb_typeof({_VALUE}) = 'number'"
@@ -393,7 +405,7 @@ def _first_postgres_views(
 
 
 # In the order in which they are made: what a view asks comes before it.
-_QUERIES: Final = {
+VIEWS: Final = {
     "all_state": f"""SELECT {_KEY}, id AS state_id, run_id, sim_time_s, wall_time_s, data, replaced
 FROM state
 UNION ALL
@@ -488,128 +500,11 @@ JOIN robot r ON r.{_KEY} = u.{_KEY} AND r.id = u.robot_id""",
 }  # fmt: skip
 
 
-def _described(name: str) -> str:
-    """What the view of that name shows, as the schema of a recording says it."""
-    said = re.search(r"/\* (.*?) \*/", shipped_objects()[name], re.DOTALL)
-    assert said is not None, f"{name} has no comment"
-    return said[1].replace("ask with run_id", f"ask with {_KEY} = ..., run_id")
-
-
-# By their names: what is said of each view, and what it selects.
-VIEWS: Final = {name: (_described(name), query) for name, query in _QUERIES.items()}
-
-
-def make_views(connection: Connection) -> None:
-    """Make the views, which are not there, and the functions that they ask."""
-    connection.execute(_FUNCTIONS.encode())
-    for name, (said, query) in VIEWS.items():
-        connection.execute(f"CREATE VIEW {name} AS\n{query}".encode())
-        connection.execute(
-            f"COMMENT ON VIEW {name} IS '{said.replace(chr(39), chr(39) * 2)}'".encode()
-        )
-
-
-# Connections to PostgreSQL, and its errors as ours: what is wrong, and whether to try again.
-
-
-Connection: TypeAlias = "psycopg.Connection[tuple[Any, ...]]"
-
-# A server that went away is noticed within a minute, on both sides.
-_CLIENT: Final[dict[str, Any]] = {
-    "connect_timeout": 10, "keepalives_idle": 30, "keepalives_interval": 10, "keepalives_count": 3,
-    "tcp_user_timeout": 60_000, "client_encoding": "UTF8",
-}  # fmt: skip
-_SERVER: Final = """
-    SET tcp_keepalives_idle = 30; SET tcp_keepalives_interval = 10; SET tcp_keepalives_count = 3;
-    SET idle_in_transaction_session_timeout = '60s'; SET lock_timeout = '30s';
-    SET synchronous_commit = on"""
-# What is said of a connection that is not made for reasons that last.
-_LASTING: Final = re.compile(
-    "password|authentication|does not exist|permission denied|pg_hba|certificate|"
-    "definition of service|invalid|not allowed|no encryption",
-    re.IGNORECASE,
-)
-# Classes of SQLSTATE, and some of their members, after which the same may succeed.
-_PASSING: Final = ("08", "40", "53", "57", "58", "55P03", "25P03", "XX")
-_PRIVILEGE: Final = "42501"
-_READ_ONLY: Final = "25006"
-_FULL: Final = "53100"
-
-
-def connect(url: str, address: str, *, autocommit: bool = True) -> Connection:
-    """Connect to the database of a URL; libpq looks for passwords where it always does.
-
-    Raises:
-        PoolUnavailableError: Nobody answers.
-        PoolError: Who answers does not let us in.
-    """
-    connection = _connected(url, address)
-    if isinstance(connection, PoolError):
-        raise connection
-    with clear_errors(address):
-        connection.execute(_SERVER.encode())
-    connection.autocommit = autocommit
-    return connection
-
-
-def _connected(url: str, address: str) -> Connection | PoolError:
-    """A connection, or why there is none.
-
-    That is not raised here, as psycopg's error would go with it, which holds the password.
-    """
-    try:
-        return psycopg.connect(
-            url, autocommit=True, fallback_application_name="webots-mcp", **_CLIENT
-        )
-    except psycopg.Error as error:
-        return _refusal(error, address)
-
-
-def _refusal(error: psycopg.Error, address: str) -> PoolError:
-    said = one_line(str(error))
-    asked = error.pgconn
-    if asked is not None and asked.needs_password:
-        return PoolError(
-            f"{address} asks for a password: give it in PGPASSWORD, ~/.pgpass or a service file"
-        )
-    if isinstance(error, psycopg.ProgrammingError) or _LASTING.search(said):
-        return PoolError(f"{address} refuses the connection: {said}")
-    return PoolUnavailableError(f"{address} does not answer: {said}")
-
-
-@contextmanager
-def clear_errors(address: str) -> Generator[None]:
-    """Inside the block, errors of PostgreSQL are ours; their texts hold no values of rows."""
-    try:
-        yield
-    except psycopg.Error as error:
-        raise told(error, address) from None
-
-
-def told(error: psycopg.Error, address: str) -> PoolError:
-    """An error of PostgreSQL as ours."""
-    state = error.sqlstate or ""
-    said = one_line(error.diag.message_primary or str(error))
-    if state == _PRIVILEGE:
-        return PoolError(f"{address} forbids it: {said}; see docs/pool.md for what to grant")
-    if state == _READ_ONLY:
-        return PoolError(
-            f"{address} is read-only ({said}): a standby, or a database or role that is set so; "
-            "give the URL of the primary, and a role that may write"
-        )
-    if state == _FULL:
-        return PoolUnavailableError(f"the disk of {address} is full: {said}")
-    if state.startswith(_PASSING) or _is_lost(error, state):
-        return PoolUnavailableError(f"{address} could not do it now: {said}")
-    return PoolError(f"{address} refused it: {said}")
-
-
-def _is_lost(error: psycopg.Error, state: str) -> bool:
-    """Whether the connection ended, which has no SQLSTATE."""
-    return not state and isinstance(error, psycopg.OperationalError)
-
-
-def one_line(text: str) -> str:
-    """A text without line breaks, and without the advice for beginners that libpq indents."""
-    lines = (line for line in text.splitlines() if not line.startswith("\t"))
-    return " ".join(" ".join(lines).split())
+def _view_statements() -> Iterator[str]:
+    """The statements that make the views, and say of each what the schema of a recording says."""
+    for name, query in VIEWS.items():
+        comment = re.search(r"/\* (.*?) \*/", shipped_objects()[name], re.DOTALL)
+        assert comment is not None, f"{name} has no comment"
+        said = comment[1].replace("ask with run_id", f"ask with {_KEY} = ..., run_id")
+        yield f"CREATE VIEW {name} AS\n{query}"
+        yield f"COMMENT ON VIEW {name} IS '{said.replace(chr(39), chr(39) * 2)}'"

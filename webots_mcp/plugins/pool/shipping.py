@@ -1,24 +1,27 @@
-"""Shipping a recording to a pool, as long as both are there; `following` goes on and on.
+"""Shipping a recording to a pool: once, or on and on while a robot records.
 
 What the pool holds is told by numbers that it stores in the same transaction as the rows. So a
 shipper may be killed anywhere, and the next one goes on; nothing at the edge has to be remembered.
 What changes is compared by digests, and sent again only where they differ.
+
+No read transaction lasts while a pool is written to: the log of the database could not be cut back
+meanwhile, and the robot's disk would fill up because a server is slow.
 """
 
 from __future__ import annotations
 
+import json
 import sqlite3
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any, Final, NamedTuple, NoReturn
+from typing import Final, NoReturn
 
 from webots_mcp.connection import FrozenConnection
-from webots_mcp.contract import Database
 from webots_mcp.errors import (
     DatabaseError,
     InvalidInputError,
@@ -36,9 +39,9 @@ from webots_mcp.plugins.pool.pool_interface import (
     Batch,
     Row,
     Shipment,
-    SQLValue,
     Table,
     Target,
+    fitted,
     is_whole,
     row_bytes,
     table,
@@ -52,13 +55,43 @@ from webots_mcp.store.recording import Recording, name_of
 from webots_mcp.store.retention_plan import Shipped, read_shipped, write_shipped
 from webots_mcp.store.run_rows import MAX_FILE_BYTES, PICTURES, inside
 
+THOROUGH_S: Final = 30.0  # between two looks at all of what may change, and not only the newest
+CHUNK_ROWS: Final = 32
+GROUPS_AT_ONCE: Final = 64
 MOST_BATCHES: Final = 8  # of a table in a round, before the others get their turn
+WRITE_BYTES: Final = 8_000_000
+_FIRST_WAIT_S: Final = 1.0
+_LONGEST_WAIT_S: Final = 60.0
 _HANDOVER_S: Final = (0.02, 0.1, 0.3, 0.6)
-_UNCHECKED: Final = -1
 _PAUSE_S: Final = 0.002  # between two short writes, for robots to write theirs
+_UNCHECKED: Final = -1
 # Of the progress: the last picture whose file was shipped, and the last state of a kept stretch.
 _PICTURE: Final = "picture"
-_STRETCH: Final = "kept_stretch/{}"
+_STRETCH: Final = "kept_stretch/"
+_SEQUENCE: Final = (
+    "SELECT max((SELECT coalesce(max(id), 0) FROM {}), "
+    "(SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = '{}'))"
+)
+_LAST: Final = "SELECT coalesce(max(id), 0) FROM {}"
+# Up to the first that somebody is still making: its id is not looked at again later.
+LAST_GROUP: Final = (
+    "SELECT coalesce((SELECT min(id) - 1 FROM row_group WHERE is_complete = 0), "
+    "(SELECT max(id) FROM row_group), 0)"
+)
+_NEXT_GROUPS: Final = "SELECT id FROM row_group WHERE id > ? AND id <= ? ORDER BY id LIMIT ?"
+_IN_NO_CHUNK: Final = (
+    "SELECT count(*) FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) AND id > ?"
+)
+_STRETCHES: Final = (
+    "SELECT k.id, k.run_id, k.start_sim_time_s, k.end_sim_time_s, u.ended_wall_time_s IS NOT NULL "
+    "FROM kept_stretch k JOIN run u ON u.id = k.run_id ORDER BY k.id"
+)
+# Of states: those that were shipped with a kept stretch, of which the numbers are given by its id.
+_UNSENT: Final = (
+    "id NOT IN (SELECT s.id FROM json_each(?) sent JOIN kept_stretch k ON k.id = sent.key "
+    "JOIN state s ON s.run_id = k.run_id AND s.id > ? AND s.id <= sent.value "
+    "AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s)"
+)
 
 
 @dataclass(frozen=True)
@@ -78,6 +111,34 @@ class Order:
     pictures: bool = False
 
 
+@dataclass
+class Report:
+    """What was shipped so far, and what was not.
+
+    Attributes:
+        rows: By table; a row that changed counts each time that it was sent.
+        pictures: Files.
+        lost: By table, rows that retention had deleted before they could be shipped.
+        replaced: By column, values that the pool cannot hold, for which it has what comes nearest.
+        lost_pictures: Files that were not there any more, or are no pictures of ours.
+        foreign: By their UUIDs, runs that another recording had shipped before, with its UUID.
+        notes: What else a person should know.
+    """
+
+    rows: Counter[str] = field(default_factory=Counter[str])
+    pictures: int = 0
+    lost: Counter[str] = field(default_factory=Counter[str])
+    replaced: Counter[str] = field(default_factory=Counter[str])
+    lost_pictures: int = 0
+    foreign: dict[str, str] = field(default_factory=dict[str, str])
+    notes: list[str] = field(default_factory=list[str])
+
+    def note(self, text: str) -> None:
+        """Remember it, once."""
+        if text not in self.notes:
+            self.notes.append(text)
+
+
 def ship(order: Order, report: Report) -> None:
     """Ship all that is there, and end.
 
@@ -85,14 +146,68 @@ def ship(order: Order, report: Report) -> None:
         PoolError: The pool cannot be reached or written, or another ships this recording.
         DatabaseError: The recording cannot be read.
     """
-    with shipper(order, report) as connected:
+    with _shipper(order, report) as connected:
         while not connected.round(thorough=True):
             pass
         connected.note_states_in_no_chunk()
 
 
+def follow(order: Order, report: Report, say: Callable[[str], None], pause_s: float) -> NoReturn:
+    """Ship what is there and what comes, until a KeyboardInterrupt.
+
+    A pool that is away is tried again, each time after a longer wait; a recording that is not there
+    yet is waited for.
+
+    Args:
+        order: What.
+        report: Grows while it goes on.
+        say: Told in a sentence when the pool is away, and when it is back.
+        pause_s: Between two looks at the recording.
+
+    Raises:
+        PoolError: The pool will not be better by itself.
+        DatabaseError: The recording cannot be read.
+    """
+    away_s, was_there, last_said = 0.0, False, ""
+    while True:
+        said, wait_s = "", 0.0
+        try:
+            with _shipper(order, report) as connected:
+                if away_s:
+                    say(f"the pool {connected.address} is there again")
+                away_s, was_there, last_said = 0.0, True, ""
+                _go_on(connected, pause_s)
+        except ReplacedError as error:
+            say(f"{error}: that one is shipped from here on")
+        except NoDatabaseError:
+            there = f"nothing is recorded at {name_of(order.recording.database)} now"
+            said, wait_s = f"{there}: it is shipped as soon as it is there", pause_s
+        except PoolBusyError as error:
+            if not was_there:
+                raise
+            # It may be our last connection, of which a server learns late.
+            said, wait_s = f"{error}; waiting until it ends", _FIRST_WAIT_S
+        except PoolUnavailableError as error:
+            away_s = wait_s = min(max(2 * away_s, _FIRST_WAIT_S), _LONGEST_WAIT_S)
+            say(f"{error}; trying again in {away_s:g} s, nothing is lost meanwhile")
+        if said and not last_said:
+            say(said)
+        last_said = said or last_said
+        time.sleep(wait_s)
+
+
+def _go_on(connected: Shipper, pause_s: float) -> NoReturn:
+    next_s = 0.0
+    while True:
+        is_thorough = time.monotonic() >= next_s
+        if is_thorough:
+            next_s = time.monotonic() + THOROUGH_S
+        if connected.round(thorough=is_thorough):
+            time.sleep(pause_s)
+
+
 @contextmanager
-def shipper(order: Order, report: Report) -> Generator[Shipper]:
+def _shipper(order: Order, report: Report) -> Generator[Shipper]:
     """Be connected to recording and pool, as the one who ships the recording.
 
     Raises:
@@ -103,11 +218,11 @@ def shipper(order: Order, report: Report) -> Generator[Shipper]:
         uuid = Source(connection).uuid()  # first: nothing is asked of the pool in vain
     with order.open_target() as target, ExitStack() as stack:
         target.prepare()
-        shipment = _enter(stack, target, uuid)
-        yield Shipper(order, report, uuid, target, shipment)
+        shipment = _entered(stack, target, uuid)
+        yield Shipper(order, report, uuid, target.address, shipment)
 
 
-def _enter(stack: ExitStack, target: Target, uuid: str) -> Shipment:
+def _entered(stack: ExitStack, target: Target, uuid: str) -> Shipment:
     """Wait a moment for a server that has not noticed yet that the shipper before was killed."""
     for wait_s in _HANDOVER_S:
         with suppress(PoolBusyError):
@@ -120,6 +235,112 @@ class ReplacedError(PoolError):
     """Another recording stands where the one was that is shipped."""
 
 
+# -- reading ----------------------------------------------------------------------------------
+
+
+class Source:
+    """A recording as it is read to be shipped, and which of its runs are another's to ship.
+
+    Args:
+        connection: A reader.
+    """
+
+    def __init__(self, connection: sqlite3.Connection) -> None:
+        self.connection = connection
+        connection.text_factory = _text
+        self.foreign = set[int]()
+        self._foreign_sessions = set[int]()
+
+    def uuid(self) -> str:
+        """The recording's.
+
+        Raises:
+            DatabaseError: It has none, or several.
+        """
+        rows = self.connection.execute("SELECT uuid FROM recording LIMIT 2").fetchall()
+        if len(rows) != 1 or not isinstance(rows[0][0], str) or not rows[0][0]:
+            raise DatabaseError(
+                f"the recording has {len(rows) or 'no'} UUIDs, by which a pool tells recordings "
+                "apart: import it into a new one ('webots-mcp import FILE --data-dir NEW') and "
+                "ship that"
+            )
+        return rows[0][0]
+
+    def number(self, query: str, *values: object) -> int:
+        """What a query counts."""
+        return int(self.connection.execute(query, values).fetchone()[0])
+
+    def runs(self) -> dict[int, str | None]:
+        """The UUIDs of the runs; those that an old version has recorded have none."""
+        return dict(self.connection.execute("SELECT id, uuid FROM run").fetchall())
+
+    def ended_runs(self) -> set[int]:
+        """The runs that are over."""
+        query = "SELECT id FROM run WHERE ended_wall_time_s IS NOT NULL"
+        return {run_id for (run_id,) in self.connection.execute(query)}
+
+    def leave_out(self, runs: set[int]) -> None:
+        """These runs are another's to ship, and sessions that have no others are as well."""
+        self.foreign = runs
+        query = "SELECT id, session_id FROM run"
+        sessions = dict(self.connection.execute(query).fetchall() if runs else ())
+        ours = {session for run_id, session in sessions.items() if run_id not in runs}
+        self._foreign_sessions = set(sessions.values()) - ours
+
+    def fingerprint(self, table: Table, row_id: int) -> int:
+        """A number of that row's values; `_UNCHECKED` where retention has deleted it."""
+        query = f"SELECT {', '.join(table.columns)} FROM {table.name} WHERE id = ?"
+        rows = self.connection.execute(query, (row_id,)).fetchall()
+        return _digest(rows) if rows else _UNCHECKED
+
+    def rows(self, table: Table, where: str, *values: object) -> list[Row]:
+        """The rows of a small part of a table that are ours to ship."""
+        return self.connection.execute(self._query(table, where), values).fetchall()
+
+    def piece(self, table: Table, where: str, *values: object) -> tuple[list[Row], bool]:
+        """Of such rows as many as a bounded size has, and whether they are all."""
+        rows: list[Row] = []
+        size = 0
+        with closing(self.connection.execute(self._query(table, where), values)) as cursor:
+            for row in cursor:
+                rows.append(row)
+                size += row_bytes(row)
+                if size >= BATCH_BYTES or len(rows) >= BATCH_ROWS:
+                    return rows, False
+        return rows, True
+
+    def _query(self, table: Table, where: str) -> str:
+        """Without what belongs to runs and sessions of another; what outlasts them names none."""
+        columns, conditions = [*table.columns], [where]
+        others = {table.run_column: self.foreign, table.session_column: self._foreign_sessions}
+        for column, foreign in others.items():
+            if column is not None and foreign:
+                listed = f"({', '.join(map(str, foreign))})"
+                if table.outlasts_runs:
+                    at = columns.index(column)
+                    columns[at] = f"CASE WHEN {column} NOT IN {listed} THEN {column} END"
+                else:
+                    conditions.append(f"coalesce({column}, 0) NOT IN {listed}")
+        order = f" ORDER BY {', '.join(table.key)}"
+        return (
+            f"SELECT {', '.join(columns)} FROM {table.name} WHERE {' AND '.join(conditions)}{order}"
+        )
+
+
+def _text(stored: bytes) -> str:
+    """Bytes that are no UTF-8, which another program has written, are read as what comes near."""
+    return stored.decode("utf-8", "replace")
+
+
+def _digest(rows: Sequence[Row]) -> int:
+    """A number that other rows have with a chance of one in 2**63."""
+    text = repr([tuple(row) for row in rows]).encode("utf-8", "surrogatepass")
+    return int.from_bytes(blake2b(text, digest_size=8).digest(), "big") >> 1
+
+
+# -- sending ----------------------------------------------------------------------------------
+
+
 class Shipper:
     """One connection to a pool, as long as it lasts.
 
@@ -128,19 +349,17 @@ class Shipper:
     """
 
     def __init__(
-        self, order: Order, report: Report, uuid: str, target: Target, shipment: Shipment
+        self, order: Order, report: Report, uuid: str, address: str, shipment: Shipment
     ) -> None:
-        self._order = order
-        self._report = report
-        self._uuid = uuid
-        self._shipment = shipment
-        self._outbox = Outbox(shipment, report, shipment.progress())
-        self._progress = self._outbox.progress
+        self.address = address
+        self._order, self._report, self._uuid, self._shipment = order, report, uuid, shipment
+        self._progress = shipment.progress()
         self._owners = dict[str, str | None]()
         self._is_checked = False
-        self._last_ids = dict[str, int]()
-        self._ended = set[int]()
-        self.address = target.address
+        self._last_ids = dict[str, int]()  # up to where what the rows refer to was read
+        self._batches = list[Batch]()  # what waits to be written together,
+        self._numbers = dict[str, int]()  # and the progress that it makes
+        self._size = 0
 
     def round(self, *, thorough: bool) -> bool:
         """Ship what is new.
@@ -160,18 +379,20 @@ class Shipper:
                 self._end_what_was_killed(connection)
             if thorough and not is_frozen:
                 self._make_chunks(source)
-            self._ship_changing(source, thorough=thorough)
-            is_complete = self._ship_groups(source) and self._ship_all_appended(source)
+            ended = self._ship_changing(source, thorough=thorough)
+            is_complete = self._ship_groups(source)
+            for each in self._appended() if is_complete else ():
+                is_complete &= self._ship_appended(source, each)
             if is_complete and not self._order.full:
                 self._ship_kept(source, thorough=thorough)
             if self._order.pictures:
                 self._ship_pictures(source)
-            is_whole = is_complete and thorough  # else some of what may change was not looked at
-            if is_whole:
-                self._tell_whole(source)
-            self._outbox.send()
+            if is_complete and thorough:  # else some of what may change was not looked at
+                whole = whole_runs(ended - source.foreign).items()
+                self._put(None, {name: n | self._progress.get(name, 0) for name, n in whole})
+            self._send()
         if not is_frozen:
-            self._leave_word(started_s, is_complete=is_whole)
+            self._leave_word(started_s, is_whole=is_complete and thorough)
         return is_complete
 
     def note_states_in_no_chunk(self) -> None:
@@ -179,7 +400,11 @@ class Shipper:
         with self._order.recording.reader() as connection:
             source = Source(connection)
             self._knows_owners(source)
-            behind = source.in_no_chunk(self._progress.get("state", 0))  # at full rate
+            behind, shipped = 0, self._progress.get("state", 0)  # at full rate
+            for run_id in source.runs().keys() - source.foreign:
+                at = reached(connection, run_id)
+                place = (run_id, at.end_s, at.last_state_id, shipped)
+                behind += source.number(_IN_NO_CHUNK, *place)
         if behind:
             mend = "ship again when their run has ended, or with --full"
             if isinstance(connection, FrozenConnection):
@@ -233,7 +458,10 @@ class Shipper:
             return
         for each in (table("run"), table("row_group"), *self._appended()):
             known = self._progress.get(each.name, 0)
-            if source.sequence(each) < known or self._is_other(source, each, known):
+            before = self._progress.get(f"{each.name}.check", _UNCHECKED)
+            now = source.fingerprint(each, known)
+            is_other = before != now and _UNCHECKED not in (before, now)
+            if source.number(_SEQUENCE.format(each.name, each.name)) < known or is_other:
                 raise PoolError(
                     f"the recording {self._uuid} is not the one that was shipped to {self.address} "
                     f"before: its table {each.name!r} is not the same up to row {known}. It is an "
@@ -243,41 +471,27 @@ class Shipper:
                 )
         self._is_checked = True
 
-    def _is_other(self, source: Source, each: Table, known: int) -> bool:
-        check = self._progress.get(f"{each.name}.check", _UNCHECKED)
-        row = source.row(each, known) if check != _UNCHECKED else None
-        return row is not None and digest([row]) != check
-
-    def _ship_changing(self, source: Source, *, thorough: bool) -> None:
-        """Ship what differs in tables that change.
-
-        What the rows of the others refer to is at the pool then, up to where they were read: to
-        `_last_ids`.
-        """
-
-        def read() -> bool:
-            if not self._knows_owners(source):
-                return False
-            for each in tables():
-                if each.is_appended:
-                    self._last_ids[each.name] = source.last_id(each)
-                elif not self._compare(source, each, thorough=thorough):
-                    return False
-            self._last_ids["row_group"] = source.last_group()
-            self._ended = source.ended_runs()
-            return True
-
-        while not source.in_one_moment(read):
+    def _ship_changing(self, source: Source, *, thorough: bool) -> set[int]:
+        """Ship what differs in tables that change; the runs that were over then."""
+        while True:
+            with _one_moment(source.connection):
+                is_all = self._knows_owners(source)
+                for each in tables() if is_all else ():
+                    if each.is_appended:
+                        self._last_ids[each.name] = source.number(_LAST.format(each.name))
+                    else:
+                        is_all = is_all and self._compare(source, each, thorough=thorough)
+                if is_all:
+                    self._last_ids["row_group"] = source.number(LAST_GROUP)
+                    return source.ended_runs()
             self._ask_for_owners(source)
-            self._outbox.send()
+            self._send()
 
     def _knows_owners(self, source: Source) -> bool:
         """Whether the pool was asked whose the runs are; those of others are left out then."""
         runs = {run_id: uuid for run_id, uuid in source.runs().items() if uuid}
-        if not self._owners.keys() >= set(runs.values()):
-            return False
-        source.leave_out({run_id for run_id, uuid in runs.items() if self._owners[uuid]})
-        return True
+        source.leave_out({run_id for run_id, uuid in runs.items() if self._owners.get(uuid)})
+        return self._owners.keys() >= set(runs.values())
 
     def _ask_for_owners(self, source: Source) -> None:
         new = {uuid for uuid in source.runs().values() if uuid} - self._owners.keys()
@@ -286,32 +500,38 @@ class Shipper:
         self._report.foreign |= found
 
     def _compare(self, source: Source, each: Table, *, thorough: bool) -> bool:
-        """Take the chunks whose digests differ from the pool's; False where they are too many."""
+        """Take the rows whose digest differs from the pool's; False where they are too many.
+
+        Rows are compared so many at a time, by their ids; all of a table that has none.
+        """
         last = self._progress.get(each.name, 0)
-        for number in source.chunks(each, 0 if thorough else last):
-            rows = source.chunk(each, number)
-            name, value = f"{each.name}:{number}", digest(rows)
+        parts, where = range(1), "? = ?"
+        if each.key == ("id",):
+            newest = source.number(_LAST.format(each.name))
+            parts = range((0 if thorough else last) // CHUNK_ROWS, newest // CHUNK_ROWS + 1)
+            where = "id >= ? AND id < ?"
+        for part in parts:
+            bounds = (part * CHUNK_ROWS, (part + 1) * CHUNK_ROWS) if each.key == ("id",) else (0, 0)
+            rows = source.rows(each, where, *bounds)
+            name, value = f"{each.name}:{part}", _digest(rows)
             if rows and self._progress.get(name) != value:
-                if self._outbox.is_full:
+                if self._size >= WRITE_BYTES:
                     return False
-                ids = [row[0] for row in rows if isinstance(row[0], int)]
-                self._outbox.add(Batch(each, rows), {name: value, each.name: max([last, *ids])})
-                last = self._progress[each.name]
+                last = max([last, *(row[0] for row in rows if isinstance(row[0], int))])
+                self._add(Batch(each, rows), {name: value, each.name: last})
         return True
 
     def _ship_groups(self, source: Source) -> bool:
         """Ship the next row groups, each with its chunks at once; whether these were all."""
-        after, upto, count = self._progress.get("row_group", 0), self._last_ids["row_group"], 0
-        for group_id, (group, chunks) in source.groups(after, upto):
-            self._outbox.add(chunks, {})
-            self._put(group, _told_of(group, group_id))
-            count += 1
-        return count < GROUPS_AT_ONCE
-
-    def _ship_all_appended(self, source: Source) -> bool:
-        """Ship the next rows of the appended tables; returns whether these were all."""
-        are_all = [self._ship_appended(source, each) for each in self._appended()]
-        return all(are_all)
+        groups, chunks = table("row_group"), table("chunk")
+        bounds = (self._progress.get(groups.name, 0), self._last_ids[groups.name])
+        found = source.connection.execute(_NEXT_GROUPS, (*bounds, GROUPS_AT_ONCE)).fetchall()
+        ids = [group_id for (group_id,) in found]
+        for group_id in ids:
+            self._add(Batch(chunks, source.rows(chunks, "group_id = ?", group_id)), {})
+            group = Batch(groups, source.rows(groups, "id = ?", group_id))
+            self._put(group, self._reached(source, groups, group_id))
+        return len(ids) < GROUPS_AT_ONCE
 
     def _ship_appended(self, source: Source, each: Table) -> bool:
         """Ship the next rows; returns whether these were all."""
@@ -319,56 +539,62 @@ class Shipper:
         for _ in range(MOST_BATCHES):
             if after >= upto:
                 return True
-            batch, last, found = source.appended(each, after, upto)
-            told = _told_of(batch, last)
-            lost = last - after - found
-            if lost:
+            count = f"SELECT count(*) FROM {each.name} WHERE id > ? AND id <= ?"
+            with _one_moment(source.connection):
+                rows, last = self._next(source, each, after, upto)
+                found = source.number(count, after, last)
+            if lost := last - after - found:
                 self._report.lost[each.name] += lost
-            self._put(self._unsent(source, batch), told)
+            self._put(Batch(each, rows), self._reached(source, each, last))
             after = last
         return after >= upto
 
+    def _next(self, source: Source, each: Table, after: int, upto: int) -> tuple[list[Row], int]:
+        """The next rows, and the last id that was looked at."""
+        where, values = "id > ? AND id <= ?", (after, upto)
+        if each.name == "state":
+            where, values = f"{where} AND {_UNSENT}", (*values, self._sent_stretches(), after)
+        rows, is_all = source.piece(each, where, *values)
+        return rows, upto if is_all else int(str(rows[-1][0]))
+
+    def _sent_stretches(self) -> str:
+        """By the ids of kept stretches, up to which state they were shipped, as JSON."""
+        names = [name for name in self._progress if name.startswith(_STRETCH)]
+        return json.dumps({name.removeprefix(_STRETCH): self._progress[name] for name in names})
+
     def _ship_kept(self, source: Source, *, thorough: bool) -> None:
         """Ship the states of kept stretches, where not all states are shipped."""
-        for stretch in source.stretches():
-            name = _STRETCH.format(stretch.id)
-            after, is_all = self._progress.get(name, 0), False
-            if name in self._progress and stretch.is_over and not thorough:
+        where = "run_id = ? AND sim_time_s BETWEEN ? AND ? AND id > ? AND id <= ?"
+        states, upto = table("state"), self._last_ids["state"]
+        for stretch_id, *bounds, is_over in source.connection.execute(_STRETCHES).fetchall():
+            name, is_all = f"{_STRETCH}{stretch_id}", False
+            if name in self._progress and is_over and not thorough:
                 continue
             while not is_all:
-                batch, is_all = source.kept(stretch, after, self._last_ids["state"])
-                if batch.rows:
-                    after = int(str(batch.rows[-1][0]))
-                    self._put(self._unsent(source, batch), {name: after})
+                after = max(self._progress.get(name, 0), self._progress.get("state", 0))
+                values = (*bounds, after, upto, self._sent_stretches(), after)
+                rows, is_all = source.piece(states, f"{where} AND {_UNSENT}", *values)
+                if rows:
+                    self._put(Batch(states, rows), {name: int(str(rows[-1][0]))})
 
-    def _unsent(self, source: Source, batch: Batch) -> Batch:
-        """Without the states that were shipped before, with all others or with a kept stretch."""
-        if batch.table.name != "state":
-            return batch
-        last = self._progress.get("state", 0)
-        known = [(each, self._progress.get(_STRETCH.format(each.id), 0)) for each in
-                 source.stretches()]  # fmt: skip
-
-        def is_sent(row_id: int, run_id: SQLValue, sim_time_s: SQLValue) -> bool:
-            return row_id <= last or any(
-                row_id <= upto and each.holds(run_id, sim_time_s) for each, upto in known
-            )
-
-        rows = [row for row in batch.rows if not is_sent(int(str(row[0])), row[1], row[2])]
-        return Batch(batch.table, rows)
+    def _reached(self, source: Source, each: Table, last: int) -> dict[str, int]:
+        """The progress up to a row, with a number by which it is known again."""
+        return {each.name: last, f"{each.name}.check": source.fingerprint(each, last)}
 
     def _ship_pictures(self, source: Source) -> None:
         """Ship the files of the pictures whose rows are shipped."""
-        upto = self._progress.get("image", 0)
-        while some := source.pictures(self._progress.get(_PICTURE, 0), upto):
-            size = 0
-            for image_id, run_id, path in some:
-                if run_id not in source.foreign:
-                    size += self._ship_picture(path)
-                self._outbox.add(None, {_PICTURE: image_id})
+        images = table("image")
+        upto, path_at = self._progress.get(images.name, 0), images.columns.index("path")
+        while (after := self._progress.get(_PICTURE, 0)) < upto:
+            rows, is_all = source.piece(images, "id > ? AND id <= ?", after, upto)
+            size, last = 0, upto if is_all else int(str(rows[-1][0]))
+            for row in rows:
+                size += self._ship_picture(str(row[path_at]))
                 if size >= WRITE_BYTES:
+                    last = int(str(row[0]))
                     break
-            self._outbox.send()
+            self._add(None, {_PICTURE: last})
+            self._send()
 
     def _ship_picture(self, path: str) -> int:
         """Returns how many bytes it has."""
@@ -384,19 +610,31 @@ class Shipper:
         self._report.pictures += 1
         return len(content)
 
-    def _tell_whole(self, source: Source) -> None:
-        """Say that all of the runs is there that were over when the round began."""
-        told = whole_runs(self._ended - source.foreign).items()
-        told = {name: mask | self._progress.get(name, 0) for name, mask in told}
-        self._outbox.add(None, dict(told.items() - self._progress.items()))
-
-    def _put(self, batch: Batch | None, told: Mapping[str, int]) -> None:
+    def _put(self, batch: Batch | None, numbers: Mapping[str, int]) -> None:
         """Send it with others, when they have come to a size."""
-        self._outbox.add(batch, told)
-        if self._outbox.is_full:
-            self._outbox.send()
+        self._add(batch, numbers)
+        if self._size >= WRITE_BYTES:
+            self._send()
 
-    def _leave_word(self, started_s: float, *, is_complete: bool) -> None:
+    def _add(self, batch: Batch | None, numbers: Mapping[str, int]) -> None:
+        """Rows, and the numbers that hold once they are written."""
+        if batch is not None and batch.rows:
+            self._batches.append(fitted(batch, self._report.replaced))
+            self._size += sum(map(row_bytes, batch.rows))
+        changed = {n: value for n, value in numbers.items() if self._progress.get(n) != value}
+        self._numbers |= changed
+        self._progress |= changed
+
+    def _send(self) -> None:
+        """Write it all, in one transaction of the pool's."""
+        if not self._batches and not self._numbers:
+            return
+        self._report.replaced.update(self._shipment.write(self._batches, self._numbers))
+        for batch in self._batches:
+            self._report.rows[batch.table.name] += len(batch.rows)
+        self._batches, self._numbers, self._size = [], {}, 0
+
+    def _leave_word(self, started_s: float, *, is_whole: bool) -> None:
         """Tell retention, by a file beside the database."""
         database = self._order.recording.database
         assert isinstance(database, Path)
@@ -404,424 +642,18 @@ class Shipper:
         complete_s = before.complete_wall_time_s if before else 0.0
         shipped_tables = (table("row_group"), *self._appended())
         last_ids = {each.name: self._progress.get(each.name, 0) for each in shipped_tables}
-        shipped = Shipped(
-            self._uuid, last_ids, started_s if is_complete else complete_s, time.time()
-        )
+        shipped = Shipped(self._uuid, last_ids, started_s if is_whole else complete_s, time.time())
         try:
             write_shipped(database, self.address, shipped)
         except OSError as error:
             self._report.note(f"retention cannot learn here what is shipped: {error}")
 
 
-def _told_of(batch: Batch, last: int) -> dict[str, int]:
-    """The progress that these rows make, with a digest of the last one."""
-    name = batch.table.name
-    newest = batch.rows[-1] if batch.rows and batch.rows[-1][0] == last else None
-    return {name: last, f"{name}.check": digest([newest]) if newest else _UNCHECKED}
-
-
-# A recording as it is shipped: read in short transactions, a bounded piece at a time.
-#
-# No read transaction lasts while a pool is written to: the log of the database could not be cut
-# back meanwhile, and the robot's disk would fill up because a server is slow.
-
-
-CHUNK_ROWS: Final = 32
-GROUPS_AT_ONCE: Final = 64
-_UUID: Final = "SELECT uuid FROM recording LIMIT 2"
-_RUNS: Final = "SELECT id, uuid FROM run"
-_SESSIONS: Final = "SELECT id, session_id FROM run"
-_ENDED: Final = "SELECT id FROM run WHERE ended_wall_time_s IS NOT NULL"
-_SEQUENCE: Final = "SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = ?"
-_LAST: Final = "SELECT coalesce(max(id), 0) FROM {table}"
-# Up to the first that somebody is still making: its id is not looked at again later.
-_COMPLETE: Final = (
-    "SELECT coalesce((SELECT min(id) - 1 FROM row_group WHERE is_complete = 0), "
-    "(SELECT max(id) FROM row_group), 0)"
-)
-_IN_NO_CHUNK: Final = (
-    "SELECT count(*) FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) AND id > ?"
-)
-_STRETCHES: Final = (
-    "SELECT k.id, k.run_id, k.start_sim_time_s, k.end_sim_time_s, u.ended_wall_time_s IS NOT NULL "
-    "FROM kept_stretch k JOIN run u ON u.id = k.run_id ORDER BY k.id"
-)
-_IN_STRETCH: Final = (
-    "SELECT {columns} FROM state WHERE run_id = ? AND sim_time_s BETWEEN ? AND ? "
-    "AND id > ? AND id <= ? ORDER BY id"
-)
-_PICTURES: Final = (
-    "SELECT id, run_id, path FROM image WHERE id > ? AND id <= ? ORDER BY id LIMIT 100"
-)
-
-
-class Stretch(NamedTuple):
-    """Seconds that are kept at full rate; `is_over` where their run has ended."""
-
-    id: int
-    run_id: int
-    start_sim_time_s: float
-    end_sim_time_s: float
-    is_over: bool
-
-    def holds(self, run_id: SQLValue, sim_time_s: SQLValue) -> bool:
-        """Whether a state is one of them."""
-        is_time = isinstance(sim_time_s, int | float)
-        return (
-            is_time
-            and run_id == self.run_id
-            and (self.start_sim_time_s <= sim_time_s <= self.end_sim_time_s)
-        )
-
-
-class Source:
-    """A connection to a recording, and which of its runs are another's to ship.
-
-    Args:
-        connection: A reader.
-    """
-
-    def __init__(self, connection: sqlite3.Connection) -> None:
-        self._connection = connection
-        connection.text_factory = _text
-        self.foreign = set[int]()
-        self._foreign_sessions = set[int]()
-
-    def uuid(self) -> str:
-        """The recording's.
-
-        Raises:
-            DatabaseError: It has none, or several.
-        """
-        rows = self._connection.execute(_UUID).fetchall()
-        if len(rows) != 1 or not isinstance(rows[0][0], str) or not rows[0][0]:
-            raise DatabaseError(
-                f"the recording has {len(rows) or 'no'} UUIDs, by which a pool tells recordings "
-                "apart: import it into a new one ('webots-mcp import FILE --data-dir NEW') and "
-                "ship that"
-            )
-        return rows[0][0]
-
-    def runs(self) -> dict[int, str | None]:
-        """The UUIDs of the runs; those that an old version has recorded have none."""
-        return dict(self._connection.execute(_RUNS).fetchall())
-
-    def leave_out(self, runs: set[int]) -> None:
-        """These runs are another's to ship, and sessions that have no others are as well."""
-        self.foreign = runs
-        sessions = dict(self._connection.execute(_SESSIONS).fetchall() if runs else ())
-        ours = {session for run_id, session in sessions.items() if run_id not in runs}
-        self._foreign_sessions = set(sessions.values()) - ours
-
-    def ended_runs(self) -> set[int]:
-        """The runs that are over."""
-        return {run_id for (run_id,) in self._connection.execute(_ENDED)}
-
-    def sequence(self, table: Table) -> int:
-        """The largest id that a row of the table ever had."""
-        last = self._first(_LAST.format(table=table.name))
-        return max(last, self._first(_SEQUENCE, table.name))
-
-    def in_one_moment(self, read: Callable[[], bool]) -> bool:
-        """Read several things from one state of the database."""
-        self._connection.execute("BEGIN")
-        try:
-            return read()
-        finally:
-            self._connection.execute("COMMIT")
-
-    def last_id(self, table: Table) -> int:
-        """The largest id in the table now; 0 where it is empty."""
-        return self._first(_LAST.format(table=table.name))
-
-    def row(self, table: Table, row_id: int) -> Row | None:
-        """One row of an appended table; None where retention has deleted it."""
-        query = f"SELECT {', '.join(table.columns)} FROM {table.name} WHERE id = ?"
-        return self._connection.execute(query, (row_id,)).fetchone()
-
-    def appended(self, table: Table, after: int, upto: int) -> tuple[Batch, int, int]:
-        """The next rows of an appended table.
-
-        Returns:
-            Those that are ours to ship; the last id that was looked at; how many rows were there.
-        """
-        query = (
-            f"SELECT {', '.join(table.columns)} FROM {table.name} "
-            "WHERE id > ? AND id <= ? ORDER BY id"
-        )
-        rows, is_all = self._some(query, (after, upto))
-        last = upto if is_all else int(str(rows[-1][0]))
-        return Batch(table, self.ours(table, rows)), last, len(rows)
-
-    def chunk(self, table: Table, number: int) -> list[Row]:
-        """The rows of a changing table whose ids lie in that chunk; all where it has no ids."""
-        columns = ", ".join(table.columns)
-        if table.key != ("id",):
-            rows = self._connection.execute(f"SELECT {columns} FROM {table.name}").fetchall()
-        else:
-            query = f"SELECT {columns} FROM {table.name} WHERE id >= ? AND id < ? ORDER BY id"
-            bounds = (number * CHUNK_ROWS, (number + 1) * CHUNK_ROWS)
-            rows = self._connection.execute(query, bounds).fetchall()
-        return self.ours(table, rows)
-
-    def chunks(self, table: Table, since: int) -> range:
-        """The numbers of the chunks from the one that holds that id on."""
-        if table.key != ("id",):
-            return range(1)
-        return range(since // CHUNK_ROWS, self.last_id(table) // CHUNK_ROWS + 1)
-
-    def last_group(self) -> int:
-        """The id of the last row group up to which all are complete."""
-        return self._first(_COMPLETE)
-
-    def groups(self, after: int, upto: int) -> Iterator[tuple[int, list[Batch]]]:
-        """The next row groups by their ids, each with its chunks; nothing of another's runs."""
-        groups, chunks = table("row_group"), table("chunk")
-        query = f"SELECT {', '.join(groups.columns)} FROM row_group WHERE id > ? AND id <= ?"
-        of_group = f"SELECT {', '.join(chunks.columns)} FROM chunk WHERE group_id = ? ORDER BY id"
-        found = self._connection.execute(
-            f"{query} ORDER BY id LIMIT ?", (after, upto, GROUPS_AT_ONCE)
-        )
-        for group in found.fetchall():
-            rows = self._connection.execute(of_group, group[:1]).fetchall()
-            both = (groups, self.ours(groups, [group])), (chunks, self.ours(chunks, rows))
-            yield int(group[0]), [Batch(*each) for each in both]
-
-    def in_no_chunk(self, shipped: int) -> int:
-        """How many states after that one are in no row group, of the runs that are ours to ship."""
-        found = 0
-        for run_id in self.runs().keys() - self.foreign:
-            at = reached(self._connection, run_id)
-            found += self._first(_IN_NO_CHUNK, run_id, at.end_s, at.last_state_id, shipped)
-        return found
-
-    def stretches(self) -> list[Stretch]:
-        """Kept stretches of the runs that are ours to ship."""
-        found = map(Stretch._make, self._connection.execute(_STRETCHES).fetchall())
-        return [stretch for stretch in found if stretch.run_id not in self.foreign]
-
-    def kept(self, stretch: Stretch, after: int, upto: int) -> tuple[Batch, bool]:
-        """The next states of a kept stretch, and whether they are all."""
-        states = table("state")
-        query = _IN_STRETCH.format(columns=", ".join(states.columns))
-        bounds = (stretch.start_sim_time_s, stretch.end_sim_time_s)
-        rows, is_all = self._some(query, (stretch.run_id, *bounds, after, upto))
-        return Batch(states, rows), is_all
-
-    def pictures(self, after: int, upto: int) -> list[tuple[int, int, str]]:
-        """The next pictures: their ids, runs and paths."""
-        return self._connection.execute(_PICTURES, (after, upto)).fetchall()
-
-    def ours(self, table: Table, rows: Sequence[Row]) -> list[Row]:
-        """Without what belongs to runs and sessions of another recording, or refers to them."""
-        rows = _without(table, rows, table.run_column, self.foreign)
-        return _without(table, rows, table.session_column, self._foreign_sessions)
-
-    def _some(self, query: str, values: tuple[Any, ...]) -> tuple[list[Row], bool]:
-        """Rows up to a bounded size, and whether they are all; the transaction is over then."""
-        rows: list[Row] = []
-        size = 0
-        cursor = self._connection.execute(query, values)
-        try:
-            for row in cursor:
-                rows.append(row)
-                size += row_bytes(row)
-                if size >= BATCH_BYTES or len(rows) >= BATCH_ROWS:
-                    return rows, False
-            return rows, True
-        finally:
-            cursor.close()
-
-    def _first(self, query: str, *values: object) -> int:
-        return int(self._connection.execute(query, values).fetchone()[0])
-
-
-def _without(table: Table, rows: Sequence[Row], column: str | None, foreign: set[int]) -> list[Row]:
-    """Rows whose column names none of these; what outlasts them names nothing then."""
-    if column is None or not foreign:
-        return list(rows)
-    at = table.columns.index(column)
-    if table.outlasts_runs:
-        return [(*row[:at], None, *row[at + 1 :]) if row[at] in foreign else row for row in rows]
-    return [row for row in rows if row[at] not in foreign]
-
-
-def digest(rows: Sequence[Sequence[SQLValue]]) -> int:
-    """A number that other rows have with a chance of one in 2**63."""
-    text = repr([tuple(row) for row in rows]).encode("utf-8", "surrogatepass")
-    return int.from_bytes(blake2b(text, digest_size=8).digest(), "big") >> 1
-
-
-def _text(value: bytes) -> str:
-    """Bytes that are no UTF-8, which another program has written, are read as what comes near."""
-    return value.decode("utf-8", "replace")
-
-
-# Rows on their way to a pool: gathered, and written with the progress that they make.
-
-
-WRITE_BYTES: Final = 8_000_000
-
-Put = Callable[["Batch | None", Mapping[str, int]], None]
-
-
-class Outbox:
-    """What waits to be written together, with the progress that it makes."""
-
-    def __init__(self, shipment: Shipment, report: Report, progress: dict[str, int]) -> None:
-        self._shipment = shipment
-        self._report = report
-        self._batches: list[Batch] = []
-        self._told = dict[str, int]()
-        self._size = 0
-        self.progress = progress
-
-    @property
-    def is_full(self) -> bool:
-        """Whether to send before anything is added."""
-        return self._size >= WRITE_BYTES
-
-    def add(self, batch: Batch | None, told: Mapping[str, int]) -> None:
-        """Rows, and the numbers that hold once they are written."""
-        if batch is not None and batch.rows:
-            self._batches.append(batch)
-            self._size += sum(map(row_bytes, batch.rows))
-        self._told |= told
-        self.progress |= told
-
-    def send(self) -> None:
-        """Write it all, in one transaction of the pool's."""
-        if not self._batches and not self._told:
-            return
-        self._report.replaced.update(self._shipment.write(self._batches, self._told))
-        for batch in self._batches:
-            self._report.rows[batch.table.name] += len(batch.rows)
-        self._batches, self._told, self._size = [], {}, 0
-
-
-# What a shipper tells of its work.
-
-
-@dataclass
-class Report:
-    """What was shipped so far, and what was not.
-
-    Attributes:
-        rows: By table; a row that changed counts each time that it was sent.
-        pictures: Files.
-        lost: By table, rows that retention had deleted before they could be shipped.
-        replaced: By column, values that the pool cannot hold, for which it has what comes nearest.
-        lost_pictures: Files that were not there any more, or are no pictures of ours.
-        foreign: By their UUIDs, runs that another recording had shipped before, with its UUID.
-        notes: What else a person should know.
-    """
-
-    rows: Counter[str] = field(default_factory=Counter[str])
-    pictures: int = 0
-    lost: Counter[str] = field(default_factory=Counter[str])
-    replaced: Counter[str] = field(default_factory=Counter[str])
-    lost_pictures: int = 0
-    foreign: dict[str, str] = field(default_factory=dict[str, str])
-    notes: list[str] = field(default_factory=list[str])
-
-    def note(self, text: str) -> None:
-        """Remember it, once."""
-        if text not in self.notes:
-            self.notes.append(text)
-
-
-# Shipping on and on while a robot records, also where the pool or the recording goes away.
-
-
-THOROUGH_S: Final = 30.0  # between two looks at all of what may change, and not only the newest
-_FIRST_WAIT_S: Final = 1.0
-_LONGEST_WAIT_S: Final = 60.0
-
-Say = Callable[[str], None]
-
-
-def follow(order: Order, report: Report, say: Say, pause_s: float) -> None:
-    """Ship what is there and what comes, until a KeyboardInterrupt.
-
-    A pool that is away is tried again, each time after a longer wait; a recording that is not there
-    yet is waited for.
-
-    Args:
-        order: What.
-        report: Grows while it goes on.
-        say: Told in a sentence when the pool is away, and when it is back.
-        pause_s: Between two looks at the recording.
-
-    Raises:
-        PoolError: The pool will not be better by itself.
-        DatabaseError: The recording cannot be read.
-    """
-    patience = _Patience(say, pause_s)
-    while True:
-        time.sleep(_go_on_until_it_fails(order, report, say, pause_s, patience))
-
-
-def _go_on_until_it_fails(
-    order: Order, report: Report, say: Say, pause_s: float, patience: _Patience
-) -> float:
-    """Ship as long as recording and pool are there; returns how long to wait then."""
+@contextmanager
+def _one_moment(connection: sqlite3.Connection) -> Generator[None]:
+    """Inside the block, all is read from one state of the database."""
+    connection.execute("BEGIN")
     try:
-        with shipper(order, report) as connected:
-            patience.connected(connected.address)
-            _go_on(connected, pause_s)
-    except ReplacedError as error:
-        say(f"{error}: that one is shipped from here on")
-        return 0.0
-    except NoDatabaseError:
-        return patience.wait_for(order.recording.database)
-    except (PoolBusyError, PoolUnavailableError) as error:
-        return patience.wait_after(error)
-
-
-class _Patience:
-    """How long to wait before the next attempt, and what is said of it."""
-
-    def __init__(self, say: Say, pause_s: float) -> None:
-        self._say = say
-        self._pause_s = pause_s
-        self._away_s = 0.0
-        self._was_there = False
-        self._has_told = False
-
-    def connected(self, address: str) -> None:
-        """The recording and the pool are there."""
-        if self._away_s:
-            self._say(f"the pool {address} is there again")
-        self._away_s, self._was_there, self._has_told = 0.0, True, False
-
-    def wait_for(self, database: Database) -> float:
-        """In seconds, where no recording is."""
-        there = f"nothing is recorded at {name_of(database)} now"
-        self._tell_once(f"{there}: it is shipped as soon as it is there")
-        return self._pause_s
-
-    def wait_after(self, error: PoolError) -> float:
-        """In seconds; what would not be better after it is raised again."""
-        if isinstance(error, PoolBusyError):
-            if not self._was_there:
-                raise error
-            self._tell_once(f"{error}; waiting until it ends")
-            return _FIRST_WAIT_S  # it may be our last connection, of which a server learns late
-        self._away_s = min(max(2 * self._away_s, _FIRST_WAIT_S), _LONGEST_WAIT_S)
-        self._say(f"{error}; trying again in {self._away_s:g} s, nothing is lost meanwhile")
-        return self._away_s
-
-    def _tell_once(self, text: str) -> None:
-        if not self._has_told:
-            self._say(text)
-        self._has_told = True
-
-
-def _go_on(connected: Shipper, pause_s: float) -> NoReturn:
-    next_s = 0.0
-    while True:
-        is_thorough = time.monotonic() >= next_s
-        if is_thorough:
-            next_s = time.monotonic() + THOROUGH_S
-        if connected.round(thorough=is_thorough):
-            time.sleep(pause_s)
+        yield
+    finally:
+        connection.execute("COMMIT")

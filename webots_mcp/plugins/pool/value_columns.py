@@ -71,7 +71,7 @@ def columns_of(
         values = _decoded(of_group, altered)
         if values.keys() >= set(_PLACES.values()):  # else nobody knows of when the others are
             made.append(_group(group_id, values, signals, types))
-    return arrow.concat_tables(made, promote_options="default").combine_chunks()
+    return arrow.concat_tables(made, promote_options="default")
 
 
 def _decoded(chunks: Mapping[int, Mapping[str, Any]], altered: Counter[str]) -> dict[int, Decoded]:

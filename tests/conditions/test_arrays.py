@@ -13,12 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.conditions.writing import Node, Rows, conditions, rows, written
-from tests.frames import frame_of_states
+from tests.frames import frame_of, frame_of_states
 from webots_mcp.conditions import parse_condition
 from webots_mcp.errors import ConditionFailedError
 from webots_mcp.naming import find_position
 from webots_mcp.store.detection.condition import OnArrays, first_failure
-from webots_mcp.store.reading.frame import Frame
 
 Failing = tuple[int, str]
 COMPARISON: dict[str, Any] = {
@@ -120,7 +119,7 @@ def test_rows_are_judged_alike_where_chunks_are_left_closed(sign: str, limit: fl
     course[7000] = 1e200
     condition = parse_condition(f"x {sign} {limit}")
 
-    frame = Frame.of(np.arange(len(course)) / 10, {"x": course})
+    frame = frame_of(np.arange(len(course)) / 10, {"x": course})
     held = OnArrays(condition.scanned, frame).condition(condition.tree).holds
 
     expected = COMPARISON[sign](course, limit) & ~np.isnan(course)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tests.detection import driving
 from tests.detection.asking import Answer, ask_since
 from tests.detection.drawing import KINDS, draw_case
-from tests.detection.judging import judge
+from tests.detection.goals import missed_goals
 from tests.detection.labelled import Case, Measure
 from tests.detection.measuring import measure
 from tests.detection.writing import write_all
@@ -87,19 +87,11 @@ def test_a_robot_stood_as_long_whatever_part_of_its_run_is_asked_for(
         assert before[2] <= after[1]  # none is told within another
 
 
-@given(kind=st.sampled_from(["gaps", "swing_gap"]), seed=SEEDS)
-@settings(max_examples=EXAMPLES, deadline=None)
-def test_every_gap_is_told_and_nothing_else_is_a_gap(kind: str, seed: int) -> None:
-    case = draw_case(kind, seed, 0, most_values=MOST_VALUES)
-    run_ids, answer = asked(case, ("gap",))
-    for run_id, run in zip(run_ids, case.runs, strict=True):
-        truth = [each for each in run.incidents if each.measure == "gap"]
-        verdict = judge(truth, answer.of("gap", run_id), run.interval_s)
-        assert not verdict.missed and not verdict.false
+BY_CHANCE = {"settling", "roaming"}  # of so few cases, whether their goals are reached
 
 
-@pytest.mark.parametrize("kind", ["missing", "late", "wide"])
-def test_silence_that_lasts_less_than_half_of_a_run_is_told_exactly(kind: str) -> None:
-    report = measure([kind], 1, 1)
-    tally = report.tallies[kind, "missing", ""]
-    assert (tally.recall or 1.0, tally.false, report.wrong) == (1.0, 0, [])
+@pytest.mark.parametrize("kind", sorted(KINDS.keys() - BY_CHANCE))
+def test_what_is_told_of_labelled_recordings_reaches_the_goals(kind: str) -> None:
+    report = measure([kind], 2, 1)
+    missed = {key: missed_goals(key, tally) for key, tally in report.tallies.items()}
+    assert {key: goals for key, goals in missed.items() if goals} == {}, report.wrong

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,6 +16,16 @@ from webots_mcp.contract import Database, MemoryDatabase
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading import frame_summary
+from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
+
+
+@pytest.fixture(scope="session", autouse=True)
+def deadlines_of_this_process() -> Iterator[None]:
+    """A deadline counts the processor time of the tests: no busy machine uses it up."""
+    with pytest.MonkeyPatch.context() as patched:
+        clock = (QUESTION_DEADLINE_S, time.process_time)
+        patched.setattr(Deadline.__init__, "__defaults__", clock)
+        yield
 
 
 @pytest.fixture

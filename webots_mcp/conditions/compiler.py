@@ -94,11 +94,10 @@ class Condition:
 
     def describe_unknown(self, known: Collection[str]) -> list[str]:
         """A sentence for each of its signals, and the position, not among the known ones."""
+        missing = "is missing as long as it is not published; there is"
+        unknown = [name for name in self.signals if name not in known]
         return [
-            *(
-                f"{name} is missing as long as it is not published; there is {near}"
-                for name, near in self.nearest_to_unknown(known)
-            ),
+            *(f"{name} {missing} {_nearest(name, known)}" for name in unknown),
             *self.describe_lost(known),
         ]
 
@@ -106,11 +105,6 @@ class Condition:
         """That it asks where the robot is, and none of the known names is a place."""
         lost = self.asks_position and find_position(known) is None
         return [f"displacement has no value: {NO_POSITION}"] * lost
-
-    def nearest_to_unknown(self, known: Collection[str]) -> list[tuple[str, str]]:
-        """Each of its signals that is not among the known ones, and the names that are near."""
-        unknown = [name for name in self.signals if name not in known]
-        return [(name, _nearest(name, known)) for name in unknown]
 
 
 class Evaluator:

@@ -13,7 +13,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from typing import Any, Final, Generic, Protocol, TypeAlias, TypeVar
+from typing import Any, Final, Generic, TypeAlias, TypeVar
 
 from webots_mcp.errors import ConditionFailedError
 from webots_mcp.naming import (
@@ -231,29 +231,25 @@ def _may_be_number(value: Value) -> bool:
     return value.__class__ is not str and value.__class__ is not bool
 
 
-class Memory(Protocol):
+class Memory(ABC):
     """Something that is kept from state to state."""
 
+    @abstractmethod
     def update(self, state: State, sim_time_s: float) -> None:
         """Take in a state."""
-        ...
 
+    @abstractmethod
     def forget(self) -> None:
         """A new run has begun."""
-        ...
 
 
-class _Asking(ABC, Generic[Answer]):
+class _Asking(Memory, Generic[Answer]):
     """Asks something of every state and keeps what follows from the answers."""
 
     def __init__(self, ask: Callable[[State], Answer]) -> None:
         self._ask = ask
         self._error: ConditionFailedError | None = None
         self.forget()
-
-    @abstractmethod
-    def forget(self) -> None:
-        """A new run has begun."""
 
     def update(self, state: State, sim_time_s: float) -> None:
         """Take in a state; why it could not be asked is raised when the result is read."""
@@ -325,7 +321,7 @@ class Rate(_Asking[int | float | None]):
         return self._rate
 
 
-class Displacement:
+class Displacement(Memory):
     """Metres between where the robot is and where it was so many seconds ago."""
 
     def __init__(

@@ -156,41 +156,6 @@ def test_a_swing_that_reaches_an_end_of_the_range_is_told_up_to_there(
     assert from_end_s <= 0.75  # of a period of 2 s: less than a half swing is left out
 
 
-def zigzag(rng: np.random.Generator, times: Array) -> Array:
-    """Straight pieces of 2 to 8 s, as the heading of a robot that turns."""
-    places = np.cumsum(rng.uniform(2, 8, 60))
-    slopes = rng.choice([0.0, 0.8, -0.8, 0.3], 60)
-    course = np.concatenate(([0.0], np.cumsum(np.diff(places) * slopes[1:])))
-    return np.interp(times, places, course)
-
-
-@pytest.mark.parametrize("seed", range(12))
-def test_a_swing_is_found_over_turns_that_follow_each_other_as_fast_as_its_periods(
-    seed: int,
-) -> None:
-    rng = np.random.default_rng(seed)
-    times = np.arange(0, 120, 0.08)
-    course = zigzag(rng, times) + rng.normal(0, 0.01, len(times))
-    inside = (times >= START_S) & (times < START_S + 6 * 4.0)
-    swing = np.where(inside, HEIGHT * np.sin(2 * np.pi * (times - START_S) / 4.0), 0)
-    assert swings_of(times, course) == []
-    (found,) = swings_of(times, course + swing)
-    assert found.period_s == pytest.approx(4.0, rel=0.05)
-    assert found.amplitude == pytest.approx(HEIGHT, rel=0.1)
-    assert found.start_s == pytest.approx(START_S, abs=5.0)
-    assert found.end_s == pytest.approx(START_S + 24.0, abs=5.0)
-
-
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_pieces_of_which_none_is_as_high_as_their_median_swing_without_a_warning() -> None:
-    rng = np.random.default_rng(43)
-    times = np.arange(0, 60, 0.1)
-    low, high = rng.uniform(0.05, 0.5, 2).tolist()
-    swing = np.sin(2 * np.pi * times / float(rng.uniform(2, 4.8)))
-    swing *= np.select([times <= 10, times < 30, times < 50], [0.0, low, high])
-    swings_of(times, zigzag(rng, times) + swing)
-
-
 def test_a_slow_swing_counts_from_six_periods_on() -> None:
     times = np.arange(0, 120, 0.1)
     dither = np.random.default_rng(6).normal(0, 0.01, len(times))

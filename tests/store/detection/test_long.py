@@ -80,17 +80,6 @@ def test_where_the_robot_stood_it_is_told_as_stuck_too_though_the_time_is_over_b
     empty.set_trace_callback(None)
 
 
-def test_what_a_part_of_the_work_leaves_of_its_time_is_left_for_the_rest() -> None:
-    now_s = [0.0]
-    deadline = Deadline(8.0, lambda: now_s[0])
-    with deadline.narrowed(0.25):
-        now_s[0] = 1.0
-        assert deadline.left_s == 1.0
-        now_s[0] = 2.0
-        assert deadline.passed
-    assert deadline.left_s == 6.0
-
-
 def test_the_position_of_a_run_is_the_one_that_it_published(empty: sqlite3.Connection) -> None:
     """Another run of the robot named it otherwise, after an edit."""
     recorder = Recorder(empty)

@@ -6,10 +6,12 @@ import re
 import sqlite3
 from collections import Counter
 from itertools import count
+from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.frames import frame_of
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from tests.store.questions.asking import ask, spans
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
@@ -19,7 +21,6 @@ from webots_mcp.store.detection.jump import find_jumps
 from webots_mcp.store.detection.kinds import Event, EventOptions, Ledger, Threshold
 from webots_mcp.store.detection.search import Search, events_touching
 from webots_mcp.store.reading.catalogue import known_signals
-from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.reading.segment import Deadline
 
@@ -51,31 +52,29 @@ def test_mode_changes_have_their_duration(rover: sqlite3.Connection, looked_at: 
     assert not any(event.ongoing for event in events)  # the run has ended
 
 
-def test_a_gap_is_an_event(rover: sqlite3.Connection, looked_at: str) -> None:
-    assert spans(ask(rover, "gap")) == [(89.9, 95.0)]
+def above(limit: float, for_s: float = 0.0) -> dict[str, Any]:
+    return {"thresholds": (Threshold("pose.0", above=limit, for_s=for_s),)}
 
 
-def test_a_silent_sensor_is_found(rover: sqlite3.Connection, looked_at: str) -> None:
-    events = ask(rover, "missing")
-    assert [event.name for event in events.events] == ["sensors.front"]
-    assert spans(events) == [(100.0, 103.9)]
-
-
-def test_a_flat_signal_is_found(rover: sqlite3.Connection) -> None:
-    events = ask(rover, "flat", signals=("pose.0", "battery_v", "target"), flat_s=5.0)
-    assert [event.name for event in events.events] == ["pose.0"]
-    assert spans(events) == [(40.0, 52.0)]
-
-
-def test_a_crossed_threshold_lasts_as_long_as_it_holds(
-    rover: sqlite3.Connection, looked_at: str
+@pytest.mark.parametrize(
+    ("kind", "options", "expected"),
+    [
+        ("gap", {}, [(None, 89.9, 95.0)]),
+        ("missing", {}, [("sensors.front", 100.0, 103.9)]),
+        ("flat", {"signals": ("pose.0", "target"), "flat_s": 5.0}, [("pose.0", 40.0, 52.0)]),
+        ("threshold", above(7.5, 5.0), [("pose.0", 37.6, 56.9), ("pose.0", 75.1, 119.9)]),
+        ("threshold", above(7.5, 50.0), []),
+        ("jump", {"signals": ("ir", "mode")}, [("ir", 70.0, 70.1), ("position", 110.0, 110.0)]),
+        ("oscillation", {}, [("heading", 60.0, 89.9)]),
+    ],
+)
+def test_what_happened_to_the_rover_is_found(
+    rover: sqlite3.Connection, looked_at: str, kind: str, options: dict[str, Any], expected: Any
 ) -> None:
-    far = Threshold("pose.0", above=7.5, for_s=5.0)
-    assert spans(ask(rover, "threshold", thresholds=(far,))) == [(37.6, 56.9), (75.1, 119.9)]
-    never = Threshold("pose.0", above=7.5, for_s=50.0)
-    assert ask(rover, "threshold", thresholds=(never,)).events == ()
-    low = Threshold("battery_v", below=12.5)
-    assert spans(ask(rover, "threshold", thresholds=(low,))) == [(100.1, 119.9)]
+    found = [(each.name, each.start_s, each.end_s) for each in ask(rover, kind, **options).events]
+    assert found == [
+        (name, *(pytest.approx(each, abs=0.2) for each in ends)) for name, *ends in expected
+    ]
 
 
 def test_numbers_too_large_to_reckon_with_cross_a_threshold_and_are_not_silent(
@@ -88,30 +87,6 @@ def test_numbers_too_large_to_reckon_with_cross_a_threshold_and_are_not_silent(
     high = Threshold("big", above=5.0)
     assert spans(ask(empty, "threshold", thresholds=(high,))) == [(10.0, 19.9)]
     assert ask(empty, "missing").events == ()
-
-
-def test_a_jump_of_the_position_is_found(rover: sqlite3.Connection) -> None:
-    jumps = [e for e in ask(rover, "jump").events if e.name == "position"]
-    assert [(jump.start_s, jump.details["distance_m"]) for jump in jumps] == [
-        (110.0, pytest.approx(1.0, abs=0.05))
-    ]
-
-
-def test_a_spike_is_a_jump_there_and_back(rover: sqlite3.Connection, looked_at: str) -> None:
-    events = ask(rover, "jump", signals=("ir",))
-    (jump,) = events.events[:1]
-    assert (jump.name, jump.start_s) == ("ir", 70.0)
-    assert jump.end_s == pytest.approx(70.1)
-
-
-def test_a_swinging_heading_is_an_oscillation(rover: sqlite3.Connection) -> None:
-    (swing,) = ask(rover, "oscillation").events
-    assert swing.name == "heading"
-    assert (swing.start_s, swing.end_s) == (
-        pytest.approx(60.0, abs=0.2), pytest.approx(89.9, abs=0.2),
-    )  # fmt: skip
-    assert swing.details["period_s"] == pytest.approx(2.0, rel=0.02)
-    assert swing.details["amplitude"] == pytest.approx(0.5, rel=0.05)
 
 
 def test_commands_logs_and_notices_are_on_the_same_clock(rover: sqlite3.Connection) -> None:
@@ -268,7 +243,7 @@ def test_options_without_sense_are_refused(rover: sqlite3.Connection) -> None:
 @pytest.mark.parametrize("seed", range(10))
 def test_noise_neither_jumps_nor_swings(seed: int) -> None:
     noise = np.random.default_rng(seed).normal(size=2000)
-    assert find_jumps(Frame.of(np.arange(2000.0), {"x": noise}), "x", 12.0) == []
+    assert find_jumps(frame_of(np.arange(2000.0), {"x": noise}), "x", 12.0) == []
 
 
 def test_a_wall_range_over_several_runs_knows_the_signals_of_each(

@@ -105,16 +105,6 @@ def test_zones_are_what_the_values_come_to(
                 assert zones.value_count[number] == expected.value_count
 
 
-def test_a_frame_of_arrays_is_one_of_rows() -> None:
-    frame = Frame.of([0.0, 0.1, 0.2], {"x": np.array([1.0, np.nan, 3.0]), "mode": ["a", None, "b"]})
-    assert frame.numbers("x").tolist()[::2] == [1.0, 3.0]
-    assert frame.values("mode") == ["a", None, "b"]
-    assert frame.usable("x")[0].tolist() == [0.0, 0.2]
-    assert "x" in frame
-    assert "y" not in frame
-    assert np.isnan(frame.numbers("y")).all()
-
-
 def test_a_damaged_chunk_is_read_from_its_rows_where_they_are_there(
     short_groups: None, empty: sqlite3.Connection
 ) -> None:

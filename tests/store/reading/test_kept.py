@@ -18,7 +18,7 @@ from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.chunk_making import make_chunks
+from webots_mcp.store.chunks.making import chunk_whole_run, make_chunks
 from webots_mcp.store.detection.events import EventOptions, find_events
 from webots_mcp.store.export_rows import Source
 from webots_mcp.store.questions.series import query_history, query_rows
@@ -329,3 +329,23 @@ def test_a_kept_call_before_the_row_of_the_same_step_comes_first(
     recorder.insert("kept_state", **recorder.at(1.0) | {"wall_time_s": 0.0}, data='{"x": 1}')
     frame = read_frame(empty, Segment(1, 0.0, 2.0, full_rate=True), Deadline(60))
     assert frame.values("x") == [1, 2]
+
+
+@pytest.mark.parametrize("deleted", [False, True])
+def test_a_range_that_is_wider_than_a_stretch_is_not_at_full_rate_though_its_rows_were_deleted(
+    empty: sqlite3.Connection, *, deleted: bool
+) -> None:
+    recorder = start_run(empty)
+    for step in range(100):
+        recorder.publish(float(step), {"x": step})
+    for time_s in (40.2, 40.4, 40.6):
+        recorder.insert("kept_state", **recorder.at(time_s), data='{"x": 1}')
+    span = {"start_sim_time_s": 40.2, "end_sim_time_s": 40.6}
+    recorder.insert("kept_stretch", uuid="k", run_id=1, **span, reason="a look", wall_time_s=0.0)
+    if deleted:
+        assert chunk_whole_run(empty, 1)
+        empty.execute("DELETE FROM state")
+        empty.execute("UPDATE run SET purged_rows = 100")
+    for start_s, is_kept in ((40.1, True), (39.0, False)):
+        (segment,) = find_range(empty, Scope(run_id=1, start_s=start_s, end_s=40.9)).segments
+        assert segment.full_rate is is_kept

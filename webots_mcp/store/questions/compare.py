@@ -82,39 +82,32 @@ def difference_of(
         tests: So many are made at once.
         min_effect_sd: See `analysis.spread`.
     """
-    whole = [[run for run in group if run is not None] for group in groups]
-    is_whole = [len(a) == len(b) for a, b in zip(whole, groups, strict=True)]
-    runs = [[run.get(signal.name, Summary()) for run in group] for group in whole]
-    runs = [[each for each in group if each.sum is not None] for group in runs]
-    read = [group if all_read else [] for group, all_read in zip(runs, is_whole, strict=True)]
-    known = all(each.sines is not None for group in runs for each in group)
-    turn = signal.turn if known else None
-    means, deviations = (
-        [each if all_read else [None] for each, all_read in zip(figures, is_whole, strict=True)]
-        for figures in (_means(turn, runs), _deviations(turn, runs))
-    )
+    runs: list[list[Summary] | None] = []  # that have a value; None of a group that is not known
+    for group in groups:
+        found = [run.get(signal.name, Summary()) for run in group if run is not None]
+        is_known = len(found) == len(group)
+        runs.append([each for each in found if each.sum is not None] if is_known else None)
+    has_angles = all(each.sines is not None for group in runs for each in group or ())
+    turn = signal.turn if has_angles else None
+    means = _means(turn, runs)
+    deviations = [
+        [None] if group is None else [_deviation(turn, each) for each in group] for group in runs
+    ]
     mean, deviation = [spread_of(each) for each in means], [spread_of(each) for each in deviations]
     of_means = verdicts_on(means, tests, min_effect_sd=min_effect_sd)
     of_deviations = verdicts_on(deviations, tests, min_effect_sd=min_effect_sd)
     verdicts = zip(of_means, of_deviations, strict=True)
+    lows = ([each.min for each in group or () if each.min is not None] for group in runs)
+    highs = ([each.max for each in group or () if each.max is not None] for group in runs)
     return Difference(
         name=signal.name,
         kind=signal.kind,
         unit=signal.unit,
         mean=mean,
         deviation=deviation,
-        min=[
-            min((each.min for each in group if each.min is not None), default=None)
-            for group in read
-        ],
-        max=[
-            max((each.max for each in group if each.max is not None), default=None)
-            for group in read
-        ],
-        count=[
-            sum(each.present for each in group) if all_read else None
-            for group, all_read in zip(runs, is_whole, strict=True)
-        ],
+        min=[min(each, default=None) for each in lows],
+        max=[max(each, default=None) for each in highs],
+        count=[None if group is None else sum(each.present for each in group) for group in runs],
         deviation_ratio=[_ratio(each, deviation[0]) for each in deviation],
         effect=[_effect(turn, mean, deviation, index) for index in range(len(groups))],
         different=[_either(a.different, b.different) for a, b in verdicts],
@@ -122,9 +115,13 @@ def difference_of(
     )
 
 
-def _means(turn: float | None, groups: Sequence[Sequence[Summary]]) -> list[list[float | None]]:
+def _means(
+    turn: float | None, groups: Sequence[Sequence[Summary] | None]
+) -> list[list[float | None]]:
     """Of an angle all within half a turn of the first: their own mean must not be cut in two."""
-    found = [[each.centre(turn) for each in group] for group in groups]
+    found: list[list[float | None]] = [
+        [None] if group is None else [each.centre(turn) for each in group] for group in groups
+    ]
     if turn is None:
         return found
     start = next((each for group in found for each in group if each is not None), 0.0)
@@ -134,14 +131,9 @@ def _means(turn: float | None, groups: Sequence[Sequence[Summary]]) -> list[list
     ]
 
 
-def _deviations(
-    turn: float | None, groups: Sequence[Sequence[Summary]]
-) -> list[list[float | None]]:
-    return [[_without_dust(each.deviation_in(turn), each) for each in group] for group in groups]
-
-
-def _without_dust(deviation: float | None, summary: Summary) -> float | None:
+def _deviation(turn: float | None, summary: Summary) -> float | None:
     """What adding floats leaves is the 0 that it means."""
+    deviation = summary.deviation_in(turn)
     if deviation is None or summary.min is None or summary.max is None:
         return deviation
     return deviation if deviation > _DUST * max(abs(summary.min), abs(summary.max)) else 0.0

@@ -420,7 +420,13 @@ def score_run(
         duration_s = end_s - began_s
         segment = segment.through(end_s)
     time_range = TimeRange(subject.robot_id, subject.robot, (segment,), "simulation")
-    return _scored(connection, score, known, time_range, duration_s, Deadline(deadline_s))
+    deadline = Deadline(deadline_s)
+    counts = {kind: _count(connection, kind, time_range, deadline) for kind in score.kinds}
+    frame = read_frame(connection, segment, deadline, full_rate=False)
+    found = Scored(None, f"time limit reached after {len(frame)} rows")
+    if frame.cut_at_s is None:
+        found = _found(score, frame, known, duration_s, counts)
+    return RunScore(run_id, score.text, *found, duration_s, len(frame))
 
 
 def unseen(connection: sqlite3.Connection, run_ids: Iterable[int | None]) -> list[str]:
@@ -440,24 +446,6 @@ def unseen(connection: sqlite3.Connection, run_ids: Iterable[int | None]) -> lis
         f"scores: {said}" if len(runs) == len(scored) else f"scores of run {listed(runs)}: {said}"
         for said, runs in alike.items()
     ]
-
-
-def _scored(
-    connection: sqlite3.Connection,
-    score: Score,
-    known: Mapping[str, Signal],
-    time_range: TimeRange,
-    duration_s: float,
-    deadline: Deadline,
-) -> RunScore:
-    (segment,) = time_range.segments
-    counts = {kind: _count(connection, kind, time_range, deadline) for kind in score.kinds}
-    frame = read_frame(connection, segment, deadline, full_rate=False)
-    if frame.cut_at_s is not None:
-        found = Scored(None, f"time limit reached after {len(frame)} rows")
-    else:
-        found = _found(score, frame, known, duration_s, counts)
-    return RunScore(segment.run_id, score.text, *found, duration_s, len(frame))
 
 
 def _found(

@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 import sqlite3
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from webots_mcp.naming import Value
 from webots_mcp.store import chunk_making
@@ -132,24 +132,6 @@ class Frame:
         self._stop = stop
         self.cut_at_s = cut_at_s
         self.run_id = source.run_id
-
-    @classmethod
-    def of(
-        cls,
-        times: Sequence[float] | Array,
-        columns: Mapping[str, Sequence[Any] | Array],
-    ) -> Frame:
-        """A frame of values that are in no recording; wall times are as simulation times.
-
-        Args:
-            times: Simulation time of each row in s, never falling.
-            columns: Of each signal one value for each row; None or NaN where it has none.
-        """
-        listed = [float(each) for each in times]
-        values = {name: _plain(column) for name, column in columns.items()}
-        ids = list(range(1, len(listed) + 1))
-        rows = StateColumns(ids, listed, listed, [""] * len(listed), values)
-        return cls(FrameSource(None, 0, np.zeros((0, 5)), rows, {}), 0, len(listed))
 
     def __len__(self) -> int:
         return self._stop - self._start
@@ -476,11 +458,6 @@ def _spans(edges: Indexes, wanted: Flags) -> list[tuple[int, int]]:
     """Rows [start, stop) between edges where it is wanted; those side by side are one span."""
     ends = edges[np.flatnonzero(np.diff(wanted, prepend=False, append=False))].tolist()
     return list(zip(ends[::2], ends[1::2], strict=True))
-
-
-def _plain(column: Sequence[Any] | Array) -> list[Any]:
-    listed: list[Any] = column.tolist() if isinstance(column, np.ndarray) else list(column)
-    return [None if value != value else value for value in listed]
 
 
 def _coded(values: Decoded, *, numbers: bool) -> Coded:

@@ -71,7 +71,7 @@ class FrameSource:
 
     def __init__(
         self,
-        connection: sqlite3.Connection | None,
+        connection: sqlite3.Connection,
         run_id: int,
         groups: Array,
         columns: StateColumns,
@@ -141,7 +141,7 @@ class FrameSource:
         groups = len(self._group_ids)
         of_group = {int(self._group_ids[place]): place for place in places if place < groups}
         signal_id, connection = self._signal_id(column), self.connection
-        if signal_id is not None and connection is not None and of_group:
+        if signal_id is not None and of_group:
             sizes = np.diff(self.first_rows)
             wanted = {group_id: int(sizes[place]) for group_id, place in of_group.items()}
             found = values_in(connection, self.run_id, signal_id, wanted)
@@ -198,9 +198,9 @@ class FrameSource:
 
     def _statistics(self, column: Column) -> Array:
         table = nothing(len(self.starts_s))
-        signal_id, connection = self._signal_id(column), self.connection
-        if signal_id is not None and connection is not None and len(self._group_ids):
-            stored = statistics_in(connection, self.run_id, signal_id, self._between)
+        signal_id = self._signal_id(column)
+        if signal_id is not None and len(self._group_ids):
+            stored = statistics_in(self.connection, self.run_id, signal_id, self._between)
             at, known = self._places_of(stored[:, 0])
             table[at] = stored[known, 1:]
         values = _of_rows(self.columns, column) or ()
@@ -214,7 +214,7 @@ class FrameSource:
         between = self.starts_s[1:] - self.ends_s[:-1] > longer_s
         found = np.append(between, False) | np.append(False, between)
         found[len(self._group_ids) :] = True
-        if self.connection is not None and len(self._group_ids):
+        if len(self._group_ids):
             asked = (self.run_id, SIM_TIMES, self._between, longer_s)
             ids = groups_with_steps(self.connection, *asked)
             found[self._places_of(np.array(ids, np.float64))[0]] = True

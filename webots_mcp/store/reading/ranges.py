@@ -32,15 +32,14 @@ from webots_mcp.store.chunks import WALL_TIMES
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.segment import (
     HAS_LOST_ROWS,
+    MOST_ROWS,
     Deadline,
     Segment,
-    Subject,
-    choose,
-    is_at_full_rate,
     just_after,
     kept_notes,
+    kept_parts,
     moment_of,
-    require_run,
+    rows_in,
     shown_time,
 )
 
@@ -52,10 +51,6 @@ _FIRST_FROM: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ? AND sim
 _HITS: Final = (
     "SELECT count(*) FROM (SELECT 1 FROM event WHERE run_id = :run AND sim_time_s >= :start "
     "AND sim_time_s < :end AND kind = 'breakpoint' GROUP BY sim_time_s LIMIT :most)"
-)
-_ROWS: Final = (
-    "SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = :run AND sim_time_s >= :start "
-    "AND sim_time_s < :end LIMIT :most)"
 )
 _IS_THROTTLED: Final = (
     "SELECT 1 FROM run r JOIN session s ON s.id = r.session_id "
@@ -160,12 +155,12 @@ def hit_notes(
         return
     values = {"run": run_id, "start": start_s, "end": end_s, "most": _MOST_HITS}
     (hits,) = connection.execute(_HITS, values).fetchone()
-    values["most"] = _LEAST_ROWS_PER_HIT * hits
-    (rows,) = connection.execute(_ROWS, values).fetchone()
+    most = _LEAST_ROWS_PER_HIT * hits
+    rows = rows_in("state", connection, run_id, (start_s, end_s), most)
     if (run := frame_of_purged(connection, run_id)) is not None:
         first, last = run.places([start_s, end_s]).tolist()
         rows = last - first
-    if hits and rows < _LEAST_ROWS_PER_HIT * hits:
+    if hits and rows < most:
         yield (
             f"up to {hits} of {rows} rows of run {run_id} were recorded because a breakpoint was "
             "hit: means and counts are biased towards them"
@@ -328,9 +323,25 @@ def whole_run(connection: sqlite3.Connection, run_id: int) -> Segment | None:
 
 
 def _rated(connection: sqlite3.Connection, segment: Segment) -> Segment:
-    """The segment, which knows whether it is kept at full rate."""
-    kept = is_at_full_rate(connection, segment.run_id, segment.start_s, segment.end_s)
-    return replace(segment, full_rate=True) if kept else segment
+    """The segment, which knows whether it is kept at full rate.
+
+    It is where it holds nothing but rows of one stretch, and not too many of them.
+    """
+    run_id, span = segment.run_id, (segment.start_s, segment.end_s)
+    for each in kept_parts(connection, run_id, *span):
+        outside = ((span[0], each.start_s), (each.after_s, span[1]))
+        if not any(_has_rows(connection, run_id, part) for part in outside):
+            both = ("state", "kept_state")
+            rows = [rows_in(table, connection, run_id, span, MOST_ROWS + 1) for table in both]
+            return replace(segment, full_rate=rows[1] > 0 and sum(rows) <= MOST_ROWS)
+    return segment
+
+
+def _has_rows(connection: sqlite3.Connection, run_id: int, span: tuple[float, float]) -> bool:
+    """Whether a row lies in [start, end), be it that it is left in a chunk alone."""
+    if span[0] >= span[1] or rows_in("state", connection, run_id, span, 1):
+        return span[0] < span[1]
+    return len(read_frame(connection, Segment(run_id, *span), Deadline())) > 0
 
 
 def _in_simulation_time(

@@ -15,10 +15,6 @@ from dataclasses import dataclass, replace
 from typing import Concatenate, Final, NamedTuple, ParamSpec, TypeVar
 
 from webots_mcp.connection import keep_deadline
-from webots_mcp.errors import NothingRecordedError
-from webots_mcp.store.chunks import SIM_TIMES, Decoded, groups_in, values_in
-from webots_mcp.store.robots import Robot, resolve_robot, robot_name
-from webots_mcp.store.run_rows import Run, current_run, fetch_run
 
 _DECIMALS: Final = 3
 HAS_LOST_ROWS: Final = (  # of a run `r`: some were deleted of which no chunk is left
@@ -108,16 +104,6 @@ class Deadline:
         """One for a part of the work: after that share of the time that is left."""
         return Deadline(share * self.left_s, self._clock)
 
-    @contextlib.contextmanager
-    def narrowed(self, share: float) -> Generator[None]:
-        """Inside, the time is over after that share of what is left, for all that hold this one."""
-        until_s = self._until_s
-        self._until_s = self._clock() + share * self.left_s
-        try:
-            yield
-        finally:
-            self._until_s = until_s
-
     @property
     def passed(self) -> bool:
         """Whether the time is over."""
@@ -202,8 +188,7 @@ _WRITTEN: Final = (
     "WHERE r.id = :run AND r.last_sim_time_s < :end AND s.throttle_interval > 1)"
 )
 _IN: Final = "WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
-_ANY: Final = f"SELECT EXISTS (SELECT 1 FROM {{table}} {_IN})"
-_COUNT: Final = f"SELECT count(*) FROM (SELECT 1 FROM {{table}} {_IN} LIMIT {MOST_ROWS + 1})"
+_ROWS: Final = f"SELECT count(*) FROM (SELECT 1 FROM {{table}} {_IN} LIMIT ?)"
 
 
 class KeptStretch(NamedTuple):
@@ -213,6 +198,11 @@ class KeptStretch(NamedTuple):
     end_s: float
     reason: str
     wall_time_s: float
+
+    @property
+    def after_s(self) -> float:
+        """Beyond what simulation times differ by where a clock adds up steps."""
+        return self.end_s + 1e-9
 
 
 def kept_stretches(
@@ -244,27 +234,8 @@ def kept_parts(
 ) -> list[KeptStretch]:
     """Of those the ones that have rows of their own."""
     found = kept_stretches(connection, run_id, start_s, end_s)
-    spans = [(each, each.start_s, _after(each.end_s)) for each in found]  # the last row is in it
-    return [each for each, *span in spans if _any(connection, "kept_state", run_id, *span)]
-
-
-def is_at_full_rate(
-    connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
-) -> bool:
-    """Whether [start_s, end_s) holds nothing but rows of one stretch, and not too many of them."""
-    for each in kept_parts(connection, run_id, start_s, end_s):
-        outside = ((start_s, each.start_s), (_after(each.end_s), end_s))
-        if not any(
-            _any(connection, "state", run_id, *span) or _any_in_chunks(connection, run_id, *span)
-            for span in outside
-        ):
-            bounds = (run_id, start_s, end_s)
-            counts = [
-                connection.execute(_COUNT.format(table=table), bounds).fetchone()[0]
-                for table in ("state", "kept_state")
-            ]
-            return counts[1] > 0 and sum(counts) <= MOST_ROWS
-    return False
+    spans = [(each, (each.start_s, each.after_s)) for each in found]  # the last row is in it
+    return [each for each, span in spans if rows_in("kept_state", connection, run_id, span, 1)]
 
 
 def kept_notes(
@@ -279,71 +250,17 @@ def kept_notes(
     return [f"run {run_id} is kept at full rate: {', '.join(named)}{more}"]
 
 
-def _any(
-    connection: sqlite3.Connection, table: str, run_id: int, start_s: float, end_s: float
-) -> bool:
-    query = _ANY.format(table=table)
-    return bool(connection.execute(query, (run_id, start_s, end_s)).fetchone()[0])
+def rows_in(
+    table: str, connection: sqlite3.Connection, run_id: int, span: tuple[float, float], most: int
+) -> int:
+    """How many rows of a run lie in [start, end), counted no further than matters.
 
-
-def _any_in_chunks(
-    connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
-) -> bool:
-    """Whether a row is there that may have been deleted since it was put into a chunk."""
-    groups = groups_in(connection, run_id, start_s, end_s) if start_s < end_s else []
-    if any(group.start_s >= start_s or group.end_s < end_s for group in groups):
-        return True
-    wanted = {group.id: group.row_count for group in groups}
-    times = (values for _, values in values_in(connection, run_id, SIM_TIMES, wanted))
-    return any(
-        bool(((each.numbers >= start_s) & (each.numbers < end_s)).any())
-        for each in times
-        if isinstance(each, Decoded)
-    )
-
-
-def _after(time_s: float) -> float:
-    """Beyond what simulation times differ by where a clock adds up steps."""
-    return time_s + 1e-9
-
-
-@dataclass(frozen=True)
-class Subject:
-    """A robot, and the run that is meant unless a question is about all of them."""
-
-    robot_id: int
-    robot: str
-    run_id: int
-
-
-def choose(
-    connection: sqlite3.Connection, robot: str | None, run_id: int | None, now_s: float
-) -> tuple[Robot, Run | None]:
-    """The run that was named, or the newest run of the robot that was named or is the only one.
-
-    Without a run the robot's controller has never recorded.
-
-    Raises:
-        UnknownRobotError, AmbiguousRobotError: As they say.
-        UnknownRunError: There is no such run, or it is another robot's.
-        NothingRecordedError: No robot has been recorded.
+    Args:
+        table: `state` or `kept_state`.
+        connection: Any.
+        run_id: Which.
+        span: Simulation times in s.
+        most: Where counting ends.
     """
-    if robot is None and run_id is not None:
-        robot = robot_name(connection, fetch_run(connection, run_id).robot_id)
-    chosen = resolve_robot(connection, robot, now_s)
-    if run_id is not None:
-        return chosen, fetch_run(connection, run_id, chosen.id)
-    return chosen, current_run(connection, chosen.id)
-
-
-def require_run(robot: Robot, run: Run | None) -> Run:
-    """The run.
-
-    Raises:
-        NothingRecordedError: The robot's controller has begun none.
-    """
-    if run is None:
-        raise NothingRecordedError(
-            f"robot {robot.name!r} has no run yet: its controller never recorded"
-        )
-    return run
+    asked = (run_id, *span, most)
+    return int(connection.execute(_ROWS.format(table=table), asked).fetchone()[0])

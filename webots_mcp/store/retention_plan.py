@@ -7,20 +7,21 @@ counted in portions small enough to be deleted one after the other.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
-import os
 import sqlite3
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.contract import FINAL_STATUSES, KEPT_FRAME, PRIVATE_FILE
+from pydantic import TypeAdapter
+from pydantic.dataclasses import dataclass as pydantic_dataclass
+
+from webots_mcp.contract import FINAL_STATUSES, KEPT_FRAME, whole_file
 from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.chunk_making import INDEX_BYTES, disk_bytes
 from webots_mcp.store.chunks import STATE_IDS, WALL_TIMES, Decoded, Group, values_in
@@ -665,7 +666,7 @@ _FILE: Final = "SELECT file FROM pragma_database_list WHERE name = 'main'"
 _UUID: Final = "SELECT uuid FROM recording"
 
 
-@dataclass(frozen=True)
+@pydantic_dataclass(frozen=True)
 class Shipped:
     """What one pool holds of a recording.
 
@@ -677,9 +678,12 @@ class Shipped:
     """
 
     recording: str
-    last_ids: Mapping[str, int]
+    last_ids: dict[str, int]
     complete_wall_time_s: float
     wall_time_s: float
+
+
+_BY_ADDRESS: Final = TypeAdapter(dict[str, Shipped])
 
 
 def last_shipped(pools: Sequence[Shipped], table: str) -> float:
@@ -718,15 +722,8 @@ def write_shipped(database: Path, address: str, shipped: Shipped) -> None:
     """
     file = _file_of(database)
     stored = {**_read(file), address: shipped}
-    aside = file.with_name(f".{file.name}.{os.getpid()}.part")
-    try:
-        aside.touch(PRIVATE_FILE)
-        aside.write_text(json.dumps({key: asdict(each) for key, each in stored.items()}, indent=1))
-        aside.replace(file)
-    except OSError:
-        with contextlib.suppress(OSError):
-            aside.unlink()
-        raise
+    with whole_file(file) as aside:
+        aside.write_bytes(_BY_ADDRESS.dump_json(stored, indent=1))
 
 
 def _file_of(database: Path) -> Path:
@@ -735,16 +732,6 @@ def _file_of(database: Path) -> Path:
 
 def _read(file: Path) -> dict[str, Shipped]:
     try:
-        stored: Any = json.loads(file.read_text("utf-8"))
-        return {str(address): _shipped(each) for address, each in stored.items()}
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        return _BY_ADDRESS.validate_json(file.read_bytes())
+    except (OSError, ValueError):
         return {}
-
-
-def _shipped(stored: Any) -> Shipped:
-    return Shipped(
-        str(stored["recording"]),
-        {str(name): int(last) for name, last in stored["last_ids"].items()},
-        float(stored["complete_wall_time_s"]),
-        float(stored["wall_time_s"]),
-    )

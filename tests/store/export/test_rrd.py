@@ -134,14 +134,6 @@ def test_everything_stands_on_both_timelines(recorder: Recorder, tmp_path: Path)
     assert read.texts("/rover/state/mode") == ["go"]
 
 
-def test_a_text_that_comes_again_after_null_is_told_again(
-    recorder: Recorder, tmp_path: Path
-) -> None:
-    for i, mode in enumerate(["go", "go", None, "go", "stop"]):
-        publish(recorder, float(i), {"mode": mode})
-    assert exported(recorder, tmp_path).texts("/rover/state/mode") == ["go", "go", "stop"]
-
-
 def test_everything_of_a_run_is_there(recorded: Recorded, tmp_path: Path) -> None:
     run_id = recorded.add_run(8)
     recorded.connection.execute("UPDATE run SET uuid = 'u-u' WHERE id = ?", (run_id,))
@@ -189,23 +181,6 @@ def test_groups_of_rows_follow_each_other(
     read = exported(recorder, tmp_path)
     assert read.scalars("/rover/state/x") == [[float(i)] for i in range(30)]
     assert read.texts("/rover/state/mode") == ["a", "b"]
-
-
-def test_a_recording_appears_when_it_is_complete_or_not_at_all(
-    recorder: Recorder, tmp_path: Path
-) -> None:
-    recorder.publish(0.0, {"x": 1})
-    file = tmp_path / "run.rrd"
-    file.write_text("old")
-
-    def fail(*_: int) -> None:
-        raise OSError("disk full")
-
-    wanted = find_range(recorder.connection, Scope())
-    with pytest.raises(InvalidInputError, match="disk full"):
-        export_for_viewers(recorder.connection, tmp_path, wanted, "rrd", file, fail)
-    assert file.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [file]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows limits no file's size")

@@ -143,3 +143,13 @@ def test_a_folder_is_imported_once(
     with pytest.raises(InvalidInputError, match="imported before, as run 1 of robot 'first'"):
         import_folder(database, peer.folder, data_dir, "second")
     assert counts(database) == before
+
+
+def test_pictures_of_our_own_data_folder_stay_where_they_are(
+    database: sqlite3.Connection, data_dir: Path
+) -> None:
+    peer = Peer(data_dir)
+    peer.picture("camera/frame_0000.png")
+    import_folder(database, data_dir, data_dir)
+    assert rows(database, "SELECT path FROM image") == [("camera/frame_0000.png",)]
+    assert [file.name for file in data_dir.rglob("*.png")] == ["frame_0000.png"]

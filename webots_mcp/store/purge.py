@@ -214,7 +214,7 @@ def purge(
     if holdings is not None:
         for step in wanted.steps:
             if step.portion is not None:
-                holdings.recount(connection, step.portion)
+                holdings.recount(step.portion)
     yield from work.give_back()
 
 
@@ -446,7 +446,7 @@ class Upkeep:
         self._budget_s = budget_s
         self._next_plan_s = 0.0
         self._connection: sqlite3.Connection | None = None
-        self._holdings = Holdings()
+        self._holdings: Holdings | None = None
         self._under_way: Iterator[Purged] | None = None
         self._has_warned = False
 
@@ -458,7 +458,7 @@ class Upkeep:
         """
         if connection is not self._connection:
             self._connection, self._under_way, self._next_plan_s = connection, None, 0.0
-            self._holdings = Holdings()
+            self._holdings = Holdings(connection)
         try:
             self._work(connection)
         except BaseException:

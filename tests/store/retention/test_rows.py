@@ -112,7 +112,8 @@ def test_what_was_counted_before_comes_to_the_same_as_a_look_at_everything(
     recorded: Recorded,
 ) -> None:
     few = Limit(rows=700, spared_rows=0)
-    limits, holdings = Retention(few, Limit(rows=2000), few, few, few, outlive=0), Holdings()
+    limits = Retention(few, Limit(rows=2000), few, few, few, outlive=0)
+    holdings = Holdings(recorded.connection)
     for rows in (900, 300, 5, 1500, 40, 2500):
         recorded.add_run(rows)
         make_chunks(recorded.connection)

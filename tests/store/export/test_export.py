@@ -36,12 +36,6 @@ from webots_mcp.store.reading.ranges import Scope, find_range
 HEAD = ["run_id", "state_id", "sim_time_s", "wall_time_s"]
 
 
-@pytest.fixture
-def recorder() -> Iterator[Recorder]:
-    with recorded_run() as recorder:
-        yield recorder
-
-
 @contextmanager
 def recorded_run() -> Generator[Recorder]:
     with memory_connection() as connection:

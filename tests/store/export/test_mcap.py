@@ -7,7 +7,6 @@ import json
 import math
 import sys
 import tracemalloc
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +14,6 @@ import pytest
 from hypothesis import given, settings
 from mcap.reader import make_reader
 
-from tests.memory import memory_connection
 from tests.recordings.rover import Recorder
 from tests.recordings.runs import Recorded
 from tests.store.export.test_export import STATES, publish, recorded_run, same
@@ -54,18 +52,6 @@ class Mcap:
 
     def values(self, topic: str) -> list[Any]:
         return [message.value for message in self.messages.get(topic, [])]
-
-
-@pytest.fixture
-def recorder() -> Iterator[Recorder]:
-    with recorded_run() as recorder:
-        yield recorder
-
-
-@pytest.fixture
-def recorded(tmp_path: Path) -> Iterator[Recorded]:
-    with memory_connection() as connection:
-        yield Recorded(connection, tmp_path)
 
 
 def exported(recorder: Recorder, folder: Path, **wanted: Any) -> Mcap:

@@ -7,7 +7,6 @@ import json
 import math
 import subprocess
 import sys
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 
-from tests.memory import memory_connection
 from tests.recordings.rover import Recorder
 from tests.recordings.rows import Recorded as RecordedOnDisk
 from tests.recordings.runs import Recorded
@@ -62,18 +60,6 @@ class Rrd:
 
 
 TIMELINES = ("sim_time", "wall_time")
-
-
-@pytest.fixture
-def recorder() -> Iterator[Recorder]:
-    with recorded_run() as recorder:
-        yield recorder
-
-
-@pytest.fixture
-def recorded(tmp_path: Path) -> Iterator[Recorded]:
-    with memory_connection() as connection:
-        yield Recorded(connection, tmp_path)
 
 
 def exported(recorder: Recorder, folder: Path, **wanted: Any) -> Rrd:

@@ -52,7 +52,7 @@ MAX_LOG_BYTES: Final = 1_000_000_000
 MAX_DEPTH: Final = 100
 _SHOWN: Final = 100  # characters of a value that is wrong
 _PROGRESS_LINES: Final = 1000
-_STAMP: Final = re.compile(r"\[([01]\d|2[0-3]):([0-5]\d):([0-5]\d)\] ?(.*)", re.DOTALL)
+_STAMP: Final = re.compile(r"\[(\d\d):(\d\d):(\d\d)\] ?(.*)", re.DOTALL)
 _KNOWN_ROBOT: Final = "SELECT 1 FROM robot WHERE name = ?"
 _IMPORTED: Final = (
     "SELECT run.id, robot.name FROM session JOIN run ON run.session_id = session.id "
@@ -310,7 +310,12 @@ def _entries(file: Path, text: bytes) -> list[tuple[Clock, str]]:
     for number, line in enumerate(text.removesuffix(b"\n").split(b"\n"), 1):
         decoded = _decode(line)
         if stamp := _STAMP.fullmatch(decoded):
-            entries.append(((int(stamp[1]), int(stamp[2]), int(stamp[3])), [stamp[4]]))
+            hour, minute, second = map(int, stamp.groups()[:3])
+            if hour > 23 or minute > 59 or second > 59:
+                raise InvalidInputError(
+                    f"{file}, line {number}: {stamp[0][:10]} is not a time of day"
+                )
+            entries.append(((hour, minute, second), [stamp[4]]))
         elif entries:
             entries[-1][1].append(decoded)
         elif decoded.strip():

@@ -20,7 +20,7 @@ BAD = [
     ("status.json", b'{"a": "\xff"}', r"status\.json: not valid JSON"),
     ("status.json", '{"timestamp": "yesterday"}', "timestamp 'yesterday' is not an ISO 8601 time"),
     ("logs/controller.log", "no time\n", r"controller\.log, line 1: expected '\[HH:MM:SS\]"),
-    ("logs/controller.log", "\n[12:61:00] a\n", r"line 2: expected '\[HH:MM:SS\]"),
+    ("logs/controller.log", "\n[12:00:00] a\n[12:61:00] b\n", r"line 3: \[12:61:00\] is not a"),
     ("camera/frame_0000.png", b"\x89PNG\r\n\x1a\n but then not", r"frame_0000\.png is not a"),
     ("camera/frame_0000.png", b"", r"frame_0000\.png is not a usable PNG"),
     ("commands.json", '[{"action": "a"}, 3]', r"commands\.json: a command is an object"),

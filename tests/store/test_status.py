@@ -8,7 +8,7 @@ import sys
 import time
 from contextlib import closing
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import pytest
 
@@ -31,7 +31,12 @@ def status_of(robot: RecordedRobot, after_s: float = 0.0) -> Status:
     return judge(robot.connection, session, current_run(robot.connection, robot.id), NOW + after_s)
 
 
-NO_PROCESS: Final = 2**30  # no system gives a process such an id
+def dead_pid() -> int:
+    with subprocess.Popen([sys.executable, "-c", ""]) as process:
+        process.wait()
+    return process.pid
+
+
 HELD = {"pause_state": "paused", "moved_wall_time_s": NOW - 100}
 UNMOVED = {"moved_wall_time_s": None}
 NEVER_STEPPED = UNMOVED | {"last_poll_wall_time_s": None}
@@ -100,7 +105,7 @@ SAID: dict[str, tuple[dict[str, Any], float, str, tuple[str, ...]]] = {
     "finished": (ended("finished"), 7.0, "stopped 7.0 s ago", ("finished",)),
     "reloaded": (ended("reload"), 7.0, "stopped 7.0 s ago", ("reloaded",)),
     "crashed": (ended("crashed"), 7.0, "stopped 7.0 s ago", ("killed or crashed",)),
-    "a process that is gone": ({"pid": NO_PROCESS}, 0.0, "stopped 0.0 s ago", ("gone",)),
+    "a process that is gone": ({"pid": 2**30}, 0.0, "stopped 0.0 s ago", ("gone",)),
     "on another host": (ELSEWHERE, 0.0, "running", ()),
     "silent on another host": (ELSEWHERE, 60.0, "stopped 60 s ago", ("gone",)),
 }  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import Any
 
 import pytest
 
@@ -55,7 +56,7 @@ def test_what_is_left_of_a_run_outlives_the_limits_of_states_and_chunks_ten_time
 
 @pytest.mark.parametrize("limits", [{"state": Limit(rows=0)}, {"chunk": Limit(rows=0)}])
 def test_a_run_is_not_forgotten_while_its_states_or_chunks_are_within_their_limit(
-    recorded: Recorded, limits: dict[str, Limit]
+    recorded: Recorded, limits: dict[str, Any]
 ) -> None:
     for _ in range(3):
         recorded.add_run(10)

@@ -124,49 +124,6 @@ def roll_back(connection: sqlite3.Connection) -> None:
         connection.execute("ROLLBACK")
 
 
-class ShortWrites:
-    """Work in transactions that hold the write lock for about a millisecond, commit included.
-
-    What an item costs differs a hundredfold from one recording to another, so it is measured: a
-    transaction ends when the next item and the commit of all of them would go beyond the time.
-
-    Attributes:
-        held_s: How long the last transaction held the lock.
-        longest_held_s: How long the longest one did.
-    """
-
-    def __init__(self, connection: sqlite3.Connection, limit_s: float = LONGEST_WRITE_S) -> None:
-        self._connection = connection
-        self._limit_s = limit_s
-        self._commit_s = 0.0  # of an item, about
-        self.held_s = 0.0
-        self.longest_held_s = 0.0
-
-    def write(self, items: Iterable[Result], store: Callable[[Result], object]) -> int:
-        """Store the first items in one transaction; returns how many: one at least, if any.
-
-        Raises:
-            sqlite3.Error: Also where the lock is not to be had (`is_busy`); nothing was stored.
-        """
-        stored, started_s, working_s = 0, 0.0, 0.0
-        with transaction(self._connection):
-            started_s = time.perf_counter()
-            for item in items:
-                store(item)
-                stored += 1
-                working_s = time.perf_counter() - started_s
-                if (stored + 1) * (working_s / stored + self._commit_s) > self._limit_s:
-                    break
-        self._measure(time.perf_counter() - started_s, working_s, stored)
-        return stored
-
-    def _measure(self, held_s: float, working_s: float, stored: int) -> None:
-        self.held_s = held_s
-        self.longest_held_s = max(self.longest_held_s, held_s)
-        if stored:
-            self._commit_s = (self._commit_s + (held_s - working_s) / stored) / 2
-
-
 class Step:
     """Statements that SQLite runs as one: one short transaction in one call.
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import re
-import sqlite3
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from webots_mcp.connection import transaction
 from webots_mcp.console import as_row
@@ -210,28 +209,18 @@ def why_silent(
 
 def newest_in(recording: Recording) -> int:
     """The newest session of a recording; 0 where there is none yet."""
-    try:
-        with recording.reader() as connection:
-            return newest_session(connection)
-    except NoDatabaseError:
-        return 0
+    return next((newest for (newest,) in _read(recording, _NEWEST)), 0)
 
 
 def starts_since(recording: Recording, session: int) -> list[SessionStart]:
-    """The sessions of a recording after that one."""
+    """The sessions of a recording after that one; those that have recorded first."""
+    return [SessionStart(*row) for row in _read(recording, _SINCE, session)]
+
+
+def _read(recording: Recording, query: str, *values: object) -> list[tuple[Any, ...]]:
+    """Nothing where there is no recording yet."""
     try:
         with recording.reader() as connection:
-            return session_starts(connection, session)
+            return connection.execute(query, values).fetchall()
     except NoDatabaseError:
         return []
-
-
-def newest_session(connection: sqlite3.Connection) -> int:
-    """The id of the newest session; 0 where there is none."""
-    ((newest,),) = connection.execute(_NEWEST)
-    return int(newest)
-
-
-def session_starts(connection: sqlite3.Connection, after: int) -> list[SessionStart]:
-    """The sessions after that one; those that have recorded first."""
-    return [SessionStart(*row) for row in connection.execute(_SINCE, (after,))]

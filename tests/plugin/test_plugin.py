@@ -205,18 +205,6 @@ def test_a_controller_that_hangs_is_named_and_the_recordings_file_too(
     result.stdout.no_fnmatch_line("*simulation.py:*: TimeoutError")
 
 
-def test_a_plain_assertion_that_fails_names_the_recordings_file(pytester: pytest.Pytester) -> None:
-    pytester.makepyfile(
-        """
-        def test_it(webots_simulation):
-            assert webots_simulation().time_s > 0
-        """
-    )
-    result = pytester.runpytest_inprocess()
-    result.assert_outcomes(failed=1)
-    result.stdout.fnmatch_lines(["*Captured recording call*", "*mcp_data_1*webots.db"])
-
-
 def test_a_command_that_is_not_done_says_why_in_the_failure(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(
         """

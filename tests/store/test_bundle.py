@@ -12,10 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
 
 from tests.recordings.runs import Recorded
-from tests.store.export.test_export import STATES, publish
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME, new_uuid
@@ -119,23 +117,6 @@ def test_a_run_comes_into_an_empty_recording_as_what_it_was(there: Folder, here:
         assert connection.execute("SELECT action FROM command WHERE id = ?", (set_by,)).fetchone()
 
 
-@settings(max_examples=4, deadline=None)
-@given(STATES)
-def test_whatever_was_published_comes_in(
-    tmp_path_factory: pytest.TempPathFactory, states: list[dict[str, Any]]
-) -> None:
-    there, here = (Folder(tmp_path_factory.mktemp(name)) for name in ("there", "here"))
-    with there.opened() as connection:
-        recorded = Recorded(connection, there.path)
-        run_id = recorded.add_run(1)
-        for i, state in enumerate(states):
-            publish(recorded, float(i + 1), state)
-        connection.execute("UPDATE run SET uuid = ?", (new_uuid(),))
-        connection.execute("UPDATE session SET uuid = ?", (new_uuid(),))
-    here.take_in(there.bundled(run_id))
-    assert here.everything(1) == there.everything(run_id)
-
-
 def test_what_a_bridge_recorded_comes_with_kept_stretches_and_frames(
     tmp_path: Path, here: Folder
 ) -> None:
@@ -222,22 +203,6 @@ def test_what_goes_on_or_has_no_name_is_no_bundle_and_no_matter_for_others(
     with pytest.raises(InvalidInputError, match=said):
         there.bundled(2)
     assert there.bundled(1).exists()
-
-
-def test_an_import_that_breaks_off_leaves_nothing_and_comes_again(
-    there: Folder, here: Folder
-) -> None:
-    bundle = there.bundled(1)
-    with here.opened() as connection:
-        before = counts(connection)
-        connection.execute(
-            "CREATE TEMP TRIGGER full BEFORE INSERT ON main.parameter_value "
-            "BEGIN SELECT raise(ABORT, 'the disk is full'); END"
-        )
-        with unpacked(bundle) as source, pytest.raises(sqlite3.Error, match="the disk is full"):
-            merge(connection, here.path, source)
-        assert counts(connection) == before
-    assert here.take_in(bundle) == [1]
 
 
 def test_an_export_that_breaks_off_leaves_nothing(there: Folder) -> None:

@@ -13,7 +13,6 @@ import pytest
 
 from tests.memory import memory_connection
 from webots_mcp.connection import (
-    ShortWrites,
     Step,
     connect,
     create_schema,
@@ -80,31 +79,6 @@ def test_a_signal_is_handled_while_the_lock_is_waited_for(tmp_path: Path) -> Non
         finally:
             signal.signal(signal.SIGALRM, before)
         assert connection.execute("PRAGMA busy_timeout").fetchone() == (2000,)
-
-
-def test_a_short_write_ends_when_its_time_is_over_and_goes_on_where_it_ended() -> None:
-    with memory_connection() as connection:
-        names = [(f"{number}",) for number in range(100)]
-
-        def store(name: tuple[str]) -> None:
-            connection.execute(LEASE, name)
-
-        one_each = ShortWrites(connection, limit_s=0.0)
-        assert [one_each.write(names[number:], store) for number in range(3)] == [1, 1, 1]
-        assert ShortWrites(connection, limit_s=60.0).write(names[3:], store) == 97
-        assert connection.execute(COUNT).fetchone() == (100,)
-        assert one_each.longest_held_s >= one_each.held_s > 0
-        assert one_each.write([], store) == 0
-
-
-def test_of_a_short_write_that_fails_nothing_is_stored() -> None:
-    with memory_connection() as connection:
-        connection.execute(LEASE, ("b",))
-        with pytest.raises(sqlite3.IntegrityError):
-            ShortWrites(connection, limit_s=60.0).write(
-                [("a",), ("b",)], lambda name: connection.execute(LEASE, name)
-            )
-        assert connection.execute(COUNT).fetchone() == (1,)
 
 
 def test_a_step_stores_everything_or_is_called_off_or_fails_and_stores_nothing() -> None:

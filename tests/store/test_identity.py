@@ -16,7 +16,6 @@ import pytest
 from tests.bridge.conftest import heartbeat_now
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect, create_schema
-from webots_mcp.contract import new_uuid
 from webots_mcp.liveness import process_identity
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.json_folder import import_folder
@@ -30,12 +29,6 @@ def uuids(connection: sqlite3.Connection, table: str) -> list[str]:
     found = [text for (text,) in connection.execute(f"SELECT uuid FROM {table}")]
     assert all(map(is_random_uuid, found)), found
     return found
-
-
-def test_new_uuids_are_random_ones_of_version_4() -> None:
-    made = [new_uuid() for _ in range(1000)]
-    assert all(map(is_random_uuid, made))
-    assert len(set(made)) == len(made)
 
 
 def test_starters_at_once_make_one_recording(tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ from webots_mcp.maintenance import Maintainer
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.purge import prune
 from webots_mcp.store.retention import Limit, Retention
-from webots_mcp.store.retention_plan import plan
 from webots_mcp.waiting_file import FORMAT, adopt
 
 BLOB = b"\x00\xff\x01"
@@ -91,19 +90,6 @@ def test_a_row_without_a_time_does_not_keep_others_from_being_purged(
     limit = Limit(age_s=10, spared_rows=0)
     prune(recorded.connection, tmp_path, Retention(*[limit] * 5, outlive=0), now_s=2000, rest=False)
     assert recorded.connection.execute(f"SELECT count(*) FROM {table}").fetchone()[0] <= 1
-
-
-@pytest.mark.parametrize("column", ["started_wall_time_s", "last_wall_time_s"])
-def test_a_run_without_a_time_does_not_keep_others_from_being_purged(
-    recorded: Recorded, column: str
-) -> None:
-    robot = recorded.robot()
-    for _ in range(2):
-        robot.state(1.0, {"x": 1})
-        robot.begin_run("reset")
-    Damage("run", column, "yesterday").apply(recorded.connection)
-    limits = Retention(*[Limit(rows=1, age_s=1, spared_rows=0)] * 5, outlive=0)
-    assert plan(recorded.connection, limits).rows_by_table()["state"] >= 1
 
 
 def test_the_process_of_a_session_need_not_be_text(recorded: Recorded) -> None:

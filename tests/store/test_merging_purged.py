@@ -127,17 +127,6 @@ def test_the_chunks_of_a_purged_run_come_and_name_the_rows_that_are_left(
     assert [row_id for (row_id,) in left] == after.ids.tolist()[ROWS - len(left) :]
 
 
-def test_a_whole_run_is_put_into_chunks_here(
-    target: sqlite3.Connection, source: Path, tmp_path: Path
-) -> None:
-    with closing(connect(source, "writer")) as there:
-        make_chunks(there, 10**9)
-    merge(target, tmp_path / "here", source)
-    make_chunks(target, 10**9)
-    sql = "SELECT count(*) FROM run WHERE is_chunked = 0 AND ended_wall_time_s IS NOT NULL"
-    assert target.execute(sql).fetchone() == (0,)
-
-
 @NONE_OR_SOME_LEFT
 def test_a_purged_run_comes_once(target: sqlite3.Connection, source: Path, tmp_path: Path) -> None:
     tables = ("state", "signal", "row_group", "chunk", "run")
@@ -146,20 +135,6 @@ def test_a_purged_run_comes_once(target: sqlite3.Connection, source: Path, tmp_p
 
     assert merge(target, tmp_path / "here", source) == merged
     assert [target.execute(f"SELECT * FROM {each}").fetchall() for each in tables] == everything
-
-
-def test_what_broke_off_leaves_nothing_of_a_purged_run(
-    target: sqlite3.Connection, source: Path, tmp_path: Path
-) -> None:
-    tables = ("state", "signal", "row_group", "chunk", "run")
-    before = [target.execute(f"SELECT * FROM {table}").fetchall() for table in tables]
-    target.execute(
-        "CREATE TEMP TRIGGER full BEFORE INSERT ON main.chunk "
-        "BEGIN SELECT raise(ABORT, 'the disk is full'); END"
-    )
-    with pytest.raises(sqlite3.Error, match="the disk is full"):
-        merge(target, tmp_path / "here", source)
-    assert [target.execute(f"SELECT * FROM {each}").fetchall() for each in tables] == before
 
 
 def test_a_purged_run_goes_as_a_bundle_from_one_to_the_next(source: Path, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import sys
 import time
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -36,76 +37,95 @@ def dead_pid() -> int:
     return process.pid
 
 
-def test_a_robot_whose_time_moves_is_running(recorded: Recorded) -> None:
-    assert status_of(recorded.robot(now=NOW), after_s=0.6) == ("running", None)
+HELD = {"pause_state": "paused", "moved_wall_time_s": NOW - 100}
+UNMOVED = {"moved_wall_time_s": None}
+NEVER_STEPPED = UNMOVED | {"last_poll_wall_time_s": None}
+ELSEWHERE = {"host": "elsewhere", "pid": 1}
+STOOD = {"moved_wall_time_s": NOW - 25}
 
 
-def test_a_loop_that_runs_and_publishes_nothing_says_so(recorded: Recorded) -> None:
-    robot = recorded.robot(now=NOW, sim_time_s=20.0)
-    for i in range(4):
-        robot.state(i * 0.5, {}, at=NOW - 20 + i * 0.5)
-    status = status_of(robot, after_s=0.6)
-    assert status.is_moving
-    assert "for 18.5 s of simulation time it recorded no state" in (status.why or "")
+def rows(*times: tuple[float, float]) -> dict[str, Any]:
+    """States at simulation times, so long before now or after it."""
+    return {"rows": times}
 
 
-def test_a_loop_that_publishes_now_and_then_publishes(recorded: Recorded) -> None:
-    robot = recorded.robot(now=NOW, sim_time_s=20.0)
-    for i in range(4):
-        robot.state(i * 5.0, {}, at=NOW - 20 + i * 5)
-    assert status_of(robot, after_s=0.6) == ("running", None)
+def ended(reason: str) -> dict[str, Any]:
+    return {"ended_wall_time_s": NOW, "end_reason": reason}
 
 
-def test_a_running_robot_stays_running_between_two_heartbeats(recorded: Recorded) -> None:
-    assert status_of(recorded.robot(now=NOW), after_s=1.4).is_moving
+# Columns of its session, with rows and events; how long after its heartbeat it is asked about; what
+# is said of it, and why.
+SAID: dict[str, tuple[dict[str, Any], float, str, tuple[str, ...]]] = {
+    "its time moves": ({}, 0.6, "running", ()),
+    "between two heartbeats": ({}, 1.4, "running", ()),
+    "it steps under command": ({"pause_state": "stepping"}, 0.0, "running", ()),
+    "it is held": (HELD, 0.5, "paused", ()),
+    "a pause since the heartbeat": ({"events": ("pause",)}, 0.0, "paused", ()),
+    "a resume since the heartbeat": (
+        HELD | {"events": ("pause", "resume")}, 0.0, "running", ()),
+    "a hold whose heartbeat stopped": (
+        HELD | {"moved_wall_time_s": NOW - 5}, 30.0, "stopped 35 s ago", ("loop is silent",)),
+    "a silent loop": (
+        {}, 42.0, "stopped 42 s ago",
+        ("paused by hand", "breakpoint", "another controller", "extern controller")),
+    "silent since its time stopped": ({}, 1.8, "stopped 1.8 s ago", ("loop is silent",)),
+    "alive without moving time": (
+        {"moved_wall_time_s": NOW - 20}, 0.0, "stopped 20 s ago", ("stands still",)),
+    "just started": (UNMOVED, 1.0, "starting", ("just started",)),
+    "started a while ago": (
+        UNMOVED | {"last_seen_wall_time_s": NOW + 5}, 5.0, "stopped 5.0 s ago",
+        ("not moved since",)),
+    "no step was ever seen": (
+        NEVER_STEPPED, 42.0, "not seen moving for 42 s",
+        ("paused in Webots", "not reached its loop", "bridge.get_command()", "attach")),
+    "publishes nothing": (
+        rows(*((i * 0.5, i * 0.5 - 20) for i in range(4))) | {"sim_time_s": 20.0}, 0.6, "running",
+        ("for 18.5 s of simulation time it recorded no state",)),
+    "publishes now and then": (
+        rows(*((i * 5.0, i * 5 - 20) for i in range(4))) | {"sim_time_s": 20.0}, 0.6, "running",
+        ()),
+    "steps unseen": (
+        rows((0.0, -20)) | {"sim_time_s": 20.0, "last_error": f"{UNSEEN}; 1.0 s so far"}, 0.6,
+        "running", (UNSEEN,)),
+    "stepped unseen": (
+        {"last_error": f"{UNSEEN}; 1.0 s so far"} | ended("finished"), 0.6, "stopped 0.6 s ago",
+        (UNSEEN,)),
+    "slow rows": (rows(*((i * 0.016, 3 * i - 9) for i in range(4))), 8.0, "running", ()),
+    "later than slow rows": (
+        rows(*((i * 0.016, 3 * i - 9) for i in range(4))), 12.0, "stopped 12 s ago", ("silent",)),
+    "one long pause among its rows": (
+        rows(*((0.016, at_s) for at_s in (-60.2, -60.1, -0.2, -0.1, 0))), 2.0, "stopped 2.0 s ago",
+        ("silent",)),
+    "a row beyond the heartbeat": (
+        STOOD | rows((36.72, 0.1)) | {"sim_time_s": 36.7}, 0.2, "running", ()),
+    "long after that row": (
+        STOOD | rows((36.72, 0.1)) | {"sim_time_s": 36.7}, 9.0, "stopped 8.9 s ago", ("silent",)),
+    "a row while time stood still": (
+        STOOD | rows((36.72, 0.1)) | {"sim_time_s": 36.72}, 0.2, "stopped 25 s ago", ("still",)),
+    "finished": (ended("finished"), 7.0, "stopped 7.0 s ago", ("finished",)),
+    "reloaded": (ended("reload"), 7.0, "stopped 7.0 s ago", ("reloaded",)),
+    "crashed": (ended("crashed"), 7.0, "stopped 7.0 s ago", ("killed or crashed",)),
+    "a process that is gone": ({"pid": 2**30}, 0.0, "stopped 0.0 s ago", ("gone",)),
+    "on another host": (ELSEWHERE, 0.0, "running", ()),
+    "silent on another host": (ELSEWHERE, 60.0, "stopped 60 s ago", ("gone",)),
+}  # fmt: skip
 
 
-def test_a_slow_simulation_is_given_the_time_that_its_rows_take(recorded: Recorded) -> None:
-    robot = recorded.robot(now=NOW)
-    for i in range(4):
-        robot.state(i * 0.016, {}, at=NOW - 3 * (3 - i))
-    assert status_of(robot, after_s=8).text == "running"
-    assert status_of(robot, after_s=12).text == "stopped 12 s ago"
-
-
-def test_one_long_pause_among_the_last_rows_does_not_make_the_robot_look_slow(
-    recorded: Recorded,
-) -> None:
-    robot = recorded.robot(now=NOW)
-    for at in (NOW - 60.2, NOW - 60.1, NOW - 0.2, NOW - 0.1, NOW):
-        robot.state(0.016, {}, at=at)
-    assert status_of(robot, after_s=2).text == "stopped 2.0 s ago"
-
-
-def test_a_held_loop_is_paused(recorded: Recorded) -> None:
-    robot = recorded.robot(now=NOW, pause_state="paused", moved_wall_time_s=NOW - 100)
-    assert status_of(robot, after_s=0.5) == ("paused", None)
-
-
-def test_a_loop_that_steps_under_command_is_running(recorded: Recorded) -> None:
-    assert status_of(recorded.robot(now=NOW, pause_state="stepping")).text == "running"
-
-
-def test_a_pause_counts_from_its_instant_not_from_the_next_heartbeat(recorded: Recorded) -> None:
-    robot = recorded.robot(now=NOW - 0.2)
+@pytest.mark.parametrize("case", SAID)
+def test_what_is_said_of_a_robots_time_and_why(recorded: Recorded, case: str) -> None:
+    session, after_s, text, why = SAID[case]
+    columns = {k: v for k, v in session.items() if k not in ("rows", "events")}
+    events = session.get("events", ())
+    robot = recorded.robot(now=NOW - 0.2 * bool(events), **columns)
     robot.now = NOW
-    robot.event(1.0, "pause", None, {"command_id": 1})
-    assert status_of(robot).text == "paused"
-
-
-def test_a_resume_counts_from_its_instant_not_from_the_next_heartbeat(recorded: Recorded) -> None:
-    robot = recorded.robot(now=NOW - 0.2, pause_state="paused", moved_wall_time_s=NOW - 100)
-    robot.now = NOW
-    robot.event(1.0, "pause", None, {"command_id": 1})
-    robot.event(1.0, "resume", None, {"command_id": 2})
-    assert status_of(robot).text == "running"
-
-
-def test_a_hold_whose_heartbeat_stopped_is_no_pause_any_more(recorded: Recorded) -> None:
-    robot = recorded.robot(now=NOW, pause_state="paused", moved_wall_time_s=NOW - 5)
-    status = status_of(robot, after_s=30)
-    assert status.text == "stopped 35 s ago"
-    assert "loop is silent" in (status.why or "")
+    for number, kind in enumerate(events, 1):
+        robot.event(1.0, kind, None, {"command_id": number})
+    for sim_time_s, at_s in session.get("rows", ()):
+        robot.state(sim_time_s, {"x": 1}, at=NOW + at_s)
+    status = status_of(robot, after_s)
+    assert status.text == text
+    assert all(part in (status.why or "") for part in why)
+    assert why or status.why is None
 
 
 def test_a_robot_is_paused_while_another_holds_the_same_simulation(recorded: Recorded) -> None:
@@ -119,43 +139,6 @@ def test_a_hold_in_another_simulation_says_nothing_about_this_one(recorded: Reco
     robot = recorded.robot("rover", now=NOW)
     recorded.robot("referee", now=NOW, pause_state="paused", instance="webots-2")
     assert status_of(robot).text == "running"
-
-
-def test_a_silent_loop_in_a_living_process_is_stopped_for_one_of_the_known_reasons(
-    recorded: Recorded,
-) -> None:
-    status = status_of(recorded.robot(now=NOW), after_s=42)
-    assert status.text == "stopped 42 s ago"
-    for reason in ("paused by hand", "breakpoint", "another controller", "extern controller"):
-        assert reason in (status.why or "")
-
-
-def test_a_loop_that_lives_without_moving_time_says_so(recorded: Recorded) -> None:
-    robot = recorded.robot(now=NOW, moved_wall_time_s=NOW - 20)
-    status = status_of(robot)
-    assert status.text == "stopped 20 s ago"
-    assert "stands still" in (status.why or "")
-
-
-def test_a_controller_that_has_just_started_is_starting_and_soon_called_stopped(
-    recorded: Recorded,
-) -> None:
-    robot = recorded.robot(now=NOW, moved_wall_time_s=None)
-    assert status_of(robot, after_s=1) == ("starting", status_of(robot).why)
-    assert "just started" in (status_of(robot).why or "")
-    robot.beat(last_seen_wall_time_s=NOW + 5)
-    assert status_of(robot, after_s=5).text == "stopped 5.0 s ago"
-    assert "not moved since" in (status_of(robot, after_s=5).why or "")
-
-
-def test_a_controller_of_which_no_step_was_ever_seen_is_not_said_to_have_stopped(
-    recorded: Recorded,
-) -> None:
-    robot = recorded.robot(now=NOW, moved_wall_time_s=None, last_poll_wall_time_s=None)
-    status = status_of(robot, after_s=42)
-    assert status.text == "not seen moving for 42 s"
-    for part in ("paused in Webots", "not reached its loop", "bridge.get_command()", "attach"):
-        assert part in (status.why or "")
 
 
 @pytest.mark.parametrize(("mode", "why"), [("fast", "does not see"), ("pause", "paused in Webots")])
@@ -172,22 +155,6 @@ def test_that_an_observer_sees_time_go_on_does_not_make_an_unseen_loop_hang(
     assert why in (status.why or "") and "hangs" not in (status.why or "")
 
 
-def test_a_loop_that_was_found_to_step_unseen_is_said_to(recorded: Recorded) -> None:
-    robot = recorded.robot(now=NOW, sim_time_s=20.0, last_error=f"{UNSEEN}; 1.0 s so far")
-    robot.state(0.0, {}, at=NOW - 20)
-    assert status_of(robot, after_s=0.6) == ("running", UNSEEN)
-    robot.beat(ended_wall_time_s=NOW, end_reason="finished")
-    assert status_of(robot).why == UNSEEN
-
-
-def test_a_loop_that_fell_silent_when_its_time_stopped_is_not_said_to_be_alive(
-    recorded: Recorded,
-) -> None:
-    status = status_of(recorded.robot(now=NOW), after_s=1.8)
-    assert status.text == "stopped 1.8 s ago"
-    assert "loop is silent" in (status.why or "")
-
-
 def claimed(robot: RecordedRobot, action: str, at: float) -> int:
     command = CommandQueue(robot.connection).enqueue(robot.id, action)
     robot.connection.execute(
@@ -195,23 +162,6 @@ def claimed(robot: RecordedRobot, action: str, at: float) -> int:
         (robot.session_id, at),
     )
     return command.id
-
-
-def test_a_row_that_is_further_than_the_heartbeat_shows_that_time_moves_again(
-    recorded: Recorded,
-) -> None:
-    robot = recorded.robot(now=NOW, moved_wall_time_s=NOW - 25, sim_time_s=36.7)
-    robot.state(36.72, {"x": 1}, at=NOW + 0.1)
-    assert status_of(robot, after_s=0.2).text == "running"
-    assert status_of(robot, after_s=9).text == "stopped 8.9 s ago"
-
-
-def test_a_row_that_was_written_while_time_stood_still_does_not_look_like_movement(
-    recorded: Recorded,
-) -> None:
-    robot = recorded.robot(now=NOW, moved_wall_time_s=NOW - 25, sim_time_s=36.72)
-    robot.state(36.72, {"x": 1}, at=NOW + 0.1)
-    assert status_of(robot, after_s=0.2).text == "stopped 25 s ago"
 
 
 def test_a_loop_that_is_inside_a_handler_says_in_which(recorded: Recorded) -> None:
@@ -226,19 +176,6 @@ def test_a_built_in_action_that_is_under_way_is_no_reason_to_stand(recorded: Rec
     robot = recorded.robot(now=NOW)
     claimed(robot, "screenshot", NOW)
     assert "loop is silent" in (status_of(robot, after_s=42).why or "")
-
-
-@pytest.mark.parametrize(
-    ("end_reason", "said"),
-    [("finished", "finished"), ("reload", "reloaded"), ("crashed", "killed or crashed")],
-)
-def test_an_ended_session_tells_how_it_ended(
-    recorded: Recorded, end_reason: str, said: str
-) -> None:
-    robot = recorded.robot(now=NOW, ended_wall_time_s=NOW, end_reason=end_reason)
-    status = status_of(robot, after_s=7)
-    assert status.text == "stopped 7.0 s ago"
-    assert said in (status.why or "")
 
 
 @pytest.mark.parametrize("managed", [True, False])
@@ -282,20 +219,6 @@ def test_where_the_database_takes_no_rows_it_says_in_which_file_they_wait_and_si
     assert gone.text == "stopped 30 s ago"
     assert waiting.name in (gone.why or "")
     assert "database or disk is full" in capfd.readouterr().err
-
-
-def test_a_process_that_is_gone_is_not_running_even_with_a_fresh_heartbeat(
-    recorded: Recorded,
-) -> None:
-    status = status_of(recorded.robot(now=NOW, pid=dead_pid()))
-    assert status.text == "stopped 0.0 s ago"
-    assert "gone" in (status.why or "")
-
-
-def test_a_session_on_another_host_is_judged_by_its_heartbeat(recorded: Recorded) -> None:
-    robot = recorded.robot(now=NOW, host="elsewhere", pid=1)
-    assert status_of(robot).text == "running"
-    assert "gone" in (status_of(robot, after_s=60).why or "")
 
 
 def test_without_a_session_a_robot_was_never_seen(recorded: Recorded) -> None:

@@ -13,7 +13,7 @@ import math
 import sqlite3
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -468,16 +468,12 @@ def _opened(recording: Recording, *, write: bool, frozen: bool) -> Generator[sql
         with chunks_aside(database, frozen=frozen) as connection:
             yield connection
         return
-    # Idle while a bridge is it.
-    maintainer = Maintainer(database, "question") if isinstance(database, Path) else None
-    with recording.writer() as connection:
-        if maintainer is not None:
+    with recording.writer() as connection, ExitStack() as at_the_end:
+        if isinstance(database, Path):
+            maintainer = Maintainer(database, "question")  # idle while a bridge is it
             maintainer.start()
-        try:
-            yield connection
-        finally:
-            if maintainer is not None:
-                maintainer.stop()
+            at_the_end.callback(maintainer.stop)
+        yield connection
 
 
 def _say(rows: int, why: str) -> str:

@@ -14,10 +14,11 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from webots_mcp.connection import LONGEST_WRITE_S, ShortWrites, Step, is_busy
+from webots_mcp.connection import LONGEST_WRITE_S, Step, is_busy
 from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.errors import DatabaseError, InvalidInputError, NothingRecordedError, warn
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
@@ -39,18 +40,12 @@ REST_S: Final = 0.005  # at least, between two writes
 HURRIED_REST_S: Final = 0.001  # where no robot records: a checkpoint still gets its turn
 RESTS: Final = 9  # the lock is held for a tenth of the time at most
 
-_FREE_RUN: Final = f"NOT EXISTS (SELECT 1 FROM run WHERE id = :run_id AND {KEPT})"
 _OLD_COMMANDS: Final = f"SELECT id {OLD_COMMANDS} ORDER BY id LIMIT :limit"
-_DELETE: Final = {
-    "command": "DELETE FROM command WHERE id = :id",
-    "image": f"DELETE FROM image WHERE id = :id AND {_FREE_RUN}",
-    "run": f"DELETE FROM run WHERE id = :id AND {_FREE_RUN}",
-}
 # A group that is not complete is none to readers; what is left of it when this process ends, the
 # maker of chunks deletes.
 _HIDE_GROUP: Final = (
-    "UPDATE row_group SET is_complete = 0 WHERE id = :id AND is_complete = 1 "
-    f"AND stored_row_count = 0 AND {_FREE_RUN}"
+    "UPDATE row_group SET is_complete = 0 WHERE id = ? AND is_complete = 1 "
+    f"AND stored_row_count = 0 AND NOT EXISTS (SELECT 1 FROM run WHERE id = ? AND {KEPT})"
 )
 _CHUNKS: Final = "SELECT id FROM chunk WHERE group_id = ?"
 _DELETE_GROUP: Final = "DELETE FROM row_group WHERE id = ? AND is_complete = 0"
@@ -62,7 +57,7 @@ _SET_STORED: Final = (  # what others deleted was not counted
     "UPDATE row_group SET stored_row_count = (SELECT count(*) FROM json_each(?) j "
     "CROSS JOIN state s ON s.id = j.value) WHERE id = ?"
 )
-# Rows without files go many at once, in one statement: see `Step`. What is left in `going` went.
+# Many rows go at once, in one statement: see `Step`. What is left in `going` went.
 _GOING: Final = "CREATE TEMP TABLE IF NOT EXISTS going (id INTEGER PRIMARY KEY, run_id INTEGER)"
 _NOT_GOING: Final = (
     "DELETE FROM going WHERE run_id IN (SELECT id FROM run WHERE {kept}) "
@@ -90,9 +85,15 @@ _END_KEEPING: Final = (
     "CROSS JOIN kept_state s ON s.id = g.id WHERE s.run_id = kept_stretch.run_id "
     "AND s.sim_time_s BETWEEN kept_stretch.start_sim_time_s AND kept_stretch.end_sim_time_s)"
 )
+_FORGET_SESSIONS: Final = (
+    "DELETE FROM session WHERE ended_wall_time_s IS NOT NULL AND id IN "
+    "(SELECT session_id FROM run WHERE id IN (SELECT id FROM going)) AND NOT EXISTS (SELECT 1 "
+    "FROM run WHERE session_id = session.id AND id NOT IN (SELECT id FROM going))"
+)
 _BEFORE_DELETION: Final = {
     "state": (_COUNT_STORED, _COUNT_PURGED, _MOVE_KEPT),
     "kept_state": (_END_KEEPING,),
+    "run": (_FORGET_SESSIONS,),
 }
 _DELETE_GOING: Final = "DELETE FROM {table} WHERE id IN (SELECT id FROM going)"
 _STEPS: Final = {
@@ -103,7 +104,7 @@ _STEPS: Final = {
         *_BEFORE_DELETION.get(table, ()),
         _DELETE_GOING.format(table=table),
     )
-    for table in ("state", "chunk", "kept_state", "log", "event")
+    for table in ("state", "chunk", "kept_state", "log", "event", "image", "command", "run")
 }
 # Frames whose kept stretch is gone.
 _LEFT_FRAMES: Final = (
@@ -111,13 +112,10 @@ _LEFT_FRAMES: Final = (
     "SELECT 1 FROM kept_stretch k WHERE k.run_id = i.run_id "
     "AND i.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s) ORDER BY id LIMIT ?"
 )
-_SESSION: Final = "SELECT session_id FROM run WHERE id = ?"
-_FORGET_SESSION: Final = (
-    "DELETE FROM session WHERE id = ? AND ended_wall_time_s IS NOT NULL "
-    "AND NOT EXISTS (SELECT 1 FROM run WHERE session_id = session.id)"
-)
-_PATH: Final = "SELECT path FROM image WHERE id = ?"
-_PATHS: Final = "SELECT path FROM image WHERE run_id = ?"
+_PATHS: Final = {  # of the pictures that go with rows
+    "image": "SELECT path FROM image WHERE id IN (SELECT id FROM temp.going)",
+    "run": "SELECT path FROM image WHERE run_id IN (SELECT id FROM temp.going)",
+}
 _IN_USE: Final = "SELECT 1 FROM image WHERE path = ? LIMIT 1"
 _MOST_FAILURES: Final = 200
 
@@ -216,7 +214,7 @@ def purge(
     if holdings is not None:
         for step in wanted.steps:
             if step.portion is not None:
-                holdings.recount(connection, step.portion)
+                holdings.recount(step.portion)
     yield from work.give_back()
 
 
@@ -238,7 +236,6 @@ class _Purge:
         self._data_dir = data_dir
         self._spare_pages = spare_pages
         self._failures = 0
-        self._writes = ShortWrites(connection)
         self._vacuuming = _Pace()
         self._paces = {table: _Pace() for table in _STEPS}
         self.purged = Purged()
@@ -263,22 +260,18 @@ class _Purge:
     def carry_out(self, steps: Sequence[Going]) -> Iterator[Purged]:
         """Delete what has to go of a table."""
         for step in steps:
-            if step.table == "state":
-                yield from self._states(step)
-            elif step.table == "chunk":
-                yield from self._chunks(step)
-            elif step.portion is not None:
-                yield from self._rows(step.portion, step.bound)
-            else:
+            if step.portion is None:
                 yield from self._by_key(step)
+            elif step.table == "chunk":
+                yield from self._chunks(step, step.portion)
+            elif step.table == "state" and not step.portion.group_id:
+                yield from self._in_no_group(step, step.portion)
+            else:
+                yield from self._rows(step.portion, step.bound)
 
-    def _states(self, step: Going) -> Iterator[Purged]:
-        """Rows of a group; those that are in none become one first."""
-        assert step.portion is not None
-        portion, run_id = step.portion, step.owner_id
-        if portion.group_id:
-            yield from self._rows(portion, step.bound)
-            return
+    def _in_no_group(self, step: Going, portion: Portion) -> Iterator[Purged]:
+        """States that are in no group become one first."""
+        run_id = step.owner_id
         while not self._unless_locked(lambda: self._chunked(run_id)):
             yield self.purged
         found = self._connection.execute(_GROUPS_WITH_ROWS, (run_id,)).fetchall()
@@ -296,28 +289,18 @@ class _Purge:
     def _rows(self, portion: Portion, bound: int) -> Iterator[Purged]:
         """Rows of a portion up to an id, in the order of their ids."""
         ids = [int(row_id) for row_id in rows_of(self._connection, portion)[0] if row_id <= bound]
-        keys = [{"id": row_id, "run_id": portion.run_id} for row_id in ids]
-        while keys:
-            keys = keys[self._delete_some(portion.table, keys, portion.group_id) :]
-            yield self.purged
+        keys = [(row_id, portion.run_id) for row_id in ids]
+        yield from self._delete(portion.table, keys, portion.group_id)
         if portion.group_id and bound >= portion.last_id:
-            stored = (json.dumps(ids), portion.group_id)
-            self._unless_locked(lambda: self._connection.execute(_SET_STORED, stored).rowcount)
+            self._execute(_SET_STORED, json.dumps(ids), portion.group_id)
 
-    def _chunks(self, step: Going) -> Iterator[Purged]:
+    def _chunks(self, step: Going, portion: Portion) -> Iterator[Purged]:
         """The chunks of a group, which no reader sees any more."""
-        assert step.portion is not None
-        group = {"id": step.portion.group_id, "run_id": step.owner_id}
-        if not self._unless_locked(lambda: self._connection.execute(_HIDE_GROUP, group).rowcount):
+        if not self._execute(_HIDE_GROUP, portion.group_id, step.owner_id):
             return
-        found = self._connection.execute(_CHUNKS, (group["id"],)).fetchall()
-        keys = [{"id": chunk_id, "run_id": 0} for (chunk_id,) in found]  # whatever was marked since
-        while keys:
-            keys = keys[self._delete_some("chunk", keys) :]
-            yield self.purged
-        self._unless_locked(
-            lambda: self._connection.execute(_DELETE_GROUP, (group["id"],)).rowcount
-        )
+        found = self._connection.execute(_CHUNKS, (portion.group_id,)).fetchall()
+        yield from self._delete("chunk", [(chunk_id, 0) for (chunk_id,) in found])
+        self._execute(_DELETE_GROUP, portion.group_id)
         self.purged.rows["chunk"] += step.rows
         yield self.purged
 
@@ -326,46 +309,33 @@ class _Purge:
         after = 0
         while found := self._connection.execute(_LEFT_FRAMES, (after, BATCH_ROWS)).fetchall():
             after = found[-1][0]
-            keys = [{"id": row_id, "run_id": run_id} for row_id, run_id in found]
-            while keys:
-                keys = keys[self._delete_some("image", keys) :]
-                yield self.purged
+            yield from self._delete("image", found)
 
     def _by_key(self, step: Going) -> Iterator[Purged]:
         """A run, or commands of a robot."""
-        keys = [{"id": step.owner_id, "run_id": step.owner_id}]
+        keys = [(step.owner_id, step.owner_id)]
         if step.table == "command":
             before = {"robot_id": step.owner_id, "before_s": step.newest_s, "limit": step.rows}
             found = self._connection.execute(_OLD_COMMANDS, before).fetchall()
-            keys = [{"id": row_id, "run_id": 0} for (row_id,) in found]
+            keys = [(row_id, 0) for (row_id,) in found]
+        yield from self._delete(step.table, keys)
+
+    def _delete(
+        self, table: str, keys: Sequence[tuple[int, int]], group_id: int | None = None
+    ) -> Iterator[Purged]:
+        """Rows by their ids, each with its run, which goes on if it was marked since the plan."""
         while keys:
-            keys = keys[self._delete_some(step.table, keys) :]
+            keys = keys[self._unless_locked(partial(self._run_step, table, keys, group_id)) :]
             yield self.purged
 
-    def _delete_some(
-        self, table: str, keys: Sequence[dict[str, int]], group_id: int | None = None
-    ) -> int:
-        """One short transaction; returns how many of the keys are done, 0 where it was locked."""
-        if table in _STEPS:
-            return self._unless_locked(lambda: self._run_step(table, keys, group_id))
-        deleted = 0
-
-        def delete(key: dict[str, int]) -> None:
-            nonlocal deleted
-            deleted += self._delete(table, key)
-
-        done = self._unless_locked(lambda: self._writes.write(keys, delete))
-        if done:
-            self.purged.rows[table] += deleted
-            self._note(self._writes.held_s)
-        return done
-
-    def _run_step(self, table: str, keys: Sequence[dict[str, int]], group_id: int | None) -> int:
+    def _run_step(self, table: str, keys: Sequence[tuple[int, int]], group_id: int | None) -> int:
+        """One short transaction; returns how many of the keys are done."""
         pace = self._paces[table]
         some = keys[: pace.count]
         self._connection.execute(_GOING)
         self._connection.execute("DELETE FROM going")
-        self._connection.executemany("INSERT INTO going VALUES (:id, :run_id)", some)
+        self._connection.executemany("INSERT INTO going VALUES (?, ?)", some)
+        paths = self._connection.execute(_PATHS[table]).fetchall() if table in _PATHS else []
         started_s = time.perf_counter()
         _STEPS[table].run(self._connection, group_id)
         held_s = time.perf_counter() - started_s
@@ -373,31 +343,12 @@ class _Purge:
         if table != "chunk":  # of which states are counted
             self.purged.rows[table] += self._first("SELECT count(*) FROM going")
         self._note(held_s)
-        return len(some)
-
-    def _delete(self, table: str, key: dict[str, int]) -> int:
-        """How many rows; none of a run that was marked since the plan."""
-        paths = self._pictures_of(table, key)
-        session = self._first(_SESSION, key["id"]) if table == "run" else None
-        deleted = self._connection.execute(_DELETE[table], key).rowcount
-        if not deleted:
-            return 0
-        if session is not None:
-            self._connection.execute(_FORGET_SESSION, (session,))
-        for path in paths:
+        for (path,) in paths:
             if not self._first(_IN_USE, path):
                 self._delete_file(path)
-        return deleted
-
-    def _pictures_of(self, table: str, key: dict[str, int]) -> list[str]:
-        """The paths of what goes with a row: the picture, or those that a run still has."""
-        query = {"image": _PATH, "run": _PATHS}.get(table)
-        if query is None:
-            return []
-        return [path for (path,) in self._connection.execute(query, (key["id"],)) if path]
+        return len(some)
 
     def _delete_file(self, path: str) -> None:
-        """Before the commit: a row that comes back without its file is found again."""
         try:
             inside(self._data_dir, path).unlink()
             self.purged.files += 1
@@ -432,6 +383,10 @@ class _Purge:
     def _first(self, query: str, *values: object) -> Any:
         row = self._connection.execute(query, values).fetchone()
         return row[0] if row else None
+
+    def _execute(self, statement: str, *values: object) -> int:
+        """How many rows a short statement of its own changed; 0 where it was locked."""
+        return self._unless_locked(lambda: self._connection.execute(statement, values).rowcount)
 
     def _unless_locked(self, write: Callable[[], int]) -> int:
         """How many were written; 0 where another holds the write lock."""
@@ -491,7 +446,7 @@ class Upkeep:
         self._budget_s = budget_s
         self._next_plan_s = 0.0
         self._connection: sqlite3.Connection | None = None
-        self._holdings = Holdings()
+        self._holdings: Holdings | None = None
         self._under_way: Iterator[Purged] | None = None
         self._has_warned = False
 
@@ -503,7 +458,7 @@ class Upkeep:
         """
         if connection is not self._connection:
             self._connection, self._under_way, self._next_plan_s = connection, None, 0.0
-            self._holdings = Holdings()
+            self._holdings = Holdings(connection)
         try:
             self._work(connection)
         except BaseException:

@@ -7,20 +7,21 @@ counted in portions small enough to be deleted one after the other.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
-import os
 import sqlite3
 import time
+from bisect import bisect_left
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.contract import FINAL_STATUSES, KEPT_FRAME, PRIVATE_FILE
+from pydantic import TypeAdapter
+from pydantic.dataclasses import dataclass as pydantic_dataclass
+
+from webots_mcp.contract import FINAL_STATUSES, KEPT_FRAME, whole_file
 from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.chunk_making import INDEX_BYTES, disk_bytes
 from webots_mcp.store.chunks import STATE_IDS, WALL_TIMES, Decoded, Group, values_in
@@ -123,76 +124,71 @@ class Holdings:
     Rows that others delete are noticed when they should go.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, connection: sqlite3.Connection) -> None:
+        self._connection = connection
+        self._page_bytes = int(connection.execute("PRAGMA page_size").fetchone()[0])
+        self._payloads: dict[str, str] = {"image": _FILE_BYTES}
         self._groups: dict[int, tuple[Any, ...]] = {}
         self._in_no_group: dict[int, tuple[Run, Portion | None]] = {}
         self._counted: dict[str, dict[int, Portion]] = {table: {} for table in _COUNTED}
         self._last_ids: dict[str, int] = dict.fromkeys(_COUNTED, 0)
 
-    def portions(
-        self, connection: sqlite3.Connection, runs: dict[int, Run]
-    ) -> dict[str, list[Portion]]:
+    def portions(self, runs: dict[int, Run]) -> dict[str, list[Portion]]:
         """What these runs hold, by table, the newest first."""
         found: dict[str, list[Portion]] = {table: [] for table in TABLES}
-        for portion in self._grouped(connection, runs):
+        for portion in (*self._grouped(runs), *self._states_in_no_group(runs)):
             found[portion.table].append(portion)
-        sizes = _Sizes(connection)
-        found["state"] += self._states_in_no_group(sizes, runs)
-        for table in _COUNTED:
-            self._count_new(sizes, table)
-            held = self._counted[table].values()
-            found[table] += [portion for portion in held if portion.run_id in runs]
-        frame_bytes: dict[int, float] = dict(connection.execute(_FRAMES).fetchall())
+        for table, held in self._counted.items():
+            self._count_new(table, held)
+            found[table] = [portion for portion in held.values() if portion.run_id in runs]
+        frame_bytes: dict[int, float] = dict(self._connection.execute(_FRAMES).fetchall())
         found["kept_state"] = _with_frames(found["kept_state"], frame_bytes)
         for portions in found.values():
             portions.sort(key=lambda each: -each.last_id)
         return found
 
-    def recount(self, connection: sqlite3.Connection, portion: Portion) -> None:
+    def recount(self, portion: Portion) -> None:
         """Count a portion again from which rows may have gone."""
-        if portion.table in self._counted:
-            held = self._counted[portion.table]
+        if (held := self._counted.get(portion.table)) is not None:
             held.pop(portion.first_id, None)
-            sizes, bounds = _Sizes(connection), (portion.first_id, portion.last_id)
-            for each in sizes.blocks(portion.table, "AND run_id = ? AND id BETWEEN ? AND ?", 0,
-                                     portion.run_id, *bounds):  # fmt: skip
-                held[each.first_id] = each
+            where = "AND run_id = ? AND id BETWEEN ? AND ?"
+            bounds = (portion.run_id, portion.first_id, portion.last_id)
+            held |= {each.first_id: each for each in self._blocks(portion.table, where, 0, *bounds)}
         self._in_no_group.pop(portion.run_id, None)
 
-    def _grouped(self, connection: sqlite3.Connection, runs: dict[int, Run]) -> Iterator[Portion]:
-        for group_id, *facts in connection.execute(_GROUPS, (max(self._groups, default=0),)):
+    def _grouped(self, runs: dict[int, Run]) -> Iterator[Portion]:
+        last_id = max(self._groups, default=0)
+        for group_id, *facts in self._connection.execute(_GROUPS, (last_id,)):
             self._groups[group_id] = tuple(facts)
             self._in_no_group.pop(facts[0], None)
-        stored = dict(connection.execute(_STORED).fetchall())
+        stored = dict(self._connection.execute(_STORED).fetchall())
         self._groups = {each: facts for each, facts in self._groups.items() if each in stored}
         for group_id, facts in self._groups.items():
             run_id, last_id, rows, row_bytes, chunk_bytes, first_id, *walls = facts
             if run_id not in runs:
                 continue
             of = (run_id, group_id, int(first_id), last_id)
-            own_s = runs[run_id].last_wall_time_s
-            oldest_s, newest_s = (own_s if wall is None else wall for wall in walls)
-            times = (oldest_s, newest_s)
+            times = (runs[run_id].last_wall_time_s if wall is None else wall for wall in walls)
+            oldest_s, newest_s = times
             if left := stored[group_id]:
-                yield Portion("state", *of, left, left * row_bytes, *times)
-            yield Portion("chunk", *of, rows, chunk_bytes, *times, is_held=left > 0)
+                yield Portion("state", *of, left, left * row_bytes, oldest_s, newest_s)
+            yield Portion("chunk", *of, rows, chunk_bytes, oldest_s, newest_s, is_held=left > 0)
 
-    def _states_in_no_group(self, sizes: _Sizes, runs: dict[int, Run]) -> Iterator[Portion]:
+    def _states_in_no_group(self, runs: dict[int, Run]) -> Iterator[Portion]:
         """The newest rows of each run; those of one that is in chunks are counted once."""
+        query = _IN_NO_GROUP.format(payload=self._payload("state"))
         for run in runs.values():
             known, portion = self._in_no_group.get(run.id, (None, None))
             if known != run or not run.is_chunked:
-                query = _IN_NO_GROUP.format(payload=sizes.payload("state"))
-                row = sizes.connection.execute(query, {"run": run.id}).fetchone()
-                portion = None if row[0] is None else sizes.portion("state", *row)
+                row = self._connection.execute(query, {"run": run.id}).fetchone()
+                portion = None if row[0] is None else self._portion("state", row)
                 self._in_no_group[run.id] = run, portion
             if portion is not None:
                 yield portion
 
-    def _count_new(self, sizes: _Sizes, table: str) -> None:
-        held = self._counted[table]
+    def _count_new(self, table: str, held: dict[int, Portion]) -> None:
         newest = {each.run_id: each for each in held.values()}
-        for each in sizes.blocks(table, "", self._last_ids[table]):
+        for each in self._blocks(table, "", self._last_ids[table]):
             self._last_ids[table] = max(self._last_ids[table], each.last_id)
             before = newest.get(each.run_id)
             if before is not None and before.rows + each.rows <= _BLOCK_IDS:
@@ -205,48 +201,28 @@ class Holdings:
                 )
             held[each.first_id] = newest[each.run_id] = each
 
-
-class _Sizes:
-    """What rows take on the disk."""
-
-    def __init__(self, connection: sqlite3.Connection) -> None:
-        self.connection = connection
-        self._payloads: dict[str, str] = {"image": _FILE_BYTES}
-
-    @cached_property
-    def _page_bytes(self) -> int:
-        return int(self.connection.execute("PRAGMA page_size").fetchone()[0])
-
-    def blocks(self, table: str, where: str, after: int, *values: int) -> Iterator[Portion]:
+    def _blocks(self, table: str, where: str, after: int, *values: int) -> Iterator[Portion]:
         """The rows after an id, in portions."""
         own = where + (f" {_OWN}" if table == "image" else "")
-        query = _BLOCKS.format(table=table, own=own, payload=self.payload(table))
-        for row in self.connection.execute(query, (after, *values)).fetchall():
-            yield self.portion(table, *row)
+        query = _BLOCKS.format(table=table, own=own, payload=self._payload(table))
+        for row in self._connection.execute(query, (after, *values)).fetchall():
+            yield self._portion(table, row)
 
-    def portion(
-        self,
-        table: str,
-        run_id: int,
-        first_id: int,
-        last_id: int,
-        sizes: str,
-        oldest_s: float,
-        newest_s: float,
-    ) -> Portion:
+    def _portion(self, table: str, row: Sequence[Any]) -> Portion:
         """A portion of rows that were looked at one by one."""
-        each: list[int] = json.loads(sizes)
-        size_bytes = sum(each) + 0.0
+        run_id, first_id, last_id, payloads, oldest_s, newest_s = row
+        each: list[int] = json.loads(payloads)
+        size_bytes = float(sum(each))
         if table != "image":
             size_bytes = disk_bytes(each, self._page_bytes) + INDEX_BYTES * len(each)
         ids = (first_id, last_id)
         return Portion(table, run_id, 0, *ids, len(each), size_bytes, oldest_s, newest_s)
 
-    def payload(self, table: str) -> str:
+    def _payload(self, table: str) -> str:
         """SQL for the bytes of a record: each column takes a byte or two in its head too."""
         if table not in self._payloads:
             parts = ["2"]
-            for name, kind, is_key in self.connection.execute(_COLUMNS, (table,)).fetchall():
+            for name, kind, is_key in self._connection.execute(_COLUMNS, (table,)).fetchall():
                 if kind == "TEXT":
                     parts.append(f"coalesce(length(CAST({name} AS BLOB)) + 1, 1)")
                 elif not is_key:
@@ -257,16 +233,14 @@ class _Sizes:
 
 def _with_frames(stretches: list[Portion], frame_bytes: dict[int, float]) -> list[Portion]:
     """Rows of kept stretches with their share of the run's frames."""
-    rows = dict[int, int]()
+    rows = Counter[int]()
     for each in stretches:
-        rows[each.run_id] = rows.get(each.run_id, 0) + each.rows
+        rows[each.run_id] += each.rows
     return [
-        each._replace(
-            size_bytes=each.size_bytes
-            + frame_bytes.get(each.run_id, 0.0) * each.rows / rows[each.run_id]
-        )
+        each._replace(size_bytes=each.size_bytes + frame_bytes.get(each.run_id, 0.0)
+                      * each.rows / rows[each.run_id])
         for each in stretches
-    ]
+    ]  # fmt: skip
 
 
 def read_runs(connection: sqlite3.Connection) -> dict[int, Run]:
@@ -281,45 +255,37 @@ def rows_of(connection: sqlite3.Connection, portion: Portion) -> tuple[Array, Ar
     """Ids of the rows that a portion had when it was counted, rising, and their wall times."""
     if portion.group_id:
         group = Group(*connection.execute(_PLACE, (portion.group_id,)).fetchone())
-        ids, walls = (_times(connection, portion.run_id, each, group)
-                      for each in (STATE_IDS, WALL_TIMES))  # fmt: skip
-        if ids is not None:
-            order = np.argsort(ids)[-portion.rows :]  # the oldest of a group go first
-            known = np.full(len(ids), portion.newest_s) if walls is None else walls
-            return ids[order], known[order]
+        found = [
+            [values.numbers for _, values in values_in(connection, portion.run_id, signal_id,
+                                                       {group.id: group.row_count})
+             if isinstance(values, Decoded)]
+            for signal_id in (STATE_IDS, WALL_TIMES)
+        ]  # fmt: skip
+        ids, walls = found  # nothing of a chunk that is missing or damaged
+        if ids:
+            order = np.argsort(ids[0])[-portion.rows :]  # the oldest of a group go first
+            known = walls[0] if walls else np.full(len(ids[0]), portion.newest_s)
+            return ids[0][order], known[order]
     own = _OWN if portion.table == "image" else ""
     bounds = (portion.run_id, portion.first_id, portion.last_id)
-    found = connection.execute(_ROWS.format(table=portion.table, own=own), bounds).fetchall()
-    table: Array = np.reshape(np.array(found, np.float64), (-1, 2))
+    rows = connection.execute(_ROWS.format(table=portion.table, own=own), bounds).fetchall()
+    table: Array = np.reshape(np.array(rows, np.float64), (-1, 2))
     return table[:, 0], table[:, 1]
-
-
-def _times(
-    connection: sqlite3.Connection, run_id: int, signal_id: int, group: Group
-) -> Array | None:
-    """Numbers of a chunk; None where it is missing or damaged."""
-    for _, values in values_in(connection, run_id, signal_id, {group.id: group.row_count}):
-        return values.numbers if isinstance(values, Decoded) else None
-    return None
 
 
 def file_sizes(connection: sqlite3.Connection) -> dict[str, int]:
     """Bytes of the database on the disk: the file, what of it is free, and the log next to it."""
-
-    def pragma(name: str) -> int:
-        return int(connection.execute(f"PRAGMA {name}").fetchone()[0])
-
-    page_bytes = pragma("page_size")
-    sizes = {
-        "file_bytes": pragma("page_count") * page_bytes,
-        "free_in_file_bytes": pragma("freelist_count") * page_bytes,
-    }
+    page_bytes, pages, free_pages = (
+        int(connection.execute(f"PRAGMA {name}").fetchone()[0])
+        for name in ("page_size", "page_count", "freelist_count")
+    )
     (file,) = connection.execute("SELECT file FROM pragma_database_list").fetchone()
     log = Path(f"{file}-wal")
-    return sizes | {"log_beside_bytes": log.stat().st_size if file and log.exists() else 0}
-
-
-# What is beyond the limits: a plan lists it, and is carried out unchanged.
+    return {
+        "file_bytes": pages * page_bytes,
+        "free_in_file_bytes": free_pages * page_bytes,
+        "log_beside_bytes": log.stat().st_size if file and log.exists() else 0,
+    }
 
 
 # Those that were created during a kept run stay with it.
@@ -436,7 +402,7 @@ def plan(
             all logs, events, pictures and kept stretches.
     """
     now_s = time.time() if now_s is None else now_s
-    return _Planner(connection, retention, now_s, holdings or Holdings()).plan()
+    return _Planner(connection, retention, now_s, holdings or Holdings(connection)).plan()
 
 
 class _Planner:
@@ -449,7 +415,7 @@ class _Planner:
         self._retention = retention
         self._now_s = now_s
         self._runs = read_runs(connection)
-        self._held = held.portions(connection, self._runs)
+        self._held = held.portions(self._runs)
         self._rows: dict[Portion, tuple[Array, Array]] = {}  # of the few that are looked into
         self._spared = dict[tuple[str, str], list[float]]()
         self._unshipped = dict[tuple[str, str], list[float]]()
@@ -468,11 +434,10 @@ class _Planner:
             steps += self._commands(robot_id)
         if limit_bytes := self._retention.unshipped.size_bytes:
             steps = self._after_shipping(steps, limit_bytes)
-        sizes = {table: _size_of(portions) for table, portions in self._held.items()}
         kept = [self._kept(table, is_kept=True) for table in TABLES]
         return Plan(
             tuple(steps),
-            {table: round(size_bytes) for table, size_bytes in sizes.items()},
+            {table: round(_size_of(portions)) for table, portions in self._held.items()},
             _listed(self._spared),
             tuple(run.id for run in self._runs.values() if run.is_kept),
             round(sum(map(_size_of, kept))),
@@ -541,22 +506,20 @@ class _Planner:
         if not limit.is_exceeded(size_bytes=_size_of(held), rows=sum(each.rows for each in held)):
             return 0
         facts = [(each.first_id, each.last_id, each.rows, each.size_bytes) for each in held]
-        first, last, rows, size = np.transpose(np.reshape(np.array(facts, np.float64), (-1, 4)))
-        low, high = 0, held[0].last_id if held else 0
-        while low < high:
-            middle = (low + high) // 2
-            whole = first > middle
+        first, last, rows, size = np.transpose(np.array(facts, np.float64))
+
+        def fits(bound: int) -> bool:
+            whole = first > bound
             rows_left, bytes_left = float(rows[whole].sum()), float(size[whole].sum())
-            cut: list[int] = np.flatnonzero(~whole & (last > middle)).tolist()
-            for place in cut:
-                stays = held[place].rows - self._up_to(held[place], middle)
+            cut: list[int] = np.flatnonzero(~whole & (last > bound)).tolist()
+            for portion in map(held.__getitem__, cut):
+                stays = portion.rows - self._up_to(portion, bound)
                 rows_left += stays
-                bytes_left += stays * held[place].row_bytes
-            if limit.is_exceeded(size_bytes=bytes_left, rows=rows_left):
-                low = middle + 1
-            else:
-                high = middle
-        return low
+                bytes_left += stays * portion.row_bytes
+            return not limit.is_exceeded(size_bytes=bytes_left, rows=rows_left)
+
+        newest = held[0].last_id
+        return bisect_left(range(newest), True, hi=newest, key=fits)
 
     def _up_to(self, portion: Portion, last_id: float) -> int:
         """How many of its rows have ids up to that."""
@@ -665,7 +628,7 @@ _FILE: Final = "SELECT file FROM pragma_database_list WHERE name = 'main'"
 _UUID: Final = "SELECT uuid FROM recording"
 
 
-@dataclass(frozen=True)
+@pydantic_dataclass(frozen=True)
 class Shipped:
     """What one pool holds of a recording.
 
@@ -677,9 +640,12 @@ class Shipped:
     """
 
     recording: str
-    last_ids: Mapping[str, int]
+    last_ids: dict[str, int]
     complete_wall_time_s: float
     wall_time_s: float
+
+
+_BY_ADDRESS: Final = TypeAdapter(dict[str, Shipped])
 
 
 def last_shipped(pools: Sequence[Shipped], table: str) -> float:
@@ -718,15 +684,8 @@ def write_shipped(database: Path, address: str, shipped: Shipped) -> None:
     """
     file = _file_of(database)
     stored = {**_read(file), address: shipped}
-    aside = file.with_name(f".{file.name}.{os.getpid()}.part")
-    try:
-        aside.touch(PRIVATE_FILE)
-        aside.write_text(json.dumps({key: asdict(each) for key, each in stored.items()}, indent=1))
-        aside.replace(file)
-    except OSError:
-        with contextlib.suppress(OSError):
-            aside.unlink()
-        raise
+    with whole_file(file) as aside:
+        aside.write_bytes(_BY_ADDRESS.dump_json(stored, indent=1))
 
 
 def _file_of(database: Path) -> Path:
@@ -735,16 +694,6 @@ def _file_of(database: Path) -> Path:
 
 def _read(file: Path) -> dict[str, Shipped]:
     try:
-        stored: Any = json.loads(file.read_text("utf-8"))
-        return {str(address): _shipped(each) for address, each in stored.items()}
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        return _BY_ADDRESS.validate_json(file.read_bytes())
+    except (OSError, ValueError):
         return {}
-
-
-def _shipped(stored: Any) -> Shipped:
-    return Shipped(
-        str(stored["recording"]),
-        {str(name): int(last) for name, last in stored["last_ids"].items()},
-        float(stored["complete_wall_time_s"]),
-        float(stored["wall_time_s"]),
-    )

@@ -57,14 +57,14 @@ def test_readers_see_chunks_that_the_file_has_not(recording: Recording) -> None:
     assert isinstance(recording.database, Path)
     before = recording.database.read_bytes()
     with recording.reader() as connection:
-        expected = trends(connection, find_range(connection, Scope()))
+        expected = trends(connection, find_range(connection, Scope()), deadline_s=600)
     told: list[tuple[int, int]] = []
     assert make_missing_chunks(recording, noted(told), write=False) == ""
     assert told[-1] == (ROWS, ROWS)
     assert in_chunks(recording) == ROWS
     assert recording.database.read_bytes() == before
     with recording.reader() as connection:
-        assert trends(connection, find_range(connection, Scope())) == expected
+        assert trends(connection, find_range(connection, Scope()), deadline_s=600) == expected
         with pytest.raises(sqlite3.OperationalError):
             connection.execute("DELETE FROM aside.chunk")
 

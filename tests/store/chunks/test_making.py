@@ -63,19 +63,14 @@ def groups(connection: sqlite3.Connection) -> list[int]:
     return [count for (count,) in rows]
 
 
-def test_full_groups_are_chunked_and_the_newest_rows_wait(empty: sqlite3.Connection) -> None:
-    record(empty, range(ROWS))
-    before = contents(empty)
-    assert make_chunks(empty, 100_000).done
-    assert groups(empty) == [GROUP_ROWS, GROUP_ROWS]
-    assert contents(empty) == before
-    assert make_chunks(empty, 100_000) == (0, True)
-
-
-def test_what_is_left_of_a_run_is_chunked_when_it_has_ended(empty: sqlite3.Connection) -> None:
+def test_full_groups_are_chunked_and_what_is_left_of_a_run_when_it_has_ended(
+    empty: sqlite3.Connection,
+) -> None:
     recorder = record(empty, range(ROWS))
     before = contents(empty)
-    make_chunks(empty, 100_000)
+    assert make_chunks(empty, 100_000).done
+    assert groups(empty) == [GROUP_ROWS, GROUP_ROWS]  # the newest rows wait
+    assert make_chunks(empty, 100_000) == (0, True)
     recorder.end_run("finished")
     assert make_chunks(empty, 100_000).done
     assert groups(empty) == [GROUP_ROWS, GROUP_ROWS, ROWS - 2 * GROUP_ROWS]
@@ -185,18 +180,6 @@ def test_of_two_that_make_the_same_chunk_one_stores(tmp_path: Path) -> None:
         make_chunks(one, 100_000)
         assert groups(one) == [GROUP_ROWS, GROUP_ROWS]
         assert contents(one) == before
-
-
-def test_a_row_that_no_bridge_wrote_costs_only_itself(
-    empty: sqlite3.Connection, capsys: pytest.CaptureFixture[str]
-) -> None:
-    recorder = record(empty, range(ROWS))
-    empty.execute("UPDATE state SET sim_time_s = 'noon' WHERE id = 10")
-    empty.execute("UPDATE state SET data = x'ff' WHERE id = 20")
-    recorder.end_run("finished")
-    make_chunks(empty, 100_000)
-    assert sum(groups(empty)) == ROWS - 2
-    assert "state 20: data holds no valid JSON" in capsys.readouterr().err
 
 
 def test_a_signal_is_what_all_rows_tell_though_its_name_was_entered_before(

@@ -23,16 +23,17 @@ from tests.memory import memory_connection
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.store.export import FORMATS, export, export_file, format_of
+from webots_mcp.store.export import (
+    FOR_VIEWERS,
+    FORMATS,
+    export,
+    export_file,
+    export_for_viewers,
+    format_of,
+)
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 HEAD = ["run_id", "state_id", "sim_time_s", "wall_time_s"]
-
-
-@pytest.fixture
-def recorder() -> Iterator[Recorder]:
-    with recorded_run() as recorder:
-        yield recorder
 
 
 @contextmanager
@@ -206,24 +207,6 @@ def test_parquet_reads_back_as_the_rows(states: list[dict[str, Any]]) -> None:
 # -- what a person sees ---------------------------------------------------------------------------
 
 
-def test_values_that_are_not_finite_come_back_as_such(recorder: Recorder) -> None:
-    publish(recorder, 0.0, {"front": math.nan, "lidar": [math.inf] * 3, "left": 1.5})
-    publish(recorder, 1.0, {"front": -math.inf, "lidar": [1.0, 2.0, 3.0], "left": None})
-    first, second = table(recorder.connection)
-    assert [first[name] for name in ("front", "lidar.0", "left")] == ["nan", "inf", "1.5"]
-    assert [second[name] for name in ("front", "lidar.0", "left")] == ["-inf", "1.0", ""]
-    line = json_lines(recorder.connection)[0]
-    assert line["front"] is None
-    assert line["replaced"] == {"front": "nan", "lidar.*": "inf"}
-
-
-def test_columns_come_in_the_order_in_which_they_first_appear(recorder: Recorder) -> None:
-    publish(recorder, 0.0, {"z": 1, "a": {"y": 2, "b": 3}})
-    publish(recorder, 1.0, {"new": 4, "z": 5})
-    header = exported(recorder.connection, "csv").splitlines()[0].decode()
-    assert header == ",".join([*HEAD, "z", "a.y", "a.b", "new"])
-
-
 def test_a_column_has_the_kind_of_its_first_value_that_is_there(recorder: Recorder) -> None:
     for number, x in enumerate((None, 1.5, 2)):
         recorder.publish(float(number), {"x": x})
@@ -252,13 +235,6 @@ def test_an_exported_file_is_its_owners_alone(recorder: Recorder, tmp_path: Path
     file = tmp_path / "rows.csv"
     export_file(recorder.connection, find_range(recorder.connection, Scope(run_id=1)), "csv", file)
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
-
-
-def test_a_long_array_is_one_column(recorder: Recorder) -> None:
-    publish(recorder, 0.0, {"lidar": [0.5] * 17, "pose": [1, 2, 3]})
-    row = table(recorder.connection)[0]
-    assert json.loads(row["lidar"]) == [0.5] * 17
-    assert [row[f"pose.{i}"] for i in range(3)] == ["1", "2", "3"]
 
 
 def test_a_signal_that_is_called_like_our_columns_gets_another_name(recorder: Recorder) -> None:
@@ -355,24 +331,25 @@ def test_a_file_appears_when_it_is_complete(reader: sqlite3.Connection, tmp_path
     assert list(tmp_path.iterdir()) == [file]
 
 
+@pytest.mark.parametrize("form", ["csv", *FOR_VIEWERS])
 def test_an_export_that_fails_leaves_the_old_file_and_no_half_of_a_new_one(
-    reader: sqlite3.Connection, tmp_path: Path
+    reader: sqlite3.Connection, tmp_path: Path, form: str
 ) -> None:
-    file = tmp_path / "run.csv"
+    pytest.importorskip({"rrd": "rerun", "mcap": "mcap"}.get(form, "csv"))
+    file = tmp_path / f"run.{form}"
     file.write_text("old")
 
     def fail(*_: int) -> None:
         raise OSError("disk full")
 
+    wanted = find_range(reader, Scope())
     with pytest.raises(InvalidInputError, match="disk full"):
-        export_file(reader, find_range(reader, Scope()), "csv", file, fail)
+        if form == "csv":
+            export_file(reader, wanted, form, file, fail)
+        else:
+            export_for_viewers(reader, tmp_path, wanted, form, file, fail)
     assert file.read_text() == "old"
     assert list(tmp_path.iterdir()) == [file]
-
-
-def test_a_folder_that_is_missing_is_named(reader: sqlite3.Connection, tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match="missing"):
-        export_file(reader, find_range(reader, Scope()), "csv", tmp_path / "missing" / "run.csv")
 
 
 def test_an_unknown_format_is_told_what_there_is(reader: sqlite3.Connection) -> None:

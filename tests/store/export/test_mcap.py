@@ -7,7 +7,6 @@ import json
 import math
 import sys
 import tracemalloc
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,10 +14,9 @@ import pytest
 from hypothesis import given, settings
 from mcap.reader import make_reader
 
-from tests.memory import memory_connection
 from tests.recordings.rover import Recorder
 from tests.recordings.runs import Recorded
-from tests.store.export.test_export import STATES, publish, recorded_run, same, without_odd
+from tests.store.export.test_export import STATES, publish, recorded_run, same
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.formats.mcap import layout_file
 from webots_mcp.store.export import export_for_viewers
@@ -54,18 +52,6 @@ class Mcap:
 
     def values(self, topic: str) -> list[Any]:
         return [message.value for message in self.messages.get(topic, [])]
-
-
-@pytest.fixture
-def recorder() -> Iterator[Recorder]:
-    with recorded_run() as recorder:
-        yield recorder
-
-
-@pytest.fixture
-def recorded(tmp_path: Path) -> Iterator[Recorded]:
-    with memory_connection() as connection:
-        yield Recorded(connection, tmp_path)
 
 
 def exported(recorder: Recorder, folder: Path, **wanted: Any) -> Mcap:
@@ -339,23 +325,6 @@ def test_memory_does_not_grow_with_a_recording_for_viewers(
     assert peaks[-1] < 1.2 * peaks[0]
 
 
-def test_files_appear_when_they_are_complete_or_not_at_all(
-    recorder: Recorder, tmp_path: Path
-) -> None:
-    recorder.publish(0.0, {"x": 1})
-    file = tmp_path / "run.mcap"
-    file.write_text("old")
-
-    def fail(*_: int) -> None:
-        raise OSError("disk full")
-
-    wanted = find_range(recorder.connection, Scope())
-    with pytest.raises(InvalidInputError, match="disk full"):
-        export_for_viewers(recorder.connection, tmp_path, wanted, "mcap", file, fail)
-    assert file.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [file]
-
-
 def test_without_the_library_the_extra_is_named(
     recorder: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -364,11 +333,3 @@ def test_without_the_library_the_extra_is_named(
     with pytest.raises(InvalidInputError, match="pip install 'mcap>="):
         exported(recorder, tmp_path)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_values_that_are_not_finite_are_null_and_named(recorder: Recorder, tmp_path: Path) -> None:
-    state = {"front": math.nan, "lidar": [math.inf, 1.0]}
-    publish(recorder, 0.0, state)
-    (value,) = exported(recorder, tmp_path).values("/rover/state")
-    assert value.pop("replaced") == {"front": "nan", "lidar.*": "inf"}
-    assert value == without_odd(state)

@@ -65,38 +65,6 @@ def test_a_command_that_nobody_took_is_shown_and_will_never_run(
     assert "never run" in command[3]
 
 
-def test_the_mark_of_a_command_that_was_taken_is_no_command(
-    peer: Peer, database: sqlite3.Connection, data_dir: Path
-) -> None:
-    peer.write("status.json", json.dumps(STATUS))
-    peer.write("commands.json", '{"action": "none", "command": "cleared", "timestamp": "0"}')
-    assert import_folder(database, peer.folder, data_dir).commands == 0
-
-
-def test_an_import_that_fails_at_last_leaves_neither_rows_nor_pictures(
-    peer: Peer, database: sqlite3.Connection, data_dir: Path
-) -> None:
-    peer.everything()
-    database.execute(
-        "CREATE TRIGGER full BEFORE INSERT ON log BEGIN SELECT raise(ABORT, 'disk full'); END"
-    )
-    with pytest.raises(sqlite3.Error, match="disk full"):
-        import_folder(database, peer.folder, data_dir)
-    assert set(counts(database).values()) == {0}
-    assert list(data_dir.rglob("*.png")) == []
-    assert not database.in_transaction
-
-
-def test_pictures_of_our_own_data_folder_stay_where_they_are(
-    database: sqlite3.Connection, data_dir: Path
-) -> None:
-    peer = Peer(data_dir)
-    peer.picture("camera/frame_0000.png")
-    import_folder(database, data_dir, data_dir)
-    assert rows(database, "SELECT path FROM image") == [("camera/frame_0000.png",)]
-    assert [file.name for file in data_dir.rglob("*.png")] == ["frame_0000.png"]
-
-
 def test_a_state_with_nan_is_stored_as_the_bridge_stores_it(
     peer: Peer, database: sqlite3.Connection, data_dir: Path
 ) -> None:
@@ -139,9 +107,7 @@ def test_lines_less_than_a_day_apart_keep_their_distance(gaps_s: list[int]) -> N
         text = "".join(f"[{datetime.fromtimestamp(moment):%H:%M:%S}] line\n" for moment in moments)
         peer = Peer(Path(folder))
         peer.write("logs/controller.log", text, datetime.fromtimestamp(moments[-1]))
-        log = read_folder(peer.folder).log
-        assert log is not None
-        assert [line.wall_time_s for line in log.read()] == moments
+        assert [wall_s for wall_s, _ in read_folder(peer.folder).lines] == moments
 
 
 def test_a_log_from_windows_is_read(
@@ -150,17 +116,6 @@ def test_a_log_from_windows_is_read(
     peer.write("logs/controller.log", "[12:00:00] Motor läuft\r\n".encode("cp1252"))
     import_folder(database, peer.folder, data_dir)
     assert rows(database, "SELECT message FROM log") == [("Motor läuft",)]
-
-
-def test_progress_counts_the_lines(
-    peer: Peer, database: sqlite3.Connection, data_dir: Path
-) -> None:
-    peer.write("logs/controller.log", "[12:00:00] line\n" * 2500)
-    told: list[tuple[int, int]] = []
-    import_folder(
-        database, peer.folder, data_dir, progress=lambda done, of: told.append((done, of))
-    )
-    assert told == [(1000, 2500), (2000, 2500), (2500, 2500)]
 
 
 def test_what_no_float_and_no_utf8_can_hold_is_replaced_and_named(
@@ -188,3 +143,13 @@ def test_a_folder_is_imported_once(
     with pytest.raises(InvalidInputError, match="imported before, as run 1 of robot 'first'"):
         import_folder(database, peer.folder, data_dir, "second")
     assert counts(database) == before
+
+
+def test_pictures_of_our_own_data_folder_stay_where_they_are(
+    database: sqlite3.Connection, data_dir: Path
+) -> None:
+    peer = Peer(data_dir)
+    peer.picture("camera/frame_0000.png")
+    import_folder(database, data_dir, data_dir)
+    assert rows(database, "SELECT path FROM image") == [("camera/frame_0000.png",)]
+    assert [file.name for file in data_dir.rglob("*.png")] == ["frame_0000.png"]

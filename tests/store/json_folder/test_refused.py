@@ -37,11 +37,6 @@ BAD = [
     ("commands.json", '{"action": {"a": ' + "[" * 900 + "]" * 900 + "}}", "nested over 100"),
     (
         "logs/controller.log",
-        b"[12:00:00] " + b"y" * 1_000_000,
-        "line 1: it has over 1,000,000 bytes",
-    ),
-    (
-        "logs/controller.log",
         b"[00:00:01]\n[00:00:00]\n" * 800_000,
         "its clock goes back 800,000 times",
     ),
@@ -66,9 +61,7 @@ def test_a_bad_file_is_named_and_nothing_is_imported(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes and devices of POSIX")
-@pytest.mark.parametrize(
-    "name", ["status.json", "commands.json", "logs/controller.log", "camera/frame_0000.png"]
-)
+@pytest.mark.parametrize("name", ["status.json", "camera/frame_0000.png"])
 @pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
 def test_what_may_never_end_is_not_read(
     peer: Peer, database: sqlite3.Connection, data_dir: Path, name: str, kind: str
@@ -87,15 +80,6 @@ def test_what_may_never_end_is_not_read(
     assert set(counts(database).values()) == {0}
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="links of POSIX")
-def test_a_folder_that_is_a_loop_of_links_is_refused(
-    peer: Peer, database: sqlite3.Connection, data_dir: Path
-) -> None:
-    peer.folder.symlink_to(peer.folder)
-    with pytest.raises(InvalidInputError, match=r"nothing to import|cannot be read"):
-        import_folder(database, peer.folder, data_dir)
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="names that are no text exist on Linux only")
 def test_a_picture_whose_name_is_no_text_is_refused(
     peer: Peer, database: sqlite3.Connection, data_dir: Path
@@ -103,15 +87,6 @@ def test_a_picture_whose_name_is_no_text_is_refused(
     picture = peer.picture("camera/frame.png")
     picture.rename(os.fsdecode(os.fsencode(picture.with_name("frame")) + b"\xff.png"))
     with pytest.raises(InvalidInputError, match="is not valid text: rename the file"):
-        import_folder(database, peer.folder, data_dir)
-
-
-def test_a_picture_that_was_cut_off_is_refused(
-    peer: Peer, database: sqlite3.Connection, data_dir: Path
-) -> None:
-    file = peer.picture("camera/frame_0000.png")
-    file.write_bytes(file.read_bytes()[:-20])
-    with pytest.raises(InvalidInputError, match="not a usable PNG"):
         import_folder(database, peer.folder, data_dir)
 
 

@@ -110,15 +110,6 @@ def test_a_run_of_which_nothing_is_left_is_wholly_unread(recorded: Recorded) -> 
     assert len(frame) == 0 and [each.why for each in frame.unread] == ["deleted by retention"]
 
 
-def test_chunks_stay_while_their_states_do(recorded: Recorded) -> None:
-    record(recorded, 2 * GROUP_ROWS)
-    make_chunks(recorded.connection, 10_000)
-    nothing = Retention(chunk=Limit(rows=0, spared_rows=0), outlive=0)
-    assert recorded.prune(nothing).rows["chunk"] == 0
-    (spared,) = plan(recorded.connection, nothing, recorded.wall_s).spared
-    assert (spared.rows, spared.why) == (2 * GROUP_ROWS, "the states are still there")
-
-
 def test_a_state_is_deleted_only_once_it_is_in_a_chunk_also_of_a_run_that_goes_on(
     recorded: Recorded,
 ) -> None:

@@ -8,15 +8,14 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Generator, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from tests.recordings.runs import Recorded
 from webots_mcp.cli import main
-from webots_mcp.connection import connect, create_schema
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.purge import Upkeep
 from webots_mcp.store.retention import (
@@ -35,17 +34,7 @@ SERVE = [sys.executable, "-m", "webots_mcp", "serve"]
 
 
 @pytest.fixture
-def recorded(tmp_path: Path) -> Iterator[Recorded]:
-    with closing(connect(tmp_path / "webots.db", "writer", create=True)) as connection:
-        create_schema(connection)
-        recorded = Recorded(connection, tmp_path)
-        recorded.add_run(20)
-        recorded.add_run(20)
-        yield recorded
-
-
-@pytest.fixture
-def say(recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Say:
+def say(filed: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Say:
     def said(*line: str) -> str:
         assert main([*line, "--data-dir", str(tmp_path)]) == 0
         return capsys.readouterr().out
@@ -62,10 +51,10 @@ def another_server(connection: sqlite3.Connection, pid: int) -> Generator[None]:
     connection.execute("DELETE FROM lease")
 
 
-def test_retain_sets_a_limit_and_deletes_nothing(say: Say, recorded: Recorded) -> None:
+def test_retain_sets_a_limit_and_deletes_nothing(say: Say, filed: Recorded) -> None:
     assert say("retain", "--keep-states", "30rows", "--keep-runs", "all") == ""
-    assert recorded.rows() == {1: 20, 2: 20}
-    assert in_force(recorded.connection).state.rows == 30
+    assert filed.rows() == {1: 20, 2: 20}
+    assert in_force(filed.connection).state.rows == 30
     status = " ".join(say("status").split())
     assert "states 30rows (set by retain, " in status
     assert "runs all (set by retain, " in status
@@ -76,40 +65,38 @@ def test_retain_sets_a_limit_and_deletes_nothing(say: Say, recorded: Recorded) -
     assert kept["file_bytes"] > kept["free_in_file_bytes"] >= 0
 
 
-def test_who_maintains_keeps_to_what_was_set(say: Say, recorded: Recorded) -> None:
-    upkeep = Upkeep(recorded.folder, interval_s=0, budget_s=60)
-    upkeep(recorded.connection)
-    assert recorded.rows() == {1: 20, 2: 20}
+def test_who_maintains_keeps_to_what_was_set(say: Say, filed: Recorded) -> None:
+    upkeep = Upkeep(filed.folder, interval_s=0, budget_s=60)
+    upkeep(filed.connection)
+    assert filed.rows() == {1: 20, 2: 20}
     say("retain", "--keep-states", "30rows")
-    while recorded.rows() != {1: 10, 2: 20}:
-        upkeep(recorded.connection)
+    while filed.rows() != {1: 10, 2: 20}:
+        upkeep(filed.connection)
 
 
-def test_prune_sets_what_it_is_given_and_a_dry_run_only_tries_it(
-    say: Say, recorded: Recorded
-) -> None:
+def test_prune_sets_what_it_is_given_and_a_dry_run_only_tries_it(say: Say, filed: Recorded) -> None:
     say("prune", "--dry-run", "--keep-states", "5rows")
-    assert in_force(recorded.connection) == DEFAULT
+    assert in_force(filed.connection) == DEFAULT
     say("prune", "--keep-states", "30rows")
-    assert recorded.rows() == {1: 10, 2: 20}
-    recorded.publish(100.0, {"x": 1})
+    assert filed.rows() == {1: 10, 2: 20}
+    filed.publish(100.0, {"x": 1})
     say("prune")
-    assert recorded.rows() == {1: 9, 2: 21}
+    assert filed.rows() == {1: 9, 2: 21}
     say("retain", "--keep-states", "default")
-    assert in_force(recorded.connection) == DEFAULT
+    assert in_force(filed.connection) == DEFAULT
 
 
 def test_retain_without_runs_and_limits_says_what_it_takes(
-    recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    filed: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["retain", "--data-dir", str(tmp_path)]) == 2
     assert "--keep-states 20GB" in capsys.readouterr().err
 
 
 def test_a_server_sets_what_nobody_has_set_and_what_an_earlier_server_had(
-    recorded: Recorded,
+    filed: Recorded,
 ) -> None:
-    db = recorded.connection
+    db = filed.connection
     for size in (60 * MB, 5 * MB):
         assert ask_at_start(db, {"state": Limit(size_bytes=size)}) == []
         assert in_force(db).state.size_bytes == size
@@ -122,8 +109,8 @@ def test_a_server_sets_what_nobody_has_set_and_what_an_earlier_server_had(
     assert in_force(db).state.size_bytes == 80 * MB
 
 
-def test_beside_a_server_that_runs_the_limits_stay_as_they_are(recorded: Recorded) -> None:
-    db, others = recorded.connection, {"state": Limit(size_bytes=5 * MB)}
+def test_beside_a_server_that_runs_the_limits_stay_as_they_are(filed: Recorded) -> None:
+    db, others = filed.connection, {"state": Limit(size_bytes=5 * MB)}
     ask_at_start(db, {"state": Limit(size_bytes=60 * MB)})
     with another_server(db, os.getppid()):
         assert "the database keeps 60.0 MB (set by serve" in ask_at_start(db, others)[0]
@@ -132,8 +119,8 @@ def test_beside_a_server_that_runs_the_limits_stay_as_they_are(recorded: Recorde
     assert unheeded(db, others)
 
 
-def test_a_server_that_was_killed_is_none(recorded: Recorded) -> None:
-    db = recorded.connection
+def test_a_server_that_was_killed_is_none(filed: Recorded) -> None:
+    db = filed.connection
     ask_at_start(db, {"state": Limit(size_bytes=60 * MB)})
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
@@ -141,8 +128,8 @@ def test_a_server_that_was_killed_is_none(recorded: Recorded) -> None:
         assert ask_at_start(db, {"state": Limit(size_bytes=5 * MB)}) == []
 
 
-def test_a_second_server_says_which_limit_holds(recorded: Recorded, tmp_path: Path) -> None:
-    line, where = [*SERVE, "--data-dir", str(tmp_path)], recorded.connection
+def test_a_second_server_says_which_limit_holds(filed: Recorded, tmp_path: Path) -> None:
+    line, where = [*SERVE, "--data-dir", str(tmp_path)], filed.connection
     with subprocess.Popen(
         [*line, "--keep-states", "60MB"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as first:
@@ -159,10 +146,10 @@ def test_a_second_server_says_which_limit_holds(recorded: Recorded, tmp_path: Pa
 
 
 @pytest.mark.parametrize("wrong", ["'state', -1", "'state', 'many'", "'soup', 1"])
-def test_a_row_that_is_no_limit_is_named(recorded: Recorded, wrong: str) -> None:
-    recorded.connection.execute(
+def test_a_row_that_is_no_limit_is_named(filed: Recorded, wrong: str) -> None:
+    filed.connection.execute(
         "INSERT INTO retention_limit (kind, size_bytes, set_by, set_wall_time_s) "
         f"VALUES ({wrong}, 'hand', 0)"
     )
     with pytest.raises(InvalidInputError, match="retention_limit is not a limit"):
-        in_force(recorded.connection)
+        in_force(filed.connection)

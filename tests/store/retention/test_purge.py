@@ -204,7 +204,7 @@ def test_a_robot_that_records_meanwhile_loses_no_row(filed: tuple[Path, Recorded
         "SELECT row_count, purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) "
         "FROM run"
     ).fetchall()
-    assert rows == [(5000, 5000), (steps, steps)]
+    assert rows == [(0, 0), (5000, 5000), (steps, steps)]
     assert recorded.connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
 
 

@@ -144,6 +144,22 @@ async def test_of_a_state_with_long_arrays_all_members_stay_and_these_are_summed
     assert "lidar, depth" in answer["hint"]
 
 
+async def test_the_full_state_has_events_and_the_recorders_health(
+    connect: Connect, recorded: Recorded
+) -> None:
+    robot = recorded.robot(rows_waiting=3, rows_dropped=2, last_error="disk full")
+    robot.state(1.0, {"x": 0.123456789})
+    robot.event(0.5, "change", "mode", {"from": "a", "to": "b"})
+    async with connect() as client:
+        answer = await ask(client, "webots_get_full_state")
+    assert answer["state"] == {"x": 0.123456789}
+    assert answer["events"]["rows"] == [[0.5, "change", "mode", {"from": "a", "to": "b"}]]
+    health = answer["recorder"]
+    assert (health["rows_waiting"], health["rows_dropped"]) == (3, 2)
+    assert health["last_error"] == "disk full"
+    assert health["controller_sha256"] == "a" * 64
+
+
 async def test_the_world_is_described_with_its_companions(
     connect: Connect, recorded: Recorded
 ) -> None:

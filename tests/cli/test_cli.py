@@ -138,18 +138,6 @@ def test_without_a_database_one_line_says_so_and_the_exit_code_is_2(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_file_that_is_no_database_is_one_line_and_exit_code_2(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = tmp_path / "notes.txt"
-    file.write_text("certainly no database, " * 100)
-    assert main(["status", "--database", str(file)]) == 2
-    assert (
-        "notes.txt is not a database: name the one that a bridge records into\n"
-        in capsys.readouterr().err
-    )
-
-
 def test_the_tail_ends_with_the_newest_lines_of_every_kind(
     rover: RecordedRobot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -17,7 +17,10 @@ import pytest
 from tests.cli.test_cli import run
 from tests.recordings.rows import Recorded
 
-pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals and terminals of POSIX")
+pytestmark = [
+    pytest.mark.skipif(sys.platform == "win32", reason="signals and terminals of POSIX"),
+    pytest.mark.slow,
+]
 
 HELLO = {
     "jsonrpc": "2.0",

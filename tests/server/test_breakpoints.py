@@ -9,7 +9,6 @@ import anyio
 import pytest
 from mcp import Client
 
-from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, Driver, ask, fail
 
 pytestmark = pytest.mark.anyio
@@ -77,18 +76,3 @@ async def test_one_that_would_go_off_at_once_says_so(connect: Connect, driver: D
         (note,) = answer["notes"]
         assert note.startswith("it will be turned off by the next state like the last ones")
         assert "> the number 1?" in note
-
-
-async def test_without_a_controller_it_is_stored_and_says_so(
-    connect: Connect, recorded: Recorded
-) -> None:
-    robot = recorded.robot("rover")
-    robot.beat(ended_wall_time_s=robot.now, end_reason="finished")
-    async with connect() as client:
-        answer = await ask(client, "webots_breakpoint", condition="front_m < 0.1 for 0.5")
-        assert answer["armed"] is False
-        assert "stored, but not armed yet" in answer["hint"]
-        rows = (await ask(client, "webots_list_breakpoints"))["breakpoints"]["rows"]
-        assert len(rows) == 1
-        again = await ask(client, "webots_breakpoint", condition="front_m < 0.1 for 0.5")
-        assert again["breakpoint_id"] == answer["breakpoint_id"]

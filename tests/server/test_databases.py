@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -48,21 +50,37 @@ async def test_a_database_that_appears_later_is_found(connect: Connect, file: Pa
         recorded.close()
 
 
-async def test_a_file_that_is_no_database_is_a_clear_error(connect: Connect, file: Path) -> None:
+def make_notes(file: Path) -> None:
     file.write_text("certainly no database, " * 100)
-    async with connect() as client:
-        assert "is not a database" in await fail(client, "webots_list_robots")
 
 
-async def test_a_database_of_another_application_is_left_alone(
-    connect: Connect, file: Path
-) -> None:
-    with sqlite3.connect(file) as other:
+def make_foreign(file: Path) -> None:
+    with closing(sqlite3.connect(file)) as other, other:
         other.execute("CREATE TABLE contact (name TEXT)")
-    other.close()
+
+
+def make_newer(file: Path) -> None:
+    Recorded(file).close()
+    with closing(sqlite3.connect(file)) as other:
+        other.execute(f"PRAGMA user_version = {SCHEMA_VERSION + 1}")
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (make_notes, "is not a database"),
+        (make_foreign, "belongs to another application"),
+        (make_newer, "pip install --upgrade"),
+        (make_older, "move it aside"),
+    ],
+    ids=["no database", "of another application", "newer", "older"],
+)
+async def test_a_database_that_is_none_of_ours_is_a_clear_error(
+    connect: Connect, file: Path, make: Callable[[Path], object], said: str
+) -> None:
+    make(file)
     async with connect() as client:
-        text = await fail(client, "webots_list_robots")
-    assert f"{file} belongs to another application" in text
+        assert said in await fail(client, "webots_list_robots")
 
 
 async def test_a_damaged_database_is_a_clear_error(
@@ -75,19 +93,3 @@ async def test_a_damaged_database_is_a_clear_error(
     file.write_bytes(data[:4096] + b"\xff" * (len(data) - 4096))
     async with connect() as client:
         assert "damaged" in await fail(client, "webots_list_robots")
-
-
-async def test_a_database_of_a_newer_version_is_a_clear_error(
-    connect: Connect, recorded: Recorded
-) -> None:
-    recorded.connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION + 1}")
-    async with connect() as client:
-        assert "pip install --upgrade" in await fail(client, "webots_list_robots")
-
-
-async def test_a_database_of_an_older_version_is_a_clear_error(
-    connect: Connect, file: Path
-) -> None:
-    make_older(file)
-    async with connect() as client:
-        assert "move it aside" in await fail(client, "webots_list_robots")

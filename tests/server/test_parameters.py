@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, Driver, ask, fail
 
 pytestmark = pytest.mark.anyio
@@ -109,33 +108,6 @@ async def test_what_cannot_be_set_is_refused_before_anything_is_sent(
         listed = await ask(client, "webots_list_commands")
         assert "commands" not in listed
     assert tunable.kp.value == 2.0
-
-
-async def test_a_robot_without_parameters_says_how_to_declare_one(
-    connect: Connect, driver: Driver
-) -> None:
-    async with connect() as client:
-        answer = await ask(client, "webots_get_parameters")
-        assert "bridge.parameter(" in answer["hint"]
-        said = await fail(client, "webots_set_parameters", values={"kp": 1.0})
-        assert "declares no parameters" in said
-    assert driver.is_alive()
-
-
-async def test_nothing_is_set_in_a_controller_that_is_gone(
-    connect: Connect, file: Path, recorded: Recorded
-) -> None:
-    driving = TunableDriver(file)
-    driving.start()
-    driving.stop()
-    async with connect() as client:
-        said = await fail(client, "webots_set_parameters", values={"kp": 1.0})
-        assert "has no live controller" in said
-        assert [each["value"] for each in table(await ask(client, "webots_get_parameters"))] == [
-            2.0,
-            3,
-            "trot",
-        ]
 
 
 async def test_many_parameters_fit_a_short_answer_that_says_how_many_there_are(

@@ -22,7 +22,7 @@ from webots_mcp.server import create_server
 from webots_mcp.standin import Mode, Simulation
 
 __all__ = ["data_dir", "filed", "start"]
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.slow]
 
 # `released` is 1 from the step on at which the test has made a file.
 LOOP = """

@@ -68,20 +68,6 @@ def crowd(file: Path) -> Iterator[Crowd]:
     robots.close()
 
 
-@pytest.mark.usefixtures("driver")
-async def test_the_scene_is_shown_with_paths_and_fields(connect: Connect) -> None:
-    async with connect() as client:
-        answer = await ask(client, "webots_get_scene", depth=1, fields=["translation"])
-        scene = answer["result"]
-        paths = {row[1]: row for row in scene["rows"]}
-        assert paths["BALL"] == [1, "BALL", "Solid", "ball", [0.2, -0.2, 0.05]]
-        assert scene["also_at_the_top"][:2] == ["WorldInfo", "Viewpoint"]
-        assert answer["robot"] == "rover"
-        assert len(json.dumps(answer)) < 4_000
-        only = await ask(client, "webots_get_scene", types="Robot")
-        assert [row[3] for row in only["result"]["rows"]] == ["rover"]
-
-
 async def test_a_robot_is_moved_and_its_event_says_by_whom(
     connect: Connect, driver: Driver, file: Path
 ) -> None:
@@ -132,15 +118,6 @@ async def test_nodes_are_added_and_removed(connect: Connect) -> None:
         assert "added nothing" in await fail(client, "webots_add_node", vrml="Hologram { }")
 
 
-@pytest.mark.usefixtures("driver")
-async def test_the_errors_say_what_there_is_and_what_is_expected(connect: Connect) -> None:
-    async with connect() as client:
-        said = await fail(client, "webots_get_field", path="ROVER.tranlation")
-        assert "(the nearest first): translation" in said
-        said = await fail(client, "webots_set_field", path="ROVER.translation", value=[1, 2])
-        assert "give 3 finite numbers, such as [0, 0.5, 0.1]; got [1, 2]" in said
-
-
 async def test_a_robot_that_is_no_supervisor_is_looked_at_by_one_that_is(
     connect: Connect, crowd: Crowd
 ) -> None:
@@ -187,12 +164,6 @@ async def test_a_server_that_only_reads_asks_no_controller(connect: Connect) -> 
         for tool, arguments in (("get_scene", dict[str, Any]()), ("get_field", {"path": "BALL"})):
             said = await fail(client, f"webots_{tool}", **arguments)
             assert "a --read-only server sends none" in said
-
-
-async def test_where_nothing_was_recorded_it_says_how_to_record(connect: Connect) -> None:
-    async with connect() as client:
-        answer = await ask(client, "webots_get_scene")
-        assert answer["status"] == "never seen"
 
 
 async def test_an_observer_sees_and_changes_a_world_whose_robots_know_nothing_of_it(

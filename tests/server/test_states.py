@@ -9,7 +9,6 @@ import pytest
 
 from tests.recordings.rows import Recorded
 from tests.server.conftest import DATA_TOOLS, Connect, ask, fail
-from webots_mcp.bridge.encoding import encode
 from webots_mcp.questions.budget import tokens_of
 from webots_mcp.questions.robot_state import unnamed_devices
 from webots_mcp.store.chunk_making import chunk_whole_run
@@ -30,20 +29,6 @@ async def test_the_state_is_rounded_and_long_arrays_are_summarised(
     assert answer["state"]["lidar"]["argmin"] == 7
     assert "arrays over 16 items" in answer["shortened"]
     assert "webots_get_full_state" in answer["hint"]
-
-
-async def test_odd_values_are_recognisable(connect: Connect, recorded: Recorded) -> None:
-    lidar = [float("inf")] * 40 + [0.5] * 140
-    encoded = encode({"front": float("nan"), "lidar": lidar, "x": 1.0})
-    robot = recorded.robot()
-    robot.state(1.0, json.loads(encoded.text), encoded.replaced)
-    async with connect() as client:
-        answer = await ask(client, "webots_get_sensors")
-    assert answer["sensors"]["front"] == "nan"
-    assert answer["sensors"]["lidar"]["inf"] == 40
-    assert answer["replaced"]["front"] == "nan"
-    assert "x" not in answer["sensors"]
-    assert answer["devices_not_named_in_state"] == "eye (Camera)"
 
 
 async def test_of_many_replaced_values_the_number_of_those_not_shown_is_said(
@@ -122,20 +107,6 @@ async def test_a_part_of_the_state_comes_whole_in_pages(
         )
 
 
-async def test_a_state_of_sixty_signals_is_whole_at_a_glance_and_exact(
-    connect: Connect, recorded: Recorded
-) -> None:
-    state = {f"joint_{i}_torque_nm": i / 7 for i in range(60)}
-    recorded.robot().state(1.0, state)
-    async with connect() as client:
-        glance = await ask(client, "webots_get_robot_state")
-        full = await ask(client, "webots_get_full_state")
-    assert len(glance["state"]) == 60
-    assert "shortened" not in glance
-    assert full["state"] == state
-    assert "total" not in full
-
-
 async def test_a_large_state_comes_in_pages_that_say_what_is_not_on_them(
     connect: Connect, recorded: Recorded
 ) -> None:
@@ -189,24 +160,6 @@ async def test_the_full_state_has_events_and_the_recorders_health(
     assert health["controller_sha256"] == "a" * 64
 
 
-async def test_the_full_state_says_which_seconds_were_kept_last(
-    connect: Connect, recorded: Recorded
-) -> None:
-    robot = recorded.robot()
-    robot.state(60.0, {"x": 1})
-    async with connect() as client:
-        assert "kept_at_full_rate" not in (await ask(client, "webots_get_full_state"))["recorder"]
-        robot.kept(5.0, 12.0, "breakpoint 1: front_m < 0.1")
-        robot.kept(40.0, 47.0, "error: the gear is gone")
-        answer = await ask(client, "webots_get_full_state")
-        seen = await ask(client, "webots_get_robot_state")
-        robot.kept(58.0, 62.0, "pause")
-        goes_on = (await ask(client, "webots_get_robot_state"))["kept_at_full_rate"]
-    assert goes_on == "58.000 s on, until 62.000 s: pause"
-    assert seen["kept_at_full_rate"] == answer["recorder"]["kept_at_full_rate"]
-    assert answer["recorder"]["kept_at_full_rate"] == "40.000-47.000 s: error: the gear is gone"
-
-
 async def test_the_world_is_described_with_its_companions(
     connect: Connect, recorded: Recorded
 ) -> None:
@@ -222,44 +175,6 @@ async def test_the_world_is_described_with_its_companions(
     assert answer["run"]["row_count"] == 5
     assert answer["other_robots"]["rows"] == [["referee", "Supervisor", ""]]
     assert answer["controller"]["file"].endswith("rover.py")
-
-
-async def test_log_lines_are_paged_towards_older_ones(connect: Connect, recorded: Recorded) -> None:
-    robot = recorded.robot()
-    for i in range(120):
-        robot.log(i * 1.0, f"line {i}", "error" if i % 10 == 0 else "info")
-    async with connect() as client:
-        newest = await ask(client, "webots_get_logs")
-        assert [row[2] for row in newest["lines"]["rows"]][-1] == "line 119"
-        assert (len(newest["lines"]["rows"]), newest["matching"]) == (50, 120)
-        older = await ask(client, "webots_get_logs", cursor=newest["cursor"])
-        assert older["lines"]["rows"][-1][2] == "line 69"
-        errors = await ask(client, "webots_get_logs", level="error", start_s=50, end_s=100)
-        assert [row[0] for row in errors["lines"]["rows"]] == [50.0, 60.0, 70.0, 80.0, 90.0]
-        nothing = await ask(client, "webots_get_logs", filter_text="collision")
-        assert "leave out filter_text" in nothing["hint"]
-        assert "less than end_s" in await fail(client, "webots_get_logs", start_s=5, end_s=5)
-
-
-async def test_log_lines_come_from_before_a_reset_too_each_with_its_run(
-    connect: Connect, recorded: Recorded
-) -> None:
-    robot = recorded.robot()
-    before = robot.run_id
-    robot.log(60.0, "before the reset", "critical")
-    robot.run_id = robot.begin_run("reset")
-    robot.log(0.5, "after the reset")
-    recorded.robot("other").log(1.0, "of another robot")
-    async with connect() as client:
-        newest = await ask(client, "webots_get_logs", robot="rover")
-        rows = [(row[2], row[3]) for row in newest["lines"]["rows"]]
-        assert rows == [("before the reset", before), ("after the reset", robot.run_id)]
-        ranged = await ask(client, "webots_get_logs", robot="rover", last_s=10)
-        assert [row[2] for row in ranged["lines"]["rows"]] == ["after the reset"]
-        earlier = await ask(client, "webots_get_logs", run_id=before)
-        assert [row[2] for row in earlier["lines"]["rows"]] == ["before the reset"]
-        grave = await ask(client, "webots_get_logs", robot="rover", level="critical")
-        assert [row[1] for row in grave["lines"]["rows"]] == ["critical"]
 
 
 async def test_a_signal_that_could_not_be_read_is_not_said_to_have_no_value(

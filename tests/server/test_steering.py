@@ -19,22 +19,6 @@ async def control(client: Client, command: str, **arguments: object) -> dict[str
     return await ask(client, "webots_simulation_control", command=command, **arguments)
 
 
-async def test_pause_step_and_resume_say_what_happened(connect: Connect, driver: Driver) -> None:
-    async with connect() as client:
-        paused = await control(client, "pause")
-        assert (paused["outcome"], paused["status"]) == ("done", "paused")
-        before = (await ask(client, "webots_get_robot_state"))["state"]["steps"]
-
-        stepped = await control(client, "step", steps=5)
-        assert (stepped["outcome"], stepped["status"]) == ("done", "paused")
-        after = (await ask(client, "webots_get_robot_state"))["state"]["steps"]
-        assert after - before == 5
-
-        resumed = await control(client, "resume")
-        assert (resumed["outcome"], resumed["status"]) == ("done", "running")
-        assert driver.is_alive()
-
-
 async def test_a_reset_begins_a_new_run(connect: Connect, driver: Driver) -> None:
     async with connect() as client:
         first = (await ask(client, "webots_get_robot_state"))["run_id"]

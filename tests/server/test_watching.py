@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,45 +28,32 @@ def drive(rover: RecordedRobot, *places: object) -> None:
         rover.state(step * 0.5, {"pose": place}, at=rover.now + step * 0.5)
 
 
-async def test_a_way_there_and_back_has_a_distance_and_no_displacement(
-    connect: Connect, rover: RecordedRobot
+NOISE = np.random.default_rng(1).normal(0, 0.03, (60, 2)).tolist()
+
+
+@pytest.mark.parametrize(
+    ("places", "distance_m", "said"),
+    [
+        ([[0, 0], [3, 4], [0, 0]], 10.0, {"displacement_m": 0.0}),
+        ([[0, 0], [None, 1], [0, 1]], 1.0, {}),  # a lost position is no movement
+        ([[0, 0], [300, 400], [0, 0]], 1000.0, {"unit": "pose.0 is taken as metres"}),
+        (
+            [[0.015 * step + x, y] for step, (x, y) in enumerate(NOISE)],
+            pytest.approx(0.9, abs=0.1),
+            {"distance_note": "the path may be up to"},
+        ),
+    ],
+    ids=["there and back", "lost", "in metres that no robot drives", "slow under noise"],
+)
+async def test_a_movement_has_its_distance_and_what_makes_it_doubtful(
+    connect: Connect, rover: RecordedRobot, places: list[Any], distance_m: Any, said: dict[str, Any]
 ) -> None:
-    drive(rover, [0, 0], [3, 4], [0, 0])
+    drive(rover, *places)
     async with connect() as client:
-        answer = await ask(client, "webots_monitor", lookback_wall_s=60)
-    assert answer["movement"]["distance_m"] == 10.0
-    assert answer["movement"]["displacement_m"] == 0.0
-    assert answer["row_count"] == 3
-
-
-async def test_a_way_in_metres_that_no_robot_drives_is_doubted(
-    connect: Connect, rover: RecordedRobot
-) -> None:
-    drive(rover, [0, 0], [300, 400], [0, 0])
-    async with connect() as client:
-        answer = await ask(client, "webots_monitor", lookback_wall_s=60)
-    assert answer["movement"]["distance_m"] == 1000.0
-    assert "pose.0 is taken as metres" in answer["movement"]["unit"]
-
-
-async def test_a_slow_way_under_noise_is_told_with_how_much_longer_it_may_be(
-    connect: Connect, rover: RecordedRobot
-) -> None:
-    noise = np.random.default_rng(1).normal(0, 0.03, (60, 2)).tolist()
-    drive(rover, *([0.015 * step + x, y] for step, (x, y) in enumerate(noise)))
-    async with connect() as client:
-        answer = await ask(client, "webots_monitor", lookback_wall_s=60)
-    assert answer["movement"]["distance_m"] < 1.0
-    assert "the path may be up to" in answer["movement"]["distance_note"]
-
-
-async def test_a_lost_position_does_not_count_as_a_way(
-    connect: Connect, rover: RecordedRobot
-) -> None:
-    drive(rover, [0, 0], [None, 1], [0, 1])
-    async with connect() as client:
-        answer = await ask(client, "webots_monitor", lookback_wall_s=60)
-    assert answer["movement"]["distance_m"] == 1.0
+        movement = (await ask(client, "webots_monitor", lookback_wall_s=60))["movement"]
+    assert movement["distance_m"] == distance_m
+    for name, value in said.items():
+        assert value in movement[name] if isinstance(value, str) else value == movement[name]
 
 
 async def test_a_robot_without_a_position_has_no_movement(

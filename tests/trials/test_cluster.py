@@ -29,7 +29,7 @@ from webots_mcp.store.parameters import Result
 __all__ = ["anyio_backend"]
 Write = Callable[[str], Path]
 
-pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals")
+pytestmark = [pytest.mark.skipif(os.name != "posix", reason="signals"), pytest.mark.slow]
 
 GRID = 'score = "last(x)"\nfor_s = 0.3\nrepeats = {}\n[grid]\nspeed = [1.0, 2.0, 5.0]'
 

@@ -24,7 +24,7 @@ from webots_mcp.webots.starting import CommandLine
 
 Write = Callable[[str], Path]
 
-pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals")
+pytestmark = [pytest.mark.skipif(os.name != "posix", reason="signals"), pytest.mark.slow]
 
 # It tells of itself, then is deaf to everything that can be ignored.
 SIMULATOR = """

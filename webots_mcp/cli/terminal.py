@@ -243,34 +243,14 @@ def _exit(number: int) -> None:
 
 _UNQUOTED: Final = r"(?<![\w'\".-])"  # a quoted name is somebody's data
 _NOT_ON: Final = r"(?![\w'\"])"
-BY_TOOL: Final = {  # by tool
-    "compare_runs": "compare",
-    "find_events": "events",
-    "get_full_state": "tail",
-    "get_logs": "logs",
-    "breakpoint": "breakpoint",
-    "get_scene": "scene",
-    "list_commands": "commands",
-    "list_commands breakpoints": "breakpoint",
-    "list_commands parameters": "parameters",
-    "list_commands outcome": "wait",
-    "list_runs trials": "trials",
-    "get_robot_state": "tail",
-    "get_trends": "trends",
-    "list_robots": "status",
-    "list_runs": "runs",
-    "monitor": "tail",
-    "plot": "plot",
-    "query_history": "history",
-    "query_sql": "sql",
-    "report": "report",
-    "run": "run",
-    "run_trials": "trials",
-    "send_command": "send",
-    "set_parameters": "parameters",
-    "simulation_control": "send",
-    "world_reset": "send reset",
-}
+_OTHERS: Final = {  # by tool: those that are answered by a command of another name or function
+    "get_full_state": "tail", "get_robot_state": "tail", "monitor": "tail",
+    "breakpoint": "breakpoint", "list_commands breakpoints": "breakpoint",
+    "list_commands parameters": "parameters", "set_parameters": "parameters",
+    "list_commands outcome": "wait", "list_runs trials": "trials", "run_trials": "trials",
+    "plot": "plot", "report": "report",
+    "simulation_control": "send", "world_reset": "send reset",
+}  # fmt: skip
 _FOR_A_CLIENT: Final = {  # what only one who asks by MCP can do, and what a person does
     "start the server with --data-dir or --database": "give --data-dir or --database",
     "the resource webots://schema": "'.schema' in the sqlite3 shell",
@@ -347,10 +327,17 @@ def _text_as_typed(text: str) -> str:
     return re.sub(joined, lambda found: f"{typed[found[1]]} {found[2]} {typed[found[3]]}", text)
 
 
+def commands_by_tool() -> dict[str, str]:
+    """The command that answers what a tool does, by the tool's name without `webots_`."""
+    from webots_mcp.cli.commands import COMMANDS
+
+    return {each.name.removeprefix("webots_"): name for name, each in COMMANDS.items()} | _OTHERS
+
+
 def _command_for(found: re.Match[str]) -> str:
     """The command that answers what a tool does; the tool itself where there is none."""
     tool, what, number = found["tool"], found["what"], found["id"]
-    command = BY_TOOL.get(f"{tool} {what}" if what else tool)
+    command = commands_by_tool().get(f"{tool} {what}" if what else tool)
     whole = f"{command} {number}" if number else command
     return f"'webots-mcp {whole}'" if command else found[0]
 

@@ -26,7 +26,6 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Protocol, TypeAlias
@@ -509,10 +508,18 @@ def _run_left(set_run: SetRun, set_id: int, report: Report) -> None:
         if trial.is_over:
             shutil.rmtree(set_run.folder(trial), ignore_errors=True)
     left = deque(trial for trial in trials if not trial.is_over)
+    running: dict[Future[Result], Trial] = {}
     pool = ThreadPoolExecutor(_MOST_THREADS)
     try:
-        next_trial = partial(_next_trial, set_run, set_id, left)
-        _run_all(set_run, pool, next_trial, partial(_require_wanted, set_run, set_id), report)
+        while True:
+            _require_wanted(set_run, set_id)
+            count = set_run.simulators.count
+            while len(running) < count and (trial := _next_trial(set_run, set_id, left)):
+                running[pool.submit(run_trial, set_run, trial)] = trial
+            if not running:
+                return
+            for future in wait(running, _PATIENCE_S, FIRST_COMPLETED).done:
+                report(running.pop(future), future.result())
     finally:
         set_run.stopping.set()
         pool.shutdown()  # the set is ours as long as a trial of it runs
@@ -543,25 +550,6 @@ def _next_trial(set_run: SetRun, set_id: int, left: deque[Trial]) -> Trial | Non
         return None
     with set_run.writer() as connection:
         return add_trial(connection, set_id, values)
-
-
-def _run_all(
-    set_run: SetRun,
-    pool: ThreadPoolExecutor,
-    next_trial: Callable[[], Trial | None],
-    require_wanted: Callable[[], None],
-    report: Report,
-) -> None:
-    running: dict[Future[Result], Trial] = {}
-    while True:
-        require_wanted()
-        count = set_run.simulators.count
-        while len(running) < count and (trial := next_trial()) is not None:
-            running[pool.submit(run_trial, set_run, trial)] = trial
-        if not running:
-            return
-        for future in wait(running, _PATIENCE_S, FIRST_COMPLETED).done:
-            report(running.pop(future), future.result())
 
 
 def run_trial(set_run: SetRun, trial: Trial) -> Result:
@@ -603,7 +591,11 @@ def _run(set_run: SetRun, trial: Trial) -> Result:
     make_folder(folder)
     if set_run.stopping.is_set():
         raise StoppedError
-    begun = partial(_begin, set_run, trial)
+
+    def begun(pid: int | None) -> None:
+        with set_run.writer() as connection:
+            begin_trial(connection, trial, pid)
+
     attempt = TrialAttempt(set_run.plan, trial.values, folder, set_run.stopping, begun)
     try:
         result = set_run.simulators.run(attempt)
@@ -613,11 +605,6 @@ def _run(set_run: SetRun, trial: Trial) -> Result:
         raise
     set_run.require_held()
     return result
-
-
-def _begin(set_run: SetRun, trial: Trial, pid: int | None) -> None:
-    with set_run.writer() as connection:
-        begin_trial(connection, trial, pid)
 
 
 # -- a search ---------------------------------------------------------------------------------

@@ -136,17 +136,21 @@ class OpenReaders:
     """
 
     def __init__(self) -> None:
-        self._idle: list[tuple[object, sqlite3.Connection]] = []
+        self._idle: dict[bool, list[tuple[object, sqlite3.Connection]]] = {False: [], True: []}
         self._is_closed = False
 
     @contextmanager
     def taken(
         self, database: Path, open_one: Callable[[], sqlite3.Connection]
     ) -> Generator[sqlite3.Connection]:
-        """One for a question; it is closed where the question fails."""
+        """One for a question; it is closed where the question fails.
+
+        Those that leave out invalid rows are kept apart: their views take longer than a question.
+        """
+        idle = self._idle[is_past_invalid_rows()]
         while True:
             try:
-                known, connection = self._idle.pop()
+                known, connection = idle.pop()
             except IndexError:
                 connection = open_one()
                 known = _identity(database, connection)
@@ -155,23 +159,25 @@ class OpenReaders:
                 break
             connection.close()
         try:
+            shadow_if_asked(connection)
             yield connection
         except BaseException:
             connection.close()
             raise
-        is_enough = len(self._idle) >= _MOST_IDLE
+        is_enough = len(idle) >= _MOST_IDLE
         if known is None or is_enough or isinstance(connection, FrozenConnection):
             connection.close()
         else:
-            self._idle.append((known, connection))
+            idle.append((known, connection))
         if self._is_closed:
             self.close()
 
     def close(self) -> None:
         """Close all that are not in use, and those when they are given back."""
         self._is_closed = True
-        while self._idle:
-            self._idle.pop()[1].close()
+        for idle in self._idle.values():
+            while idle:
+                idle.pop()[1].close()
 
 
 def _identity(database: Path, connection: sqlite3.Connection) -> object:
@@ -205,7 +211,7 @@ class Recording:
     @contextmanager
     def reader(self) -> Generator[sqlite3.Connection]:
         """A connection that cannot write, and that no other uses meanwhile."""
-        if self.readers is None or not isinstance(self.database, Path) or is_past_invalid_rows():
+        if self.readers is None or not isinstance(self.database, Path):
             with self._opened("reader") as connection:
                 shadow_if_asked(connection)
                 yield connection

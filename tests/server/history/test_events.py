@@ -8,14 +8,13 @@ from typing import Any
 
 import pytest
 
-from tests.recordings.rover import GAP_S, NAN_S, STUCK_S
+from tests.recordings.rover import STUCK_S
 from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask, fail
-from tests.server.history.conftest import STORY, refuse, tell
-from tests.server.story import WAYS, Way, client_on, copy_of, rows_of
-from webots_mcp.connection import connect
-from webots_mcp.store.detection.events import asked_kinds
-from webots_mcp.store.detection.kinds import EventOptions
+from tests.server.history.conftest import STORY, tell
+from tests.server.story import WAYS, Way, client_on, rows_of
+from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.registry import asked_kinds
 
 pytestmark = pytest.mark.anyio
 
@@ -53,40 +52,6 @@ async def test_position_and_mode_can_be_named(recorded: Recorded, connect: Conne
         assert "position" in wrong
 
 
-async def test_events_tell_what_nobody_noted(story: Path) -> None:
-    answer = await tell(story, "webots_find_events", run_id=STORY)
-    events = rows_of(answer["events"])
-    found = {(event["kind"], event["name"]): event for event in events}
-    assert found["missing", "sensors.front"]["start_s"] == NAN_S[0]
-    assert found["gap", None]["start_s"] == pytest.approx(GAP_S[0], abs=0.2)
-    assert found["oscillation", "heading"]["details"]["period_s"] == pytest.approx(2.0, rel=0.05)
-    assert found["jump", "ir"]["start_s"] == 70.0
-    assert [event["start_s"] for event in events] == sorted(event["start_s"] for event in events)
-    assert sum(answer["verdicts"]["found"].values()) == len(events)
-
-
-async def test_a_condition_is_found_in_the_past_as_often_as_it_would_have_been_hit(
-    story: Path,
-) -> None:
-    where = "sensors.bumper and displacement(3) < 0.01"
-    answer = await tell(story, "webots_find_events", run_id=STORY, where=where)
-    assert answer["verdicts"]["found"] == {"condition": 1}
-    (row,) = rows_of(answer["events"])
-    assert (row["start_s"], row["name"]) == (43.0, where)
-    assert row["details"]["sensors.bumper"] is True
-    assert any("what happened in between is not seen" in note for note in answer["notes"])
-    assert "column 3" in await refuse(story, "webots_find_events", where="n = 3")
-
-
-async def test_a_threshold_holds_for_at_least_so_long(story: Path) -> None:
-    asked = {"signals": ["pose.0"], "above": 7.9, "run_id": STORY}
-    both = await tell(story, "webots_find_events", **asked, for_s=2)
-    assert [row["start_s"] for row in rows_of(both["events"])] == [39.6, 95.6]
-    none = await tell(story, "webots_find_events", **asked, for_s=60)
-    assert "pose.0 was beyond the limit for at most" in none["verdicts"]["nearest"]["threshold"]
-    assert "need signals" in await refuse(story, "webots_find_events", above=1)
-
-
 async def test_lines_below_the_level_that_was_asked_for_are_not_absent(
     recorded: Recorded, connect: Connect
 ) -> None:
@@ -119,28 +84,6 @@ async def test_the_timeline_goes_on_page_by_page(story: Path) -> None:
     assert [at for _, _, at in seen] == sorted(at for _, _, at in seen)
     assert ("command", "set_speed", 20.0) in seen
     assert ("image", "cam", 30.0) in seen
-
-
-async def test_looking_back_reports_at_once_on_exactly_those_rows(story: Path) -> None:
-    answer = await tell(story, "webots_monitor", lookback_wall_s=15)
-    (trend,) = answer["trends"]
-    assert answer["row_count"] == trend["row_count"] == 301
-    assert (trend["start_s"], trend["end_s"]) == (29.9, 59.9)
-    assert answer["movement"]["distance_m"] == pytest.approx(9.0, abs=0.01)
-    assert [row["details"]["what"] for row in rows_of(answer["events"])] == ["ended"]
-
-
-async def test_looking_back_over_a_reset_tells_of_both_runs_and_no_way_between(
-    story: Path, tmp_path: Path
-) -> None:
-    file = copy_of(story, tmp_path / "webots.db")
-    with connect(file, "writer") as connection:
-        connection.execute("DELETE FROM run WHERE id = 3")
-    connection.close()
-    answer = await tell(file, "webots_monitor", lookback_wall_s=20)
-    assert [trend["run_id"] for trend in answer["trends"]] == [1, 2]
-    ways = answer["movement"]["runs"]
-    assert sum(way["distance_m"] for way in ways) < 12  # the jump back would add 12.8
 
 
 async def test_of_each_kind_it_is_told_whether_it_was_found_is_absent_or_was_not_searched(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.recordings.rover import GAP_S, WALL_START_S
+from tests.recordings.rover import WALL_START_S
 from tests.recordings.rows import Recorded
 from tests.server.conftest import ask
 from tests.server.history.conftest import EVERY, STORY, tell
@@ -25,20 +25,6 @@ async def test_every_answer_says_about_which_robot_and_run_and_as_of_when(story:
         assert (answer["robot"], answer["run_id"], answer["sim_time_s"]) == ("rover", 3, 59.9), tool
         assert answer["status"].startswith("stopped "), tool
         assert answer["age_s"] > 0, tool
-
-
-async def test_signals_have_kinds_ranges_and_rows_without_a_value(
-    story: Path,
-) -> None:
-    answer = await tell(story, "webots_list_signals", run_id=STORY)
-    signals = {row["signal"]: row for row in rows_of(answer["signals"])}
-    assert answer["total"] == len(signals) == 15
-    assert (signals["mode"]["kind"], signals["mode"]["last"]) == ("text", "cruise")
-    assert (signals["battery_v"]["unit"], signals["battery_v"]["max"]) == ("V", 12.6)
-    assert signals["sensors.bumper"]["last"] is False
-    assert signals["sensors.front"]["missing"] == "in 40 of 1150 rows; values from 0.0 to 119.9 s"
-    assert signals["mode"]["missing"] is None
-    assert "lidar.argmin" in signals
 
 
 async def test_signals_come_in_pages_and_by_pattern(story: Path) -> None:
@@ -61,27 +47,6 @@ async def test_an_extreme_is_never_lost_in_a_bucket(story: Path) -> None:
     assert (whole["max"], whole["max_at_s"]) == (5.0, 70.0)
     assert run["recording_gaps"] == [[89.9, 95.0]]
     assert sum(run["count"]) == run["row_count"] == 1150
-
-
-async def test_rows_in_a_gap_are_null_and_modes_are_change_points(story: Path) -> None:
-    answer = await tell(
-        story,
-        "webots_query_history",
-        signals=["pose.0", "mode"],
-        run_id=STORY,
-        start_s=85,
-        end_s=99,
-    )
-    (run,) = answer["runs"]
-    buckets = dict(zip(run["sim_time_s"], run["numbers"]["pose.0"]["mean"], strict=True))
-    assert all(mean is None for at, mean in buckets.items() if GAP_S[0] <= at < GAP_S[1] - 1)
-    assert run["states"]["mode"]["since_s"] == [60.0, 95.0]
-    assert run["states"]["mode"]["value"] == ["avoid", "cruise"]
-
-
-async def test_what_did_not_change_is_said_once(story: Path) -> None:
-    answer = await tell(story, "webots_query_history", signals=["target"])
-    assert answer["runs"][0]["numbers"]["target"] == {"constant": 3.0}
 
 
 async def test_numbers_too_large_to_reckon_with_are_not_called_silent(tmp_path: Path) -> None:

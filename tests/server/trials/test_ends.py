@@ -24,7 +24,7 @@ from webots_mcp.connection import connect as database
 from webots_mcp.server import create_server
 from webots_mcp.standin import Simulation
 
-pytestmark = pytest.mark.anyio
+pytestmark = [pytest.mark.anyio, pytest.mark.slow]
 SERVER = """
 import os, pathlib, sys
 from webots_mcp.cli import main

@@ -1,0 +1,315 @@
+"""Questions as a person types them: options and values, the answer, its words, what is refused."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.cli.conftest import Cli, line_with
+from tests.recordings.rows import Recorded
+from tests.server.story import copy_of
+from webots_mcp.cli import names
+from webots_mcp.cli.commands import app_for, described
+from webots_mcp.cli.terminal import as_typed, commands_by_tool, print_table
+
+# What is typed about a recording of three runs, and what lines of the answer hold, as patterns.
+ANSWERED = [
+    ("runs", "robot rover.* controller rover.py", "^3 2023.* finished", "^2 2023.* crashed",
+     "^1 2023.* reset.* log warning 1"),
+    ("runs -n 1", "total 3, cursor 3"),
+    ("history pose.0 mode --run 1 --points 8", "step_s 15", "pose.0 min .*pose.0 mean",
+     "^52 back_up", r"gaps \[\[89.9, 95.0\]\]"),
+    ("history pose.0 --last 0.3", "59.9 17.97", "sim_time_s pose.0 value$"),
+    ("trends --run 1", "heading .*period 2 s", "mode .*cruise 76.9, avoid 35"),
+    ("trends --run 1 -n 2", "7 of 9 numbers"),
+    ("trends pose.0 --run 1 battery_v", "^pose.0 ", "^battery_v "),
+    ("events --run 1 --kind stuck --kind gap", "stuck 40.*cruise", "gap 89.9"),
+    ("events --run 1 --signal pose.0 --above 7.9 --for 2", "threshold 39.6", "threshold 95.6"),
+    ("events --run 1 --where 'pose.0 > 7.9 and displacement(3) < 0.01'", "condition 43 9.1"),
+    ("events --kind stuck", "nearest: stuck smallest movement"),
+    ("compare", "commanded_m_s .*0.2.*0.3", "mean_speed_m_s .*0.2.*0.3"),
+    ("compare 1 3", "signal mean .*effect", r"^run 3 \[3\]"),
+    ("compare 1 -n 3 3", r"^run 3 \[3\]", "the 3 that differ most of 13"),
+    ("signals --run 1", "pose.0 num .*12.78"),
+    ("signals -n 1", "1 of 15: go on with --after"),
+    ("sql 'SELECT id, label, 1e999 AS big FROM run ORDER BY id'", "id label big", "1 NULL inf"),
+    ("sql 'SELECT id FROM run' -n 1", "only the first 1 rows"),
+    ("sql 'SELECT id FROM run WHERE id > 99'", "no row"),
+    ("logs --text fire", "no line matches"),
+]  # fmt: skip
+# What is typed about it, and what the line says that refuses it, in the words that were typed.
+REFUSED = [
+    ("history moed", "mode"),
+    ("history mode --points 9999", "--points must be less than or equal to 500, not 9999"),
+    ("history mode --run 99", "newest runs are [3, 2, 1]"),
+    ("history mode --after 3", "only rows go on with --after: ask for them with --raw"),
+    ("trends --robot rovr", "did you mean 'rover'"),
+    ("trends --start 9 --end 3", "--start 9 must be less than --end 3"),
+    ("trends --start 3 --last 3", "two ways"),
+    ("trends --last 3 --since 0", "use --start and --end (simulation time), or --last, or --since"),
+    ("trends --last -3", "--last must be greater than 0, not -3"),
+    ("trends lost_s", "'lost_s'"),
+    ("events --kind explosion", "--kind must be one of"),
+    ("events --above 3", "need signals"),
+    ("events --above 1 --below 3", "--above and --below need signals"),
+    ("events --for 3", "--for 3 needs a limit: give --above or --below"),
+    ("events --after x", "--after 'x' is not a cursor"),
+    ("compare 1 1", "1 to 10"),
+    ("compare 77 78", "no run 77: the newest runs are ["),
+    ("runs -n 501", "-n must be less than or equal to 500, not 501"),
+    ("plot -o a.gif", ".png or .svg"),
+    ("plot -o /no/such/folder/a.png", "cannot be written"),
+    ("plot -o p.png --width 5000", "--width 5000 must be from 400 to 2000"),
+    ("plot -o p.png --height 5", "--height 5 must be from 300 to 2000"),
+    ("signals moed", "mode"),
+    ("logs --last -3", "--last must be greater than 0, not -3.0"),
+    ("logs --start 9 --end 3", "reversed"),
+    ("logs --robot rovr", "did you mean 'rover'"),
+    ("logs --text \udcff", "--text must be a valid string"),
+    ("logs --follow --before 3", "leave out --before"),
+    ("logs --level loud", "--level"),
+    ("sql 'DELETE FROM run'", "only one reading statement"),
+    ("sql 'WITH a AS (SELECT 1) DELETE FROM run'", "only reading is allowed"),
+    ("sql 'SELECT lable FROM run'", "label"),
+    ("label 1", "give a label or a note"),
+    ("label 99 x", "no run 99: the newest runs are ["),
+    (f"label 1 {'x' * 101}", "at most 100"),
+    ("label 1 \udcff", "TEXT must be a valid string"),
+    ("label --note --raw", 'Invalid value "--raw" for --note'),
+    ("step 0", "N must be greater than or equal to 1, not 0"),
+    ("parameters --from-reset", "--from-reset needs what is set then: NAME=VALUE"),
+    ("field ROVER.translation --stop", "--stop goes with a VALUE"),
+    (f"tail -n {10**20} --no-follow", f"{10**20} is too large"),
+    ("export -o x.zz", "or say it with --format"),
+    ("send", 'Command "send" parameter ACTION requires an argument'),
+    *((f"{name} -n {number}", number) for name in ("events", "tail") for number in ("-1", "1.5")),
+    *(
+        (asked.format(number), number)
+        for asked in ("compare 1 {}", "label {} x", "trends --run {}", "wait {}", "report {}",
+                      "plot -o a.png --run {}", "export --run {}", "export --trials {}")
+        for number in (str(2**63), "1.5", "x")
+    ),
+]  # fmt: skip
+
+
+@pytest.fixture
+def told(story: Path, cli: Cli) -> Cli:
+    return cli.on("--database", story)
+
+
+@pytest.mark.parametrize(("typed", "patterns"), [(typed, words) for typed, *words in ANSWERED])
+def test_a_person_reads_what_the_recording_holds(
+    told: Cli, typed: str, patterns: list[str]
+) -> None:
+    lines = [" ".join(line.split()) for line in told(typed).splitlines()]
+    for pattern in patterns:
+        assert any(re.search(pattern, line) for line in lines), (pattern, lines)
+
+
+@pytest.mark.parametrize(("typed", "words"), REFUSED)
+def test_bad_input_is_one_line_and_exit_code_2(told: Cli, typed: str, words: str) -> None:
+    said = told.refused(typed)
+    assert words in said
+    assert said.count("\n") == 1
+
+
+@pytest.mark.parametrize("typed", ["runs", "trends", "events", "compare", "history mode"])
+def test_json_is_one_object_for_other_programs(told: Cli, typed: str) -> None:
+    answer = told.json(typed)
+    assert isinstance(answer, dict) and answer
+
+
+def test_json_names_the_fields_of_what_it_has(told: Cli, tmp_path: Path) -> None:
+    run = told.json("trends pose.0 --run 3")["runs"][0]
+    assert (run["row_count"], run["numbers"]["columns"][0]) == (600, "signal")
+    assert told.json("compare 1 3")["measures"]["columns"][:2] == ["name", "median"]
+    signals = told.json("signals 'po*' --run 1")["signals"]
+    assert [row[:2] for row in signals["rows"]] == [["pose.0", "num"], ["pose.1", "num"]]
+    assert told.json("sql \"SELECT 1e999, 'a'\"")["result"]["rows"] == [["inf", "a"]]
+    drawn = told.json(f"plot pose.0 --run 1 -o {tmp_path / 'a.png'}")
+    assert drawn["file"] == str(tmp_path / "a.png") and "pose.0" in drawn["caption"]
+    lines = told("tail -n 3 --no-follow --json").splitlines()
+    kinds = {"wall_time_s", "robot", "run_id", "sim_time_s", "kind", "text"}
+    assert [set(json.loads(line)) for line in lines] == [kinds] * 3
+
+
+@pytest.mark.parametrize(("name", "start"), [("a.png", b"\x89PNG"), ("a.svg", b"<?xml")])
+def test_plot_writes_a_picture(told: Cli, tmp_path: Path, name: str, start: bytes) -> None:
+    file = tmp_path / name
+    assert str(file) in told(f"plot pose.0 --run 1 -o {file}")
+    assert sys.platform == "win32" or stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert file.read_bytes().startswith(start)
+
+
+@pytest.mark.parametrize(
+    "typed", ["--runs 1 3 pose.0 -o {}", "-o {} --runs 1 3 pose.0", "pose.0 -o {} --runs 1 3"]
+)
+def test_a_plot_of_runs_takes_its_signal_wherever_it_stands(
+    told: Cli, tmp_path: Path, typed: str
+) -> None:
+    said = told(f"plot {typed.format(tmp_path / 'a.png')}")
+    assert "pose.0" in said and "run 1" in said and "run 3" in said
+
+
+def test_compare_says_how_runs_ended_with_which_code_and_what_only_some_of_them_have(
+    tmp_path: Path, cli: Cli
+) -> None:
+    recorded = Recorded(tmp_path / "webots.db")
+    published = {"arm": {"grip": 1.0, "reach": 2.0}, "rover": {"speed": 3.0}}
+    for name, reason in zip(published, ("finished", "crashed"), strict=True):
+        robot = recorded.robot(name)
+        for step in range(60):
+            robot.state(step / 10, published[name])
+        robot.end_run(reason)
+    recorded.close()
+    said = cli("compare 1 2")
+    assert line_with(said, "sha256 aaaaaaaa")
+    assert line_with(said, "run 1 ", "finished") and line_with(said, "run 2 ", "crashed")
+    assert line_with(said, '["run 1"]', '["run 2"]')
+    assert "differences:" not in said
+
+
+def test_logs_are_those_of_all_runs_or_of_a_range(tmp_path: Path, cli: Cli) -> None:
+    recording = Recorded(tmp_path / "webots.db")
+    robot = recording.robot("rover")
+    robot.state(1.0, {"x": 1})
+    robot.log(1.0, "begun")
+    robot.log(2.0, "battery low", level="warning")
+    robot.end_run("reset")
+    robot.begin_run("reset")
+    robot.state(5.0, {"x": 1})
+    robot.log(1.0, "begun again")
+    robot.log(4.5, "wheel lost", level="error")
+    recording.close()
+    told = cli.json("logs -n 2")
+    for typed, messages in (
+        ("", ["begun", "battery low", "begun again", "wheel lost"]),
+        ("--level warning", ["battery low", "wheel lost"]),
+        ("--run 1", ["begun", "battery low"]),
+        ("--last 1", ["wheel lost"]),
+        ("--end 2", ["begun again"]),
+        ("--text BEGUN -n 1", ["begun again"]),
+        (f"--before {told['cursor']}", ["begun", "battery low"]),
+    ):
+        lines = cli.json(f"logs {typed}")["lines"]
+        assert [row[lines["columns"].index("message")] for row in lines["rows"]] == messages
+    table = cli("logs -n 1")
+    assert line_with(table, "4.5", "error", "2", "wheel lost")
+    assert "the newest 1 of 4: ask again with --before for older ones" in table
+
+
+def test_a_person_reads_log_lines_whole_and_as_many_as_were_asked_for(
+    tmp_path: Path, cli: Cli
+) -> None:
+    recording = Recorded(tmp_path / "webots.db")
+    robot = recording.robot("rover")
+    for number in range(100):
+        robot.log(1.0, "x" * 1000 + f"end {number}")
+    recording.close()
+    rows = cli.json("logs -n 100")["lines"]["rows"]
+    assert [row[-1][1000:] for row in rows] == [f"end {number}" for number in range(100)]
+
+
+def test_a_label_is_given_shown_and_taken_away(story: Path, tmp_path: Path, cli: Cli) -> None:
+    copy_of(story, tmp_path / "webots.db")
+    given = cli("label 2 'kp 3' --note 'on ice'")
+    assert "run_id 2, robot rover, label kp 3" in given and "note on ice" in given
+    assert line_with(cli("runs"), "  2  kp 3", "on ice")
+    run = cli.json("label 2 -")["run"]
+    assert (run.get("label"), run["note"]) == (None, "on ice")
+    cli("label 2 --note -")
+    assert "on ice" not in cli("runs")
+    cli("events --where '-pose.0 < 0'")
+
+
+# -- words ----------------------------------------------------------------------------------------
+
+
+def test_several_robots_are_told_apart_by_an_option(tmp_path: Path, cli: Cli) -> None:
+    recording = Recorded(tmp_path / "webots.db")
+    for name in ("rover", "crane"):
+        recording.robot(name).state(1.5, {"last_s": 1.0, "mode": "cruise"})
+    recording.close()
+    assert "say which one with --robot " in cli.refused("trends")
+    said = " ".join(cli("compare --robot rover").split())
+    assert "give two or more RUN ('webots-mcp runs' has them)" in said
+    said = " ".join(cli("logs --robot rover").split())
+    assert "bridge.log('text', level='info') records one" in said, "a line of Python"
+
+
+def test_a_flag_that_is_to_be_turned_off_is_named_by_the_option_that_does(
+    tmp_path: Path, cli: Cli
+) -> None:
+    recording = Recorded(tmp_path / "webots.db")
+    rover = recording.robot("rover")
+    for row in range(1200):
+        rover.state(row * 0.1, {"front_m": None if row % 40 > 19 else 1.0})
+    recording.close()
+    said = " ".join(cli("events --kind missing").split())
+    assert "--one-by-one tells alike events one by one" in said
+
+
+def test_a_hint_names_commands_and_options_instead_of_tools_and_arguments() -> None:
+    app_for(["send"])
+    waits = 'webots_list_commands(what="outcome", command_id=7)'
+    hint = f"wait for it with {waits}, or ask with a longer timeout_wall_s"
+    assert as_typed(hint) == "wait for it with 'webots-mcp wait 7', or ask with a longer --timeout"
+    assert as_typed("webots_list_commands has it") == "'webots-mcp commands' has it"
+    app_for(["trends"])
+    quoted = "no signal 'last_s'; last_s=3 is too much since the start"  # a name of somebody's data
+    assert as_typed(quoted) == "no signal 'last_s'; --last 3 is too much since the start"
+
+
+def test_a_person_is_told_of_no_server_and_no_resource(tmp_path: Path, cli: Cli) -> None:
+    said = cli.on("--data-dir", tmp_path).refused("status")
+    assert "If controllers record elsewhere, give --data-dir or --database" in said
+    assert "'.schema' in the sqlite3 shell" in described()["sql"].text
+
+
+def test_examples_can_be_typed() -> None:
+    typed = [
+        line.strip()
+        for command in described().values()
+        for line in command.text.splitlines()
+        if line.startswith("    webots-mcp ")
+    ]
+    assert len(typed) > 15
+    for line in typed:
+        _, name, *given = shlex.split(line)
+        app_for([name]).parse_args([name, *given], exit_on_error=False, print_error=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("signals", "'*' is any text. (*)"), ("events", "no value for so long. (1)")],
+)
+def test_help_loses_no_word_and_no_default(cli: Cli, name: str, words: str) -> None:
+    assert words in cli.on()(f"{name} --help")
+
+
+def test_each_command_that_stands_for_a_tool_exists() -> None:
+    commands = commands_by_tool()
+    assert commands["list_robots"] == "status" and commands["run_trials"] == "trials"
+    assert {command.partition(" ")[0] for command in commands.values()} <= {*names()}
+
+
+def test_what_a_terminal_would_obey_is_spelled_out(capsys: pytest.CaptureFixture[str]) -> None:
+    print_table(("name", "empty"), [["red \x1b[31m alarm", None], ["two\nlines", None]])
+    assert capsys.readouterr().out == "name\nred \\x1b[31m alarm\ntwo\\nlines\n"
+
+
+def test_questions_load_neither_the_server_nor_matplotlib(story: Path) -> None:
+    program = (
+        "import sys\nfrom webots_mcp.cli import main\n"
+        f"main(['trends', '--database', {str(story)!r}])\n"
+        "print({'mcp', 'matplotlib', 'sqlmodel'} & set(sys.modules), file=sys.stderr)"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert ended.stderr.strip() == "set()"

@@ -11,10 +11,9 @@ import pytest
 
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.requirements import checkout
-from webots_mcp.setup import apply
+from webots_mcp.setup import FileChange, apply
 from webots_mcp.setup.client_entries import (
     Client,
-    ClientEntry,
     claude_desktop,
     clients_of,
     plan_entry,
@@ -30,13 +29,13 @@ def client(tmp_path: Path) -> Client:
     return clients_of(tmp_path)[0]
 
 
-def plan(client: Client, held: dict[str, Any] | str) -> ClientEntry:
+def plan(client: Client, held: dict[str, Any] | str) -> tuple[FileChange, str | None]:
     client.file.write_text(held if isinstance(held, str) else json.dumps(held))
     return plan_entry(client, "webots", LINE)
 
 
 def entry_after(client: Client, entry: dict[str, Any]) -> dict[str, Any]:
-    change = plan(client, {"mcpServers": {"webots": entry}}).change
+    change = plan(client, {"mcpServers": {"webots": entry}})[0]
     return json.loads(change.after)["mcpServers"]["webots"]
 
 
@@ -45,17 +44,17 @@ def test_each_client_gets_a_full_path_in_its_own_form(tmp_path: Path) -> None:
     for client, servers in zip(
         clients_of(tmp_path), ("mcpServers", "mcpServers", "servers"), strict=True
     ):
-        apply(plan_entry(client, "webots", line).change)
+        apply(plan_entry(client, "webots", line)[0])
         entry = json.loads(client.file.read_text())[servers]["webots"]
         assert Path(entry["command"]).is_absolute()
         assert Path(entry["command"]).is_file()
         assert entry["args"][-3:] == ["serve", "--data-dir", str(tmp_path / "mcp_data")]
-        assert not plan_entry(client, "webots", line).change.is_needed
+        assert not plan_entry(client, "webots", line)[0].is_needed
 
 
 @pytest.mark.parametrize("held", ["", " \n", "\ufeff{}"])
 def test_an_empty_file_is_taken_for_an_empty_object(client: Client, held: str) -> None:
-    after = plan(client, held).change.after.decode()
+    after = plan(client, held)[0].after.decode()
     assert json.loads(after.removeprefix("\ufeff"))["mcpServers"]["webots"]["command"] == LINE[0]
     assert after.startswith("\ufeff") == held.startswith("\ufeff")
 
@@ -79,9 +78,9 @@ def test_an_entry_that_can_be_started_is_kept_and_said(client: Client) -> None:
     args = ["-m", "webots_mcp", "serve", "--read-only"]
     held = {"mcpServers": {"webots": {"command": sys.executable, "args": args}}}
     entry = plan(client, held)
-    assert not entry.change.is_needed
-    assert "kept" in (entry.note or "")
-    assert "--read-only" in (entry.note or "")
+    assert not entry[0].is_needed
+    assert "kept" in (entry[1] or "")
+    assert "--read-only" in (entry[1] or "")
 
 
 def test_a_server_of_another_kind_is_not_replaced(client: Client) -> None:
@@ -109,7 +108,7 @@ def test_a_symbolic_link_is_followed_and_stays(client: Client, tmp_path: Path) -
     real.write_text('{"a": 1}')
     real.chmod(0o640)
     client.file.symlink_to(real)
-    apply(plan_entry(client, "webots", LINE).change)
+    apply(plan_entry(client, "webots", LINE)[0])
     assert client.file.is_symlink()
     assert json.loads(real.read_text())["mcpServers"]
     assert real.stat().st_mode & 0o777 == 0o640
@@ -125,12 +124,12 @@ def test_a_folder_that_links_to_nothing_makes_none_elsewhere(tmp_path: Path) -> 
 
 def test_the_same_server_by_another_name_is_not_told_twice(client: Client) -> None:
     entry = plan(client, {"mcpServers": {"mine": {"command": LINE[0], "args": LINE[1:]}}})
-    assert not entry.change.is_needed
-    assert "'mine'" in (entry.note or "")
+    assert not entry[0].is_needed
+    assert "'mine'" in (entry[1] or "")
 
 
 def test_a_file_that_changed_meanwhile_is_not_overwritten(client: Client) -> None:
-    change = plan(client, {}).change
+    change = plan(client, {})[0]
     client.file.write_text('{"new": 1}')
     with pytest.raises(CommandRefusedError, match="changed meanwhile"):
         apply(change)

@@ -16,7 +16,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, cast
 
@@ -364,6 +364,12 @@ def _left_s(until_s: float) -> float:
 
 
 _PRESSING_TIMEOUT_S: Final = 10.0
+_ON_MACOS: Final = (
+    "allow the program that runs this under System Settings, Privacy & Security, Accessibility"
+)
+_ON_WINDOWS: Final = (
+    "it needs exactly one window of Webots, and Windows' leave to bring it to the front"
+)
 _TITLE: Final = "Webots R20"  # "<world> (<project>) - Webots R2023b"
 
 
@@ -403,9 +409,14 @@ def press(order: Order, pid: int | None, platform: str = sys.platform) -> None:
     """
     key = KEYS[order]
     try:
-        if platform not in _PRESSING:
+        if platform == "linux":
+            _press_in_x11(key, pid)
+        elif platform == "darwin":
+            _run(macos_command(key, pid), _ON_MACOS)
+        elif platform == "win32":
+            _run(windows_command(key, pid), _ON_WINDOWS)
+        else:
             raise CommandRefusedError(f"no way to press keys on {platform!r} is known")
-        _PRESSING[platform](key, pid)
     except CommandRefusedError as error:
         raise CommandRefusedError(f"{error}; or press {key.spoken} in Webots yourself") from error
 
@@ -437,20 +448,6 @@ def windows_command(key: Key, pid: int | None) -> list[str]:
         f"$shell.SendKeys('^{'+' * key.shift}{key.name}')"
     )
     return ["powershell", "-NoProfile", "-NonInteractive", "-Command", script]
-
-
-def _press_on_macos(key: Key, pid: int | None) -> None:
-    _run(
-        macos_command(key, pid),
-        "allow the program that runs this under System Settings, Privacy & Security, Accessibility",
-    )
-
-
-def _press_on_windows(key: Key, pid: int | None) -> None:
-    _run(
-        windows_command(key, pid),
-        "it needs exactly one window of Webots, and Windows' leave to bring it to the front",
-    )
 
 
 def _press_in_x11(key: Key, pid: int | None) -> None:
@@ -508,10 +505,3 @@ def _attempt(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
         raise CommandRefusedError(f"the program {command[0]} is not there{install}") from error
     except (OSError, subprocess.TimeoutExpired) as error:
         raise CommandRefusedError(f"{command[0]} could not be run: {error}") from error
-
-
-_PRESSING: Final[dict[str, Callable[[Key, int | None], None]]] = {
-    "linux": _press_in_x11,
-    "darwin": _press_on_macos,
-    "win32": _press_on_windows,
-}

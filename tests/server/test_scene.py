@@ -15,7 +15,8 @@ from tests.bridge.conftest import Recording
 from tests.observer.conftest import OBSERVER
 from tests.recordings.rows import Recorded
 from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail
-from webots_mcp import MCPBridge, observer
+from webots_mcp import MCPBridge
+from webots_mcp.observer import observe
 from webots_mcp.standin import InProcessRobot, InProcessSimulation, InProcessSupervisor
 
 pytestmark = pytest.mark.anyio
@@ -203,7 +204,7 @@ async def test_an_observer_sees_and_changes_a_world_whose_robots_know_nothing_of
     simulation = InProcessSimulation(world)
     simulation.resume()
     robot = InProcessSupervisor("mcp_observer", world=simulation)
-    observing = threading.Thread(target=observer, args=(robot, 100), kwargs={"database": file})
+    observing = threading.Thread(target=observe, args=(robot, 100), kwargs={"database": file})
     rover = InProcessRobot("rover", world=simulation)
     observing.start()
     try:

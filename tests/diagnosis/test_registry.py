@@ -55,10 +55,12 @@ def test_a_check_that_fails_says_so_and_the_others_go_on(tmp_path: Path) -> None
 
     subject = subject_of(Recording(tmp_path / "webots.db", tmp_path), "the test")
     well = Check("Two", lambda _: iter(()), well="all well")
-    first, second = diagnose(subject, (Check("One", fails), well))
+    several = Check("Three", lambda _: iter([Finding("ok", "a"), Finding("wrong", "b", "x")]))
+    first, second, third = diagnose(subject, (Check("One", fails), well, several))
     assert first.finding.verdict == "not checked"
     assert "nobody may look there" in first.finding.seen
     assert second.is_well
+    assert third.finding == Finding("wrong", "b", "x")
 
 
 def test_of_several_findings_those_that_are_well_are_left_out() -> None:

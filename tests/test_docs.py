@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import inspect
+import json
 import re
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import anyio
 import pytest
@@ -15,12 +18,14 @@ from webots_mcp.bridge.backlog import MAX_WAITING_BYTES, MAX_WAITING_ROWS
 from webots_mcp.bridge.capture import MOST_LINES_PER_S
 from webots_mcp.bridge.devices import MOST_OBJECTS, SECTORS
 from webots_mcp.cli import names
-from webots_mcp.connection import OLDEST_SQLITE, SCHEMA_FILE
+from webots_mcp.cli.commands import described
+from webots_mcp.connection import OLDEST_SQLITE
 from webots_mcp.contract import BUILT_IN_ACTIONS, KEEP_AFTER_S
 from webots_mcp.questions.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS
 from webots_mcp.questions.declaring import MAX_WAIT_S
 from webots_mcp.server import create_server
-from webots_mcp.store.detection.events import kind_names
+from webots_mcp.setup.client_entries import claude_desktop, clients_of, is_ours
+from webots_mcp.store.detection.registry import kind_names
 
 CHECKOUT = Path(__file__).parents[1]
 DOCS = CHECKOUT / "docs"
@@ -36,12 +41,9 @@ def page(name: str) -> str:
 
 
 def test_the_page_of_the_tools_names_every_tool_and_no_other() -> None:
-    memory = MemoryDatabase()
-    try:
+    with closing(MemoryDatabase()) as memory:
         server = create_server(memory, memory.data_dir)
         tools = {tool.name for tool in anyio.run(server.list_tools)}
-    finally:
-        memory.close()
     assert set(re.findall(r"\bwebots_[a-z_]+\b", page("tools.md"))) == tools
 
 
@@ -138,3 +140,100 @@ def anchors(text: str) -> set[str]:
     """Of the headings, as code hosts make them."""
     heads = re.findall(r"(?m)^#+ (.+)$", text)
     return {re.sub(r"[^\w -]", "", head).lower().replace(" ", "-") for head in heads}
+
+
+README = (CHECKOUT / "README.md").read_text("utf-8")
+
+
+def test_it_installs_from_what_exists() -> None:
+    lines = re.findall(r"(?:pip|uv tool) install ([^#`\n]*)|uvx --from (\S+)", README)
+    sources = {(installed or run).split()[-1] for installed, run in lines}
+    assert sources == {"."}
+    assert "not on the package index yet" in README
+
+
+def test_what_it_installs_by_default_has_the_page_and_reports() -> None:
+    wanted = (CHECKOUT / "pyproject.toml").read_text("utf-8")
+    default = wanted.partition("\ndependencies = [")[2].partition("\n]")[0]
+    assert (
+        "pip install .            # the bridge, the server, the command line, the live page"
+        in README
+    )
+    assert {"bokeh", "jinja2"} <= set(re.findall(r'"([\w-]+)', default))
+
+
+def test_no_advice_names_a_package_index_on_which_anybody_may_register_the_name() -> None:
+    """Neither docs nor messages: what is installed by a name is not ours until it is published."""
+    by_name = re.compile(
+        r"\bwebots-mcp\[|webots-mcp==|\buvx webots-mcp|"
+        r"\b(pip|pipx|uv tool) install\b[^`#]*\bwebots-mcp\b"
+    )
+    files = [
+        CHECKOUT / "README.md",
+        *CHECKOUT.glob("docs/**/*.md"),
+        *CHECKOUT.glob("examples/**/*.md"),
+    ]
+    files += CHECKOUT.glob("webots_mcp/**/*.py")
+    found = [
+        f"{file.relative_to(CHECKOUT)}: {line.strip()}"
+        for file in files
+        for line in file.read_text("utf-8").splitlines()
+        if by_name.search(line)
+    ]
+    assert found == []
+
+
+def test_it_is_short() -> None:
+    assert len(README.encode()) <= 10_000
+
+
+FIRST_STEPS = (DOCS / "first-steps.md").read_text("utf-8")
+CLIENTS = (DOCS / "clients.md").read_text("utf-8")
+
+
+def _blocks(page: str, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("page", [FIRST_STEPS, CLIENTS])
+def test_the_commands_and_their_options_are_there(page: str) -> None:
+    options = {
+        name: set(re.findall(r"-[\w-]+", " ".join(command.arguments)))
+        for name, command in described().items()
+    }
+    lines = re.findall(r"webots-mcp ([a-z]+\b[^`\n|]*)", page)
+    assert len(lines) >= 4
+    for line in lines:
+        name, *words = line.split()
+        used = {re.sub(r"[^\w-].*", "", word) for word in words if word.startswith("--")}
+        assert used <= options[name], line
+
+
+def test_each_client_that_init_tells_has_its_part_with_its_file(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("APPDATA", "%APPDATA%")
+    monkeypatch.delenv("XDG_CONFIG_HOME", raising=False)
+    parts = dict(re.findall(r"^## (.+)\n((?:(?!^## ).*\n)*)", CLIENTS, re.MULTILINE))
+    for client in clients_of(Path("/project")):
+        assert client.file.relative_to("/project").as_posix() in parts[client.name]
+    for platform in ("linux", "darwin", "win32"):
+        file = claude_desktop(platform).file.as_posix().replace(Path.home().as_posix(), "~")
+        file = file.replace("/", "\\") if platform == "win32" else file
+        assert f"`{file}`" in parts["Claude Desktop"]
+
+
+def test_what_clients_are_told_is_an_entry_of_ours() -> None:
+    blocks = [json.loads(text) for text in _blocks(CLIENTS, "json")]
+    members = {"mcpServers", *(client.servers for client in clients_of(Path("/project")))}
+    assert {member for block in blocks for member in block} == members
+    entries: list[Any] = [entry for block in blocks for each in block.values()
+                          for entry in each.values()]  # fmt: skip
+    assert all(is_ours(entry) for entry in entries)
+
+
+def test_the_prompts_that_are_named_are_there() -> None:
+    with closing(MemoryDatabase()) as memory:
+        server = create_server(memory, memory.data_dir)
+        prompts = {prompt.name for prompt in anyio.run(server.list_prompts)}
+    assert set(re.findall(r"`(\w+_\w+)`", CLIENTS)) - {"mcp_data"} == prompts

@@ -22,7 +22,7 @@ import re
 import sys
 import time
 import unicodedata
-from collections.abc import Collection, Generator
+from collections.abc import Callable, Collection, Generator
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple, TypeAlias
 
@@ -75,22 +75,17 @@ class StepPace:
 
     def go_on(self) -> bool:
         """One round; False where Webots wants the controller to end."""
-        if not self._may_pump or self._tells_time is False or self._is_fast():
+        is_fast = self._robot.simulationGetMode() == self._robot.SIMULATION_MODE_FAST
+        if not self._may_pump or self._tells_time is False or is_fast:
             return self._robot.step(self._period_ms) != -1
         if self._tells_time is None and self._has_stood():
             return self._try_step()
         answer = self._robot.step(0)
-        self._note()
-        time.sleep(_ROUND_S)
-        return answer != -1
-
-    def _is_fast(self) -> bool:
-        return self._robot.simulationGetMode() == self._robot.SIMULATION_MODE_FAST
-
-    def _note(self) -> None:
         now_s = float(self._robot.getTime())
         if now_s != self._time_s:
             self._time_s, self._tells_time = now_s, True
+        time.sleep(_ROUND_S)
+        return answer != -1
 
     def _has_stood(self) -> bool:
         if self._robot.simulationGetMode() == self._robot.SIMULATION_MODE_PAUSE:
@@ -112,18 +107,18 @@ class ObserverBridge(MCPBridge):
 
     _kind = OBSERVER
 
-    def record_world(self, world: dict[str, object]) -> None:
-        """Record what there is: an event, as it changes seldom."""
-        self._session.journal.event(WORLD_EVENT, world)
+    def record_event(self, kind: str, data: dict[str, object]) -> None:
+        """Record what changes seldom: what there is, and the mode."""
+        self._session.context.journal.event(kind, data)
 
     def count_steps_by_time(self) -> None:
         """Count steps by time, since the world advances between two rounds of this loop."""
         self._session.clock.step_s = self._session.simulation.basic_time_step_s
 
-    def record_mode(self) -> None:
-        """Record in which mode the simulation is seen to be: an event."""
-        mode = self._session.simulation.mode_name
-        self._session.journal.event(MODE_EVENT, {"mode": mode})
+    @property
+    def mode_name(self) -> str:
+        """The mode in which the simulation is seen to be."""
+        return self._session.context.simulation.mode_name
 
     def failed(self, error: Exception) -> None:
         """Count what could not be seen, and say it once on stderr."""
@@ -134,19 +129,12 @@ def main(arguments: list[str] | None = None) -> None:
     """The whole controller; its first argument may be a period in milliseconds."""
     from controller import Supervisor  # type: ignore[import-not-found]
 
-    given = sys.argv[1:] if arguments is None else arguments
-    observe(Supervisor(), _period(given))
-
-
-def _period(given: list[str]) -> int:
-    if not given:
-        return PERIOD_MS
+    given = " ".join(sys.argv[1:] if arguments is None else arguments)
     try:
-        return checked_period(int(" ".join(given)))
+        period_ms = checked_period(int(given)) if given else PERIOD_MS
     except (ValueError, InvalidInputError) as error:
-        raise SystemExit(
-            f"give a period of 1 to {LONGEST_PERIOD_MS} ms, not {' '.join(given)!r}"
-        ) from error
+        raise SystemExit(f"give a period of 1 to {LONGEST_PERIOD_MS} ms, not {given!r}") from error
+    observe(Supervisor(), period_ms)
 
 
 def observe(robot: Any, period_ms: int = PERIOD_MS, **options: Any) -> None:
@@ -160,7 +148,8 @@ def observe(robot: Any, period_ms: int = PERIOD_MS, **options: Any) -> None:
     Raises:
         CommandRefusedError: The robot has no supervisor's rights.
     """
-    with Observer(robot, period_ms, **options) as observer:
+    observer = Observer(robot, period_ms, **options)
+    with observer.bridge:
         while observer.go_on():
             pass
 
@@ -186,12 +175,6 @@ class Observer:
         self._mode = -1
         self._record_again_s = math.inf
         self.bridge.register_command(LOOK_AT, self.look_at)
-
-    def __enter__(self) -> Observer:
-        return self
-
-    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        self.bridge.__exit__(kind, error, traceback)
 
     def go_on(self) -> bool:
         """One round; False where Webots wants the controller to end."""
@@ -220,11 +203,11 @@ class Observer:
         is_due, mode = time.monotonic() > self._record_again_s, int(self._robot.simulationGetMode())
         if mode != self._mode or is_due:
             self._mode = mode
-            self.bridge.record_mode()
+            self.bridge.record_event(MODE_EVENT, {"mode": self.bridge.mode_name})
         self.world.go_on()
         if self.world.is_new or is_due:
             self._record_again_s = time.monotonic() + _RECORD_AGAIN_S
-            self.bridge.record_world(self.world.describe())
+            self.bridge.record_event(WORLD_EVENT, self.world.describe())
 
     def _warn(self, text: str) -> None:
         self.bridge.log(text, "warning")
@@ -371,8 +354,8 @@ class ObservedBody:
         described = {
             "key": self.key,
             "type": self.scene.type_name,
-            "def": _other_than(self.key, self.scene.definition),
-            "name": _other_than(self.key, self.name),
+            "def": self.scene.definition if self.scene.definition not in ("", self.key) else None,
+            "name": self.name if self.name not in ("", self.key) else None,
             "controller": self.controller or None,
             "on_robot": carrier.name if carrier else None,
         }
@@ -389,21 +372,15 @@ def is_followed(scene: SceneNode) -> bool:
 
 def robot_around(scene: SceneNode) -> SceneNode | None:
     """The robot that a node is a part of, or stands on."""
+    return _around(scene, lambda each: each.base_type == "Robot")
+
+
+def _around(scene: SceneNode, is_meant: Callable[[SceneNode], bool]) -> SceneNode | None:
+    """The innermost node of a kind that a node stands in."""
     around = scene.parent
-    while around is not None and around.base_type != "Robot":
+    while around is not None and not is_meant(around):
         around = around.parent
     return around
-
-
-def _other_than(key: str, name: str) -> str | None:
-    return name if name and name != key else None
-
-
-def body_of(scene: SceneNode, key: str) -> ObservedBody:
-    """The body of a node that stands in the tree; its fields are asked for."""
-    is_robot = scene.base_type == "Robot"
-    controller = read_value(scene.node, "controller") if is_robot else None
-    return ObservedBody(key, scene, scene.name, str(controller or ""), is_robot)
 
 
 def word_of(name: str, taken: Collection[str]) -> str:
@@ -537,9 +514,9 @@ class ObservedWorld:
         """What stands in a slot may be shown in the slot and, with another id, inside the PROTO."""
         if not scene.hidden or scene.id in self._keys:
             return False
-        around, name = _proto_around(scene), scene.name
+        around, name = _proto_id_around(scene), scene.name
         return any(
-            body.name == name and not body.scene.hidden and _proto_around(body.scene) == around
+            body.name == name and not body.scene.hidden and _proto_id_around(body.scene) == around
             for body in self.bodies.values()
         )
 
@@ -549,7 +526,9 @@ class ObservedWorld:
             return
         if key is None:
             key = self._name(scene)
-        self.bodies[key] = body_of(scene, key)
+        is_robot = scene.base_type == "Robot"
+        controller = str((is_robot and read_value(scene.node, "controller")) or "")
+        self.bodies[key] = ObservedBody(key, scene, scene.name, controller, is_robot)
         if self._is_tracking:
             scene.node.enablePoseTracking(self._period_ms)
         self._is_new = True
@@ -601,9 +580,6 @@ def _is_stale(body: ObservedBody, before: BodyPose | None) -> bool:
     return place.distance_m(body.scene.node.getPosition()) > _STALE_M
 
 
-def _proto_around(scene: SceneNode) -> int | None:
-    """The id of the innermost PROTO node that a node stands in."""
-    around = scene.parent
-    while around is not None and not around.is_proto:
-        around = around.parent
-    return None if around is None else around.id
+def _proto_id_around(scene: SceneNode) -> int | None:
+    proto = _around(scene, lambda each: each.is_proto)
+    return None if proto is None else proto.id

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from tests.diagnosis.conftest import Look
-from webots_mcp.diagnosis.recording_checks import has_wal_reset_bug, judge_sqlite
+from webots_mcp.diagnosis.recording_checks import judge_sqlite
 
 
 def test_the_python_that_runs_is_named(look: Look) -> None:
@@ -26,7 +26,6 @@ def test_the_python_that_runs_is_named(look: Look) -> None:
     ],
 )  # fmt: skip
 def test_the_wal_reset_bug_is_known_by_version(version: tuple[int, ...], has_it: bool) -> None:
-    assert has_wal_reset_bug(version) is has_it
     found = judge_sqlite(version)
     assert found.verdict == "ok"
     assert ("WAL-reset bug" in found.seen) is has_it

@@ -1,4 +1,4 @@
-"""What is in the recording."""
+"""What each check finds in recordings that are not as they should be, and in some that are."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
@@ -51,6 +52,86 @@ def overdue(robot: RecordedRobot) -> None:
     queue.enqueue(robot.id, "pause")
 
 
+def without_wal(recorded: Recorded) -> None:
+    recorded.close()
+    with closing(sqlite3.connect(str(recorded.database))) as connection:
+        connection.execute("PRAGMA journal_mode=DELETE")
+
+
+def waiting_file_that_was_not_begun(recorded: Recorded) -> None:
+    gone(recorded)
+    waiting_path(Path(str(recorded.database)), "d3").touch()  # as a full disk leaves it
+
+
+def claimed_by_a_dead_controller(recorded: Recorded) -> None:
+    robot = gone(recorded)
+    CommandQueue(robot.connection).enqueue(robot.id, "aim")
+    robot.connection.execute(
+        "UPDATE command SET status = 'claimed', session_id = ?, claimed_wall_time_s = ?",
+        (robot.session_id, time.time()),
+    )
+
+
+def never_polled(recorded: Recorded) -> None:
+    now = time.time()
+    recorded.robot(last_poll_wall_time_s=None, started_wall_time_s=now - 60, now=now)
+
+
+def no_longer_polled(recorded: Recorded) -> None:
+    now = time.time()
+    recorded.robot(now=now, last_poll_wall_time_s=now - 40)
+
+
+def queued(recorded: Recorded) -> None:
+    robot = recorded.robot()
+    CommandQueue(robot.connection).enqueue(robot.id, "pause")
+
+
+Arrange = Callable[[Recorded], object]
+
+# What is arranged; the check, its verdict, what is seen, and what mends it.
+SCENARIOS: dict[str, tuple[Arrange, str, str, str, str]] = {
+    "a newer schema asks for a newer version": (
+        lambda r: r.connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION + 1}"),
+        "Schema", "wrong", f"{SCHEMA_VERSION + 1}, this", "upgrade"),
+    "a journal that is no wal": (
+        without_wal, "Database", "wrong", "journal mode delete", "local disk"),
+    "nobody records any more": (
+        gone, "Recording now", "warning", "the last sign of life was 0.", "start the simulation"),
+    "not even a waiting file could be begun": (
+        waiting_file_that_was_not_begun,
+        "Rows", "warning", "rows may be lost that nothing counts", "free space"),
+    "a living controller drops rows": (
+        lambda r: r.robot(rows_dropped=3, last_error="disk full"),
+        "Rows", "wrong", "3 rows of rover were dropped (disk full)", "what was dropped is lost"),
+    "commands that are not overdue are counted": (
+        queued, "Commands", "ok", "1 queued, 0 claimed, none overdue", ""),
+    "an overdue command of a loop that never asks": (
+        lambda r: overdue(r.robot(last_poll_wall_time_s=None)),
+        "Commands", "wrong", "command 1 (pause) for rover waits since 60", "bridge.get_command()"),
+    "an overdue command of a controller that is gone": (
+        lambda r: overdue(gone(r)), "Commands", "wrong", "its controller is gone", "start"),
+    "a command that a dead controller has claimed": (
+        claimed_by_a_dead_controller, "Commands", "warning", "it is lost", "ask again"),
+    "a loop that records and never asks": (
+        never_polled, "get_command", "warning", "never called get_command()", "attach(robot)"),
+    "a loop that has ceased to ask and goes on": (
+        no_longer_polled, "get_command", "warning", "called get_command() last 4", "attach(robot)"),
+    "a loop that asks": (
+        lambda r: r.robot(), "get_command", "ok", "rover's loop asks for commands", ""),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_a_check_finds_it_and_what_mends_it(look: Look, recorded: Recorded, name: str) -> None:
+    arrange, check, verdict, seen, fix = SCENARIOS[name]
+    arrange(recorded)
+    found = look(check)
+    assert found.verdict == verdict, found
+    assert seen in found.seen
+    assert fix in (found.fix or "")
+
+
 def test_where_nothing_was_recorded_the_lines_that_record_are_shown(look: Look) -> None:
     database = look("Database")
     assert (database.verdict, "nothing was recorded" in database.seen) == ("warning", True)
@@ -67,23 +148,12 @@ def test_an_older_schema_says_what_to_do_with_the_recording(look: Look, file: Pa
     assert look("Database").verdict == "ok"
 
 
-def test_a_newer_schema_asks_for_a_newer_version(
-    look: Look, file: Path, recorded: Recorded
-) -> None:
-    recorded.connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION + 1}")
-    assert "upgrade" in (look("Schema").fix or "")
-
-
-def test_a_file_that_is_no_database_is_wrong(look: Look, file: Path) -> None:
-    file.write_bytes(b"a letter to a friend, in no format" * 99)
-    database = look("Database")
-    assert database.verdict == "wrong"
-    assert "not a database" in database.seen
-
-
-def test_a_database_that_is_damaged_in_its_middle_is_wrong(
+def test_a_file_that_is_no_database_or_is_damaged_is_wrong(
     look: Look, file: Path, bridge_recording: Path
 ) -> None:
+    file.write_bytes(b"a letter to a friend, in no format" * 99)
+    database = look("Database")
+    assert (database.verdict, "not a database" in database.seen) == ("wrong", True)
     content = bytearray(bridge_recording.read_bytes())
     content[4096 * 4 : 4096 * 12] = b"garbage!" * 4096
     file.write_bytes(content)
@@ -92,27 +162,12 @@ def test_a_database_that_is_damaged_in_its_middle_is_wrong(
     assert ".recover" in (rows.fix or "")
 
 
-def test_a_journal_that_is_no_wal_is_wrong(look: Look, file: Path, recorded: Recorded) -> None:
-    recorded.close()
-    with closing(sqlite3.connect(file)) as connection:
-        connection.execute("PRAGMA journal_mode=DELETE")
-    database = look("Database")
-    assert (database.verdict, "journal mode delete" in database.seen) == ("wrong", True)
-
-
 def test_who_records_is_named_with_its_process_and_python(look: Look, recorded: Recorded) -> None:
     robot = recorded.robot()
     (pid,) = robot.connection.execute("SELECT pid FROM session").fetchone()
     now = look("Recording now")
     assert now.verdict == "ok"
     assert f"rover (process {pid}, Python 3.11.7)" in now.seen
-
-
-def test_where_nobody_records_it_is_said_since_when(look: Look, recorded: Recorded) -> None:
-    gone(recorded)
-    now = look("Recording now")
-    assert now.verdict == "warning"
-    assert "the last sign of life was 0." in now.seen
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="kills by signal")
@@ -124,80 +179,3 @@ def test_rows_that_wait_for_a_killed_writer_are_counted_and_named(look: Look, fi
     assert rows.verdict == "warning"
     assert "7 rows of a controller that is gone wait in webots.db-waiting-" in rows.seen
     assert "webots-mcp serve" in (rows.fix or "")
-
-
-def test_where_not_even_a_waiting_file_could_be_begun_rows_may_be_lost(
-    look: Look, recorded: Recorded, file: Path
-) -> None:
-    gone(recorded)
-    waiting_path(file, "d3").touch()  # as a full disk leaves it
-    rows = look("Rows")
-    assert rows.verdict == "warning"
-    assert "rows may be lost that nothing counts" in rows.seen
-
-
-def test_dropped_rows_of_a_living_controller_are_wrong(look: Look, recorded: Recorded) -> None:
-    recorded.robot(rows_dropped=3, last_error="disk full")
-    rows = look("Rows")
-    assert rows.verdict == "wrong"
-    assert rows.seen == "3 rows of rover were dropped (disk full)"
-
-
-def test_commands_that_are_not_overdue_are_counted(look: Look, recorded: Recorded) -> None:
-    robot = recorded.robot()
-    CommandQueue(robot.connection).enqueue(robot.id, "pause")
-    assert look("Commands").seen == "1 queued, 0 claimed, none overdue"
-
-
-def test_an_overdue_command_of_a_loop_that_never_asks_names_the_line_that_it_lacks(
-    look: Look, recorded: Recorded
-) -> None:
-    overdue(recorded.robot(last_poll_wall_time_s=None))
-    commands = look("Commands")
-    assert commands.verdict == "wrong"
-    assert "command 1 (pause) for rover waits since 60" in commands.seen
-    assert "never calls get_command()" in commands.seen
-    assert "bridge.get_command()" in (commands.fix or "")
-
-
-def test_an_overdue_command_of_a_controller_that_is_gone_says_so(
-    look: Look, recorded: Recorded
-) -> None:
-    overdue(gone(recorded))
-    assert "its controller is gone" in look("Commands").seen
-
-
-def test_a_command_that_a_dead_controller_has_claimed_is_lost(
-    look: Look, recorded: Recorded
-) -> None:
-    robot = gone(recorded)
-    CommandQueue(robot.connection).enqueue(robot.id, "aim")
-    robot.connection.execute(
-        "UPDATE command SET status = 'claimed', session_id = ?, claimed_wall_time_s = ?",
-        (robot.session_id, time.time()),
-    )
-    commands = look("Commands")
-    assert (commands.verdict, "it is lost" in commands.seen) == ("warning", True)
-
-
-def test_a_loop_that_records_and_never_asks_for_commands_is_warned_of(
-    look: Look, recorded: Recorded
-) -> None:
-    now = time.time()
-    recorded.robot(last_poll_wall_time_s=None, started_wall_time_s=now - 60, now=now)
-    assert "never called get_command()" in look("get_command").seen
-
-
-def test_a_loop_that_has_ceased_to_ask_and_goes_on_is_warned_of(
-    look: Look, recorded: Recorded
-) -> None:
-    now = time.time()
-    recorded.robot(now=now, last_poll_wall_time_s=now - 40)
-    polled = look("get_command")
-    assert polled.verdict == "warning"
-    assert "called get_command() last 4" in polled.seen
-
-
-def test_a_loop_that_asks_is_well(look: Look, recorded: Recorded) -> None:
-    recorded.robot()
-    assert look("get_command").verdict == "ok"

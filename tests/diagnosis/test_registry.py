@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 from tests.diagnosis.conftest import found
@@ -49,17 +50,17 @@ def test_a_recording_in_memory_is_looked_at_as_well() -> None:
 
 
 def test_a_check_that_fails_says_so_and_the_others_go_on(tmp_path: Path) -> None:
-    def fails(_: Examined) -> Finding:
+    def fails(_: Examined) -> Iterator[Finding]:
         raise PermissionError("nobody may look there")
 
-    def well(_: Examined) -> Finding:
-        return Finding("ok", "all well")
-
     subject = subject_of(Recording(tmp_path / "webots.db", tmp_path), "the test")
-    first, second = diagnose(subject, (Check("One", fails), Check("Two", well)))
+    well = Check("Two", lambda _: iter(()), well="all well")
+    several = Check("Three", lambda _: iter([Finding("ok", "a"), Finding("wrong", "b", "x")]))
+    first, second, third = diagnose(subject, (Check("One", fails), well, several))
     assert first.finding.verdict == "not checked"
     assert "nobody may look there" in first.finding.seen
     assert second.is_well
+    assert third.finding == Finding("wrong", "b", "x")
 
 
 def test_of_several_findings_those_that_are_well_are_left_out() -> None:

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -77,15 +78,20 @@ def eventually(look: Callable[[], Finding], words: str) -> Finding:
     return finding
 
 
-def test_a_robot_whose_time_moves_is_well(look: Look, recorded: Recorded) -> None:
-    recorded.robot()
-    assert look("Simulation") == Finding("ok", "rover: running")
-
-
-def test_a_pause_by_command_names_what_ends_it(look: Look, recorded: Recorded) -> None:
-    recorded.robot(pause_state="paused")
+@pytest.mark.parametrize(
+    ("session", "verdict", "seen", "fix"),
+    [
+        ({}, "ok", "rover: running", None),
+        ({"end_reason": "finished", "ended_wall_time_s": time.time()}, "ok", "finished", None),
+        ({"pause_state": "paused"}, "warning", "paused", "webots-mcp resume --robot rover"),
+    ],
+)
+def test_what_the_recording_shows_is_told(
+    look: Look, recorded: Recorded, session: dict[str, Any], verdict: str, seen: str, fix: str
+) -> None:
+    recorded.robot(**session)
     found = look("Simulation")
-    assert (found.verdict, found.fix) == ("warning", "webots-mcp resume --robot rover")
+    assert (found.verdict, found.fix, seen in found.seen) == (verdict, fix, True), found
 
 
 def test_where_nobody_computes_it_was_most_likely_paused_by_hand(
@@ -98,7 +104,7 @@ def test_where_nobody_computes_it_was_most_likely_paused_by_hand(
     assert found.fix == "press play in Webots"
 
 
-@pytest.mark.parametrize("options", [(), ("--stream",)])
+@pytest.mark.parametrize("options", [(), ("--stream", "--mode=fast")])
 def test_that_webots_obeys_by_its_websocket_is_named_where_it_does(
     look: Look,
     recorded: Recorded,
@@ -116,6 +122,9 @@ def test_that_webots_obeys_by_its_websocket_is_named_where_it_does(
     while "another controller computes" in found.seen:  # it is still starting
         found = look("Simulation")
     assert found.fix == "press play in Webots" + obeys * bool(options)
+    running = look("Running Webots").seen
+    assert f"port {port} (process " in running
+    assert ("arena.wbt, mode fast) obeys orders" in running) == bool(options)
 
 
 def test_a_controller_that_computes_holds_itself_up(
@@ -200,12 +209,6 @@ def test_a_controller_whose_steps_no_bridge_saw_is_told_of_while_it_lives_and_wh
     )
 
 
-def test_a_controller_that_has_finished_is_well(look: Look, recorded: Recorded) -> None:
-    robot = recorded.robot()
-    robot.beat(ended_wall_time_s=robot.now, end_reason="finished")
-    assert look("Simulation").verdict == "ok"
-
-
 def test_a_controller_that_records_nothing_and_hangs_is_found_as_a_child_of_its_webots(
     start_webots: StartWebots, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -226,17 +229,6 @@ def test_a_controller_that_records_nothing_and_hangs_is_found_as_a_child_of_its_
     running = found(file, "Running Webots")
     assert f"port {port}" in running.seen
     assert "was started without --stream and does not obey" in running.seen
-
-
-def test_a_webots_that_obeys_is_told_with_its_world_and_mode(
-    start_webots: StartWebots, world: Path, look: Look
-) -> None:
-    port = free_port()
-    line = ("--stream", "--mode=fast", "--stdout", f"--port={port}", world)
-    wait_for_line(start_webots(*line), "ready")
-    seen = look("Running Webots").seen
-    assert f"port {port} (process " in seen
-    assert "arena.wbt, mode fast) obeys orders from outside" in seen
 
 
 def test_which_webots_there_is_tells_its_place(webots: Path, look: Look) -> None:

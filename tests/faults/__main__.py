@@ -54,7 +54,7 @@ def verdict_on(fault: Fault, copy: Path) -> str:
         return f"CANNOT BE APPLIED: {error}"
     if not fault.caught_by:
         return "known hole"
-    file = copy / fault.file
+    file = fault.place(copy)
     sound = file.read_text("utf-8")
     file.write_text(text, "utf-8")
     try:

@@ -10,6 +10,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
+from tests.faults.listed import is_test, located
+
 CHECKOUT: Final = Path(__file__).parents[2]
 TABLE: Final = Path(__file__).with_name("promises.toml")
 _BENCHMARK: Final = "benchmark "
@@ -58,7 +60,7 @@ def read_promises(table: Path = TABLE) -> list[Promise]:
     toml: Any = import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
     pages: dict[str, list[dict[str, Any]]] = toml.loads(table.read_text("utf-8"))
     return [
-        Promise(page, each.pop("says"), tuple(each.pop("shown_by")), **each)
+        Promise(page, each.pop("says"), tuple(map(located, each.pop("shown_by"))), **each)
         for page, promises in pages.items()
         for each in promises
     ]
@@ -72,19 +74,12 @@ def is_there(shown_by: str) -> bool:
     """Whether there is such a test or benchmark; only files are read, nothing is imported."""
     if shown_by.startswith(_BENCHMARK):
         return shown_by.removeprefix(_BENCHMARK) in _benchmarks()
-    file, _, name = shown_by.partition("::")
-    return name in _tests_of(CHECKOUT / file)
+    return is_test(shown_by)
 
 
 @cache
 def _folded(page: str) -> str:
     return " ".join((CHECKOUT / page).read_text("utf-8").split())
-
-
-@cache
-def _tests_of(file: Path) -> list[str]:
-    text = file.read_text("utf-8") if file.exists() else ""
-    return re.findall(r"(?m)^(?:async )?def (test_\w+)\(", text)
 
 
 @cache

@@ -175,7 +175,7 @@ async def test_an_observer_sees_and_changes_a_world_whose_robots_know_nothing_of
     simulation = InProcessSimulation(world)
     simulation.resume()
     robot = InProcessSupervisor("mcp_observer", world=simulation)
-    observing = threading.Thread(target=observer, args=(robot, 100), kwargs={"database": file})
+    observing = threading.Thread(target=observe, args=(robot, 100), kwargs={"database": file})
     rover = InProcessRobot("rover", world=simulation)
     observing.start()
     try:

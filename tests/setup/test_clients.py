@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,9 @@ import pytest
 
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.requirements import checkout
-from webots_mcp.setup import apply
+from webots_mcp.setup import FileChange, apply
 from webots_mcp.setup.client_entries import (
     Client,
-    ClientEntry,
     claude_desktop,
     clients_of,
     plan_entry,
@@ -30,14 +30,9 @@ def client(tmp_path: Path) -> Client:
     return clients_of(tmp_path)[0]
 
 
-def plan(client: Client, held: dict[str, Any] | str) -> ClientEntry:
+def plan(client: Client, held: dict[str, Any] | str) -> tuple[FileChange, str | None]:
     client.file.write_text(held if isinstance(held, str) else json.dumps(held))
     return plan_entry(client, "webots", LINE)
-
-
-def entry_after(client: Client, entry: dict[str, Any]) -> dict[str, Any]:
-    change = plan(client, {"mcpServers": {"webots": entry}}).change
-    return json.loads(change.after)["mcpServers"]["webots"]
 
 
 def test_each_client_gets_a_full_path_in_its_own_form(tmp_path: Path) -> None:
@@ -45,62 +40,72 @@ def test_each_client_gets_a_full_path_in_its_own_form(tmp_path: Path) -> None:
     for client, servers in zip(
         clients_of(tmp_path), ("mcpServers", "mcpServers", "servers"), strict=True
     ):
-        apply(plan_entry(client, "webots", line).change)
+        apply(plan_entry(client, "webots", line)[0])
         entry = json.loads(client.file.read_text())[servers]["webots"]
         assert Path(entry["command"]).is_absolute()
         assert Path(entry["command"]).is_file()
         assert entry["args"][-3:] == ["serve", "--data-dir", str(tmp_path / "mcp_data")]
-        assert not plan_entry(client, "webots", line).change.is_needed
+        assert not plan_entry(client, "webots", line)[0].is_needed
 
 
 @pytest.mark.parametrize("held", ["", " \n", "\ufeff{}"])
 def test_an_empty_file_is_taken_for_an_empty_object(client: Client, held: str) -> None:
-    after = plan(client, held).change.after.decode()
+    after = plan(client, held)[0].after.decode()
     assert json.loads(after.removeprefix("\ufeff"))["mcpServers"]["webots"]["command"] == LINE[0]
     assert after.startswith("\ufeff") == held.startswith("\ufeff")
 
 
-@pytest.mark.parametrize("command", ["webots-mcp", "/gone/webots-mcp", r"C:\gone\webots-mcp.exe"])
+@pytest.mark.parametrize(
+    ("command", "options", "kept"),
+    [
+        ("webots-mcp", ["--read-only"], LINE[1:]),
+        ("/gone/webots-mcp", ["--read-only"], LINE[1:]),
+        (r"C:\gone\webots-mcp.exe", ["--read-only"], LINE[1:]),
+        ("webots-mcp", ["--data-dir", "/mine"], LINE[1:4]),
+    ],
+)
 def test_an_entry_that_cannot_be_started_is_mended_and_keeps_its_options(
-    client: Client, command: str
+    client: Client, command: str, options: list[str], kept: list[str]
 ) -> None:
-    entry = {"command": command, "args": ["serve", "--read-only"], "env": {"A": "b"}}
-    assert entry_after(client, entry) == {
-        "command": LINE[0], "args": [*LINE[1:], "--read-only"], "env": {"A": "b"},
+    entry = {"command": command, "args": ["serve", *options], "env": {"A": "b"}}
+    change, _ = plan(client, {"mcpServers": {"webots": entry}})
+    assert json.loads(change.after)["mcpServers"]["webots"] == {
+        "command": LINE[0], "args": [*kept, *options], "env": {"A": "b"},
     }  # fmt: skip
 
 
-def test_its_own_data_folder_is_among_them(client: Client) -> None:
-    entry = {"command": "webots-mcp", "args": ["serve", "--data-dir", "/mine"]}
-    assert entry_after(client, entry)["args"] == [*LINE[1:4], "--data-dir", "/mine"]
+@pytest.mark.parametrize(
+    ("name", "arguments", "said"),
+    [
+        ("webots", ["-m", "webots_mcp", "serve", "--read-only"], "kept: .*--read-only"),
+        ("mine", LINE[1:], "by the name 'mine'"),
+    ],
+)
+def test_a_server_that_is_there_and_can_be_started_is_left_as_it_is_and_said(
+    client: Client, name: str, arguments: list[str], said: str
+) -> None:
+    change, note = plan(client, {"mcpServers": {name: {"command": LINE[0], "args": arguments}}})
+    assert not change.is_needed
+    assert re.search(said, note or "")
 
 
-def test_an_entry_that_can_be_started_is_kept_and_said(client: Client) -> None:
-    args = ["-m", "webots_mcp", "serve", "--read-only"]
-    held = {"mcpServers": {"webots": {"command": sys.executable, "args": args}}}
-    entry = plan(client, held)
-    assert not entry.change.is_needed
-    assert "kept" in (entry.note or "")
-    assert "--read-only" in (entry.note or "")
-
-
-def test_a_server_of_another_kind_is_not_replaced(client: Client) -> None:
-    held = {"mcpServers": {"webots": {"command": "npx", "args": ["webots"]}}}
-    with pytest.raises(InvalidInputError, match="--name"):
-        plan(client, held)
-    assert json.loads(client.file.read_text()) == held
-
-
-@pytest.mark.parametrize("held", ['{"mcpServers": {', '{"mcpServers": []}', "[]"])
-def test_a_file_that_is_not_understood_is_refused_by_name(client: Client, held: str) -> None:
-    with pytest.raises(InvalidInputError, match=r"\.mcp\.json is left as it is"):
-        plan(client, held)
-
-
-def test_a_file_in_another_encoding_is_refused(client: Client) -> None:
-    client.file.write_bytes('{"a": "ü"}'.encode("latin-1"))
-    with pytest.raises(InvalidInputError, match="left as it is"):
+@pytest.mark.parametrize(
+    ("held", "why"),
+    [
+        (b'{"mcpServers": {"webots": {"command": "npx", "args": ["webots"]}}}', "--name"),
+        (b'{"mcpServers": {', "left as it is"),
+        (b'{"mcpServers": []}', "left as it is"),
+        (b"[]", "left as it is"),
+        ('{"a": "ü"}'.encode("latin-1"), "left as it is"),
+    ],
+)
+def test_what_is_not_understood_or_not_ours_is_refused_by_name(
+    client: Client, held: bytes, why: str
+) -> None:
+    client.file.write_bytes(held)
+    with pytest.raises(InvalidInputError, match=rf"\.mcp\.json .*{why}"):
         plan_entry(client, "webots", LINE)
+    assert client.file.read_bytes() == held
 
 
 def test_a_symbolic_link_is_followed_and_stays(client: Client, tmp_path: Path) -> None:
@@ -109,7 +114,7 @@ def test_a_symbolic_link_is_followed_and_stays(client: Client, tmp_path: Path) -
     real.write_text('{"a": 1}')
     real.chmod(0o640)
     client.file.symlink_to(real)
-    apply(plan_entry(client, "webots", LINE).change)
+    apply(plan_entry(client, "webots", LINE)[0])
     assert client.file.is_symlink()
     assert json.loads(real.read_text())["mcpServers"]
     assert real.stat().st_mode & 0o777 == 0o640
@@ -123,14 +128,8 @@ def test_a_folder_that_links_to_nothing_makes_none_elsewhere(tmp_path: Path) -> 
         plan_entry(cursor, "webots", LINE)
 
 
-def test_the_same_server_by_another_name_is_not_told_twice(client: Client) -> None:
-    entry = plan(client, {"mcpServers": {"mine": {"command": LINE[0], "args": LINE[1:]}}})
-    assert not entry.change.is_needed
-    assert "'mine'" in (entry.note or "")
-
-
 def test_a_file_that_changed_meanwhile_is_not_overwritten(client: Client) -> None:
-    change = plan(client, {}).change
+    change = plan(client, {})[0]
     client.file.write_text('{"new": 1}')
     with pytest.raises(CommandRefusedError, match="changed meanwhile"):
         apply(change)

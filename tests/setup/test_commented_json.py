@@ -32,9 +32,9 @@ def test_every_other_value_is_kept_in_its_order(
     after = CommentedJSON(json.dumps(held, indent=indent)).with_member(("mcpServers", "w"), ENTRY) \
         if isinstance(held.get("mcpServers", {}), dict) else None  # fmt: skip
     if after is not None:
-        wanted = held | {"mcpServers": {**(held.get("mcpServers") or {}), "w": ENTRY}}
-        assert json.loads(after) == wanted
-        assert list(json.loads(after)) == list(wanted)
+        found = json.loads(after)
+        assert found == held | {"mcpServers": {**(held.get("mcpServers") or {}), "w": ENTRY}}
+        assert [name for name in found if name in held] == list(held)
 
 
 COMMENTED = """// mine
@@ -51,8 +51,8 @@ COMMENTED = """// mine
 def test_comments_trailing_commas_and_indentation_stay() -> None:
     after = CommentedJSON(COMMENTED).with_member(("servers", "webots"), {"command": "w"})
     assert after == COMMENTED.replace(
-        "// not a comment: //y\n",
-        '// not a comment: //y\n        "webots": {\n          "command": "w"\n        },\n',
+        '"servers": {\n',
+        '"servers": {\n        "webots": {\n          "command": "w"\n        },\n',
     )
     assert CommentedJSON(after).value["servers"]["webots"] == {"command": "w"}
 
@@ -74,7 +74,7 @@ def test_each_comment_and_value_is_still_there(text: str) -> None:
 
 def test_lines_end_as_those_before() -> None:
     after = CommentedJSON('{\r\n  "a": 1\r\n}\r\n').with_member(("b",), {"c": 2})
-    assert after == '{\r\n  "a": 1,\r\n  "b": {\r\n    "c": 2\r\n  }\r\n}\r\n'
+    assert after == '{\r\n  "b": {\r\n    "c": 2\r\n  },\r\n  "a": 1\r\n}\r\n'
 
 
 @pytest.mark.parametrize(

@@ -55,31 +55,26 @@ def prefer(home: Path, version: str, command: str) -> None:
     )
 
 
-def test_without_anything_it_is_the_default_of_the_system(controller: Path) -> None:
-    assert chosen(controller, "linux").command == ("python3",)
-    assert chosen(controller, "darwin").command == ("python3",)
-    assert chosen(controller, "win32").command == ("python",)
-
-
-def test_the_preferences_go_before_it_the_newest_first(controller: Path, home: Path) -> None:
-    prefer(home, "R2023b", "/old/python")
-    prefer(home, "R2025a", "/new/python")
-    found = chosen(controller, "linux")
-    assert found.command == ("/new/python",)
-    assert found.by == "the preferences of Webots R2025a"
-
-
-def test_those_of_the_installed_version_go_before_newer_ones(
+def test_each_place_that_names_a_python_goes_before_the_one_before(
     controller: Path, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    assert [chosen(controller, system).command for system in ("linux", "darwin", "win32")] == [
+        ("python3",), ("python3",), ("python",)
+    ]  # fmt: skip
     prefer(home, "R2023b", "/old/python")
     prefer(home, "R2025a", "/new/python")
+    assert chosen(controller, "linux") == (("/new/python",), "the preferences of Webots R2025a")
     installed = tmp_path / "webots"
     (installed / "resources").mkdir(parents=True)
     (installed / "resources" / "version.txt").write_text("R2023b\n")
     (installed / "webots").write_text("#!/bin/sh\n")
     monkeypatch.setenv("WEBOTS_HOME", str(installed))
     assert chosen(controller, "linux").command == ("/old/python",)
+    runtime(controller, '"/my venv/bin/python"')
+    assert chosen(controller, "linux").command == ("/my venv/bin/python",)
+    controller.write_text("#!/usr/bin/env python3.12\n")
+    assert chosen(controller, "linux").command == ("/usr/bin/env", "python3.12")
+    assert chosen(controller, "win32").command == ("/my venv/bin/python",)
 
 
 def test_macos_keeps_them_in_a_property_list(controller: Path, home: Path) -> None:
@@ -90,20 +85,6 @@ def test_macos_keeps_them_in_a_property_list(controller: Path, home: Path) -> No
     assert chosen(controller, "darwin").command == ("/opt/python",)
     file.write_bytes(b"damaged")
     assert chosen(controller, "darwin").command == ("python3",)
-
-
-def test_runtime_ini_goes_before_the_preferences(controller: Path, home: Path) -> None:
-    prefer(home, "R2025a", "/new/python")
-    runtime(controller, '"/my venv/bin/python"')
-    assert chosen(controller, "linux").command == ("/my venv/bin/python",)
-    assert chosen(controller, "win32").command == ("/my venv/bin/python",)
-
-
-def test_the_first_line_goes_before_both_but_on_windows(controller: Path) -> None:
-    runtime(controller, "/ini/python")
-    controller.write_text("#!/usr/bin/env python3.12\n")
-    assert chosen(controller, "linux").command == ("/usr/bin/env", "python3.12")
-    assert chosen(controller, "win32").command == ("/ini/python",)
 
 
 def test_a_python_with_the_bridge_says_its_version(controller: Path) -> None:
@@ -136,36 +117,29 @@ def test_a_controllers_own_file_that_hides_the_package_is_seen(controller: Path)
     assert look_into(controller).error == "RuntimeError: mine"
 
 
-def program(tmp_path: Path, text: str) -> str:
+ENDLESS = "exec sleep 600"
+OLD = '{"executable": "/p", "python": "3.8.1", "error": "SyntaxError: x", "pip": true}'
+
+
+@pytest.mark.parametrize(
+    ("program", "error", "fix"),
+    [
+        ("echo broken >&2; exit 3", "exit code 3, broken", "start it in a terminal"),
+        (ENDLESS, "within 0.2 s", "start it in a terminal"),
+        (f"echo '{OLD}'", "SyntaxError: x", "3.8.1 is too old"),
+        (None, "no program '/no/such/python'", "my röbot/runtime.ini"),
+    ],
+)
+def test_what_is_no_python_that_works_is_named_with_what_mends_it(
+    controller: Path, tmp_path: Path, program: str | None, error: str, fix: str
+) -> None:
     file = tmp_path / "fake-python"
-    file.write_text(f"#!/bin/sh\n{text}\n")
+    file.write_text(f"#!/bin/sh\n{program}\n")
     file.chmod(0o755)
-    return str(file)
-
-
-def test_a_program_that_fails_is_told_with_its_words(controller: Path, tmp_path: Path) -> None:
-    runtime(controller, program(tmp_path, "echo broken >&2; exit 3"))
-    found = look_into(controller)
-    assert "exit code 3, broken" in (found.error or "")
-    assert found.fix
-
-
-def test_one_that_never_ends_is_given_up(controller: Path, tmp_path: Path) -> None:
-    runtime(controller, program(tmp_path, "exec sleep 600"))
-    assert "within 0.2 s" in (look_into(controller, timeout_s=0.2).error or "")
-
-
-def test_one_that_is_missing_is_named_with_where_it_stands(controller: Path) -> None:
-    runtime(controller, "/no/such/python")
-    found = look_into(controller)
-    assert "'/no/such/python'" in (found.error or "")
-    assert "my röbot/runtime.ini" in (found.fix or "")
-
-
-def test_an_old_python_is_not_told_to_install(controller: Path, tmp_path: Path) -> None:
-    said = '{"executable": "/p", "python": "3.8.1", "error": "SyntaxError: x", "pip": true}'
-    runtime(controller, program(tmp_path, f"echo '{said}'"))
-    assert "3.8.1 is too old" in (look_into(controller).fix or "")
+    runtime(controller, str(file) if program else "/no/such/python")
+    found = look_into(controller, timeout_s=0.2 if program == ENDLESS else 60)
+    assert error in (found.error or "")
+    assert fix in (found.fix or "")
 
 
 def test_the_environment_of_this_shell_does_not_count(

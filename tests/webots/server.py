@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import socket
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from types import TracebackType
 from typing import Any, Final, Literal
@@ -20,7 +20,14 @@ from websockets.sync.server import Server, ServerConnection, serve
 
 Manner = Literal["well", "busy", "cut off", "in other words"]
 
+_PART_BYTES: Final = 512 << 10
 _MODES: Final = {"pause": "pause", "real-time": "real-time", "fast": "fast", "step": "pause"}
+
+
+def _in_parts(text: str) -> Iterator[str]:
+    """As Qt, which Webots is built with, cuts messages."""
+    for begin in range(0, len(text), _PART_BYTES):
+        yield text[begin : begin + _PART_BYTES]
 
 
 class WebotsServer:
@@ -127,7 +134,7 @@ class WebotsServer:
             self._window(client, text.removeprefix("robot:"))
         elif self._streams:
             if self._announce_bytes:
-                client.send("model:" + "x" * self._announce_bytes)
+                client.send(_in_parts("model:" + "x" * self._announce_bytes))
             if self._manner == "cut off":
                 client.socket.sendall(b"\x81\x7e\x10\x00paused by")  # of 4,096 bytes
                 client.socket.close()

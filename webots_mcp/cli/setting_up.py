@@ -310,9 +310,8 @@ def _told(client: Client, name: str, line: list[str], writing: Writing) -> dict[
 
     named = {"client": client.name}
     try:
-        entry = plan_entry(client, name, line)
-        note = {"note": entry.note} if entry.note else {}
-        return named | writing.apply(entry.change) | note
+        change, note = plan_entry(client, name, line)
+        return named | writing.apply(change) | ({"note": note} if note else {})
     except (WebotsMCPError, OSError) as error:
         return {**named, "file": str(client.file), "outcome": "refused", "note": str(error)}
 

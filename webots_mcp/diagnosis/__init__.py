@@ -1,8 +1,8 @@
 """Checks of each link between a controller and its client, and how they are run.
 
-A check is one function of what is `Examined` that returns a `Finding`, declared by `@check(NAME)`
-in one of the modules of this package. Its finding is explained in docs/troubleshooting.md, under a
-heading of its name. A diagnosis changes nothing.
+A check is one function of what is `Examined` that yields each `Finding`, declared by `@check(NAME)`
+in one of the modules of this package. What it finds is explained in docs/troubleshooting.md, under
+a heading of its name. A diagnosis changes nothing.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from __future__ import annotations
 import sqlite3
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 from webots_mcp.connection import is_damage, text_of
 from webots_mcp.contract import PROJECT_DATA_FOLDER, full_path
@@ -45,6 +45,26 @@ class Finding:
     verdict: Verdict
     seen: str
     fix: str | None = None
+
+
+def ok(seen: str) -> Finding:
+    """Nothing is to be mended."""
+    return Finding("ok", seen)
+
+
+def warning(seen: str, fix: str) -> Finding:
+    """It may be as it should be."""
+    return Finding("warning", seen, fix)
+
+
+def wrong(seen: str, fix: str) -> Finding:
+    """It has to be mended."""
+    return Finding("wrong", seen, fix)
+
+
+def unclear(seen: str) -> Finding:
+    """It could not be looked at, and why."""
+    return Finding("not checked", seen)
 
 
 @dataclass(frozen=True)
@@ -105,12 +125,14 @@ class Check:
     Attributes:
         name: In one word or a few; the heading of its part of the page.
         look: Looks at it.
+        well: What is seen where it finds nothing.
         needs_recording: It is not looked at where there is no recording that can be read.
         starts_process: It takes seconds: a server does not ask it of itself.
     """
 
     name: str
-    look: Callable[[Examined], Finding]
+    look: Callable[[Examined], Iterator[Finding]]
+    well: str = ""
     needs_recording: bool = False
     starts_process: bool = False
 
@@ -132,11 +154,9 @@ class Checked(NamedTuple):
         return self.finding.verdict == "ok"
 
 
-def check(
-    name: str, *, needs_recording: bool = False, starts_process: bool = False
-) -> Callable[[Callable[[Examined], Finding]], Check]:
-    """Declare a function as a check; a `Check` has what is to be given."""
-    return lambda look: Check(name, look, needs_recording, starts_process)
+def check(name: str, **options: Any) -> Callable[[Callable[[Examined], Iterator[Finding]]], Check]:
+    """Declare a function as a check; a `Check` has the options."""
+    return lambda look: Check(name, look, **options)
 
 
 def all_checks(*, with_server: bool = False) -> list[Check]:
@@ -188,15 +208,15 @@ def diagnose(subject: Examined, checks: Sequence[Check] | None = None) -> list[C
 def _look(check: Check, subject: Examined) -> Finding:
     """Run one check; one that fails reports that, and the others still run."""
     if check.needs_recording and subject.connection is None:
-        return Finding("not checked", "there is no recording that can be read")
+        return unclear("there is no recording that can be read")
     try:
-        return check.look(subject)
+        return worst(list(check.look(subject)) or [ok(check.well)])
     except ModuleNotFoundError as error:
-        return Finding("not checked", f"the Python package {error.name!r} is missing")
+        return unclear(f"the Python package {error.name!r} is missing")
     except Exception as error:  # noqa: BLE001  (it is reported)
         if is_damage(error):
-            return Finding("wrong", f"the database is damaged: {text_of(error)}", _RECOVER)
-        return Finding("not checked", f"{type(error).__name__}: {error}")
+            return wrong(f"the database is damaged: {text_of(error)}", _RECOVER)
+        return unclear(f"{type(error).__name__}: {error}")
 
 
 def subject_of(recording: Recording, chosen_by: str) -> Examined:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from webots_mcp.contract import UNSEEN, host_name
-from webots_mcp.diagnosis import Examined, Finding, check, last_seen_s, worst
+from webots_mcp.diagnosis import Examined, Finding, check, last_seen_s, ok, unclear, warning, wrong
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.pauses import PAUSED, SEEN_PAUSED, SEEN_RUNNING
 from webots_mcp.setup.client_entries import (
@@ -33,14 +33,13 @@ from webots_mcp.setup.client_entries import (
     words_of,
 )
 from webots_mcp.store.recording import View
-from webots_mcp.store.robots import SILENT, Session, companions
-from webots_mcp.webots import Installation, find_webots, installations
+from webots_mcp.store.sessions import Session, companions
+from webots_mcp.store.status import SILENT
+from webots_mcp.webots import find_webots, installations, shown_of
 from webots_mcp.webots.orders import address_of
 
 if TYPE_CHECKING:
     from typing import TextIO
-
-    import psutil
 
     from webots_mcp.webots import Instance
 
@@ -54,50 +53,26 @@ _ENDED_BADLY: Final = ("crashed", "reload")
 _SEE_PAGE: Final = "see docs/troubleshooting.md#simulation"
 _PRESS_PLAY: Final = "press play in Webots"
 _RELOAD: Final = "end or mend that controller, then reload the world (Ctrl+Shift+R in Webots)"
+_PLACES: Final = ("--data-dir", "--database")
+_INIT: Final = "run 'webots-mcp init' in the project"
 _OBEYS: Final = "{}; or webots_simulation_control('{}'): this Webots obeys it by its WebSocket"
 
 
-@check("Simulation", needs_recording=True)
-def simulation(subject: Examined) -> Finding:
-    """Whether time moves, and why it does not."""
-    concerned = subject.live or _last_seen(subject.views)
-    if not concerned:
-        return Finding("ok", "no robot has been recorded yet")
-    return worst([_judged(subject, view) for view in _once_each(concerned)])
+@check("Simulation", needs_recording=True, well="no robot has been recorded yet")
+def simulation(subject: Examined) -> Iterator[Finding]:
+    """Whether time moves, and why it does not.
 
-
-def _once_each(views: list[View]) -> list[View]:
-    """Of the robots that stand silent in the same simulation one: it is watched for them all."""
+    Of the robots that stand silent in the same simulation one is watched for them all.
+    """
     watched = dict[str, View]()
-    others = list[View]()
-    for view in views:
+    newest = max(subject.views, key=last_seen_s, default=None)
+    for view in subject.live or ([newest] if newest else []):
         if view.session is not None and view.robot.live and _is_unclear(view):
             watched.setdefault(view.session.instance, view)
         else:
-            others.append(view)
-    return [*others, *list(watched.values())[:_MOST_WATCHED]]
-
-
-def _last_seen(views: list[View]) -> list[View]:
-    newest = max(views, key=last_seen_s, default=None)
-    return [newest] if newest else []
-
-
-def _judged(subject: Examined, view: View) -> Finding:
-    name, status = view.robot.name, view.status
-    seen = f"{name}: {status.text}{f' ({status.why})' if status.why else ''}"
-    session = view.session
-    if session is None or not view.robot.live:
-        return _ended(view, seen)
-    if status.is_moving:
-        return Finding("warning" if status.why else "ok", seen)
-    if status.text == PAUSED:
-        return Finding("warning", seen, f"webots-mcp resume --robot {name}")
-    if (status.why or "").startswith(SEEN_PAUSED):
-        return Finding("warning", seen, "webots_simulation_control('resume'), or press play")
-    if not _is_unclear(view):
-        return Finding("wrong", seen, _SEE_PAGE)
-    return _narrowed(subject, view, session)
+            yield _judged(view)
+    for view in list(watched.values())[:_MOST_WATCHED]:
+        yield _narrowed(subject, view)
 
 
 def _is_unclear(view: View) -> bool:
@@ -105,41 +80,54 @@ def _is_unclear(view: View) -> bool:
     return (view.status.why or "").startswith((SILENT, SEEN_RUNNING))
 
 
-def _ended(view: View, seen: str) -> Finding:
-    if view.status.why == UNSEEN:
-        return Finding("warning", seen, _SEE_PAGE)
-    if view.session is None or (view.session.end_reason or "crashed") not in _ENDED_BADLY:
-        return Finding("ok", seen)
-    fix = "see 'webots-mcp logs --level error', mend the controller and start it again"
-    return Finding("wrong", seen, fix)
+def _judged(view: View) -> Finding:
+    name, status = view.robot.name, view.status
+    seen = f"{name}: {status.text}{f' ({status.why})' if status.why else ''}"
+    if view.session is None or not view.robot.live:
+        if status.why == UNSEEN:
+            return warning(seen, _SEE_PAGE)
+        if view.session and (view.session.end_reason or "crashed") in _ENDED_BADLY:
+            return wrong(seen, "see 'webots-mcp logs --level error', mend the controller and start "
+                         "it again")  # fmt: skip
+        return ok(seen)
+    if status.is_moving:
+        return Finding("warning" if status.why else "ok", seen)
+    if status.text == PAUSED:
+        return warning(seen, f"webots-mcp resume --robot {name}")
+    if (status.why or "").startswith(SEEN_PAUSED):
+        return warning(seen, "webots_simulation_control('resume'), or press play")
+    return wrong(seen, _SEE_PAGE)
 
 
-def _narrowed(subject: Examined, view: View, session: Session) -> Finding:
+def _narrowed(subject: Examined, view: View) -> Finding:
     """Of the reasons that look alike from inside, the one that shows from outside."""
-    head = f"{view.robot.name}: {view.status.text}"
+    session = view.session
+    assert session is not None
+    head, why = f"{view.robot.name}: {view.status.text}", view.status.why or ""
     webots = _webots_of(subject, session)
+    reload, play = (
+        _also_by_websocket(fix, order, webots)
+        for fix, order in ((_RELOAD, "reload"), (_PRESS_PLAY, "resume"))
+    )
     busy = _busy_controllers(view, session, webots)
     if busy is not None and session.pid in busy:
         seen = f"{head}; its own process computes: its loop does not come back to step()"
-        return Finding("wrong", seen, "look for a long computation or an endless loop in it")
+        return wrong(seen, "look for a long computation or an endless loop in it")
     if busy:
         others = ", ".join(f"{what} (process {pid})" for pid, what in busy.items())
-        seen = f"{head}; another controller computes and holds the step up: {others}"
-        return Finding("wrong", seen, _also_by_websocket(_RELOAD, "reload", webots))
-    if missing := _missing_externs(subject, view, webots):
+        return wrong(f"{head}; another controller computes and holds the step up: {others}", reload)
+    if missing := _missing_externs(view, session, webots):
         fix = "start it: 'webots-controller --robot-name=NAME FILE', or press play if it is paused"
-        return Finding("wrong", f"{head}; {missing}", fix)
-    press_play = _also_by_websocket(_PRESS_PLAY, "resume", webots)
-    if (view.status.why or "").startswith(SEEN_RUNNING):
-        seen = f"{head} ({view.status.why})"
-        return Finding("wrong", seen, _also_by_websocket(_RELOAD, "reload", webots))
+        return wrong(f"{head}; {missing}", fix)
+    if why.startswith(SEEN_RUNNING):
+        return wrong(f"{head} ({why})", reload)
     if busy is None:
-        return Finding("wrong", f"{head} ({view.status.why})", press_play)
+        return wrong(f"{head} ({why})", play)
     seen = (
         f"{head}; no controller computes and none is known to be missing: most likely it was "
         "paused by hand in Webots"
     )
-    return Finding("wrong", seen, press_play)
+    return wrong(seen, play)
 
 
 def _also_by_websocket(fix: str, order: str, webots: Instance | None) -> str:
@@ -157,193 +145,140 @@ def _webots_of(subject: Examined, session: Session) -> Instance | None:
 def _busy_controllers(
     view: View, session: Session, webots: Instance | None
 ) -> dict[int, str] | None:
-    """Controllers of the same simulation that compute now; None where that cannot be looked at."""
+    """Controllers of the same simulation that compute now; None where that cannot be looked at.
+
+    One that waits for its next step needs no processor. One that computes wants to continue at each
+    look, also where a busy machine gives it little; only Linux shows that.
+    """
     if session.host != host_name():
         return None
-    import psutil
-
-    controllers = list(_controllers(view, session, webots))
-    before_s = {process: _processor_s(process) for process in controllers}
-    waited = set[psutil.Process]()
+    pids = {session.pid}
+    pids |= {each.pid for each in companions(view.connection, session, view.now_s)}
+    if webots is not None:  # the processes that it has started
+        pids |= {each.pid for each in shown_of(webots.pid, lambda p: p.children(True), [])}
+    before_s = {pid: _processor_s(pid) for pid in sorted(pids)}
+    waited = set[int]()
     for _ in range(_LOOKS):
         time.sleep(_WATCHED_S / _LOOKS)
-        waited |= {process for process in controllers if not _wants_processor(process)}
+        waited |= {pid for pid in pids if not _wants_processor(pid)}
     return {
-        process.pid: _named(process)
-        for process in controllers
-        if process not in waited or _processor_s(process) - before_s[process] > _BUSY * _WATCHED_S
+        pid: _program_of(pid)
+        for pid, used_s in before_s.items()
+        if pid not in waited or _processor_s(pid) - used_s > _BUSY * _WATCHED_S
     }
 
 
-def _wants_processor(process: psutil.Process) -> bool:
-    """Whether it would continue if a processor were free; only Linux shows it."""
-    import psutil
-
-    try:
-        return sys.platform == "linux" and process.status() == psutil.STATUS_RUNNING
-    except psutil.Error:
-        return False
+def _wants_processor(pid: int) -> bool:
+    is_linux = sys.platform == "linux"
+    return is_linux and shown_of(pid, lambda process: process.status(), "") == "running"
 
 
-def _controllers(view: View, session: Session, webots: Instance | None) -> Iterator[psutil.Process]:
-    """The processes that record in this simulation, and those that its Webots has started."""
-    import psutil
-
-    pids = {session.pid}
-    pids |= {each.pid for each in companions(view.connection, session, view.now_s)}
-    if webots is not None:
-        with suppress(psutil.Error):  # another user's: what records is known nevertheless
-            pids |= {child.pid for child in psutil.Process(webots.pid).children(recursive=True)}
-    for pid in sorted(pids):
-        try:
-            yield psutil.Process(pid)
-        except psutil.Error:  # noqa: PERF203  (it has ended meanwhile)
-            continue
+def _processor_s(pid: int) -> float:
+    return shown_of(pid, lambda process: sum(process.cpu_times()[:2]), 0.0)
 
 
-def _processor_s(process: psutil.Process) -> float:
-    import psutil
-
-    try:
-        used = process.cpu_times()
-    except psutil.Error:
-        return 0.0
-    return used.user + used.system
-
-
-def _named(process: psutil.Process) -> str:
+def _program_of(pid: int) -> str:
     """What it runs: the file of a Python controller, else the program."""
-    import psutil
-
-    try:
-        words = process.cmdline()
-        file = next((word for word in words[1:] if word.endswith(".py")), None)
-        return Path(file).name if file else process.name()
-    except psutil.Error:
-        return "a controller"
+    words = shown_of(pid, lambda process: process.cmdline(), list[str]())
+    file = next((word for word in words[1:] if word.endswith(".py")), None)
+    return Path(file).name if file else shown_of(pid, lambda p: p.name(), "a controller")
 
 
-def _missing_externs(subject: Examined, view: View, webots: Instance | None) -> str | None:
+def _missing_externs(view: View, session: Session, webots: Instance | None) -> str | None:
     """That the world has more extern robots than record; by its text, so only perhaps."""
-    world = (view.run and view.run.world) or (webots and webots.world)
-    count = _externs_in(Path(world)) if world else 0
-    session = view.session
-    assert session is not None
+    named = (view.run and view.run.world) or (webots and webots.world)
+    world = Path(named) if named else None
+    count = 0
+    with suppress(OSError):
+        if world is not None and world.stat().st_size <= _LARGEST_WORLD_BYTES:
+            count = len(_EXTERN.findall(world.read_text("utf-8", "replace")))
     alive = [session, *companions(view.connection, session, view.now_s)]
     here = sum(each.extern for each in alive)
-    if count <= here:
+    if world is None or count <= here:
         return None
     return (
-        f"{count} robots of {Path(str(world)).name} have the controller <extern> and {here} record "
+        f"{count} robots of {world.name} have the controller <extern> and {here} record "
         "here: one that has not been started stops the whole simulation"
     )
 
 
-def _externs_in(world: Path) -> int:
-    try:
-        if world.stat().st_size > _LARGEST_WORLD_BYTES:
-            return 0
-        return len(_EXTERN.findall(world.read_text("utf-8", "replace")))
-    except OSError:
-        return 0
-
-
 @check("Webots")
-def installed(_: Examined) -> Finding:
+def installed(_: Examined) -> Iterator[Finding]:
     """Which Webots there are."""
-    found = installations()
-    if found:
-        return worst([_complete(each) for each in found])
     try:
         find_webots()
     except CommandRefusedError as error:
         seen, fix = str(error).rsplit(": ", 1)
-        return Finding("warning", seen, fix)
-    return Finding("not checked", "it was installed while this looked")
+        yield warning(seen, fix)
+    for each in installations():
+        seen = f"{each.version or 'a Webots without a version'} at {each.home or each.program}"
+        seen = f"{seen} (by {each.found_by})"
+        parts = {"webots-controller": each.launcher, "lib/controller/python": each.python_api}
+        missing = [name for name, path in parts.items() if path is None]
+        if each.home is None or not missing:
+            yield ok(seen)
+        else:
+            fix = "install Webots again, or set WEBOTS_HOME to the folder of a whole one"
+            yield warning(f"{seen} lacks {' and '.join(missing)}", fix)
 
 
-def _complete(webots: Installation) -> Finding:
-    where = webots.home or webots.program
-    seen = f"{webots.version or 'a Webots without a version'} at {where} (by {webots.found_by})"
-    missing = [
-        name
-        for name, path in (
-            ("webots-controller", webots.launcher),
-            ("lib/controller/python", webots.python_api),
-        )
-        if path is None
-    ]
-    if webots.home is None or not missing:
-        return Finding("ok", seen)
-    fix = "install Webots again, or set WEBOTS_HOME to the folder of a whole one"
-    return Finding("warning", f"{seen} lacks {' and '.join(missing)}", fix)
-
-
-@check("Running Webots")
-def running(subject: Examined) -> Finding:
+@check("Running Webots", well="no Webots runs on this machine")
+def running(subject: Examined) -> Iterator[Finding]:
     """Which of them run, and whether they can be steered from outside."""
-    if not subject.running_webots:
-        return Finding("ok", "no Webots runs on this machine")
-    return worst([_reachable(each) for each in subject.running_webots])
-
-
-def _reachable(webots: Instance) -> Finding:
-    world = f", {webots.world.name}" if webots.world else ""
-    seen = f"port {webots.port} (process {webots.pid}{world}, mode {webots.mode or 'of its own'})"
-    if not webots.is_listening:
-        return Finding(
-            "warning",
-            f"{seen} was not seen to listen there",
-            "wait until it has started; the system does not show another user's processes",
-        )
-    obeys = "obeys" if webots.streams else "was started without --stream and does not obey"
-    return Finding("ok", f"{seen} {obeys} orders from outside")
-
-
-_PLACES: Final = ("--data-dir", "--database")
-_INIT: Final = "run 'webots-mcp init' in the project"
+    for each in subject.running_webots:
+        world = f", {each.world.name}" if each.world else ""
+        seen = f"port {each.port} (process {each.pid}{world}, mode {each.mode or 'of its own'})"
+        if each.is_listening:
+            obeys = "obeys" if each.streams else "was started without --stream and does not obey"
+            yield ok(f"{seen} {obeys} orders from outside")
+        else:
+            yield warning(
+                f"{seen} was not seen to listen there",
+                "wait until it has started; the system does not show another user's processes",
+            )
 
 
 @check("Clients")
-def clients(subject: Examined) -> Finding:
+def clients(subject: Examined) -> Iterator[Finding]:
     """Each file that is there, and whether its server can start on this recording."""
     known = [*clients_of(subject.project), claude_desktop()]
-    there = [client for client in known if client.file.exists()]
-    findings = [found for client in there for found in _look(subject, client)]
-    if findings:
-        return worst(findings)
-    names = ", ".join(client.name for client in known)
-    seen = f"no file of {names} for {subject.project} names webots-mcp"
-    return Finding("warning", seen, f"{_INIT}; other clients have files of their own")
+    findings = [each for client in known for each in _servers_of(subject, client)]
+    yield from findings
+    if not findings:
+        names = ", ".join(client.name for client in known)
+        seen = f"no file of {names} for {subject.project} names webots-mcp"
+        yield warning(seen, f"{_INIT}; other clients have files of their own")
 
 
-def _look(subject: Examined, client: Client) -> list[Finding]:
+def _servers_of(subject: Examined, client: Client) -> Iterator[Finding]:
     """What a file says of our server: nothing where it names only others."""
+    if not client.file.exists():
+        return
     try:
         text = client.file.read_text("utf-8-sig")
         servers = CommentedJSON(text.strip() or "{}").value.get(client.servers)
     except (OSError, UnicodeDecodeError, InvalidInputError) as error:
         seen = f"{client.file} ({client.name}) cannot be read: {error}"
-        return [Finding("wrong", seen, f"mend that file: {client.name} cannot read it either")]
+        yield wrong(seen, f"mend that file: {client.name} cannot read it either")
+        return
     entries = cast("dict[str, Any]", servers) if isinstance(servers, dict) else {}
-    return [
-        _entry(subject, f"{client.name}, server {name!r}", entry)
-        for name, entry in entries.items()
-        if is_ours(entry)
-    ]
+    for name, entry in entries.items():
+        if is_ours(entry):
+            yield _entry(subject, f"{client.name}, server {name!r}", entry)
 
 
 def _entry(subject: Examined, name: str, entry: dict[str, Any]) -> Finding:
     command, *arguments = words_of(entry)
     if shutil.which(command) is None:
-        return Finding("wrong", f"{name}: there is no program {command!r}", _INIT)
+        return wrong(f"{name}: there is no program {command!r}", _INIT)
     if (other := _other_place(subject, arguments)) is not None:
         seen = f"{name} serves {other}, which is not what is looked at here"
-        return Finding("warning", seen, "name the folder in which the controllers record")
+        return warning(seen, "name the folder in which the controllers record")
     if not can_be_started(entry):
-        seen = f"{name}: {command!r} is found by the PATH alone, which programs with windows lack"
-        return Finding("ok", seen)
-    return Finding("ok", f"{name} starts {command}")
+        return ok(
+            f"{name}: {command!r} is found by the PATH alone, which programs with windows lack"
+        )
+    return ok(f"{name} starts {command}")
 
 
 def _other_place(subject: Examined, arguments: list[str]) -> str | None:
@@ -366,10 +301,11 @@ _FIX: Final = (
 
 
 @check("Server", starts_process=True)
-def server(subject: Examined) -> Finding:
+def server(subject: Examined) -> Iterator[Finding]:
     """Whether a server starts, names its tools and answers."""
     if subject.file is None:
-        return Finding("not checked", "a recording in memory belongs to one process")
+        yield unclear("a recording in memory belongs to one process")
+        return
     import anyio
 
     line = [*subject.server, "--database", str(subject.file)]
@@ -378,14 +314,17 @@ def server(subject: Examined) -> Finding:
         try:
             tools, refused = anyio.run(_converse, line, complaints)
         except Exception as error:  # noqa: BLE001  (it is reported)
-            seen = f"'{' '.join(line)}' did not answer: {_why(error)}{_last_line(complaints)}"
-            return Finding("wrong", seen, _FIX)
+            complaints.seek(0)
+            wrote = complaints.read().strip().splitlines()
+            last = f"; it wrote: {wrote[-1][:_SHOWN_CHARACTERS]}" if wrote else ""
+            yield wrong(f"'{' '.join(line)}' did not answer: {_why(error)}{last}", _FIX)
+            return
     started = f"started over stdio, {tools} tools that only read"  # by --read-only
     if refused:
         seen = f"{started}, and answers: {refused[:_SHOWN_CHARACTERS]}"
-        return Finding("warning", seen, "mend the recording: see Database and Schema")
-    took_s = time.monotonic() - started_s
-    return Finding("ok", f"{started}, one answer, {took_s:.1f} s in all")
+        yield warning(seen, "mend the recording: see Database and Schema")
+    else:
+        yield ok(f"{started}, one answer, {time.monotonic() - started_s:.1f} s in all")
 
 
 async def _converse(line: list[str], complaints: TextIO) -> tuple[int, str]:
@@ -412,10 +351,3 @@ def _why(error: BaseException) -> str:
     if isinstance(error, TimeoutError):
         return f"nothing came within {_TIMEOUT_S:g} s"
     return f"{error or type(error).__name__}"[:_SHOWN_CHARACTERS]
-
-
-def _last_line(complaints: TextIO) -> str:
-    """What it wrote on stderr last."""
-    complaints.seek(0)
-    lines = complaints.read().strip().splitlines()
-    return f"; it wrote: {lines[-1][:_SHOWN_CHARACTERS]}" if lines else ""

@@ -130,8 +130,7 @@ print(json.dumps(said))
 """
 
 
-@dataclass(frozen=True)
-class Chosen:
+class Chosen(NamedTuple):
     """The command with which Webots starts a controller.
 
     Attributes:

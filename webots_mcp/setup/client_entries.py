@@ -9,9 +9,10 @@ import re
 import shutil
 import sys
 import sysconfig
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final, NamedTuple, NoReturn, cast
+from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.requirements import checkout, install_line, quoted
@@ -28,13 +29,6 @@ class Client(NamedTuple):
     name: str
     file: Path
     servers: str = "mcpServers"
-
-
-class ClientEntry(NamedTuple):
-    """What is to be done in a client's file, and what there is to know about it."""
-
-    change: FileChange
-    note: str | None = None
 
 
 def clients_of(project: Path) -> list[Client]:
@@ -81,8 +75,8 @@ def server_hindrance() -> str | None:
     )
 
 
-def plan_entry(client: Client, name: str, command: list[str]) -> ClientEntry:
-    """The change that makes a client know the server.
+def plan_entry(client: Client, name: str, command: list[str]) -> tuple[FileChange, str | None]:
+    """The change that makes a client know the server, and what there is to know about it.
 
     An entry of ours that can be started is left as it is, also where it differs: its options are
     the user's. One that cannot be started any more gets the command anew and keeps its options.
@@ -100,7 +94,7 @@ def plan_entry(client: Client, name: str, command: list[str]) -> ClientEntry:
         raise InvalidInputError(f"{client.file} is left as it is: {error}") from error
     bom = _BOM if before is not None and before.startswith(_BOM.encode()) else ""
     unchanged = before if before is not None and note else None
-    return ClientEntry(FileChange(client.file, before, unchanged or (bom + after).encode()), note)
+    return FileChange(client.file, before, unchanged or (bom + after).encode()), note
 
 
 def _with_entry(
@@ -109,12 +103,11 @@ def _with_entry(
     document = CommentedJSON(text)
     known = document.value.get(servers)
     there = cast("dict[str, Any]", known if isinstance(known, dict) else {})
-    path = (servers, name)
     if name not in there:
         for other, entry in there.items():
             if entry == wanted:
                 return text, f"it has this server by the name {other!r}"
-        return document.with_member(path, wanted), None
+        return document.with_member((servers, name), wanted), None
     if not is_ours(there[name]):
         raise InvalidInputError(
             f"its server {name!r} is not webots-mcp; choose another name with --name"
@@ -125,13 +118,12 @@ def _with_entry(
     if can_be_started(entry):
         kept = " ".join(words_of(entry))
         return text, f"it has an entry {name!r} of its own, which is kept: {kept}"
-    arguments = entry.get("args", [])
-    options = arguments[arguments.index("serve") + 1 :]
-    own = wanted["args"][: wanted["args"].index("serve") + 1]
-    mended = [*own, *(options if "--data-dir" in options or "--database" in options
-                      else [*wanted["args"][len(own):], *options])]  # fmt: skip
-    text = document.with_member((*path, "args"), mended)
-    return CommentedJSON(text).with_member((*path, "command"), wanted["command"]), None
+    arguments: list[str] = wanted["args"]
+    options = entry["args"][entry["args"].index("serve") + 1 :]
+    if "--data-dir" in options or "--database" in options:
+        arguments = arguments[: arguments.index("serve") + 1]
+    mended = {**entry, "command": wanted["command"], "args": [*arguments, *options]}
+    return document.with_member((servers, name), mended), None
 
 
 def is_ours(entry: Any) -> bool:
@@ -204,8 +196,7 @@ class CommentedJSON:
 
     def __init__(self, text: str) -> None:
         self.text = text
-        self._uncommented = _blanked(_COMMENT, text)
-        self._plain = _blanked(_TRAILING_COMMA, self._uncommented)
+        self._plain = _blanked(_TRAILING_COMMA, _blanked(_COMMENT, text))
         try:
             self.value: dict[str, Any] = json.loads(self._plain, object_pairs_hook=_unique)
         except json.JSONDecodeError as error:
@@ -218,26 +209,25 @@ class CommentedJSON:
             raise InvalidInputError("it holds no JSON object at its top, which begins with {")
 
     def with_member(self, path: tuple[str, ...], value: Any) -> str:
-        """The text with a member put in or replaced; objects on the way are made.
+        """The text with a member replaced, or put in as the first; objects on the way are made.
 
         Raises:
             InvalidInputError: What lies on the way is no object.
         """
-        begin, above = self._skip(0), self.value
-        for depth, name in enumerate(path):
+        begin, end = self._skip(0), len(self.text)
+        for depth, name in enumerate(path, 1):
+            if self._plain[begin] != "{":
+                raise InvalidInputError(f"{json.dumps(path[depth - 2])} holds no object there")
             here = list(self._members(begin))
             found = next((member for member in here if member.name == name), None)
-            rest = path[depth + 1 :]
             if found is None:
-                return self._inserted(begin, here, name, _nested(rest, value), depth + 1)
-            if not rest:
-                return self._replaced(found, value, depth + 1)
-            above = above[name]
-            if not isinstance(above, dict):
-                raise InvalidInputError(f"{json.dumps(name)} holds no object there")
-            above = cast("dict[str, Any]", above)
-            begin = found.value
-        return self.text
+                for above in reversed(path[depth:]):
+                    value = {above: value}
+                return self._inserted(begin, here, name, value, depth)
+            begin, end = found.value, found.end
+        before = self.text[:begin].rpartition("\n")[2]
+        indent = before[: len(before) - len(before.lstrip())]
+        return self.text[:begin] + self._written(value, indent) + self.text[end:]
 
     def _members(self, begin: int) -> Iterator[_Member]:
         """Those of the object that begins there, with `{`."""
@@ -259,37 +249,18 @@ class CommentedJSON:
     def _inserted(
         self, begin: int, members: list[_Member], name: str, value: Any, depth: int
     ) -> str:
-        indent = self._indent_of(members, depth)
-        written = f"{indent}{json.dumps(name)}: {self._written(value, indent)}"
-        if members:
-            return self._appended(members[-1].end, written)
-        end = self._skip(begin + 1)
-        if self.text[begin + 1 : end].strip():  # a comment
-            return f"{self.text[: begin + 1]}{self._eol}{written}{self.text[begin + 1 :]}"
-        closing = self._eol + indent[: -len(_step_of(indent))]
-        return f"{self.text[: begin + 1]}{self._eol}{written}{closing}{self.text[end:]}"
-
-    def _appended(self, end: int, written: str) -> str:
-        """Behind the last member, and behind the comment that follows it on its line."""
-        trailing = re.compile(r"\s*,").match(self._uncommented, end)
-        comma = trailing.end() if trailing else end
-        rest = self._plain[comma:].partition("\n")[0]
-        place = comma + len(rest.rstrip("\r")) if not rest.strip() else comma
-        before, after = ("", ",") if trailing else (",", "")
-        between = before + self.text[comma:place] + self._eol + written + after
-        return self.text[:comma] + between + self.text[place:]
-
-    def _replaced(self, member: _Member, value: Any, depth: int) -> str:
-        written = self._written(value, self._indent_of([member], depth))
-        return self.text[: member.value] + written + self.text[member.end :]
-
-    def _indent_of(self, members: list[_Member], depth: int) -> str:
-        """That of the members that are there, where each has a line of its own."""
-        if members:
-            before = self.text[: members[-1].begin].rpartition("\n")[2]
-            if not before.strip():
-                return before
-        return _INDENT * depth
+        """With a first member; a comment after the brace then stands after it."""
+        place = self.text[: members[0].begin].rpartition("\n")[2] if members else " {"
+        indent = _INDENT * depth if place.strip() else place
+        start = self._eol + f"{indent}{json.dumps(name)}: {self._written(value, indent)}"
+        start += "," if members else ""
+        end = members[0].begin if members else self._skip(begin + 1)
+        between = self.text[begin + 1 : end]
+        if members and "\n" not in between:
+            between += self._eol + indent
+        elif not between.strip() and not members:
+            between = self._eol + indent[: -len(_step_of(indent))]
+        return self.text[: begin + 1] + start + between + self.text[end:]
 
     def _written(self, value: Any, indent: str) -> str:
         lines = json.dumps(value, indent=_step_of(indent), ensure_ascii=False).split("\n")
@@ -315,17 +286,7 @@ def _blanked(pattern: re.Pattern[str], text: str) -> str:
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     members = dict(pairs)
-    if len(members) < len(pairs):
-        _refuse_twice([name for name, _ in pairs])
+    for name, count in Counter(name for name, _ in pairs).items():
+        if count > 1:
+            raise InvalidInputError(f"the name {json.dumps(name)} is there twice in one object")
     return members
-
-
-def _refuse_twice(names: list[str]) -> NoReturn:
-    twice = next(name for name in names if names.count(name) > 1)
-    raise InvalidInputError(f"the name {json.dumps(twice)} is there twice in one object")
-
-
-def _nested(path: tuple[str, ...], value: Any) -> Any:
-    for name in reversed(path):
-        value = {name: value}
-    return value

@@ -25,6 +25,9 @@ _BRIDGE: Final = "MCPBridge"
 _ROBOTS: Final = ("Robot", "Supervisor")
 _MODULES: Final = ("controller", "controller.robot", "controller.supervisor")
 _LINES: Final = re.compile(rb"[^\r\n]*(?:\r\n|\r|\n|\Z)")
+_ADDED: Final = re.compile(
+    rb"\s*(?:from webots_mcp import MCPBridge|MCPBridge\.attach\([^()]+\))\s*"
+)
 
 _Function: TypeAlias = ast.FunctionDef | ast.AsyncFunctionDef
 
@@ -34,10 +37,11 @@ class AlreadyPatchedError(InvalidInputError):
 
 
 class _Place(NamedTuple):
-    """The statement behind which the robot is attached, and what attaches it."""
+    """The statement after which the robot is attached, what attaches it, and the import's."""
 
-    behind: ast.stmt
+    after: ast.stmt
     attach: str
+    imported: ast.stmt
 
 
 def attach_line(source: bytes) -> str:
@@ -47,21 +51,7 @@ def attach_line(source: bytes) -> str:
         AlreadyPatchedError: It, or another of the kind, is there.
         InvalidInputError: It cannot be determined for certain; the message says why.
     """
-    return _placed(source)[0].attach
-
-
-def _placed(source: bytes) -> tuple[_Place, int]:
-    """Where the robot is attached, and the line behind which the import belongs."""
-    module = _parsed(source)
-    _refuse_bridge(module)
-    robots = _Robots(module)
-    place = robots.place()
-    imported = robots.imported
-    if imported.lineno <= place.behind.lineno <= (imported.end_lineno or 0):
-        raise InvalidInputError(
-            f"the module controller is imported inside the block of line {imported.lineno}"
-        )
-    return place, imported.end_lineno or imported.lineno
+    return _place(_parsed(source)).attach
 
 
 def patch(source: bytes) -> bytes:
@@ -71,19 +61,21 @@ def patch(source: bytes) -> bytes:
         AlreadyPatchedError: They, or others of the kind, are there.
         InvalidInputError: It cannot be determined for certain where they belong.
     """
-    place, import_after = _placed(source)
+    module = _parsed(source)
+    place = _place(module)
     lines = _split(source)
     first = (line.rstrip(b"\r\n") + b"\n" for line in lines)
     encoding = tokenize.detect_encoding(first.__next__)[0]
     try:
-        attach = _attach_line(lines, place, encoding)
+        attach = _indented(lines, place, encoding)
     except UnicodeError as error:
         raise InvalidInputError(f"it is not all {encoding}: {error}") from error
-    behind = place.behind.end_lineno or place.behind.lineno
-    for after, line in sorted([(behind, attach), (import_after, IMPORT.encode())], reverse=True):
-        _insert(lines, after, line)
+    added = [(place.after, attach), (place.imported, IMPORT.encode())]
+    for statement, line in sorted(added, key=lambda each: each[0].lineno, reverse=True):
+        _insert(lines, statement.end_lineno or statement.lineno, line)
     patched = b"".join(lines)
-    _prove(source, patched)
+    if not _is_proven(module, patched, place.attach):
+        raise InvalidInputError("the lines cannot be put in without changing others: write them")
     return patched
 
 
@@ -93,25 +85,22 @@ def unpatch(source: bytes) -> bytes:
     Raises:
         InvalidInputError: The lines are not there, or not as `patch` writes them.
     """
-    added = [node for node in _parsed(source).body for node in _ours(node)]
     lines = _split(source)
-    places = [node.lineno - 1 for node in added if node.lineno == node.end_lineno]
-    if len(places) == 2:
-        for place in sorted(places, reverse=True):
-            _remove(lines, place)
-        before = b"".join(lines)
-        if _gives(before, source):
-            return before
-    raise InvalidInputError(
-        "the lines of the bridge are not there as --patch writes them: take them out by hand"
-    )
-
-
-def _gives(before: bytes, patched: bytes) -> bool:
+    places = [number for number, line in enumerate(lines) if _ADDED.fullmatch(line)]
+    for place in reversed(places):
+        if not lines[place].endswith((b"\r", b"\n")):
+            lines[place - 1] = lines[place - 1].rstrip(b"\r\n")
+        del lines[place]
+    before = b"".join(lines)
     try:
-        return patch(before) == patched
+        is_undone = patch(before) == source
     except InvalidInputError:
-        return False
+        is_undone = False
+    if not is_undone:
+        raise InvalidInputError(
+            "the lines of the bridge are not there as --patch writes them: take them out by hand"
+        )
+    return before
 
 
 def _parsed(source: bytes) -> ast.Module:
@@ -126,10 +115,49 @@ def _parsed(source: bytes) -> ast.Module:
         raise InvalidInputError(f"it is no Python that can be read: {error}") from error
 
 
-def _refuse_bridge(module: ast.Module) -> None:
-    for node in ast.walk(module):
-        names = _imported(node)
-        if any(name.partition(".")[0] == "webots_mcp" for name in names):
+def _place(module: ast.Module) -> _Place:
+    """Where the robot is attached: after its constructor, or after it was assigned to a name."""
+    nodes = list(ast.walk(module))
+    _refuse_bridge(nodes)
+    imports = [
+        (statement, names)
+        for statement in module.body
+        if not isinstance(statement, (_Function, ast.ClassDef))
+        for node in ast.walk(statement)
+        if (names := _robots_imported(node))
+    ]
+    if not imports:
+        raise InvalidInputError(
+            "it does not import Robot or Supervisor of the module controller at its top: "
+            "where another module makes the robot, write the lines there"
+        )
+    classes = set[str]().union(*(names for _, names in imports))  # names, also dotted
+    own = _subclasses(nodes, classes)
+    _refuse_rebound(nodes, classes, own)
+    made = [
+        node
+        for node in nodes
+        if isinstance(node, ast.Call) and _dotted(node.func) in classes | own.keys()
+    ]
+    if len(made) > 1:
+        lines = ", ".join(str(node.lineno) for node in made)
+        raise InvalidInputError(f"it makes a robot in several places (lines {lines})")
+    if not made:
+        raise InvalidInputError("it makes no Robot() and no Supervisor()")
+    after, attach = _in_constructor(own, made[0]) or _assigned(nodes, made[0])
+    imported = imports[0][0]
+    if imported.lineno <= after.lineno <= (imported.end_lineno or 0):
+        raise InvalidInputError(
+            f"the module controller is imported inside the block of line {imported.lineno}"
+        )
+    return _Place(after, f"{_BRIDGE}.attach({attach})", imported)
+
+
+def _refuse_bridge(nodes: list[ast.AST]) -> None:
+    for node in nodes:
+        modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        modules += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        if any(name.partition(".")[0] == "webots_mcp" for name in modules):
             raise AlreadyPatchedError(f"it has webots_mcp already, in line {_line_of(node)}")
         if _BRIDGE in _bound(node) or (isinstance(node, ast.Name) and node.id == _BRIDGE):
             raise InvalidInputError(
@@ -141,12 +169,6 @@ def _line_of(node: ast.AST) -> int:
     return getattr(node, "lineno", 1)
 
 
-def _imported(node: ast.AST) -> list[str]:
-    if isinstance(node, ast.Import):
-        return [alias.name for alias in node.names]
-    return [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
-
-
 def _bound(node: ast.AST) -> list[str]:
     """The names that a node binds."""
     if isinstance(node, (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
@@ -156,108 +178,6 @@ def _bound(node: ast.AST) -> list[str]:
     if isinstance(node, ast.Name) and not isinstance(node.ctx, ast.Load):
         return [node.id]
     return [node.arg] if isinstance(node, ast.arg) else []
-
-
-class _Robots:
-    """Where a module makes its robot."""
-
-    def __init__(self, module: ast.Module) -> None:
-        self._module = module
-        self._classes: set[str] = set()  # names, also dotted, of Robot and Supervisor
-        self.imported = self._read_imports()
-        self._own = self._subclasses()
-        self._refuse_rebound()
-
-    def _read_imports(self) -> ast.stmt:
-        """Learn what Webots' classes are called here; returns the first statement of that."""
-        first: ast.stmt | None = None
-        for statement in self._module.body:
-            if isinstance(statement, (_Function, ast.ClassDef)):
-                continue
-            for node in ast.walk(statement):
-                if names := _robots_imported(node):
-                    self._classes |= names
-                    first = first or statement
-        if first is None:
-            raise InvalidInputError(
-                "it does not import Robot or Supervisor of the module controller at its top: "
-                "where another module makes the robot, write the lines there"
-            )
-        return first
-
-    def _subclasses(self) -> dict[str, ast.ClassDef]:
-        """The module's own classes of robots, by name."""
-        own: dict[str, ast.ClassDef] = {}
-        for node in ast.walk(self._module):
-            if isinstance(node, ast.ClassDef) and any(
-                _dotted(base) in self._classes | own.keys() for base in node.bases
-            ):
-                if node.name in own:
-                    raise InvalidInputError(f"there are two classes {node.name!r}")
-                own[node.name] = node
-        return own
-
-    def _refuse_rebound(self) -> None:
-        names = {name.partition(".")[0] for name in self._classes} | self._own.keys()
-        for node in ast.walk(self._module):
-            if _robots_imported(node) or node in self._own.values():
-                continue
-            if again := names.intersection(_bound(node)):
-                raise InvalidInputError(
-                    f"the name {again.pop()!r} means something else too (line {_line_of(node)})"
-                )
-
-    def place(self) -> _Place:
-        """Where the robot is there."""
-        made = [node for node in ast.walk(self._module) if self._makes_robot(node)]
-        if not made:
-            raise InvalidInputError("it makes no Robot() and no Supervisor()")
-        if len(made) > 1:
-            lines = ", ".join(str(_line_of(node)) for node in made)
-            raise InvalidInputError(f"it makes a robot in several places (lines {lines})")
-        (call,) = made
-        assert isinstance(call, ast.Call)
-        if found := self._in_constructor(_dotted(call.func) or ""):
-            return found
-        return self._behind(call)
-
-    def _makes_robot(self, node: ast.AST) -> bool:
-        names = self._classes | self._own.keys()
-        return isinstance(node, ast.Call) and _dotted(node.func) in names
-
-    def _in_constructor(self, name: str) -> _Place | None:
-        """Behind `super().__init__()` of the robot's own class, where it has a constructor."""
-        while cls := self._own.get(name):
-            for statement in cls.body:
-                if isinstance(statement, _Function) and statement.name == "__init__":
-                    return _behind_super(statement, [_dotted(base) for base in cls.bases])
-            name = next(
-                (base for base in map(_dotted, cls.bases) if base in self._own), ""
-            )  # fmt: skip
-        return None
-
-    def _behind(self, call: ast.Call) -> _Place:
-        """Behind the statement that assigns the robot to a name."""
-        statement = next(
-            (node for node in ast.walk(self._module)
-             if isinstance(node, (ast.Assign, ast.AnnAssign)) and node.value is call),
-            None,
-        )  # fmt: skip
-        if statement is None:
-            raise InvalidInputError(
-                f"the robot made in line {call.lineno} is not assigned to a name by itself"
-            )
-        targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
-        names = [name for name in map(_dotted, targets) if name]
-        if not names:
-            raise InvalidInputError(f"line {call.lineno} assigns the robot to no plain name")
-        self._refuse_loop(statement)
-        return _Place(statement, f"{_BRIDGE}.attach({names[0]})")
-
-    def _refuse_loop(self, statement: ast.stmt) -> None:
-        for loop in ast.walk(self._module):
-            if isinstance(loop, (ast.For, ast.While)) and statement in ast.walk(loop):
-                raise InvalidInputError(f"line {statement.lineno} makes the robot within a loop")
 
 
 def _robots_imported(node: ast.AST) -> set[str]:
@@ -275,24 +195,47 @@ def _robots_imported(node: ast.AST) -> set[str]:
     return set()
 
 
-def _dotted(node: ast.AST) -> str | None:
-    """`a.b.c` of a name or of attributes of one."""
-    if isinstance(node, ast.Name):
-        return node.id
-    if isinstance(node, ast.Attribute) and (above := _dotted(node.value)):
-        return f"{above}.{node.attr}"
+def _subclasses(nodes: list[ast.AST], classes: set[str]) -> dict[str, ast.ClassDef]:
+    """The module's own classes of robots, by name."""
+    own: dict[str, ast.ClassDef] = {}
+    for node in nodes:
+        if isinstance(node, ast.ClassDef) and any(
+            _dotted(base) in classes | own.keys() for base in node.bases
+        ):
+            if node.name in own:
+                raise InvalidInputError(f"there are two classes {node.name!r}")
+            own[node.name] = node
+    return own
+
+
+def _refuse_rebound(nodes: list[ast.AST], classes: set[str], own: dict[str, ast.ClassDef]) -> None:
+    names = {name.partition(".")[0] for name in classes} | own.keys()
+    for node in nodes:
+        if _robots_imported(node) or node in own.values():
+            continue
+        if again := names.intersection(_bound(node)):
+            raise InvalidInputError(
+                f"the name {again.pop()!r} means something else too (line {_line_of(node)})"
+            )
+
+
+def _in_constructor(own: dict[str, ast.ClassDef], made: ast.Call) -> tuple[ast.stmt, str] | None:
+    """`super().__init__()` of the robot's own class, where it has a constructor, and its self."""
+    name = _dotted(made.func) or ""
+    while cls := own.get(name):
+        bases = [_dotted(base) for base in cls.bases]
+        for statement in cls.body:
+            if isinstance(statement, _Function) and statement.name == "__init__":
+                parameters = [*statement.args.posonlyargs, *statement.args.args]
+                calls = [each for each in statement.body if _calls_super(each, bases)]
+                if len(calls) != 1 or not parameters:
+                    raise InvalidInputError(
+                        f"the constructor in line {statement.lineno} does not call "
+                        "super().__init__() as a statement of its own, once"
+                    )
+                return calls[0], parameters[0].arg
+        name = next((base for base in bases if base in own), "") or ""
     return None
-
-
-def _behind_super(constructor: _Function, bases: list[str | None]) -> _Place:
-    parameters = [*constructor.args.posonlyargs, *constructor.args.args]
-    calls = [statement for statement in constructor.body if _calls_super(statement, bases)]
-    if len(calls) != 1 or not parameters:
-        raise InvalidInputError(
-            f"the constructor in line {constructor.lineno} does not call super().__init__() as a "
-            "statement of its own, once"
-        )
-    return _Place(calls[0], f"{_BRIDGE}.attach({parameters[0].arg})")
 
 
 def _calls_super(statement: ast.stmt, bases: list[str | None]) -> bool:
@@ -305,24 +248,31 @@ def _calls_super(statement: ast.stmt, bases: list[str | None]) -> bool:
     return call.func.attr == "__init__" and (is_super or _dotted(owner) in bases)
 
 
-def _ours(node: ast.AST) -> Iterator[ast.stmt]:
-    """The statements that `patch` puts in, in a statement and below it."""
-    for each in ast.walk(node):
-        if isinstance(each, ast.stmt) and (_is_import(each) or _is_attach(each)):
-            yield each
+def _assigned(nodes: list[ast.AST], made: ast.Call) -> tuple[ast.stmt, str]:
+    """The statement that assigns the robot to a name, and that name."""
+    for node in nodes:
+        if isinstance(node, (ast.Assign, ast.AnnAssign)) and node.value is made:
+            break
+    else:
+        raise InvalidInputError(
+            f"the robot made in line {made.lineno} is not assigned to a name by itself"
+        )
+    targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+    names = [name for name in map(_dotted, targets) if name]
+    if not names:
+        raise InvalidInputError(f"line {made.lineno} assigns the robot to no plain name")
+    if any(isinstance(each, (ast.For, ast.While)) and node in ast.walk(each) for each in nodes):
+        raise InvalidInputError(f"line {node.lineno} makes the robot within a loop")
+    return node, names[0]
 
 
-def _is_import(statement: ast.stmt) -> bool:
-    return (
-        isinstance(statement, ast.ImportFrom)
-        and statement.module == "webots_mcp"
-        and [(alias.name, alias.asname) for alias in statement.names] == [(_BRIDGE, None)]
-    )
-
-
-def _is_attach(statement: ast.stmt) -> bool:
-    call = statement.value if isinstance(statement, ast.Expr) else None
-    return isinstance(call, ast.Call) and _dotted(call.func) == f"{_BRIDGE}.attach"
+def _dotted(node: ast.AST) -> str | None:
+    """`a.b.c` of a name or of attributes of one."""
+    if isinstance(node, ast.Name):
+        return node.id
+    if isinstance(node, ast.Attribute) and (above := _dotted(node.value)):
+        return f"{above}.{node.attr}"
+    return None
 
 
 def _split(source: bytes) -> list[bytes]:
@@ -335,29 +285,19 @@ def _insert(lines: list[bytes], after: int, line: bytes) -> None:
     before = lines[after - 1]
     ending = before[len(before.rstrip(b"\r\n")) :]
     if not ending:  # the file ends without one, and does so afterwards
-        lines[after - 1] = before + _ending_of(lines)
+        first = lines[0]
+        lines[after - 1] = before + (first[len(first.rstrip(b"\r\n")) :] or b"\n")
     lines.insert(after, line + ending)
 
 
-def _remove(lines: list[bytes], place: int) -> None:
-    if not lines[place].endswith((b"\r", b"\n")):
-        lines[place - 1] = lines[place - 1].rstrip(b"\r\n")
-    del lines[place]
-
-
-def _ending_of(lines: list[bytes]) -> bytes:
-    first = lines[0]
-    return first[len(first.rstrip(b"\r\n")) :] or b"\n"
-
-
-def _attach_line(lines: list[bytes], place: _Place, encoding: str) -> bytes:
+def _indented(lines: list[bytes], place: _Place, encoding: str) -> bytes:
     """What attaches the robot, indented as the statement before it.
 
     Raises:
         InvalidInputError: That statement shares its lines with others.
         UnicodeError: The file is not in its encoding.
     """
-    statement = place.behind
+    statement = place.after
 
     def utf_8(number: int) -> bytes:  # in which a syntax tree counts columns
         return lines[number - 1].decode(encoding).encode()
@@ -371,28 +311,21 @@ def _attach_line(lines: list[bytes], place: _Place, encoding: str) -> bytes:
     return indent + place.attach.encode(encoding.removesuffix("-sig"))
 
 
-def _prove(before: bytes, after: bytes) -> None:
-    """Nothing but the two statements is new.
+def _is_proven(before: ast.Module, patched: bytes, attach: str) -> bool:
+    """Whether nothing but the two statements is new."""
 
-    Raises:
-        InvalidInputError: The lines cannot be put in as lines of their own.
-    """
+    class Without(ast.NodeTransformer):
+        def visit(self, node: ast.AST) -> Any:
+            is_ours = isinstance(node, ast.stmt) and ast.unparse(node) in (IMPORT, attach)
+            return None if is_ours else self.generic_visit(node)
+
     try:
-        is_same = ast.dump(_Without().visit(_parsed(after))) == ast.dump(_parsed(before))
+        return ast.dump(Without().visit(_parsed(patched))) == ast.dump(before)
     except (InvalidInputError, RecursionError):
-        is_same = False
-    if not is_same:
-        raise InvalidInputError("the lines cannot be put in without changing others: write them")
+        return False
 
 
-class _Without(ast.NodeTransformer):
-    """Leaves out what `patch` puts in."""
-
-    def visit(self, node: ast.AST) -> Any:
-        if isinstance(node, ast.stmt) and (_is_import(node) or _is_attach(node)):
-            return None
-        return self.generic_visit(node)
-
+# -- the observer in a world ----------------------------------------------------------------------
 
 COPY_SUFFIX: Final = "_observed"
 CONTROLLER: Final = b'''"""The observer of webots-mcp: it records where all robots are."""
@@ -410,8 +343,6 @@ _ROBOT: Final = """Robot {{
   synchronization FALSE
 }}
 """
-_RUNTIME: Final = "runtime.ini"
-_RUNTIME_TEXT: Final = "[python]\nCOMMAND = {}\n"
 _HEADER: Final = b"#VRML_SIM "
 _TOKEN: Final = re.compile(rb'"(?:\\.|[^"\\])*"|#[^\r\n]*|[{}\[\]]|[^\s,"#{}\[\]]+', re.DOTALL)
 
@@ -516,8 +447,8 @@ def python_change(controller: Path, python: str) -> FileChange:
     Raises:
         OSError: It cannot be read.
     """
-    file = controller.with_name(_RUNTIME)
-    return FileChange(file, read(file), _RUNTIME_TEXT.format(python).encode())
+    file = controller.with_name("runtime.ini")
+    return FileChange(file, read(file), _runtime(python))
 
 
 def unused_controller(project: Path, python: str) -> list[Path]:
@@ -530,8 +461,12 @@ def unused_controller(project: Path, python: str) -> list[Path]:
     if any(f'"{OBSERVER_NAME}"'.encode() in world.read_bytes() for world in worlds):
         return []
     file = _controller_of(project)
-    ours = {file: CONTROLLER, file.with_name(_RUNTIME): _RUNTIME_TEXT.format(python).encode()}
+    ours = {file: CONTROLLER, file.with_name("runtime.ini"): _runtime(python)}
     return [each for each, content in ours.items() if read(each) == content]
+
+
+def _runtime(python: str) -> bytes:
+    return f"[python]\nCOMMAND = {python}\n".encode()
 
 
 def _controller_of(project: Path) -> Path:

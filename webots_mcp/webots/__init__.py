@@ -10,10 +10,10 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from webots_mcp.contract import DATA_DIR_VARIABLE, host_name
 from webots_mcp.errors import CommandRefusedError
@@ -22,6 +22,7 @@ from webots_mcp.webots.orders import WebotsAddress
 if TYPE_CHECKING:
     import psutil
 
+T = TypeVar("T")
 HOME_VARIABLE: Final = "WEBOTS_HOME"
 
 _DEFAULT_HOMES: Final[dict[str, tuple[str, ...]]] = {
@@ -187,12 +188,8 @@ class Instance:
     @property
     def data_dir(self) -> Path | None:
         """Where its controllers record if its environment says so; None where it does not."""
-        import psutil
-
-        try:
-            named = psutil.Process(self.pid).environ().get(DATA_DIR_VARIABLE)
-        except (psutil.Error, OSError):
-            return None
+        environment = shown_of(self.pid, lambda process: process.environ(), dict[str, str]())
+        named = environment.get(DATA_DIR_VARIABLE)
         return Path(named) if named else None
 
     @property
@@ -219,15 +216,14 @@ def instances() -> list[Instance]:
     """The Webots of this machine, as far as its processes may be looked at."""
     import psutil
 
-    found: dict[int, tuple[psutil.Process, list[str]]] = {}
+    found: dict[int, list[str]] = {}
     starters: set[int] = set()
     for process in psutil.process_iter(["cmdline", "ppid"]):
         arguments = _arguments(process.info["cmdline"] or ())
         if arguments is not None:
-            found[process.pid] = process, arguments
+            found[process.pid] = arguments
             starters.add(process.info["ppid"])
-    programs = [found[pid] for pid in sorted(found.keys() - starters)]
-    return [_look(process, arguments) for process, arguments in programs]
+    return [_look(pid, found[pid]) for pid in sorted(found.keys() - starters)]
 
 
 def instance_at(port: int) -> Instance | None:
@@ -246,58 +242,31 @@ def _arguments(command_line: Sequence[str]) -> list[str] | None:
     return None
 
 
-def _look(process: psutil.Process, arguments: list[str]) -> Instance:
-    options = dict(_options(arguments))
+def _look(pid: int, arguments: list[str]) -> Instance:
+    words = [word[2:].partition("=") for word in arguments if word.startswith("--")]
+    options = {name: value for name, _, value in words}
     asked = options.get("port", "")
     port = int(asked) if asked.isascii() and asked.isdecimal() else DEFAULT_PORT
-    listening = sorted(set(_ports(process)) & set(range(port, port + PORTS_TRIED)))
+    sockets = shown_of(pid, lambda process: process.net_connections(kind="tcp"), [])
+    ports = sorted(each.laddr.port for each in sockets if each.status == "LISTEN")
+    listening = [each for each in ports if port <= each < port + PORTS_TRIED]
+    world = next((word for word in arguments if word.endswith(".wbt")), None)
     return Instance(
-        process.pid,
+        pid,
         listening[0] if listening else port,
         bool(listening),
         options.get("mode"),
         "stream" in options,
-        _world(process, arguments),
-        _started_s(process),
+        Path(shown_of(pid, lambda process: process.cwd(), ""), world) if world else None,
+        shown_of(pid, lambda process: process.create_time(), 0.0),
     )
 
 
-def _options(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
-    for word in arguments:
-        if word.startswith("--"):
-            name, _, value = word[2:].partition("=")
-            yield name, value
-
-
-def _ports(process: psutil.Process) -> Iterator[int]:
-    """The ports where it listens; none where the system hides another user's process."""
+def shown_of(pid: int, ask: Callable[[psutil.Process], T], otherwise: T) -> T:
+    """What the system shows of a process; it hides much of another user's."""
     import psutil
 
     try:
-        for connection in process.net_connections(kind="tcp"):
-            if connection.status == psutil.CONN_LISTEN:
-                yield connection.laddr.port
-    except psutil.Error:
-        return
-
-
-def _started_s(process: psutil.Process) -> float:
-    import psutil
-
-    try:
-        return process.create_time()
-    except psutil.Error:
-        return 0.0
-
-
-def _world(process: psutil.Process, arguments: Sequence[str]) -> Path | None:
-    """Its world; a relative path is resolved by its working folder, where that is shown."""
-    import psutil
-
-    named = next((word for word in arguments if word.endswith(".wbt")), None)
-    if named is None:
-        return None
-    try:
-        return Path(process.cwd(), named)
-    except psutil.Error:
-        return Path(named)
+        return ask(psutil.Process(pid))
+    except (psutil.Error, OSError):
+        return otherwise

@@ -16,9 +16,9 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, cast
 
 from webots_mcp.contract import host_name
 from webots_mcp.errors import CommandRefusedError
@@ -28,14 +28,12 @@ if TYPE_CHECKING:
 
 Order = Literal["pause", "resume", "fast", "step", "reset", "reload"]
 
-MAX_FRAME_BYTES: Final = 4 << 20  # Qt, which Webots is built with, cuts messages into 512 kB
+MAX_MESSAGE_BYTES: Final = 4 << 20
 ANSWER_S: Final = 1.0  # Webots answers at once, or it does not obey
 _CLOSING_S: Final = 0.2
 _CHUNK_BYTES: Final = 1 << 16
 _HEAD_END: Final = b"\r\n\r\n"
 _LONGEST_HEAD_BYTES: Final = 1 << 16
-_LENGTH: Final = 0x7F  # of the second byte; 126 and 127 say that the length follows
-_LENGTH_BYTES: Final = {126: 2, 127: 8}
 # A robot of this name need not exist: asking for a window begins the logs for this client.
 _BEGIN_CONSOLE: Final = "robot:" + json.dumps(
     {"name": "webots-mcp", "message": "init robot window"}, separators=(",", ":")
@@ -69,7 +67,7 @@ class Message(NamedTuple):
     """What Webots sent: its text as far as it is kept, or that it answered a ping.
 
     Attributes:
-        dropped_bytes: How much of the end is not kept, about.
+        dropped_bytes: How much of the end is not kept.
     """
 
     text: str
@@ -106,55 +104,6 @@ def address_of(instance: str) -> WebotsAddress | None:
     return WebotsAddress("127.0.0.1" if host == host_name() else host, int(port))
 
 
-class FrameTrimmer:
-    """Shortens WebSocket frames that are too long while they are read (RFC 6455, section 5.2).
-
-    The scene of a large world is one message of hundreds of megabytes, and every client gets those
-    that another has asked for. Libraries either keep such a frame whole or hang up. Of each frame
-    the first bytes are passed on.
-    """
-
-    def __init__(self, limit_bytes: int = MAX_FRAME_BYTES) -> None:
-        self.trimmed_bytes = 0
-        self._limit = limit_bytes
-        self._header = bytearray()
-        self._pass = self._drop = 0
-
-    def feed(self, data: bytes) -> bytes:
-        """What is left of the next bytes from the server."""
-        left, at = bytearray(), 0
-        while at < len(data):
-            if self._pass:
-                part = data[at : at + self._pass]
-                left += part
-                self._pass -= len(part)
-            elif self._drop:
-                part = data[at : at + self._drop]
-                self._drop -= len(part)
-            else:
-                part = data[at : at + 1]
-                self._header += part
-                left += self._begin() if self._is_complete() else b""
-            at += len(part)
-        return bytes(left)
-
-    def _is_complete(self) -> bool:
-        if len(self._header) < 2:
-            return False
-        return len(self._header) == 2 + _LENGTH_BYTES.get(self._header[1] & _LENGTH, 0)
-
-    def _begin(self) -> bytes:
-        """The header of a frame that is no longer than the limit."""
-        header, self._header = bytes(self._header), bytearray()
-        length = int.from_bytes(header[2:], "big") if len(header) > 2 else header[1] & _LENGTH
-        if length <= self._limit:
-            self._pass = length
-            return header
-        self._pass, self._drop = self._limit, length - self._limit
-        self.trimmed_bytes += self._drop
-        return bytes((header[0], header[1] | _LENGTH)) + self._limit.to_bytes(8, "big")
-
-
 class Stream:
     """A connection to Webots, in this thread alone. Times are those of `time.monotonic`."""
 
@@ -163,12 +112,9 @@ class Stream:
         from websockets.uri import parse_uri
 
         self.address = address
-        self._protocol = ClientProtocol(
-            parse_uri(f"ws://{address}/"), max_size=MAX_FRAME_BYTES + _CHUNK_BYTES
-        )
-        self._trimmer = FrameTrimmer()
+        self._protocol = ClientProtocol(parse_uri(f"ws://{address}/"), max_size=None)
         self._message = bytearray()
-        self._dropped_bytes = self._told_dropped_bytes = 0
+        self._dropped_bytes = 0
         self._socket = socket.create_connection(address, _left_s(until_s))
         self._arrived: list[Message] = []
         try:
@@ -207,11 +153,6 @@ class Stream:
             if not self._read(until_s):
                 return None
         return self._arrived.pop(0)
-
-    @property
-    def dropped_bytes(self) -> int:
-        """What of long messages was not kept."""
-        return self._dropped_bytes + self._trimmer.trimmed_bytes
 
     def close(self) -> None:
         """Send the closing frame, wait a moment for that of Webots, and close the socket."""
@@ -274,29 +215,28 @@ class Stream:
         return CommandRefusedError(f"Webots at {self.address} closed the connection")
 
     def _take(self, data: bytes) -> None:
-        self._protocol.receive_data(self._trimmer.feed(data))
-        for event in self._protocol.events_received():
-            self._take_frame(event)
-
-    def _take_frame(self, frame: Any) -> None:
         from websockets.frames import Opcode
 
-        if frame.opcode is Opcode.PONG:
-            self._arrived.append(Message("", is_pong=True))
-        elif frame.opcode in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT):
-            self._put_together(frame)
+        self._protocol.receive_data(data)
+        for frame in cast("list[Frame]", self._protocol.events_received()):
+            if frame.opcode is Opcode.PONG:
+                self._arrived.append(Message("", is_pong=True))
+            elif frame.opcode in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT):
+                self._put_together(frame)
 
     def _put_together(self, frame: Frame) -> None:
-        """Of the parts of a message as much as of a frame."""
-        room = MAX_FRAME_BYTES - len(self._message)
+        """Keep of the parts of a message the first bytes.
+
+        The scene of a large world is one message of hundreds of megabytes, in parts of 512 kB, and
+        every client gets those that another has asked for.
+        """
+        room = MAX_MESSAGE_BYTES - len(self._message)
         self._message += frame.data[:room]
         self._dropped_bytes += max(len(frame.data) - room, 0)
         if frame.fin:
-            dropped_bytes = self.dropped_bytes - self._told_dropped_bytes
-            self._told_dropped_bytes += dropped_bytes
             text = self._message.decode("utf-8", "replace")
-            self._arrived.append(Message(text, dropped_bytes=dropped_bytes))
-            self._message = bytearray()
+            self._arrived.append(Message(text, dropped_bytes=self._dropped_bytes))
+            self._message, self._dropped_bytes = bytearray(), 0
 
     def _bytes(self, until_s: float) -> bytes | None:
         """Of the socket; empty at its end, None where nothing came in time."""
@@ -424,6 +364,12 @@ def _left_s(until_s: float) -> float:
 
 
 _PRESSING_TIMEOUT_S: Final = 10.0
+_ON_MACOS: Final = (
+    "allow the program that runs this under System Settings, Privacy & Security, Accessibility"
+)
+_ON_WINDOWS: Final = (
+    "it needs exactly one window of Webots, and Windows' leave to bring it to the front"
+)
 _TITLE: Final = "Webots R20"  # "<world> (<project>) - Webots R2023b"
 
 
@@ -463,9 +409,14 @@ def press(order: Order, pid: int | None, platform: str = sys.platform) -> None:
     """
     key = KEYS[order]
     try:
-        if platform not in _PRESSING:
+        if platform == "linux":
+            _press_in_x11(key, pid)
+        elif platform == "darwin":
+            _run(macos_command(key, pid), _ON_MACOS)
+        elif platform == "win32":
+            _run(windows_command(key, pid), _ON_WINDOWS)
+        else:
             raise CommandRefusedError(f"no way to press keys on {platform!r} is known")
-        _PRESSING[platform](key, pid)
     except CommandRefusedError as error:
         raise CommandRefusedError(f"{error}; or press {key.spoken} in Webots yourself") from error
 
@@ -497,20 +448,6 @@ def windows_command(key: Key, pid: int | None) -> list[str]:
         f"$shell.SendKeys('^{'+' * key.shift}{key.name}')"
     )
     return ["powershell", "-NoProfile", "-NonInteractive", "-Command", script]
-
-
-def _press_on_macos(key: Key, pid: int | None) -> None:
-    _run(
-        macos_command(key, pid),
-        "allow the program that runs this under System Settings, Privacy & Security, Accessibility",
-    )
-
-
-def _press_on_windows(key: Key, pid: int | None) -> None:
-    _run(
-        windows_command(key, pid),
-        "it needs exactly one window of Webots, and Windows' leave to bring it to the front",
-    )
 
 
 def _press_in_x11(key: Key, pid: int | None) -> None:
@@ -568,10 +505,3 @@ def _attempt(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
         raise CommandRefusedError(f"the program {command[0]} is not there{install}") from error
     except (OSError, subprocess.TimeoutExpired) as error:
         raise CommandRefusedError(f"{command[0]} could not be run: {error}") from error
-
-
-_PRESSING: Final[dict[str, Callable[[Key, int | None], None]]] = {
-    "linux": _press_in_x11,
-    "darwin": _press_on_macos,
-    "win32": _press_on_windows,
-}

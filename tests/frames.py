@@ -11,7 +11,7 @@ import numpy as np
 
 from webots_mcp.naming import Value, flatten
 from webots_mcp.store.analysis.arrays import Array
-from webots_mcp.store.chunks.columns import StateColumns
+from webots_mcp.store.chunks import StateColumns
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.reading.frame_source import FrameSource
 

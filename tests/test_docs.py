@@ -25,7 +25,7 @@ from webots_mcp.questions.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS
 from webots_mcp.questions.declaring import MAX_WAIT_S
 from webots_mcp.server import create_server
 from webots_mcp.setup.client_entries import claude_desktop, clients_of, is_ours
-from webots_mcp.store.detection.registry import kind_names
+from webots_mcp.store.detection.events import kind_names
 
 CHECKOUT = Path(__file__).parents[1]
 DOCS = CHECKOUT / "docs"

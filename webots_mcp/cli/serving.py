@@ -200,7 +200,8 @@ def _connect_to(url: str | None, robot: str) -> str:
     Raises:
         CommandRefusedError: There is no such library.
     """
-    from webots_mcp.webots import DEFAULT_PORT, HOME_VARIABLE, installations
+    from webots_mcp.webots import (DEFAULT_PORT, HOME_VARIABLE)
+    from webots_mcp.webots import installations
 
     url = url or os.environ.get(_URL) or f"ipc://{DEFAULT_PORT}"
     os.environ[_URL] = f"{url.rstrip('/')}/{robot}" if url.count("/") == 2 else url

@@ -33,9 +33,10 @@ from webots_mcp.setup.client_entries import (
     words_of,
 )
 from webots_mcp.store.recording import View
-from webots_mcp.store.sessions import Session, companions
-from webots_mcp.store.status import SILENT
-from webots_mcp.webots import find_webots, installations, shown_of
+from webots_mcp.store.robots import (Session, companions)
+from webots_mcp.store.robots import SILENT
+from webots_mcp.webots import (find_webots, shown_of)
+from webots_mcp.webots import installations
 from webots_mcp.webots.orders import address_of
 
 if TYPE_CHECKING:

@@ -31,7 +31,7 @@ from webots_mcp.errors import PoolBusyError, PoolError, PoolUnavailableError
 from webots_mcp.plugins.pool.pool_interface import Batch, Row, table, tables
 from webots_mcp.plugins.pool.postgres_pool import PostgresShipment, PostgresTarget
 from webots_mcp.plugins.pool.postgres_schema import connect as connect_pool
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.store.chunk_making import make_chunks
 
 pytestmark = pytest.mark.slow
 

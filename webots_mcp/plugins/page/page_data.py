@@ -31,7 +31,7 @@ from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plotting.trajectory_axes import Obstacle, Track, TrajectoryAxes
 from webots_mcp.plugins.report.obstacles import obstacles_of
-from webots_mcp.store.images import StoredImage, newest_image, opened
+from webots_mcp.store.run_rows import (StoredImage, newest_image, opened)
 from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines
 from webots_mcp.store.parameters import described
 from webots_mcp.store.questions.runs import RunInfo, list_runs
@@ -39,8 +39,8 @@ from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, record
 from webots_mcp.store.recording import Recording, View, view_of
 from webots_mcp.store.robots import list_robots, without_observers
 from webots_mcp.store.run_rows import current_run, fetch_run
-from webots_mcp.store.signals.catalogue import catalogue, known_signals
-from webots_mcp.store.status import RUNNING
+from webots_mcp.store.reading.catalogue import (catalogue, known_signals)
+from webots_mcp.store.robots import RUNNING
 
 Axes = TypeVar("Axes", SignalAxes, TrajectoryAxes)
 

@@ -16,7 +16,7 @@ from webots_mcp.store.run_rows import Run, fetch_run
 
 if TYPE_CHECKING:
     from webots_mcp.standin.arena import Body
-    from webots_mcp.standin.shapes import Shape
+    from webots_mcp.standin.geometry import Shape
 
 _MOST_BYTES: Final = 1_000_000  # of a world file: reading a larger one would take seconds
 _CORNERS: Final = ((1, 1), (-1, 1), (-1, -1), (1, -1))
@@ -50,7 +50,7 @@ def _of_file(run: Run) -> tuple[Obstacle, ...]:
 @lru_cache(maxsize=8)
 def _standing(file: Path, _changed_ns: int) -> tuple[Obstacle, ...]:
     from webots_mcp.standin.arena import Arena
-    from webots_mcp.standin.standin_errors import WorldError
+    from webots_mcp.standin.vrml import WorldError
     from webots_mcp.standin.world import load_world
 
     try:
@@ -68,7 +68,7 @@ def _outlines(body: Body) -> Iterator[Obstacle]:
 
 
 def _corners(shape: Shape) -> tuple[tuple[float, float], ...]:
-    from webots_mcp.standin.shapes import Disc
+    from webots_mcp.standin.geometry import Disc
 
     if isinstance(shape, Disc):
         angles = [math.tau * side / _SIDES for side in range(_SIDES)]

@@ -1,7 +1,7 @@
 """A stand-in for Webots: a small, deterministic simulator for tests and first steps.
 
 It is not Webots and does not try to be: a flat arena with upright boxes, cylinders and balls,
-robots on driven wheels, thirteen kinds of devices. What it does reproduce is how Webots treats
+robots on driven wheels, sixteen kinds of devices. What it does reproduce is how Webots treats
 controllers: processes, blocking, pause, reset, reload, and what each call returns or refuses.
 
 Simpler than in Webots: robots are discs where they touch something; what has Physics is pushed

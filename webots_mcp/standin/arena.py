@@ -1,4 +1,4 @@
-"""What stands in the world and what happens when it touches."""
+"""What stands in the world, what moves it, and what happens when it touches."""
 
 from __future__ import annotations
 
@@ -359,7 +359,7 @@ def _color(numbers: Sequence[float]) -> Color:
     return r, g, b
 
 
-# How motors turn wheels and wheels move a robot.
+# Motors turn wheels, and wheels move a robot ------------------------------------------------------
 
 
 _MOTORS = ("RotationalMotor", "LinearMotor")

@@ -1,4 +1,4 @@
-"""The controllers of a world: which program each robot runs, and how far it is."""
+"""The controllers of a world: which program each robot runs, its process and its connection."""
 
 from __future__ import annotations
 
@@ -16,9 +16,6 @@ from controller.session import Inbox, Message, pack
 
 from webots_mcp.standin.simulator import Robot, Simulator
 from webots_mcp.standin.vrml import StandInError
-
-# One controller process: starting it, passing on what it prints, ending it.
-
 
 _TERMINATION_S: Final = 1.0
 """How long a process may take to end after it was asked to."""
@@ -92,9 +89,6 @@ class ControllerProcess:
         for reader in self._readers:  # a grandchild may hold the pipes open: do not wait for it
             reader.join(0.5)
         self._on_exit(self)
-
-
-# The simulator's end of a controller's socket.
 
 
 class Connection:

@@ -1,4 +1,4 @@
-"""Places in space: a rotation matrix and a translation, put one after the other."""
+"""Places in space, and the shapes that stand on the plane."""
 
 from __future__ import annotations
 
@@ -80,10 +80,8 @@ def frame_of(translation: Sequence[float], axis_angle: Sequence[float]) -> Frame
     return Frame(_rotation_matrix(axis_angle), (x, y, z))
 
 
-# Upright shapes on a plane: how rays hit them, and how they push a disc away.
-#
-# The stand-in is two-dimensional with heights: a box is a turned rectangle, a cylinder or a ball a
-# disc, each between a bottom and a top.
+# Shapes that stand upright on a plane, and how rays hit them and they push a disc away ------------
+# A box is a turned rectangle, a cylinder or a ball a disc, each between a bottom and a top.
 
 
 Color = tuple[float, float, float]

@@ -1,4 +1,4 @@
-"""The picture of the whole arena from above, for `Supervisor.exportImage`."""
+"""Pictures: of the whole arena from above, for `exportImage`, and those of cameras."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def _rgb(color: Color) -> tuple[int, int, int]:
     return r, g, b
 
 
-# Renders small camera pictures, one ray per column of pixels.
+# Pictures of cameras, one ray per column of pixels ------------------------------------------------
 
 
 _LIGHT: Final = (0.8, 0.6)

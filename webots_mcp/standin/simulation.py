@@ -1,4 +1,4 @@
-"""A running simulation with real controller processes."""
+"""A running simulation with real controller processes, and the loop that runs it."""
 
 from __future__ import annotations
 
@@ -263,9 +263,6 @@ class Simulation:
     def _tell(self) -> None:
         with self._changed:
             self._changed.notify_all()
-
-
-# The loop that runs a simulation: serves controllers, keeps time, starts and ends processes.
 
 
 _PATIENCE_S: Final = 1.0

@@ -23,7 +23,10 @@ Value: TypeAlias = "bool | str | Node | list[float] | list[Value] | None"
 NUMBERS_IN: Final = {"Vec2f": 2, "Vec3f": 3, "Color": 3, "Rotation": 4}
 """How many numbers make one value of a type; all other types take one."""
 
-_FIELD_KEYWORDS: Final = ("field", "vrmlField", "exposedField", "unconnectedField", "hiddenField")
+_FIELD_KEYWORDS: Final = (
+    *("field", "vrmlField", "w3dField", "exposedField"),
+    *("unconnectedField", "hiddenField", "deprecatedField"),
+)
 _FIRST_RELEASE: Final = "R2022"
 """The oldest one with the axes of today."""
 

@@ -1,4 +1,4 @@
-"""A world: the scene tree with typed fields, read from a .wbt file."""
+"""A world: the scene tree with typed fields, read from a .wbt file and written as text."""
 
 from __future__ import annotations
 
@@ -278,7 +278,7 @@ def own_frame(node: Node) -> Frame:
     return frame_of(node.fields["translation"], node.fields["rotation"])
 
 
-# Nodes as text, as they would stand in a world file.
+# Nodes as text, as they would stand in a world file -----------------------------------------------
 
 
 def as_text(node: Node, protos: Protos) -> str:

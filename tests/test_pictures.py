@@ -14,6 +14,7 @@ from PIL import Image, ImageChops, ImageStat
 from docs import pictures
 from webots_mcp.testing import RecordedSimulation
 
+pytestmark = pytest.mark.slow
 DRAWN = json.loads(pictures.DRAWN.read_text("utf-8"))
 MOST_BYTES = 150_000
 # Mean difference of the channels, of 255: 0 where the same is drawn, 1.9 and more where it is

@@ -24,7 +24,7 @@ from webots_mcp.connection import connect
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
-from webots_mcp.plotting.trial_scores import compose_trials
+from webots_mcp.plotting.trials import compose_trials
 from webots_mcp.plugins.report.making import make_report
 from webots_mcp.questions import all_questions
 from webots_mcp.questions.declaring import MergedQuestion

@@ -18,6 +18,7 @@ from webots_mcp.contract import DATABASE_NAME
 pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 from playwright.sync_api import Page, expect
 
+pytestmark = pytest.mark.slow
 PATIENCE_MS = 120_000
 FIGURES = "[...document.querySelectorAll('.figure')].map(each => each.figure?.data)"
 CURVE = f"name => ({FIGURES})[0]?.curves?.find(each => each.name === name)"

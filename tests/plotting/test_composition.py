@@ -19,8 +19,7 @@ from webots_mcp.plotting.canvas import MOST_PANELS, Sheet
 from webots_mcp.plotting.curves import MOST_CURVES, Curve, by_scale, by_signal
 from webots_mcp.plotting.palette import MERGED, MOST_VALUES, OTHER_VALUES, area_styles
 from webots_mcp.plotting.path import Path, Place, headings, thinned
-from webots_mcp.plotting.signal_axes import SignalAxes
-from webots_mcp.plotting.signals import compose_signals
+from webots_mcp.plotting.signals import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.store.chunk_making import chunk_whole_run
 

@@ -31,12 +31,10 @@ from webots_mcp.plotting import Picture, PlotKind, Sheet, image_format_of, plot,
 from webots_mcp.plotting.canvas import Canvas
 from webots_mcp.plotting.intervals import Interval
 from webots_mcp.plotting.palette import DASHES, LINES
-from webots_mcp.plotting.signal_axes import paint_signals
-from webots_mcp.plotting.signals import compose_signals
-from webots_mcp.plotting.trajectory import compose_trajectory
-from webots_mcp.plotting.trajectory_axes import paint_trajectory
-from webots_mcp.questions.declaring import RunIds
-from webots_mcp.store.chunk_making import make_chunks
+from webots_mcp.plotting.signals import compose_signals, paint_signals
+from webots_mcp.plotting.trajectory import compose_trajectory, paint_trajectory
+from webots_mcp.questions.argument_types import RunIds
+from webots_mcp.store.chunks.making import make_chunks
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 Ask = dict[str, Any]

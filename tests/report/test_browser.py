@@ -10,6 +10,7 @@ import pytest
 
 from webots_mcp.plugins.report.making import Report
 
+pytestmark = pytest.mark.slow
 DRAWN = "() => [...document.querySelectorAll('[data-figure]')].every(each => each.figure)"
 CURVES = """() => [...document.querySelectorAll('[data-figure]')]
     .flatMap(each => each.figure.data.curves ?? [])

@@ -14,7 +14,7 @@ from webots_mcp.plotting.canvas import (
 from webots_mcp.plotting.question import PlotKind, plot
 from webots_mcp.plotting.signals import plot_signals
 from webots_mcp.plotting.trajectory import plot_trajectory
-from webots_mcp.plotting.trial_scores import plot_trials
+from webots_mcp.plotting.trials import plot_trials
 
 __all__ = [
     "HEIGHT_PX",

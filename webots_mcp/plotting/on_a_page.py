@@ -18,13 +18,8 @@ from webots_mcp.plotting.canvas import ON_A_PAGE, Frame, Room
 from webots_mcp.plotting.curves import Curve
 from webots_mcp.plotting.intervals import Lane
 from webots_mcp.plotting.path import thinned
-from webots_mcp.plotting.signal_axes import SignalAxes, paint_signals
-from webots_mcp.plotting.trajectory_axes import (
-    Obstacle,
-    Track,
-    TrajectoryAxes,
-    paint_trajectory,
-)
+from webots_mcp.plotting.signals import SignalAxes, paint_signals
+from webots_mcp.plotting.trajectory import Obstacle, Track, TrajectoryAxes, paint_trajectory
 from webots_mcp.store.questions.series import MOST_POINTS
 
 ROOM: Final = Room(points=MOST_POINTS, panels=8, lanes=8, rows=16)

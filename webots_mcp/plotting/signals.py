@@ -2,15 +2,50 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, Final
 
 from webots_mcp.errors import NothingRecordedError
-from webots_mcp.naming import listed
-from webots_mcp.plotting.canvas import LEAST_HEIGHT_PX, Picture, Room, Sheet
-from webots_mcp.plotting.curves import Curve, by_choice, by_scale, by_signal, curve_of
+from webots_mcp.naming import listed, spelled_out
+from webots_mcp.plotting.canvas import (
+    LEAST_HEIGHT_PX,
+    ON_PAPER,
+    ROW_PX,
+    Canvas,
+    Frame,
+    Look,
+    Picture,
+    Room,
+    Sheet,
+    axis_range,
+    fitted,
+    short,
+    ticks,
+    width_of,
+    wrapped,
+)
+from webots_mcp.plotting.curves import Curve, Panel, by_choice, by_scale, by_signal, curve_of
 from webots_mcp.plotting.intervals import Interval, Lane, lane_of, merged_notes
+from webots_mcp.plotting.legend import (
+    LINE_PX,
+    Entry,
+    area_sample,
+    hatch_sample,
+    line_sample,
+    paint_area,
+    paint_grid,
+    paint_mark,
+    paint_rows,
+    paint_title,
+    paint_x_axis,
+    paint_y_axis,
+    rows_of,
+)
+from webots_mcp.plotting.palette import DASHES, INK, LINES, Area, area_styles
 from webots_mcp.plotting.parts import (
     Part,
     event_lanes,
@@ -21,7 +56,8 @@ from webots_mcp.plotting.parts import (
     title_of,
     unread_parts,
 )
-from webots_mcp.plotting.signal_axes import SignalAxes, paint_signals
+from webots_mcp.store.analysis.arrays import np
+from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
 
@@ -212,3 +248,325 @@ def _nothing(parts: Sequence[Part]) -> str:
     return f"nothing to draw: none of the signals has a value in {title_of(parts)}" + (
         f" ({notes})" if notes else ""
     )
+
+
+_SMALL_PX: Final = 9.5  # of the letters in rows of intervals
+_TICK_PX: Final = 70.0  # between the labels of the time axis, and
+_LEVEL_PX: Final = 20.0  # between those of the others, at least
+_RIGHT_PX: Final = 16.0
+_BELOW_PX: Final = 24.0  # the labels of the time axis
+_FLAGS: Final = {"true": Area(INK, dotted=False), "false": Area("#EDEDED", dotted=False)}
+_BAND_OPACITY: Final = 0.35
+_LINES_THROUGH: Final = 30  # more instants would be a curtain
+
+
+@dataclass(frozen=True)
+class SignalAxes:
+    """What is to be painted; all times are on the clock of the picture.
+
+    Attributes:
+        colour_by_run: Run to its name in the legend, where several are overlaid; else empty.
+        bands: A text signal behind the curves.
+        lanes: Text and boolean signals below.
+        events: One lane per kind of event.
+        gaps: Where nothing was recorded.
+        unread: Where not all was read.
+    """
+
+    title: str
+    x_label: str
+    x_range: tuple[float, float]
+    panels: Sequence[Panel]
+    colour_by_run: Mapping[int, str]
+    bands: Lane | None
+    lanes: Sequence[Lane]
+    events: Sequence[Lane]
+    gaps: Sequence[Interval]
+    unread: Sequence[Interval] = ()
+
+    @property
+    def rows(self) -> Sequence[Lane]:
+        """All that stands in rows below the curves."""
+        return [*self.lanes, *self.events]
+
+
+def paint_signals(
+    plot: SignalAxes, width_px: int, height_px: int, look: Look = ON_PAPER, *, titled: bool = True
+) -> tuple[Canvas, list[Frame]]:
+    """Paint it; the frames are those of the panels, and of the rows below them as the last."""
+    return _Painter(plot, width_px, height_px, look).paint(titled=titled)
+
+
+class _Painter:
+    """Paints what shares a clock and the margins."""
+
+    def __init__(self, plot: SignalAxes, width_px: int, height_px: int, look: Look) -> None:
+        self._plot = plot
+        self._canvas = Canvas(width_px, height_px, look)
+        behind = plot.bands.values if plot.bands else ()
+        values = [value for lane in plot.lanes for value in lane.values]
+        # The same value has the same style in every row, and behind the panels.
+        self._styles = area_styles([v for v in (*behind, *values) if v not in _FLAGS]) | _FLAGS
+
+    def paint(self, *, titled: bool) -> tuple[Canvas, list[Frame]]:
+        plot, canvas = self._plot, self._canvas
+        top = paint_title(canvas, plot.title) if titled else 6.0
+        heads = [
+            rows_of(self._head(panel), canvas.width_px - 60, 4 * canvas.height_px)
+            for panel in plot.panels
+        ]
+        label = wrapped(plot.x_label, canvas.width_px - 70)
+        scales = [
+            axis_range(min(c.low for c in panel.curves), max(c.high for c in panel.curves))
+            for panel in plot.panels
+        ]
+        left = self._left_px(scales)
+        legend = rows_of(self._entries(left), canvas.width_px - 20, canvas.height_px)
+        below = _BELOW_PX + LINE_PX * (len(label) + len(legend)) + 4
+        heads_px = sum(LINE_PX * len(rows) + 8 for rows in heads)
+        room = max(20.0, canvas.height_px - top - below - heads_px)
+        rows_px = self._rows_px(room)
+        panel_px = (room - rows_px) / max(1, len(plot.panels))
+        frames: list[Frame] = []
+        width = canvas.width_px - left - _RIGHT_PX
+        for panel, rows, scale in zip(plot.panels, heads, scales, strict=True):
+            paint_rows(canvas, rows, top, left)
+            top += LINE_PX * len(rows) + 2
+            frames.append(Frame(left, top, width, panel_px - 2, plot.x_range, scale))
+            self._panel(panel, frames[-1])
+            top += panel_px + 6
+        if plot.rows:
+            frames.append(Frame(left, top, width, rows_px, plot.x_range, (len(plot.rows), 0.0)))
+            self._rows(frames[-1])
+        marks = self._time_marks(frames[-1])
+        for frame in frames[:-1]:
+            paint_x_axis(canvas, frame, [(value, "") for value, _ in marks])
+        paint_x_axis(canvas, frames[-1], marks, label)
+        paint_rows(canvas, legend, canvas.height_px - LINE_PX * len(legend) - 2)
+        return canvas, frames
+
+    def _left_px(self, scales: Sequence[tuple[float, float]]) -> float:
+        """What labels at the left take; of a long name of a row the end is shown."""
+        most = 0.3 * self._canvas.width_px
+        named = [width_of(short(lane.name)) for lane in self._plot.rows]
+        labels = [width_of(text) for scale in scales for _, text in ticks(*scale, 5)]
+        return 12 + min(most, max([24.0, *named, *labels]))
+
+    def _rows_px(self, room: float) -> float:
+        """Rows take the pixels that they need, the panels share the rest."""
+        if not self._plot.panels:
+            return room
+        return min(len(self._plot.rows) * float(ROW_PX), room / 2)
+
+    def _time_marks(self, frame: Frame) -> list[tuple[float, str]]:
+        low, high = self._plot.x_range
+        room = max(_TICK_PX, 1.6 * max(width_of(text) for _, text in ticks(low, high, 8)))
+        return ticks(low, high, frame.width / room)
+
+    # Panels ---------------------------------------------------------------------------------------
+
+    def _head(self, panel: Panel) -> list[Entry]:
+        """What stands above a panel: the name of its signal, or each with a sample of its line."""
+        unit = [f"[{panel.unit}]"] if panel.unit else []
+        room = self._canvas.width_px - 90
+        if len(panel.names) == 1:
+            part = "" if self._plot.colour_by_run else self._part(panel.curves[0])
+            return [Entry(fitted(" ".join([panel.names[0], *unit]), room), None, part)]
+        entries = [
+            Entry(_named(curve, panel), line_sample(*self._pen(panel, index)), self._part(curve))
+            for index, curve in enumerate(panel.curves)
+        ]
+        return [*entries, *map(Entry, unit)]
+
+    def _part(self, curve: Curve) -> str:
+        """By which a page finds it: of several runs all curves of one are hidden together."""
+        run = self._plot.colour_by_run.get(curve.run_id)
+        return f"run {curve.run_id}" if run is not None else f"curve {spelled_out(curve.name)}"
+
+    def _pen(self, panel: Panel, index: int) -> tuple[str, str]:
+        """Colour and dashes: by run where several are overlaid, else by signal."""
+        runs = list(self._plot.colour_by_run)
+        index = runs.index(panel.curves[index].run_id) if runs else index
+        colour = LINES[index % len(LINES)]
+        return (self._canvas.look.ink if colour == "#000000" else colour), DASHES[index % 4]
+
+    def _panel(self, panel: Panel, frame: Frame) -> None:
+        canvas = self._canvas
+        levels = ticks(*frame.y, max(2.0, frame.height / _LEVEL_PX))
+        self._open(frame)
+        self._ground(frame)
+        paint_grid(canvas, frame, (), levels)
+        for event in [each for lane in self._plot.events for each in lane.intervals][
+            :_LINES_THROUGH
+        ]:
+            x = float(frame.px(event.start_s))
+            pen = {"stroke": canvas.look.faint, "stroke_width": 0.6, "stroke_dasharray": "1 3"}
+            canvas.add("path", d=f"M{x:.1f} {frame.top:.1f}V{frame.bottom:.1f}", **pen)
+        for index, curve in enumerate(panel.curves):
+            self._curve(frame, curve, *self._pen(panel, index), len(panel.curves))
+        self._close()
+        paint_y_axis(canvas, frame, levels)
+
+    def _open(self, frame: Frame) -> None:
+        """Begin what is cut off at the frame, and scaled in a page that is zoomed."""
+        box = {"x": frame.left, "y": frame.top, "width": frame.width, "height": frame.height}
+        view = f"{frame.left:.2f} {frame.top:.2f} {frame.width:.2f} {frame.height:.2f}"
+        self._canvas.open("svg", **box, viewBox=view, preserveAspectRatio="none")
+        self._canvas.open(class_="zoom")
+
+    def _close(self) -> None:
+        self._canvas.close()
+        self._canvas.close("svg")
+
+    def _curve(self, frame: Frame, curve: Curve, colour: str, dash: str, count: int) -> None:
+        canvas = self._canvas
+        canvas.open(data_part=self._part(curve))
+        rows: Any = np.array(curve.points, np.float64)
+        x = frame.px(rows[:, 0])
+        mean, low, high = (frame.py(rows[:, column]) for column in (1, 2, 3))
+        edges = [-1, *np.flatnonzero(np.isnan(rows[:, 0])).tolist(), len(rows)]
+        pieces = [
+            slice(start + 1, end) for start, end in pairwise(edges)
+            if end > start + 1
+        ]  # fmt: skip
+        bands = "".join(
+            f"{line_through(x[piece], high[piece])}L"
+            f"{line_through(x[piece][::-1], low[piece][::-1])[1:]}Z"
+            for piece in pieces
+            if (np.abs(high[piece] - low[piece]) > 0.2).any()
+        )
+        if bands:
+            canvas.add("path", d=bands, fill=colour, fill_opacity=0.28 / math.sqrt(count))
+        line = "".join(line_through(x[piece], mean[piece]) for piece in pieces)
+        canvas.add("path", d=line, fill="none", stroke=colour, stroke_width=1.4,
+                   stroke_linejoin="round", stroke_dasharray=dash)  # fmt: skip
+        for piece in pieces:
+            if piece.stop - piece.start == 1:  # a line would not show it
+                at = piece.start
+                canvas.add("path", d=f"M{x[at]:.1f} {low[at]:.1f}V{high[at]:.1f}",
+                           stroke=colour, stroke_width=2, stroke_opacity=0.4)  # fmt: skip
+                canvas.add("path", d=f"M{x[at]:.1f} {mean[at]:.1f}h.01", stroke=colour,
+                           stroke_width=4, stroke_linecap="round")  # fmt: skip
+        canvas.close()
+
+    def _ground(self, frame: Frame) -> None:
+        """Modes and gaps, over the whole height behind the curves."""
+        bands = self._plot.bands
+        for each in bands.intervals if bands else ():
+            box = (*self._stretch(frame, each), frame.height)
+            paint_area(self._canvas, self._styles[each.value], box, _BAND_OPACITY)
+        self._hatch(frame)
+
+    def _hatch(self, frame: Frame) -> None:
+        """Where nothing was recorded, or read, whatever stands there in the last row's name."""
+        canvas = self._canvas
+        for stretches, name in ((self._plot.gaps, "gap"), (self._plot.unread, "unread")):
+            for each in stretches:
+                left, top, width = self._stretch(frame, each)
+                for fill in (canvas.look.ground, f"url(#hatch-{name})"):
+                    canvas.add("rect", x=left, y=top, width=width, height=frame.height, fill=fill)
+
+    def _stretch(self, frame: Frame, interval: Interval) -> tuple[float, float, float]:
+        """Left, top and width."""
+        left, right = float(frame.px(interval.start_s)), float(frame.px(interval.end_s))
+        return left, frame.top, right - left
+
+    # Rows -----------------------------------------------------------------------------------------
+
+    def _rows(self, frame: Frame) -> None:
+        canvas, plot = self._canvas, self._plot
+        row_px = frame.height / len(plot.rows)
+        self._open(frame)
+        for row, lane in enumerate(plot.rows):
+            top = frame.top + (row + 0.1) * row_px
+            for each in lane.intervals:
+                left, _, width = self._stretch(frame, each)
+                box = (left, top, width, 0.8 * row_px)
+                if row < len(plot.lanes):
+                    paint_area(canvas, self._styles[each.value], box)
+                else:
+                    paint_area(canvas, Area(LINES[1], dotted=False), box, 0.3)
+        self._hatch(frame)
+        self._close()
+        for row, lane in enumerate(plot.rows):
+            middle = frame.top + (row + 0.5) * row_px
+            name = fitted(short(lane.name), frame.left - 10)
+            canvas.text(frame.left - 7, middle + 4, name, anchor="end")
+            canvas.open(class_="marks")
+            if row < len(plot.lanes):
+                self._name_states(frame, middle, lane)
+            else:
+                self._mark_events(frame, middle, lane)
+            canvas.close()
+
+    def _name_states(self, frame: Frame, middle: float, lane: Lane) -> None:
+        for each in lane.intervals:
+            if _has_room(frame, each):
+                ink = "#FFFFFF" if self._styles[each.value].colour == INK else INK
+                x = float(frame.px((each.start_s + each.end_s) / 2))
+                self._name(short(each.value), x, middle, colour=ink, anchor="middle")
+
+    def _mark_events(self, frame: Frame, middle: float, lane: Lane) -> None:
+        """A mark at the start of each, its name where there is room."""
+        ends = [*(each.start_s for each in lane.intervals[1:]), frame.x[1]]
+        for each, end_s in zip(lane.intervals, ends, strict=True):
+            x = float(frame.px(each.start_s))
+            paint_mark(self._canvas, "diamond", (x, middle), 4.0, fill=LINES[1])
+            if _has_room(frame, Interval(each.value, each.start_s, end_s)):
+                self._name(short(each.value), x, middle, shift=7.0)
+
+    def _name(self, text: str, x: float, y: float, *, shift: float = 0.0, **style: Any) -> None:
+        canvas = self._canvas
+        canvas.open(class_="at", data_x=x, data_y=y, transform=f"translate({x:.1f} {y:.1f})")
+        canvas.text(shift, 3.5, text, size=_SMALL_PX, **style)
+        canvas.close()
+
+    # Legend ---------------------------------------------------------------------------------------
+
+    def _entries(self, left: float) -> list[Entry]:
+        """What the legend below the axes has to tell."""
+        plot = self._plot
+        entries: list[Entry] = []
+        for index, (run_id, name) in enumerate(plot.colour_by_run.items()):
+            sample = line_sample(LINES[index % len(LINES)], DASHES[index % len(DASHES)])
+            room = self._canvas.width_px - 80
+            entries.append(Entry(fitted(name, room), sample, f"run {run_id}"))
+        if plot.gaps:
+            entries.append(Entry("nothing recorded", hatch_sample("hatch-gap")))
+        if plot.unread:
+            entries.append(Entry("not all was read", hatch_sample("hatch-unread")))
+        if plot.bands is not None and plot.panels:
+            entries.append(Entry(f"{short(plot.bands.name)}:"))
+            entries += [
+                Entry(short(value), area_sample(self._styles[value], _BAND_OPACITY))
+                for value in plot.bands.values
+            ]
+        width = self._canvas.width_px - left - _RIGHT_PX
+        frame = Frame(left, 0, width, 1, plot.x_range, (0, 1))
+        return entries + [
+            Entry(short(value), area_sample(self._styles[value]))
+            for value in _unnamed(plot.lanes, frame)
+        ]
+
+
+def _named(curve: Curve, panel: Panel) -> str:
+    """With its own unit where that of the panel is not that of all."""
+    own = f" [{curve.unit}]" if curve.unit and not panel.unit else ""
+    return short(curve.name) + own
+
+
+def line_through(x: Any, y: Any) -> str:
+    """The path through places in pixels."""
+    return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
+
+
+def _has_room(frame: Frame, interval: Interval) -> bool:
+    width = frame.width * (interval.end_s - interval.start_s) / (frame.x[1] - frame.x[0])
+    return width > 10 + width_of(short(interval.value), _SMALL_PX)
+
+
+def _unnamed(lanes: Sequence[Lane], frame: Frame) -> list[str]:
+    """Values in the rows below that no interval had room for."""
+    intervals = [interval for lane in lanes for interval in lane.intervals]
+    named = {interval.value for interval in intervals if _has_room(frame, interval)}
+    return [v for v in dict.fromkeys(each.value for each in intervals) if v not in named]

@@ -4,12 +4,42 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Sequence
-from typing import Final
+from dataclasses import dataclass
+from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.naming import listed
-from webots_mcp.plotting.canvas import Picture, Sheet
+from webots_mcp.naming import listed, spelled_out
+from webots_mcp.plotting.canvas import (
+    ON_PAPER,
+    Canvas,
+    Frame,
+    Look,
+    Picture,
+    Sheet,
+    axis_range,
+    fitted,
+    short,
+    ticks,
+    width_of,
+)
 from webots_mcp.plotting.intervals import Lane, lane_of, merged_notes
+from webots_mcp.plotting.legend import (
+    LINE_PX,
+    SCALE_PX,
+    Entry,
+    line_sample,
+    mark_sample,
+    paint_grid,
+    paint_mark,
+    paint_rows,
+    paint_scale,
+    paint_title,
+    paint_x_axis,
+    paint_y_axis,
+    paint_y_label,
+    rows_of,
+)
+from webots_mcp.plotting.palette import DASHES, INK, LINES, area_styles, scaled
 from webots_mcp.plotting.parts import (
     Known,
     Part,
@@ -20,9 +50,10 @@ from webots_mcp.plotting.parts import (
     stuck_mark,
     title_of,
 )
-from webots_mcp.plotting.path import read_path
-from webots_mcp.plotting.trajectory_axes import Track, TrajectoryAxes, paint_trajectory
-from webots_mcp.store.detection.kinds import EventOptions
+from webots_mcp.plotting.path import Path, Place, extent, headings, read_path, thinned
+from webots_mcp.plotting.signals import line_through
+from webots_mcp.store.analysis.arrays import np
+from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import motion_in
 from webots_mcp.store.reading.catalogue import one_signal
 from webots_mcp.store.reading.frame import read_frame
@@ -183,3 +214,270 @@ def _cut(tracks: Sequence[Track]) -> list[str]:
         for track in tracks
         if track.path.places and not track.path.is_whole
     ]
+
+
+_ARROWS: Final = 9
+_TICK_PX: Final = 50.0  # between ticks, at least
+_ON_THE_SPOT: Final = 0.03  # of the size of the whole way
+_LEAST_SIZE: Final = 0.02  # of the picture, in the unit of the position
+_MARGIN: Final = 0.06
+_COLOURS: Final = 64  # of a way that is coloured by time
+_MANY: Final = 10  # marks of a kind; more are drawn smaller
+_SHAPES: Final = ("circle", "cross", "plus", "triangle", "star")  # the first is around the others
+_OBSTACLE: Final = {"fill": "#B8B8B8", "fill_opacity": 0.55, "stroke_width": 0.8}
+
+
+@dataclass(frozen=True)
+class Track:
+    """The way of one run.
+
+    Attributes:
+        modes: What colours it; None for the time, or for the run where there are several.
+        marks: Events, one lane per kind, which may be empty; at most five.
+    """
+
+    name: str
+    path: Path
+    modes: Lane | None
+    marks: Sequence[Lane]
+
+
+@dataclass(frozen=True)
+class Obstacle:
+    """Something that stands in a world.
+
+    Attributes:
+        outline: Its corners, seen from above, in metres; empty where its size is not known.
+    """
+
+    name: str
+    x: float
+    y: float
+    outline: tuple[tuple[float, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class TrajectoryAxes:
+    """What is to be painted."""
+
+    title: str
+    x_label: str
+    y_label: str
+    tracks: Sequence[Track]
+    mode: str | None
+
+    @property
+    def places(self) -> Sequence[Place]:
+        """Of all tracks."""
+        return [place for track in self.tracks for place in track.path.places]
+
+
+def paint_trajectory(
+    plot: TrajectoryAxes, width_px: int, height_px: int, look: Look = ON_PAPER, *,
+    obstacles: Sequence[Obstacle] = (), titled: bool = True,
+) -> tuple[Canvas, Frame]:  # fmt: skip
+    """Paint it, at the same scale on both axes."""
+    return _Painter(plot, Canvas(width_px, height_px, look), obstacles).paint(titled=titled)
+
+
+class _Painter:
+    def __init__(self, plot: TrajectoryAxes, canvas: Canvas, obstacles: Sequence[Obstacle]) -> None:
+        self._plot, self._canvas, self._standing = plot, canvas, obstacles
+        self._alone = len(plot.tracks) == 1
+        modes = plot.tracks[0].modes if self._alone else None
+        self._modes = modes if plot.mode is not None else None
+        self._styles = area_styles(modes.values) if modes else {}
+
+    def paint(self, *, titled: bool) -> tuple[Canvas, Frame]:
+        plot, canvas = self._plot, self._canvas
+        top = paint_title(canvas, plot.title) if titled else 6.0
+        legend = rows_of(self._entries(), canvas.width_px - 20, canvas.height_px)
+        by_time = self._alone and self._modes is None and bool(plot.tracks[0].path.steps())
+        frame = self._frame(top, 44 + LINE_PX * len(legend), SCALE_PX if by_time else 16.0)
+        marks = _marks_of(frame)
+        paint_grid(canvas, frame, *marks)
+        box = {"x": frame.left, "y": frame.top, "width": frame.width, "height": frame.height}
+        view = f"{frame.left:.2f} {frame.top:.2f} {frame.width:.2f} {frame.height:.2f}"
+        canvas.open("svg", **box, viewBox=view)
+        canvas.open(class_="zoom")
+        self._obstacles(frame)
+        drawn = [(i, each) for i, each in enumerate(plot.tracks) if each.path.places]
+        for index, track in drawn:
+            self._way(frame, track, index)
+        canvas.close()
+        canvas.close("svg")
+        canvas.open(class_="marks")
+        for index, track in drawn:
+            self._marks(frame, track, index)
+        canvas.close()
+        paint_x_axis(canvas, frame, marks[0], [fitted(plot.x_label, frame.width)])
+        paint_y_axis(canvas, frame, marks[1])
+        paint_y_label(canvas, frame, fitted(plot.y_label, frame.height))
+        if by_time:
+            path = plot.tracks[0].path
+            bounds = (path.places[0].time_s, path.places[-1].time_s)
+            label = fitted("simulation time [s]", frame.height)
+            paint_scale(canvas, frame, "time", bounds, label)
+        paint_rows(canvas, legend, canvas.height_px - LINE_PX * len(legend) - 2)
+        return canvas, frame
+
+    def _frame(self, top: float, below: float, right: float) -> Frame:
+        """The same scale on both axes; a robot that stands still is not blown up."""
+        canvas, places = self._canvas, self._plot.places
+        low, high = ([pick(p[i] for p in places) for i in (1, 2)] for pick in (min, max))
+        sides = [max(b - a, _LEAST_SIZE) * (1 + 2 * _MARGIN)
+                 for a, b in zip(low, high, strict=True)]  # fmt: skip
+        middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
+        labels = [text for _, text in ticks(*axis_range(low[1], high[1]), 8)]
+        left = 30 + max(24.0, *map(width_of, labels))
+        width = canvas.width_px - left - right
+        height = max(20.0, canvas.height_px - top - below)
+        per_px = max(sides[0] / width, sides[1] / height)
+        x, y = ((m - n * per_px / 2, m + n * per_px / 2)
+                for m, n in zip(middle, (width, height), strict=True))  # fmt: skip
+        return Frame(left, top, width, height, x, y)
+
+    def _ink(self, index: int) -> str:
+        """Of several ways each has a colour of its own."""
+        if self._alone or LINES[index % len(LINES)] == "#000000":
+            return self._canvas.look.ink
+        return LINES[index % len(LINES)]
+
+    def _obstacles(self, frame: Frame) -> None:
+        """Outlines where sizes are known, squares elsewhere; a page tells their names."""
+        for each in self._standing:
+            x, y = float(frame.px(each.x)), float(frame.py(each.y))
+            d = f"M{x - 4:.1f} {y - 4:.1f}h8v8h-8Z"
+            if each.outline:
+                corners = np.array(each.outline)
+                d = line_through(frame.px(corners[:, 0]), frame.py(corners[:, 1])) + "Z"
+            named = {"stroke": self._canvas.look.faint, "data_name": spelled_out(each.name)}
+            self._canvas.add("path", d=d, **named, **_OBSTACLE)
+
+    def _way(self, frame: Frame, track: Track, index: int) -> None:
+        canvas, path = self._canvas, track.path
+        canvas.open(data_part=f"track {index}")
+        for at in path.breaks:  # where nothing was recorded, or it leapt: what follows what
+            leap = [path.places[at - 1], path.places[at]]
+            self._line(frame, [leap], canvas.look.faint, 0.8, stroke_dasharray="1 2")
+        if not self._alone:
+            pen = {"stroke_dasharray": DASHES[index % len(DASHES)]}
+            self._line(frame, path.pieces(), self._ink(index), 1.8, **pen)
+        elif self._modes is not None:
+            self._by_mode(frame, path, self._modes)
+        else:
+            self._by_time(frame, path)
+        canvas.close()
+
+    def _by_mode(self, frame: Frame, path: Path, modes: Lane) -> None:
+        stretches: dict[str, list[Sequence[Place]]] = {value: [] for value in modes.values}
+        spot = _ON_THE_SPOT * extent(path.places)
+        spots: list[tuple[Place, str]] = []
+        for piece in path.pieces():
+            part = Path(piece, None, frozenset())
+            for interval in modes.intervals:
+                held = part.between(interval.start_s, interval.end_s)
+                stretches[interval.value].append(held)
+                if len(held) > 1 and extent(held) < spot:
+                    spots.append((held[-1], self._styles[interval.value].colour))
+        # An edge, so that light colours are seen.
+        self._line(frame, path.pieces(), self._canvas.look.ink, 4.6)
+        for value, held in stretches.items():
+            self._line(frame, held, self._styles[value].colour, 3.2)
+            if self._styles[value].dotted:
+                self._line(frame, held, INK, 1.4, stroke_dasharray="1.4 2.8", stroke_linecap="butt")
+        for place, colour in spots:  # what happened on the spot, where a line has no length
+            self._line(frame, [[place, place]], self._canvas.look.ink, 7.0)
+            self._line(frame, [[place, place]], colour, 5.4)
+
+    def _by_time(self, frame: Frame, path: Path) -> None:
+        start_s, end_s = path.places[0].time_s, path.places[-1].time_s
+        length_s = (end_s - start_s) or 1.0
+        stretches: list[list[Sequence[Place]]] = [[] for _ in range(_COLOURS)]
+        for before, after in path.steps():
+            share = (before.time_s - start_s) / length_s
+            stretches[min(_COLOURS - 1, int(share * _COLOURS))].append((before, after))
+        for number, steps in enumerate(stretches):
+            self._line(frame, steps, scaled(number / (_COLOURS - 1), "time"), 2.4)
+
+    def _line(self, frame: Frame, stretches: Any, colour: str, width: float, **style: Any) -> None:
+        """One line, broken between the stretches."""
+        drawn = [np.array(thinned(each))[:, 1:] for each in stretches if len(each) > 1]
+        if drawn:
+            d = "".join(line_through(frame.px(each[:, 0]), frame.py(each[:, 1])) for each in drawn)
+            style = {"stroke_linecap": "round", "stroke_linejoin": "round"} | style
+            self._canvas.add("path", d=d, fill="none", stroke=colour, stroke_width=width, **style)
+
+    def _marks(self, frame: Frame, track: Track, index: int) -> None:
+        canvas, path, ink = self._canvas, track.path, self._ink(index)
+        canvas.open(data_part=f"track {index}")
+        edge = {"stroke": canvas.look.ground, "stroke_width": 0.6}
+        for each in headings(path, _ARROWS):
+            at = (float(frame.px(each.x)), float(frame.py(each.y)))
+            paint_mark(canvas, "arrow", at, 6.0, degrees=-each.degrees, fill=ink, **edge)
+        first, last = path.places[0], path.places[-1]
+        at = (float(frame.px(first.x)), float(frame.py(first.y)))
+        paint_mark(canvas, "circle", at, 5.0, fill=canvas.look.ground, stroke=ink, stroke_width=2.0)
+        if path.is_whole:
+            at = (float(frame.px(last.x)), float(frame.py(last.y)))
+            paint_mark(canvas, "square", at, 6.5, fill=ink)
+        for mark, shape in zip(track.marks, _SHAPES, strict=False):
+            size = 0.6 if len(mark.intervals) > _MANY else 1.0
+            for interval in mark.intervals:
+                place = path.at(interval.start_s)
+                at = (float(frame.px(place.x)), float(frame.py(place.y)))
+                paint_mark(canvas, shape, at, size * _size(shape), **self._style(shape, index))
+        canvas.close()
+
+    def _style(self, shape: str, index: int) -> dict[str, Any]:
+        colour = LINES[1] if self._alone else self._ink(index)
+        if shape == "circle":
+            return {"fill": "none", "stroke": colour, "stroke_width": 2.6}
+        return {"fill": colour, "stroke": self._canvas.look.ground, "stroke_width": 0.8}
+
+    def _entries(self) -> list[Entry]:
+        plot, ink, ground = self._plot, self._canvas.look.ink, self._canvas.look.ground
+        start = mark_sample("circle", 5.0, fill=ground, stroke=ink, stroke_width=2.0)
+        entries = [Entry("start", start)]
+        if any(each.path.is_whole for each in plot.tracks if each.path.places):
+            entries.append(Entry("end", mark_sample("square", 6.5, fill=ink)))
+        if self._modes is not None:
+            entries.append(Entry(f"{short(self._modes.name)}:"))
+            for value in self._modes.values:
+                style = self._styles[value]
+                entries.append(Entry(short(value), _mode_sample(style.colour, style.dotted)))
+        for index, track in enumerate(plot.tracks):
+            if not track.path.places:
+                continue
+            if not self._alone:
+                sample = line_sample(self._ink(index), DASHES[index % len(DASHES)], 2.0)
+                room = self._canvas.width_px - 80
+                entries.append(Entry(fitted(track.name, room), sample, f"track {index}"))
+            whose = "" if self._alone else f", {track.name}"
+            for mark, shape in zip(track.marks, _SHAPES, strict=False):
+                if mark.intervals:
+                    size = min(9.0, _size(shape))
+                    sample = mark_sample(shape, size, **self._style(shape, index))
+                    text = f"{short(mark.name)}{whose} ({len(mark.intervals)})"
+                    entries.append(Entry(fitted(text, self._canvas.width_px - 80), sample))
+        return entries
+
+
+def _size(shape: str) -> float:
+    return 11.0 if shape == "circle" else 6.0
+
+
+def _mode_sample(colour: str, dotted: bool) -> Any:
+    def draw(canvas: Canvas, x: float, y: float) -> None:
+        line_sample(colour, width=4.5)(canvas, x, y)
+        if dotted:
+            line_sample(INK, "1.4 2.8", 1.4)(canvas, x, y)
+
+    return draw
+
+
+def _marks_of(frame: Frame) -> tuple[list[tuple[float, str]], list[tuple[float, str]]]:
+    """Ticks of both axes, at the same distances."""
+    widest = max(width_of(text) for _, text in ticks(*frame.x, frame.width / _TICK_PX))
+    room = max(_TICK_PX, 1.4 * widest)
+    return ticks(*frame.x, frame.width / room), ticks(*frame.y, frame.height / room)

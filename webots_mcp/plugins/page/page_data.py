@@ -26,10 +26,8 @@ from webots_mcp.errors import (
 from webots_mcp.naming import spelled_out
 from webots_mcp.plotting.on_a_page import ROOM, signals_figure, way_figure
 from webots_mcp.plotting.question import changed_most
-from webots_mcp.plotting.signal_axes import SignalAxes
-from webots_mcp.plotting.signals import compose_signals
-from webots_mcp.plotting.trajectory import compose_trajectory
-from webots_mcp.plotting.trajectory_axes import Obstacle, Track, TrajectoryAxes
+from webots_mcp.plotting.signals import SignalAxes, compose_signals
+from webots_mcp.plotting.trajectory import Obstacle, Track, TrajectoryAxes, compose_trajectory
 from webots_mcp.plugins.report.obstacles import obstacles_of
 from webots_mcp.store.run_rows import (StoredImage, newest_image, opened)
 from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines

@@ -9,7 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from webots_mcp.plotting.trajectory_axes import Obstacle
+from webots_mcp.plotting.trajectory import Obstacle
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.robots import world_seen
 from webots_mcp.store.run_rows import Run, fetch_run

@@ -19,7 +19,7 @@ from webots_mcp.bridge.capture import MOST_LINES_PER_S
 from webots_mcp.bridge.devices import MOST_OBJECTS, SECTORS
 from webots_mcp.cli import names
 from webots_mcp.cli.commands import described
-from webots_mcp.connection import OLDEST_SQLITE
+from webots_mcp.connection import OLDEST_SQLITE, SCHEMA_FILE
 from webots_mcp.contract import BUILT_IN_ACTIONS, KEEP_AFTER_S
 from webots_mcp.questions.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS
 from webots_mcp.questions.declaring import MAX_WAIT_S

@@ -27,8 +27,7 @@ from webots_mcp.liveness import give_back, holder_of, lease_of, take
 from webots_mcp.store.logs import ConsoleRows, Said
 from webots_mcp.store.recording import Job, Recording
 from webots_mcp.store.robots import list_robots
-from webots_mcp.webots import Instance
-from webots_mcp.webots import instances
+from webots_mcp.webots import Instance, instances
 from webots_mcp.webots.orders import (
     ANSWER_S,
     Message,

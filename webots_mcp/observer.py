@@ -109,7 +109,7 @@ class ObserverBridge(MCPBridge):
 
     def record_event(self, kind: str, data: dict[str, object]) -> None:
         """Record what changes seldom: what there is, and the mode."""
-        self._session.context.journal.event(kind, data)
+        self._session.journal.event(kind, data)
 
     def count_steps_by_time(self) -> None:
         """Count steps by time, since the world advances between two rounds of this loop."""
@@ -118,7 +118,7 @@ class ObserverBridge(MCPBridge):
     @property
     def mode_name(self) -> str:
         """The mode in which the simulation is seen to be."""
-        return self._session.context.simulation.mode_name
+        return self._session.simulation.mode_name
 
     def failed(self, error: Exception) -> None:
         """Count what could not be seen, and say it once on stderr."""

@@ -58,7 +58,7 @@ from webots_mcp.store.run_rows import Event, State, newest_events, runs_of
 from webots_mcp.store.signals import cleaned, registered
 
 if TYPE_CHECKING:
-    from controller.wire import Message
+    from controller.session import Message
 
 __all__ = [
     "RecordedCommand",

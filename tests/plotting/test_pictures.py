@@ -33,8 +33,8 @@ from webots_mcp.plotting.intervals import Interval
 from webots_mcp.plotting.palette import DASHES, LINES
 from webots_mcp.plotting.signals import compose_signals, paint_signals
 from webots_mcp.plotting.trajectory import compose_trajectory, paint_trajectory
-from webots_mcp.questions.argument_types import RunIds
-from webots_mcp.store.chunks.making import make_chunks
+from webots_mcp.questions.declaring import RunIds
+from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 Ask = dict[str, Any]

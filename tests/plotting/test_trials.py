@@ -15,7 +15,7 @@ from tests.plotting.test_pictures import words
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plotting import Sheet, plot, plot_trials
 from webots_mcp.plotting.trials import compose_trials
-from webots_mcp.store.trials import Result, create_trial_set, finish_trial, trials_of
+from webots_mcp.store.parameters import Result, create_trial_set, finish_trial, trials_of
 
 SVG = Sheet(image_format="svg")
 Tried = Callable[..., sqlite3.Connection]

@@ -26,7 +26,6 @@ from webots_mcp.errors import (
 from webots_mcp.plugins.pool.pool_contents import pooled_runs
 from webots_mcp.plugins.pool.pool_interface import BATCH_BYTES, is_whole, table
 from webots_mcp.plugins.pool.shipping import LAST_GROUP, Report, Source, follow
-from webots_mcp.connection import (OLDER_SCHEMA, create_schema)
 from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.merging import merge
 from webots_mcp.store.recording import Recording

@@ -16,7 +16,7 @@ from tests.observer.conftest import OBSERVER
 from tests.recordings.rows import Recorded
 from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail
 from webots_mcp import MCPBridge
-from webots_mcp.observer import main as observer
+from webots_mcp.observer import observe
 from webots_mcp.standin import InProcessRobot, InProcessSimulation, InProcessSupervisor
 
 pytestmark = pytest.mark.anyio

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import random
 import sqlite3
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -131,6 +132,42 @@ SPEEDS = [
     {"world": {"one": {"x_m": 1, "y_m": 2, "speed_mps": 3}}, "velocity": 0.5},
     {"odometry": [1, 2, 3, 0.5], "pose_mm": [7, 8, 9]},
 ]
+
+
+WORDS = (
+    "pose", "position", "gps", "odom", "x", "y", "X", "mm", "cm", "km", "m", "robot", "current",
+    "goal", "target", "vel", "ball", "mode", "state", "status", "name", "str", "last", "next",
+    "action", "arm", "GPS", "IMU", "nav", "task", "own", "0", "1", "speed", "solid", "world",
+    "heading", "yaw", "deg", "theta", "cmd", "wheel", "motor", "left", "command", "z", "alt",
+)  # fmt: skip
+
+
+def some_key(numbers: random.Random) -> str:
+    words = numbers.choices(WORDS, k=numbers.randint(1, 3))
+    camel = words[0] + "".join(word.capitalize() for word in words[1:])
+    return numbers.choice(("_".join(words), camel, camel[:1].upper() + camel[1:], camel.upper()))
+
+
+def some_value(numbers: random.Random, depth: int = 0) -> Any:
+    kind = numbers.random() + depth / 10
+    if kind > 0.4:
+        return numbers.choice((1, 2, 3.5, -7, 0.25, 100, "go", "wait", "", None, True))
+    if kind > 0.25:
+        return [some_value(numbers, depth + 1) for _ in range(numbers.randint(1, 6))]
+    return {some_key(numbers): some_value(numbers, depth + 1) for _ in range(numbers.randint(1, 3))}
+
+
+def some_state(numbers: random.Random) -> dict[str, Any]:
+    """A state with a pair of coordinates in a branch, as a rule, and with anything else."""
+    state = {some_key(numbers): some_value(numbers) for _ in range(numbers.randint(1, 4))}
+    before, after = numbers.choice(("", "pos_", "robot_")), numbers.choice(("", "_mm", "_cm", "_m"))
+    pair = {f"{before}x{after}": 1.5, f"{before}y{after}": 2}
+    return state | ({some_key(numbers): pair} if numbers.random() < 0.7 else {})
+
+
+def some_states(count: int) -> list[dict[str, Any]]:
+    numbers = random.Random(11)
+    return [some_state(numbers) for _ in range(count)]
 
 
 def record_robots(connection: sqlite3.Connection, states: Sequence[dict[str, Any]]) -> None:

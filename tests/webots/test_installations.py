@@ -9,8 +9,7 @@ import pytest
 from webots_mcp import webots as module
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.steering.trial_run import webots
-from webots_mcp.webots import find_webots
-from webots_mcp.webots import installations
+from webots_mcp.webots import find_webots, installations
 
 LAYOUTS = {
     "linux": ("webots", "webots-controller", "lib/controller/python", "resources"),
@@ -78,7 +77,7 @@ def test_a_program_without_a_home_is_still_one(
     script.chmod(0o755)
     found = find_webots()
     assert (found.home, found.version, found.program) == (None, None, script)
-    assert instances("a.wbt").words[0] == str(script)
+    assert webots("a.wbt").words[0] == str(script)
 
 
 def test_of_several_webots_home_comes_first_and_each_is_there_once(
@@ -103,4 +102,4 @@ def test_where_none_is_installed_the_places_are_named(
     with pytest.raises(CommandRefusedError, match=r"WEBOTS_HOME \(.*gone\), on the PATH or in"):
         find_webots()
     with pytest.raises(CommandRefusedError, match="--stand-in"):
-        instances("a.wbt")
+        webots("a.wbt")

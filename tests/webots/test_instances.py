@@ -8,8 +8,7 @@ import subprocess
 from pathlib import Path
 
 from tests.webots.conftest import StartWebots, free_port, wait_for_line
-from webots_mcp.webots import (Instance, _arguments, instance_at)
-from webots_mcp.webots import instances
+from webots_mcp.webots import Instance, _arguments, instance_at, instances
 from webots_mcp.webots.orders import give_order
 
 

@@ -200,8 +200,7 @@ def _connect_to(url: str | None, robot: str) -> str:
     Raises:
         CommandRefusedError: There is no such library.
     """
-    from webots_mcp.webots import (DEFAULT_PORT, HOME_VARIABLE)
-    from webots_mcp.webots import installations
+    from webots_mcp.webots import DEFAULT_PORT, HOME_VARIABLE, installations
 
     url = url or os.environ.get(_URL) or f"ipc://{DEFAULT_PORT}"
     os.environ[_URL] = f"{url.rstrip('/')}/{robot}" if url.count("/") == 2 else url
@@ -222,7 +221,7 @@ def _connect_to(url: str | None, robot: str) -> str:
 # -- starting Webots --
 
 _LOOK_EVERY_S: Final = 0.2
-_EXTERN_HERE: Final = "python -m webots_mcp.standin --robot runs one"
+_EXTERN_HERE: Final = "--robot NAME=FILE runs one"
 MAX_PORT: Final = 65_535
 
 
@@ -261,6 +260,14 @@ def launch(
             "Webots is installed; it ends with Ctrl-C.",
         ),
     ] = False,
+    robot: Annotated[
+        tuple[str, ...],
+        Parameter(
+            "--robot",
+            help="With --stand-in: NAME=FILE runs this file as the controller of a robot, also of "
+            "one that is <extern>.",
+        ),
+    ] = (),
     data_dir: Annotated[
         Path | None,
         Parameter("--data-dir", help="Where controllers record; else mcp_data/ of the project."),
@@ -290,7 +297,9 @@ def launch(
         os.environ[DATA_DIR_VARIABLE] = str(recording.data_dir)
         watched = recording, newest_in(recording), file, patience_s
         threading.Thread(target=_watch, args=watched, daemon=True).start()
-        return stand_in_simulator()(file, mode or "realtime")
+        return stand_in_simulator()(file, mode or "realtime", None, _controllers(robot))
+    if robot:
+        raise InvalidInputError("--robot is for --stand-in: Webots runs what the world names")
     start = Start(file, mode, headless, stream, port or free_port())
     environment = {DATA_DIR_VARIABLE: str(recording.data_dir)}
     console = _Console()
@@ -302,6 +311,17 @@ def launch(
             if not launched.webots.is_over:
                 _say("ending Webots")
             launched.webots.end()
+
+
+def _controllers(robots: tuple[str, ...]) -> dict[str, str]:
+    """Controller files by robot name, of NAME=FILE."""
+    named: dict[str, str] = {}
+    for text in robots:
+        name, equals, file = text.partition("=")
+        if not (name and equals and file):
+            raise InvalidInputError(f"--robot {text!r} is not NAME=FILE")
+        named[name] = file
+    return named
 
 
 def _watch(recording: Recording, before: int, world: Path, patience_s: float) -> None:

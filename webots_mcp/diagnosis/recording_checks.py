@@ -19,6 +19,8 @@ from webots_mcp.connection import (
     connect,
     is_there,
     journal_mode,
+    require_current,
+    schema_version,
 )
 from webots_mcp.contract import DATA_DIR_VARIABLE, HEARTBEAT_LATE_S, SCHEMA_VERSION
 from webots_mcp.diagnosis import (
@@ -35,8 +37,7 @@ from webots_mcp.diagnosis import (
 from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
 from webots_mcp.requirements import install_line, missing_requirements, package_of
 from webots_mcp.store.recording import GETTING_STARTED, View, name_of
-from webots_mcp.store.robots import fetch_session
-from webots_mcp.store.robots import (handler_at_work, rows_waiting)
+from webots_mcp.store.robots import fetch_session, handler_at_work, rows_waiting
 from webots_mcp.waiting_file import count_rows, waiting_paths
 
 _OLDEST_PYTHON: Final = (3, 10)

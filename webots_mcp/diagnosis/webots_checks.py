@@ -33,10 +33,8 @@ from webots_mcp.setup.client_entries import (
     words_of,
 )
 from webots_mcp.store.recording import View
-from webots_mcp.store.robots import (Session, companions)
-from webots_mcp.store.robots import SILENT
-from webots_mcp.webots import (find_webots, shown_of)
-from webots_mcp.webots import installations
+from webots_mcp.store.robots import SILENT, Session, companions
+from webots_mcp.webots import find_webots, installations, shown_of
 from webots_mcp.webots.orders import address_of
 
 if TYPE_CHECKING:

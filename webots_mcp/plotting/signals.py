@@ -57,7 +57,6 @@ from webots_mcp.plotting.parts import (
     unread_parts,
 )
 from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
 

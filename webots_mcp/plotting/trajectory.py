@@ -53,7 +53,7 @@ from webots_mcp.plotting.parts import (
 from webots_mcp.plotting.path import Path, Place, extent, headings, read_path, thinned
 from webots_mcp.plotting.signals import line_through
 from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.detection.motion import motion_in
 from webots_mcp.store.reading.catalogue import one_signal
 from webots_mcp.store.reading.frame import read_frame

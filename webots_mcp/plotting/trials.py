@@ -40,8 +40,8 @@ from webots_mcp.plotting.legend import (
 from webots_mcp.plotting.palette import INK, LINES, scaled
 from webots_mcp.plotting.signals import line_through
 from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.analysis.ranking import Outcome, Ranked, rank
-from webots_mcp.store.trials import Trial, best_of, fetch_trial_set, trials_of
+from webots_mcp.store.analysis.spread import Outcome, Ranked, rank
+from webots_mcp.store.parameters import Trial, best_of, fetch_trial_set, trials_of
 
 
 def plot_trials(

@@ -37,8 +37,7 @@ from webots_mcp.steering.dispatch import Dispatcher, find_target
 from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.robots import Session, find_holder, list_robots, live_observer
-from webots_mcp.webots import (Instance, instance_at)
-from webots_mcp.webots import instances
+from webots_mcp.webots import Instance, instance_at, instances
 from webots_mcp.webots.orders import (
     ANSWER_S,
     KEYS,

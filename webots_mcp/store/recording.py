@@ -484,6 +484,7 @@ _UNSTORABLE: Final = (
     TypeError, OverflowError, ValueError, RecursionError, sqlite3.DataError, sqlite3.IntegrityError,
 )  # fmt: skip
 # Where several tables are read as one, a view of `main` would go on to read the tables themselves.
+_IS_SHADOWED: Final = "SELECT 1 FROM sqlite_temp_master WHERE name = 'robot'"
 _COLUMNS: Final = 'SELECT name, type, "notnull", dflt_value, pk FROM pragma_table_info(?)'
 
 
@@ -550,8 +551,12 @@ def is_past_invalid_rows() -> bool:
 
 def shadow_if_asked(connection: sqlite3.Connection) -> None:
     """Inside `past_invalid_rows` give a reader views of the valid rows under the tables' names."""
-    if (invalid := _reading.get()) is not None:
+    if (invalid := _reading.get()) is None:
+        return
+    if connection.execute(_IS_SHADOWED).fetchone() is None:
         _shadow(connection, invalid)
+    else:  # by a question before, on a connection that is kept open
+        connection.create_function("note_invalid", 4, invalid.note)
 
 
 def _shadow(connection: sqlite3.Connection, invalid: InvalidValues) -> None:

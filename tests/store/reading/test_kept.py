@@ -18,7 +18,7 @@ from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.chunk_making import (chunk_whole_run, make_chunks)
+from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.detection.events import EventOptions, find_events
 from webots_mcp.store.export_rows import Source
 from webots_mcp.store.questions.series import query_history, query_rows

@@ -15,6 +15,7 @@ from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plugins.report.chapter import Chapter, Moment
 from webots_mcp.plugins.report.obstacles import obstacles_of
+from webots_mcp.store.reading.catalogue import known_signals, resolve_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 from webots_mcp.store.signals import Signal
 

@@ -35,10 +35,13 @@ from webots_mcp.store.reading.segment import (
     MOST_ROWS,
     Deadline,
     Segment,
+    Subject,
+    choose,
     just_after,
     kept_notes,
     kept_parts,
     moment_of,
+    require_run,
     rows_in,
     shown_time,
 )

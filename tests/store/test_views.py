@@ -199,7 +199,7 @@ def seen_by_tools(connection: sqlite3.Connection, robot_id: int, state: Any) -> 
 
 def test_the_views_and_the_tools_take_the_same_signals_for_the_same_roles() -> None:
     states: list[dict[str, Any]] = [*PLACES, *MODES, *CHOICES, *SPEEDS]
-    states += [state for state, _ in POSES]
+    states += [*(state for state, _ in POSES), *some_states(400)]
     with memory_connection() as connection:
         record_robots(connection, states)
         early = [seen_by_tools(connection, n + 1, state) for n, state in enumerate(states)]

@@ -13,16 +13,25 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import parse_qsl, urlsplit
 
+import anyio
+
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
+from webots_mcp.parameter import Value
 from webots_mcp.plotting.on_a_page import figure_part
-from webots_mcp.plugins.page.chunk_maker import ChunkMaker
 from webots_mcp.plugins.page.page_data import choice_of, draw, look, picture, problem
+from webots_mcp.questions.answers import CommandAnswer
+from webots_mcp.questions.send_command import set_parameters
+from webots_mcp.steering.dispatch import Dispatcher
+from webots_mcp.steering.routes import Attempt
+from webots_mcp.store.chunk_making import make_missing_chunks
 from webots_mcp.store.recording import Recording
+from webots_mcp.webots.orders import Order
 
 HOST: Final = "127.0.0.1"
 MOST_TABS: Final = 20  # each reads the recording five times a second
@@ -230,7 +239,6 @@ def _picture(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
 
 
 def _steer(server: PageServer, asked: dict[str, str], body: dict[str, Any]) -> dict[str, Any]:
-    from webots_mcp.plugins.page.steering_buttons import steer, tune
 
     robot = asked.get("robot", "")
     if body.get("order") in ORDERS:
@@ -239,3 +247,88 @@ def _steer(server: PageServer, asked: dict[str, str], body: dict[str, Any]) -> d
 
 
 _QUESTIONS: Final = {"look": _look, "draw": _draw, "picture": _picture}
+
+
+# Making chunks while the page is served, where no server does: what is long is drawn whole.
+
+
+_PERIOD_S: Final = 1.0
+
+
+class ChunkMaker(threading.Thread):
+    """Looks once a second whether there is something to put into chunks.
+
+    Attributes:
+        says: How far it has come, or why it does not go on; "" where nothing is left.
+        rounds: How often it put all that there was into chunks.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        super().__init__(name="webots-mcp page", daemon=True)
+        self._recording = recording
+        self._ending = threading.Event()
+        self.says = ""
+        self.rounds = 0
+
+    def run(self) -> None:
+        """Look until stopped."""
+        while not self._ending.is_set():
+            self.look()
+            self._ending.wait(_PERIOD_S)
+
+    def look(self) -> None:
+        """Put what there is into chunks."""
+        worked = False
+
+        def note(done: int, of: int) -> None:
+            nonlocal worked
+            worked = True
+            self.says = f"making chunks of what was recorded: {100 * done // max(of, 1)} %"
+
+        try:
+            self.says = make_missing_chunks(self._recording, note, called_off=self._ending.is_set)
+        except WebotsMCPError:  # the tabs say what it is
+            self.says = ""
+        self.rounds += worked
+
+    def stop(self) -> None:
+        """End it within an instant."""
+        self._ending.set()
+        self.join(timeout=2)
+
+
+# What the buttons and inputs of the page do: the way that the tools' own commands go.
+
+
+_WAIT_S: Final = 10.0
+
+
+def steer(recording: Recording, robot: str, order: Order) -> dict[str, Any]:
+    """Give an order to the simulation of a robot; answers in words what came of it."""
+    params = {"steps": 1} if order == "step" else {}
+    dispatcher = Dispatcher(recording, _silent)
+    attempt = Attempt(recording, dispatcher, robot, _WAIT_S, order, params)
+    return _told(order, attempt.steer)
+
+
+def tune(recording: Recording, robot: str, name: str, value: Value) -> dict[str, Any]:
+    """Set one parameter of a robot's controller, and say what came of it."""
+    setting = partial(
+        set_parameters, recording, _silent, {name: value}, robot=robot, timeout_s=_WAIT_S
+    )
+    return _told(f"{name} = {value!r}", setting)
+
+
+def _told(what: str, ask: Any) -> dict[str, Any]:
+    try:
+        answer: CommandAnswer = anyio.run(ask)
+    except WebotsMCPError as error:
+        return {"text": f"{what}: {error}", "is_done": False}
+    if answer.outcome == "done":
+        return {"text": f"{what}: done", "is_done": True}
+    why = answer.error or answer.hint or "no answer in time"
+    return {"text": f"{what}: not done ({answer.outcome}): {why}", "is_done": False}
+
+
+async def _silent(waited_s: float, of_s: float | None, text: str) -> None:
+    """The page says that it waits by the button itself."""

@@ -15,9 +15,15 @@ from hypothesis import strategies as st
 from tests.plotting.conftest import Record, whole
 from tests.recordings.rover import WALL_START_S
 from webots_mcp.errors import NothingRecordedError
-from webots_mcp.plotting.canvas import MOST_PANELS, Sheet
+from webots_mcp.plotting.canvas import (
+    MERGED,
+    MOST_PANELS,
+    MOST_VALUES,
+    OTHER_VALUES,
+    Sheet,
+    area_styles,
+)
 from webots_mcp.plotting.curves import MOST_CURVES, Curve, by_scale, by_signal
-from webots_mcp.plotting.palette import MERGED, MOST_VALUES, OTHER_VALUES, area_styles
 from webots_mcp.plotting.path import Path, Place, headings, thinned
 from webots_mcp.plotting.signals import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory

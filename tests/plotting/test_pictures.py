@@ -28,9 +28,8 @@ from webots_mcp.errors import (
     UnknownSignalError,
 )
 from webots_mcp.plotting import Picture, PlotKind, Sheet, image_format_of, plot, plot_signals
-from webots_mcp.plotting.canvas import Canvas
+from webots_mcp.plotting.canvas import DASHES, LINES, Canvas
 from webots_mcp.plotting.intervals import Interval
-from webots_mcp.plotting.palette import DASHES, LINES
 from webots_mcp.plotting.signals import compose_signals, paint_signals
 from webots_mcp.plotting.trajectory import compose_trajectory, paint_trajectory
 from webots_mcp.questions.declaring import RunIds

@@ -6,8 +6,16 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple, TypeAlias
 
-from webots_mcp.plotting.canvas import TEXT_PX, Canvas, Frame, ticks, width_of, wrapped
-from webots_mcp.plotting.palette import Area, scaled
+from webots_mcp.plotting.canvas import (
+    TEXT_PX,
+    Area,
+    Canvas,
+    Frame,
+    scaled,
+    ticks,
+    width_of,
+    wrapped,
+)
 
 TITLE_PX: Final = 13.0
 LINE_PX: Final = 16.0  # from line to line

@@ -12,15 +12,20 @@ from typing import Any, Final
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.naming import listed, spelled_out
 from webots_mcp.plotting.canvas import (
+    DASHES,
+    INK,
     LEAST_HEIGHT_PX,
+    LINES,
     ON_PAPER,
     ROW_PX,
+    Area,
     Canvas,
     Frame,
     Look,
     Picture,
     Room,
     Sheet,
+    area_styles,
     axis_range,
     fitted,
     short,
@@ -45,7 +50,6 @@ from webots_mcp.plotting.legend import (
     paint_y_axis,
     rows_of,
 )
-from webots_mcp.plotting.palette import DASHES, INK, LINES, Area, area_styles
 from webots_mcp.plotting.parts import (
     Part,
     event_lanes,

@@ -10,14 +10,19 @@ from typing import Any, Final
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.naming import listed, spelled_out
 from webots_mcp.plotting.canvas import (
+    DASHES,
+    INK,
+    LINES,
     ON_PAPER,
     Canvas,
     Frame,
     Look,
     Picture,
     Sheet,
+    area_styles,
     axis_range,
     fitted,
+    scaled,
     short,
     ticks,
     width_of,
@@ -39,7 +44,6 @@ from webots_mcp.plotting.legend import (
     paint_y_label,
     rows_of,
 )
-from webots_mcp.plotting.palette import DASHES, INK, LINES, area_styles, scaled
 from webots_mcp.plotting.parts import (
     Known,
     Part,

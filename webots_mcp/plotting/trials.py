@@ -11,12 +11,15 @@ from typing import Any, Final
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.naming import listed, nearest_first
 from webots_mcp.plotting.canvas import (
+    INK,
+    LINES,
     Canvas,
     Frame,
     Picture,
     Sheet,
     axis_range,
     fitted,
+    scaled,
     short,
     ticks,
     width_of,
@@ -37,7 +40,6 @@ from webots_mcp.plotting.legend import (
     paint_y_label,
     rows_of,
 )
-from webots_mcp.plotting.palette import INK, LINES, scaled
 from webots_mcp.plotting.signals import line_through
 from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.analysis.spread import Outcome, Ranked, rank

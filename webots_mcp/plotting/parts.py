@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final, NamedTuple, TypeAlias
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.plotting.canvas import short
+from webots_mcp.plotting.canvas import (
+    TEXT_PX,
+    Area,
+    Canvas,
+    Frame,
+    scaled,
+    short,
+    ticks,
+    width_of,
+    wrapped,
+)
 from webots_mcp.plotting.intervals import Interval, Lane
 from webots_mcp.store.detection.events import Events, drawn_kinds, find_events
 from webots_mcp.store.detection.kinds import Event, EventOptions, Verdicts
@@ -299,3 +310,227 @@ def stuck_mark(
     intervals = [_within(Interval("stuck", e.start_s, e.end_s), part) for e in found.events]
     lane = Lane(f"stuck over {options.stuck_s:g} s", intervals, ())
     return lane, _not_looked_for(found.verdicts)
+
+
+# What surrounds axes: titles, ticks, marks, and a legend in as many rows as it needs.
+
+
+TITLE_PX: Final = 13.0
+LINE_PX: Final = 16.0  # from line to line
+_SWATCH_PX: Final = 26.0
+_GAP_PX: Final = 14.0
+_MOST_HEIGHT: Final = 0.25  # of the picture
+_BAR_PX: Final = 12.0
+_BAR_STEPS: Final = 64
+
+
+Sample: TypeAlias = "Callable[[Canvas, float, float], None]"
+
+
+class Entry(NamedTuple):
+    """A line of a legend.
+
+    Attributes:
+        draw: Draws its sample around a place; None without one.
+        hides: The name of the elements that a click on it hides in a page.
+    """
+
+    text: str
+    draw: Sample | None = None
+    hides: str = ""
+
+    @property
+    def width_px(self) -> float:
+        """With its sample."""
+        return width_of(self.text) + (_SWATCH_PX if self.draw else 0.0) + _GAP_PX
+
+
+def line_sample(colour: str, dash: str = "none", width: float = 1.6) -> Sample:
+    """Draws a stretch of a line."""
+
+    def draw(canvas: Canvas, x: float, y: float) -> None:
+        canvas.add("path", d=f"M{x - 10:g} {y:g}h20", stroke=colour, stroke_width=width,
+                   stroke_dasharray=dash)  # fmt: skip
+
+    return draw
+
+
+def area_sample(area: Area, opacity: float = 1.0) -> Sample:
+    """Draws an area."""
+
+    def draw(canvas: Canvas, x: float, y: float) -> None:
+        paint_area(canvas, area, (x - 10, y - 5, 20.0, 10.0), opacity)
+
+    return draw
+
+
+def paint_area(
+    canvas: Canvas, area: Area, box: tuple[float, float, float, float], opacity: float = 1.0
+) -> None:
+    """A rectangle (left, top, width, height) in the style of an area."""
+    left, top, width, height = box
+    place = {"x": left, "y": top, "width": width, "height": height}
+    opaque = {} if opacity == 1.0 else {"fill_opacity": opacity}
+    canvas.add("rect", **place, fill=area.colour, **opaque)
+    if area.dotted:
+        canvas.add("rect", **place, fill="url(#hatch-dots)", fill_opacity=opacity / 2)
+
+
+def hatch_sample(pattern: str) -> Sample:
+    """Draws a hatched area."""
+
+    def draw(canvas: Canvas, x: float, y: float) -> None:
+        canvas.add("rect", x=x - 10, y=y - 5, width=20, height=10, fill=f"url(#{pattern})")
+
+    return draw
+
+
+def rows_of(entries: Sequence[Entry], width_px: float, height_px: float) -> list[list[Entry]]:
+    """The entries in rows of that width, up to a quarter of the height; the rest are counted."""
+    most = max(1, int(_MOST_HEIGHT * height_px / LINE_PX))
+    rows: list[list[Entry]] = []
+    for index, entry in enumerate(entries):
+        if rows and sum(each.width_px for each in rows[-1]) + entry.width_px <= width_px:
+            rows[-1].append(entry)
+        elif len(rows) < most:
+            rows.append([entry])
+        else:
+            rows[-1][-1] = Entry(f"and {len(entries) - index + 1} more")
+            break
+    return rows
+
+
+def paint_rows(
+    canvas: Canvas, rows: Sequence[Sequence[Entry]], top: float, left: float | None = None
+) -> None:
+    """Rows of a legend from a height downwards: centred, or from the left."""
+    for row, entries in enumerate(rows):
+        width = sum(each.width_px for each in entries) - _GAP_PX
+        x = max(4.0, (canvas.width_px - width) / 2) if left is None else left
+        y = top + (row + 0.5) * LINE_PX
+        for entry in entries:
+            hides = {"data_hides": entry.hides} if entry.hides else {}
+            canvas.open(class_="entry", **hides)
+            if entry.draw:
+                entry.draw(canvas, x + 10, y)
+            canvas.text(x + (_SWATCH_PX if entry.draw else 0.0), y + 4, entry.text)
+            canvas.close()
+            x += entry.width_px
+
+
+def paint_title(canvas: Canvas, title: str) -> float:
+    """At the top left, in as many lines as it needs; returns how high it is."""
+    lines = wrapped(title, canvas.width_px - 16, TITLE_PX * 1.1)
+    for row, line in enumerate(lines):
+        canvas.text(8, TITLE_PX + 4 + row * LINE_PX, line, size=TITLE_PX, font_weight="bold")
+    return 10 + LINE_PX * len(lines)
+
+
+def paint_x_axis(
+    canvas: Canvas, frame: Frame, marks: Sequence[tuple[float, str]], label: Sequence[str] = ()
+) -> None:
+    """A line below the frame, with ticks, their labels, and what the axis is."""
+    canvas.open(class_="x-axis")
+    pen = {"stroke": canvas.look.faint, "stroke_width": 0.8}
+    canvas.add("path", d=f"M{frame.left:.1f} {frame.bottom:.1f}H{frame.right:.1f}", **pen)
+    canvas.open(class_="ticks")
+    for value, text in marks:
+        x = float(frame.px(value))
+        canvas.add("path", d=f"M{x:.1f} {frame.bottom:.1f}v4", **pen)
+        half = width_of(text) / 2
+        inside = min(max(x, half), canvas.width_px - half)
+        canvas.text(inside, frame.bottom + 16, text, anchor="middle")
+    canvas.close()
+    for row, line in enumerate(label):
+        y = frame.bottom + 33 + row * LINE_PX
+        canvas.text(frame.left + frame.width / 2, y, line, anchor="middle")
+    canvas.close()
+
+
+def paint_y_axis(canvas: Canvas, frame: Frame, marks: Sequence[tuple[float, str]]) -> None:
+    """A line at the left of the frame, with ticks, their labels, and lines through the frame."""
+    canvas.open(class_="y-axis")
+    faint = {"stroke": canvas.look.faint, "stroke_width": 0.8}
+    canvas.add("path", d=f"M{frame.left:.1f} {frame.top:.1f}V{frame.bottom:.1f}", **faint)
+    canvas.open(class_="ticks")
+    for value, text in marks:
+        y = float(frame.py(value))
+        canvas.add("path", d=f"M{frame.left:.1f} {y:.1f}h-4", **faint)
+        canvas.text(frame.left - 7, y + 4, text, anchor="end")
+    canvas.close()
+    canvas.close()
+
+
+def paint_grid(
+    canvas: Canvas, frame: Frame, x: Sequence[tuple[float, str]], y: Sequence[tuple[float, str]]
+) -> None:
+    """Light lines at the ticks."""
+    lines = [f"M{frame.px(value):.1f} {frame.top:.1f}V{frame.bottom:.1f}" for value, _ in x]
+    lines += [f"M{frame.left:.1f} {frame.py(value):.1f}H{frame.right:.1f}" for value, _ in y]
+    canvas.add("path", class_="grid", d="".join(lines), stroke=canvas.look.grid, stroke_width=0.7)
+
+
+def paint_y_label(canvas: Canvas, frame: Frame, label: str) -> None:
+    """What the vertical axis is, along it."""
+    x, y = TEXT_PX + 2, frame.top + frame.height / 2
+    canvas.text(0, 0, label, anchor="middle", transform=f"translate({x:g} {y:.1f}) rotate(-90)")
+
+
+def paint_scale(
+    canvas: Canvas, frame: Frame, scale: str, bounds: tuple[float, float], label: str
+) -> None:
+    """A scale of colours at the right of the frame, and what it means."""
+    left, height = frame.right + 12, frame.height / _BAR_STEPS
+    for step in range(_BAR_STEPS):
+        colour = scaled(step / (_BAR_STEPS - 1), scale)
+        y = frame.bottom - (step + 1) * height
+        canvas.add("rect", x=left, y=y, width=_BAR_PX, height=height + 0.5, fill=colour)
+    bar = Frame(left, frame.top, _BAR_PX, frame.height, (0, 1), bounds)
+    for value, text in ticks(*bounds, frame.height / 40):
+        canvas.text(left + _BAR_PX + 4, float(bar.py(value)) + 4, text)
+    x, y = canvas.width_px - 6, frame.top + frame.height / 2
+    canvas.text(0, 0, label, anchor="middle", transform=f"translate({x:g} {y:.1f}) rotate(-90)")
+
+
+SCALE_PX: Final = 78.0  # what a scale of colours takes
+
+
+# Marks --------------------------------------------------------------------------------------------
+
+_STAR: Final = "M" + "L".join(
+    f"{r * math.sin(i * math.pi / 5):.2f} {-r * math.cos(i * math.pi / 5):.2f}"
+    for i, r in enumerate([1.2, 0.5] * 5)
+) + "Z"  # fmt: skip
+SHAPES: Final = {
+    "circle": "M-1 0A1 1 0 1 1 1 0A1 1 0 1 1-1 0Z",
+    "square": "M-.9-.9H.9V.9H-.9Z",
+    "diamond": "M0-1.2L.7 0 0 1.2-.7 0Z",
+    "cross": "M-1-.6L-.6-1 0-.4.6-1 1-.6.4 0 1 .6 .6 1 0 .4-.6 1-1 .6-.4 0Z",
+    "plus": "M-.35-1H.35V-.35H1V.35H.35V1H-.35V.35H-1V-.35H-.35Z",
+    "triangle": "M0-1.1L1 .8H-1Z",
+    "star": _STAR,
+    "arrow": "M1 0L-.9.9V-.9Z",
+}
+
+
+def paint_mark(
+    canvas: Canvas, shape: str, place: tuple[float, float], size: float, *, degrees: float = 0.0,
+    **style: Any,
+) -> None:  # fmt: skip
+    """A mark at a place in pixels, so large from its middle; in a page it keeps its size."""
+    x, y = place
+    canvas.open(class_="at", data_x=x, data_y=y, transform=f"translate({x:.2f} {y:.2f})")
+    turned = f" rotate({degrees:.1f})" if degrees else ""
+    scaled_by = {"transform": f"scale({size:g}){turned}"}
+    width = style.pop("stroke_width", 0.0) / size
+    canvas.add("path", d=SHAPES[shape], stroke_width=f"{width:.3f}", **scaled_by, **style)
+    canvas.close()
+
+
+def mark_sample(shape: str, size: float, **style: Any) -> Sample:
+    """Draws a mark."""
+
+    def draw(canvas: Canvas, x: float, y: float) -> None:
+        paint_mark(canvas, shape, (x, y), size, **style)
+
+    return draw

@@ -35,12 +35,16 @@ from webots_mcp.plotting.canvas import (
 )
 from webots_mcp.plotting.curves import Curve, Panel, by_choice, by_scale, by_signal, curve_of
 from webots_mcp.plotting.intervals import Interval, Lane, lane_of, merged_notes
-from webots_mcp.plotting.legend import (
+from webots_mcp.plotting.parts import (
     LINE_PX,
     Entry,
+    Part,
     area_sample,
+    event_lanes,
     hatch_sample,
+    known_signals,
     line_sample,
+    mode_signal,
     paint_area,
     paint_grid,
     paint_mark,
@@ -48,15 +52,9 @@ from webots_mcp.plotting.legend import (
     paint_title,
     paint_x_axis,
     paint_y_axis,
-    rows_of,
-)
-from webots_mcp.plotting.parts import (
-    Part,
-    event_lanes,
-    known_signals,
-    mode_signal,
     parts_of,
     range_notes,
+    rows_of,
     title_of,
     unread_parts,
 )

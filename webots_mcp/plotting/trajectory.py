@@ -28,12 +28,16 @@ from webots_mcp.plotting.canvas import (
     width_of,
 )
 from webots_mcp.plotting.intervals import Lane, lane_of, merged_notes
-from webots_mcp.plotting.legend import (
+from webots_mcp.plotting.parts import (
     LINE_PX,
     SCALE_PX,
     Entry,
+    Known,
+    Part,
+    known_signals,
     line_sample,
     mark_sample,
+    mode_signal,
     paint_grid,
     paint_mark,
     paint_rows,
@@ -42,15 +46,9 @@ from webots_mcp.plotting.legend import (
     paint_x_axis,
     paint_y_axis,
     paint_y_label,
-    rows_of,
-)
-from webots_mcp.plotting.parts import (
-    Known,
-    Part,
-    known_signals,
-    mode_signal,
     parts_of,
     range_notes,
+    rows_of,
     stuck_mark,
     title_of,
 )

@@ -24,7 +24,7 @@ from webots_mcp.plotting.canvas import (
     ticks,
     width_of,
 )
-from webots_mcp.plotting.legend import (
+from webots_mcp.plotting.parts import (
     LINE_PX,
     SCALE_PX,
     Entry,

@@ -23,8 +23,16 @@ from webots_mcp.plotting.canvas import (
     Sheet,
     area_styles,
 )
-from webots_mcp.plotting.curves import MOST_CURVES, Curve, by_scale, by_signal
-from webots_mcp.plotting.path import Path, Place, headings, thinned
+from webots_mcp.plotting.curves import (
+    MOST_CURVES,
+    Curve,
+    Path,
+    Place,
+    by_scale,
+    by_signal,
+    headings,
+    thinned,
+)
 from webots_mcp.plotting.signals import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.store.chunk_making import chunk_whole_run

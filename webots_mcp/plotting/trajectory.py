@@ -27,6 +27,7 @@ from webots_mcp.plotting.canvas import (
     ticks,
     width_of,
 )
+from webots_mcp.plotting.curves import Path, Place, extent, headings, read_path, thinned
 from webots_mcp.plotting.intervals import Lane, lane_of, merged_notes
 from webots_mcp.plotting.parts import (
     LINE_PX,
@@ -52,7 +53,6 @@ from webots_mcp.plotting.parts import (
     stuck_mark,
     title_of,
 )
-from webots_mcp.plotting.path import Path, Place, extent, headings, read_path, thinned
 from webots_mcp.plotting.signals import line_through
 from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.detection.kinds import EventOptions

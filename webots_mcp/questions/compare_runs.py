@@ -54,9 +54,9 @@ from webots_mcp.store.questions.compare import (
     Group,
     compare_runs,
 )
-from webots_mcp.store.questions.outcomes import Measure
 from webots_mcp.store.questions.runs import (
     MOST_RUNS,
+    Measure,
     RunInfo,
     annotate_run,
     list_runs,

@@ -66,7 +66,7 @@ from webots_mcp.store.parameters import (
     stop_trial_set,
     trials_of,
 )
-from webots_mcp.store.questions.outcomes import require_kinds, unseen, way_of_run
+from webots_mcp.store.questions.runs import require_kinds, unseen, way_of_run
 from webots_mcp.store.reading.segment import Deadline, Subject, in_one_snapshot
 from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.robots import robot_name

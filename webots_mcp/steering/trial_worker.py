@@ -37,7 +37,7 @@ from webots_mcp.store.parameters import (
     take_up,
     trials_of,
 )
-from webots_mcp.store.questions.outcomes import score_run
+from webots_mcp.store.questions.runs import score_run
 from webots_mcp.store.recording import Job, Recording, View
 from webots_mcp.store.robots import robot_name
 

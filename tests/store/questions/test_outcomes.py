@@ -14,7 +14,7 @@ from tests.recordings.rover import Recorder
 from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.questions.compare import Comparison, compare_runs
-from webots_mcp.store.questions.outcomes import Measure
+from webots_mcp.store.questions.runs import Measure
 
 State = Callable[[float], dict[str, Any]]
 DURATION_S = 40

@@ -18,8 +18,14 @@ from webots_mcp.store.analysis.summary import Summary
 from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.detection.motion import motion_in
 from webots_mcp.store.parameters import differing, parameters_of, scored_runs
-from webots_mcp.store.questions.outcomes import OUT_OF_TIME, Measure, RunPart, outcomes_of
-from webots_mcp.store.questions.runs import RunInfo, run_infos
+from webots_mcp.store.questions.runs import (
+    OUT_OF_TIME,
+    Measure,
+    RunInfo,
+    RunPart,
+    outcomes_of,
+    run_infos,
+)
 from webots_mcp.store.reading.catalogue import catalogue, resolve_signals
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.frame_summary import summary_of

@@ -42,7 +42,7 @@ from webots_mcp.plotting.parts import (
 )
 from webots_mcp.plotting.signals import line_through
 from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.analysis.spread import Outcome, Ranked, rank
+from webots_mcp.store.analysis.summary import Outcome, Ranked, rank
 from webots_mcp.store.parameters import Trial, best_of, fetch_trial_set, trials_of
 
 

@@ -45,7 +45,7 @@ from webots_mcp.questions.declaring import (
     Value,
     question,
 )
-from webots_mcp.store.analysis.spread import MIN_EFFECT_SD, Spread
+from webots_mcp.store.analysis.summary import MIN_EFFECT_SD, Spread
 from webots_mcp.store.detection.kinds import EventOptions, both_of
 from webots_mcp.store.parameters import scored_runs
 from webots_mcp.store.questions.compare import (

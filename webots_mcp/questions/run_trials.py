@@ -49,7 +49,7 @@ from webots_mcp.steering.trial_plan import (
     stored_world_plan,
 )
 from webots_mcp.steering.trial_worker import TrialWorkers
-from webots_mcp.store.analysis.spread import Best, Ranked, Ranking
+from webots_mcp.store.analysis.summary import Best, Ranked, Ranking
 from webots_mcp.store.parameters import (
     Declared,
     Trial,

@@ -16,7 +16,7 @@ from webots_mcp.conditions import parse_condition
 from webots_mcp.conditions.scoring import parse_score
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.naming import nearest_first
-from webots_mcp.store.analysis.spread import Best
+from webots_mcp.store.analysis.summary import Best
 
 Search = Literal["tpe", "random"]
 MOST_TRIALS: Final = 10_000

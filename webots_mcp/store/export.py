@@ -17,7 +17,7 @@ from typing import Any, BinaryIO, ClassVar, Final, NamedTuple
 from webots_mcp.contract import whole_file
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins import ExportFormat, export_formats, load
-from webots_mcp.store.analysis.spread import Ranked
+from webots_mcp.store.analysis.summary import Ranked
 from webots_mcp.store.export_rows import Column, Progress, Row, Source, Table, as_text
 from webots_mcp.store.parameters import Trial, best_of, fetch_trial_set, ranking_of, trials_of
 from webots_mcp.store.reading.ranges import TimeRange

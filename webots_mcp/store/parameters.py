@@ -23,7 +23,7 @@ from webots_mcp.liveness import (
     take,
 )
 from webots_mcp.parameter import Declaration, Value, require_known
-from webots_mcp.store.analysis.spread import Best, Outcome, Ranking, rank
+from webots_mcp.store.analysis.summary import Best, Outcome, Ranking, rank
 from webots_mcp.store.run_rows import Run, columns_of
 
 COLUMNS: Final = (

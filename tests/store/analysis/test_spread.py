@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from webots_mcp.store.analysis.spread import (
+from webots_mcp.store.analysis.summary import (
     MIN_EFFECT_SD,
     Spread,
     Verdict,

@@ -17,7 +17,7 @@ from webots_mcp.errors import (
     UnknownRobotError,
     UnknownRunError,
 )
-from webots_mcp.store.analysis.spread import Spread
+from webots_mcp.store.analysis.summary import Spread
 from webots_mcp.store.questions.compare import Comparison, Difference, compare_runs
 from webots_mcp.store.questions.runs import annotate_run, list_runs, run_info
 

@@ -10,7 +10,7 @@ from typing import Final
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.naming import listed
 from webots_mcp.plugins.report.words import Grid, Row, length, number, spelled
-from webots_mcp.store.analysis.spread import Spread
+from webots_mcp.store.analysis.summary import Spread
 from webots_mcp.store.questions.compare import Comparison, Difference, compare_runs
 
 MOST_DIFFERENCES: Final = 30

@@ -13,8 +13,7 @@ from typing import Final
 from webots_mcp.conditions.signal_values import SAME_TIME_S
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.parameter import Value
-from webots_mcp.store.analysis.spread import MIN_EFFECT_SD, Spread, spread_of, verdicts_on
-from webots_mcp.store.analysis.summary import Summary
+from webots_mcp.store.analysis.summary import MIN_EFFECT_SD, Spread, Summary, spread_of, verdicts_on
 from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.detection.motion import motion_in
 from webots_mcp.store.parameters import differing, parameters_of, scored_runs

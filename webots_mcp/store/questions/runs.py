@@ -19,7 +19,7 @@ from webots_mcp.naming import FARTHEST_M, NAME_POSITION, listed, nearest_first
 from webots_mcp.parameter import Value
 from webots_mcp.pauses import paused_s
 from webots_mcp.store.analysis.arrays import Array, np
-from webots_mcp.store.analysis.spread import (
+from webots_mcp.store.analysis.summary import (
     Spread,
     Verdict,
     chance_of,

@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plotting.canvas import Room
 from webots_mcp.plotting.on_a_page import Figure, signals_figure, way_figure
 from webots_mcp.plotting.signals import compose_signals
-from webots_mcp.plotting.trajectory import compose_trajectory
+from webots_mcp.plotting.trajectory import Obstacle, compose_trajectory
 from webots_mcp.plugins.report.chapter import Chapter, Moment
-from webots_mcp.plugins.report.obstacles import obstacles_of
 from webots_mcp.store.reading.catalogue import known_signals, resolve_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
+from webots_mcp.store.robots import world_seen
+from webots_mcp.store.run_rows import Run, fetch_run
 from webots_mcp.store.signals import Signal
+
+if TYPE_CHECKING:
+    from webots_mcp.standin.arena import Body
+    from webots_mcp.standin.geometry import Shape
 
 MOST_SIGNALS: Final = 16
 _ROOM: Final = Room(points=500, panels=12, lanes=8, rows=16)
@@ -205,4 +213,83 @@ def _embedded(figures: Mapping[str, Figure]) -> Figures:
         {key: figure.markup for key, figure in figures.items()},
         {key: figure.title for key, figure in figures.items()},
         {key: figure.notes for key, figure in figures.items()},
+    )
+
+
+# What stands in a robot's world: from the world file where it can be read, else as it was seen.
+
+
+_MOST_BYTES: Final = 1_000_000  # of a world file: reading a larger one would take seconds
+_CORNERS: Final = ((1, 1), (-1, 1), (-1, -1), (1, -1))
+_SIDES: Final = 24  # of what a circle is drawn as
+
+
+def obstacles_of(
+    connection: sqlite3.Connection, ranges: Sequence[TimeRange]
+) -> tuple[Obstacle, ...]:
+    """What stands in the world of the last run of the ranges.
+
+    Fixed bodies of the world file, of the types that the stand-in knows; what can be moved is left
+    out, since the file tells only where it began. Where there is no such file: the solids that an
+    observer has seen.
+    """
+    run = fetch_run(connection, ranges[-1].segments[-1].run_id)
+    return _of_file(run) or _seen(connection, run)
+
+
+def _of_file(run: Run) -> tuple[Obstacle, ...]:
+    file = Path(run.world or "")
+    try:
+        status = file.stat()
+    except (OSError, ValueError):
+        return ()
+    if file.suffix != ".wbt" or not file.is_file() or status.st_size > _MOST_BYTES:
+        return ()
+    return _standing(file, status.st_mtime_ns)
+
+
+@lru_cache(maxsize=8)
+def _standing(file: Path, _changed_ns: int) -> tuple[Obstacle, ...]:
+    from webots_mcp.standin.arena import Arena
+    from webots_mcp.standin.vrml import WorldError
+    from webots_mcp.standin.world import load_world
+
+    try:
+        bodies = Arena(load_world(file)).bodies
+    except (WorldError, OSError):
+        return ()  # the way is drawn without them
+    return tuple(each for body in bodies for each in _outlines(body))
+
+
+def _outlines(body: Body) -> Iterator[Obstacle]:
+    if body.node.type_name == "Robot" or body.is_movable:
+        return
+    for shape in body.solid_shapes:
+        yield Obstacle(body.name, shape.x, shape.y, _corners(shape))
+
+
+def _corners(shape: Shape) -> tuple[tuple[float, float], ...]:
+    from webots_mcp.standin.geometry import Disc
+
+    if isinstance(shape, Disc):
+        angles = [math.tau * side / _SIDES for side in range(_SIDES)]
+        radius_m = shape.radius_m
+        return tuple(
+            (shape.x + radius_m * math.cos(angle), shape.y + radius_m * math.sin(angle))
+            for angle in angles
+        )
+    halves = [(a * shape.half_x_m, b * shape.half_y_m) for a, b in _CORNERS]
+    cos, sin = shape.cos_yaw, shape.sin_yaw
+    return tuple((shape.x + cos * u - sin * v, shape.y + sin * u + cos * v) for u, v in halves)
+
+
+def _seen(connection: sqlite3.Connection, run: Run) -> tuple[Obstacle, ...]:
+    world = world_seen(connection, run)
+    solids = world.told.get("solids", ()) if world else ()
+    places = world.places if world else {}
+    told = [(each["key"], each | places.get(each["key"], {})) for each in solids]
+    return tuple(
+        Obstacle(str(key), float(body["x_m"]), float(body["y_m"]))
+        for key, body in told
+        if body.get("x_m") is not None and body.get("y_m") is not None
     )

@@ -159,7 +159,7 @@ def test_what_it_installs_by_default_has_the_page_and_reports() -> None:
         "pip install .            # the bridge, the server, the command line, the live page"
         in README
     )
-    assert {"bokeh", "jinja2"} <= set(re.findall(r'"([\w-]+)', default))
+    assert {"resvg-py", "jinja2"} <= set(re.findall(r'"([\w-]+)', default))
 
 
 def test_no_advice_names_a_package_index_on_which_anybody_may_register_the_name() -> None:

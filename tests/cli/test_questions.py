@@ -140,7 +140,7 @@ def test_json_names_the_fields_of_what_it_has(told: Cli, tmp_path: Path) -> None
     assert [set(json.loads(line)) for line in lines] == [kinds] * 3
 
 
-@pytest.mark.parametrize(("name", "start"), [("a.png", b"\x89PNG"), ("a.svg", b"<?xml")])
+@pytest.mark.parametrize(("name", "start"), [("a.png", b"\x89PNG"), ("a.svg", b"<svg")])
 def test_plot_writes_a_picture(told: Cli, tmp_path: Path, name: str, start: bytes) -> None:
     file = tmp_path / name
     assert str(file) in told(f"plot pose.0 --run 1 -o {file}")

@@ -68,7 +68,7 @@ def test_nothing_but_its_own_module_and_the_registry_names_a_kind() -> None:
         if path.name not in own and (named := names & set(strings_in(path)))
     }
     # A threshold is what the asker gives: the tool and the command line refuse or imply the kind.
-    allowed = {"questions/find_events.py", "questions/get_timeline.py", "cli/history.py"}
+    allowed = {"questions/events.py"}
     assert {path: named for path, named in naming.items() if path not in allowed} == {}
 
 

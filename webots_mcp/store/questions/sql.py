@@ -373,10 +373,6 @@ def _ask(asked: Statement) -> Result:
         )  # fmt: skip
 
 
-if __name__ == "__main__":
-    main(_ask)
-
-
 # -- the schema as a short text, read from the database itself -------------------------------------
 
 
@@ -459,3 +455,7 @@ def _listed(columns: list[str], comments: dict[str, str]) -> str:
 def _bookkeeping() -> str:
     tables, columns = ", ".join(_BOOKKEEPING), ", ".join(_BOOKKEEPING_COLUMNS)
     return f"bookkeeping, not listed: tables {tables}; columns {columns}"
+
+
+if __name__ == "__main__":
+    main(_ask)

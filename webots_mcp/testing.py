@@ -46,7 +46,7 @@ from webots_mcp.store.analysis.summary import LARGEST
 from webots_mcp.store.detection.events import find_events
 from webots_mcp.store.detection.kinds import Event as FoundEvent
 from webots_mcp.store.detection.kinds import EventOptions
-from webots_mcp.store.export_rows import Source
+from webots_mcp.store.export import Source
 from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines
 from webots_mcp.store.parameters import parameters_of
 from webots_mcp.store.reading.catalogue import resolve_signals, signals_of_frame

@@ -49,7 +49,7 @@ from webots_mcp.store.chunks import (
     encode,
     statistics_of,
 )
-from webots_mcp.store.export_rows import Progress
+from webots_mcp.store.export import Progress
 from webots_mcp.store.parameters import fetch_trial_set, is_at_work
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.run_rows import MAX_FILE_BYTES, PICTURES, inside

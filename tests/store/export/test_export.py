@@ -303,7 +303,7 @@ def test_progress_reaches_its_end(recorder: Recorder, form: str) -> None:
 def test_memory_does_not_grow_with_the_recording(
     recorder: Recorder, form: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("webots_mcp.store.export_rows.CHUNK_ROWS", 100)
+    monkeypatch.setattr("webots_mcp.store.export.CHUNK_ROWS", 100)
     peaks: list[int] = []
     for rows in (300, 300, 1200):
         for i in range(rows):

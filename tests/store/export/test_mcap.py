@@ -311,7 +311,7 @@ def read_path(value: Any, path: str) -> None:
 def test_memory_does_not_grow_with_a_recording_for_viewers(
     recorder: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("webots_mcp.store.export_rows.CHUNK_ROWS", 100)
+    monkeypatch.setattr("webots_mcp.store.export.CHUNK_ROWS", 100)
     peaks: list[int] = []
     for rows in (2000, 2000, 4000):
         for i in range(rows):

@@ -20,7 +20,7 @@ from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.detection.events import EventOptions, find_events
-from webots_mcp.store.export_rows import Source
+from webots_mcp.store.export import Source
 from webots_mcp.store.questions.series import query_history, query_rows
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.frame import read_frame
@@ -288,7 +288,7 @@ def test_stretches_are_events_with_their_reason(connection: sqlite3.Connection) 
 def test_an_export_has_each_call_once_and_in_order(
     connection: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("webots_mcp.store.export_rows.CHUNK_ROWS", 7)
+    monkeypatch.setattr("webots_mcp.store.export.CHUNK_ROWS", 7)
     kept, every = (Source.of(connection, each.segments, 1, None) for each in inside(connection))
     numbers = [row.values["n"] for row in kept.rows()]
     assert numbers == [row.values["n"] for row in every.rows()]

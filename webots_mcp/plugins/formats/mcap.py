@@ -25,8 +25,7 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.formats.contents import KINDS, Contents, PlacedCommand, Pose, Way
 from webots_mcp.requirements import explain_extra
 from webots_mcp.store.chunks import parse
-from webots_mcp.store.export import Exported, json_text, placed
-from webots_mcp.store.export_rows import Progress, Recorded, value_at
+from webots_mcp.store.export import Exported, Progress, Recorded, json_text, placed, value_at
 from webots_mcp.store.logs import LogLine
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.run_rows import Event, StoredImage

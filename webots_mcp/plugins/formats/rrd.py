@@ -27,8 +27,16 @@ from webots_mcp.plugins.formats.contents import KINDS, Contents, Item, PlacedCom
 from webots_mcp.plugins.formats.mcap import main_signals
 from webots_mcp.requirements import explain_extra
 from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.export import Exported, placed
-from webots_mcp.store.export_rows import Progress, Recorded, Row, as_text, flat_row, kind_of
+from webots_mcp.store.export import (
+    Exported,
+    Progress,
+    Recorded,
+    Row,
+    as_text,
+    flat_row,
+    kind_of,
+    placed,
+)
 from webots_mcp.store.logs import LogLine
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.run_rows import Event

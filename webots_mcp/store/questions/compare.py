@@ -55,7 +55,7 @@ class Difference:
             without values, or both constant and not equal. Rows follow each other too closely to
             be independent, so it describes, and proves nothing.
         different: Whether the means or the deviations differ by more than those of like runs do;
-            None where that cannot be decided (`analysis.spread`).
+            None where that cannot be decided (`analysis.summary`).
         interval: The difference of the means of the groups lies in it nine times of ten.
     """
 
@@ -85,7 +85,7 @@ def difference_of(
         signal: Which.
         groups: Of each run its summaries; None of one of which not all was read.
         tests: So many are made at once.
-        min_effect_sd: See `analysis.spread`.
+        min_effect_sd: See `analysis.summary`.
     """
     runs: list[list[Summary] | None] = []  # that have a value; None of a group that is not known
     for group in groups:

@@ -356,7 +356,7 @@ class Measure:
             more runs are wanted; False where a difference that matters is excluded.
         runs_wanted: So many runs of each group would tell, if they went on like these; None where
             nothing shows that they would.
-        interval: The difference of the means lies in it nine times of ten (`analysis.spread`).
+        interval: The difference of the means lies in it nine times of ten (`analysis.summary`).
     """
 
     name: str

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import time
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, closing
 from functools import partial
 from itertools import product
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import psutil
@@ -25,12 +28,19 @@ from tests.benchmarks.core import (
 )
 from tests.benchmarks.history import record
 from tests.benchmarks.ways import make_states
+from tests.pool.lab import short_runs
 from tests.postgres import NoServerError, Server, running_server
 from webots_mcp.connection import connect as connect_recording
 from webots_mcp.connection import create_schema
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.plugins.pool.fetching import fetch
-from webots_mcp.plugins.pool.pool_contents import Choice, meant, open_pool, open_target
+from webots_mcp.plugins.pool.pool_contents import (
+    Choice,
+    meant,
+    open_pool,
+    open_target,
+    pooled_runs,
+)
 from webots_mcp.plugins.pool.pool_interface import Batch, batches, table
 from webots_mcp.plugins.pool.postgres_pool import PostgresShipment
 from webots_mcp.plugins.pool.postgres_schema import Connection, connect, prepare
@@ -59,6 +69,25 @@ def measure_pool(bench: Bench) -> Iterable[Line]:
             yield from _measure(bench, server)
     except NoServerError as reason:
         raise NotMeasurableError(str(reason)) from reason
+
+
+@benchmark("pool_listing", "the runs of a pool of Parquet files with many recordings, listed")
+def measure_listing(bench: Bench) -> Iterable[Line]:
+    recordings = bench.count(1000, 20)
+    with short_runs(bench.folder / "robot") as recorded:
+        recording = Recording(recorded.folder / DATABASE_NAME, recorded.folder, read_only=True)
+        url = str(bench.place("listed"))
+        ship(Order(recording, partial(open_target, url)), Report())
+    (shipped,) = Path(url).glob("recording=*")
+    for _ in range(recordings - 1):
+        other = shipped.with_name(f"recording={new_uuid()}")
+        shutil.copytree(shipped, other, copy_function=os.link)
+    with open_pool(url) as pool:
+        listed_s = processor_s(lambda: pooled_runs(pool))
+    yield Line(
+        "list the runs of 1,000 recordings", f"{recordings}", "", 1000 * listed_s / recordings, "s",
+        Target(1.0),
+    )  # fmt: skip
 
 
 @benchmark(

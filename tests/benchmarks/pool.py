@@ -219,4 +219,4 @@ def _timed(connection: Connection, work: Callable[[], None]) -> _Taken:
     return _Taken(wall_s, shipper_s, server_s)
 
 
-BENCHMARKS = (measure_pool, measure_room)
+BENCHMARKS = (measure_pool, measure_listing, measure_room)

@@ -93,7 +93,7 @@ def _questions(
     yield "timeline", lambda: timeline(db, whole), 0.05
     yield "log search", lambda: (newest_lines(db, asked, 50), count_lines(db, asked)), 0.5
     yield "monitor, an hour back", lambda: look_back(recording, None, 3600), 0.4
-    if importlib.util.find_spec("matplotlib"):
+    if importlib.util.find_spec("resvg_py"):
         yield "plot, 1 signal", lambda: plot(db, "signals", [_OVERVIEW]), 1.2
         yield "plot, way of the robot", lambda: plot(db, "trajectory"), 1.2
 

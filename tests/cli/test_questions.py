@@ -305,11 +305,11 @@ def test_what_a_terminal_would_obey_is_spelled_out(capsys: pytest.CaptureFixture
     assert capsys.readouterr().out == "name\nred \\x1b[31m alarm\ntwo\\nlines\n"
 
 
-def test_questions_load_neither_the_server_nor_matplotlib(story: Path) -> None:
+def test_questions_load_neither_the_server_nor_what_draws(story: Path) -> None:
     program = (
         "import sys\nfrom webots_mcp.cli import main\n"
         f"main(['trends', '--database', {str(story)!r}])\n"
-        "print({'mcp', 'matplotlib', 'sqlmodel'} & set(sys.modules), file=sys.stderr)"
+        "print({'mcp', 'resvg_py', 'sqlmodel'} & set(sys.modules), file=sys.stderr)"
     )
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert ended.stderr.strip() == "set()"

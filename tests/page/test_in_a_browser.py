@@ -234,7 +234,11 @@ def test_it_moves_while_the_robot_moves_and_its_buttons_steer(
     speed.press("Enter")
     tab.says("speed = 7: done")
     assert newest(driven, "SELECT value FROM parameter_value ORDER BY id DESC") == "7.0"
-    speed.fill("70")
+    speed.fill("70")  # and while it is typed, a look brings the value that somebody else set
+    tab.page.evaluate("ask('steer', {robot: 'rover'}, {name: 'speed', value: 6})")
+    for _ in range(3):
+        tab.page.wait_for_event("response", lambda answer: "/look?" in answer.url)
+    assert speed.input_value() == "70"
     speed.press("Enter")
     tab.says("a number from 0 up to 10, not 70")
     tab.page.get_by_role("button", name="Reset").click()

@@ -289,7 +289,7 @@ function showParameters(parameters, settable, anew = false) {
   for (const { name, value } of parameters) {
     const made = [...place.querySelectorAll("[data-name]")].find((each) => each.dataset.name === name);
     made.disabled = !settable;
-    if (!anew && made.dataset.told === JSON.stringify(value)) continue;
+    if (made.dataset.typing || (!anew && made.dataset.told === JSON.stringify(value))) continue;
     made.dataset.told = JSON.stringify(value);
     if (made.type === "checkbox") made.checked = value;
     else made.value = value;
@@ -301,7 +301,10 @@ function input({ name, value, choices }) {
     ? element("select", {}, ...choices.map((each) => element("option", { value: each, textContent: each })))
     : element("input", { type: typeof value === "boolean" ? "checkbox" : typeof value === "number" ? "number" : "text", step: "any" });
   made.dataset.name = name;
+  made.addEventListener("input", () => { made.dataset.typing = "true"; });
+  made.addEventListener("blur", () => { delete made.dataset.typing; });
   made.addEventListener("change", () => {
+    delete made.dataset.typing;
     const typed = made.type === "checkbox" ? made.checked : made.type === "number" ? made.valueAsNumber : made.value;
     const chosen = choices?.find((each) => String(each) === made.value) ?? typed;
     if (!Number.isNaN(chosen)) command(name, { name, value: chosen });

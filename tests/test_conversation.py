@@ -48,6 +48,7 @@ def test_a_page_shows_kinds_and_counts_by_the_names_that_they_have(page: Path) -
     assert re.search(r'"rows": \d', shown) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONVERSATIONS)
 def test_the_page_shows_what_is_said_and_answered_today(name: str) -> None:
     line = [sys.executable, str(EXAMPLES / "ask.py"), str(EXAMPLES / name)]

@@ -180,6 +180,28 @@ def test_the_points_of_a_lidar_are_recorded_as_numbers() -> None:
     assert replaced == {}
 
 
+NOWHERE = 8  # an address that ends the process when it is followed
+
+
+@pytest.mark.usefixtures("encoder")
+@pytest.mark.parametrize(
+    "data",
+    [
+        ctypes.cast(NOWHERE, ctypes.POINTER(ctypes.c_double)),
+        ctypes.cast(NOWHERE, ctypes.c_char_p),
+        ctypes.c_void_p(NOWHERE),
+        ctypes.byref(ctypes.c_double()),
+        (ctypes.c_char_p * 2)(),
+        (ctypes.c_double * 3)(),
+    ],
+    ids=lambda data: type(data).__name__,
+)
+def test_what_may_hold_a_pointer_is_named_and_never_followed(data: Any) -> None:
+    text, replaced, _ = encoding.encode({"touch": data, "pose": POSE})
+    assert json.loads(text) == {"touch": None, "pose": POSE}
+    assert replaced == {"touch": f"type {type(data).__name__}"}
+
+
 LEAVES: st.SearchStrategy[Any] = (
     st.none()
     | st.booleans()

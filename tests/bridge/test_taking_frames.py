@@ -125,7 +125,7 @@ class Lidar(Ranger):
         return 0.2
 
 
-def test_depths_are_colours_from_red_to_blue_and_a_bar_says_how_many_metres() -> None:
+def test_depths_are_colours_from_red_to_blue() -> None:
     picture = take_picture(RangeFinder([0.5, 10.0, math.inf, math.nan], 2))
     assert picture.scale == "red 0.5 m, yellow, green, blue 10 m; black: nothing in range"
     image = shown(picture)
@@ -134,10 +134,6 @@ def test_depths_are_colours_from_red_to_blue_and_a_bar_says_how_many_metres() ->
     assert near[0] > 200 > 100 > near[2]
     assert far[2] > 180 > 100 > far[0]
     assert {image.getpixel((0, 159)), image.getpixel((159, 159))} == {BLACK}
-    assert image.getpixel((0, 165)) == near
-    assert image.getpixel((159, 165)) == far
-    labels = [image.getpixel((x, y)) for x in range(image.width) for y in range(174, image.height)]
-    assert WHITE in labels
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (7, 3), (640, 480), (1000, 2), (321, 321)])

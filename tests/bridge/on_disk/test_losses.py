@@ -8,7 +8,6 @@ import os
 import subprocess
 import sys
 import threading
-import time
 from contextlib import closing
 from pathlib import Path
 
@@ -120,30 +119,6 @@ def test_recording_goes_on_after_the_write_ahead_log_was_deleted(
     catch_up(bridge)
     bridge.publish({"n": 2})
     assert numbers(filed)[-1] == 2
-
-
-@POSIX
-@pytest.mark.parametrize("part", [0.0, 0.5])
-@pytest.mark.usefixtures("retry_at_once")
-def test_recording_goes_on_after_the_write_ahead_log_was_cut_short(
-    bridge: MCPBridge, file: Path, filed: Recording, part: float, capfd: pytest.CaptureFixture[str]
-) -> None:
-    log = Path(f"{file}-wal")
-    for n in range(50):
-        bridge.publish({"n": n})
-    heartbeat_now(bridge)
-    os.truncate(log, int(log.stat().st_size * part))
-    deadline_s = time.monotonic() + 20
-    n = 50
-    while "truncated" not in capfd.readouterr().err:
-        bridge.publish({"n": n})
-        heartbeat_now(bridge)
-        n += 1
-        assert time.monotonic() < deadline_s
-    bridge.publish({"n": n})
-    catch_up(bridge)
-    assert numbers(filed)[-1] == n
-    assert filed.rows("PRAGMA integrity_check") == ["ok"]
 
 
 def test_a_log_that_checkpoints_empty_counts_as_whole(

@@ -328,7 +328,6 @@ def draw_from_above(device: Any) -> tuple[Canvas, str]:
     rings = max(1, math.ceil(farthest_m / spacing_m - 1e-6))
     canvas, middle = Canvas(_TOP_VIEW_PX, _TOP_VIEW_PX), _TOP_VIEW_PX / 2
     per_m = (middle - 8) / (rings * spacing_m)
-    _draw_edges(canvas, device.getFov())
     for number in range(1, rings + 1):
         radius = number * spacing_m * per_m
         canvas.circle(middle, middle, radius, GREY)
@@ -364,16 +363,6 @@ def _points(ranges: Sequence[float], lidar: Any) -> list[tuple[float, float]]:
             point = on_ground_m * math.cos(angle_rad), on_ground_m * math.sin(angle_rad)
             points.append(point)
     return points
-
-
-def _draw_edges(canvas: Canvas, fov_rad: float) -> None:
-    """Draw the limits of the field of view, unless it is a full circle."""
-    if fov_rad > 2 * math.pi - 0.1:
-        return
-    middle = canvas.width / 2
-    for angle_rad in (fov_rad / 2, -fov_rad / 2):
-        x, y = middle * (1 - math.sin(angle_rad)), middle * (1 - math.cos(angle_rad))
-        canvas.line(middle, middle, x, y, GREY)
 
 
 def _shades() -> list[int]:
@@ -447,12 +436,4 @@ class Canvas:
         for number in range(count):
             angle = 2 * math.pi * number / count
             at = x + radius * math.cos(angle), y + radius * math.sin(angle)
-            self.fill(round(at[0]), round(at[1]), 1, 1, colour)
-
-    def line(self, x: float, y: float, to_x: float, to_y: float, colour: int) -> None:
-        """Draw a straight line."""
-        count = max(1, math.ceil(max(abs(to_x - x), abs(to_y - y))))
-        for number in range(count + 1):
-            share = number / count
-            at = x + share * (to_x - x), y + share * (to_y - y)
             self.fill(round(at[0]), round(at[1]), 1, 1, colour)

@@ -10,7 +10,7 @@ import itertools
 import json
 import re
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from webots_mcp.bridge.commands import ClaimedCommand, Progress
@@ -158,12 +158,12 @@ def add_node(session: Session, command: ClaimedCommand) -> Progress:
             "world file first: IMPORTABLE EXTERNPROTO"
         )
     path = _path_of(robot, node)
-    is_remembered = session.scene.remember_added(path, int(node.getId()))
+    session.scene.added.add(int(node.getId()))
     facts: dict[str, Any] = {"path": path, "type": str(node.getTypeName()), "parent": place.path}
     yield from _until_stepped(session)
     session.journal.event("add_node", facts | {"vrml": cut(text, 2000)} | _asked_by(command), path)
-    reset = {"a_reset": "removes it"} if is_remembered else _effect_of_reset(is_remembered)
-    return facts | {"node": label(node), "sim_time_s": session.clock.sim_time_s} | reset
+    now_s = session.clock.sim_time_s
+    return facts | {"node": label(node), "sim_time_s": now_s, "a_reset": "removes it"}
 
 
 def _count(place: Place) -> int:
@@ -249,9 +249,10 @@ def remove_node(session: Session, command: ClaimedCommand) -> Progress:
         yield from _until_stepped(session)
     if robot.getFromId(node_id) is not None:
         raise CommandRefusedError(f"Webots did not remove {place.path}; {_SAYS}")
-    was_added = session.scene.added.pop(node_id, None) is not None
     session.journal.event("remove_node", facts | _asked_by(command), place.path)
-    reset = _ADDED_BEFORE if was_added else "does not bring it back; a reload does"
+    reset = (
+        _ADDED_BEFORE if node_id in session.scene.added else "does not bring it back; a reload does"
+    )
     return facts | {"sim_time_s": session.clock.sim_time_s, "a_reset": reset}
 
 
@@ -334,98 +335,44 @@ MOST_EDITS: Final = 200  # that are put back
 
 
 class SceneEdits:
-    """Remembers changes of the scene, and undoes them after a reset.
+    """Remembers changes of the scene, and undoes after a reset what Webots does not.
 
     Attributes:
         fields: The fields that were set in this run, in that order.
-        added: The paths of the nodes that were added in this run, by their numbers.
+        added: The numbers of the nodes that were added in this run.
     """
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._restored_at_step: int | None = None  # None: what was put back is recorded
-        self._set: list[FieldEdit] = []
-        self._outcomes: dict[str, list[str]] = {}
         self.fields: dict[tuple[int, str, int | None], FieldEdit] = {}
-        self.added: dict[int, str] = {}
+        self.added: set[int] = set()
 
     def remember_field(self, edit: FieldEdit) -> bool:
         """Remember that a field is about to be set; False if that will not be undone."""
         key = (edit.node_id, edit.name, edit.entry)
         known = self.fields.get(key)
-        if known is None and self._is_full:
+        if known is None and len(self.fields) >= MOST_EDITS:
             return False
         self.fields[key] = edit if known is None else known._replace(value=edit.value)
         return True
 
-    def remember_added(self, path: str, node_id: int) -> bool:
-        """Remember an added node; False if that will not be undone."""
-        if self._is_full:
-            return False
-        self.added[node_id] = path
-        return True
-
-    @property
-    def _is_full(self) -> bool:
-        return len(self.fields) + len(self.added) >= MOST_EDITS
-
     def begin_run(self) -> None:
-        """The world was reset: undo the changes that Webots has not undone."""
-        if not (self.fields or self.added):
-            return
-        self._restored_at_step = self._session.clock.steps_seen
-        self._set, self._outcomes = [], {"by_webots": [], "by_bridge": [], "not": []}
-        for edit in reversed(self.fields.values()):
-            self._try(edit.path, self._set_back, edit)
-        for node_id, path in self.added.items():
-            self._try(path, self._take_away, node_id, path)
-        self.fields, self.added = {}, {}
+        """The world was reset: set the fields back that still hold what they were set to."""
+        edits, self.fields, self.added = reversed(self.fields.values()), {}, set()
+        outcomes = {edit.path: self._set_back(edit) for edit in edits}
+        if paths := [path for path, is_set in outcomes.items() if is_set]:
+            self._session.journal.event("put_back", {"paths": paths})
 
-    def look(self) -> None:
-        """Record what was put back, after the step with which Webots sets the fields."""
-        if self._restored_at_step in (None, self._session.clock.steps_seen):
-            return
-        self._restored_at_step = None
-        for edit in self._set:
-            self._try(edit.path, self._check_set, edit)
-        outcomes = {how: paths for how, paths in self._outcomes.items() if paths}
-        self._session.journal.event("put_back", dict[str, object](outcomes))
-
-    @property
-    def _robot(self) -> Any:
-        return self._session.simulation.robot
-
-    def _try(self, path: str, restore: Callable[..., object], *arguments: object) -> None:
+    def _set_back(self, edit: FieldEdit) -> bool:
+        """Set a field to its value before; False where Webots or someone else has set it since."""
         try:
-            restore(*arguments)
-        except Exception as error:  # noqa: BLE001  (the robot comes first)
-            self._session.errors.failed(f"putting {path} back", error)
-            self._outcomes["not"].append(path)
-
-    def _set_back(self, edit: FieldEdit) -> None:
-        field = find_again(self._robot, edit.node_id, edit.name)
-        if field is None:
-            self._outcomes["not"].append(f"{edit.path}: its node does not exist any more")
-        elif edit.name in _MOVED_BY_PHYSICS or not self._holds(edit, edit.value):
-            self._outcomes["by_webots"].append(edit.path)
-        else:
+            field = find_again(self._session.simulation.robot, edit.node_id, edit.name)
+            if field is None or edit.name in _MOVED_BY_PHYSICS:
+                return False
+            if not is_same(edit.type_name, read(field, edit.entry), edit.value):
+                return False
             write(field, edit.before, edit.entry)
-            self._set.append(edit)
-
-    def _check_set(self, edit: FieldEdit) -> None:
-        self._note(edit.path, done=self._holds(edit, edit.before))
-
-    def _holds(self, edit: FieldEdit, value: Any) -> bool:
-        field = find_again(self._robot, edit.node_id, edit.name)
-        return field is not None and is_same(edit.type_name, read(field, edit.entry), value)
-
-    def _take_away(self, node_id: int, path: str) -> None:
-        node = self._robot.getFromId(node_id)
-        if node is None:
-            self._outcomes["by_webots"].append(f"{path} (added)")
-            return
-        node.remove()
-        self._note(f"{path} (added)", done=self._robot.getFromId(node_id) is None)
-
-    def _note(self, path: str, *, done: bool) -> None:
-        self._outcomes["by_bridge" if done else "not"].append(path)
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            self._session.errors.failed(f"putting {edit.path} back", error)
+            return False
+        return True

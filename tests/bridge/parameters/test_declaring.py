@@ -102,11 +102,6 @@ def test_a_wrong_declaration_is_refused_where_it_stands(
     assert recording.rows("SELECT name FROM parameter") == []
 
 
-def test_infinity_as_a_bound_means_none(bridge: MCPBridge, recording: Recording) -> None:
-    bridge.parameter("p", 1.0, low=-math.inf, high=math.inf)
-    assert recording.rows("SELECT low, high FROM parameter") == [(None, None)]
-
-
 def test_declaring_again_the_same_writes_nothing_and_gives_the_same_parameter(
     bridge: MCPBridge, recording: Recording
 ) -> None:

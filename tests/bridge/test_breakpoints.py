@@ -221,19 +221,6 @@ def test_a_signal_that_is_never_published_is_told_once_with_the_nearest(
     assert "fornt_m is missing" in told and "there is front_m" in told
 
 
-def test_devices_are_asked_in_every_call(
-    robot: InProcessSupervisor, throttled: MCPBridge, recording: Recording
-) -> None:
-    throttled.breakpoint("time > 0.1", "log")
-
-    for _ in range(9):
-        robot.step(STEP_MS)
-        throttled.auto_publish()
-
-    ((time_s, _, data),) = hits(recording)
-    assert time_s == data["values"]["time"] == pytest.approx(0.112)
-
-
 def test_what_cannot_be_set_is_refused_where_it_is_set(bridge: MCPBridge) -> None:
     with pytest.raises(InvalidConditionError, match="column 3"):
         bridge.breakpoint("n = 3")

@@ -10,14 +10,13 @@ import json
 import math
 import uuid
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
 from tests.bridge.conftest import STEP_MS, Recording
 from webots_mcp import MCPBridge, MemoryDatabase
-from webots_mcp.bridge import encoding
 from webots_mcp.standin import InProcessSupervisor
 
 
@@ -79,15 +78,6 @@ def test_extras_that_are_no_dict_do_not_stop_the_loop(
         bridge.auto_publish(extra=[1])  # type: ignore[arg-type]
         assert bridge.stats().failures == 1
     assert "auto_publish failed: TypeError" in capfd.readouterr().err
-
-
-def test_a_row_carries_simulation_time_wall_time_and_the_run(
-    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
-) -> None:
-    robot.step(STEP_MS)
-    bridge.publish({"x": 1})
-    sql = "SELECT sim_time_s, wall_time_s > 1.7e9, run_id FROM state"
-    assert recording.rows(sql) == [(pytest.approx(0.016), 1, bridge.run_id)]
 
 
 @pytest.mark.usefixtures("encoder")
@@ -162,23 +152,6 @@ def test_a_huge_array_costs_itself_and_not_the_row(bridge: MCPBridge, recording:
     assert json.loads(replaced) == {"image": "array[921600]", "list": "array[400000]"}
 
 
-@pytest.mark.usefixtures("encoder")
-def test_a_picture_as_nested_lists_costs_itself_and_not_the_row(
-    bridge: MCPBridge, recording: Recording
-) -> None:
-    bridge.publish({"x": 1, "depth": [[0.123456] * 640 for _ in range(480)]})
-    assert recording.states() == [{"x": 1, "depth": None}]
-    assert recording.rows("SELECT replaced FROM state") == ['{"depth":"array[307200]"}']
-
-
-def test_a_state_that_contains_itself_is_cut(bridge: MCPBridge, recording: Recording) -> None:
-    state: dict[str, Any] = {"x": 1}
-    state["self"] = state
-    bridge.publish(state)
-    (replaced,) = recording.rows("SELECT replaced FROM state")
-    assert set(json.loads(replaced).values()) == {"too deep"}
-
-
 def test_the_callers_dict_is_never_changed(bridge: MCPBridge) -> None:
     state = {"pose": [1.0, math.nan], "nested": {"raw": b"x", 1: (2, 3)}}
     before = copy.deepcopy(state)
@@ -211,13 +184,6 @@ class Sullen:
         raise MuteError
 
 
-class Unreadable(dict[str, int]):
-    def items(self) -> Any:
-        raise RuntimeError("no items")
-
-    __iter__ = keys = values = items
-
-
 BROKEN = (Broken(), Unconnected(), Picture(), Sullen(), 10**5000, Mode)
 
 
@@ -231,42 +197,6 @@ def test_whatever_an_object_does_it_costs_itself_and_is_counted(
     assert recording.states() == [{"x": 1, "value": None}, {"x": 2, "values": [None]}]
     assert bridge.stats().values_replaced == 2
     assert recording.rows("SELECT count(*) FROM log WHERE source = 'bridge'") == [2]
-
-
-@pytest.mark.usefixtures("encoder")
-def test_a_key_without_text_costs_itself(bridge: MCPBridge, recording: Recording) -> None:
-    class Key:
-        def __str__(self) -> str:
-            raise RuntimeError("no text")
-
-    bridge.publish({"x": 1, "by key": {Key(): 2, 3: 4}})
-    assert recording.states() == [{"x": 1, "by key": {"<Key>": 2, "3": 4}}]
-    assert recording.rows("SELECT replaced FROM state") == ['{"by key.<Key>":"key"}']
-
-
-def test_a_state_that_cannot_be_read_at_all_is_a_row_that_says_why(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(encoding, "orjson", None)
-    text, replaced, _ = encoding.encode(Unreadable(x=1))
-    assert (text, replaced) == ("{}", {"": "type Unreadable: no items"})
-
-
-@pytest.mark.usefixtures("encoder")
-def test_an_array_of_another_library_is_stored_whatever_its_size_means(
-    bridge: MCPBridge, recording: Recording
-) -> None:
-    class Tensor:
-        shape = (2,)
-
-        def size(self) -> tuple[int]:
-            return (2,)
-
-        def tolist(self) -> list[int]:
-            return [1, 2]
-
-    bridge.publish({"tensor": Tensor()})
-    assert recording.states() == [{"tensor": [1, 2]}]
 
 
 @pytest.mark.usefixtures("encoder")
@@ -294,25 +224,6 @@ def test_both_encoders_store_the_same(bridge: MCPBridge, recording: Recording) -
         }
     ]
     assert recording.rows("SELECT replaced FROM state") == [None]
-
-
-@pytest.mark.usefixtures("encoder")
-def test_an_integer_beyond_64_bits_is_read_as_the_nearest_float(
-    bridge: MCPBridge, recording: Recording
-) -> None:
-    bridge.publish({"id": 2**100, "gap": math.nan})
-    assert recording.rows("SELECT data ->> '$.id' FROM state") == [float(2**100)]
-    assert recording.states()[0]["id"] == 2**100
-
-
-@pytest.mark.usefixtures("encoder")
-def test_a_scan_with_several_kinds_of_gaps_names_each(
-    bridge: MCPBridge, recording: Recording
-) -> None:
-    bridge.publish({"scan": [0.5, math.inf, math.nan]})
-    assert recording.states() == [{"scan": [0.5, None, None]}]
-    (replaced,) = recording.rows("SELECT replaced FROM state")
-    assert json.loads(replaced) == {"scan.1": "inf", "scan.2": "nan"}
 
 
 def test_a_dataclass_may_be_the_whole_state(bridge: MCPBridge, recording: Recording) -> None:

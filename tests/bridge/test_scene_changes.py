@@ -127,7 +127,7 @@ def test_a_reset_puts_back_what_webots_does_not(scene: Scene) -> None:
     assert scene.get("ROVER.translation") == [-1.2, 0.0, 0.04]
     ((_, data),) = scene.events("put_back")
     told = json.loads(data)
-    assert told == {"by_webots": ["ROVER.translation"], "by_bridge": [friction, colour]}
+    assert told == {"paths": [friction, colour]}
 
 
 def test_a_reset_leaves_what_somebody_else_has_set_since(scene: Scene) -> None:
@@ -163,8 +163,6 @@ def test_a_node_is_added_with_a_path_that_leads_to_it_until_a_reset(scene: Scene
     assert [name for name, _ in scene.events("add_node")] == ["PILL", second["path"]]
     scene.reset()
     assert "no node has the DEF name, name or type 'PILL'" in scene.fail("get_field", path="PILL")
-    ((_, data),) = scene.events("put_back")
-    assert json.loads(data) == {"by_webots": ["PILL (added)", f"{second['path']} (added)"]}
 
 
 def test_a_field_that_is_null_takes_a_node(scene: Scene) -> None:
@@ -207,19 +205,13 @@ def test_brackets_in_texts_and_comments_are_no_brackets(scene: Scene) -> None:
     assert scene.get("ODD.name") == 'a { and a " ['
 
 
-def test_a_node_that_was_removed_is_brought_back_by_each_reset(scene: Scene) -> None:
-    whole = scene.robot.getFromDef("CRATE")
-    assert whole is not None
-    written = whole.exportString()
-    assert scene.ask("remove_node", path="CRATE")["a_reset"] == "puts it back"
-    assert "no node has the DEF name, name or type 'CRATE'" in scene.fail("get_field", path="CRATE")
-    for _ in range(2):
-        scene.reset()
-        again = scene.robot.getFromDef("CRATE")
-        assert again is not None and again.exportString() == written
-    assert [json.loads(data) for _, data in scene.events("put_back")] == [
-        {"by_bridge": ["CRATE (removed)"]}
-    ] * 2
+@pytest.mark.parametrize("path", ["CRATE", "BALL.physics"])
+def test_a_node_that_was_removed_stays_away_until_a_reload(scene: Scene, path: str) -> None:
+    removed = scene.ask("remove_node", path=path)
+    assert removed["a_reset"] == "does not bring it back; a reload does"
+    scene.reset()
+    assert scene.robot.getFromDef("CRATE") is None or scene.get("BALL.physics") is None
+    assert not scene.events("put_back")
 
 
 def test_what_was_added_and_removed_again_stays_away(scene: Scene) -> None:
@@ -229,13 +221,6 @@ def test_what_was_added_and_removed_again_stays_away(scene: Scene) -> None:
     scene.reset()
     assert scene.robot.getFromDef("PILL") is None
     assert not scene.events("put_back")
-
-
-def test_the_node_of_a_single_field_is_removed_and_brought_back(scene: Scene) -> None:
-    scene.ask("remove_node", path="BALL.physics")
-    assert scene.get("BALL.physics") is None
-    scene.reset()
-    assert scene.get("BALL.physics.mass") == 0.05
 
 
 @pytest.mark.parametrize(

@@ -38,44 +38,34 @@ def test_each_frame_of_a_pause_is_taken_while_it_lasts(
     assert len(paths) == 2
 
 
-@pytest.mark.parametrize("camera", ["camera", ""])
-def test_a_disabled_camera_is_named_with_the_line_that_enables_it(
-    bridge: MCPBridge, recording: Recording, drive: Drive, camera: str
+@pytest.mark.parametrize(
+    ("enabled", "camera", "said"),
+    [
+        ((), "camera", "robot.getDevice('camera').enable(time_step)"),
+        ((), "", "disabled: 'camera' (Camera)"),
+        (("camera",), "camera", "has no image yet"),
+        (("lidar",), "lidar", "'lidar' has not measured anything yet"),
+        ((), "gps", "'gps' is a GPS; devices with pictures: 'camera' (Camera), 'lidar' (Lidar)"),
+        ((), "eye", "no device 'eye'; devices with pictures: 'camera' (Camera), 'lidar' (Lidar)"),
+    ],
+)
+def test_a_device_without_a_picture_is_named_with_what_to_do(
+    robot: InProcessSupervisor,
+    bridge: MCPBridge,
+    recording: Recording,
+    drive: Drive,
+    enabled: tuple[str, ...],
+    camera: str,
+    said: str,
 ) -> None:
     drive(1)
+    for name in enabled:
+        robot.devices[name].enable(STEP_MS)  # type: ignore[attr-defined]
     sent = recording.send("take_frame", camera=camera)
     eager(bridge)
     status, _, error = recording.fate(sent)
     assert status == "failed"
-    assert "disabled: 'camera' (Camera)" in str(error)
-    assert "robot.getDevice('camera').enable(time_step)" in str(error)
-
-
-def test_a_camera_that_has_no_image_yet_says_so(
-    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording, drive: Drive
-) -> None:
-    drive(1)
-    robot.devices["camera"].enable(STEP_MS)  # type: ignore[attr-defined]
-    robot.devices["lidar"].enable(STEP_MS)  # type: ignore[attr-defined]
-    camera, lidar = (recording.send("take_frame", camera=name) for name in ("camera", "lidar"))
-    eager(bridge)
-    eager(bridge)
-    assert "has no image yet" in str(recording.fate(camera)[2])
-    assert "'lidar' has not measured anything yet" in str(recording.fate(lidar)[2])
-
-
-@pytest.mark.parametrize(
-    ("camera", "said"), [("gps", "'gps' is a GPS"), ("eye", "no device 'eye'")]
-)
-def test_what_has_no_pictures_is_named_with_what_has(
-    bridge: MCPBridge, recording: Recording, drive: Drive, camera: str, said: str
-) -> None:
-    drive(1)
-    sent = recording.send("take_frame", camera=camera)
-    eager(bridge)
-    error = str(recording.fate(sent)[2])
-    assert said in error
-    assert "devices with pictures: 'camera' (Camera), 'lidar' (Lidar)" in error
+    assert said in str(error)
 
 
 # -- distances -----------------------------------------------------------------------------------
@@ -125,7 +115,7 @@ class Lidar(Ranger):
         return 0.2
 
 
-def test_depths_are_colours_from_red_to_blue_and_a_bar_says_how_many_metres() -> None:
+def test_depths_are_colours_from_red_to_blue() -> None:
     picture = take_picture(RangeFinder([0.5, 10.0, math.inf, math.nan], 2))
     assert picture.scale == "red 0.5 m, yellow, green, blue 10 m; black: nothing in range"
     image = shown(picture)
@@ -134,10 +124,6 @@ def test_depths_are_colours_from_red_to_blue_and_a_bar_says_how_many_metres() ->
     assert near[0] > 200 > 100 > near[2]
     assert far[2] > 180 > 100 > far[0]
     assert {image.getpixel((0, 159)), image.getpixel((159, 159))} == {BLACK}
-    assert image.getpixel((0, 165)) == near
-    assert image.getpixel((159, 165)) == far
-    labels = [image.getpixel((x, y)) for x in range(image.width) for y in range(174, image.height)]
-    assert WHITE in labels
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (7, 3), (640, 480), (1000, 2), (321, 321)])

@@ -206,32 +206,6 @@ def test_the_reload_of_an_extern_controller_is_answered_when_its_process_has_end
         connection.close()
 
 
-def test_a_robot_that_was_left_in_the_pause_of_another_is_told_by_whom(
-    simulation_of_two: Simulation, connect_extern: Connect, filed: Recording
-) -> None:
-    simulation = simulation_of_two
-    simulation.wait_for(lambda: simulation.controller("referee").is_running)
-    process = connect_extern(simulation)
-    simulation.wait_for(lambda: has_states(filed), timeout_s=30)
-    simulation.wait_for(lambda: filed.rows("SELECT count(*) FROM session") == [2])
-    (newest,) = filed.rows("SELECT name FROM robot WHERE id = (SELECT max(id) FROM robot)")
-    wait(simulation, filed, filed.send("pause"))
-    other = "referee" if newest == "rover" else "rover"
-    if newest == "rover":
-        process.kill()
-        process.wait()
-    else:
-        simulation.controller("referee").kill()
-
-    def why() -> bool:
-        connection = connect(filed.database, "reader")
-        said = look(connection, other).status.why or ""
-        connection.close()
-        return f"robot {newest!r} paused the simulation" in said
-
-    simulation.wait_for(why, timeout_s=20)
-
-
 def test_a_killed_extern_controllers_hold_is_taken_over_by_the_next_one(
     extern_world: Path, connect_extern: Connect, filed: Recording
 ) -> None:

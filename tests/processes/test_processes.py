@@ -98,29 +98,6 @@ for n in range(1007):
     assert len(steps) == 313
 
 
-def test_a_run_that_an_exception_ends_names_it(start: Start, filed: Recording) -> None:
-    simulation = start(
-        """
-falls = []
-bridge.register_command("fall", lambda command: falls.append(1))
-while robot.step(16) != -1:
-    bridge.publish({"n": 1})
-    bridge.get_command()
-    if falls:
-        {}["speed"]
-"""
-    )
-    simulation.wait_for(lambda: has_states(filed), 30)
-    sent = filed.send("run", for_s=100_000)
-    simulation.wait_for(lambda: filed.fate(sent)[0] == "claimed", 30)
-    fallen = filed.send("fall")
-    simulation.wait_for(lambda: simulation.controller("rover").exit_code is not None, timeout_s=30)
-    assert filed.fate(fallen)[0] == "done"
-    status, result, _ = filed.fate(sent)
-    assert (status, result["ended"]) == ("done", "run ended")
-    assert result["why"].startswith("the controller ended by KeyError: 'speed' (rover.py, line ")
-
-
 def test_a_killed_controllers_session_is_judged_and_its_command_is_lost(
     start: Start, filed: Recording
 ) -> None:

@@ -59,38 +59,6 @@ def first_step_below_0_02() -> float:
     return next(time for time in steps if round(abs(math.sin(1.3 * time)), 6) < 0.02)
 
 
-def test_the_step_is_the_one_that_a_recording_of_every_step_shows(
-    start: Start, filed: Recording
-) -> None:
-    simulation = drive(start, 1)
-    simulation.wait_for(lambda: has_states(filed), timeout_s=30)
-    command = filed.send("run", until="front_m > 0.9 for 0.1", reset=True, pace="fast")
-    result = wait(simulation, filed, command)
-    rows = filed.rows(
-        "SELECT sim_time_s, data ->> 'front_m' FROM state WHERE run_id = ? ORDER BY id",
-        result["run_id"],
-    )
-    since = next(time for time, front in rows if front > 0.9)
-    assert result["sim_time_s"] == pytest.approx(
-        next(t for t, _ in rows if t - since >= 0.1 - 1e-6)
-    )
-    assert rows[-1][0] == pytest.approx(result["sim_time_s"])
-
-
-def test_twenty_seconds_are_twenty_seconds(start: Start, filed: Recording) -> None:
-    simulation = drive(start, 7, ASKED_FIRST)
-    simulation.wait_for(lambda: has_states(filed), timeout_s=30)
-    result = wait(simulation, filed, filed.send("run", for_s=20, reset=True, pace="fast"))
-    assert (result["ended"], result["sim_time_s"]) == (
-        "simulation time reached",
-        pytest.approx(20.0),
-    )
-    assert simulation.time_s == pytest.approx(20.0)
-    further = wait(simulation, filed, filed.send("run", for_s=0.5, pace="fast"))
-    assert further["advanced_s"] == pytest.approx(0.512)  # the step of 16 ms that reaches 0.5 s
-    assert simulation.time_s == pytest.approx(20.512)
-
-
 def test_a_killed_controller_leaves_no_run_behind(start: Start, filed: Recording) -> None:
     simulation = drive(start, 5)
     simulation.wait_for(lambda: has_states(filed), timeout_s=30)
@@ -108,19 +76,3 @@ def test_a_killed_controller_leaves_no_run_behind(start: Start, filed: Recording
         "lost",
         "its controller ended before it finished; it may have run in part",
     )
-
-
-@pytest.mark.parametrize("press", ["reset", "reload", "quit"])
-def test_what_a_person_does_ends_it(start: Start, filed: Recording, press: str) -> None:
-    simulation = drive(start, 5, mode="realtime")
-    simulation.wait_for(lambda: has_states(filed), timeout_s=30)
-    command = filed.send("run", until="front_m > 2", then="go_on")
-    simulation.wait_for(lambda: filed.fate(command)[0] == "claimed")
-    at_s = simulation.time_s
-    simulation.wait_for(lambda: simulation.time_s > at_s + 0.2)
-    getattr(simulation, press)()
-    simulation.wait_for(lambda: filed.fate(command)[0] != "claimed", timeout_s=20)
-    status, result, error = filed.fate(command)
-    assert (status, error) == ("done", None)
-    assert result["ended"] == "run ended"
-    assert result["sim_time_s"] >= at_s

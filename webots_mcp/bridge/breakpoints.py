@@ -35,7 +35,6 @@ class Breakpoint:
 
     Attributes:
         id: None where the database could not take it yet.
-        of_code: The controller's own code has set it.
         hit_count: How often its condition began to hold in this run.
         holding: Its condition held in the previous state.
         asked_since_s: The simulation time of the first state that it was evaluated on in this run.
@@ -49,11 +48,8 @@ class Breakpoint:
         evaluator: Evaluator,
         action: str,
         after_hits: int,
-        *,
-        of_code: bool,
     ) -> None:
         self.id = id
-        self.of_code = of_code
         self.condition = condition
         self.evaluator = evaluator
         self.action = action
@@ -142,20 +138,12 @@ class Breakpoints:
         return ()
 
     def _move(self, stored: list[Breakpoint]) -> None:
-        """Move to another database: those of the code are stored there, others are reported off."""
+        """Move to another database: what is armed and not there is stored in it."""
+        there = {each.asks: each for each in stored}
         for each in self.armed:
-            same = next((other for other in stored if other.asks == each.asks), None)
-            if same is not None:
-                each.id = same.id
-                stored[stored.index(same)] = each
-            elif each.of_code:
-                each.id = self._store(*each.asks)
-                stored.append(each)
-            else:
-                why = "the database that it was set in is lost; set it again"
-                text = f"breakpoint {each.id} ({each.condition.text}) is off: {why}"
-                self._journal.log("warning", "bridge", text)
-        self.armed = stored
+            same = there.pop(each.asks, None)
+            each.id = same.id if same is not None else self._store(*each.asks)
+        self.armed += there.values()
 
     def _read(self, number: int, text: bytes, action: bytes, after_hits: int) -> Breakpoint | None:
         from webots_mcp.conditions import parse_condition
@@ -166,7 +154,7 @@ class Breakpoints:
             self._disable(number, str(error))
             return None
         asked = (condition, action.decode("utf-8", "replace"), int(after_hits))
-        return _armed(number, *asked, of_code=False)
+        return _armed(number, *asked)
 
     def set(self, text: str, action: str, after_hits: int) -> int | None:
         """Arm one of the controller's code, for as long as its session lasts.
@@ -188,7 +176,7 @@ class Breakpoints:
         if len(self.armed) >= MAX_BREAKPOINTS:
             raise InvalidInputError(f"{MAX_BREAKPOINTS} breakpoints are armed already: remove one")
         number = self._store(condition.text, action, after_hits)
-        self.armed.append(_armed(number, condition, action, after_hits, of_code=True))
+        self.armed.append(_armed(number, condition, action, after_hits))
         return number
 
     def _store(self, text: str, action: str, after_hits: int) -> int | None:
@@ -301,11 +289,8 @@ _CANNOT_PAUSE: Final = (
 )
 
 
-def _armed(
-    number: int | None, condition: Condition, action: str, after_hits: int, *, of_code: bool
-) -> Breakpoint:
-    evaluator = condition.evaluator(plain)
-    return Breakpoint(number, condition, evaluator, action, after_hits, of_code=of_code)
+def _armed(number: int | None, condition: Condition, action: str, after_hits: int) -> Breakpoint:
+    return Breakpoint(number, condition, condition.evaluator(plain), action, after_hits)
 
 
 def _require_action(action: str, after_hits: object) -> None:

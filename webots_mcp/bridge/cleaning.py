@@ -11,7 +11,7 @@ import math
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from itertools import compress, islice
 from json.encoder import encode_basestring
 from operator import not_
@@ -26,17 +26,10 @@ _MOST_KIND_CHARACTERS: Final = 100
 
 # Classes of Webots' `controller` package whose instances are nothing but their attributes.
 _WEBOTS_RECORDS: Final = ("LidarPoint", "RadarTarget", "MouseState", "ContactPoint")
-_ADDRESSES: Final = "zZPXO"  # the ctypes codes of char *, wchar_t *, void *, BSTR and PyObject *
-_TEXTS: Final = ("c", "u")  # of char and wchar_t
-_UNKNOWN_LENGTH: Final = "pointer of unknown length"
 
 
 class NoCounterpartError(TypeError):
     """The value cannot be stored; the text names what it was."""
-
-
-class Unreadable:
-    """Placeholder of a field that must not be read."""
 
 
 def convert(value: Any) -> object:
@@ -46,12 +39,8 @@ def convert(value: Any) -> object:
         NoCounterpartError: It has no counterpart, or more items than a row takes.
         Exception: Whatever the value raises while it is read.
     """
-    if isinstance(value, Unreadable):
-        raise NoCounterpartError(_UNKNOWN_LENGTH)
-    if type(value) in (type, memoryview) or isinstance(value, type):
+    if type(value) in (type, memoryview) or isinstance(value, type) or _is_of_c(value):
         raise NoCounterpartError(f"type {kind_name(value)}")
-    if (ctypes := _ctypes_of(value)) is not None:
-        return _read_c(ctypes, value)
     if type(value).__name__ in _WEBOTS_RECORDS:
         attributes: dict[str, object] = value.__dict__
         return {name: item for name, item in attributes.items() if not name.startswith("_")}
@@ -94,56 +83,16 @@ def is_number_array(value: Any) -> bool:
     return getattr(getattr(value, "dtype", None), "kind", None) in ("b", "i", "u", "f")
 
 
-# -- ctypes ------------------------------------------------------------------------------------
+def _is_of_c(value: object) -> bool:
+    """Whether it is data of ctypes: it may hold pointers, and reading one can crash the controller.
 
-
-def _ctypes_of(value: object) -> Any:
-    """The ctypes module if the value is of one of its types, else None; it is never imported here.
-
-    All data of ctypes derives from one class, which has no public name.
+    All of it derives from one class, which has no public name. It is never imported here.
     """
     ctypes = sys.modules.get("ctypes")
     if ctypes is None:
-        return None
+        return False
     is_reference = type(value).__name__ == "CArgObject"  # what byref() gives
-    return ctypes if is_reference or isinstance(value, ctypes.Structure.__mro__[1]) else None
-
-
-def _read_c(ctypes: Any, value: Any) -> object:
-    """Read numbers, arrays and structures; a pointer is never followed, not even to a C string.
-
-    What it points to may be freed by now, and reading it would crash the controller.
-
-    Raises:
-        NoCounterpartError: It is a pointer, or an array of more items than a row takes.
-    """
-    if isinstance(value, (ctypes.Structure, ctypes.Union)):
-        return dict(_c_fields(value))
-    if isinstance(value, ctypes.Array):
-        return _c_items(value)
-    code = getattr(value, "_type_", None)
-    if not isinstance(code, str) or code in _ADDRESSES:
-        raise NoCounterpartError(_UNKNOWN_LENGTH if value else "null pointer")
-    return value.value
-
-
-def _c_items(array: Any) -> object:
-    _require_few(len(array))
-    if (code := getattr(array._type_, "_type_", None)) in _TEXTS:
-        return bytes(array) if code == "c" else array.value
-    return [Unreadable()] * len(array) if _is_followed(array._type_) else list(array)
-
-
-def _c_fields(structure: Any) -> Iterator[tuple[str, object]]:
-    for cls in reversed(type(structure).__mro__):
-        for name, kind, *_ in vars(cls).get("_fields_", ()):
-            yield name, Unreadable() if _is_followed(kind) else getattr(structure, name)
-
-
-def _is_followed(kind: Any) -> bool:
-    """Whether ctypes follows such a pointer by itself as soon as the field is read."""
-    code = getattr(kind, "_type_", None)
-    return isinstance(code, str) and code in _ADDRESSES
+    return is_reference or isinstance(value, ctypes.Structure.__mro__[1])
 
 
 # -- everything else ---------------------------------------------------------------------------

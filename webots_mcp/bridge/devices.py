@@ -8,7 +8,6 @@ such reading.
 from __future__ import annotations
 
 import math
-import statistics
 import time
 from collections import deque
 from collections.abc import Callable
@@ -198,12 +197,15 @@ def _summarise_ranges(device: Any, columns: int) -> dict[str, object] | None:
         return None
     ranges: list[float] = device.getRangeImage()
     directions = _column_minima(ranges, columns)
-    nearest = min(filter(math.isfinite, directions), default=None)
+    sectors = _sector_minima(directions)
+    nearest = min(sectors)
+    if not math.isfinite(nearest) or math.isnan(sum(sectors)):  # a minimum ends at a NaN
+        nearest = min(filter(math.isfinite, directions), default=None)
     return {
         "count": len(ranges),
         "min_m": math.inf if nearest is None else nearest,
         "min_index": None if nearest is None else ranges.index(nearest),
-        "sector_min_m": _sector_minima(directions),
+        "sector_min_m": sectors,
     }
 
 
@@ -292,7 +294,7 @@ class DeviceReader:
     def _count(self, duration_us: float) -> None:
         """Set the interval by the median of the last durations; log it when it has doubled."""
         self._durations_us.append(duration_us)
-        usual_us = statistics.median(self._durations_us)
+        usual_us = sorted(self._durations_us)[len(self._durations_us) // 2]
         interval = max(1, math.ceil(usual_us / MOST_READING_US))
         if interval != self.ring_interval:
             self.ring_interval = interval

@@ -23,7 +23,7 @@ replaced, what is too large is cut, and the column `replaced` names the path and
     key over 200 characters            its beginning   "key[5000]"
     text with a lone surrogate         with "?"        "surrogate"
     key that has no text               "<Handle>"      "key"
-    C pointer                          null            "null pointer", "pointer of unknown length"
+    data of ctypes, also a pointer     null            "type c_double"
     any other object                   null            "type Socket"
     object after those before it took  null            "type Socket: no time left"
     10 ms of processor time
@@ -36,11 +36,10 @@ keys 150,000. Where there is no room for everything, the levels near the top com
 names up to 1,000 places; the empty path has the number of further ones: "4000 more". A robot rarely
 publishes a tenth of that. A state that contains itself is cut like any other nested too deeply.
 
-Numpy scalars and arrays, ctypes numbers, arrays and structures, Webots' lidar points and radar
-targets, dataclasses, enums, tuples, sets, ranges, deques, dates, paths, UUIDs, decimals and keys
-that are not text are stored as their plain JSON counterparts and are not named in `replaced`.
-Neither are integers beyond 64 bits: they become the nearest float, as SQLite would read them
-anyway.
+Numpy scalars and arrays, Webots' lidar points and radar targets, dataclasses, enums, tuples, sets,
+ranges, deques, dates, paths, UUIDs, decimals and keys that are not text are stored as their plain
+JSON counterparts and are not named in `replaced`. Neither are integers beyond 64 bits: they become
+the nearest float, as SQLite would read them anyway.
 """
 
 from __future__ import annotations

@@ -361,7 +361,7 @@ class Ring:
     def __init__(self, last_s: float, most_bytes: int = MAX_RING_BYTES) -> None:
         self._last_s = last_s
         self._most_bytes = most_bytes
-        self._rows: deque[tuple[int, RingRow]] = deque()
+        self._rows: deque[RingRow] = deque()
         self.size_bytes = 0
         self.starts_s = 0.0
 
@@ -370,18 +370,17 @@ class Ring:
 
     def add(self, row: RingRow) -> None:
         """Add the newest row."""
-        size_bytes = row.size_bytes
-        self._rows.append((size_bytes, row))
-        self.size_bytes += size_bytes
+        self._rows.append(row)
+        self.size_bytes += row.size_bytes
         oldest_s = row.sim_time_s - self._last_s
         while self._rows and (
-            self.size_bytes > self._most_bytes or self._rows[0][1].sim_time_s < oldest_s
+            self.size_bytes > self._most_bytes or self._rows[0].sim_time_s < oldest_s
         ):
             self._forget_oldest()
 
     def take(self) -> list[RingRow]:
         """Remove and return all rows."""
-        rows = [row for _, row in self._rows]
+        rows = list(self._rows)
         self._rows.clear()
         self.size_bytes = 0
         return rows
@@ -392,9 +391,9 @@ class Ring:
         self.size_bytes, self.starts_s = 0, starts_s
 
     def _forget_oldest(self) -> None:
-        size_bytes, row = self._rows.popleft()
-        self.size_bytes -= size_bytes
-        self.starts_s = self._rows[0][1].sim_time_s if self._rows else row.sim_time_s
+        row = self._rows.popleft()
+        self.size_bytes -= row.size_bytes
+        self.starts_s = self._rows[0].sim_time_s if self._rows else row.sim_time_s
 
 
 LONGEST_SIDE_PX: Final = 160

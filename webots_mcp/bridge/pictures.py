@@ -284,8 +284,7 @@ def _kind(device: Any) -> str:
 
 
 _LONGEST_SIDE_PX: Final = 320
-_SHORTEST_WIDTH_PX: Final = 160  # room for two labels next to each other
-_BAR_PX: Final = 10
+_SHORTEST_WIDTH_PX: Final = 160  # of a small image, which is magnified
 _TOP_VIEW_PX: Final = 360
 _MOST_RAYS: Final = 20_000
 _POINT_PX: Final = 3
@@ -294,7 +293,7 @@ _RAMP: Final = ((220, 30, 30), (250, 220, 40), (40, 190, 80), (30, 60, 200))  # 
 
 
 def draw_depths(device: Any) -> tuple[Canvas, str]:
-    """A range finder's image in colours above a colour bar, and the scale in words.
+    """A range finder's image in colours, and the scale in words.
 
     Raises:
         CommandRefusedError: It has no image yet.
@@ -305,14 +304,13 @@ def draw_depths(device: Any) -> tuple[Canvas, str]:
     grown = max(1, _SHORTEST_WIDTH_PX // width) if step == 1 else 1
     rows = [ranges[i : i + width : step] for i in range(0, len(ranges), width * step)]
     shown = max(_SHORTEST_WIDTH_PX, grown * len(rows[0]))
-    canvas = Canvas(shown, grown * len(rows) + _BAR_PX + TEXT_HEIGHT_PX + 6)
+    canvas = Canvas(shown, grown * len(rows))
     shades, per_m = _shades(), (_SHADES - 1) / max(far_m - near_m, 1e-9)
     for number, row in enumerate(rows):
         pixels = [_shade_of(shades, (each - near_m) * per_m) for each in row]
         wide = [pixel for pixel in pixels for _ in range(grown)]
         for line in range(grown):
             canvas.row(grown * number + line, wide)
-    _explain(canvas, shades, grown * len(rows) + 2, near_m, far_m)
     scale = f"red {_metres(near_m)}, yellow, green, blue {_metres(far_m)}; black: nothing in range"
     return canvas, scale
 
@@ -330,11 +328,9 @@ def draw_from_above(device: Any) -> tuple[Canvas, str]:
     rings = max(1, math.ceil(farthest_m / spacing_m - 1e-6))
     canvas, middle = Canvas(_TOP_VIEW_PX, _TOP_VIEW_PX), _TOP_VIEW_PX / 2
     per_m = (middle - 8) / (rings * spacing_m)
-    _draw_edges(canvas, device.getFov())
     for number in range(1, rings + 1):
         radius = number * spacing_m * per_m
         canvas.circle(middle, middle, radius, GREY)
-        canvas.text(int(middle) + 4, int(middle - radius) + 3, _metres(number * spacing_m), GREY)
     for ahead_m, left_m in points:
         x, y = round(middle - left_m * per_m), round(middle - ahead_m * per_m)
         canvas.fill(x - 1, y - 1, _POINT_PX, _POINT_PX, WHITE)
@@ -369,25 +365,6 @@ def _points(ranges: Sequence[float], lidar: Any) -> list[tuple[float, float]]:
     return points
 
 
-def _draw_edges(canvas: Canvas, fov_rad: float) -> None:
-    """Draw the limits of the field of view, unless it is a full circle."""
-    if fov_rad > 2 * math.pi - 0.1:
-        return
-    middle = canvas.width / 2
-    for angle_rad in (fov_rad / 2, -fov_rad / 2):
-        x, y = middle * (1 - math.sin(angle_rad)), middle * (1 - math.cos(angle_rad))
-        canvas.line(middle, middle, x, y, GREY)
-
-
-def _explain(canvas: Canvas, shades: list[int], y: int, near_m: float, far_m: float) -> None:
-    pixels = [shades[i * (_SHADES - 1) // (canvas.width - 1)] for i in range(canvas.width)]
-    for line in range(_BAR_PX):
-        canvas.row(y + line, pixels)
-    below, far = y + _BAR_PX + 2, _metres(far_m)
-    canvas.text(1, below, _metres(near_m), WHITE)
-    canvas.text(canvas.width - LETTER_PX * len(far), below, far, WHITE)
-
-
 def _shades() -> list[int]:
     """The colours of distances from near to far."""
     parts = len(_RAMP) - 1
@@ -415,16 +392,6 @@ def _metres(length_m: float) -> str:
 
 
 # -- drawing with the standard library alone -------------------------------------------------------
-
-
-_GLYPHS: Final = {  # three pixels wide, five rows from the top
-    "0": "75557", "1": "26227", "2": "71747", "3": "71717", "4": "55711", "5": "74717",
-    "6": "74757", "7": "71222", "8": "75757", "9": "75717", ".": "00002", "m": "00775",
-    " ": "00000",
-}  # fmt: skip
-_DOT_PX: Final = 2  # of a letter
-LETTER_PX: Final = 4 * _DOT_PX
-TEXT_HEIGHT_PX: Final = 5 * _DOT_PX
 
 
 def colour(red: int, green: int, blue: int) -> int:
@@ -470,20 +437,3 @@ class Canvas:
             angle = 2 * math.pi * number / count
             at = x + radius * math.cos(angle), y + radius * math.sin(angle)
             self.fill(round(at[0]), round(at[1]), 1, 1, colour)
-
-    def line(self, x: float, y: float, to_x: float, to_y: float, colour: int) -> None:
-        """Draw a straight line."""
-        count = max(1, math.ceil(max(abs(to_x - x), abs(to_y - y))))
-        for number in range(count + 1):
-            share = number / count
-            at = x + share * (to_x - x), y + share * (to_y - y)
-            self.fill(round(at[0]), round(at[1]), 1, 1, colour)
-
-    def text(self, x: int, y: int, text: str, colour: int) -> None:
-        """Write digits, dots and the letter m."""
-        for place, letter in enumerate(text):
-            for row, bits in enumerate(_GLYPHS[letter]):
-                for column in range(3):
-                    if int(bits) >> (2 - column) & 1:
-                        dot = (x + place * LETTER_PX + column * _DOT_PX, y + row * _DOT_PX)
-                        self.fill(*dot, _DOT_PX, _DOT_PX, colour)

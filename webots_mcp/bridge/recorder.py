@@ -135,7 +135,6 @@ class Recorder:
         self._lock = ConnectionLock()
         self._backlog = Backlog(self._waiting_file(), self.describe_run, self._drop)
         self._files: tuple[int, ...] = ()
-        self._log = _Log(f"{database}-wal")
         self._retry_at_s = 0.0
         self._confirmed = 0  # rows that were written when the files were looked after
         self._unreported = 0  # dropped rows that no event in the database reports yet
@@ -504,7 +503,6 @@ class Recorder:
             raise
         self.connection, self.registration = connection, registration
         self._files = identify_files(self.database)
-        self._log.forget()
         if (mode := journal_mode(connection)) not in ("wal", "memory"):
             self.errors.warn(
                 "journal",
@@ -555,8 +553,6 @@ class Recorder:
             return
         if self._files != identify_files(self.database):
             self._start_over("the database file or its write-ahead log was deleted or replaced")
-        elif not self._log.is_whole():
-            self._start_over("the database's write-ahead log was truncated")
         else:
             self._confirmed = self.rows_written
 
@@ -626,58 +622,6 @@ def _patiently(act: Callable[[], Result]) -> Result:
             if not is_busy(error) or time.monotonic() >= until_s:
                 raise
         time.sleep(_BETWEEN_TRIES_S)
-
-
-class _Log:
-    """Detects that the write-ahead log was truncated under an open connection.
-
-    SQLite keeps the length of the log in shared memory, and continues to read and write beyond the
-    end of a truncated file: the missing part reads as zeros, and what is written afterwards is lost
-    when the database is opened next. The format: sqlite.org/fileformat2.html, section 4.
-    """
-
-    _HEADER_BYTES: Final = 32
-    _FRAME_HEADER_BYTES: Final = 24
-    _MAGIC: Final = (b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x83")
-
-    def __init__(self, log: str) -> None:
-        self._log = log
-        self._last: tuple[bytes, int] | None = None  # salts of the log, and where its last frame's
-
-    def forget(self) -> None:
-        """Another file is used from now on."""
-        self._last = None
-
-    def is_whole(self) -> bool:
-        """Whether the last frame of the last call is still there, as far as can be known.
-
-        A log that a checkpoint emptied has other salts. An empty file could be either; it is judged
-        at the next call, when it has frames again.
-        """
-        last, self._last = self._last, None
-        try:
-            with open(self._log, "rb", buffering=0) as file:  # noqa: PTH123  (at each heartbeat)
-                header = file.read(self._HEADER_BYTES)
-                if len(header) < self._HEADER_BYTES:
-                    return True
-                salts, page_bytes = header[16:24], int.from_bytes(header[8:12], "big")
-                if header[:4] not in self._MAGIC:
-                    return False
-                if last is not None and last[0] == salts and _read(file, last[1]) != salts:
-                    return False
-                frame_bytes = self._FRAME_HEADER_BYTES + page_bytes
-                frames = max(1, (file.seek(0, 2) - self._HEADER_BYTES) // frame_bytes)
-                at = self._HEADER_BYTES + (frames - 1) * frame_bytes + 8
-                if _read(file, at) == salts:  # else the frame is of the generation before
-                    self._last = salts, at
-        except OSError:
-            pass
-        return True
-
-
-def _read(file: Any, at: int) -> bytes:
-    file.seek(at)
-    return file.read(8)
 
 
 # -- the connection lock -----------------------------------------------------------------------

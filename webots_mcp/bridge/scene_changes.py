@@ -10,19 +10,16 @@ import itertools
 import json
 import re
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from webots_mcp.bridge.commands import ClaimedCommand, Progress
 from webots_mcp.bridge.error_report import cut
 from webots_mcp.bridge.scene import (
     MOST_ENTRIES,
-    Pace,
     Place,
     checked,
     children,
-    entries,
-    fields_of,
     find,
     find_node,
     is_nearer,
@@ -161,12 +158,12 @@ def add_node(session: Session, command: ClaimedCommand) -> Progress:
             "world file first: IMPORTABLE EXTERNPROTO"
         )
     path = _path_of(robot, node)
-    is_remembered = session.scene.remember_added(path, int(node.getId()))
+    session.scene.added.add(int(node.getId()))
     facts: dict[str, Any] = {"path": path, "type": str(node.getTypeName()), "parent": place.path}
     yield from _until_stepped(session)
     session.journal.event("add_node", facts | {"vrml": cut(text, 2000)} | _asked_by(command), path)
-    reset = {"a_reset": "removes it"} if is_remembered else _effect_of_reset(is_remembered)
-    return facts | {"node": label(node), "sim_time_s": session.clock.sim_time_s} | reset
+    now_s = session.clock.sim_time_s
+    return facts | {"node": label(node), "sim_time_s": now_s, "a_reset": "removes it"}
 
 
 def _count(place: Place) -> int:
@@ -247,25 +244,16 @@ def remove_node(session: Session, command: ClaimedCommand) -> Progress:
         "type": str(node.getTypeName()),
         "node": label(node),
     }
-    removal = yield from _removal(robot, place, node_id)
-    was_added = node_id in session.scene.added
     node.remove()
     if robot.getFromId(node_id) is not None:
         yield from _until_stepped(session)
     if robot.getFromId(node_id) is not None:
         raise CommandRefusedError(f"Webots did not remove {place.path}; {_SAYS}")
-    is_remembered = removal is not None and session.scene.remember_removed(removal)
     session.journal.event("remove_node", facts | _asked_by(command), place.path)
-    reset = _ADDED_BEFORE if was_added else _brought_back(removal, is_remembered)
+    reset = (
+        _ADDED_BEFORE if node_id in session.scene.added else "does not bring it back; a reload does"
+    )
     return facts | {"sim_time_s": session.clock.sim_time_s, "a_reset": reset}
-
-
-def _brought_back(removal: Removal | None, is_remembered: bool) -> str:
-    if is_remembered:
-        return "puts it back"
-    if removal is None or not removal.is_written_out:
-        return "does not bring it back; a reload does"
-    return str(_effect_of_reset(False)["a_reset"])
 
 
 def _require_removable(robot: Any, place: Place) -> None:
@@ -289,21 +277,8 @@ def _require_removable(robot: Any, place: Place) -> None:
         each = each.getParentNode()
 
 
-def _removal(robot: Any, place: Place, node_id: int) -> Generator[None, None, Removal | None]:
-    """How to bring a node back; None where its position is not found, or it cannot be exported."""
-    found = yield from spot_of(robot, place.node)
-    export = getattr(place.node, "exportString", None)
-    if found is None or export is None:
-        return None
-    return Removal(place.path, node_id, *found, str(export() or ""))
-
-
 # Physics has changed these since a command set them, and Webots' own reset restores them.
 _MOVED_BY_PHYSICS: Final = ("translation", "rotation", "battery")
-
-_MOST_EXPORTED_CHARACTERS: Final = 200_000  # of a removed node
-
-_Spot = tuple[int | None, str, int | None]
 
 
 class FieldEdit(NamedTuple):
@@ -328,39 +303,14 @@ class FieldEdit(NamedTuple):
     value: Any
 
 
-class Removal(NamedTuple):
-    """A node that was removed, as text, and its former position.
-
-    Attributes:
-        path: The path of the command.
-        node_id: The number of the node, or of the one that replaced it at the last reset.
-        parent_id: The number of its parent; None for the top of the tree.
-        field: The name of the field that contained it.
-        entry: Its index in the field; None in a field for a single node.
-        text: Its text as in a world file.
-    """
-
-    path: str
-    node_id: int
-    parent_id: int | None
-    field: str
-    entry: int | None
-    text: str
-
-    @property
-    def is_written_out(self) -> bool:
-        """Whether Webots exported its text, and it is short enough to be remembered."""
-        return 0 < len(self.text) <= _MOST_EXPORTED_CHARACTERS
-
-
 def find_again(robot: Any, node_id: int, name: str) -> Any | None:
     """The field of that name, of a node that may not exist any more."""
     node = robot.getFromId(node_id)
     return None if node is None else node.getField(name)
 
 
-def import_node(field: Any, text: str, index: int | None = None) -> Any | None:
-    """Add a node to a field of nodes, by default at its end.
+def import_node(field: Any, text: str) -> Any | None:
+    """Add a node to a field of nodes, at its end.
 
     Webots reports errors in its console only, and the package raises nothing, so the field is
     compared with before.
@@ -372,159 +322,57 @@ def import_node(field: Any, text: str, index: int | None = None) -> Any | None:
         field.importSFNodeFromString(text)
         return field.getSFNode()
     before = field.getCount()
-    place = before if index is None else min(index, before)
-    field.importMFNodeFromString(place, text)
-    return field.getMFNode(place) if field.getCount() > before else None
-
-
-def spot_of(robot: Any, node: Any) -> Generator[None, None, _Spot | None]:
-    """The position of a node: the number of its parent (None: the top), the field, and the index.
-
-    Returns:
-        None where it is not found.
-    """
-    parent, root, wanted, pace = node.getParentNode(), robot.getRoot(), node.getId(), Pace()
-    parent_id, fields = None, iter((children(root),))
-    if parent is not None and parent.getId() != root.getId():
-        parent_id, fields = int(parent.getId()), fields_of(parent)
-    for field in fields:
-        if field.getTypeName() not in ("SFNode", "MFNode"):
-            continue
-        for index, each in entries(field):
-            if each.getId() == wanted:
-                return parent_id, str(field.getName()), index
-            yield from pace.rest()
-    return None
+    field.importMFNodeFromString(before, text)
+    return field.getMFNode(before) if field.getCount() > before else None
 
 
 # -- what a reset has to undo ----------------------------------------------------------------------
-# A reset by Webots restores poses and removes added nodes. It does not restore other fields or
-# removed nodes: that is done here, as long as the controller's process lives.
+# A reset by Webots restores poses and removes added nodes. It does not restore other fields: that
+# is done here, as long as the controller's process lives. Removed nodes come back with a reload.
 
 
 MOST_EDITS: Final = 200  # that are put back
 
 
 class SceneEdits:
-    """Remembers changes of the scene, and undoes them after a reset.
+    """Remembers changes of the scene, and undoes after a reset what Webots does not.
 
     Attributes:
         fields: The fields that were set in this run, in that order.
-        added: The paths of the nodes that were added in this run, by their numbers.
-        removed: The nodes that were removed in this run or an earlier one.
+        added: The numbers of the nodes that were added in this run.
     """
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._restored_at_step: int | None = None  # None: what was put back is recorded
-        self._set: list[FieldEdit] = []
-        self._outcomes: dict[str, list[str]] = {}
         self.fields: dict[tuple[int, str, int | None], FieldEdit] = {}
-        self.added: dict[int, str] = {}
-        self.removed: list[Removal] = []
+        self.added: set[int] = set()
 
     def remember_field(self, edit: FieldEdit) -> bool:
         """Remember that a field is about to be set; False if that will not be undone."""
         key = (edit.node_id, edit.name, edit.entry)
         known = self.fields.get(key)
-        if known is None and self._is_full:
+        if known is None and len(self.fields) >= MOST_EDITS:
             return False
         self.fields[key] = edit if known is None else known._replace(value=edit.value)
         return True
 
-    def remember_added(self, path: str, node_id: int) -> bool:
-        """Remember an added node; False if that will not be undone."""
-        if self._is_full:
-            return False
-        self.added[node_id] = path
-        return True
-
-    def remember_removed(self, removal: Removal) -> bool:
-        """Remember a removed node; False if it will not be restored."""
-        if self.added.pop(removal.node_id, None) is not None:
-            return True  # it did not exist when the run began
-        if self._is_full or not removal.is_written_out:
-            return False
-        self.removed.append(removal)
-        return True
-
-    @property
-    def _is_full(self) -> bool:
-        return len(self.fields) + len(self.added) + len(self.removed) >= MOST_EDITS
-
     def begin_run(self) -> None:
-        """The world was reset: undo the changes that Webots has not undone."""
-        if not (self.fields or self.added or self.removed):
-            return
-        self._restored_at_step = self._session.clock.steps_seen
-        self._set, self._outcomes = [], {"by_webots": [], "by_bridge": [], "not": []}
-        for edit in reversed(self.fields.values()):
-            self._try(edit.path, self._set_back, edit)
-        for node_id, path in self.added.items():
-            self._try(path, self._take_away, node_id, path)
-        self.fields, self.added = {}, {}
-        # Nodes that are brought back get new numbers, and have to be remembered: to Webots they
-        # are added nodes, so the next reset removes them again.
-        in_order = sorted(self.removed, key=lambda each: each.entry or 0)
-        self.removed = [self._try(e.path, self._bring_back, e) or e for e in in_order]
+        """The world was reset: set the fields back that still hold what they were set to."""
+        edits, self.fields, self.added = reversed(self.fields.values()), {}, set()
+        outcomes = {edit.path: self._set_back(edit) for edit in edits}
+        if paths := [path for path, is_set in outcomes.items() if is_set]:
+            self._session.journal.event("put_back", {"paths": paths})
 
-    def look(self) -> None:
-        """Record what was put back, after the step with which Webots sets the fields."""
-        if self._restored_at_step in (None, self._session.clock.steps_seen):
-            return
-        self._restored_at_step = None
-        for edit in self._set:
-            self._try(edit.path, self._check_set, edit)
-        outcomes = {how: paths for how, paths in self._outcomes.items() if paths}
-        self._session.journal.event("put_back", dict[str, object](outcomes))
-
-    @property
-    def _robot(self) -> Any:
-        return self._session.simulation.robot
-
-    def _try(self, path: str, restore: Callable[..., Any], *arguments: Any) -> Any:
+    def _set_back(self, edit: FieldEdit) -> bool:
+        """Set a field to its value before; False where Webots or someone else has set it since."""
         try:
-            return restore(*arguments)
-        except Exception as error:  # noqa: BLE001  (the robot comes first)
-            self._session.errors.failed(f"putting {path} back", error)
-            self._outcomes["not"].append(path)
-            return None
-
-    def _set_back(self, edit: FieldEdit) -> None:
-        field = find_again(self._robot, edit.node_id, edit.name)
-        if field is None:
-            self._outcomes["not"].append(f"{edit.path}: its node does not exist any more")
-        elif edit.name in _MOVED_BY_PHYSICS or not self._holds(edit, edit.value):
-            self._outcomes["by_webots"].append(edit.path)
-        else:
+            field = find_again(self._session.simulation.robot, edit.node_id, edit.name)
+            if field is None or edit.name in _MOVED_BY_PHYSICS:
+                return False
+            if not is_same(edit.type_name, read(field, edit.entry), edit.value):
+                return False
             write(field, edit.before, edit.entry)
-            self._set.append(edit)
-
-    def _check_set(self, edit: FieldEdit) -> None:
-        self._note(edit.path, done=self._holds(edit, edit.before))
-
-    def _holds(self, edit: FieldEdit, value: Any) -> bool:
-        field = find_again(self._robot, edit.node_id, edit.name)
-        return field is not None and is_same(edit.type_name, read(field, edit.entry), value)
-
-    def _take_away(self, node_id: int, path: str) -> None:
-        node = self._robot.getFromId(node_id)
-        if node is None:
-            self._outcomes["by_webots"].append(f"{path} (added)")
-            return
-        node.remove()
-        self._note(f"{path} (added)", done=self._robot.getFromId(node_id) is None)
-
-    def _bring_back(self, removal: Removal) -> Removal:
-        if self._robot.getFromId(removal.node_id) is not None:
-            return removal
-        parent = self._robot.getRoot()
-        if removal.parent_id is not None:
-            parent = self._robot.getFromId(removal.parent_id)
-        field = None if parent is None else parent.getField(removal.field)
-        node = None if field is None else import_node(field, removal.text, removal.entry)
-        self._note(f"{removal.path} (removed)", done=node is not None)
-        return removal if node is None else removal._replace(node_id=int(node.getId()))
-
-    def _note(self, path: str, *, done: bool) -> None:
-        self._outcomes["by_bridge" if done else "not"].append(path)
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            self._session.errors.failed(f"putting {edit.path} back", error)
+            return False
+        return True

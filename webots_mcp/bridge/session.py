@@ -106,7 +106,6 @@ class Session:
         self.parameters.take_wanted()
         if self.keeper.busy:
             self.keeper.go_on()
-        self.scene.look()
         command = self.control.serve()
         self.heartbeat.poll()
         if simulation.over:

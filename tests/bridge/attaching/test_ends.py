@@ -83,14 +83,6 @@ def test_attaching_twice_gives_the_same_bridge(
         MCPBridge.attach(robot, throttle_interval=3)
 
 
-def test_a_bridge_that_was_open_is_attached(
-    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
-) -> None:
-    assert MCPBridge.attach(robot) is bridge
-    robot.step(STEP_MS)
-    assert len(times(recording)) == 1
-
-
 def test_an_interrupt_in_the_bridges_part_of_a_step_ends_the_loop_and_loses_nothing(
     robot: InProcessSupervisor,
     attached: MCPBridge,

@@ -90,20 +90,6 @@ def test_rows_of_a_killed_controller_are_taken_in_by_a_maintainer(
 
 
 @POSIX
-def test_a_run_that_began_while_the_database_was_locked_is_taken_in_as_well(
-    kill: Callable[[str], Path],
-) -> None:
-    file = kill("publish(5, 9)\nrobot.simulationReset()\npublish(9, 12)\n")
-    assert adopt_into(file) > 0
-    recording = Recording(file)
-    per_run = recording.rows("SELECT run_id, count(*) FROM state GROUP BY run_id")
-    assert [count for _, count in per_run] == [9, 3]
-    reasons = recording.rows("SELECT start_reason, end_reason, row_count FROM run ORDER BY id")
-    assert reasons[0] == ("start", "reset", 9)
-    assert reasons[1][:2] == ("reset", None)
-
-
-@POSIX
 def test_of_several_that_open_the_database_at_once_one_takes_each_row_in(
     kill: Callable[[str], Path],
 ) -> None:
@@ -135,17 +121,6 @@ def test_an_adopter_that_is_killed_before_it_removes_the_file_costs_no_row_and_d
     assert adopt_into(file) == 0
     assert not path.exists()
     assert numbers(Recording(file)) == list(range(300))
-
-
-@POSIX
-def test_a_line_that_was_cut_off_by_the_kill_costs_itself_only(
-    kill: Callable[[str], Path],
-) -> None:
-    file = kill("publish(5, 9)\n")
-    (path,) = waiting_paths(file)
-    path.write_bytes(path.read_bytes()[:-10])
-    assert adopt_into(file) == 3
-    assert numbers(Recording(file)) == list(range(8))
 
 
 @POSIX

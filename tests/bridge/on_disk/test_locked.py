@@ -145,18 +145,6 @@ def test_arming_is_answered_once_the_breakpoints_could_be_read(
     assert answer.value.value == {"armed": [1]}
 
 
-def test_breakpoints_of_the_last_controllers_code_go_although_the_next_one_meets_a_lock(
-    bridge: MCPBridge, file: Path, filed: Recording
-) -> None:
-    with write_lock(file) as other:
-        _store_breakpoint(other, "n == 1", "controller")
-        bridge.publish({"n": 0})
-        bridge._session.breakpoints.begin()  # pyright: ignore[reportPrivateUsage]
-    catch_up(bridge)
-
-    assert not filed.rows("SELECT condition FROM breakpoint")
-
-
 def _store_breakpoint(connection: sqlite3.Connection, condition: str, by: str = "mcp") -> None:
     connection.execute(
         "INSERT INTO breakpoint (robot_id, condition, action, created_wall_time_s, created_by) "

@@ -8,8 +8,6 @@ import os
 import subprocess
 import sys
 import threading
-import time
-from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -25,7 +23,6 @@ from tests.bridge.conftest import (
 )
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import backlog
-from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.standin import InProcessSupervisor
 
@@ -67,20 +64,6 @@ def test_the_last_error_stays_short_however_many_rows_are_dropped(
     assert json.loads(told)["why"] == "database is locked"
 
 
-def test_a_run_counts_the_rows_that_are_in_the_database(
-    bridge: MCPBridge, file: Path, filed: Recording, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(backlog, "MAX_WAITING_ROWS", 3)
-    keep_in_memory(bridge)
-    with write_lock(file):
-        for n in range(9):
-            bridge.publish({"n": n})
-    catch_up(bridge)
-    heartbeat_now(bridge)
-    assert numbers(filed) == [6, 7, 8]
-    assert filed.rows("SELECT row_count FROM run") == [3]
-
-
 @POSIX
 @pytest.mark.usefixtures("retry_at_once")
 def test_rows_that_went_into_a_deleted_file_are_counted_as_dropped(
@@ -120,46 +103,6 @@ def test_recording_goes_on_after_the_write_ahead_log_was_deleted(
     catch_up(bridge)
     bridge.publish({"n": 2})
     assert numbers(filed)[-1] == 2
-
-
-@POSIX
-@pytest.mark.parametrize("part", [0.0, 0.5])
-@pytest.mark.usefixtures("retry_at_once")
-def test_recording_goes_on_after_the_write_ahead_log_was_cut_short(
-    bridge: MCPBridge, file: Path, filed: Recording, part: float, capfd: pytest.CaptureFixture[str]
-) -> None:
-    log = Path(f"{file}-wal")
-    for n in range(50):
-        bridge.publish({"n": n})
-    heartbeat_now(bridge)
-    os.truncate(log, int(log.stat().st_size * part))
-    deadline_s = time.monotonic() + 20
-    n = 50
-    while "truncated" not in capfd.readouterr().err:
-        bridge.publish({"n": n})
-        heartbeat_now(bridge)
-        n += 1
-        assert time.monotonic() < deadline_s
-    bridge.publish({"n": n})
-    catch_up(bridge)
-    assert numbers(filed)[-1] == n
-    assert filed.rows("PRAGMA integrity_check") == ["ok"]
-
-
-def test_a_log_that_checkpoints_empty_counts_as_whole(
-    bridge: MCPBridge, file: Path, filed: Recording
-) -> None:
-    with closing(connect(file, "writer")) as maintainer:
-        for n in range(60):
-            bridge.publish({"n": n, "padding": "x" * 2000})
-            heartbeat_now(bridge)
-            if n % 7 == 0:
-                maintainer.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
-            if n % 11 == 0:
-                maintainer.execute("PRAGMA wal_checkpoint(RESTART)").fetchall()
-    assert bridge.stats().rows_dropped == 0
-    assert numbers(filed) == list(range(60))
-    assert filed.rows("SELECT count(*) FROM run") == [1]
 
 
 @pytest.mark.usefixtures("retry_at_once")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import sqlite3
-import stat
 import subprocess
 import sys
 from contextlib import closing
@@ -27,10 +25,6 @@ from webots_mcp.connection import OLDER_SCHEMA, connect, create_schema
 from webots_mcp.contract import DATABASE_NAME, SCHEMA_VERSION
 from webots_mcp.errors import DatabaseError
 from webots_mcp.standin import InProcessSupervisor
-
-NOT_ROOT = pytest.mark.skipif(
-    sys.platform == "win32" or os.geteuid() == 0, reason="root may write read-only files"
-)
 
 
 @pytest.mark.usefixtures("retry_at_once")
@@ -72,7 +66,7 @@ def test_a_deleted_database_is_made_again_and_told(
 
 @pytest.mark.usefixtures("retry_at_once")
 @pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be deleted there")
-def test_breakpoints_of_the_code_stay_armed_in_a_new_database_and_others_are_told_to_be_off(
+def test_breakpoints_stay_armed_in_a_new_database(
     robot: InProcessSupervisor, bridge: MCPBridge, file: Path, filed: Recording
 ) -> None:
     bridge.breakpoint("n == 1", "log")
@@ -92,10 +86,9 @@ def test_breakpoints_of_the_code_stay_armed_in_a_new_database_and_others_are_tol
             robot.step(STEP_MS)
             bridge.publish({"n": n})
             catch_up(bridge)
-    assert filed.rows("SELECT condition, hit_count FROM breakpoint") == [("n == 1", 2)]
-    assert filed.rows("SELECT name FROM event WHERE kind = 'breakpoint'") == ["n == 1"] * 2
-    (said,) = filed.rows("SELECT message FROM log WHERE level = 'warning'")
-    assert "(n == 1 or n > 9) is off" in said
+    hits = filed.rows("SELECT condition, hit_count FROM breakpoint ORDER BY condition")
+    assert hits == [("n == 1", 2), ("n == 1 or n > 9", 2)]
+    assert filed.rows("SELECT count(*) FROM event WHERE kind = 'breakpoint'") == [4]
 
 
 @pytest.mark.usefixtures("retry_at_once")
@@ -117,18 +110,6 @@ def test_a_database_that_is_damaged_in_mid_run_is_moved_aside_and_a_new_one_begu
     assert len(list(file.parent.glob(f"{DATABASE_NAME}.damaged-*"))) >= 1
     assert filed.rows("SELECT count(*) FROM event WHERE kind = 'storage'") == [1]
     assert capfd.readouterr().err.count("was damaged") == 1
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be moved there")
-def test_a_schema_whose_text_is_no_text_is_damage_at_the_start_as_well(
-    robot: InProcessSupervisor, file: Path, filed: Recording
-) -> None:
-    MCPBridge(robot, data_dir=file.parent).close()
-    damage_schema(file, b"CREATE \xff\xfe")
-    with MCPBridge(robot, data_dir=file.parent, throttle_interval=1) as bridge:
-        bridge.publish({"n": 1})
-    assert numbers(filed) == [1]
-    assert len(list(file.parent.glob(f"{DATABASE_NAME}.damaged-*"))) >= 1
 
 
 def test_a_damaged_database_is_moved_aside_at_the_start(
@@ -255,17 +236,6 @@ def test_a_folder_that_cannot_be_made_costs_rows_only(
         assert bridge.get_command() is None
         assert bridge.stats().rows_waiting >= 1
     assert "cannot be made" in capfd.readouterr().err
-
-
-@NOT_ROOT
-def test_a_read_only_folder_costs_rows_only(robot: InProcessSupervisor, tmp_path: Path) -> None:
-    tmp_path.chmod(stat.S_IRUSR | stat.S_IXUSR)
-    try:
-        with MCPBridge(robot, data_dir=tmp_path / "x", throttle_interval=1) as bridge:
-            bridge.publish({"n": 1})
-            assert bridge.stats().rows_waiting >= 1
-    finally:
-        tmp_path.chmod(stat.S_IRWXU)
 
 
 @pytest.mark.usefixtures("retry_at_once")

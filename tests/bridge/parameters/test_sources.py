@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from tests.bridge.conftest import STEP_MS, Recording, catch_up, eager, heartbeat_now, write_lock
+from tests.bridge.conftest import STEP_MS, Recording, catch_up, eager, heartbeat_now
 from tests.bridge.parameters.conftest import VALUES, ask
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.contract import PARAMETERS_VARIABLE
@@ -133,40 +130,3 @@ while robot.step(16) != -1:
     bridge.publish({"kp": kp.value})
     bridge.get_command()
 """
-
-
-def test_a_kill_between_a_change_and_its_answer_leaves_the_change_and_a_lost_command(
-    file: Path, filed: Recording
-) -> None:
-    line = [sys.executable, "-c", KILLED, str(file)]
-    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
-        sent = filed.send("set_parameters", time_to_live_s=60, values={"kp": 3.0})
-        assert process.wait(60) == -signal.SIGKILL
-    with MCPBridge(InProcessSupervisor("rover"), database=file) as bridge:
-        assert bridge.parameter("kp", 2.0).value == 2.0
-    assert filed.fate(sent)[0] == "lost"
-    assert filed.rows(VALUES) == [
-        (1, "kp", "2.0", 1, "code", None),
-        (1, "kp", "3.0", 0, "command", sent),
-        (2, "kp", "2.0", 1, "code", None),
-    ]
-
-
-def test_rows_that_wait_are_taken_in_with_the_values_in_order(
-    robot: InProcessSupervisor, file: Path, filed: Recording
-) -> None:
-    with MCPBridge(robot, throttle_interval=1, database=file) as bridge:
-        kp = bridge.parameter("kp", 2.0)
-        with write_lock(file):
-            kp.set(3.0)
-            bridge.get_command()
-            bridge.parameter("late", 1.0)
-            assert bridge.stats().rows_waiting == 3
-        catch_up(bridge)
-    assert [row[1:3] for row in filed.rows(VALUES)] == [
-        ("kp", "2.0"),
-        ("kp", "3.0"),
-        ("late", "1.0"),
-    ]

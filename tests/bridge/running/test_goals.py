@@ -58,22 +58,6 @@ def test_the_time_is_exact_where_the_loop_does_not_publish_in_each_round(
     assert paused == [pytest.approx(51 * STEP_S)]
 
 
-def test_the_time_is_exact_where_the_loop_asks_for_commands_now_and_then(
-    robot: InProcessSupervisor, sparse: MCPBridge, recording: Recording
-) -> None:
-    rounds = Rounds(robot, sparse, recording, "published first")
-    paused = let_go_when_paused(rounds)
-    sent = recording.send("run", for_s=20 * STEP_S)
-    rounds.drive(1)
-    for n in range(60):
-        robot.step(STEP_MS)
-        if n % 25 == 0:
-            sparse.publish({"n": n})
-            eager(sparse)
-    assert paused == [pytest.approx(21 * STEP_S)]
-    assert recording.fate(sent)[1]["advanced_s"] == pytest.approx(20 * STEP_S)
-
-
 def test_a_reset_counts_the_time_from_zero_and_asks_the_first_state_after_it(
     rounds: Rounds, recording: Recording
 ) -> None:
@@ -117,17 +101,6 @@ def test_at_the_end_it_goes_on_or_is_as_it_was(
     assert result["sim_time_s"] == pytest.approx(10 * STEP_S)
     assert 10 in [state["n"] for state in recording.states()]
     assert recording.rows("SELECT count(*) FROM event WHERE kind = 'pause'") == [0]
-
-
-def test_what_was_paused_goes_on_at_the_pace_that_it_had_before(
-    rounds: Rounds, recording: Recording
-) -> None:
-    robot = rounds.robot
-    robot.simulationSetMode(robot.SIMULATION_MODE_REAL_TIME)
-    recording.send("pause")
-    sent = recording.send("run", until="n >= 10", pace="fast", then="go_on")
-    rounds.drive(12)
-    assert recording.fate(sent)[1]["mode"] == "real_time"
 
 
 @pytest.mark.parametrize("ended_by", ["its goal", "a breakpoint", "pause", "reset", "close"])

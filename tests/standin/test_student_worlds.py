@@ -94,7 +94,7 @@ def test_loose_boxes_are_pushed_and_fixed_ones_not() -> None:
     text = (WORLDS / "e_puck_r2023b.wbt").read_text(encoding="utf-8")
     assert "supervisor" not in text
     robot = robot_in("e_puck_r2023b.wbt")
-    arena = robot.simulation._simulator.arena  # pyright: ignore[reportPrivateUsage]
+    arena = robot.simulation.simulator.arena
     movable = {body.name: body.is_movable for body in arena.bodies if "box" in body.name}
     assert movable == {"wooden box": False, "wooden box(1)": True}
 
@@ -140,7 +140,7 @@ def test_a_youbot_drives_turns_and_moves_its_arm_and_fingers(tmp_path: Path) -> 
 
 def test_walls_have_the_color_of_their_appearance() -> None:
     robot = robot_in("four_wheels_r2025a.wbt")
-    arena = robot.simulation._simulator.arena  # pyright: ignore[reportPrivateUsage]
+    arena = robot.simulation.simulator.arena
     (walls,) = [body for body in arena.bodies if body.name == "rectangle arena"]
     assert {shape.color for shape in walls.shapes} == {(0.9, 0.2, 0.1)}
 
@@ -165,7 +165,7 @@ def test_the_wall_of_a_circle_arena_is_round(tmp_path: Path) -> None:
 
 def test_solids_inside_solids_are_obstacles() -> None:
     simulation = InProcessSimulation(WORLDS / "rooms_r2025a.wbt")
-    arena = simulation._simulator.arena  # pyright: ignore[reportPrivateUsage]
+    arena = simulation.simulator.arena
     obstacles = {body.name: body for body in arena.bodies if body.is_obstacle}
     assert set(obstacles) == {"wall", "table"}
     leg, top = sorted(obstacles["table"].solid_shapes, key=lambda shape: shape.top_m)

@@ -10,7 +10,7 @@ from controller.session import Message
 from webots_mcp.standin.arena import Body
 from webots_mcp.standin.devices import FetchedSensor
 from webots_mcp.standin.pictures import Label
-from webots_mcp.standin.simulator import Mode, Robot, Simulator, Wanted
+from webots_mcp.standin.simulator import Mode, Robot, Simulator
 from webots_mcp.standin.vrml import (
     NODE_TYPES,
     FieldDefinition,
@@ -239,7 +239,7 @@ class SupervisorRequests:
         if any(each.type_name == "Robot" for each in (node, *descendants_of(node))):
             raise WorldError("the stand-in adds no robots")
         self._world.add(node, around, name, index)
-        self._simulator.note_added(node)
+        self._simulator.added.append(node)
         self._stand_anew(around)
 
     def on_node_remove(self, node_id: int) -> Any:
@@ -331,7 +331,7 @@ class SupervisorRequests:
         """End a robot's controller and start it again."""
         node = self._node(node_id)
         if node.type_name == "Robot":
-            self._simulator.wanted = Wanted("restart", robot=node.fields["name"])
+            self._simulator.wanted = ("restart", node.fields["name"])
 
     def _body_around(self, node: Node | None) -> Body | None:
         bodies = {body.node: body for body in self._simulator.arena.bodies}
@@ -347,7 +347,7 @@ class SupervisorRequests:
 
     def on_simulation_reset(self) -> None:
         """Reset with the next physics step."""
-        self._simulator.ask_reset()
+        self._simulator.is_reset_wanted = True
 
     def on_simulation_reset_physics(self) -> None:
         """Stop everything that moves."""
@@ -355,15 +355,15 @@ class SupervisorRequests:
 
     def on_world_reload(self) -> None:
         """Read the world again from its file."""
-        self._simulator.wanted = Wanted("reload")
+        self._simulator.wanted = ("load", "")
 
     def on_world_load(self, path: str) -> None:
         """Load another world after the next physics step."""
-        self._simulator.ask_load(str(self._robot.folder / path))
+        self._simulator.wanted_after_step = ("load", str(self._robot.folder / path))
 
     def on_simulation_quit(self, status: int) -> None:
         """End the simulation."""
-        self._simulator.wanted = Wanted("quit", status=status)
+        self._simulator.wanted = ("quit", status)
 
     def on_export_image(self, path: str, quality: int) -> None:
         """Write a picture of the arena; relative paths start from the controller's folder."""

@@ -1,7 +1,7 @@
 """The simulation itself: robots, time and modes; no messages, no processes, no sockets.
 
-The driver of a `Simulator` makes the physics steps (`advance`) and carries out what the
-simulation wants done to itself (`wanted`).
+A `Driver` makes the physics steps (`advance`) and carries out what the simulation wants done to
+itself (`wanted`).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Callable
 from enum import IntEnum
 from math import ceil
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from webots_mcp.standin.arena import Arena, Body, Vehicle, joints_in
 from webots_mcp.standin.devices import Device, Emitter, Receiver, devices_in
@@ -30,14 +30,12 @@ class Mode(IntEnum):
     FAST = 2
 
 
-class Wanted(NamedTuple):
-    """What a controller asked to be done to the whole simulation."""
+Wanted: TypeAlias = "tuple[Literal['load', 'restart'], str] | tuple[Literal['quit'], int]"
+"""What a controller asked to be done to the whole simulation.
 
-    action: str
-    """`reload`, `load`, `restart` (one controller) or `quit`."""
-    path: str = ""
-    robot: str = ""
-    status: int = 0
+A world to be loaded, empty to read the same one again; a robot whose controller is to start again;
+or an exit status.
+"""
 
 
 class Robot:
@@ -144,9 +142,11 @@ class Simulator:
         self.time_ms = 0.0
         self.wanted: Wanted | None = None
         self.labels: dict[int, Label] = {}
-        self._reset_asked = False
-        self._added: list[Node] = []
-        self._load_asked: Wanted | None = None
+        self.is_reset_wanted = False
+        """Whether everything is put back at the end of the next physics step."""
+        self.wanted_after_step: Wanted | None = None
+        self.added: list[Node] = []
+        """What controllers have added: the next reset removes it."""
         self._pictures: list[Picture] = []
         self._start = {
             node: ([*node.fields["translation"]], [*node.fields["rotation"]])
@@ -225,13 +225,13 @@ class Simulator:
         for emitter in self._emitters:
             emitter.transmit(self._receivers)
         self.time_ms += basic
-        if self._reset_asked:
+        if self.is_reset_wanted:
             self.reset()
             self.time_ms = basic  # the step that resets counts
         for robot in self.robots:
             self._measure(robot, basic)
         self._render()
-        self.wanted, self._load_asked = self._load_asked or self.wanted, None
+        self.wanted, self.wanted_after_step = self.wanted_after_step or self.wanted, None
         return [robot for robot in self.robots if self._let_pass(robot, basic)]
 
     def _measure(self, robot: Robot, passed_ms: float) -> None:
@@ -248,9 +248,9 @@ class Simulator:
 
     def reset(self) -> None:
         """Put everything back to the start of the world, at time 0; controllers go on."""
-        self._reset_asked = False
+        self.is_reset_wanted = False
         self.time_ms = 0.0
-        added, self._added = self._added, []
+        added, self.added = self.added, []
         for node in added:
             self.world.remove(node)
         self.arena.follow()
@@ -267,10 +267,6 @@ class Simulator:
             for device in robot.devices.values():
                 device.make_due()
 
-    def note_added(self, node: Node) -> None:
-        """A controller has added it: the next reset removes it."""
-        self._added.append(node)
-
     def stand_anew(self, body: Body) -> None:
         """Let a body follow its node's fields."""
         frame = self.world.frame_of(body.node)
@@ -283,14 +279,6 @@ class Simulator:
             body.stop()
         for robot in self.robots:
             robot.vehicle.stop()
-
-    def ask_reset(self) -> None:
-        """Reset at the end of the next physics step."""
-        self._reset_asked = True
-
-    def ask_load(self, path: str) -> None:
-        """Load another world after the next physics step."""
-        self._load_asked = Wanted("load", path)
 
     def export(self, path: Path, quality: int) -> None:
         """Write a picture: at once when paused, else with the next rendering."""

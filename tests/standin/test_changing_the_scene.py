@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from controller import Field, Node
 
+from tests.standin.placing import STEP_MS, drive
 from webots_mcp.standin import InProcessSupervisor, Simulation
 
-STEP_MS = 16
 PILLAR = """DEF PILLAR Solid {
   translation -0.9 0 0.1
   children [ DEF LOOK Shape { geometry Box { size 0.1 0.5 0.2 } } ]
@@ -44,12 +44,7 @@ def test_a_node_that_is_added_stands_in_the_way_until_a_reset_removes_it(
     children.importMFNodeFromString(-1, PILLAR)
     assert children.getCount() == count + 1
     assert node(robot, "PILLAR").getPosition() == [-0.9, 0.0, 0.1]
-    for name in ("left wheel motor", "right wheel motor"):
-        motor = robot.getDevice(name)
-        motor.setPosition(float("inf"))
-        motor.setVelocity(8.0)
-    for _ in range(100):
-        robot.step(STEP_MS)
+    drive(robot, 8.0, 8.0, 100)
     assert robot.simulation.robot("rover").is_touching
     robot.simulationReset()
     robot.step(STEP_MS)
@@ -92,20 +87,6 @@ def test_what_a_node_says_of_itself_makes_the_same_node_again(robot: InProcessSu
         third = field(robot, "root", "children").getMFNode(2)
         assert third is not None and third.getDef() == definition
     assert node(robot, "ROVER").exportString().startswith("DEF ROVER Robot { translation -1.2 0")
-
-
-def test_a_field_of_one_node_can_be_emptied_and_filled(
-    robot: InProcessSupervisor, capfd: pytest.CaptureFixture[str]
-) -> None:
-    physics = field(robot, "BALL", "physics")
-    physics.importSFNodeFromString("Physics { mass 3 }")
-    assert "called with a non-empty field" in capfd.readouterr().err
-    physics.removeSF()
-    assert physics.getSFNode() is None
-    physics.importSFNodeFromString("Physics { density -1 mass 3 }")
-    made = physics.getSFNode()
-    mass = made.getField("mass") if made else None
-    assert mass is not None and mass.value == 3.0
 
 
 @pytest.mark.parametrize(

@@ -162,11 +162,7 @@ class Driver(ABC):
         match wanted:
             case None:
                 return
-            case ("quit", int(status)):
+            case int(status):
                 self._quit(status)
-            case ("restart", str(name)):
-                seats = [seat for seat in self._seats if seat.robot.name == name]
-                self._end(seats)
-                self._start(seats)
-            case (_, path):
+            case path:
                 self._load(Path(path or self.simulator.world.path))

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from enum import IntEnum
 from math import ceil
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 from webots_mcp.standin.arena import Arena, Body, Vehicle, joints_in
 from webots_mcp.standin.devices import Device, Emitter, Receiver, devices_in
@@ -30,11 +30,10 @@ class Mode(IntEnum):
     FAST = 2
 
 
-Wanted: TypeAlias = "tuple[Literal['load', 'restart'], str] | tuple[Literal['quit'], int]"
+Wanted: TypeAlias = "str | int"
 """What a controller asked to be done to the whole simulation.
 
-A world to be loaded, empty to read the same one again; a robot whose controller is to start again;
-or an exit status.
+A world to be loaded, empty to read the same one again, or the exit status to quit with.
 """
 
 
@@ -169,33 +168,25 @@ class Simulator:
     def no_robot(self, name: str | None = None) -> str:
         """Why there is no robot of this name, or none at all, in words."""
         if left_out := self.left_out_robots(name):
-            return f"{self.world.path.name}, {self._suspects(left_out)}"
+            types = [*dict.fromkeys(node.type_name for node in left_out)]
+            return (
+                f"{self.world.path.name}, line {left_out[0].line}: the stand-in has no "
+                f"{' or '.join(types)} nodes{self.world.why_not(types[0])}. If the robot is one: "
+                "in Webots, right-click it, choose 'Convert Root to Base Node(s)' and save the "
+                "world, or let WEBOTS_HOME name an installed Webots, whose PROTO files are read "
+                "then; docs/standin.md lists what the stand-in has"
+            )
         known = ", ".join(repr(robot.name) for robot in self.robots)
         asked = "no robot" if name is None else f"no robot {name!r}"
         return f"{asked} in {self.world.path.name}; it has {known or 'none'}"
 
-    def _suspects(self, left_out: list[Node]) -> str:
-        """What was left out and is the robot, or may be it, and what to do about it."""
-        nodes = self.world.likeliest_robots(left_out)
-        first, types = nodes[0], [*dict.fromkeys(node.type_name for node in nodes)]
-        if_robot = "that" if len(types) == 1 else "one of them"
-        return (
-            f"line {first.line}: the stand-in has no {' or '.join(types)} nodes"
-            f"{self.world.why_not(first.type_name)}. "
-            f"If {if_robot} is the robot: in Webots, right-click it, choose 'Convert Root to Base "
-            "Node(s)' and save the world, or let WEBOTS_HOME name an installed Webots, whose PROTO "
-            "files are read then; docs/standin.md lists what the stand-in has"
-        )
-
     def left_out_robots(self, name: str | None = None) -> list[Node]:
-        """What was left out of the world and may be this robot, or any."""
-        return [node for node in self.world.left_out if self._may_be(node, name)]
-
-    def _may_be(self, node: Node, name: str | None) -> bool:
-        """Whether a node that was left out may be the robot that is asked for."""
+        """What was left out of the world and may be this robot, or any: what has a controller."""
+        at_top = [n for n in self.world.left_out if self.world.parent_of(n) is self.world.root]
+        robots = [node for node in self.world.left_out if _has_controller(node)]
         if name is None:
-            return _has_controller(node) or self.world.parent_of(node) is self.world.root
-        return _has_controller(node) and node.fields.get("name", name) == name
+            return robots or at_top
+        return [node for node in robots if node.fields.get("name", name) == name]
 
     def robot_of(self, node: Node) -> Robot:
         """The robot that a Robot node describes."""
@@ -231,7 +222,8 @@ class Simulator:
         for robot in self.robots:
             self._measure(robot, basic)
         self._render()
-        self.wanted, self.wanted_after_step = self.wanted_after_step or self.wanted, None
+        if self.wanted_after_step is not None:
+            self.wanted, self.wanted_after_step = self.wanted_after_step, None
         return [robot for robot in self.robots if self._let_pass(robot, basic)]
 
     def _measure(self, robot: Robot, passed_ms: float) -> None:
@@ -272,13 +264,6 @@ class Simulator:
         frame = self.world.frame_of(body.node)
         assert frame is not None
         body.stand(frame)
-
-    def stop_motion(self) -> None:
-        """Take the speed of everything away."""
-        for body in self.arena.bodies:
-            body.stop()
-        for robot in self.robots:
-            robot.vehicle.stop()
 
     def export(self, path: Path, quality: int) -> None:
         """Write a picture: at once when paused, else with the next rendering."""

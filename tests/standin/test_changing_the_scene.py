@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 from controller import Field, Node
 
 from tests.standin.placing import STEP_MS, drive
-from webots_mcp.standin import InProcessSupervisor, Simulation
+from webots_mcp.standin import InProcessSupervisor
 
 PILLAR = """DEF PILLAR Solid {
   translation -0.9 0 0.1
@@ -136,23 +134,3 @@ def test_entries_are_inserted_and_removed_at_once(
     assert said[0] == "Error: wb_supervisor_field_remove_mf() called for an empty field."
     assert "out-of-bound index: 9 (should be between -4 and 3)" in said[1]
     assert "insert_mf_float() called with a field of type MFString" in said[2]
-
-
-def test_a_node_is_added_by_a_controller_process_too(tmp_path: Path) -> None:
-    file = tmp_path / "adding.py"
-    file.write_text(
-        f"""from controller import Supervisor
-robot = Supervisor()
-children = robot.getRoot().getField("children")
-children.importMFNodeFromString(-1, '''{PILLAR}''')
-pillar = robot.getFromDef("PILLAR")
-print("made", pillar.getTypeName(), children.getCount())
-pillar.remove()
-print("left", robot.getFromDef("PILLAR"), children.getCount())
-""",
-        encoding="utf-8",
-    )
-    world = Path(__file__).parent / "asked_host.wbt"
-    with Simulation(world, mode="fast", controllers={"rover": file}) as simulation:
-        simulation.wait_for(lambda: "[rover] left None 5" in simulation.console)
-        assert "[rover] made Solid 6" in simulation.console

@@ -52,18 +52,6 @@ def test_an_inertial_unit_shows_plausible_nonsense_first(robot: InProcessSupervi
     assert unit.getQuaternion() == [0.0, 0.0, 0.0, 1.0]
 
 
-def test_a_disabled_sensor_keeps_its_value_and_complains_each_time(
-    robot: InProcessSupervisor, capfd: pytest.CaptureFixture[str]
-) -> None:
-    gps = enabled(robot, "gps")
-    steps(robot, 1)
-    gps.disable()
-    steps(robot, 5)
-    assert gps.getSamplingPeriod() == 0
-    assert gps.getValues() == gps.getValues() == pytest.approx([-1.2, 0.0, 0.09])
-    assert capfd.readouterr().err.count("called for a disabled device") == 2
-
-
 def test_a_distance_sensor_looks_along_its_ray(robot: InProcessSupervisor) -> None:
     sensor: DistanceSensor = enabled(robot, "ds_left")
     place(robot, 1.44, 1.5, -0.4)  # the left eye looks 0.4 rad to the left: straight east

@@ -62,23 +62,6 @@ def test_a_supervisors_reload_ends_the_controller_and_starts_it_again(
     assert console.count("[rover] time 0.0") >= 2
 
 
-def test_a_supervisors_reset_does_not_end_the_controller(
-    world: Path, write_controller: WriteController
-) -> None:
-    write_controller(
-        """
-        robot.step(160)
-        robot.simulationReset()
-        robot.step(16)
-        print("after", robot.getTime(), flush=True)
-        """,
-        LOOP,
-    )
-    with fast(world) as simulation:
-        simulation.wait_for(lambda: has_line(simulation, "after 0.016"))
-        assert simulation.controller("rover").starts == 1
-
-
 def test_a_reset_by_hand_starts_controllers_again(
     world: Path, write_controller: WriteController
 ) -> None:

@@ -65,23 +65,6 @@ def test_each_type_that_is_left_out_is_warned_of_once() -> None:
     ]
 
 
-def test_a_warning_of_several_nodes_names_the_line_of_the_first(tmp_path: Path) -> None:
-    world = tmp_path / "deep.wbt"
-    world.write_text(
-        "#VRML_SIM R2025a utf8\n"
-        "WorldInfo { }\n"
-        'Robot { name "r" controller "<none>" children [\n'
-        "  Radar { }\n"
-        "] }\n"
-        "Fog { }\n"
-        "Radar { }\n"
-    )
-    assert InProcessSimulation(world).console == [
-        "WARNING: deep.wbt, line 4: the stand-in has no Radar nodes; these 2 are left out.",
-        "WARNING: deep.wbt, line 6: the stand-in has no Fog nodes; this one is left out.",
-    ]
-
-
 def test_loose_boxes_are_pushed_and_fixed_ones_not() -> None:
     text = (WORLDS / "e_puck_r2023b.wbt").read_text(encoding="utf-8")
     assert "supervisor" not in text
@@ -128,13 +111,6 @@ def test_a_youbot_drives_turns_and_moves_its_arm_and_fingers(tmp_path: Path) -> 
 
     drive(robot, 4.0, -4.0, 20, wheels)
     assert robot.simulation.robot("youBot").yaw_rad > 0.1
-
-
-def test_walls_have_the_color_of_their_appearance() -> None:
-    robot = robot_in("four_wheels_r2025a.wbt")
-    arena = robot.simulation.simulator.arena
-    (walls,) = [body for body in arena.bodies if body.name == "rectangle arena"]
-    assert {shape.color for shape in walls.shapes} == {(0.9, 0.2, 0.1)}
 
 
 def test_the_wall_of_a_circle_arena_is_round(tmp_path: Path) -> None:

@@ -240,10 +240,11 @@ def test_real_time_is_no_faster_than_the_clock(
     world: Path, write_controller: WriteController
 ) -> None:
     write_controller(LOOP)
-    began_s = time.monotonic()
     with Simulation(world) as simulation:
-        simulation.wait_for(lambda: simulation.time_s > 0.4)
-    assert time.monotonic() - began_s > 0.3
+        simulation.wait_for(lambda: simulation.time_s > 0)
+        began_s, simulated_s = time.monotonic(), simulation.time_s
+        simulation.wait_for(lambda: simulation.time_s > simulated_s + 0.4)
+        assert time.monotonic() - began_s > 0.25  # what was lost is caught up with, 0.1 s of it
 
 
 def test_a_controller_that_is_linked_into_the_project_is_started(

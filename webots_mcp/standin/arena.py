@@ -72,15 +72,14 @@ class Footprint:
         ]
         if not at_and_half:
             return Footprint(0.0, 0.0, 0.0)
-        x0, x1 = (
-            min(at[0] - half[0] for at, half in at_and_half),
-            max(at[0] + half[0] for at, half in at_and_half),
+        x, y = (
+            (
+                min(at[axis] - half[axis] for at, half in at_and_half)
+                + max(at[axis] + half[axis] for at, half in at_and_half)
+            )
+            / 2.0
+            for axis in (0, 1)
         )
-        y0, y1 = (
-            min(at[1] - half[1] for at, half in at_and_half),
-            max(at[1] + half[1] for at, half in at_and_half),
-        )
-        x, y = (x0 + x1) / 2.0, (y0 + y1) / 2.0
         return Footprint(x, y, max(part.reach_m(x, y) for part in parts))
 
 

@@ -718,7 +718,7 @@ class RecordedSimulation(Simulation):
         self._seen_s, self._ends_in_s = self.time_s, duration_s
         self.fast()
         self.wait_for(self._is_at_rest, timeout_s)
-        for controller in self._runner.controllers:
+        for controller in self.controllers:
             if controller.exit_code:
                 raise AssertionError(
                     f"the controller of {controller.name!r} ended with status "
@@ -730,7 +730,7 @@ class RecordedSimulation(Simulation):
         try:
             return super().wait_for(condition, timeout_s)
         except TimeoutError as error:
-            hanging = [why for each in self._runner.controllers if (why := self._why_hung(each))]
+            hanging = [why for each in self.controllers if (why := self._why_hung(each))]
             raise TimeoutError("\n".join([*hanging, str(error)])) from None
 
     def _why_hung(self, controller: Controller) -> str | None:
@@ -756,13 +756,13 @@ class RecordedSimulation(Simulation):
         if self._ends_in_s > 0.0:
             self._ends_in_s = round(self._ends_in_s - passed_s, 9)
             if self._ends_in_s <= 0.0:
-                self._runner.set_mode(Mode.PAUSE)
+                self._set_mode(Mode.PAUSE)
         super()._notice()
 
     def _is_at_rest(self) -> bool:
         if not self.is_running:
             return True
-        return self.mode is Mode.PAUSE and not any(map(self._why_hung, self._runner.controllers))
+        return self.mode is Mode.PAUSE and not any(map(self._why_hung, self.controllers))
 
     def _is_held(self, name: str) -> bool:
         """Whether a bridge holds the controller's loop: it asks for no step until it is resumed."""

@@ -17,6 +17,7 @@ from webots_mcp.setup.client_entries import (
     Client,
     claude_desktop,
     clients_of,
+    object_in,
     plan_entry,
     server_command,
     server_hindrance,
@@ -106,6 +107,52 @@ def test_what_is_not_understood_or_not_ours_is_refused_by_name(
     with pytest.raises(InvalidInputError, match=rf"\.mcp\.json .*{why}"):
         plan_entry(client, "webots", LINE)
     assert client.file.read_bytes() == held
+
+
+OTHERS = {"inputs": ["ü", 1.5], "mcpServers": {"other": {"url": "http://x//y"}}, "b": None}
+
+
+@pytest.mark.parametrize("indent", ["  ", "\t", "    "])
+def test_the_entry_comes_first_and_all_else_stays_in_its_order(client: Client, indent: str) -> None:
+    held = json.dumps(OTHERS, indent=indent, ensure_ascii=False).replace("\n", "\r\n")
+    after = plan(client, held)[0].after.decode()
+    entry = {"command": LINE[0], "args": LINE[1:]}
+    wanted = {**OTHERS, "mcpServers": {"webots": entry, "other": {"url": "http://x//y"}}}
+    lines = json.dumps(wanted, indent=indent, ensure_ascii=False).split("\n")
+    assert after == "\r\n".join([*lines, ""])
+
+
+COMMENTED = """// mine
+{
+    /* about { servers */
+    "servers": { "other": {"url": "http://x//y"}, }, // end
+}
+"""
+
+
+def test_a_file_with_comments_can_be_read_and_is_not_changed(tmp_path: Path) -> None:
+    assert object_in(COMMENTED) == {"servers": {"other": {"url": "http://x//y"}}}
+    client = clients_of(tmp_path)[2]
+    client.file.parent.mkdir()
+    client.file.write_text(COMMENTED)
+    with pytest.raises(
+        InvalidInputError, match=r"is left as it is.*line 1.*by hand to hold .*serve"
+    ):
+        plan_entry(client, "webots", LINE)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('{\n  "a": 1\n  "b": 2\n}', "line 3, column 3"),
+        ("[1]", "no JSON object"),
+        ('{"a": 1, "a": 2}', '"a" is there twice'),
+        ("[" * 100_000, "too deep"),
+    ],
+)
+def test_what_cannot_be_read_is_refused_with_the_place(text: str, said: str) -> None:
+    with pytest.raises(InvalidInputError, match=said):
+        object_in(text)
 
 
 def test_a_symbolic_link_is_followed_and_stays(client: Client, tmp_path: Path) -> None:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 from controller import Field, Node
 
-from webots_mcp.standin import InProcessSupervisor, Simulation
+from tests.standin.placing import STEP_MS, drive
+from webots_mcp.standin import InProcessSupervisor
 
-STEP_MS = 16
 PILLAR = """DEF PILLAR Solid {
   translation -0.9 0 0.1
   children [ DEF LOOK Shape { geometry Box { size 0.1 0.5 0.2 } } ]
@@ -44,12 +42,7 @@ def test_a_node_that_is_added_stands_in_the_way_until_a_reset_removes_it(
     children.importMFNodeFromString(-1, PILLAR)
     assert children.getCount() == count + 1
     assert node(robot, "PILLAR").getPosition() == [-0.9, 0.0, 0.1]
-    for name in ("left wheel motor", "right wheel motor"):
-        motor = robot.getDevice(name)
-        motor.setPosition(float("inf"))
-        motor.setVelocity(8.0)
-    for _ in range(100):
-        robot.step(STEP_MS)
+    drive(robot, 8.0, 8.0, 100)
     assert robot.simulation.robot("rover").is_touching
     robot.simulationReset()
     robot.step(STEP_MS)
@@ -92,20 +85,6 @@ def test_what_a_node_says_of_itself_makes_the_same_node_again(robot: InProcessSu
         third = field(robot, "root", "children").getMFNode(2)
         assert third is not None and third.getDef() == definition
     assert node(robot, "ROVER").exportString().startswith("DEF ROVER Robot { translation -1.2 0")
-
-
-def test_a_field_of_one_node_can_be_emptied_and_filled(
-    robot: InProcessSupervisor, capfd: pytest.CaptureFixture[str]
-) -> None:
-    physics = field(robot, "BALL", "physics")
-    physics.importSFNodeFromString("Physics { mass 3 }")
-    assert "called with a non-empty field" in capfd.readouterr().err
-    physics.removeSF()
-    assert physics.getSFNode() is None
-    physics.importSFNodeFromString("Physics { density -1 mass 3 }")
-    made = physics.getSFNode()
-    mass = made.getField("mass") if made else None
-    assert mass is not None and mass.value == 3.0
 
 
 @pytest.mark.parametrize(
@@ -155,23 +134,3 @@ def test_entries_are_inserted_and_removed_at_once(
     assert said[0] == "Error: wb_supervisor_field_remove_mf() called for an empty field."
     assert "out-of-bound index: 9 (should be between -4 and 3)" in said[1]
     assert "insert_mf_float() called with a field of type MFString" in said[2]
-
-
-def test_a_node_is_added_by_a_controller_process_too(tmp_path: Path) -> None:
-    file = tmp_path / "adding.py"
-    file.write_text(
-        f"""from controller import Supervisor
-robot = Supervisor()
-children = robot.getRoot().getField("children")
-children.importMFNodeFromString(-1, '''{PILLAR}''')
-pillar = robot.getFromDef("PILLAR")
-print("made", pillar.getTypeName(), children.getCount())
-pillar.remove()
-print("left", robot.getFromDef("PILLAR"), children.getCount())
-""",
-        encoding="utf-8",
-    )
-    world = Path(__file__).parent / "asked_host.wbt"
-    with Simulation(world, mode="fast", controllers={"rover": file}) as simulation:
-        simulation.wait_for(lambda: "[rover] left None 5" in simulation.console)
-        assert "[rover] made Solid 6" in simulation.console

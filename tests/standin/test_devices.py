@@ -4,31 +4,17 @@ from __future__ import annotations
 
 from math import inf, isnan, nan
 from pathlib import Path
-from typing import Any
 
 import pytest
 from controller import GPS, Camera, DistanceSensor, Lidar, Motor, Node
 
-from tests.standin.placing import place
+from tests.standin.placing import STEP_MS, drive, enabled, place, steps
 from webots_mcp.standin import InProcessSupervisor
-
-STEP_MS = 16
 
 
 @pytest.fixture
 def robot() -> InProcessSupervisor:
     return InProcessSupervisor()
-
-
-def enabled(robot: InProcessSupervisor, name: str, period_ms: int = STEP_MS) -> Any:
-    device = robot.getDevice(name)
-    device.enable(period_ms)
-    return device
-
-
-def steps(robot: InProcessSupervisor, count: int) -> None:
-    for _ in range(count):
-        assert robot.step(STEP_MS) == 0
 
 
 def test_devices_come_in_the_order_of_the_scene_tree(robot: InProcessSupervisor) -> None:
@@ -66,26 +52,6 @@ def test_an_inertial_unit_shows_plausible_nonsense_first(robot: InProcessSupervi
     assert unit.getQuaternion() == [0.0, 0.0, 0.0, 1.0]
 
 
-def test_a_disabled_sensor_keeps_its_value_and_complains_each_time(
-    robot: InProcessSupervisor, capfd: pytest.CaptureFixture[str]
-) -> None:
-    gps = enabled(robot, "gps")
-    steps(robot, 1)
-    gps.disable()
-    steps(robot, 5)
-    assert gps.getSamplingPeriod() == 0
-    assert gps.getValues() == gps.getValues() == pytest.approx([-1.2, 0.0, 0.09])
-    assert capfd.readouterr().err.count("called for a disabled device") == 2
-
-
-def test_a_device_made_by_name_enables_the_sensor_of_the_whole_process(
-    robot: InProcessSupervisor,
-) -> None:
-    gps = GPS("gps")
-    assert gps is not robot.getDevice("gps")
-    assert robot.getDevice("gps").getSamplingPeriod() == STEP_MS
-
-
 def test_a_distance_sensor_looks_along_its_ray(robot: InProcessSupervisor) -> None:
     sensor: DistanceSensor = enabled(robot, "ds_left")
     place(robot, 1.44, 1.5, -0.4)  # the left eye looks 0.4 rad to the left: straight east
@@ -100,11 +66,7 @@ def test_a_distance_sensor_looks_along_its_ray(robot: InProcessSupervisor) -> No
 
 def test_gps_and_speed_follow_the_robot(robot: InProcessSupervisor) -> None:
     gps: GPS = enabled(robot, "gps")
-    for side in ("left", "right"):
-        motor: Motor = robot.getDevice(f"{side} wheel motor")
-        motor.setPosition(inf)
-        motor.setVelocity(5.0)
-    steps(robot, 50)
+    drive(robot, 5.0, 5.0, 50)
     assert gps.getSpeed() == pytest.approx(0.2)
     assert gps.getSpeedVector() == pytest.approx([0.2, 0.0, 0.0])
     assert gps.getValues()[0] == pytest.approx(-1.2 + 0.2 * 0.8)
@@ -174,50 +136,14 @@ def test_a_picture_shows_the_moment_it_was_taken(robot: InProcessSupervisor) -> 
     assert camera.getImage() != first
 
 
-def test_motors_tell_what_was_commanded(
-    robot: InProcessSupervisor, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_motors_tell_what_was_commanded(robot: InProcessSupervisor) -> None:
     motor: Motor = robot.getDevice("left wheel motor")
     assert motor.getVelocity() == motor.getMaxVelocity() == 12.0
-    motor.setVelocity(-1.0)  # the target position is finite
-    assert "negative" in capfd.readouterr().err
+    motor.setVelocity(-1.0)  # refused: the target position is finite
+    assert motor.getVelocity() == 12.0
     motor.setPosition(inf)
     motor.setVelocity(-1)
-    assert (motor.getVelocity(), motor.getTargetPosition()) == (-1.0, inf)
-    motor.setVelocity(nan)
-    assert "NaN" in capfd.readouterr().err
-    assert motor.target_velocity == -1.0
+    motor.setVelocity(nan)  # refused
+    assert (motor.target_velocity, motor.getTargetPosition()) == (-1.0, inf)
     sensor = motor.getPositionSensor()
-    assert sensor is not None
-    assert sensor.getName() == "left wheel sensor"
-    with pytest.raises(TypeError):
-        motor.setVelocity("1")  # type: ignore[arg-type]
-
-
-def test_nobody_types_on_the_keyboard(
-    robot: InProcessSupervisor, capfd: pytest.CaptureFixture[str]
-) -> None:
-    keyboard = robot.getKeyboard()
-    assert keyboard is robot.keyboard
-    assert keyboard.getKey() == -1
-    assert "disabled" in capfd.readouterr().err
-    keyboard.enable(STEP_MS)
-    assert keyboard.getKey() == -1 != keyboard.UP
-    assert capfd.readouterr().err == ""
-
-
-def test_the_points_of_a_lidar_have_layers_and_places(
-    robot: InProcessSupervisor, capfd: pytest.CaptureFixture[str]
-) -> None:
-    lidar: Lidar = enabled(robot, "lidar")
-    steps(robot, 1)
-    assert lidar.getPointCloud() == []
-    assert lidar.getNumberOfPoints() == 0
-    assert "wb_lidar_enable_point_cloud" in capfd.readouterr().err
-    lidar.enablePointCloud()
-    points = lidar.getPointCloud()
-    assert lidar.number_of_points == len(points) == 180
-    middle = points[45]  # straight to the left, where the wall in the north is 2 m away
-    assert (middle.x, middle.y, middle.z) == pytest.approx((0.0, 2.0, 0.0), abs=0.02)
-    assert (middle.layer, middle.time) == (0, pytest.approx(0.016))
-    assert not isinstance(middle, tuple)
+    assert sensor is not None and sensor.getName() == "left wheel sensor"

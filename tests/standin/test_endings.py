@@ -62,23 +62,6 @@ def test_a_supervisors_reload_ends_the_controller_and_starts_it_again(
     assert console.count("[rover] time 0.0") >= 2
 
 
-def test_a_supervisors_reset_does_not_end_the_controller(
-    world: Path, write_controller: WriteController
-) -> None:
-    write_controller(
-        """
-        robot.step(160)
-        robot.simulationReset()
-        robot.step(16)
-        print("after", robot.getTime(), flush=True)
-        """,
-        LOOP,
-    )
-    with fast(world) as simulation:
-        simulation.wait_for(lambda: has_line(simulation, "after 0.016"))
-        assert simulation.controller("rover").starts == 1
-
-
 def test_a_reset_by_hand_starts_controllers_again(
     world: Path, write_controller: WriteController
 ) -> None:
@@ -159,18 +142,3 @@ def test_quitting_gives_the_simulation_its_exit_status(
     assert has_line(simulation, "[rover] ended")
     with pytest.raises(StandInError, match="has ended"):
         simulation.pause()
-
-
-def test_a_supervisor_restarts_the_controller_of_another_robot(
-    world: Path, write_controller: WriteController
-) -> None:
-    second = 'Robot { name "second" controller "second" supervisor TRUE }'
-    world.write_text(world.read_text(encoding="utf-8") + second, encoding="utf-8")
-    write_controller("print('began', robot.getTime() > 0, flush=True)", LOOP)
-    write_controller(
-        "robot.step(160)\nrobot.getFromDef('ROVER').restartController()", LOOP, name="second"
-    )
-    with fast(world) as simulation:
-        simulation.wait_for(lambda: has_line(simulation, "[rover] began True"))
-        assert simulation.controller("rover").starts == 2
-        assert simulation.controller("second").starts == 1

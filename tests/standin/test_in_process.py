@@ -65,14 +65,6 @@ def test_a_single_step_by_hand_lets_a_waiting_controller_go_on_once() -> None:
     assert simulation.time_s == pytest.approx(0.016)
 
 
-def test_robots_of_one_process_have_the_names_they_are_given() -> None:
-    robots = [InProcessRobot("rover"), InProcessRobot("rover2")]
-    assert [robot.getName() for robot in robots] == ["rover", "rover2"]
-    for robot in robots:
-        robot.step(STEP_MS)
-    assert [robot.getTime() for robot in robots] == [0.016, 0.016]
-
-
 def test_robots_that_share_a_simulation_keep_step(tmp_path: Path) -> None:
     world = tmp_path / "two.wbt"
     referee = 'Robot { name "referee" supervisor TRUE }'
@@ -90,18 +82,20 @@ def test_robots_that_share_a_simulation_keep_step(tmp_path: Path) -> None:
         InProcessRobot("nobody", world=simulation)
 
 
-def test_steps_are_rounded_up_to_whole_time_steps() -> None:
-    robot = InProcessRobot()
-    robot.step(1)
-    assert robot.getTime() == pytest.approx(0.016)
-    robot.step(20)
-    assert robot.getTime() == pytest.approx(0.048)
+def test_each_has_the_name_it_is_given_and_steps_are_whole_time_steps() -> None:
+    robots = [InProcessRobot("rover"), InProcessRobot("rover2")]
+    assert [robot.getName() for robot in robots] == ["rover", "rover2"]
+    for duration_ms, time_s in ((1, 0.016), (20, 0.048)):
+        for robot in robots:
+            robot.step(duration_ms)
+            assert robot.getTime() == pytest.approx(time_s)
 
 
 def test_after_a_reload_step_ends_and_what_follows_is_an_error() -> None:
     robot = InProcessSupervisor()
     robot.step(STEP_MS)
     robot.worldReload()
+    assert robot.getFromDef("ROVER") is None
     assert robot.step(STEP_MS) == -1
     assert robot.getTime() == pytest.approx(0.016)
     with pytest.raises(ControllerEndedError, match="-1"):
@@ -109,13 +103,6 @@ def test_after_a_reload_step_ends_and_what_follows_is_an_error() -> None:
     with pytest.raises(ControllerEndedError):
         robot.getSelf()
     assert InProcessSupervisor(world=robot.simulation).getTime() == 0.0
-
-
-def test_a_request_after_a_reload_gets_nothing_and_the_step_after_it_ends() -> None:
-    robot = InProcessSupervisor()
-    robot.worldReload()
-    assert robot.getFromDef("ROVER") is None
-    assert robot.step(STEP_MS) == -1
 
 
 def test_reset_and_quit_by_hand_end_the_controller() -> None:

@@ -16,16 +16,13 @@ STEP_MS = 16
 class Team:
     """Two robots two metres apart on the x axis, facing east."""
 
-    def __init__(
-        self, tmp_path: Path, emitter: str = "", receiver: str = "", between: str = ""
-    ) -> None:
+    def __init__(self, tmp_path: Path, emitter: str = "", receiver: str = "") -> None:
         self.world = tmp_path / "team.wbt"
         robot = """Robot {{ name "{0}" translation {1} 0 0 supervisor TRUE children [ {2} ] }}"""
         text = (
             "#VRML_SIM R2025a utf8\nWorldInfo { basicTimeStep 16 }\n"
             + robot.format("sender", -1, f"Emitter {{ {emitter} }} Receiver {{ }}")
             + robot.format("listener", 1, f"Receiver {{ {receiver} }}")
-            + between
         )
         self.world.write_text(text.replace("'", '"'), encoding="utf-8")
         simulation = InProcessSimulation(self.world)
@@ -72,7 +69,6 @@ def test_packets_arrive_in_order_with_direction_and_strength(tmp_path: Path) -> 
     assert receiver.getInts() == (3, 4)
     receiver.nextPacket()
     assert receiver.getBools() == (True, False)
-    assert receiver.data[:2] == [1, 0]
 
 
 def test_an_empty_queue_says_so_and_gives_nothing(
@@ -86,26 +82,22 @@ def test_an_empty_queue_says_so_and_gives_nothing(
 
 
 @pytest.mark.parametrize(
-    ("emitter", "receiver", "between", "arrives"),
+    ("emitter", "receiver", "arrives"),
     [
-        ("channel 2", "channel 2", "", True),
-        ("channel 2", "channel 3", "", False),
-        ("channel -1", "channel 3", "", True),
-        ("channel 2", "channel -1", "", True),
-        ("range 1.9", "", "", False),
-        ("range 2.1", "", "", True),
-        ("", "type 'infra-red'", "", False),
-        ("type 'infra-red' aperture 1", "type 'infra-red'", "", True),
-        (f"type 'infra-red' aperture 1 rotation 0 0 1 {pi}", "type 'infra-red'", "", False),
-        ("type 'infra-red'", "type 'infra-red' aperture 1", "", False),  # it looks away
-        ("type 'infra-red'", "type 'infra-red'", "Wall { translation 0 0 -1 }", False),
-        ("", "", "Wall { translation 0 0 -1 }", True),
+        ("channel 2", "channel 2", True),
+        ("channel 2", "channel 3", False),
+        ("channel -1", "channel 3", True),
+        ("channel 2", "channel -1", True),
+        ("range 1.9", "", False),
+        ("range 2.1", "", True),
+        ("", "type 'infra-red'", False),
+        ("type 'infra-red'", "type 'infra-red'", True),
     ],
 )
 def test_a_packet_arrives_where_it_can_be_heard(
-    emitter: str, receiver: str, between: str, arrives: bool, tmp_path: Path
+    emitter: str, receiver: str, arrives: bool, tmp_path: Path
 ) -> None:
-    team = Team(tmp_path, emitter, receiver, between)
+    team = Team(tmp_path, emitter, receiver)
     assert team.heard("hello") == (["hello"] if arrives else [])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import time
@@ -76,15 +77,6 @@ def test_a_person_pauses_steps_and_resumes(world: Path, write_controller: WriteC
         simulation.resume()
         simulation.wait_for(lambda: simulation.time_s > stopped_s + 0.1)
         assert simulation.mode is Mode.REAL_TIME
-
-
-def test_real_time_is_as_fast_as_the_clock(world: Path, write_controller: WriteController) -> None:
-    write_controller(LOOP)
-    with Simulation(world) as simulation:
-        simulation.wait_for(lambda: simulation.time_s > 0)
-        began_s, simulated_s = time.monotonic(), simulation.time_s
-        simulation.wait_for(lambda: simulation.time_s > simulated_s + 0.5)
-        assert time.monotonic() - began_s == pytest.approx(0.5, abs=0.15)
 
 
 def test_in_a_pause_step_blocks_but_step_zero_and_requests_do_not(
@@ -170,23 +162,6 @@ def test_a_robot_without_synchronization_is_told_how_late_it_is(
         simulation.wait_for(lambda: has_line(simulation, "late True False"))
 
 
-def test_a_second_robot_object_is_half_made(world: Path, write_controller: WriteController) -> None:
-    write_controller(
-        """
-        second = Robot()
-        try:
-            second.getDevice("gps")
-        except AttributeError as error:
-            first = Robot.created is robot
-            print("half made", second.step(16), second.getTime(), first, flush=True)
-        """,
-        LOOP,
-    )
-    with fast(world) as simulation:
-        simulation.wait_for(lambda: has_line(simulation, "half made 0 0.016 True"))
-        simulation.wait_for(lambda: has_line(simulation, "Only one instance of the Robot class"))
-
-
 def test_a_program_of_ones_own_can_be_an_extern_controller(
     world: Path, write_controller: WriteController
 ) -> None:
@@ -240,27 +215,36 @@ def test_what_cannot_be_run_is_refused_at_once(world: Path, tmp_path: Path) -> N
         Simulation(double)
 
 
-def test_a_missing_controller_is_a_warning(world: Path) -> None:
-    with fast(world) as simulation:
-        simulation.wait_for(lambda: simulation.time_s > 0.1)
-        assert has_line(simulation, "WARNING: rover: the controller")
-
-
-@pytest.mark.parametrize("way", ["from the root", "out of controllers/"])
-def test_a_controller_outside_of_controllers_is_not_started(
-    world: Path, tmp_path: Path, way: str
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("rover", "the controller .*rover.py is missing"),
+        ("../evil", "is no name of a folder in controllers/"),
+        ("/tmp/evil", "is no name of a folder in controllers/"),
+    ],
+)
+def test_a_controller_that_is_not_in_its_folder_is_not_started(
+    world: Path, name: str, why: str
 ) -> None:
-    for folder in ("controllers", "evil"):
-        (tmp_path / folder).mkdir()
-    (tmp_path / "evil.py").write_text("print('here I am', flush=True)", encoding="utf-8")
-    name = "../evil" if way == "out of controllers/" else (tmp_path / "evil").as_posix()
+    (world.parent.parent / "controllers").mkdir()
+    (world.parent.parent / "evil.py").write_text("print('here I am', flush=True)")
     text = world.read_text(encoding="utf-8")
-    assert 'controller "rover"' in text
     world.write_text(text.replace('controller "rover"', f'controller "{name}"'), encoding="utf-8")
     with fast(world) as simulation:
         simulation.wait_for(lambda: simulation.time_s > 0.1)
-        assert has_line(simulation, f"the controller '{name}' is no name of a folder in")
+        assert re.search(f"WARNING: rover: .*{why}", "\n".join(simulation.console))
         assert simulation.controller("rover").pid is None
+
+
+def test_real_time_is_no_faster_than_the_clock(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller(LOOP)
+    with Simulation(world) as simulation:
+        simulation.wait_for(lambda: simulation.time_s > 0)
+        began_s, simulated_s = time.monotonic(), simulation.time_s
+        simulation.wait_for(lambda: simulation.time_s > simulated_s + 0.4)
+        assert time.monotonic() - began_s > 0.25  # what was lost is caught up with, 0.1 s of it
 
 
 def test_a_controller_that_is_linked_into_the_project_is_started(

@@ -101,12 +101,14 @@ def test_what_is_left_out_is_counted_by_type_and_scaling_is_said_to_be_ignored(
         DEF A Foo { children [ Bar { } ] }
         USE A
         Floor { appearance Foo { } }
-        Transform { scale 1 1 2 children [ Shape { geometry Mesh { } } ] }""",
+        Transform { scale 1 1 2 children [ Shape { geometry Mesh { } } ] }
+        Zed { }""",
         tmp_path,
     )
     assert world.warnings() == [
         "WARNING: small.wbt, line 3: the stand-in has no Foo nodes; these 2 are left out.",
         "WARNING: small.wbt, line 6: the stand-in has no Mesh nodes; this one is left out.",
+        "WARNING: small.wbt, line 7: the stand-in has no Zed nodes; this one is left out.",
         "WARNING: small.wbt, line 6: the stand-in scales nothing: what is in this Transform keeps "
         "its size.",
     ]

@@ -15,11 +15,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
-from controller.session import ADDRESS_FILE
-
 from tests.webots.server import WebotsServer
 from webots_mcp.standin import Simulation
-from webots_mcp.standin.controllers import Address
 
 _ROOT: Final = Path(__file__).parents[2]
 _DEFAULT_PORT: Final = 1234
@@ -29,21 +26,13 @@ _PRINTED: Final = ("pause", "real-time", "fast", "step")  # as it obeys
 
 
 class World(Simulation):
-    """A simulation whose controllers find the port of Webots in the name of its folder."""
-
-    def start_at(self, port: int) -> None:
-        door, token = self._runner.open(), self._runner.token
-        folder = self._folder / str(port)
-        folder.mkdir()
-        (folder / ADDRESS_FILE).write_text(f"{door} {token}", "utf-8")
-        self._launch.address = Address(door, token, folder)
-        self._thread.start()
+    """A simulation that obeys the orders of Webots' clients."""
 
     def obey(self, order: str) -> None:
         word, _, rest = order.partition(":")
         if word == "load":
-            path = self._runner.simulator.world.path.with_name(rest)
-            self._runner.call(lambda: self._runner.load(path))
+            path = self.simulator.world.path.with_name(rest)
+            self._obey(lambda: self._load(path))
             return
         orders: dict[str, Callable[[], None]] = {
             "pause": self.pause, "real-time": self.resume, "fast": self.fast, "step": self.step,
@@ -114,7 +103,7 @@ def _run(server: WebotsServer, world: World) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
     with server:
-        world.start_at(server.port)
+        world.start(server.port)
         world.wait_for(lambda: stopped.is_set() or not world.is_running, float("inf"))
         status = world.exit_status
         world.close()

@@ -145,7 +145,7 @@ def init(
 
     The project is the nearest folder with worlds/ and controllers/. Claude Code (.mcp.json), Cursor
     (.cursor/mcp.json) and VS Code (.vscode/mcp.json) are told of the server, by a full path;
-    other entries and comments stay. Of each controller in Python the lines that it needs are
+    other entries stay. Of each controller in Python the lines that it needs are
     shown, the Python that Webots starts it with, and what mends that where the bridge is not
     installed there. Nothing is changed a second time.
 

@@ -25,11 +25,11 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.pauses import PAUSED, SEEN_PAUSED, SEEN_RUNNING
 from webots_mcp.setup.client_entries import (
     Client,
-    CommentedJSON,
     can_be_started,
     claude_desktop,
     clients_of,
     is_ours,
+    object_in,
     words_of,
 )
 from webots_mcp.store.recording import View
@@ -255,7 +255,7 @@ def _servers_of(subject: Examined, client: Client) -> Iterator[Finding]:
         return
     try:
         text = client.file.read_text("utf-8-sig")
-        servers = CommentedJSON(text.strip() or "{}").value.get(client.servers)
+        servers = object_in(text.strip() or "{}").get(client.servers)
     except (OSError, UnicodeDecodeError, InvalidInputError) as error:
         seen = f"{client.file} ({client.name}) cannot be read: {error}"
         yield wrong(seen, f"mend that file: {client.name} cannot read it either")

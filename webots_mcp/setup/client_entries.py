@@ -10,7 +10,6 @@ import shutil
 import sys
 import sysconfig
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
@@ -90,24 +89,27 @@ def plan_entry(client: Client, name: str, command: list[str]) -> tuple[FileChang
     try:
         text = before.decode("utf-8-sig") if before is not None else ""
         after, note = _with_entry(text if text.strip() else "{}\n", client.servers, name, wanted)
-    except (InvalidInputError, UnicodeDecodeError) as error:
+        bom = _BOM if before is not None and before.startswith(_BOM.encode()) else ""
+        content = (bom + after).encode()
+    except (InvalidInputError, UnicodeError) as error:
         raise InvalidInputError(f"{client.file} is left as it is: {error}") from error
-    bom = _BOM if before is not None and before.startswith(_BOM.encode()) else ""
     unchanged = before if before is not None and note else None
-    return FileChange(client.file, before, unchanged or (bom + after).encode()), note
+    return FileChange(client.file, before, unchanged or content), note
 
 
 def _with_entry(
     text: str, servers: str, name: str, wanted: dict[str, Any]
 ) -> tuple[str, str | None]:
-    document = CommentedJSON(text)
-    known = document.value.get(servers)
-    there = cast("dict[str, Any]", known if isinstance(known, dict) else {})
+    document = object_in(text)
+    there: dict[str, Any] = document.get(servers, {})
+    if not isinstance(there, dict):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise InvalidInputError(f"{json.dumps(servers)} holds no object there")
     if name not in there:
         for other, entry in there.items():
             if entry == wanted:
                 return text, f"it has this server by the name {other!r}"
-        return document.with_member((servers, name), wanted), None
+        first: dict[str, Any] = {} if servers in document else {servers: {}}
+        return _rewritten(text, {**first, **document, servers: {name: wanted, **there}}), None
     if not is_ours(there[name]):
         raise InvalidInputError(
             f"its server {name!r} is not webots-mcp; choose another name with --name"
@@ -123,7 +125,7 @@ def _with_entry(
     if "--data-dir" in options or "--database" in options:
         arguments = arguments[: arguments.index("serve") + 1]
     mended = {**entry, "command": wanted["command"], "args": [*arguments, *options]}
-    return document.with_member((servers, name), mended), None
+    return _rewritten(text, {**document, servers: {**there, name: mended}}), None
 
 
 def is_ours(entry: Any) -> bool:
@@ -171,108 +173,44 @@ def ignore_file(data_dir: Path) -> FileChange:
 _STRING: Final = r'"(?:\\.|[^"\\\n])*"'
 _COMMENT: Final = re.compile(rf"{_STRING}|(//[^\n]*|/\*.*?\*/)", re.DOTALL)
 _TRAILING_COMMA: Final = re.compile(rf"{_STRING}|(,)(?=\s*[}}\]])")
-_BLANK: Final = re.compile(r"\s*")
-_INDENT: Final = "  "
 
 
-class _Member(NamedTuple):
-    """A member of an object, by where its name begins and its value begins and ends."""
-
-    name: str
-    begin: int
-    value: int
-    end: int
-
-
-class CommentedJSON:
-    """A text that holds one JSON object, perhaps with comments.
-
-    Args:
-        text: All of it.
+def object_in(text: str) -> dict[str, Any]:
+    """The JSON object that a text holds, perhaps with comments and trailing commas.
 
     Raises:
         InvalidInputError: It is no such thing; the message names the line and the column.
     """
-
-    def __init__(self, text: str) -> None:
-        self.text = text
-        self._plain = _blanked(_TRAILING_COMMA, _blanked(_COMMENT, text))
-        try:
-            self.value: dict[str, Any] = json.loads(self._plain, object_pairs_hook=_unique)
-        except json.JSONDecodeError as error:
-            raise InvalidInputError(
-                f"line {error.lineno}, column {error.colno}: {error.msg}"
-            ) from error
-        except RecursionError as error:
-            raise InvalidInputError("its values lie too deep in each other") from error
-        if not isinstance(self.value, dict):  # pyright: ignore[reportUnnecessaryIsInstance]
-            raise InvalidInputError("it holds no JSON object at its top, which begins with {")
-
-    def with_member(self, path: tuple[str, ...], value: Any) -> str:
-        """The text with a member replaced, or put in as the first; objects on the way are made.
-
-        Raises:
-            InvalidInputError: What lies on the way is no object.
-        """
-        begin, end = self._skip(0), len(self.text)
-        for depth, name in enumerate(path, 1):
-            if self._plain[begin] != "{":
-                raise InvalidInputError(f"{json.dumps(path[depth - 2])} holds no object there")
-            here = list(self._members(begin))
-            found = next((member for member in here if member.name == name), None)
-            if found is None:
-                for above in reversed(path[depth:]):
-                    value = {above: value}
-                return self._inserted(begin, here, name, value, depth)
-            begin, end = found.value, found.end
-        before = self.text[:begin].rpartition("\n")[2]
-        indent = before[: len(before) - len(before.lstrip())]
-        return self.text[:begin] + self._written(value, indent) + self.text[end:]
-
-    def _members(self, begin: int) -> Iterator[_Member]:
-        """Those of the object that begins there, with `{`."""
-        decoder = json.JSONDecoder()
-        place = self._skip(begin + 1)
-        while self._plain[place] != "}":
-            name, end = decoder.raw_decode(self._plain, place)
-            value = self._skip(self._skip(end) + 1)
-            _, end = decoder.raw_decode(self._plain, value)
-            yield _Member(name, place, value, end)
-            place = self._skip(end)
-            if self._plain[place] == ",":
-                place = self._skip(place + 1)
-
-    def _skip(self, place: int) -> int:
-        blank = _BLANK.match(self._plain, place)
-        return blank.end() if blank else place
-
-    def _inserted(
-        self, begin: int, members: list[_Member], name: str, value: Any, depth: int
-    ) -> str:
-        """With a first member; a comment after the brace then stands after it."""
-        place = self.text[: members[0].begin].rpartition("\n")[2] if members else " {"
-        indent = _INDENT * depth if place.strip() else place
-        start = self._eol + f"{indent}{json.dumps(name)}: {self._written(value, indent)}"
-        start += "," if members else ""
-        end = members[0].begin if members else self._skip(begin + 1)
-        between = self.text[begin + 1 : end]
-        if members and "\n" not in between:
-            between += self._eol + indent
-        elif not between.strip() and not members:
-            between = self._eol + indent[: -len(_step_of(indent))]
-        return self.text[: begin + 1] + start + between + self.text[end:]
-
-    def _written(self, value: Any, indent: str) -> str:
-        lines = json.dumps(value, indent=_step_of(indent), ensure_ascii=False).split("\n")
-        return (self._eol + indent).join(lines)
-
-    @property
-    def _eol(self) -> str:
-        return "\r\n" if "\r\n" in self.text else "\n"
+    plain = _blanked(_TRAILING_COMMA, _blanked(_COMMENT, text))
+    try:
+        value: object = json.loads(plain, object_pairs_hook=_unique)
+    except json.JSONDecodeError as error:
+        raise InvalidInputError(
+            f"line {error.lineno}, column {error.colno}: {error.msg}"
+        ) from error
+    except RecursionError as error:
+        raise InvalidInputError("its values lie too deep in each other") from error
+    if not isinstance(value, dict):
+        raise InvalidInputError("it holds no JSON object at its top, which begins with {")
+    return cast("dict[str, Any]", value)
 
 
-def _step_of(indent: str) -> str:
-    return "\t" if indent.startswith("\t") else _INDENT
+def _rewritten(text: str, value: dict[str, Any]) -> str:
+    """The text of another value, indented as before.
+
+    Raises:
+        InvalidInputError: The text has comments or trailing commas, which would be lost.
+    """
+    try:
+        json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InvalidInputError(
+            f"what is no plain JSON in it would be lost (line {error.lineno}), as a comment; "
+            f"change it by hand to hold {json.dumps(value)}"
+        ) from error
+    step = re.search(r"\n([ \t]+)", text)
+    written = json.dumps(value, indent=step[1] if step else 2, ensure_ascii=False) + "\n"
+    return written.replace("\n", "\r\n") if "\r\n" in text else written
 
 
 def _blanked(pattern: re.Pattern[str], text: str) -> str:

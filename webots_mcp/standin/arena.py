@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from math import cos, hypot, isinf, pi, sin
+from math import cos, hypot, isinf, sin
 from typing import Any, Final
 
 from webots_mcp.standin.geometry import Block, Color, Disc, Frame, Shape, frame_of
@@ -13,7 +13,7 @@ from webots_mcp.standin.world import World, own_frame
 
 _GEOMETRIES: Final = ("Box", "Capsule", "Cylinder", "Sphere")
 _DEFAULT_COLOR: Final[Color] = (0.5, 0.5, 0.5)
-_LIGHTS: Final = ("DirectionalLight", "PointLight", "SpotLight")
+_LIGHTS: Final = ("DirectionalLight", "PointLight")
 _SLIDING_FRICTION: Final = 1.0
 """Coulomb friction of everything on the floor, Webots' default."""
 
@@ -72,15 +72,14 @@ class Footprint:
         ]
         if not at_and_half:
             return Footprint(0.0, 0.0, 0.0)
-        x0, x1 = (
-            min(at[0] - half[0] for at, half in at_and_half),
-            max(at[0] + half[0] for at, half in at_and_half),
+        x, y = (
+            (
+                min(at[axis] - half[axis] for at, half in at_and_half)
+                + max(at[axis] + half[axis] for at, half in at_and_half)
+            )
+            / 2.0
+            for axis in (0, 1)
         )
-        y0, y1 = (
-            min(at[1] - half[1] for at, half in at_and_half),
-            max(at[1] + half[1] for at, half in at_and_half),
-        )
-        x, y = (x0 + x1) / 2.0, (y0 + y1) / 2.0
         return Footprint(x, y, max(part.reach_m(x, y) for part in parts))
 
 
@@ -115,11 +114,6 @@ class Body:
     def stop(self) -> None:
         """Take its speed away."""
         self.velocity_mps, self.yaw_rate_radps, self.is_pushed = (0.0, 0.0), 0.0, False
-
-    def mass_kg(self) -> float:
-        """What the Physics nodes in it weigh; without one it weighs nothing."""
-        solids = (self.node, *descendants_of(self.node))
-        return sum(_mass_kg(node) for node in solids if node.fields.get("physics"))
 
     @property
     def frame(self) -> Frame:
@@ -213,13 +207,12 @@ class Arena:
         """Let movable bodies whose speed was set slide on, until friction has stopped them."""
         for body in self._movable:
             if body.is_pushed:
-                self.slide(body, seconds)
+                self._slide(body, seconds)
                 body.touched.clear()
                 if self._clear(body):
                     body.stop()
 
-    def slide(self, body: Body, seconds: float) -> None:
-        """Let a body slide for one time step, slower and slower."""
+    def _slide(self, body: Body, seconds: float) -> None:
         (vx, vy), turn = body.velocity_mps, body.yaw_rate_radps
         body.move(body.x + vx * seconds, body.y + vy * seconds, body.yaw_rad + turn * seconds)
         speed, lost = hypot(vx, vy), _SLIDING_FRICTION * self.gravity_mps2 * seconds
@@ -292,19 +285,6 @@ def bounding_parts(node: Node, frame: Frame) -> list[Part]:
     bounding = node.fields["boundingObject"]
     geometries = _geometries(bounding, frame) if bounding else ()
     return [_part(geometry, place, _DEFAULT_COLOR, True) for geometry, place in geometries]
-
-
-def _mass_kg(node: Node) -> float:
-    physics = node.fields["physics"].fields
-    if physics["mass"] >= 0.0:
-        return physics["mass"]
-    return physics["density"] * sum(_volume_m3(part) for part in bounding_parts(node, Frame()))
-
-
-def _volume_m3(part: Part) -> float:
-    hx, hy, hz = part.half_m
-    share = {"Box": 1.0, "Sphere": pi / 6.0}.get(part.kind, pi / 4.0)
-    return share * 8.0 * hx * hy * hz
 
 
 def _geometries(node: Node, frame: Frame) -> Iterator[tuple[Node, Frame]]:
@@ -478,7 +458,6 @@ class Vehicle:
         """
         rolled = {id(joint): joint.turn(seconds) for joint in self.joints}
         if self._sides is None:
-            self._slide(arena, seconds)
             return
         left, right = (
             sum(rolled[id(wheel.joint)] * wheel.radius_m for wheel in side) / len(side)
@@ -487,32 +466,17 @@ class Vehicle:
         track = self._sides[0][0].left_m - self._sides[1][0].left_m
         self._roll((left + right) / 2.0, (right - left) / track, arena, seconds)
 
-    def _slide(self, arena: Arena, seconds: float) -> None:
-        if self.body.is_pushed:
-            arena.slide(self.body, seconds)
-            self._notice(arena.settle(self.body))
-
     def _roll(self, ahead_m: float, turn_rad: float, arena: Arena, seconds: float) -> None:
         body = self.body
         x, y, yaw = body.x, body.y, body.yaw_rad
-        kick_x, kick_y, kick_rad = self._kick(seconds)
-        if ahead_m or turn_rad or body.is_pushed:
+        if ahead_m or turn_rad:
             middle = yaw + turn_rad / 2.0  # exact to second order: the arc's chord
-            x_then, y_then = x + ahead_m * cos(middle), y + ahead_m * sin(middle)
-            body.move(x_then + kick_x, y_then + kick_y, yaw + turn_rad + kick_rad)
+            body.move(x + ahead_m * cos(middle), y + ahead_m * sin(middle), yaw + turn_rad)
             self._notice(arena.settle(body))
         else:
             body.touched.clear()
         body.velocity_mps = ((body.x - x) / seconds, (body.y - y) / seconds)
         body.yaw_rate_radps = (body.yaw_rad - yaw) / seconds
-        body.is_pushed = False
-
-    def _kick(self, seconds: float) -> tuple[float, float, float]:
-        """The way of a speed that was set from outside: after one step the wheels have it again."""
-        if not self.body.is_pushed:
-            return 0.0, 0.0, 0.0
-        (vx, vy), turn = self.body.velocity_mps, self.body.yaw_rate_radps
-        return vx * seconds, vy * seconds, turn * seconds
 
     def _notice(self, touching: bool) -> None:
         self.collisions += touching and not self.touching

@@ -10,7 +10,7 @@ from controller.session import Message
 from webots_mcp.standin.arena import Body
 from webots_mcp.standin.devices import FetchedSensor
 from webots_mcp.standin.pictures import Label
-from webots_mcp.standin.simulator import Mode, Robot, Simulator, Wanted
+from webots_mcp.standin.simulator import Mode, Robot, Simulator
 from webots_mcp.standin.vrml import (
     NODE_TYPES,
     FieldDefinition,
@@ -143,11 +143,6 @@ class SupervisorRequests:
         """A node by its number."""
         return self._shown(self._world.node(node_id))
 
-    def on_node_get_from_device(self, tag: int) -> Any:
-        """The node of one of the robot's devices."""
-        device = self._robot.devices.get(tag)
-        return self._shown(device.node) if device else None
-
     def on_node_get_parent_node(self, node_id: int) -> Any:
         """The node around a node."""
         return self._shown(self._world.parent_of(self._node(node_id)))
@@ -169,10 +164,6 @@ class SupervisorRequests:
         """The same of the node that a PROTO node is made of."""
         node = self._node(node_id)
         return _described(node, name, NODE_TYPES[node.type_name])
-
-    def on_node_get_base_node_field_names(self, node_id: int) -> list[str]:
-        """The names of all fields of what a PROTO node is made of."""
-        return [*NODE_TYPES[self._node(node_id).type_name]]
 
     def on_node_get_field_names(self, node_id: int) -> list[str]:
         """The names of all fields of a node."""
@@ -227,20 +218,17 @@ class SupervisorRequests:
         if index is not None and many is not None and index < 0:
             index += len(many) + 1
         try:
-            self._add(Parser(text).nodes(), around, name, index)
+            nodes = Parser(text).nodes()
+            if len(nodes) != 1:
+                raise WorldError("one node is to be given")
+            if _holds_robot(nodes[0]):
+                raise WorldError("the stand-in adds no robots")
+            self._world.add(nodes[0], around, name, index)
+            self._simulator.added.append(nodes[0])
+            self._stand_anew(around)
         except WorldError as error:
             self._simulator.log(f"ERROR: importing a node: {error}")
         return -1 if many is None else len(many)
-
-    def _add(self, nodes: list[Node], around: Node, name: str, index: int | None) -> None:
-        if len(nodes) != 1:
-            raise WorldError("one node is to be given")
-        (node,) = nodes
-        if any(each.type_name == "Robot" for each in (node, *descendants_of(node))):
-            raise WorldError("the stand-in adds no robots")
-        self._world.add(node, around, name, index)
-        self._simulator.note_added(node)
-        self._stand_anew(around)
 
     def on_node_remove(self, node_id: int) -> Any:
         """Remove a node; the field that it stood in, and the number of entries left there."""
@@ -253,7 +241,7 @@ class SupervisorRequests:
         return self._world.id_of(parent), name, count
 
     def _remove(self, node: Node) -> tuple[Node, str] | None:
-        if any(each.type_name == "Robot" for each in (node, *descendants_of(node))):
+        if _holds_robot(node):
             self._simulator.log("ERROR: the stand-in removes no robots")
             return None
         if node.type_name in ("WorldInfo", "Viewpoint") or node is self._world.root:
@@ -319,20 +307,6 @@ class SupervisorRequests:
             if robot.node is self._node(node_id):
                 robot.vehicle.stop()
 
-    def on_node_set_joint_position(self, node_id: int, position_rad: float) -> None:
-        """Turn a hinge to an angle at once; its motor continues with its command."""
-        node = self._node(node_id)
-        for robot in self._simulator.robots:
-            for joint in robot.vehicle.joints:
-                if joint.node is node:
-                    joint.position_rad = position_rad
-
-    def on_node_restart_controller(self, node_id: int) -> None:
-        """End a robot's controller and start it again."""
-        node = self._node(node_id)
-        if node.type_name == "Robot":
-            self._simulator.wanted = Wanted("restart", robot=node.fields["name"])
-
     def _body_around(self, node: Node | None) -> Body | None:
         bodies = {body.node: body for body in self._simulator.arena.bodies}
         while node is not None and node not in bodies:
@@ -347,23 +321,19 @@ class SupervisorRequests:
 
     def on_simulation_reset(self) -> None:
         """Reset with the next physics step."""
-        self._simulator.ask_reset()
-
-    def on_simulation_reset_physics(self) -> None:
-        """Stop everything that moves."""
-        self._simulator.stop_motion()
+        self._simulator.is_reset_wanted = True
 
     def on_world_reload(self) -> None:
         """Read the world again from its file."""
-        self._simulator.wanted = Wanted("reload")
+        self._simulator.wanted = ""
 
     def on_world_load(self, path: str) -> None:
         """Load another world after the next physics step."""
-        self._simulator.ask_load(str(self._robot.folder / path))
+        self._simulator.wanted_after_step = str(self._robot.folder / path)
 
     def on_simulation_quit(self, status: int) -> None:
         """End the simulation."""
-        self._simulator.wanted = Wanted("quit", status=status)
+        self._simulator.wanted = status
 
     def on_export_image(self, path: str, quality: int) -> None:
         """Write a picture of the arena; relative paths start from the controller's folder."""
@@ -379,6 +349,10 @@ class SupervisorRequests:
             self._simulator.labels[number] = Label(text, x, y, size, rgb)
         else:
             self._simulator.labels.pop(number, None)
+
+
+def _holds_robot(node: Node) -> bool:
+    return any(each.type_name == "Robot" for each in (node, *descendants_of(node)))
 
 
 def _described(node: Node, name: str, definitions: Mapping[str, FieldDefinition]) -> Any:

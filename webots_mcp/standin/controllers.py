@@ -6,14 +6,16 @@ import os
 import socket
 import subprocess
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Final
+from typing import Final
 
 from controller.session import Inbox, Message, pack
 
+from webots_mcp.standin.controller_path import LIBRARY
+from webots_mcp.standin.driver import Seat
 from webots_mcp.standin.simulator import Robot, Simulator
 from webots_mcp.standin.vrml import StandInError
 
@@ -38,7 +40,7 @@ class ControllerProcess:
             env=environment,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
             text=True,
             encoding="utf-8",
             errors="replace",
@@ -49,7 +51,8 @@ class ControllerProcess:
         """Whether it had to be ended by force."""
         self._on_line = on_line
         self._on_exit = on_exit
-        self._readers = [self._reader(self._process.stdout), self._reader(self._process.stderr)]
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
         self._watcher = threading.Thread(target=self._watch, daemon=True)
         self._watcher.start()
 
@@ -73,21 +76,15 @@ class ControllerProcess:
             self._process.kill()
         self._watcher.join()
 
-    def _reader(self, stream: IO[str] | None) -> threading.Thread:
-        assert stream is not None
-        thread = threading.Thread(target=self._read, args=(stream,), daemon=True)
-        thread.start()
-        return thread
-
-    def _read(self, stream: IO[str]) -> None:
-        with stream:
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        with self._process.stdout as stream:
             for line in stream:
                 self._on_line(line.rstrip("\r\n"))
 
     def _watch(self) -> None:
         self._process.wait()
-        for reader in self._readers:  # a grandchild may hold the pipes open: do not wait for it
-            reader.join(0.5)
+        self._reader.join(0.5)  # a grandchild may hold the pipe open: do not wait for it
         self._on_exit(self)
 
 
@@ -97,7 +94,7 @@ class Connection:
     def __init__(self, stream: socket.socket) -> None:
         stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.stream = stream
-        self.inbox = Inbox()
+        self._inbox = Inbox()
 
     def send(self, message: Message) -> None:
         """Send an answer; a controller that is gone is noticed when its socket is read."""
@@ -112,8 +109,8 @@ class Connection:
             data = b""
         if not data:
             return None
-        self.inbox.feed(data)
-        return [*iter(self.inbox.take, None)]
+        self._inbox.feed(data)
+        return [*iter(self._inbox.take, None)]
 
 
 _NOBODY: Final = ("", "<none>", "void", "<generic>")
@@ -122,91 +119,40 @@ _INTERN_VARIABLES: Final = ("WEBOTS_ROBOT_NAME", "WEBOTS_INSTANCE_PATH")
 _EXTERN_VARIABLES: Final = ("WEBOTS_CONTROLLER_URL", "WEBOTS_STANDIN_TOKEN")
 
 
-@dataclass(frozen=True)
-class Address:
-    """Where controllers find the simulator.
-
-    Attributes:
-        port: On this machine.
-        token: What they show to be let in.
-        folder: The simulator's own folder, named after the port as Webots names its own.
-    """
-
-    port: int
-    token: str
-    folder: Path
-
-
 @dataclass
 class Launch:
     """How controllers are started, the same for all robots of a simulation."""
 
-    library: Path
     python: str
     environment: Mapping[str, str]
     overrides: Mapping[str, Path]
     """Controller files by robot name, instead of what the world says."""
     print_line: Callable[[str], None]
     on_exit: Callable[[], None]
-    address: Address | None = None
-    """None before the simulator has started."""
+    token: str
+    """What controllers show to be let in."""
+    port: int = 0
+    """Where controllers find the simulator on this machine; 0 before it has started."""
+    folder: Path = Path()
+    """The simulator's own folder, named after the port as Webots names its own."""
     failure: int | None = None
     """The exit status of the first controller that ended with an error, but not by force."""
 
-    def file_of(self, robot: Robot, simulator: Simulator) -> Path | None:
-        """The controller's file; None if the robot has none or it is started by a person.
 
-        Only the world's own name has to be one: links that stand in the project are followed, as
-        Webots does, and a file that the caller names may lie anywhere.
-        """
-        name: str = robot.node.fields["controller"]
-        if robot.name in self.overrides:
-            return self.overrides[robot.name].resolve()
-        if name in (*_NOBODY, _EXTERN):
-            return None
-        if name == ".." or Path(name).name != name:
-            self.print_line(
-                f"WARNING: {robot.name}: the controller {name!r} is no name of a folder in "
-                "controllers/ but a path: it is not started."
-            )
-            return None
-        return simulator.world.path.parent.parent / "controllers" / name / f"{name}.py"
-
-    def environment_of(self, robot: Robot) -> dict[str, str]:
-        """The environment of the robot's controller, as Webots would set it."""
-        merged = {**os.environ, **self.environment}
-        path = [str(self.library), merged.get("PYTHONPATH", "")]
-        merged["PYTHONPATH"] = os.pathsep.join(part for part in path if part)
-        for name in (*_INTERN_VARIABLES, *_EXTERN_VARIABLES):
-            merged.pop(name, None)
-        return merged | self._way_to(robot)
-
-    def _way_to(self, robot: Robot) -> dict[str, str]:
-        """The variables that Webots sets for a controller, or a person for an extern one."""
-        if self.address is None:
-            raise StandInError("start the simulation before you ask how to reach it")
-        if robot.node.fields["controller"] == _EXTERN and robot.name not in self.overrides:
-            url = f"tcp://127.0.0.1:{self.address.port}/{robot.name}"
-            return dict(zip(_EXTERN_VARIABLES, (url, self.address.token), strict=True))
-        folder = f"{self.address.folder}{os.sep}"  # Webots writes it so
-        own = dict(zip(_INTERN_VARIABLES, (robot.name, folder), strict=True))
-        return own | {"PYTHONIOENCODING": "UTF-8"}
-
-
-@dataclass
-class Controller:
+class Controller(Seat):
     """A robot's controller, through all its processes."""
 
-    robot: Robot
-    launch: Launch
-    file: Path | None
-    process: ControllerProcess | None = None
-    starts: int = 0
-    """How often a process was started for the robot."""
-    connection: Connection | None = None
-    has_left: bool = False
-    """Whether the present process has closed its connection."""
-    _was_told: bool = field(default=False, repr=False)
+    def __init__(self, robot: Robot, launch: Launch) -> None:
+        self.robot = robot
+        self.launch = launch
+        self.file: Path | None = None
+        """Its program; None if the robot has none or a person starts it."""
+        self.process: ControllerProcess | None = None
+        self.starts = 0
+        """How often a process was started for the robot."""
+        self.connection: Connection | None = None
+        self.has_left = False
+        """Whether the present process has closed its connection."""
 
     @property
     def name(self) -> str:
@@ -233,11 +179,6 @@ class Controller:
         """Whether there is nothing to start any more."""
         return self.process is not None or self.file is None
 
-    def kill(self) -> None:
-        """End the process at once, as a crash would."""
-        if self.process:
-            self.process.kill()
-
     @property
     def holds_up(self) -> bool:
         """Whether the world has to wait for this controller before the next physics step."""
@@ -246,30 +187,57 @@ class Controller:
         if self.connection is not None:
             return True
         if self.file is None:
-            return self.robot.node.fields["controller"] == _EXTERN
+            return self._is_extern
         return self.is_running and not self.has_left
 
     @property
     def has_to_be_told(self) -> bool:
         """Whether it is connected and does not know yet that it has to quit."""
-        return self.connection is not None and not self._was_told
+        return self.connection is not None and not self.was_told
 
     @property
     def is_leaving(self) -> bool:
         """Whether it was asked to quit, or has left, and is still running."""
-        is_going = self._was_told or self.has_left
+        is_going = self.was_told or self.has_left
         return is_going and (self.is_running or self.connection is not None)
+
+    @property
+    def _is_extern(self) -> bool:
+        """Whether a person starts its program."""
+        is_extern = self.robot.node.fields["controller"] == _EXTERN
+        return is_extern and self.name not in self.launch.overrides
+
+    def enter(self, robot: Robot, simulator: Simulator) -> None:
+        """Control a robot of a world that was loaded.
+
+        Only the world's own name of a controller has to be one: links that stand in the project are
+        followed, as Webots does, and a file that the caller names may lie anywhere.
+        """
+        self.robot, self.process, self.file = robot, None, None
+        self.was_told = False
+        name: str = robot.node.fields["controller"]
+        if robot.name in self.launch.overrides:
+            self.file = self.launch.overrides[robot.name].resolve()
+        elif name in (*_NOBODY, _EXTERN):
+            return
+        elif name == ".." or Path(name).name != name:
+            self._warn(
+                f"the controller {name!r} is no name of a folder in "
+                "controllers/ but a path: it is not started."
+            )
+        else:
+            self.file = simulator.world.path.parent.parent / "controllers" / name / f"{name}.py"
 
     def start(self) -> None:
         """Start a process, if the robot has a controller file."""
-        self.has_left = self._was_told = False
+        self.has_left = self.was_told = False
         self.process = None
         if self.file is None:
-            if self.robot.node.fields["controller"] == _EXTERN and self.connection is None:
-                self._tell_extern()
+            if self._is_extern and self.connection is None:
+                self._warn_of_extern()
             return
         if not self.file.is_file():
-            self.launch.print_line(f"WARNING: {self.name}: the controller {self.file} is missing.")
+            self._warn(f"the controller {self.file} is missing.")
             self.file = None
             return
         arguments: list[str] = self.robot.node.fields["controllerArgs"]
@@ -280,36 +248,63 @@ class Controller:
         self.process = ControllerProcess(
             command,
             self.file.parent,
-            self.launch.environment_of(self.robot),
+            self.environment(),
             lambda line: self.launch.print_line(f"[{self.name}] {line}"),
             self._exited,
         )
 
-    def _tell_extern(self) -> None:
+    def environment(self) -> dict[str, str]:
+        """The variables that Webots sets for a controller, or a person for an extern one."""
+        launch = self.launch
+        if not launch.port:
+            raise StandInError("start the simulation before you ask how to reach it")
+        merged = {**os.environ, **launch.environment}
+        path = [str(LIBRARY), merged.get("PYTHONPATH", "")]
+        merged["PYTHONPATH"] = os.pathsep.join(part for part in path if part)
+        for name in (*_INTERN_VARIABLES, *_EXTERN_VARIABLES):
+            merged.pop(name, None)
+        if self._is_extern:
+            url = f"tcp://127.0.0.1:{launch.port}/{self.name}"
+            return merged | dict(zip(_EXTERN_VARIABLES, (url, launch.token), strict=True))
+        folder = f"{launch.folder}{os.sep}"  # Webots writes it so
+        own = dict(zip(_INTERN_VARIABLES, (self.name, folder), strict=True))
+        return merged | own | {"PYTHONIOENCODING": "UTF-8"}
+
+    def _warn(self, what: str) -> None:
+        self.launch.print_line(f"WARNING: {self.name}: {what}")
+
+    def _warn_of_extern(self) -> None:
         """Warn that its controller is not started here, for which the world may wait for ever."""
         waits = "the world waits for it" if self.robot.is_synchronous else "it has none until then"
-        self.launch.print_line(
-            f"WARNING: {self.name}: the controller is <extern>, so somebody else has to start it; "
+        self._warn(
+            "the controller is <extern>, so somebody else has to start it; "
             f"{waits}. Let the stand-in do so with --robot '{self.name}=FILE.py' (in Python "
             f"Simulation(..., controllers={{{self.name!r}: FILE}})), or start a program of yours "
             f"with Simulation.environment_of({self.name!r})."
         )
 
+    def reply(self, message: Message) -> None:
+        """Send an answer, if it is there."""
+        if self.connection:
+            self.connection.send(message)
+
     def tell_to_quit(self) -> None:
-        """Send the one answer after which `step` returns -1."""
-        if self.connection and not self._was_told:
-            self._was_told = True
-            self.robot.remaining_ms = None
-            self.connection.send(("quit",))
+        """Send the end, if it is there."""
+        if self.connection:
+            super().tell_to_quit()
+
+    def kill(self) -> None:
+        """End the process at once, as a crash would."""
+        if self.process:
+            self.process.kill()
 
     def end(self) -> None:
         """End the process by force, if it is still there."""
         if self.process is None:
             return
-        if self.is_running and self._was_told:
-            self.launch.print_line(
-                f"WARNING: {self.name}: Forced termination (because process didn't terminate "
-                "itself after 1 second)."
+        if self.is_running and self.was_told:
+            self._warn(
+                "Forced termination (because process didn't terminate itself after 1 second)."
             )
         self.process.end()
 
@@ -317,24 +312,8 @@ class Controller:
         code = process.exit_code or 0
         if code > 0 or (code < 0 and not process.was_ended):
             self.launch.failure = self.launch.failure or (code if code > 0 else 128 - code)
-        if process.exit_code == 0:
+        if code == 0:
             self.launch.print_line(f"INFO: '{self.name}' controller exited successfully.")
         else:
-            self.launch.print_line(
-                f"WARNING: '{self.name}' controller exited with status: {process.exit_code}."
-            )
+            self.launch.print_line(f"WARNING: '{self.name}' controller exited with status: {code}.")
         self.launch.on_exit()
-
-
-def controllers_of(
-    simulator: Simulator, launch: Launch, before: Iterable[Controller]
-) -> list[Controller]:
-    """A controller for each robot of the world; those of the world before are kept by name."""
-    known = {controller.name: controller for controller in before}
-    controllers: list[Controller] = []
-    for robot in simulator.robots:
-        file = launch.file_of(robot, simulator)
-        controller = known.get(robot.name) or Controller(robot, launch, file)
-        controller.robot, controller.file, controller.process = robot, file, None
-        controllers.append(controller)
-    return controllers

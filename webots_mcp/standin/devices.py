@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
-from math import acos, atan2, cos, hypot, inf, nan, pi, sin
+from math import atan2, cos, hypot, inf, nan, pi, sin
 from typing import Any, Final
 
 from webots_mcp.standin import pictures
@@ -53,21 +53,6 @@ class Site:
         """Where the device's x axis points."""
         r = self.pose().rotation
         return r[0], r[3], r[6]
-
-    def is_blocked(self, way: Vector, distance_m: float, *others: Body) -> bool:
-        """Whether an obstacle stands in the way, but for the robot itself and other bodies."""
-        x, y, z = self.pose().translation
-        level = hypot(way[0], way[1])
-        if level < 1e-9:  # straight above
-            return False
-        dx, dy, reach_m = way[0] / level, way[1] / level, distance_m * level
-        obstacles = self.arena.obstacles(self.body, *others)
-        for target in targets_from(obstacles, x, y, None, reach_m):
-            away_m = target.distance_m(dx, dy)
-            height_m = z + away_m * way[2] / level if away_m <= reach_m else -1.0
-            if target.shape.bottom_m <= height_m <= target.shape.top_m:
-                return True
-        return False
 
 
 class Device:
@@ -271,33 +256,11 @@ class TouchSensor(Device):
         parts = bounding_parts(node, site.frame)
         self._sides = [side for part in parts for side in _sides(part, disc.ahead_m, disc.left_m)]
 
-    def measure(self, period_ms: float) -> float | list[float]:
-        """Of a bumper 0 or 1, else the force in newtons, looked up."""
-        kind = self.node.fields["type"]
-        fx, fy = self._force_n()
-        if kind not in ("force", "force-3d"):
-            return float(bool(self._felt()))
-        force = self.site.pose().direction((fx, fy, 0.0))
-        if kind == "force":  # its x axis points outwards, against what presses
-            return resolved(self.node, -force[0])
-        return [resolved(self.node, part) for part in force]
-
-    def _felt(self) -> list[tuple[float, float]]:
-        """How far what it touches pushed the robot back in the last step, metres."""
+    def measure(self, period_ms: float) -> float:
+        """1 while it touches something, else 0."""
         yaw = self.site.body.yaw_rad
-        return [
-            push
-            for push in self.site.body.touched
-            if any(
-                abs(_turn(atan2(-push[1], -push[0]) - yaw - at)) <= half for at, half in self._sides
-            )
-        ]
-
-    def _force_n(self) -> tuple[float, float]:
-        """The momentum that was taken from the robot in the last step, by its duration."""
-        scale = self.site.body.mass_kg() / self.site.arena.step_s**2
-        felt = self._felt()
-        return scale * sum(x for x, _ in felt), scale * sum(y for _, y in felt)
+        angles = [atan2(-y, -x) - yaw for x, y in self.site.body.touched]
+        return float(any(abs(_turn(a - at)) <= half for a in angles for at, half in self._sides))
 
 
 def _sides(part: Part, ahead_m: float, left_m: float) -> Iterator[tuple[float, float]]:
@@ -385,23 +348,13 @@ class Camera(FetchedSensor):
 
     _seen: pictures.View | None = None
 
-    def __init__(self, tag: int, node: Node, site: Site) -> None:
-        super().__init__(tag, node, site)
-        self.field_of_view_rad: float = node.fields["fieldOfView"]
-
-    def configure(self, setting: str, value: Any) -> None:
-        """Take a setting from the controller."""
-        super().configure(setting, value)
-        if setting == "fov":
-            self.field_of_view_rad = value
-
     def look(self) -> None:
         """Note where everything stands."""
         self._seen = pictures.View(
             *self.site.place(),
             width=self.node.fields["width"],
             height=self.node.fields["height"],
-            field_of_view_rad=self.field_of_view_rad,
+            field_of_view_rad=self.node.fields["fieldOfView"],
             shapes=tuple(self.site.arena.scene(without=self.site.body)),
         )
 
@@ -424,10 +377,7 @@ class LightSensor(Device):
         if not fields["on"]:
             return 0.0
         way, distance_m = self._way_to(light, world)
-        faced = max(_dot(self.site.axis(), way), 0.0)
-        direct = fields["intensity"] * faced * _spot(light, way, world)
-        if direct and self.node.fields["occlusion"] and self.site.is_blocked(way, distance_m):
-            direct = 0.0
+        direct = fields["intensity"] * max(_dot(self.site.axis(), way), 0.0)
         color = _dot(fields["color"], seen_through) / 3.0
         return color * _attenuation(light, distance_m) * (fields["ambientIntensity"] + direct)
 
@@ -447,27 +397,10 @@ def _attenuation(light: Node, distance_m: float) -> float:
     return 1.0 / max(a + b * distance_m + c * distance_m**2, 1e-9)
 
 
-def _spot(light: Node, way: Vector, world: World) -> float:
-    """How much of a SpotLight's beam goes this way, 0 to 1."""
-    if light.type_name != "SpotLight":
-        return 1.0
-    beam = _unit(world.frame_around(light).turned(light.fields["direction"]))
-    angle = _angle(beam, (-way[0], -way[1], -way[2]))
-    cut_off, full = light.fields["cutOffAngle"], light.fields["beamWidth"]
-    if angle > cut_off:
-        return 0.0
-    return 1.0 if angle <= full else (angle - cut_off) / (full - cut_off)
-
-
 def _way(here: Vector, there: Vector) -> tuple[Vector, float]:
     """From one place to another: a unit vector and metres."""
     way = (there[0] - here[0], there[1] - here[1], there[2] - here[2])
     return _unit(way), hypot(*way)
-
-
-def _angle(a: Vector, b: Vector) -> float:
-    """Between two unit vectors, radians."""
-    return acos(min(max(_dot(a, b), -1.0), 1.0))
 
 
 def _dot(a: Vector, b: Vector) -> float:
@@ -522,28 +455,16 @@ class Receiver(Device):
         """Take packets from an emitter that it can hear."""
         here, there = self.site.pose(), emitter.site.pose()
         way, distance_m = _way(here.translation, there.translation)
-        if self.period_ms and self._can_hear(emitter, way, distance_m):
+        if self.period_ms and self._can_hear(emitter, distance_m):
             strength = 1.0 / distance_m**2 if distance_m else inf
             direction = here.direction(way)
             self._arrived.extend((packet, direction, strength) for packet in packets)
 
-    def _can_hear(self, emitter: Emitter, way: Vector, distance_m: float) -> bool:
+    def _can_hear(self, emitter: Emitter, distance_m: float) -> bool:
         mine, theirs = self.node.fields, emitter.node.fields
         if mine["type"] != theirs["type"] or 0.0 <= theirs["range"] < distance_m:
             return False
-        if -1 not in (mine["channel"], theirs["channel"]) and mine["channel"] != theirs["channel"]:
-            return False
-        if mine["type"] != "infra-red":
-            return True
-        back = (-way[0], -way[1], -way[2])
-        return (
-            (mine["aperture"] < 0.0 or 2.0 * _angle(self.site.axis(), way) <= mine["aperture"])
-            and (
-                theirs["aperture"] < 0.0
-                or 2.0 * _angle(emitter.site.axis(), back) <= theirs["aperture"]
-            )
-            and not self.site.is_blocked(way, distance_m, emitter.site.body)
-        )
+        return -1 in (mine["channel"], theirs["channel"]) or mine["channel"] == theirs["channel"]
 
     def put_value(self, fresh: dict[int, Any]) -> None:
         """Add the packets to those that the controller has not been sent yet."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
@@ -11,11 +12,11 @@ from controller.robot import Robot, Supervisor
 from controller.session import Message
 
 from webots_mcp.contract import bundled
-from webots_mcp.standin.controller_answers import answer, description, step_over
-from webots_mcp.standin.simulator import Mode, Simulator, Wanted
+from webots_mcp.standin.controller_answers import description
+from webots_mcp.standin.driver import Driver, Seat
+from webots_mcp.standin.simulator import Mode
 from webots_mcp.standin.simulator import Robot as SimulatedRobot
 from webots_mcp.standin.vrml import ControllerEndedError, StandInError, WorldError, WouldBlockError
-from webots_mcp.standin.world import load_world
 
 DEFAULT_WORLD: Final = bundled("examples") / "worlds" / "arena.wbt"
 """A 4 m x 4 m arena with a few obstacles and one two-wheeled robot, "rover"."""
@@ -23,14 +24,13 @@ DEFAULT_WORLD: Final = bundled("examples") / "worlds" / "arena.wbt"
 _LONGEST_STEP_MS: Final = 1 << 31
 
 
-class InProcessSimulation:
+class InProcessSimulation(Driver):
     """A world that the robots of this process move themselves, step by step.
 
     There is no thread and no pacing: time passes while a robot is inside `step`. Several robots
     may share a simulation. Each has its own clock: the one that is behind finds that its time has
-    passed already, so stepping them in turn keeps them together, and none waits for another.
-
-    The methods named after buttons are a person's hands on Webots' window.
+    passed already, so stepping them in turn keeps them together, and none waits for another. After
+    a reset or a reload a new robot object may take the place of one that was ended.
     """
 
     def __init__(self, world: str | Path = DEFAULT_WORLD, *, pause_timeout_s: float = 0.0) -> None:
@@ -49,79 +49,27 @@ class InProcessSimulation:
         self._pause_timeout_s = pause_timeout_s
         self._changed = threading.Condition(threading.RLock())
         self._links: list[_LocalLink] = []
-        self._simulator = Simulator(load_world(world), Mode.FAST, self.console.append)
-        self.exit_status: int | None = None
-        """The status given to `simulationQuit`; None while the simulation is there."""
+        super().__init__(world, Mode.FAST, self.console.append)
 
     @property
-    def time_s(self) -> float:
-        """Simulated time in seconds."""
-        return self._simulator.time_s
+    def _seats(self) -> Sequence[_LocalLink]:
+        return self._links
 
-    @property
-    def mode(self) -> Mode:
-        """How the simulation runs; fast and real time are the same here."""
-        return self._simulator.mode
-
-    def robot(self, name: str) -> SimulatedRobot:
-        """What is really the case with a robot: its `position`, `yaw_rad`, `collisions`, ...
-
-        Raises:
-            WorldError: The world has no robot with this name.
-        """
-        return self._simulator.robot(name)
-
-    # A person's hands ----------------------------------------------------------------------------
-
-    def pause(self) -> None:
-        """Press pause."""
-        self._set_mode(Mode.PAUSE)
-
-    def resume(self) -> None:
-        """Press play."""
-        self._set_mode(Mode.REAL_TIME)
-
-    def fast(self) -> None:
-        """Press fast."""
-        self._set_mode(Mode.FAST)
-
-    def step(self) -> None:
-        """Make one basic time step and pause."""
+    def _obey(self, function: Callable[[], None]) -> None:
         with self._changed:
-            self._simulator.mode = Mode.PAUSE
-            self._advance()
+            function()
             self._changed.notify_all()
 
-    def reset(self) -> None:
-        """Reset the world; controllers are ended, a new robot object may take their place."""
-        with self._changed:
-            self._end(self._links)
-            self._simulator.reset()
+    def _step_once(self) -> None:
+        self.simulator.mode = Mode.PAUSE
+        self._advance()
 
-    def reload(self) -> None:
-        """Read the world from its file; controllers are ended as with `reset`."""
-        self._load(self._simulator.world.path)
-
-    def quit(self, status: int = 0) -> None:
-        """End the simulation: every `step` returns -1."""
-        with self._changed:
-            self.exit_status = status
-            self._end(self._links)
-
-    def _set_mode(self, mode: Mode) -> None:
-        with self._changed:
-            self._simulator.mode = mode
-            self._changed.notify_all()
-
-    def _load(self, path: Path) -> None:
-        with self._changed:
-            self._end(self._links)
-            self._simulator = Simulator(load_world(path), self.mode, self.console.append)
-
-    def _end(self, links: list[_LocalLink]) -> None:
-        for link in links:
-            link.quit()
-        self._links = [link for link in self._links if link not in links]
+    def _end(self, seats: Sequence[Seat]) -> None:
+        for seat in seats:
+            seat.is_ending = True
+            if seat.robot.remaining_ms is not None:
+                seat.tell_to_quit()
+        self._links = [link for link in self._links if not link.is_ending]
         self._changed.notify_all()
 
     # Controllers ---------------------------------------------------------------------------------
@@ -132,25 +80,23 @@ class InProcessSimulation:
             robot = self._found(name)
             if any(link.robot is robot for link in self._links):
                 raise StandInError(f"robot {robot.name!r} has a controller already")
-            link = _LocalLink(self, self._simulator, robot)
+            link = _LocalLink(self, robot)
             self._links.append(link)
             return link
 
     def _found(self, name: str | None) -> SimulatedRobot:
-        robots = self._simulator.robots
+        robots = self.simulator.robots
         if not robots:
-            raise WorldError(self._simulator.no_robot())
-        if name is not None and len(robots) == 1 and not self._simulator.left_out_robots(name):
+            raise WorldError(self.simulator.no_robot())
+        if name is not None and len(robots) == 1 and not self.simulator.left_out_robots(name):
             robots[0].node.fields["name"] = name
-        return robots[0] if name is None else self._simulator.robot(name)
+        return robots[0] if name is None else self.simulator.robot(name)
 
     def take(self, link: _LocalLink, message: Message) -> None:
         """Take a controller's request, and let time pass as far as it asks for."""
         with self._changed:
-            reply = answer(self._simulator, link.robot, message)
-            if reply:
-                link.replies.append(reply)
-            self._carry_out(self._simulator.wanted)
+            self._serve(link, message)
+            self._carry_out_wanted()
 
     def wait(self, link: _LocalLink) -> None:
         """Let time pass until the controller has its answer.
@@ -177,58 +123,31 @@ class InProcessSimulation:
                 self._links.remove(link)
                 link.robot.forget_controller()
 
-    def _advance(self) -> None:
-        waiting = {link.robot.name: link for link in self._links}
-        for robot in self._simulator.advance():
-            waiting[robot.name].replies.append(step_over(self._simulator, robot))
-        self._carry_out(self._simulator.wanted)
 
-    def _carry_out(self, wanted: Wanted | None) -> None:
-        if wanted is None:
-            return
-        self._simulator.wanted = None
-        if wanted.action == "quit":
-            self.quit(wanted.status)
-        elif wanted.action == "restart":
-            self._end([link for link in self._links if link.robot.name == wanted.robot])
-        else:
-            self._load(Path(wanted.path) if wanted.path else self._simulator.world.path)
+class _LocalLink(Seat):
+    """Both ends of the connection of an in-process robot."""
 
-
-class _LocalLink:
-    """The connection of an in-process robot."""
-
-    def __init__(
-        self, simulation: InProcessSimulation, simulator: Simulator, robot: SimulatedRobot
-    ) -> None:
-        self.simulation = simulation
+    def __init__(self, simulation: InProcessSimulation, robot: SimulatedRobot) -> None:
         self.robot = robot
-        self.description: dict[str, Any] = description(simulator, robot)
+        self.description: dict[str, Any] = description(simulation.simulator, robot)
         self.replies: deque[Message] = deque()
-        self._ended = False
+        self._simulation = simulation
         robot.forget_controller()
+
+    def reply(self, message: Message) -> None:
+        self.replies.append(message)
 
     def send(self, message: Message) -> None:
         if message[0] == "step" and message[1] > _LONGEST_STEP_MS:
             raise WouldBlockError(
                 "a negative time step asks for 2**32 ms: step() would never return"
             )
-        if not self._ended:
-            self.simulation.take(self, message)
-        elif not self.replies:
-            self.replies.append(("quit",))
+        self._simulation.take(self, message)
 
     def receive(self) -> Message:
         if not self.replies:
-            self.simulation.wait(self)
+            self._simulation.wait(self)
         return self.replies.popleft()
-
-    def quit(self) -> None:
-        """The next answer, or the one that is waited for, is that the simulation ends."""
-        self._ended = True
-        if self.robot.remaining_ms is not None:
-            self.robot.remaining_ms = None
-            self.replies.append(("quit",))
 
     def exit(self) -> NoReturn:
         raise ControllerEndedError(
@@ -237,7 +156,7 @@ class _LocalLink:
         )
 
     def close(self) -> None:
-        self.simulation.leave(self)
+        self._simulation.leave(self)
 
 
 class InProcessRobot(Robot):

@@ -13,35 +13,37 @@ import threading
 import time
 import weakref
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError, Future
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, TypeVar, cast
+from typing import Final, TypeVar, cast
 
 from controller.session import ADDRESS_FILE, Message
 
-from webots_mcp.standin.controller_answers import answer, description, step_over
-from webots_mcp.standin.controller_path import LIBRARY
-from webots_mcp.standin.controllers import Address, Connection, Controller, Launch, controllers_of
-from webots_mcp.standin.simulator import Mode, Robot, Simulator
-from webots_mcp.standin.vrml import StandInError, WorldError
-from webots_mcp.standin.world import load_world
+from webots_mcp.standin.controller_answers import description
+from webots_mcp.standin.controllers import Connection, Controller, Launch
+from webots_mcp.standin.driver import Driver, Seat
+from webots_mcp.standin.simulator import Mode
+from webots_mcp.standin.vrml import StandInError
 
 _MODES: Final = {"pause": Mode.PAUSE, "realtime": Mode.REAL_TIME, "fast": Mode.FAST}
 _NOTICE_S: Final = 0.002
 _RECHECK_S: Final = 0.05
 _CONSOLE_LINES: Final = 10_000
+_PATIENCE_S: Final = 1.0
+"""How long Webots waits for a controller to ask for something, and then for it to exit."""
+_MAX_LAG_S: Final = 0.1
+"""Real time that is lost is caught up with at most so much."""
 
 T = TypeVar("T")
 
 
-class Simulation:
+class Simulation(Driver):
     """A world that runs in a background thread, its controllers as processes of their own.
 
-    Use it in a `with` statement; leaving it ends all controllers. The methods named after buttons
-    are a person's hands on Webots' window: they return once the simulation has obeyed.
+    Use it in a `with` statement; leaving it ends all controllers.
     """
 
     def __init__(
@@ -80,27 +82,41 @@ class Simulation:
         self._clean_up = weakref.finalize(self, shutil.rmtree, self._folder, True)
         overrides = {name: Path(file) for name, file in (controllers or {}).items()}
         self._launch = Launch(
-            LIBRARY, python, environment or {}, overrides, self._print, self._exited
+            python, environment or {}, overrides, self._print, self._exited, secrets.token_hex(16)
         )
-        simulator = Simulator(load_world(world), _MODES[mode], self._print)
+        self.controllers: list[Controller] = []
+        """One for each robot, in the order of the scene tree."""
+        super().__init__(world, _MODES[mode], self._print)
         for name in overrides:
-            simulator.robot(name)  # refuses a name that the world does not have
-        self._runner = Runner(
-            simulator,
-            lambda simulator, before: controllers_of(simulator, self._launch, before),
-            self._notice,
-        )
-        self._thread = threading.Thread(target=self._runner.run, name="simulation", daemon=True)
+            self.robot(name)  # refuses a name that the world does not have
+        self._find_controllers()
+        self._admitted: dict[Connection, Controller] = {}
+        self._calls: deque[tuple[Callable[[], None], Future[None]]] = deque()
+        self._steps_asked = 0
+        self._due_s = 0.0
+        self._over = False
+        self._selector = selectors.DefaultSelector()
+        self._bell_rope: socket.socket
+        self._thread = threading.Thread(target=self._run, name="simulation", daemon=True)
 
     # Life ----------------------------------------------------------------------------------------
 
-    def start(self) -> Simulation:
-        """Start the controllers and, unless it is to be paused, time."""
-        port, token = self._runner.open(), self._runner.token
-        folder = self._folder / str(port)  # it is this user's alone
-        folder.mkdir()
-        (folder / ADDRESS_FILE).write_text(f"{port} {token}", encoding="utf-8")
-        self._launch.address = Address(port, token, folder)
+    def start(self, shown_port: int | None = None) -> Simulation:
+        """Start the controllers and, unless it is to be paused, time.
+
+        Args:
+            shown_port: What the folder for controllers is named after, where another program
+                listens for Webots' clients; None: the port for controllers.
+        """
+        door = socket.create_server(("127.0.0.1", 0))
+        bell, self._bell_rope = socket.socketpair()
+        self._selector.register(door, selectors.EVENT_READ, self._welcome)
+        self._selector.register(bell, selectors.EVENT_READ, _hush)
+        self._launch.port = door.getsockname()[1]
+        self._launch.folder = self._folder / str(shown_port or self._launch.port)
+        self._launch.folder.mkdir()  # it is this user's alone
+        address = f"{self._launch.port} {self._launch.token}"
+        (self._launch.folder / ADDRESS_FILE).write_text(address, encoding="utf-8")
         self._thread.start()
         return self
 
@@ -122,12 +138,7 @@ class Simulation:
     @property
     def is_running(self) -> bool:
         """Whether the simulation has not been quit."""
-        return self._runner.exit_status is None
-
-    @property
-    def exit_status(self) -> int | None:
-        """The status given to `simulationQuit`; None while it runs."""
-        return self._runner.exit_status
+        return self.exit_status is None
 
     @property
     def failure(self) -> int | None:
@@ -140,44 +151,19 @@ class Simulation:
     # What is the case ----------------------------------------------------------------------------
 
     @property
-    def time_s(self) -> float:
-        """Simulated time in seconds."""
-        return self._runner.simulator.time_s
-
-    @property
-    def mode(self) -> Mode:
-        """How the simulation runs."""
-        return self._runner.simulator.mode
-
-    @property
-    def labels(self) -> dict[int, str]:
-        """The texts of `setLabel` by number."""
-        return {number: label.text for number, label in self._runner.simulator.labels.items()}
-
-    @property
     def console(self) -> list[str]:
         """The last lines of the console: `[robot] text` from controllers, others from Webots."""
         with self._printing:
             return [*self._lines]
 
-    def robot(self, name: str) -> Robot:
-        """What is really the case with a robot: its `position`, `yaw_rad`, `collisions`, ...
-
-        Raises:
-            WorldError: The world has no robot with this name.
-        """
-        return self._runner.simulator.robot(name)
-
     def controller(self, name: str) -> Controller:
         """A robot's controller: its `pid`, `exit_code`, `starts`, `kill()`, ...
 
         Raises:
-            StandInError: The world has no robot with this name.
+            WorldError: The world has no robot with this name.
         """
-        for controller in self._runner.controllers:
-            if controller.name == name:
-                return controller
-        raise StandInError(f"no robot {name!r} in {self._runner.simulator.world.path.name}")
+        robot = self.robot(name)
+        return next(controller for controller in self.controllers if controller.robot is robot)
 
     def environment_of(self, name: str) -> dict[str, str]:
         """The environment that makes a program of yours the controller of an <extern> robot.
@@ -185,8 +171,7 @@ class Simulation:
         Raises:
             StandInError: There is no such robot, or the simulation has not started.
         """
-        controller = self.controller(name)
-        return controller.launch.environment_of(controller.robot)
+        return self.controller(name).environment()
 
     def wait_for(self, condition: Callable[[], T], timeout_s: float = 10.0) -> T:
         """Wait until something is the case; looks whenever something has happened.
@@ -211,37 +196,28 @@ class Simulation:
                 self._changed.wait(min(left_s, _RECHECK_S))
         return value
 
-    # A person's hands ----------------------------------------------------------------------------
+    # From other threads --------------------------------------------------------------------------
 
-    def pause(self) -> None:
-        """Press pause."""
-        self._runner.call(lambda: self._runner.set_mode(Mode.PAUSE))
+    def _obey(self, function: Callable[[], None]) -> None:
+        """Have the loop call a function between two physics steps.
 
-    def resume(self) -> None:
-        """Press play: real time."""
-        self._runner.call(lambda: self._runner.set_mode(Mode.REAL_TIME))
+        Raises:
+            StandInError: The simulation has ended.
+        """
+        future: Future[None] = Future()
+        self._calls.append((function, future))
+        self._wake()
+        if self._over:
+            self._cancel_calls()
+        try:
+            future.result()
+        except CancelledError:
+            raise StandInError("the simulation has ended") from None
 
-    def fast(self) -> None:
-        """Press fast."""
-        self._runner.call(lambda: self._runner.set_mode(Mode.FAST))
-
-    def step(self) -> None:
-        """Press step: one basic time step as soon as all controllers have asked, then pause."""
-        self._runner.call(self._runner.step)
-
-    def reset(self) -> None:
-        """Reset the world and start all controllers again."""
-        self._runner.call(self._runner.reset)
-
-    def reload(self) -> None:
-        """Read the world from its file again and start all controllers again."""
-        self._runner.call(lambda: self._runner.load(self._runner.simulator.world.path))
-
-    def quit(self, status: int = 0) -> None:
-        """Close the window."""
-        self._runner.call(lambda: self._runner.quit(status))
-
-    # From the simulation's threads ---------------------------------------------------------------
+    def _wake(self) -> None:
+        """Let the loop look around, if it waits."""
+        with suppress(OSError):
+            self._bell_rope.send(b"!")
 
     def _print(self, line: str) -> None:
         with self._printing:
@@ -251,10 +227,11 @@ class Simulation:
         self._tell()
 
     def _exited(self) -> None:
-        self._runner.wake()
+        self._wake()
         self._tell()
 
     def _notice(self) -> None:
+        """Called in the simulation's thread when something has happened, as after each step."""
         now_s = time.monotonic()
         if now_s - self._noticed_s > _NOTICE_S:  # a thread switch for each step would cost too much
             self._noticed_s = now_s
@@ -264,113 +241,38 @@ class Simulation:
         with self._changed:
             self._changed.notify_all()
 
-
-_PATIENCE_S: Final = 1.0
-"""How long Webots waits for a controller to ask for something, and then for it to exit."""
-_MAX_LAG_S: Final = 0.1
-"""Real time that is lost is caught up with at most so much."""
-
-
-class Runner:
-    """Runs a simulation in the thread that calls `run`; other threads use `call`."""
-
-    def __init__(
-        self,
-        simulator: Simulator,
-        controllers_for: Callable[[Simulator, list[Controller]], list[Controller]],
-        notify: Callable[[], None],
-    ) -> None:
-        self.simulator = simulator
-        self.controllers = controllers_for(simulator, [])
-        self.token = secrets.token_hex(16)
-        self.exit_status: int | None = None
-        self._controllers_for = controllers_for
-        self._notify = notify
-        self._admitted: dict[Connection, Controller] = {}
-        self._calls: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
-        self._steps_asked = 0
-        self._due_s = 0.0
-        self._ending: list[Controller] = []
-        self._over = False
-        self._selector: selectors.BaseSelector
-        self._bell_rope: socket.socket
-
-    def open(self) -> int:
-        """Open the door for controllers; returns its port."""
-        self._selector = selectors.DefaultSelector()
-        door = socket.create_server(("127.0.0.1", 0))
-        bell, self._bell_rope = socket.socketpair()
-        self._selector.register(door, selectors.EVENT_READ, self._welcome)
-        self._selector.register(bell, selectors.EVENT_READ, _hush)
-        return door.getsockname()[1]
-
-    # From other threads --------------------------------------------------------------------------
-
-    def call(self, function: Callable[[], Any]) -> Any:
-        """Have the loop call a function between two physics steps; returns what it returns.
-
-        Raises:
-            StandInError: The simulation has ended.
-        """
-        future: Future[Any] = Future()
-        self._calls.append((function, future))
-        self.wake()
-        if self._over:
-            self._cancel_calls()
-        try:
-            return future.result()
-        except CancelledError:
-            raise StandInError("the simulation has ended") from None
-
-    def wake(self) -> None:
-        """Let the loop look around, if it waits."""
-        with suppress(OSError):
-            self._bell_rope.send(b"!")
-
     # The loop ------------------------------------------------------------------------------------
 
-    def run(self) -> None:
+    def _run(self) -> None:
         """Run until the simulation is quit."""
         try:
-            if self.simulator.mode is not Mode.PAUSE:
-                self._start_controllers()
+            if self.mode is not Mode.PAUSE:
+                self._start(self.controllers)
             while self.exit_status is None:
                 self._listen(self._patience_s())
                 self._answer_calls()
                 self._carry_out_wanted()
-                if self._may_advance():
+                if self.exit_status is None and self._patience_s() == 0.0:
                     self._advance()
         finally:
             self._shut_down()
 
     def _patience_s(self) -> float | None:
-        if not self._wants_to_advance() or self._held_up():
+        """How long to listen before the next physics step; None: until something is heard."""
+        wants_to_advance = self.mode is not Mode.PAUSE or self._steps_asked
+        if not wants_to_advance or any(each.holds_up for each in self.controllers):
             return None
-        if self.simulator.mode is Mode.FAST or self._steps_asked:
+        if self.mode is Mode.FAST or self._steps_asked:
             return 0.0
         return max(self._due_s - time.monotonic(), 0.0)
-
-    def _wants_to_advance(self) -> bool:
-        return self.simulator.mode is not Mode.PAUSE or self._steps_asked > 0
-
-    def _held_up(self) -> bool:
-        return any(controller.holds_up for controller in self.controllers)
-
-    def _may_advance(self) -> bool:
-        return self.exit_status is None and self._patience_s() == 0.0
 
     def _advance(self) -> None:
         now_s, step_s = time.monotonic(), self.simulator.world.basic_time_step_ms / 1000.0
         # A step that came early, as all do in fast mode, is no reason to wait longer for the next.
         self._due_s = max(min(self._due_s, now_s) + step_s, now_s - _MAX_LAG_S)
-        done = self.simulator.advance()
-        for controller in self.controllers:
-            if controller.robot in done and controller.connection:
-                controller.connection.send(step_over(self.simulator, controller.robot))
-        if self._steps_asked:
-            self._steps_asked -= 1
-        self._carry_out_wanted()
-        self._notify()
+        self._steps_asked = max(self._steps_asked - 1, 0)
+        super()._advance()
+        self._notice()
 
     def _listen(self, timeout_s: float | None) -> None:
         for key, _ in self._selector.select(timeout_s):
@@ -388,8 +290,29 @@ class Runner:
                 future.set_result(function())
             except Exception as error:  # noqa: BLE001 - it is the caller's
                 future.set_exception(error)
+            self._notice()
+
+    def _shut_down(self) -> None:
+        self.exit_status = self.exit_status or 0
+        self._end(self.controllers)
+        for key in [*self._selector.get_map().values()]:
+            cast("socket.socket", key.fileobj).close()
+        self._selector.close()
+        self._over = True
+        self._bell_rope.close()
+        self._cancel_calls()
+        self._notice()
+
+    def _cancel_calls(self) -> None:
+        with suppress(IndexError):  # both threads may get here at once
+            while self._calls:
+                self._calls.popleft()[1].cancel()
 
     # Controllers ---------------------------------------------------------------------------------
+
+    @property
+    def _seats(self) -> Sequence[Controller]:
+        return self.controllers
 
     def _welcome(self, door: socket.socket) -> None:
         connection = Connection(door.accept()[0])
@@ -404,14 +327,16 @@ class Runner:
             return
         for message in messages:
             if controller := self._admitted.get(connection):
-                self._serve(connection, controller, message)
+                self._serve(controller, message)
+                if message[0] == "ask":
+                    self._notice()
             else:
                 self._admit(connection, message)
 
     def _admit(self, connection: Connection, message: Message) -> None:
         _, token, name = message
         controller = next((c for c in self.controllers if c.name == name), None)
-        if not hmac.compare_digest(token, self.token):
+        if not hmac.compare_digest(token, self._launch.token):
             connection.send(("refused", "the token is that of another simulation"))
         elif controller is None:
             connection.send(("refused", self.simulator.no_robot(name)))
@@ -421,17 +346,7 @@ class Runner:
             controller.connection, self._admitted[connection] = connection, controller
             controller.robot.forget_controller()
             connection.send(("welcome", description(self.simulator, controller.robot)))
-            self._notify()
-
-    def _serve(self, connection: Connection, controller: Controller, message: Message) -> None:
-        if controller in self._ending:
-            controller.tell_to_quit()
-            return
-        reply = answer(self.simulator, controller.robot, message)
-        if reply:
-            connection.send(reply)
-        if message[0] == "ask":
-            self._notify()
+            self._notice()
 
     def _forget(self, connection: Connection) -> None:
         self._selector.unregister(connection.stream)
@@ -439,16 +354,28 @@ class Runner:
         if controller := self._admitted.pop(connection, None):
             controller.connection, controller.has_left = None, True
             controller.robot.forget_controller()
-            self._notify()
+            self._notice()
 
-    def _start_controllers(self) -> None:
+    def _find_controllers(self) -> None:
+        """A controller for each robot of the world; those of the world before are kept by name."""
+        known = {controller.name: controller for controller in self.controllers}
+        self.controllers = [
+            known.get(robot.name) or Controller(robot, self._launch)
+            for robot in self.simulator.robots
+        ]
+        for controller, robot in zip(self.controllers, self.simulator.robots, strict=True):
+            controller.enter(robot, self.simulator)
+
+    def _start(self, seats: Sequence[Seat]) -> None:
         for controller in self.controllers:
-            controller.start()
+            if controller in seats:
+                controller.start()
 
-    def _end(self, controllers: list[Controller]) -> None:
+    def _end(self, seats: Sequence[Seat]) -> None:
         """As Webots does it: a second to ask, a second to exit, then by force."""
-        self._ending = controllers
+        controllers = [controller for controller in self.controllers if controller in seats]
         for controller in controllers:
+            controller.is_ending = True
             if controller.robot.remaining_ms is not None:
                 controller.tell_to_quit()
         self._listen_until(lambda: not any(c.has_to_be_told for c in controllers))
@@ -459,83 +386,30 @@ class Runner:
             controller.end()
             if connection := controller.connection:
                 self._forget(connection)
-        self._ending = []
+            controller.is_ending = False
 
-    # A person's hands, to be used through `call` -------------------------------------------------
+    # What a person or a controller wants ---------------------------------------------------------
 
-    def set_mode(self, mode: Mode) -> None:
-        """Pause or run."""
-        self.simulator.mode = mode
-        self._after_mode_change()
+    def _set_mode(self, mode: Mode) -> None:
+        super()._set_mode(mode)
+        self._start_late()
 
-    def step(self) -> None:
-        """Make one basic time step and pause."""
+    def _step_once(self) -> None:
+        """One basic time step as soon as all controllers have asked."""
         self.simulator.mode = Mode.PAUSE
         self._steps_asked += 1
-        self._after_mode_change()
+        self._start_late()
 
-    def reset(self) -> None:
-        """Reset the world and start all controllers again."""
-        self._end(self.controllers)
-        self.simulator.reset()
-        self._start_controllers()
-        self._notify()
-
-    def load(self, path: Path) -> None:
-        """Read a world and start its controllers; a bad world is named and the old one stays."""
-        self._end(self.controllers)
-        try:
-            world = load_world(path)
-            self.simulator = Simulator(world, self.simulator.mode, self.simulator.log)
-            self.controllers = self._controllers_for(self.simulator, self.controllers)
-        except WorldError as error:
-            self.simulator.log(f"ERROR: {error}; the world stays as it was")
-            self.simulator.reset()
-        if self.simulator.mode is not Mode.PAUSE:
-            self._start_controllers()
-        self._notify()
-
-    def quit(self, status: int) -> None:
-        """End the simulation."""
-        self.exit_status = status
-
-    def _after_mode_change(self) -> None:
+    def _start_late(self) -> None:
+        """A world that was loaded in pause starts its controllers only when time is to pass."""
         self._due_s = time.monotonic()
-        for controller in self.controllers:  # a world loaded in pause starts them only now
-            if self._wants_to_advance() and not controller.was_started:
-                controller.start()
-        self._notify()
+        if self.mode is not Mode.PAUSE or self._steps_asked:
+            self._start([each for each in self.controllers if not each.was_started])
 
-    def _carry_out_wanted(self) -> None:
-        wanted, self.simulator.wanted = self.simulator.wanted, None
-        if wanted is None:
-            return
-        if wanted.action == "quit":
-            self.quit(wanted.status)
-        elif wanted.action == "restart":
-            self._restart(next(c for c in self.controllers if c.name == wanted.robot))
-        else:
-            self.load(Path(wanted.path) if wanted.path else self.simulator.world.path)
-
-    def _restart(self, controller: Controller) -> None:
-        self._end([controller])
-        controller.start()
-
-    def _shut_down(self) -> None:
-        self.exit_status = self.exit_status or 0
-        self._end(self.controllers)
-        for key in [*self._selector.get_map().values()]:
-            cast("socket.socket", key.fileobj).close()
-        self._selector.close()
-        self._over = True
-        self._bell_rope.close()
-        self._cancel_calls()
-        self._notify()
-
-    def _cancel_calls(self) -> None:
-        with suppress(IndexError):  # both threads may get here at once
-            while self._calls:
-                self._calls.popleft()[1].cancel()
+    def _enter_world(self) -> None:
+        self._find_controllers()
+        if self.mode is not Mode.PAUSE:
+            self._start(self.controllers)
 
 
 def _hush(bell: socket.socket) -> None:

@@ -1,7 +1,7 @@
 """The simulation itself: robots, time and modes; no messages, no processes, no sockets.
 
-The driver of a `Simulator` makes the physics steps (`advance`) and carries out what the
-simulation wants done to itself (`wanted`).
+A `Driver` makes the physics steps (`advance`) and carries out what the simulation wants done to
+itself (`wanted`).
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Callable
 from enum import IntEnum
 from math import ceil
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 from webots_mcp.standin.arena import Arena, Body, Vehicle, joints_in
 from webots_mcp.standin.devices import Device, Emitter, Receiver, devices_in
@@ -30,14 +30,11 @@ class Mode(IntEnum):
     FAST = 2
 
 
-class Wanted(NamedTuple):
-    """What a controller asked to be done to the whole simulation."""
+Wanted: TypeAlias = "str | int"
+"""What a controller asked to be done to the whole simulation.
 
-    action: str
-    """`reload`, `load`, `restart` (one controller) or `quit`."""
-    path: str = ""
-    robot: str = ""
-    status: int = 0
+A world to be loaded, empty to read the same one again, or the exit status to quit with.
+"""
 
 
 class Robot:
@@ -144,9 +141,11 @@ class Simulator:
         self.time_ms = 0.0
         self.wanted: Wanted | None = None
         self.labels: dict[int, Label] = {}
-        self._reset_asked = False
-        self._added: list[Node] = []
-        self._load_asked: Wanted | None = None
+        self.is_reset_wanted = False
+        """Whether everything is put back at the end of the next physics step."""
+        self.wanted_after_step: Wanted | None = None
+        self.added: list[Node] = []
+        """What controllers have added: the next reset removes it."""
         self._pictures: list[Picture] = []
         self._start = {
             node: ([*node.fields["translation"]], [*node.fields["rotation"]])
@@ -169,33 +168,25 @@ class Simulator:
     def no_robot(self, name: str | None = None) -> str:
         """Why there is no robot of this name, or none at all, in words."""
         if left_out := self.left_out_robots(name):
-            return f"{self.world.path.name}, {self._suspects(left_out)}"
+            types = [*dict.fromkeys(node.type_name for node in left_out)]
+            return (
+                f"{self.world.path.name}, line {left_out[0].line}: the stand-in has no "
+                f"{' or '.join(types)} nodes{self.world.why_not(types[0])}. If the robot is one: "
+                "in Webots, right-click it, choose 'Convert Root to Base Node(s)' and save the "
+                "world, or let WEBOTS_HOME name an installed Webots, whose PROTO files are read "
+                "then; docs/standin.md lists what the stand-in has"
+            )
         known = ", ".join(repr(robot.name) for robot in self.robots)
         asked = "no robot" if name is None else f"no robot {name!r}"
         return f"{asked} in {self.world.path.name}; it has {known or 'none'}"
 
-    def _suspects(self, left_out: list[Node]) -> str:
-        """What was left out and is the robot, or may be it, and what to do about it."""
-        nodes = self.world.likeliest_robots(left_out)
-        first, types = nodes[0], [*dict.fromkeys(node.type_name for node in nodes)]
-        if_robot = "that" if len(types) == 1 else "one of them"
-        return (
-            f"line {first.line}: the stand-in has no {' or '.join(types)} nodes"
-            f"{self.world.why_not(first.type_name)}. "
-            f"If {if_robot} is the robot: in Webots, right-click it, choose 'Convert Root to Base "
-            "Node(s)' and save the world, or let WEBOTS_HOME name an installed Webots, whose PROTO "
-            "files are read then; docs/standin.md lists what the stand-in has"
-        )
-
     def left_out_robots(self, name: str | None = None) -> list[Node]:
-        """What was left out of the world and may be this robot, or any."""
-        return [node for node in self.world.left_out if self._may_be(node, name)]
-
-    def _may_be(self, node: Node, name: str | None) -> bool:
-        """Whether a node that was left out may be the robot that is asked for."""
+        """What was left out of the world and may be this robot, or any: what has a controller."""
+        at_top = [n for n in self.world.left_out if self.world.parent_of(n) is self.world.root]
+        robots = [node for node in self.world.left_out if _has_controller(node)]
         if name is None:
-            return _has_controller(node) or self.world.parent_of(node) is self.world.root
-        return _has_controller(node) and node.fields.get("name", name) == name
+            return robots or at_top
+        return [node for node in robots if node.fields.get("name", name) == name]
 
     def robot_of(self, node: Node) -> Robot:
         """The robot that a Robot node describes."""
@@ -225,13 +216,14 @@ class Simulator:
         for emitter in self._emitters:
             emitter.transmit(self._receivers)
         self.time_ms += basic
-        if self._reset_asked:
+        if self.is_reset_wanted:
             self.reset()
             self.time_ms = basic  # the step that resets counts
         for robot in self.robots:
             self._measure(robot, basic)
         self._render()
-        self.wanted, self._load_asked = self._load_asked or self.wanted, None
+        if self.wanted_after_step is not None:
+            self.wanted, self.wanted_after_step = self.wanted_after_step, None
         return [robot for robot in self.robots if self._let_pass(robot, basic)]
 
     def _measure(self, robot: Robot, passed_ms: float) -> None:
@@ -248,9 +240,9 @@ class Simulator:
 
     def reset(self) -> None:
         """Put everything back to the start of the world, at time 0; controllers go on."""
-        self._reset_asked = False
+        self.is_reset_wanted = False
         self.time_ms = 0.0
-        added, self._added = self._added, []
+        added, self.added = self.added, []
         for node in added:
             self.world.remove(node)
         self.arena.follow()
@@ -267,30 +259,11 @@ class Simulator:
             for device in robot.devices.values():
                 device.make_due()
 
-    def note_added(self, node: Node) -> None:
-        """A controller has added it: the next reset removes it."""
-        self._added.append(node)
-
     def stand_anew(self, body: Body) -> None:
         """Let a body follow its node's fields."""
         frame = self.world.frame_of(body.node)
         assert frame is not None
         body.stand(frame)
-
-    def stop_motion(self) -> None:
-        """Take the speed of everything away."""
-        for body in self.arena.bodies:
-            body.stop()
-        for robot in self.robots:
-            robot.vehicle.stop()
-
-    def ask_reset(self) -> None:
-        """Reset at the end of the next physics step."""
-        self._reset_asked = True
-
-    def ask_load(self, path: str) -> None:
-        """Load another world after the next physics step."""
-        self._load_asked = Wanted("load", path)
 
     def export(self, path: Path, quality: int) -> None:
         """Write a picture: at once when paused, else with the next rendering."""

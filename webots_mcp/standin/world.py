@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -26,8 +25,6 @@ _NAME_OF_LACKING: Final = {
     **{"Speaker": "speaker", "VacuumGripper": "vacuum gripper"},
 }
 """What devices that the stand-in does not have are called, unless the world gives them a name."""
-_OF_ROBOTS: Final = {"controller", "controllerArgs", "supervisor", "synchronization"}
-_IS_NO_ROBOT: Final = re.compile(r"Background|Light|Floor|Appearance|/(objects|appearances)/")
 _UNSCALED: Final = [1.0, 1.0, 1.0]
 
 
@@ -125,18 +122,6 @@ class World:
         """Why the file of a PROTO cannot be used, in brackets; empty where there is none."""
         why = self.protos.why_not.get(type_name)
         return f" ({why})" if why else ""
-
-    def likeliest_robots(self, nodes: list[Node]) -> list[Node]:
-        """Of nodes that were left out those most like robots, by their fields or their URLs."""
-        signs: tuple[Callable[[Node], bool], ...] = (
-            lambda node: bool(_OF_ROBOTS & node.fields.keys()),
-            lambda node: "/robots/" in self.protos.urls.get(node.type_name, ""),
-            lambda node: (
-                not _IS_NO_ROBOT.search(node.type_name + self.protos.urls.get(node.type_name, ""))
-            ),
-        )
-        found = ([node for node in nodes if sign(node)] for sign in signs)
-        return next((likely for likely in found if likely), nodes)
 
     def left_out_in(self, robot: Node) -> dict[str, str]:
         """Devices that the world gives a robot and the stand-in does not: names and node types."""

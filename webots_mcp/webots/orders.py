@@ -12,28 +12,26 @@ from __future__ import annotations
 
 import json
 import os
-import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, cast
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from webots_mcp.contract import host_name
 from webots_mcp.errors import CommandRefusedError
 
 if TYPE_CHECKING:
-    from websockets.frames import Frame
+    from websockets.sync.client import ClientConnection
 
 Order = Literal["pause", "resume", "fast", "step", "reset", "reload"]
 
 MAX_MESSAGE_BYTES: Final = 4 << 20
 ANSWER_S: Final = 1.0  # Webots answers at once, or it does not obey
 _CLOSING_S: Final = 0.2
-_CHUNK_BYTES: Final = 1 << 16
-_HEAD_END: Final = b"\r\n\r\n"
-_LONGEST_HEAD_BYTES: Final = 1 << 16
+_LOOK_S: Final = 0.02  # whether the ping was answered
 # A robot of this name need not exist: asking for a window begins the logs for this client.
 _BEGIN_CONSOLE: Final = "robot:" + json.dumps(
     {"name": "webots-mcp", "message": "init robot window"}, separators=(",", ":")
@@ -64,14 +62,13 @@ class WebotsAddress(NamedTuple):
 
 
 class Message(NamedTuple):
-    """What Webots sent: its text as far as it is kept, or that it answered a ping.
+    """What Webots sent: its text as far as it is kept.
 
     Attributes:
         dropped_bytes: How much of the end is not kept.
     """
 
     text: str
-    is_pong: bool = False
     dropped_bytes: int = 0
 
 
@@ -105,23 +102,11 @@ def address_of(instance: str) -> WebotsAddress | None:
 
 
 class Stream:
-    """A connection to Webots, in this thread alone. Times are those of `time.monotonic`."""
+    """A connection to Webots."""
 
-    def __init__(self, address: WebotsAddress, until_s: float) -> None:
-        from websockets.client import ClientProtocol
-        from websockets.uri import parse_uri
-
-        self.address = address
-        self._protocol = ClientProtocol(parse_uri(f"ws://{address}/"), max_size=None)
-        self._message = bytearray()
-        self._dropped_bytes = 0
-        self._socket = socket.create_connection(address, _left_s(until_s))
-        self._arrived: list[Message] = []
-        try:
-            self._shake_hands(until_s)
-        except BaseException:
-            self._socket.close()
-            raise
+    def __init__(self, connection: ClientConnection, address: WebotsAddress) -> None:
+        self._connection = connection
+        self._address = address
 
     def send(self, text: str) -> None:
         """Send a text.
@@ -129,128 +114,43 @@ class Stream:
         Raises:
             CommandRefusedError: Webots closed the connection.
         """
-        self._require_open()
-        self._protocol.send_text(text.encode())
-        self._write()
+        with self._open():
+            self._connection.send(text)
 
-    def ping(self) -> None:
+    def ping(self) -> threading.Event:
         """Ask Webots' main thread for a sign of life, which comes after what was sent before.
 
         Raises:
             CommandRefusedError: Webots closed the connection.
         """
-        self._require_open()
-        self._protocol.send_ping(b"webots-mcp")
-        self._write()
+        with self._open():
+            return self._connection.ping()
 
     def receive(self, until_s: float) -> Message | None:
-        """The next message; None if none came in time.
+        """The next message; None if none came by a time of `time.monotonic`.
 
         Raises:
             CommandRefusedError: Webots closed the connection.
         """
-        while not self._arrived:
-            if not self._read(until_s):
+        with self._open():
+            try:
+                data = self._connection.recv(_left_s(until_s), decode=False)
+            except TimeoutError:
                 return None
-        return self._arrived.pop(0)
+        # The scene of a large world is a message of hundreds of megabytes, and every client gets
+        # those that another has asked for.
+        kept = data[:MAX_MESSAGE_BYTES]
+        return Message(kept.decode("utf-8", "replace"), len(data) - len(kept))
 
-    def close(self) -> None:
-        """Send the closing frame, wait a moment for that of Webots, and close the socket."""
-        until_s = time.monotonic() + _CLOSING_S
+    @contextmanager
+    def _open(self) -> Generator[None]:
+        from websockets.exceptions import ConnectionClosed
+
         try:
-            self._shake_hands_to_close(until_s)
-        finally:
-            self._socket.close()
-
-    @property
-    def _is_open(self) -> bool:
-        from websockets.protocol import OPEN
-
-        return self._protocol.state is OPEN
-
-    def _shake_hands_to_close(self, until_s: float) -> None:
-        with suppress(OSError, CommandRefusedError):
-            if self._is_open:  # else Webots was first
-                self._protocol.send_close(1000)
-                self._write()
-            while self._read(until_s):
-                self._arrived.clear()
-
-    def _shake_hands(self, until_s: float) -> None:
-        self._protocol.send_request(self._protocol.connect())
-        self._write()
-        head = bytearray()
-        while _HEAD_END not in head and len(head) < _LONGEST_HEAD_BYTES:
-            data = self._bytes(until_s)
-            if data is None:
-                raise TimeoutError
-            if not data:
-                break
-            head += data
-        head_bytes, end, rest = bytes(head).partition(_HEAD_END)
-        self._protocol.receive_data(head_bytes + end)
-        self._protocol.events_received()
-        if not self._is_open:
-            why = self._protocol.handshake_exc or "it does not speak as a WebSocket does"
-            raise CommandRefusedError(f"what listens at {self.address} is no Webots ({why})")
-        self._take(rest)
-
-    def _read(self, until_s: float) -> bool:
-        """Take what has come; False if nothing has in time."""
-        data = self._bytes(until_s)
-        if data is None:
-            return False
-        if data:
-            self._take(data)
-            self._write()  # pongs
-        if not data or (self._protocol.close_expected() and not self._arrived):
-            raise self._closed()
-        return True
-
-    def _require_open(self) -> None:
-        if not self._is_open:
-            raise self._closed()
-
-    def _closed(self) -> CommandRefusedError:
-        return CommandRefusedError(f"Webots at {self.address} closed the connection")
-
-    def _take(self, data: bytes) -> None:
-        from websockets.frames import Opcode
-
-        self._protocol.receive_data(data)
-        for frame in cast("list[Frame]", self._protocol.events_received()):
-            if frame.opcode is Opcode.PONG:
-                self._arrived.append(Message("", is_pong=True))
-            elif frame.opcode in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT):
-                self._put_together(frame)
-
-    def _put_together(self, frame: Frame) -> None:
-        """Keep of the parts of a message the first bytes.
-
-        The scene of a large world is one message of hundreds of megabytes, in parts of 512 kB, and
-        every client gets those that another has asked for.
-        """
-        room = MAX_MESSAGE_BYTES - len(self._message)
-        self._message += frame.data[:room]
-        self._dropped_bytes += max(len(frame.data) - room, 0)
-        if frame.fin:
-            text = self._message.decode("utf-8", "replace")
-            self._arrived.append(Message(text, dropped_bytes=self._dropped_bytes))
-            self._message, self._dropped_bytes = bytearray(), 0
-
-    def _bytes(self, until_s: float) -> bytes | None:
-        """Of the socket; empty at its end, None where nothing came in time."""
-        self._socket.settimeout(_left_s(until_s))
-        try:
-            return self._socket.recv(_CHUNK_BYTES)
-        except (TimeoutError, BlockingIOError):
-            return None
-
-    def _write(self) -> None:
-        self._socket.settimeout(ANSWER_S)  # only a full buffer can make this wait
-        for data in self._protocol.data_to_send():
-            if data:
-                self._socket.sendall(data)
+            yield
+        except ConnectionClosed as error:
+            why = f"Webots at {self._address} closed the connection"
+            raise CommandRefusedError(why) from error
 
 
 @contextmanager
@@ -261,23 +161,30 @@ def connected(address: WebotsAddress, timeout_s: float) -> Generator[Stream]:
         CommandRefusedError: Nothing listens there, it is not Webots, it does not answer, or it
             hung up.
     """
+    from websockets.exceptions import InvalidHandshake
+    from websockets.sync.client import connect
+
     try:
-        stream = Stream(address, time.monotonic() + timeout_s)
+        connection = connect(
+            f"ws://{address}/",
+            open_timeout=timeout_s,
+            close_timeout=_CLOSING_S,
+            ping_interval=None,
+            compression=None,
+            max_size=None,
+            proxy=None,
+        )
     except TimeoutError as error:
         raise CommandRefusedError(
             f"what listens at {address} did not answer within {timeout_s:g} s: Webots' main thread "
             "is busy, or it is no Webots"
         ) from error
+    except InvalidHandshake as error:
+        raise CommandRefusedError(f"what listens at {address} is no Webots ({error})") from error
     except OSError as error:
         raise CommandRefusedError(f"no Webots listens at {address} ({error})") from error
-    try:
-        yield stream
-    except OSError as error:
-        raise CommandRefusedError(
-            f"the connection to Webots at {address} broke: {error}"
-        ) from error
-    finally:
-        stream.close()
+    with connection:
+        yield Stream(connection, address)
 
 
 def give_order(address: WebotsAddress, order: Order, timeout_s: float = ANSWER_S) -> OrderReply:
@@ -303,20 +210,23 @@ def _give(
     address: WebotsAddress, words: str, answers: tuple[str, ...], timeout_s: float, *, late: bool
 ) -> OrderReply:
     until_s = time.monotonic() + timeout_s
-    is_alive, other = False, None
+    other = None
     with connected(address, timeout_s) as stream:
         stream.send(words)
-        stream.ping()
-        while (message := stream.receive(until_s)) is not None:
-            line = message.text.partition("\n")[0][:_LONGEST_WORDS]
-            if line.startswith(answers):
+        pong = stream.ping()
+        is_alive = False
+        while (now_s := time.monotonic()) < until_s:
+            message = stream.receive(min(until_s, now_s + _LOOK_S))
+            line = message.text.partition("\n")[0][:_LONGEST_WORDS] if message else ""
+            if message and line.startswith(answers):
                 return OrderReply(line, is_alive=True)
-            if not (message.is_pong or line.startswith(_SAID_TO_ALL)):
+            if message and not line.startswith(_SAID_TO_ALL):
                 other = other or line[:_LONGEST_OTHER]
-            is_alive = is_alive or message.is_pong
-            if is_alive and not late:
-                # Words are answered in their order: what comes now is about something else.
-                until_s = min(until_s, time.monotonic() + _CLOSING_S)
+            if pong.is_set() and not is_alive:
+                is_alive = True
+                if not late:
+                    # Words are answered in their order: what comes now is about something else.
+                    until_s = min(until_s, time.monotonic() + _CLOSING_S)
     return OrderReply(None, is_alive, other)
 
 

@@ -17,9 +17,8 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 from . import session as library
-from .surface import Completed, integer, number, say, text, type_number
+from .surface import Completed, integer, lacking, number, say, text, type_number
 
-_POINT: Final = struct.Struct("fffif")
 _MEMORY: Final = [0.4375, -0.0625, 1.2890625, 0.734375]
 """What stands in the memory that Webots reads before an InertialUnit's first value: any numbers."""
 _UNKNOWN: Final = [nan, nan, nan]
@@ -101,15 +100,6 @@ class Sensor(Device):
         with self._session.lock:
             return self._session.periods_ms.get(self._tag, 0)
 
-    @property
-    def sampling_period(self) -> int:
-        """The sampling period in milliseconds, 0 if disabled."""
-        return self.getSamplingPeriod()
-
-    @sampling_period.setter
-    def sampling_period(self, p: int | None) -> None:
-        self.enable(0 if p is None else p)
-
     def _value(self, default: Any, what: str = "get_value") -> Any:
         if not self.getSamplingPeriod():
             use = f"Please use: wb_{self._c_name}_enable()."
@@ -185,31 +175,17 @@ class DistanceSensor(_NumberSensor, _LookupTable):
         return _place(self._fields["type"], _DISTANCE_SENSOR_TYPES)
 
 
-class TouchSensor(_LookupTable):
-    """Whether, or how hard, the robot runs into something where the sensor is."""
+class TouchSensor(_NumberSensor, _LookupTable):
+    """Whether the robot runs into something where the sensor is."""
 
     _c_name = "touch_sensor"
     BUMPER, FORCE, FORCE3D = range(3)
 
     def getValue(self) -> float:
-        """Of a bumper 1 or 0, of a force sensor newtons, translated by the lookup table."""
-        if self.getType() == self.FORCE3D:
-            self._complain(
-                "get_value",
-                " can only be used with the 'bumper' or 'force' types of TouchSensor. "
-                "Please use wb_touch_sensor_get_values().",
-            )
-            return nan
-        return self._value(nan)
-
-    def getValues(self) -> Any:
-        """Newtons along x, y and z of a force-3d sensor: a `ctypes` pointer, so take `[:3]`."""
-        values = _UNKNOWN
-        if self.getType() == self.FORCE3D:
-            values = self._value(_UNKNOWN, "get_values")
-        else:
-            self._complain("get_values", " can only be used with a device of type 'force-3d'.")
-        return ctypes.cast((ctypes.c_double * 3)(*values), ctypes.POINTER(ctypes.c_double))
+        """1 or 0; NaN before the first one."""
+        if self.getType() != self.BUMPER:
+            raise lacking(f"TouchSensor of type {self._fields['type']!r}")
+        return super().getValue()
 
     def getType(self) -> int:
         """`TouchSensor.BUMPER`, `FORCE` or `FORCE3D`."""
@@ -225,14 +201,6 @@ class PositionSensor(_NumberSensor):
     def getType(self) -> int:
         """`PositionSensor.ROTATIONAL`."""
         return self.ROTATIONAL
-
-    def getMotor(self) -> Device | None:
-        """None and a line on stderr: broken in Webots' Python package."""
-        say("Error: wb_brake_get_motor(): invalid device tag.")
-        return None
-
-    def getBrake(self) -> None:
-        """None: the stand-in has no brakes."""
 
 
 class GPS(Sensor):
@@ -368,9 +336,6 @@ class Motor(Device):
         """`Motor.ROTATIONAL` or `Motor.LINEAR`."""
         return int(self._description["node_type"] == "LinearMotor")
 
-    def getBrake(self) -> None:
-        """None: the stand-in has no brakes."""
-
     def getPositionSensor(self) -> PositionSensor | None:
         """The sensor of the same joint; None if there is none."""
         for other in self._session.robot["devices"]:
@@ -388,10 +353,7 @@ class Camera(Sensor):
     getWidth = _field("width")
     getHeight = _field("height")
     getNear = _field("near")
-
-    def __init__(self, name: int | str, sampling_period: int | None = None) -> None:
-        super().__init__(name, sampling_period)
-        self._fov: float = self._fields.get("fieldOfView", 0.0)
+    getFov = _field("fieldOfView")
 
     def getImage(self) -> bytes:
         """The last picture, rows from the top left.
@@ -431,34 +393,9 @@ class Camera(Sensor):
         start = 4 * (y * width + x)
         return sum(image[start : start + 3]) / 3.0
 
-    def getFov(self) -> float:
-        """Horizontal field of view in radians."""
-        return self._fov
-
-    def setFov(self, f: float) -> None:
-        """Zoom: set the horizontal field of view, in radians; needs a Zoom node."""
-        low, high = self.getMinFov(), self.getMaxFov()
-        if not low <= number(f) <= high:
-            self._complain("set_fov", f" out of zoom range [{low:f}, {high:f}].")
-            return
-        self._fov = number(f)
-        self._session.change(self._tag, "fov", self._fov)
-
-    def getMinFov(self) -> float:
-        """The narrowest field of view, radians: that of the Zoom node, or the only one."""
-        return self._zoom("minFieldOfView")
-
-    def getMaxFov(self) -> float:
-        """The widest field of view, radians: that of the Zoom node, or the only one."""
-        return self._zoom("maxFieldOfView")
-
-    def _zoom(self, field: str) -> float:
-        zoom: dict[str, float] = self._fields["zoom"] or {}
-        return zoom[field] if field in zoom else self._fields["fieldOfView"]
-
     def getFocalLength(self) -> float:
         """The focal length in pixels."""
-        return self.getWidth() / 2.0 / tan(self._fov / 2.0)
+        return self.getWidth() / 2.0 / tan(self.getFov() / 2.0)
 
     def hasRecognition(self) -> bool:
         """False: cameras of the stand-in recognize nothing."""
@@ -482,25 +419,10 @@ class Camera(Sensor):
         return 0
 
 
-class LidarPoint:
-    """A point of the point cloud: x, y and z in metres in the frame of the lidar."""
-
-    def __init__(self, data: bytes, offset: int) -> None:
-        self.x: float
-        self.y: float
-        self.z: float
-        self.layer: int
-        self.time: float
-        self.x, self.y, self.z, self.layer, self.time = _POINT.unpack_from(
-            data, offset * _POINT.size
-        )
-
-
 class Lidar(Sensor):
     """Measures a fan of distances from left to right, layer after layer; all layers are level."""
 
     _c_name = "lidar"
-    _with_points = False
 
     getHorizontalResolution = _field("horizontalResolution")
     getNumberOfLayers = _field("numberOfLayers")
@@ -538,58 +460,6 @@ class Lidar(Sensor):
     def getLayerRangeImage(self, layer: int) -> list[float]:
         """Layer 0 whatever is asked for, as in Webots."""
         return self.getRangeImage()[: self.getHorizontalResolution()]
-
-    def getRangeImageArray(self) -> list[list[float]]:
-        """As many lists as there are layers, each of them layer 0, as in Webots."""
-        return [self.getLayerRangeImage(i) for i in range(self.getNumberOfLayers())]
-
-    def enablePointCloud(self) -> None:
-        """Let `getPointCloud` work."""
-        self._with_points = True
-
-    def disablePointCloud(self) -> None:
-        """Let `getPointCloud` work no longer."""
-        self._with_points = False
-
-    def isPointCloudEnabled(self) -> bool:
-        """Whether `getPointCloud` works."""
-        return self._with_points
-
-    def getNumberOfPoints(self) -> int:
-        """Points in the point cloud; 0 and a line on stderr unless it is enabled."""
-        if self._has_points("get_number_of_points", "!"):
-            return self.getHorizontalResolution() * self.getNumberOfLayers()
-        return 0
-
-    def getPointCloud(self) -> list[LidarPoint]:
-        """The scan as points, layer after layer; empty and lines on stderr unless enabled."""
-        count = self.getNumberOfPoints()
-        if not self._has_points("get_point_cloud", "."):
-            return []
-        data = self._packed_points()
-        return [LidarPoint(data, offset) for offset in range(count)]
-
-    def getLayerPointCloud(self, layer: int) -> list[LidarPoint]:
-        """The points of one layer; empty and lines on stderr unless enabled."""
-        size = self.getHorizontalResolution()
-        return self.getPointCloud()[layer * size : (layer + 1) * size]
-
-    def _has_points(self, what: str, mark: str) -> bool:
-        if not self._with_points:
-            use = "Please use: wb_lidar_enable_point_cloud()."
-            self._complain(what, f" called for a lidar with point cloud disabled{mark} {use}")
-        return self._with_points
-
-    def _packed_points(self) -> bytes:
-        resolution, fov = self.getHorizontalResolution(), self.getFov()
-        step, time_s = fov / max(resolution - 1, 1), self._session.time_s
-        points: list[bytes] = []
-        for i, distance in enumerate(self.getRangeImage()):
-            layer, column = divmod(i, resolution)
-            angle = fov / 2.0 - column * step
-            x, y = distance * cos(angle), distance * sin(angle)
-            points.append(_POINT.pack(x, y, 0.0, layer, time_s))
-        return b"".join(points)
 
 
 class Emitter(Device):
@@ -673,20 +543,6 @@ class Receiver(Sensor):
     def getString(self) -> str:
         """The packet as text."""
         return self.getBytes().decode()
-
-    def getData(self) -> str:
-        """The packet as text; deprecated."""
-        print(  # noqa: T201 - as Webots does
-            "DEPRECATION: Receiver.getData is deprecated, please use Receiver.getString instead.",
-            file=sys.stderr,
-        )
-        return self.getString()
-
-    @property
-    def data(self) -> Any:
-        """The packet as a raw `ctypes` pointer."""
-        packet = self.getBytes()
-        return ctypes.cast(ctypes.create_string_buffer(packet), ctypes.POINTER(ctypes.c_ubyte))
 
     def getDataSize(self) -> int:
         """Bytes of the packet; -1 without one."""

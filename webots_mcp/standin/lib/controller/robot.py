@@ -51,15 +51,6 @@ class Keyboard(Completed):
         """The sampling period in milliseconds, 0 if disabled."""
         return self._period_ms
 
-    @property
-    def sampling_period(self) -> int:
-        """The sampling period in milliseconds, 0 if disabled."""
-        return self.getSamplingPeriod()
-
-    @sampling_period.setter
-    def sampling_period(self, p: int | None) -> None:
-        self.enable(p or 0)
-
     def getKey(self) -> int:
         """-1: no key is pressed."""
         if not self._period_ms:
@@ -271,14 +262,6 @@ class Supervisor(Robot):
         """The node with this number; None if there is none."""
         return self._node(self._session.ask("node_get_from_id", integer(id)))
 
-    def getFromDevice(self, tag: int) -> Node | None:
-        """The node of a device: wants the number `device._tag`, not the device."""
-        return self._node(self._session.ask("node_get_from_device", integer(tag)))
-
-    def getSelected(self) -> Node | None:
-        """None: there is no window to select a node in."""
-        return None
-
     def _node(self, found: Any) -> Node | None:
         return None if found is None else node_of(self._session, found)
 
@@ -295,10 +278,6 @@ class Supervisor(Robot):
     def simulationReset(self) -> None:
         """Reset the world at the end of the next physics step; controllers go on."""
         self._session.ask("simulation_reset")
-
-    def simulationResetPhysics(self) -> None:
-        """Stop everything that moves."""
-        self._session.ask("simulation_reset_physics")
 
     def simulationQuit(self, status: int) -> None:
         """End the simulation with an exit status."""

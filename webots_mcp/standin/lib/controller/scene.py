@@ -363,30 +363,11 @@ class Node(Completed):
 
     def getBaseNodeField(self, fieldName: str) -> Field | None:
         """A field of the node that a PROTO node is made of, to be read only."""
-        if not self._is_proto("getBaseNodeField"):
+        if not self.isProto():
+            say("Error: getBaseNodeField() called with a node that is no PROTO node.")
             return None
         found = self._session.ask("node_get_base_node_field", self._id, text(fieldName))
         return None if found is None else inner_field_of(self._session, self._id, fieldName, found)
-
-    def getNumberOfBaseNodeFields(self) -> int:
-        """How many fields the node has that a PROTO node is made of."""
-        return len(self._base_node_field_names("getNumberOfBaseNodeFields"))
-
-    def getBaseNodeFieldByIndex(self, index: int) -> Field | None:
-        """A field of what a PROTO node is made of, by its place; None beyond the last."""
-        names = self._base_node_field_names("getBaseNodeFieldByIndex")
-        has_it = 0 <= integer(index, 2) < len(names)
-        return self.getBaseNodeField(names[index]) if has_it else None
-
-    def _base_node_field_names(self, asked: str) -> list[str]:
-        if not self._is_proto(asked):
-            return []
-        return self._session.ask("node_get_base_node_field_names", self._id, default=[])
-
-    def _is_proto(self, asked: str) -> bool:
-        if not self.isProto():
-            say(f"Error: {asked}() called with a node that is no PROTO node.")
-        return self.isProto()
 
     # Places --------------------------------------------------------------------------------------
 
@@ -416,7 +397,10 @@ class Node(Completed):
         return [*self._session.ask("node_get_velocity", self._id, default=[nan] * 6)]
 
     def setVelocity(self, velocity: list[float]) -> None:
-        """Set linear and angular velocity; on the plane, so x, y and the turn about z count."""
+        """Let a body slide: linear and angular velocity, of which x, y and the turn about z count.
+
+        A robot keeps to its wheels.
+        """
         self._session.ask("node_set_velocity", self._id, numbers(velocity, 6))
 
     def enablePoseTracking(self, samplingPeriod: int, fromNode: Node | None = None) -> None:
@@ -427,17 +411,6 @@ class Node(Completed):
     def disablePoseTracking(self, fromNode: Node | None = None) -> None:
         """Have it sent no more."""
         self._session.track((self._id, fromNode._id if fromNode else None), 0)
-
-    def setJointPosition(self, position: float, index: int = 1) -> None:
-        """Turn a HingeJoint to an angle in radians at once."""
-        if integer(index, position=3) == 1:
-            self._session.ask("node_set_joint_position", self._id, number(position))
-        else:
-            say(f"Error: wb_supervisor_node_set_joint_position(): a hinge has no axis {index}.")
-
-    def restartController(self) -> None:
-        """End the controller of this Robot node and start it again."""
-        self._session.ask("node_restart_controller", self._id)
 
     def resetPhysics(self) -> None:
         """Take the node's speed away."""

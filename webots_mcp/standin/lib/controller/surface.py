@@ -17,6 +17,7 @@ _ACCESSORS: Final = {
     "target_position": ("getTargetPosition", "setPosition"),
     "target_velocity": ("getVelocity", "setVelocity"),
     "target_acceleration": ("getAcceleration", "setAcceleration"),
+    "sampling_period": ("getSamplingPeriod", "enable"),
     "simulation_mode": ("simulationGetMode", "simulationSetMode"),
 }
 """Properties that are not named like their methods."""

@@ -38,7 +38,6 @@ from webots_mcp.plugins.pool.pool_contents import (
     Choice,
     meant,
     open_pool,
-    open_target,
     pooled_runs,
 )
 from webots_mcp.plugins.pool.pool_interface import Batch, batches, table
@@ -77,7 +76,7 @@ def measure_listing(bench: Bench) -> Iterable[Line]:
     with short_runs(bench.folder / "robot") as recorded:
         recording = Recording(recorded.folder / DATABASE_NAME, recorded.folder, read_only=True)
         url = str(bench.place("listed"))
-        ship(Order(recording, partial(open_target, url)), Report())
+        ship(Order(recording, partial(open_pool, url, ships=True)), Report())
     (shipped,) = Path(url).glob("recording=*")
     for _ in range(recordings - 1):
         other = shipped.with_name(f"recording={new_uuid()}")
@@ -118,7 +117,7 @@ def measure_room(bench: Bench) -> Iterable[Line]:
             bench.say(what)
             url = make()
             recording = Recording(database, database.parent, read_only=True)
-            order = Order(recording, partial(open_target, url), full=full)
+            order = Order(recording, partial(open_pool, url, ships=True), full=full)
             shipped_s = processor_s(lambda order=order: ship(order, Report()))
             here = bench.place(what)
             with closing(connect_recording(here / DATABASE_NAME, "writer", create=True)) as db:
@@ -141,7 +140,6 @@ def _measure(bench: Bench, server: Server) -> Iterable[Line]:
     pool = server.new_database()
     url = server.url(pool)
     prepare(url, "the pool")
-    server.execute(pool, "SELECT make_partition('state', 2023, 11)")
     rows = bench.count(20_000, 50)
     with connect(url, "the pool") as connection:
         shipped = list(batches(table("state"), _states(rows)))

@@ -6,20 +6,19 @@ import sqlite3
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.pool.lab import Lab, short_runs
-from tests.pool.sqlite_target import SQLitePool, SQLiteTarget, pooled
-from tests.pool.sqlite_target import recorded as recorded_rows
+from tests.pool.rows import pooled, recorded, uuid_of
 from tests.postgres import NoServerError, Server, running_server
 from tests.recordings.runs import Recorded
 from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME, new_uuid
-from webots_mcp.plugins.pool.pool_contents import open_pool, open_target
+from webots_mcp.plugins.pool.pool_contents import open_pool
 from webots_mcp.plugins.pool.shipping import Order, Report, ship
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.recording import Recording
@@ -30,9 +29,8 @@ class Shipped:
 
     def __init__(self, folder: Path, connection: sqlite3.Connection, pool: Path) -> None:
         self.folder, self.pool, self.connection = folder, pool, connection
-        self.order = Order(
-            Recording(folder / DATABASE_NAME, folder, read_only=True), lambda: SQLiteTarget(pool)
-        )
+        recording = Recording(folder / DATABASE_NAME, folder, read_only=True)
+        self.order = Order(recording, partial(open_pool, str(pool), ships=True))
 
     @cached_property
     def recorded(self) -> Recorded:
@@ -41,7 +39,7 @@ class Shipped:
 
     @property
     def uuid(self) -> str:
-        return self.connection.execute("SELECT uuid FROM recording").fetchone()[0]
+        return uuid_of(self.connection)
 
     def add_run(self, rows: int = 60, end: str | None = "reset") -> int:
         """A run with a UUID, in chunks."""
@@ -71,7 +69,7 @@ class Shipped:
         return pooled(self.pool, self.uuid)
 
     def rows(self) -> dict[str, Any]:
-        return recorded_rows(self.connection)
+        return recorded(self.connection)
 
 
 @pytest.fixture
@@ -79,7 +77,7 @@ def shipped(tmp_path: Path) -> Iterator[Shipped]:
     folder = tmp_path / "robot"
     with closing(connect(folder / DATABASE_NAME, "writer", create=True)) as connection:
         create_schema(connection)
-        yield Shipped(folder, connection, tmp_path / "pool.db")
+        yield Shipped(folder, connection, tmp_path / "pool")
 
 
 @pytest.fixture(scope="session")
@@ -95,16 +93,11 @@ def postgres() -> Iterator[Server]:
 
 @pytest.fixture
 def lab(tmp_path: Path, request: pytest.FixtureRequest) -> Lab:
-    """With a pool in one file, or of the kind that the test asks for."""
-    kind = getattr(request, "param", "sqlite")
-    file = tmp_path / "pool"
-    if kind == "sqlite":
-        return Lab(tmp_path, lambda: SQLiteTarget(file), lambda: SQLitePool(file))
-    url = str(file)
-    if kind == "postgres":
-        server: Server = request.getfixturevalue("postgres")
-        url = server.url(server.new_database())
-    return Lab(tmp_path, lambda: open_target(url), lambda: open_pool(url))
+    """With a pool of files, or of the kind that the test asks for."""
+    if getattr(request, "param", "parquet") == "parquet":
+        return Lab(tmp_path, str(tmp_path / "pool"))
+    server: Server = request.getfixturevalue("postgres")
+    return Lab(tmp_path, server.url(server.new_database()))
 
 
 @pytest.fixture

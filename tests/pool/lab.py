@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,7 @@ from tests.recordings.runs import Recorded
 from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.plugins.pool.fetching import Fetched, fetch
-from webots_mcp.plugins.pool.pool_contents import Choice, meant
-from webots_mcp.plugins.pool.pool_interface import Pool, Target
+from webots_mcp.plugins.pool.pool_contents import Choice, meant, open_pool
 from webots_mcp.plugins.pool.shipping import Order, Report, ship
 from webots_mcp.store.parameters import Result, create_trial_set, finish_trial, trials_of
 from webots_mcp.store.recording import Recording
@@ -27,20 +27,18 @@ IN_EACH_POOL = pytest.mark.parametrize("lab", ["parquet", POSTGRES], indirect=Tr
 class Lab:
     """A pool, and a folder of a recording to fetch into."""
 
-    def __init__(
-        self, folder: Path, target: Callable[[], Target], pool: Callable[[], Pool]
-    ) -> None:
-        self._target, self.pool, self.here = target, pool, folder / "here"
+    def __init__(self, folder: Path, url: str) -> None:
+        self.url, self.here = url, folder / "here"
         self.here.mkdir()
         with closing(connect(self.here / DATABASE_NAME, "writer", create=True)) as connection:
             create_schema(connection)
 
     def ship(self, database: Path, **options: Any) -> None:
         recording = Recording(database, database.parent, read_only=True)
-        ship(Order(recording, self._target, **options), Report())
+        ship(Order(recording, partial(open_pool, self.url, ships=True), **options), Report())
 
     def fetch(self, **choice: Any) -> Fetched:
-        with self.opened() as connection, self.pool() as pool:
+        with self.opened() as connection, open_pool(self.url) as pool:
             return fetch(pool, connection, self.here, meant(pool, Choice(**choice)))
 
     def opened(self) -> closing[sqlite3.Connection]:

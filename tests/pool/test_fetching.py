@@ -25,7 +25,6 @@ from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plugins.pool.pool_contents import open_pool, open_target, pooled_runs
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.parameters import find_trial_set, trials_of
@@ -143,7 +142,7 @@ def test_each_value_of_a_state_comes_back(lab: Lab, runs: Recorded) -> None:
     with lab.opened() as here:
         (fetched,) = here.execute(query, (run,)).fetchone()
     (recorded,) = runs.connection.execute(query, (run_id,)).fetchone()
-    assert fetched.replace("-0.0", "0.0") == recorded.replace("-0.0", "0.0")
+    assert fetched == recorded
 
 
 @IN_EACH_POOL
@@ -197,7 +196,6 @@ def test_of_a_run_whose_first_rows_were_purged_before_they_were_shipped_the_othe
         assert everything(here, lab.here, found.runs[uuid]) == everything(there, rounds.parent, 1)
 
 
-@pytest.mark.parametrize("lab", ["parquet"], indirect=True)
 def test_of_a_run_with_damaged_times_the_rest_is_fetched(lab: Lab, rounds: Path) -> None:
     """It was refused, and free space and permissions were blamed."""
     with closing(connect(rounds, "writer")) as there:
@@ -332,7 +330,7 @@ def test_pictures_that_were_not_shipped_are_rows_without_a_file(lab: Lab, runs: 
 
 
 def test_what_goes_on_or_is_not_wholly_shipped_is_fetched_when_it_is(
-    lab: Lab, runs: Recorded, tmp_path: Path
+    lab: Lab, runs: Recorded
 ) -> None:
     database = runs.folder / DATABASE_NAME
     late = runs.add_run(5, end=None)
@@ -350,36 +348,20 @@ def test_what_goes_on_or_is_not_wholly_shipped_is_fetched_when_it_is(
         "UPDATE run SET ended_wall_time_s = last_wall_time_s, end_reason = 'finished'"
     )
     lab.ship(database, full=True)
-    with closing(sqlite3.connect(tmp_path / "pool")) as pool, pool:
-        told = "FROM progress WHERE name = 'run.whole:0'"
-        pool.execute(f"CREATE TABLE later AS SELECT * {told}")
-        pool.execute(f"DELETE {told}")
-    found = lab.fetch(run_uuid=uuid)
-    assert (found.runs, found.arriving) == ({}, [uuid])
+    (progress,) = Path(lab.url).glob("recording=*/_progress")
+    whole = json.loads(progress.read_text())
+    numbers = {name: n for name, n in whole["numbers"].items() if not name.startswith("run.whole")}
+    (rows,) = (part["rows"] for name, part in whole["parts"].items() if name == "state")
+    fewer = {folder: count - 3 for folder, count in rows.items()}
+    parts = whole["parts"] | {"state": whole["parts"]["state"] | {"rows": fewer}}
+    for not_yet in ({"numbers": numbers}, {"parts": parts}):
+        progress.write_text(json.dumps(whole | not_yet))
+        found = lab.fetch(run_uuid=uuid)
+        assert (found.runs, found.arriving) == ({}, [uuid])
+        assert lab.everything() == before
 
-    with closing(sqlite3.connect(tmp_path / "pool")) as pool, pool:
-        pool.execute("INSERT INTO progress SELECT * FROM later")
-        pool.execute("CREATE TABLE state_later AS SELECT * FROM state WHERE run_id = ?", (late,))
-        pool.execute("DELETE FROM state WHERE run_id = ? AND sim_time_s > 1", (late,))
-    found = lab.fetch(run_uuid=uuid)
-    assert (found.runs, found.arriving) == ({}, [uuid])
-    assert lab.everything() == before
-
-    with closing(sqlite3.connect(tmp_path / "pool")) as pool, pool:
-        pool.execute("INSERT OR IGNORE INTO state SELECT * FROM state_later")
+    progress.write_text(json.dumps(whole))
     assert list(lab.fetch(run_uuid=uuid).runs) == [uuid]
-
-
-@IN_EACH_POOL
-def test_a_run_without_a_uuid_is_listed_and_not_taken(lab: Lab, runs: Recorded) -> None:
-    runs.connection.execute("UPDATE run SET uuid = NULL WHERE id = 1")
-    lab.ship(runs.folder / DATABASE_NAME, full=True)
-    with lab.pool() as pool:
-        assert [run.uuid for run in pooled_runs(pool) if run.run_id == 1] == [""]
-
-    found = lab.fetch(robot="rover")
-
-    assert (found.nameless, list(found.runs)) == (1, [uuid_of(runs.folder / DATABASE_NAME, 2)])
 
 
 def test_a_run_that_lacks_is_answered_with_the_nearest(lab: Lab, runs: Recorded) -> None:
@@ -399,17 +381,15 @@ def test_a_run_that_lacks_is_answered_with_the_nearest(lab: Lab, runs: Recorded)
 
 
 def test_a_fetch_that_is_killed_leaves_whole_runs_and_is_gone_on_with(
-    tmp_path: Path, runs: Recorded
+    lab: Lab, runs: Recorded
 ) -> None:
     for _ in range(60):
         run_id = runs.add_run(20)
         for table in ("session", "run"):
             update = f"UPDATE {table} SET uuid = ? WHERE id = ?"
             runs.connection.execute(update, (new_uuid(), run_id))
-    url = str(tmp_path / "pool")
-    lab = Lab(tmp_path, lambda: open_target(url), lambda: open_pool(url))
     lab.ship(runs.folder / DATABASE_NAME, full=True)
-    words = ("fetch", "--from", url, "--robot", "rover", "--data-dir", str(lab.here))
+    words = ("fetch", "--from", lab.url, "--robot", "rover", "--data-dir", str(lab.here))
     line = [sys.executable, "-m", "webots_mcp", *words]
     with subprocess.Popen(line) as fetching, lab.opened() as here:
         while not count(here, "run") and fetching.poll() is None:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import functools
-import json
 import multiprocessing
 import random
-from collections.abc import Generator, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext
@@ -16,13 +15,11 @@ from typing import Any
 
 import pytest
 
-from tests.pool.chunk_values import chunk_values
-from tests.pool.sqlite_target import recorded
+from tests.pool.rows import BeforeWrite, pooled, recorded
 from tests.postgres import Server
 from tests.recordings.bridge import STEP_MS, Rover
 from webots_mcp.connection import connect
-from webots_mcp.plugins.pool.pool_contents import open_pool, open_target
-from webots_mcp.plugins.pool.pool_interface import Row, Table, tables
+from webots_mcp.plugins.pool.pool_contents import open_pool
 from webots_mcp.plugins.pool.shipping import Order, Report, follow, ship
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.recording import Recording
@@ -32,40 +29,17 @@ pytestmark = pytest.mark.slow
 KILLS = {"postgresql": 20, "parquet": 8}
 
 
-class Telling:
-    """A target, or its shipment, that tells before each transaction."""
-
-    def __init__(self, inner: Any, writing: Connection) -> None:
-        self._inner = inner
-        self._writing = writing
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._inner, name)
-
-    def __enter__(self) -> Telling:
-        self._inner.__enter__()
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._inner.__exit__(*exception)
-
-    @contextmanager
-    def shipment(self, uuid: str) -> Generator[Any]:
-        with self._inner.shipment(uuid) as shipment:
-            yield Telling(shipment, self._writing)
-
-    def write(self, *arguments: Any) -> Any:
-        self._writing.send("about to write")
-        return self._inner.write(*arguments)
-
-
 def order_of(folder: Path, url: str) -> Order:
     recording = Recording(folder / "webots.db", folder, read_only=True)
-    return Order(recording, functools.partial(open_target, url), full=True, pictures=True)
+    return Order(recording, functools.partial(open_pool, url, ships=True), full=True, pictures=True)
 
 
 def ship_on_and_on(folder: Path, url: str, writing: Connection) -> None:
-    order = replace(order_of(folder, url), open_target=lambda: Telling(open_target(url), writing))
+    def tell() -> None:
+        writing.send("about to write")
+
+    opened: Callable[[], Any] = lambda: BeforeWrite(open_pool(url, ships=True), tell)  # noqa: E731
+    order = replace(order_of(folder, url), open_pool=opened)
     follow(order, Report(), lambda _: None, 0.01)
 
 
@@ -129,23 +103,7 @@ def test_of_shippers_that_are_killed_while_a_bridge_records_no_row_is_lost_or_tw
         last = ship_again(folder, url)
         (uuid,) = connection.execute("SELECT uuid FROM recording").fetchone()
         rows = recorded(connection)
-    with open_pool(url) as pool:
-        for table in tables():
-            found = [row for batch in pool.rows(uuid, table, {}) for row in batch.rows]
-            assert parsed(table, found) == parsed(table, rows[table.name])
+    assert pooled(url, uuid) == rows
     assert len(rows["state"]) > 80
     assert last.rows["state"] < len(rows["state"]) / 2  # those that were killed did something
     assert ship_again(folder, url).rows.total() == 0
-
-
-def parsed(table: Table, rows: Sequence[Row]) -> list[tuple[Any, ...]]:
-    """With JSON as what it means, and chunks as what they hold: each pool has its own notation."""
-    if table.name == "chunk":
-        return sorted(chunk_values(rows).items())
-    return [
-        tuple(
-            json.loads(str(value)) if name in table.json_columns and value else value
-            for name, value in zip(table.columns, row, strict=True)
-        )
-        for row in sorted(rows, key=lambda row: f"{row[0]:>20}")
-    ]

@@ -15,7 +15,6 @@ from webots_mcp.cli import main
 from webots_mcp.contract import DATABASE_NAME
 
 Ask = Callable[..., Any]
-files = pytest.mark.parametrize("lab", ["parquet"], indirect=True)
 
 
 @pytest.fixture
@@ -24,7 +23,7 @@ def ask(lab: Lab, runs: Recorded, capsys: pytest.CaptureFixture[str]) -> Ask:
     lab.ship(runs.folder / DATABASE_NAME)
 
     def run(*words: str, code: int = 0) -> str:
-        url = [lab.pool().address if word == "POOL" else word for word in words]
+        url = [lab.url if word == "POOL" else word for word in words]
         assert main(url) == code
         said = capsys.readouterr()
         return said.err if code == 2 else said.out
@@ -32,7 +31,6 @@ def ask(lab: Lab, runs: Recorded, capsys: pytest.CaptureFixture[str]) -> Ask:
     return run
 
 
-@files
 def test_robots_runs_trial_sets_and_sizes_are_listed(ask: Ask) -> None:
     robots = [line.split()[:4] for line in ask("pool", "POOL").splitlines()]
     assert robots[0] == ["robot", "recordings", "runs", "rows"]
@@ -44,7 +42,6 @@ def test_robots_runs_trial_sets_and_sizes_are_listed(ask: Ask) -> None:
     assert "event" in ask("pool", "POOL", "sizes")
 
 
-@files
 def test_programs_read_json(ask: Ask, runs: Recorded) -> None:
     found = json.loads(ask("pool", "POOL", "runs", "--label", "wall 2", "--json"))
     (run,) = found["runs"]
@@ -54,7 +51,6 @@ def test_programs_read_json(ask: Ask, runs: Recorded) -> None:
     assert json.loads(ask("pool", "POOL", "sizes", "--json"))["tables"]
 
 
-@files
 def test_a_select_is_answered_with_its_first_rows(ask: Ask) -> None:
     query = ("--sql", "SELECT label, NULL AS empty FROM run ORDER BY label")
     said = ask("pool", "POOL", *query, "-n", "2").splitlines()
@@ -89,20 +85,18 @@ def test_an_answer_has_the_limits_of_sql_and_is_json_for_strict_readers(ask: Ask
     assert "name at most 100" in ask("pool", "POOL", "--sql", f"SELECT {columns}", code=2)
 
 
-@files
 def test_what_came_is_said_and_what_is_missing_of_it(ask: Ask, lab: Lab) -> None:
     words = ("fetch", "--from", "POOL", "--data-dir", str(lab.here), "--robot", "rover")
     assert ask(*words).splitlines() == [
-        f"fetched from {lab.pool().address}: run 1 to 2",
+        f"fetched from {lab.url}: run 1 to 2",
         "of run 1 to 2 only chunks were shipped, no rows ('webots-mcp ship --full' does)",
     ]
     assert ask(*words).splitlines()[1] == "here already: run 1 to 2"
     told = json.loads(ask(*words, "--json"))
     assert (told["fetched_run_ids"], told["known_run_ids"]) == ([], [1, 2])
-    assert told["not_taken"] == {"going_on": [], "not_wholly_shipped": [], "without_uuid": 0}
+    assert told["not_taken"] == {"going_on": [], "not_wholly_shipped": []}
 
 
-@files
 def test_what_is_not_there_is_refused_with_what_is_and_makes_no_recording(
     ask: Ask, tmp_path: Path
 ) -> None:
@@ -112,7 +106,6 @@ def test_what_is_not_there_is_refused_with_what_is_and_makes_no_recording(
     assert not (tmp_path / "new").exists()
 
 
-@files
 def test_a_select_that_is_no_text_is_refused_in_one_line(ask: Ask) -> None:
     said = ask("pool", "POOL", "--sql", "SELECT '\udcff'", code=2)
     assert "cannot be written as utf-8" in said

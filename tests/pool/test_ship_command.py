@@ -8,7 +8,7 @@ import pytest
 
 from tests.pool.conftest import Shipped
 from tests.pool.lab import POSTGRES
-from tests.pool.postgres.shipped import assert_equal
+from tests.pool.rows import pooled
 from tests.postgres import Server
 from webots_mcp.cli import main
 
@@ -61,7 +61,7 @@ def test_a_recording_is_shipped_to_postgresql_as_it_is(
     line = ["ship", "--data-dir", str(shipped.folder), "--to", postgres.url(pool), "--full"]
     assert main(line) == 0
     assert "state 1200" in capsys.readouterr().out
-    assert_equal(postgres, pool, shipped.connection)
+    assert pooled(postgres.url(pool), shipped.uuid) == shipped.rows()
     assert main(line) == 0
     assert "has everything already" in capsys.readouterr().out
 

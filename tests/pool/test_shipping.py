@@ -6,13 +6,16 @@ import shutil
 import subprocess
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests import unprivileged
 from tests.pool.conftest import Shipped
-from tests.pool.sqlite_target import SQLitePool, SQLiteTarget, pooled
+from tests.pool.parquet import bucket
+from tests.pool.rows import BeforeWrite, pooled, shipping
 from tests.recordings.runs import states
 from webots_mcp.connection import OLDER_SCHEMA, connect, create_schema
 from webots_mcp.contract import host_name, new_uuid
@@ -23,9 +26,9 @@ from webots_mcp.errors import (
     PoolUnavailableError,
     SchemaTooOldError,
 )
-from webots_mcp.plugins.pool.pool_contents import pooled_runs
+from webots_mcp.plugins.pool.pool_contents import open_pool, pooled_runs
 from webots_mcp.plugins.pool.pool_interface import BATCH_BYTES, is_whole, table
-from webots_mcp.plugins.pool.shipping import LAST_GROUP, Report, Source, follow
+from webots_mcp.plugins.pool.shipping import LAST_GROUP, Order, Report, Source, follow
 from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.merging import merge
 from webots_mcp.store.recording import Recording
@@ -50,7 +53,7 @@ def test_a_run_whose_process_was_killed_is_over_in_the_pool(shipped: Shipped) ->
         (gone.pid, host_name()),
     )
     shipped.ship()
-    with SQLitePool(shipped.pool) as pool:
+    with open_pool(str(shipped.pool)) as pool:
         (run,) = pooled_runs(pool)
         assert run.end_reason == "crashed"
         assert is_whole(pool.progress(shipped.uuid), run.run_id)
@@ -247,11 +250,7 @@ def test_a_recording_of_an_older_schema_is_not_shipped(shipped: Shipped) -> None
 
 def test_a_second_shipper_of_the_same_recording_is_refused(shipped: Shipped) -> None:
     shipped.add_run()
-    with (
-        SQLiteTarget(shipped.pool) as target,
-        target.shipment(shipped.uuid),
-        pytest.raises(PoolBusyError),
-    ):
+    with shipping(shipped.pool, shipped.uuid), pytest.raises(PoolBusyError):
         shipped.ship()
 
 
@@ -273,23 +272,24 @@ def test_the_folder_tells_retention_what_is_shipped(shipped: Shipped) -> None:
 
 def test_a_pool_that_is_away_is_tried_again_and_then_gets_everything(shipped: Shipped) -> None:
     shipped.add_run()
-    away = shipped.pool.parent / "away" / "pool.db"
+    url = bucket.empty()
+    away = partial(open_pool, url, ships=True)
     said: list[str] = []
 
     def hear(text: str) -> None:
         said.append(text)
-        away.parent.mkdir(exist_ok=True)
+        bucket.Bucket.puts_left = None
         if "is there again" in text:
             raise KeyboardInterrupt
 
-    order = replace(shipped.order, open_target=lambda: SQLiteTarget(away), full=True)
-    with pytest.raises(KeyboardInterrupt):
-        follow(order, Report(), hear, 0.0)
-    assert "does not answer; trying again in 1 s" in said[0]
-    with pytest.raises(PoolUnavailableError):
-        shipped.ship(open_target=lambda: SQLiteTarget(shipped.pool.parent / "gone" / "pool.db"))
-    shipped.ship(open_target=lambda: SQLiteTarget(away), full=True)
-    assert pooled(away, shipped.uuid) == shipped.rows()
+    with bucket.failing(0, ConnectionResetError("reset")):
+        with pytest.raises(PoolUnavailableError):
+            shipped.ship(open_pool=away)
+        with pytest.raises(KeyboardInterrupt):
+            follow(replace(shipped.order, open_pool=away, full=True), Report(), hear, 0.0)
+    assert "does not answer: reset; trying again in 1 s" in said[0]
+    shipped.ship(open_pool=away, full=True)
+    assert pooled(url, shipped.uuid) == shipped.rows()
 
 
 def ship_unwritable(shipped: Shipped, *, full: bool) -> str:
@@ -298,12 +298,13 @@ def ship_unwritable(shipped: Shipped, *, full: bool) -> str:
     shipped.connection.close()
     code = (
         "import functools, sys; from pathlib import Path; "
-        "from tests.pool.sqlite_target import SQLiteTarget; "
+        "from webots_mcp.plugins.pool.pool_contents import open_pool; "
         "from webots_mcp.plugins.pool.shipping import Report; "
         "from webots_mcp.plugins.pool.shipping import Order, ship; "
         "from webots_mcp.store.recording import Recording; folder, pool = map(Path, sys.argv[1:]); "
         "recording = Recording(folder / 'webots.db', folder, read_only=True); report = Report(); "
-        f"ship(Order(recording, functools.partial(SQLiteTarget, pool), full={full}), report); "
+        "opened = functools.partial(open_pool, str(pool), ships=True); "
+        f"ship(Order(recording, opened, full={full}), report); "
         "print(*report.notes)"
     )
     with unprivileged.unwritable(shipped.folder):
@@ -405,7 +406,7 @@ def test_while_a_pool_writes_the_log_of_the_database_can_be_cut_back(shipped: Sh
         answer = shipped.connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
         busy.append(answer[0])
 
-    shipped.ship(full=True, open_target=lambda: SQLiteTarget(shipped.pool, cut_back))
+    shipped.ship(full=True, open_pool=lambda: BeforeWrite(shipped.order.open_pool(), cut_back))
     assert busy == [0] * len(busy) != []
 
 
@@ -448,17 +449,13 @@ def test_a_recording_that_is_not_there_yet_is_waited_for_and_one_in_its_place_is
         with closing(connect(database, "writer")) as connection:
             connection.execute("UPDATE recording SET uuid = ?", (other,))
 
-    order = replace(
-        shipped.order,
-        recording=Recording(database, database.parent, read_only=True),
-        open_target=lambda: SQLiteTarget(shipped.pool, replace_it),
-        full=True,
-    )
+    recording = Recording(database, database.parent, read_only=True)
+    opened: Any = lambda: BeforeWrite(shipped.order.open_pool(), replace_it)  # noqa: E731
     with pytest.raises(KeyboardInterrupt):
-        follow(order, Report(), hear, 0.0)
+        follow(Order(recording, opened, full=True), Report(), hear, 0.0)
     assert said[0] == f"nothing is recorded at {database} now: it is shipped as soon as it is there"
     assert f"the recording {other} stands now where {shipped.uuid} was" in said[1]
-    assert pooled(shipped.pool, shipped.uuid) == shipped.rows()
+    assert shipped.pooled() == shipped.rows()
 
 
 def test_what_comes_while_a_shipper_follows_is_shipped_with_all_that_it_refers_to(
@@ -473,13 +470,12 @@ def test_what_comes_while_a_shipper_follows_is_shipped_with_all_that_it_refers_t
             raise KeyboardInterrupt
         shipped.add_run(4, end=None)
 
-    order = replace(
-        shipped.order, open_target=lambda: SQLiteTarget(shipped.pool, record_more), full=True
-    )
+    opened: Any = lambda: BeforeWrite(shipped.order.open_pool(), record_more)  # noqa: E731
     with pytest.raises(KeyboardInterrupt):
+        order = Order(shipped.order.recording, opened, full=True)
         follow(order, Report(), lambda _: None, 0.0)
-    pooled = shipped.pooled()
-    runs = {row[0] for row in pooled["run"]}
+    found = shipped.pooled()
+    runs = {row[0] for row in found["run"]}
     assert len(runs) == 47
-    assert {row[1] for row in pooled["state"]} == runs
-    assert {row[1] for row in pooled["run"]} <= {row[0] for row in pooled["session"]}
+    assert {row[1] for row in found["state"]} == runs
+    assert {row[1] for row in found["run"]} <= {row[0] for row in found["session"]}

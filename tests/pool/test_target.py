@@ -7,7 +7,7 @@ from collections import Counter
 import pytest
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plugins.pool.pool_contents import open_target
+from webots_mcp.plugins.pool.pool_contents import open_pool
 from webots_mcp.plugins.pool.pool_interface import Batch, fitted, redacted, table, tables
 
 SECRET = "hunter2"
@@ -28,7 +28,7 @@ SECRET = "hunter2"
 )
 def test_a_secret_in_a_url_is_refused_and_not_repeated(url: str) -> None:
     with pytest.raises(InvalidInputError, match="every process on this machine can see") as raised:
-        open_target(url)
+        open_pool(url)
     assert SECRET not in str(raised.value)
     assert SECRET not in redacted(url)
 
@@ -36,7 +36,7 @@ def test_a_secret_in_a_url_is_refused_and_not_repeated(url: str) -> None:
 @pytest.mark.parametrize("url", ["", " ", "postgresql:pool", "mailto:me", "s3:bucket"])
 def test_what_is_neither_a_url_nor_a_folder_is_refused_with_examples(url: str) -> None:
     with pytest.raises(InvalidInputError, match="postgresql://HOST/DATABASE"):
-        open_target(url)
+        open_pool(url)
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,7 @@ def test_what_is_neither_a_url_nor_a_folder_is_refused_with_examples(url: str) -
 )
 def test_a_connection_string_makes_no_folder_of_its_password(text: str) -> None:
     with pytest.raises(InvalidInputError, match="is no URL: write postgresql://") as raised:
-        open_target(text)
+        open_pool(text)
     assert SECRET not in str(raised.value)
 
 

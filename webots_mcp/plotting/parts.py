@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sqlite3
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple, TypeAlias
 
@@ -21,7 +21,7 @@ from webots_mcp.plotting.canvas import (
     wrapped,
 )
 from webots_mcp.plotting.intervals import Interval, Lane
-from webots_mcp.store.detection.events import Events, drawn_kinds, find_events
+from webots_mcp.store.detection.events import Events, Found, drawn_kinds, find_events
 from webots_mcp.store.detection.kinds import Event, EventOptions, Verdicts
 from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.parameters import differing, parameters_of
@@ -240,7 +240,11 @@ MOST_LANES: Final = 5  # in one picture
 
 
 def event_lanes(
-    connection: sqlite3.Connection, part: Part, names: Sequence[str], rows: int = MOST_LANES
+    connection: sqlite3.Connection,
+    part: Part,
+    names: Sequence[str],
+    rows: int = MOST_LANES,
+    known: Mapping[int, Found] | None = None,
 ) -> tuple[list[Lane], list[str]]:
     """One lane per kind of event, and notes: of the drawn signals, and of the robot as a whole.
 
@@ -249,15 +253,18 @@ def event_lanes(
         part: The run.
         names: The drawn signals.
         rows: How many lanes have room.
+        known: By run, what was searched before in all of it, and told by whoever did.
     """
     most = min(rows, MOST_LANES)
     drawn = tuple(kind.name for kind in drawn_kinds())
     options = EventOptions(kinds=drawn, signals=tuple(names))
-    found = find_events(connection, part.range, options, limit=MOST_EVENTS, around=(), group=False)
+    found = _found(connection, part, options, known or {})
     kinds = [kind for kind in drawn if any(event.kind == kind for event in found.events)]
     lanes = [_lane(kind, found, part) for kind in kinds[:most]]
-    notes = [note for note in found.notes if note not in part.notes]
-    notes += _not_looked_for(found.verdicts)
+    notes = list[str]()
+    if not known:
+        notes = [note for note in found.notes if note not in part.notes]
+        notes += _not_looked_for(found.verdicts)
     if found.left_out:
         kind, rest = max(found.left_out.items(), key=lambda item: item[1].count)
         notes.append(
@@ -298,18 +305,43 @@ def _within(interval: Interval, part: Part) -> Interval:
     return Interval(interval.value, start_s, min(interval.end_s, max(part.end_s, start_s)))
 
 
+def _found(
+    connection: sqlite3.Connection,
+    part: Part,
+    options: EventOptions,
+    known: Mapping[int, Found],
+    deadline_s: float = QUESTION_DEADLINE_S,
+) -> Events:
+    """What is drawn of a run: searched for, or out of what was searched before."""
+    if (before := known.get(part.run.run_id)) is None:
+        return find_events(
+            connection, part.range, options, limit=MOST_EVENTS, around=(), group=False,
+            deadline_s=deadline_s,
+        )  # fmt: skip
+    of_numbers = {kind.name for kind in drawn_kinds() if kind.of_numbers}
+    undrawn = known_signals(connection, [part.range]).keys() - set(options.signals)
+    drawn = [
+        event
+        for event in before.events
+        if event.kind in options.kinds
+        if event.kind not in of_numbers or event.name not in undrawn
+    ]
+    return replace(before.only(drawn), context=()).told(connection, MOST_EVENTS)
+
+
 def stuck_mark(
-    connection: sqlite3.Connection, part: Part, position: tuple[str, str], deadline_s: float
+    connection: sqlite3.Connection,
+    part: Part,
+    position: tuple[str, str],
+    deadline_s: float,
+    known: Mapping[int, Found] | None = None,
 ) -> tuple[Lane, list[str]]:
     """When the robot was stuck, and where that was not looked for."""
     options = EventOptions(kinds=("stuck",), signals=position, position=position)
-    found = find_events(
-        connection, part.range, options, limit=MOST_EVENTS, around=(), group=False,
-        deadline_s=deadline_s,
-    )  # fmt: skip
+    found = _found(connection, part, options, known or {}, deadline_s)
     intervals = [_within(Interval("stuck", e.start_s, e.end_s), part) for e in found.events]
     lane = Lane(f"stuck over {options.stuck_s:g} s", intervals, ())
-    return lane, _not_looked_for(found.verdicts)
+    return lane, [] if known else _not_looked_for(found.verdicts)
 
 
 # What surrounds axes: titles, ticks, marks, and a legend in as many rows as it needs.

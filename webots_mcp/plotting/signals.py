@@ -59,6 +59,7 @@ from webots_mcp.plotting.parts import (
     unread_parts,
 )
 from webots_mcp.store.analysis.arrays import np
+from webots_mcp.store.detection.events import Found
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
 
@@ -109,15 +110,17 @@ def compose_signals(
     *,
     bands: str | None = None,
     events: bool = True,
+    found: Mapping[int, Found] | None = None,
     room: Room | None = None,
     grouped: Sequence[Sequence[str]] | None = None,
     deadline_s: float = QUESTION_DEADLINE_S,
 ) -> tuple[SignalAxes, tuple[str, ...]]:
     """What `plot_signals` paints, and its notes; arguments and errors as there.
 
-    `room` is how much it may be; None for that of a PNG of 900 x 500 pixels. `grouped` are the
-    signals of each panel; None puts those of one unit and scale together. `deadline_s` is for
-    what is read of a range; what is not read in it is hatched, and a note says so.
+    `found` is what was searched before in the whole of these runs, each event by itself. `room` is
+    how much it may be; None for that of a PNG of 900 x 500 pixels. `grouped` are the signals of
+    each panel; None puts those of one unit and scale together. `deadline_s` is for what is read of
+    a range; what is not read in it is hatched, and a note says so.
     """
     room = room or Sheet().room
     mode = mode_signal(known_signals(connection, ranges), bands)
@@ -138,7 +141,9 @@ def compose_signals(
     marked, event_notes = ([], [])
     if events and not overlaid:
         drawn = [name for panel in panels for name in panel.names] or names
-        marked, event_notes = event_lanes(connection, parts[0], drawn, room.rows - len(below))
+        marked, event_notes = event_lanes(
+            connection, parts[0], drawn, room.rows - len(below), found
+        )
     plot = SignalAxes(
         title=title_of(parts),
         x_label=_x_label(parts),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -55,6 +55,7 @@ from webots_mcp.plotting.parts import (
 )
 from webots_mcp.plotting.signals import line_through
 from webots_mcp.store.analysis.arrays import np
+from webots_mcp.store.detection.events import Found
 from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.detection.motion import motion_in
 from webots_mcp.store.reading.catalogue import one_signal
@@ -105,11 +106,13 @@ def compose_trajectory(
     *,
     bands: str | None = None,
     events: bool = True,
+    found: Mapping[int, Found] | None = None,
     deadline_s: float = QUESTION_DEADLINE_S,
 ) -> tuple[TrajectoryAxes, tuple[str, ...]]:
     """What `plot_trajectory` paints, and its notes; arguments and errors as there.
 
-    `deadline_s` is for each thing that is read; where a way was cut by it, it has no end.
+    `found` is as in `compose_signals`. `deadline_s` is for each thing that is read; where a way was
+    cut by it, it has no end.
     """
     known = known_signals(connection, ranges)
     x, y = position_of(connection, known, ranges[-1], position)
@@ -123,7 +126,7 @@ def compose_trajectory(
         modes = _lane(part, mode) if len(parts) == 1 else None
         marks = [_flagged(part, flag) for flag in flags]
         if events:
-            stuck, notes = stuck_mark(connection, part, (x.name, y.name), deadline_s)
+            stuck, notes = stuck_mark(connection, part, (x.name, y.name), deadline_s, found)
             marks.insert(0, stuck)
             unlooked += notes
         path = read_path(connection, part, x, y, deadline_s)

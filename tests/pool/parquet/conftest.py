@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -13,7 +14,7 @@ import pytest
 from tests.pool.parquet import bucket
 from tests.recordings.rows import Recorded
 from webots_mcp.contract import DATABASE_NAME, new_uuid
-from webots_mcp.plugins.pool.parquet_pool import ParquetTarget
+from webots_mcp.plugins.pool.pool_contents import open_pool
 from webots_mcp.plugins.pool.shipping import Order, Report, ship
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.recording import Recording
@@ -62,6 +63,6 @@ def many(tmp_path_factory: pytest.TempPathFactory) -> Many:
     url = bucket.empty()  # a disk would have to be waited for a thousand times
     for database in databases:
         recording = Recording(database, database.parent, read_only=True)
-        ship(Order(recording, lambda: ParquetTarget(url), full=True), Report())
+        ship(Order(recording, partial(open_pool, url, ships=True), full=True), Report())
     bucket.copy_to(folder / "pool")
     return Many(folder / "pool", tuple(databases))

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from contextlib import closing
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.pool.chunk_values import chunk_values
-from tests.pool.parquet.rows import globbed, parquet, pooled, rows_of, shipping, uuid_of
+from tests.pool.parquet.files import globbed, parquet
+from tests.pool.rows import chunk_values, pooled_rows, rows_of, shipping, uuid_of
 from tests.recordings.rows import Recorded
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plugins.pool.parquet_pool import ParquetPool, ParquetTarget
+from webots_mcp.plugins.pool.parquet_pool import ParquetPool
 from webots_mcp.plugins.pool.pool_interface import Batch, table
 from webots_mcp.plugins.pool.shipping import Order, Report, ship
 from webots_mcp.store.chunk_making import chunk_whole_run
@@ -33,7 +33,7 @@ STATES: list[tuple[dict[str, Any], dict[str, str] | None]] = [
 
 
 @pytest.fixture
-def database(tmp_path: Path) -> Path:
+def database(tmp_path: Path) -> Iterator[Recorded]:
     """A run whose signals have values of all types."""
     folder = tmp_path / "there"
     folder.mkdir()
@@ -44,20 +44,21 @@ def database(tmp_path: Path) -> Path:
             robot.state(float(number), state, replaced=replaced)
         robot.end_run("finished")
         assert chunk_whole_run(connection, 1)
-    return folder / DATABASE_NAME
+        yield recorded
 
 
-def shipped(database: Path, pool: Path) -> Report:
-    recording = Recording(database, database.parent, read_only=True)
+def shipped(pool: Path) -> Report:
+    folder = pool.parent / "there"
+    recording = Recording(folder / DATABASE_NAME, folder, read_only=True)
     report = Report()
-    ship(Order(recording, lambda: ParquetTarget(str(pool))), report)
+    ship(Order(recording, lambda: ParquetPool(str(pool), ships=True)), report)
     return report
 
 
 def test_a_signal_is_a_column_of_its_type_and_others_stand_beside(
-    database: Path, tmp_path: Path
+    database: Recorded, tmp_path: Path
 ) -> None:
-    assert not shipped(database, tmp_path / "pool").replaced
+    assert not shipped(tmp_path / "pool").replaced
     (file,) = (tmp_path / "pool").rglob("table=value/run=1/*.parquet")
     types = {field.name: str(field.type) for field in parquet.read_schema(file)}
     fixed = {"group_id": "int64", "state_id": "int64", "sim_time_s": "double",
@@ -74,16 +75,21 @@ def test_a_signal_is_a_column_of_its_type_and_others_stand_beside(
     ]  # fmt: skip
 
 
-def test_chunks_come_back_with_every_value(database: Path, tmp_path: Path) -> None:
-    shipped(database, tmp_path / "pool")
-    expected = rows_of(database, table("chunk"))
-    found = pooled(str(tmp_path / "pool"), uuid_of(database), "chunk", {"run_id": (1,)})
+def test_chunks_come_back_with_every_value(database: Recorded, tmp_path: Path) -> None:
+    shipped(tmp_path / "pool")
+    expected = rows_of(database.connection, table("chunk"))
+    found = pooled_rows(
+        str(tmp_path / "pool"), uuid_of(database.connection), "chunk", {"run_id": (1,)}
+    )
     assert chunk_values(found) == chunk_values(expected) != {}
-    assert pooled(str(tmp_path / "pool"), uuid_of(database), "chunk", {"run_id": (2,)}) == []
+    assert (
+        pooled_rows(str(tmp_path / "pool"), uuid_of(database.connection), "chunk", {"run_id": (2,)})
+        == []
+    )
 
 
-def test_engines_read_numbers_without_a_word_of_json(database: Path, tmp_path: Path) -> None:
-    shipped(database, tmp_path / "pool")
+def test_engines_read_numbers_without_a_word_of_json(database: Recorded, tmp_path: Path) -> None:
+    shipped(tmp_path / "pool")
     with ParquetPool(str(tmp_path / "pool")) as pool:
         asked = "SELECT run_id, sum(x), max(sim_time_s), bool_or(bumper) FROM value GROUP BY run_id"
         assert pool.select(asked, 9).rows == ((1, 3.5, 6.0, True),)
@@ -92,17 +98,17 @@ def test_engines_read_numbers_without_a_word_of_json(database: Path, tmp_path: P
 
 
 def test_groups_that_come_later_are_put_behind_with_their_new_signals(
-    database: Path, tmp_path: Path
+    database: Recorded, tmp_path: Path
 ) -> None:
     chunks = table("chunk")
-    rows = rows_of(database, chunks)
+    rows = rows_of(database.connection, chunks)
     group, signal = (chunks.columns.index(each) for each in ("group_id", "signal_id"))
     later = [(*row[:group], 2, *row[group + 1 :]) for row in rows]
-    with shipping(tmp_path / "pool", uuid_of(database)) as shipment:
-        shipment.write([Batch(table("signal"), rows_of(database, table("signal")))], {})
+    with shipping(tmp_path / "pool", uuid_of(database.connection)) as shipment:
+        shipment.write([Batch(table("signal"), rows_of(database.connection, table("signal")))], {})
         shipment.write([Batch(chunks, [row for row in rows if int(str(row[signal])) < 3])], {})
         shipment.write([Batch(chunks, later)], {})
-    found = pooled(str(tmp_path / "pool"), uuid_of(database), "chunk")
+    found = pooled_rows(str(tmp_path / "pool"), uuid_of(database.connection), "chunk")
     values = chunk_values(found)
     expected = {(key, number): each for (_, number), each in chunk_values(rows).items()
                 for key in ((2,) if number >= 3 else (1, 2))}  # fmt: skip
@@ -110,12 +116,10 @@ def test_groups_that_come_later_are_put_behind_with_their_new_signals(
 
 
 def test_a_chunk_that_is_damaged_is_counted_and_the_others_are_shipped(
-    database: Path, tmp_path: Path
+    database: Recorded, tmp_path: Path
 ) -> None:
-    sqlite3 = import_module("sqlite3")
-    with closing(sqlite3.connect(database)) as connection, connection:
-        connection.execute("UPDATE chunk SET numbers = x'00' WHERE signal_id = 1")
-    assert shipped(database, tmp_path / "pool").replaced == {"damaged chunk": 1}
+    database.connection.execute("UPDATE chunk SET numbers = x'00' WHERE signal_id = 1")
+    assert shipped(tmp_path / "pool").replaced == {"damaged chunk": 1}
     (row, *_) = globbed(tmp_path / "pool", "value")
     assert (row["mode"], row["run (4)"]) == ("go", 5.0)
     assert (row["x"], json.loads(row["others"])["x"]) == (None, ["damaged"])

@@ -6,7 +6,7 @@ import errno
 import io
 import json
 import os
-import shutil
+import sqlite3
 import stat
 import subprocess
 import sys
@@ -14,7 +14,6 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -22,39 +21,35 @@ from typing import Any
 import pytest
 
 from tests import unprivileged
-from tests.pool.chunk_values import chunk_values
 from tests.pool.parquet import bucket
 from tests.pool.parquet.bucket import Bucket, KilledError
-from tests.pool.parquet.rows import (
+from tests.pool.parquet.files import globbed, parquet, records
+from tests.pool.rows import (
     OTHER_UUID,
     UUID,
     batch,
-    globbed,
     logs,
-    parquet,
     pooled,
-    records,
-    rows_of,
+    pooled_rows,
+    recorded,
+    run_row,
     ship,
     shipping,
     uuid_of,
 )
-from webots_mcp.connection import connect
 from webots_mcp.errors import InvalidInputError, PoolBusyError, PoolError, PoolUnavailableError
 from webots_mcp.plugins.pool.parquet_files import LEASE_S
-from webots_mcp.plugins.pool.parquet_pool import PART_BYTES, ParquetPool, ParquetTarget
-from webots_mcp.plugins.pool.pool_interface import Batch, Row, SQLValue, table, tables
-from webots_mcp.store.chunk_making import chunk_whole_run
+from webots_mcp.plugins.pool.parquet_pool import PART_BYTES, ParquetPool
+from webots_mcp.plugins.pool.pool_interface import Batch, Row, SQLValue, table
 
 DAY_S = 86_400.0
 MIDNIGHT_S = 19_700 * DAY_S
 
 HOLDER = """
 import os, sys
-from webots_mcp.plugins.pool.parquet_pool import ParquetTarget
-with ParquetTarget(sys.argv[1]) as target:
-    target.prepare()
-    with target.shipment(sys.argv[2]):
+from webots_mcp.plugins.pool.pool_contents import open_pool
+with open_pool(sys.argv[1], ships=True) as pool:
+    with pool.shipment(sys.argv[2]):
         print("ships", flush=True)
         sys.stdin.read()
         os._exit(9)
@@ -65,23 +60,10 @@ def ids(rows: Sequence[Row]) -> list[SQLValue]:
     return [row[0] for row in rows]
 
 
-@pytest.mark.parametrize("kind", ["folder", "object store"])
-def test_each_table_of_a_recording_is_in_the_pool_row_by_row(
-    bridge_recording: Path, tmp_path: Path, kind: str
-) -> None:
-    url = str(tmp_path / "pool") if kind == "folder" else bucket.empty()
-    recording = Path(shutil.copy(bridge_recording, tmp_path))
-    with closing(connect(recording, "writer")) as connection:
-        for (run_id,) in connection.execute("SELECT id FROM run").fetchall():
-            assert chunk_whole_run(connection, run_id)
-    ship(recording, url)
-    for each in tables():
-        found = pooled(url, uuid_of(recording), each.name)
-        expected = rows_of(recording, each)
-        if each.name == "chunk":
-            assert chunk_values(found) == chunk_values(expected) != {}
-        else:
-            assert found == expected
+def test_an_object_store_has_each_table_row_by_row(reader: sqlite3.Connection) -> None:
+    url = bucket.empty()
+    ship(reader, url)
+    assert pooled(url, uuid_of(reader)) == recorded(reader)
 
 
 def write_all(url: str, steps: Sequence[list[Batch]]) -> None:
@@ -90,15 +72,6 @@ def write_all(url: str, steps: Sequence[list[Batch]]) -> None:
         for number, step in enumerate(steps, 1):
             if number > shipment.progress().get("step", 0):
                 shipment.write(step, {"step": number})
-
-
-def run_row(row_id: int, rows: int) -> dict[str, SQLValue]:
-    return {
-        "id": row_id, "session_id": 1, "robot_id": 1, "start_reason": "start", "row_count": rows,
-        "started_wall_time_s": 1.0, "started_sim_time_s": 0.0, "last_wall_time_s": 2.0,
-        "last_sim_time_s": 1.0, "keep": 0, "purged_rows": 0,
-        "uuid": f"run-{row_id}",
-    }  # fmt: skip
 
 
 STEPS = [
@@ -124,9 +97,11 @@ def test_killed_at_any_put_a_shipper_goes_on_and_each_row_is_there_once() -> Non
         assert not [n for n in Counter(globbed_ids("log")).values() if n > 1]
         Bucket.store.pop(f"/pool/robots/recording={UUID}/_lease", None)  # it has run out
         write_all(url, STEPS)
-        assert ids(pooled(url, UUID, "log")) == sorted(globbed_ids("log")) == [1, 2, 3, 4, 5, 6]
+        assert (
+            ids(pooled_rows(url, UUID, "log")) == sorted(globbed_ids("log")) == [1, 2, 3, 4, 5, 6]
+        )
         at = table("run").columns.index("row_count")
-        assert [row[at] for row in pooled(url, UUID, "run")] == [6, 0]
+        assert [row[at] for row in pooled_rows(url, UUID, "run")] == [6, 0]
 
 
 def test_rows_that_never_counted_and_were_purged_meanwhile_are_not_there_twice_or_half() -> None:
@@ -137,9 +112,9 @@ def test_rows_that_never_counted_and_were_purged_meanwhile_are_not_there_twice_o
         write_all(url, [STEPS[0], [logs(4, 5, 6), batch("run", run_row(1, 6))]])
     assert Bucket.puts > puts
     Bucket.store.pop(f"/pool/robots/recording={UUID}/_lease", None)
-    assert ids(pooled(url, UUID, "log")) == [1, 2, 3]  # the others do not count yet
+    assert ids(pooled_rows(url, UUID, "log")) == [1, 2, 3]  # the others do not count yet
     write_all(url, [STEPS[0], [logs(6, 7)]])
-    assert ids(pooled(url, UUID, "log")) == sorted(globbed_ids("log")) == [1, 2, 3, 6, 7]
+    assert ids(pooled_rows(url, UUID, "log")) == sorted(globbed_ids("log")) == [1, 2, 3, 6, 7]
 
 
 def test_who_reads_all_files_while_somebody_ships_sees_no_row_twice(tmp_path: Path) -> None:
@@ -169,7 +144,7 @@ def test_small_batches_are_gathered_in_one_file_a_day(tmp_path: Path) -> None:
             shipment.write([logs(row_id, wall_time_s=MIDNIGHT_S - 20)], {})
     names = [file.parent.name for file in tmp_path.rglob("table=log/*/*.parquet")]
     assert sorted(names) == ["day=2023-12-08", "day=2023-12-09"]
-    assert ids(pooled(str(tmp_path), UUID, "log")) == list(range(1, 31))
+    assert ids(pooled_rows(str(tmp_path), UUID, "log")) == list(range(1, 31))
 
 
 def test_a_large_file_is_over_and_another_begins(tmp_path: Path) -> None:
@@ -179,14 +154,7 @@ def test_a_large_file_is_over_and_another_begins(tmp_path: Path) -> None:
             shipment.write([logs(row_id, message=noise)], {})
     names = sorted(file.name for file in tmp_path.rglob("table=log/*/*.parquet"))
     assert names == [f"part-{number:06}.parquet" for number in (1, 2, 3, 4)]
-    assert ids(pooled(str(tmp_path), UUID, "log")) == list(range(1, 8))
-
-
-def test_a_table_may_come_twice_in_a_write(tmp_path: Path) -> None:
-    with shipping(tmp_path) as shipment:
-        shipment.write([logs(1, 2), logs(3)], {})
-    rows = globbed(tmp_path, "log")
-    assert [row["message"] for row in rows] == ["driving 1", "driving 2", "driving 3"]
+    assert ids(pooled_rows(str(tmp_path), UUID, "log")) == list(range(1, 8))
 
 
 def test_rows_may_come_that_lie_before_others_and_each_is_there_once(tmp_path: Path) -> None:
@@ -198,41 +166,17 @@ def test_rows_may_come_that_lie_before_others_and_each_is_there_once(tmp_path: P
             *others, last = sorted({*range(first, first + 100)} - kept)
             shipment.write([logs(*others), logs(last, message=noise)], {})
     assert len(list(tmp_path.rglob("table=log/*/*.parquet"))) > 1
-    assert ids(pooled(str(tmp_path), UUID, "log")) == list(range(1, 1001))
+    assert ids(pooled_rows(str(tmp_path), UUID, "log")) == list(range(1, 1001))
     rows = globbed(tmp_path, "log")
     assert Counter(row["id"] for row in rows) == Counter(range(1, 1001))
     assert {row["id"] for row in rows if row["message"].startswith("kept")} == kept
 
 
-def test_a_row_replaces_the_one_of_its_key_but_what_lasts_is_not_lost(tmp_path: Path) -> None:
-    command = {
-        "id": 1, "robot_id": 1, "action": "grasp", "params": "{}", "status": "claimed",
-        "created_wall_time_s": 1.0, "expires_wall_time_s": 2.0, "session_id": 4,
-    }  # fmt: skip
-    with shipping(tmp_path) as shipment:
-        shipment.write([batch("command", command, command | {"id": 2})], {})
-        done = command | {"status": "done", "session_id": None}
-        shipment.write([batch("command", done)], {})
-        shipment.write([batch("command", done | {"id": 3}, done | {"id": 3, "error": "e"})], {})
-    found = [
-        (row["id"], row["status"], row["session_id"], row["error"])
-        for row in globbed(tmp_path, "command")
-    ]
-    assert found == [(1, "done", 4, None), (2, "claimed", 4, None), (3, "done", None, "e")]
-
-
-def test_what_is_listed_is_what_was_written_last(tmp_path: Path) -> None:
-    with shipping(tmp_path) as shipment:
-        for step in STEPS:
-            shipment.write(step, {})
-    with ParquetPool(str(tmp_path)) as pool:
-        found = {uuid: row[-1] for _, (_, _, uuid, *row) in pool.listed("run")}
-    assert found == {"run-1": 6, "run-2": 0}
-
-
 def test_a_row_without_a_time_is_on_no_day(tmp_path: Path) -> None:
     with shipping(tmp_path) as shipment:
-        shipment.write([batch("log", {"id": 1}), logs(2, wall_time_s=1e300)], {})
+        shipment.write(
+            [batch("log", {"id": 1, "wall_time_s": None}), logs(2, wall_time_s=1e300)], {}
+        )
     assert [file.parent.name for file in tmp_path.rglob("table=log/*/*.parquet")] == [
         "day=__HIVE_DEFAULT_PARTITION__"
     ]
@@ -292,20 +236,6 @@ def test_who_lost_the_lease_writes_nothing_that_counts(tmp_path: Path) -> None:
         assert shipment.progress() == {"log": 1}
 
 
-def test_a_run_that_another_recording_has_shipped_is_told_and_not_taken(tmp_path: Path) -> None:
-    with shipping(tmp_path) as shipment:
-        assert shipment.foreign_runs(["run-1"]) == {}
-        shipment.write([batch("run", run_row(1, 3))], {})
-        assert shipment.foreign_runs(["run-1"]) == {}
-    with shipping(tmp_path, OTHER_UUID) as shipment:
-        assert shipment.foreign_runs(["run-1", "run-2"]) == {"run-1": UUID}
-        with pytest.raises(PoolError, match=f"run-1 is in .* as one of recording {UUID}"):
-            shipment.write([batch("run", run_row(1, 3)), logs(1)], {})
-        shipment.write([batch("run", run_row(2, 3))], {})
-    assert len(globbed(tmp_path, "run")) == 2
-    assert globbed(tmp_path, "log") == []
-
-
 def test_a_folder_that_holds_other_things_is_refused_and_not_touched(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("important")
     with pytest.raises(PoolError, match="holds other things and is no pool"):
@@ -313,16 +243,6 @@ def test_a_folder_that_holds_other_things_is_refused_and_not_touched(tmp_path: P
     assert [file.name for file in tmp_path.rglob("*")] == ["thesis.tex"]
     with pytest.raises(PoolError, match=r"thesis.tex.* cannot be a pool"):
         write_all(str(tmp_path / "thesis.tex"), STEPS)
-
-
-@pytest.mark.parametrize(
-    ("schema", "next_step"), [(99, "update webots-mcp"), (9, "ship the recordings anew")]
-)
-def test_a_pool_of_another_version_is_refused(tmp_path: Path, schema: int, next_step: str) -> None:
-    write_all(str(tmp_path), STEPS)
-    (tmp_path / "_pool").write_text(f'{{"format": 1, "schema": {schema}}}')
-    with pytest.raises(PoolError, match=f"schema {schema}.*{next_step}"):
-        write_all(str(tmp_path), STEPS)
 
 
 @pytest.mark.parametrize("name", ["_progress", "part"])
@@ -335,7 +255,7 @@ def test_what_is_damaged_is_named_and_nothing_is_written_over_it(tmp_path: Path,
         write_all(str(tmp_path), STEPS)
     assert file.read_bytes() == b"PAR1 and no more"
     with pytest.raises(PoolError, match=r"_progress .*cannot be read|is damaged"):
-        pooled(str(tmp_path), UUID, "log")
+        pooled_rows(str(tmp_path), UUID, "log")
 
 
 @pytest.mark.parametrize(
@@ -366,7 +286,9 @@ def test_a_storage_that_fails_is_told_and_nothing_is_lost(
             shipment.write(STEPS[1], {"step": 2})
         assert type(raised.value) is expected
         write_all(url, STEPS)
-        assert ids(pooled(url, UUID, "log")) == sorted(globbed_ids("log")) == [1, 2, 3, 4, 5, 6]
+        assert (
+            ids(pooled_rows(url, UUID, "log")) == sorted(globbed_ids("log")) == [1, 2, 3, 4, 5, 6]
+        )
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limits of this kind")
@@ -390,24 +312,6 @@ def test_a_full_folder_is_told_and_the_same_shipment_goes_on_once_there_is_room(
     assert list((tmp_path / "_incoming").iterdir()) == []
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="modes of POSIX")
-@pytest.mark.parametrize(("made", "files"), [(None, 0o600), (0o755, 0o600), (0o2770, 0o660)])
-def test_what_is_shipped_is_its_owners_alone_and_whose_the_folder_lets_write(
-    tmp_path: Path, made: int | None, files: int
-) -> None:
-    pool = tmp_path / "pool"
-    if made is not None:
-        pool.mkdir()
-        pool.chmod(made)
-    with shipping(pool) as shipment:
-        shipment.write([logs(1)], {"log": 1})
-    modes = {each: stat.S_IMODE(each.stat().st_mode) for each in (pool, *pool.rglob("*"))}
-    assert modes.pop(pool) == (0o700 if made is None else made)
-    assert {mode for path, mode in modes.items() if path.is_file()} == {files}
-    folders = {mode & 0o777 for path, mode in modes.items() if path.is_dir()}
-    assert folders == {0o770 if made == 0o2770 else 0o700}
-
-
 @pytest.mark.skipif(not unprivileged.POSSIBLE, reason="this user may write everywhere")
 def test_a_folder_that_may_not_be_written_is_told(tmp_path: Path) -> None:
     with unprivileged.unwritable(tmp_path):
@@ -420,23 +324,26 @@ def test_a_folder_that_may_not_be_written_is_told(tmp_path: Path) -> None:
 @pytest.mark.skipif(find_spec("s3fs") is not None, reason="s3fs is installed")
 def test_a_filesystem_whose_package_is_missing_names_it() -> None:
     with pytest.raises(PoolError, match="s3fs"):
-        ParquetTarget("s3://lab/pool")
+        ParquetPool("s3://lab/pool")
 
 
 def test_a_filesystem_that_nobody_knows_is_refused() -> None:
     with pytest.raises(InvalidInputError, match="on no filesystem that fsspec knows"):
-        ParquetTarget("carrier-pigeon://lab/pool")
+        ParquetPool("carrier-pigeon://lab/pool")
 
 
-def test_pictures_come_back_and_none_leads_out_of_the_recording(tmp_path: Path) -> None:
+@pytest.mark.skipif(sys.platform == "win32", reason="modes of POSIX")
+def test_a_new_pool_is_its_owners_alone(tmp_path: Path) -> None:
+    with shipping(tmp_path / "pool") as shipment:
+        shipment.write([logs(1)], {})
+    assert stat.S_IMODE((tmp_path / "pool").stat().st_mode) == 0o700
+
+
+def test_no_picture_leads_out_of_the_recording(tmp_path: Path) -> None:
     with shipping(tmp_path) as shipment:
-        shipment.write_picture("camera/1.png", b"a picture")
         for path in ("../../x.png", "/etc/x.png", "", "a\\..\\b.png"):
             with pytest.raises(PoolError, match="no path of a picture"):
                 shipment.write_picture(path, b"")
-    with ParquetPool(str(tmp_path)) as pool:
-        assert pool.picture(UUID, "camera/1.png") == b"a picture"
-        assert pool.picture(UUID, "camera/2.png") is None
 
 
 def test_a_folder_with_signs_of_patterns_in_its_name_is_a_pool_like_others(
@@ -444,6 +351,6 @@ def test_a_folder_with_signs_of_patterns_in_its_name_is_a_pool_like_others(
 ) -> None:
     folder = tmp_path / "trials [a-c] *?"
     write_all(str(folder), STEPS)
-    assert ids(pooled(str(folder), UUID, "log")) == [1, 2, 3, 4, 5, 6]
+    assert ids(pooled_rows(str(folder), UUID, "log")) == [1, 2, 3, 4, 5, 6]
     with ParquetPool(str(folder)) as pool:
         assert pool.select("SELECT count(*) FROM log", 1).rows == ((6,),)

@@ -31,7 +31,7 @@ from typing import Any, Final, NamedTuple
 from webots_mcp import __version__
 from webots_mcp.contract import DATABASE_NAME, host_name
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, LeaseLostError, WebotsMCPError
-from webots_mcp.plugins.pool.pool_contents import open_pool, open_target
+from webots_mcp.plugins.pool.pool_contents import open_pool
 from webots_mcp.requirements import explain_extra
 from webots_mcp.steering.trial_plan import WorldPlan
 from webots_mcp.steering.trial_run import (
@@ -129,7 +129,7 @@ def _require_pool(url: str) -> None:
         InvalidInputError: It cannot, or the packages for it are missing.
     """
     try:
-        open_target(url)
+        open_pool(url)
     except ModuleNotFoundError as error:
         raise InvalidInputError(str(error)) from error
 
@@ -207,7 +207,7 @@ def _shipped(folder: Path, url: str) -> str:
     from webots_mcp.plugins.pool.shipping import Order, Report, Source, ship
 
     recording = Recording(folder / DATABASE_NAME, folder, read_only=True)
-    ship(Order(recording, partial(open_target, url), full=True, pictures=True), Report())
+    ship(Order(recording, partial(open_pool, url, ships=True), full=True, pictures=True), Report())
     with recording.reader() as connection:
         return Source(connection).uuid()
 

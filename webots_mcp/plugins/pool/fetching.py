@@ -83,7 +83,6 @@ class Fetched:
         only_chunks: Of those that came now, the ones of which the pool has no rows.
         going_on: Those that are not over.
         arriving: Those that are over, and not yet wholly shipped.
-        nameless: How many have no UUID, which no recording could tell from those that are there.
         unchunked: Of those in `only_chunks`, how many rows are in chunks, where not all are.
     """
 
@@ -92,7 +91,6 @@ class Fetched:
     only_chunks: list[str] = field(default_factory=list[str])
     going_on: list[str] = field(default_factory=list[str])
     arriving: list[str] = field(default_factory=list[str])
-    nameless: int = 0
     unchunked: dict[str, int] = field(default_factory=dict[str, int])
 
     @property
@@ -123,10 +121,9 @@ def fetch(
     _sweep(data_dir)
     found, here = Fetched(), _here(connection)
     found.known = [run.uuid for run in meant.runs if run.uuid in here]
-    new = [run for run in meant.runs if run.uuid not in here]
-    found.nameless = sum(not run.uuid for run in new)
-    found.going_on = [run.uuid for run in new if run.uuid and run.end_reason is None]
-    ended = [run for run in new if run.uuid and run.end_reason is not None]
+    new = [run for run in meant.runs if run.uuid and run.uuid not in here]
+    found.going_on = [run.uuid for run in new if run.end_reason is None]
+    ended = [run for run in new if run.end_reason is not None]
     shipped = {each: pool.progress(each) for each in {run.recording_uuid for run in ended}}
     whole = [run for run in ended if is_whole(shipped[run.recording_uuid], run.run_id)]
     found.arriving = [run.uuid for run in ended if run not in whole]

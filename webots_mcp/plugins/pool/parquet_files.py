@@ -38,7 +38,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Final, cast
 from uuid import uuid4
 
-from webots_mcp.contract import PRIVATE_FOLDER, SCHEMA_VERSION, host_name, make_folder
+from webots_mcp.contract import SCHEMA_VERSION, host_name, make_folder
 from webots_mcp.errors import (
     InvalidInputError,
     PoolBusyError,
@@ -69,10 +69,6 @@ _INCOMING: Final = "_incoming"  # what is written, before it is moved to its pla
 _NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _REFUSED: Final = (errno.EACCES, errno.EPERM, errno.EROFS)
 _NOT_A_FOLDER: Final = (errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG)
-_OTHERS: Final = (0o070, 0o007)  # the group, and everybody
-_WRITING: Final = 0o022
-_SEARCH: Final = 0o111
-_INHERITED: Final = 0o7000  # the group's sign, which a folder hands on
 # One that ends later was taken before a clock was set back. It is not one lease from now: it may
 # be renewed after this host looked at its clock, and the clock of the other host may be ahead.
 _LATEST_S: Final = 2 * LEASE_S
@@ -228,22 +224,11 @@ class Storage:
         root = str(self.root).strip("/")
         return str(PurePosixPath(full.strip("/").removeprefix(root).lstrip("/")))
 
-    @property
-    def _rights(self) -> int:
-        """Of folders: the owner's alone, and whose the folder of the pool lets write into it."""
-        root = Path(self.root).stat().st_mode
-        return PRIVATE_FOLDER | sum(who for who in _OTHERS if root & who & _WRITING)
-
     def _make_folder(self, folder: Path) -> None:
-        if folder.is_dir():
-            return
-        if folder == Path(self.root):
-            make_folder(folder)
-            return
-        self._make_folder(folder.parent)
-        with suppress(FileExistsError):  # another shipper was first
-            folder.mkdir(PRIVATE_FOLDER)
-            folder.chmod(folder.stat().st_mode & _INHERITED | self._rights)
+        """That of the pool is its owner's alone, unless it was there."""
+        if not Path(self.root).is_dir():
+            make_folder(Path(self.root))
+        folder.mkdir(parents=True, exist_ok=True)
 
     @contextmanager
     def _written(self, content: bytes) -> Generator[Path]:
@@ -252,7 +237,6 @@ class Storage:
         self._make_folder(file.parent)
         try:
             with file.open("xb") as sink:
-                file.chmod(self._rights & ~_SEARCH)
                 sink.write(content)
                 sink.flush()
                 os.fsync(sink.fileno())
@@ -466,45 +450,33 @@ def place_progress(storage: Storage, recording_uuid: str, progress: Progress) ->
     storage.place(f"{folder_of(recording_uuid)}/{PROGRESS}", content)
 
 
-def require_pool(storage: Storage) -> None:
-    """Raise unless a pool of exactly this version is there.
+def require_pool(storage: Storage, *, make: bool) -> None:
+    """Raise unless a pool of exactly this version is there, or can be made where nothing is.
 
     Raises:
-        PoolError: There is none, or an older or a newer one.
+        PoolError: There is none, one of another version, or other things are there.
     """
     content = storage.read(POOL)
-    if content is None:
+    if content is None and not make:
         raise PoolError(f"there is no pool in {storage.address}: ship a recording to it first")
-    try:
-        about: dict[str, Any] = json.loads(content)
-        version = int(about["format"]), int(about["schema"])
-    except (ValueError, TypeError, KeyError) as error:
-        raise PoolError(f"{POOL} in {storage.address} cannot be read: {error}") from error
-    its = f"the pool in {storage.address} has format {version[0]} and schema {version[1]}"
-    if version[0] > FORMAT or version[1] > SCHEMA_VERSION:
-        raise PoolError(
-            f"{its}, this webots-mcp knows {FORMAT} and {SCHEMA_VERSION}: update webots-mcp"
-        )
-    if version != (FORMAT, SCHEMA_VERSION):
-        raise PoolError(
-            f"{its}, of an older webots-mcp: ship the recordings anew, into another folder"
-        )
-
-
-def make_pool(storage: Storage) -> None:
-    """Make a pool where there is nothing.
-
-    Raises:
-        PoolError: Other things are there, or another version made it.
-    """
-    if storage.read(POOL) is not None:
-        return require_pool(storage)
-    if storage.names():
+    if content is None and storage.names():
         raise PoolError(
             f"{storage.address} holds other things and is no pool: name a new or empty folder"
         )
-    about = {"format": FORMAT, "schema": SCHEMA_VERSION}
-    storage.place(POOL, json.dumps(about).encode())
+    wanted = {"format": FORMAT, "schema": SCHEMA_VERSION}
+    if content is None:
+        return storage.place(POOL, json.dumps(wanted).encode())
+    try:
+        found: dict[str, int] = {name: int(json.loads(content)[name]) for name in wanted}
+    except (ValueError, TypeError, KeyError) as error:
+        raise PoolError(f"{POOL} in {storage.address} cannot be read: {error}") from error
+    if found != wanted:
+        has, knows = (f"format {x['format']} and schema {x['schema']}" for x in (found, wanted))
+        raise PoolError(
+            f"the pool in {storage.address} has {has}, this webots-mcp {knows}: use one version "
+            "of it, or ship the recordings anew, into another folder"
+        )
+    return None
 
 
 # -- one shipper at a time --------------------------------------------------------------------

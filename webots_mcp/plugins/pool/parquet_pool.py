@@ -34,7 +34,6 @@ from webots_mcp.plugins.pool.parquet_files import (
     files_of,
     folder_of,
     is_cut,
-    make_pool,
     name_of,
     package,
     part_file,
@@ -69,50 +68,6 @@ _APPENDED_GROUP_ROWS: Final = 20_000
 _CHANGING_GROUP_ROWS: Final = 4_000  # those of many files are read side by side
 _VALUES_LEVEL: Final = 9  # of zstd: 97 bytes a row of 39 numbers instead of 128, in 6 us
 _ROWS_AT_ONCE: Final = 1000
-
-
-class ParquetTarget:
-    """A folder, or a place on a filesystem of fsspec, that recordings are shipped to.
-
-    Attributes:
-        address: Without secrets.
-    """
-
-    def __init__(self, url: str) -> None:
-        package("pyarrow")
-        self._storage = Storage(url)
-        self.address = self._storage.address
-
-    def __enter__(self) -> ParquetTarget:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        pass
-
-    def prepare(self) -> None:
-        """Make the pool where there is nothing.
-
-        Raises:
-            PoolError: Other things are there, another version made it, or it cannot be written.
-        """
-        make_pool(self._storage)
-        self._storage.clear(older_than_s=time.time() - _HALF_WRITTEN_S)
-
-    @contextmanager
-    def shipment(self, recording_uuid: str) -> Generator[ParquetShipment]:
-        """Be the one who ships this recording.
-
-        Raises:
-            PoolBusyError: Another does.
-        """
-        require_pool(self._storage)
-        lease = Lease(self._storage, recording_uuid)
-        lease.take()
-        try:
-            yield ParquetShipment(self._storage, recording_uuid, lease)
-        finally:
-            with suppress(PoolUnavailableError):  # it runs out by itself
-                lease.give_back()
 
 
 class ParquetShipment:
@@ -255,25 +210,42 @@ class ParquetShipment:
 
 
 class ParquetPool:
-    """A pool in a folder, or on a filesystem of fsspec, as it is read.
+    """A folder, or a place on a filesystem of fsspec, as a pool; see `Pool`.
 
     Attributes:
         address: Without secrets.
     """
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, *, ships: bool = False) -> None:
         package("pyarrow")
-        self._storage = Storage(url)
+        self._storage, self._ships = Storage(url), ships
         self._url = self._storage.root if self._storage.is_local else url
         self.address = self._storage.address
         self._all: dict[str, Progress] | None = None
 
     def __enter__(self) -> ParquetPool:
-        require_pool(self._storage)
+        require_pool(self._storage, make=self._ships)
+        if self._ships:
+            self._storage.clear(older_than_s=time.time() - _HALF_WRITTEN_S)
         return self
 
     def __exit__(self, *exception: object) -> None:
         pass
+
+    @contextmanager
+    def shipment(self, recording_uuid: str) -> Generator[ParquetShipment]:
+        """Be the one who ships this recording.
+
+        Raises:
+            PoolBusyError: Another does.
+        """
+        lease = Lease(self._storage, recording_uuid)
+        lease.take()
+        try:
+            yield ParquetShipment(self._storage, recording_uuid, lease)
+        finally:
+            with suppress(PoolUnavailableError):  # it runs out by itself
+                lease.give_back()
 
     def listed(self, name: str) -> Iterator[tuple[str, Sequence[Any]]]:
         """The columns `LISTED` of all rows of such a table, behind their recording's UUID."""

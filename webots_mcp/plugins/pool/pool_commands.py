@@ -87,7 +87,6 @@ def _as_data(found: Fetched) -> dict[str, Any]:
         "not_taken": {
             "going_on": found.going_on,
             "not_wholly_shipped": found.arriving,
-            "without_uuid": found.nameless,
         },
     }
 
@@ -110,8 +109,6 @@ def _print_fetched(found: Fetched, address: str) -> None:
             "those, or the recording could not be written where it was shipped ('webots-mcp ship "
             "--full' ships rows that are still there)"
         )
-    if found.nameless:
-        print(f"not taken: {found.nameless} runs without a UUID, which every bridge of today gives")
     if found.going_on:
         print(f"not taken: {_named(found.going_on)} goes on, or nobody has shipped its end")
     if found.arriving:
@@ -287,7 +284,7 @@ def ship(
     with --full each state. A password comes from PGPASSWORD, ~/.pgpass or a service file, never
     from the URL.
     """
-    from webots_mcp.plugins.pool.pool_contents import is_postgres, open_target
+    from webots_mcp.plugins.pool.pool_contents import is_postgres, open_pool
     from webots_mcp.plugins.pool.pool_interface import redacted
     from webots_mcp.plugins.pool.shipping import Order, Report
     from webots_mcp.plugins.pool.shipping import follow as follow_recording
@@ -301,7 +298,7 @@ def ship(
     if pause_s is not None and not follow:
         raise InvalidInputError("--every is for --follow: without it, everything is shipped once")
     (url,) = urls
-    connect = functools.partial(open_target, url)
+    connect = functools.partial(open_pool, url, ships=True)
     order = Order(recorded.recording(), connect, full, pictures)
     report, is_done = Report(), False
     try:

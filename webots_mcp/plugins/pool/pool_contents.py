@@ -19,7 +19,7 @@ from typing import Annotated, Final
 from webots_mcp.cli.options import Parameter
 from webots_mcp.errors import InvalidInputError, PoolError
 from webots_mcp.naming import nearest_first
-from webots_mcp.plugins.pool.pool_interface import LISTED, Pool, Target, require_no_secret
+from webots_mcp.plugins.pool.pool_interface import LISTED, Pool, require_no_secret
 from webots_mcp.requirements import explain_extra
 from webots_mcp.store.reading.ranges import parse_wall_time
 
@@ -31,33 +31,28 @@ _CONNECTION_STRING: Final = re.compile(
 _NEARLY_A_URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
 
 
-def open_target(url: str) -> Target:
-    """The pool of a URL, to ship to: not yet connected. What it needs is imported only here.
+def open_pool(url: str, *, ships: bool = False) -> Pool:
+    """The pool of a URL, not yet connected. What it needs is imported only here.
+
+    Args:
+        url: Of PostgreSQL, or of files.
+        ships: To ship to it, and not only to read it.
 
     Raises:
         InvalidInputError: The URL names no pool, or holds a secret.
         PoolError: The packages of an extra are missing.
     """
     if is_postgres(url):
-        _require_psycopg()
-        from webots_mcp.plugins.pool.postgres_pool import PostgresTarget
-
-        return PostgresTarget(url)
-    from webots_mcp.plugins.pool.parquet_pool import ParquetTarget
-
-    return ParquetTarget(url)
-
-
-def open_pool(url: str) -> Pool:
-    """The pool of a URL, to read from; as `open_target`."""
-    if is_postgres(url):
-        _require_psycopg()
+        try:
+            import_module("psycopg")
+        except ImportError as missing:  # psycopg itself, or a libpq for it
+            raise PoolError(explain_extra("a pool in PostgreSQL", "postgres")) from missing
         from webots_mcp.plugins.pool.postgres_pool import PostgresPool
 
-        return PostgresPool(url)
+        return PostgresPool(url, ships=ships)
     from webots_mcp.plugins.pool.parquet_pool import ParquetPool
 
-    return ParquetPool(url)
+    return ParquetPool(url, ships=ships)
 
 
 def is_postgres(url: str) -> bool:
@@ -83,13 +78,6 @@ def is_postgres(url: str) -> bool:
             "s3://BUCKET/PREFIX or ./FOLDER"
         )
     return False
-
-
-def _require_psycopg() -> None:
-    try:
-        import_module("psycopg")
-    except ImportError as missing:  # psycopg itself, or a libpq for it
-        raise PoolError(explain_extra("a pool in PostgreSQL", "postgres")) from missing
 
 
 # -- what is there ----------------------------------------------------------------------------

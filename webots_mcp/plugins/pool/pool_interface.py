@@ -279,45 +279,6 @@ class Shipment(Protocol):
         ...
 
 
-class Target(Protocol):
-    """A pool that recordings are shipped to; a context manager, connected as long as it is open.
-
-    Attributes:
-        address: Its URL without secrets: for messages, logs and the file of what was shipped.
-    """
-
-    address: str
-
-    def __enter__(self) -> Target:
-        """Connect.
-
-        Raises:
-            PoolUnavailableError: Nobody answers there now.
-            PoolError: It is no pool that can be written, or an extra is missing.
-        """
-        ...
-
-    def __exit__(self, *exception: object) -> None:
-        """Disconnect; what was not written is gone."""
-        ...
-
-    def prepare(self) -> None:
-        """Make the tables where there are none.
-
-        Raises:
-            PoolError: They are of another version, none of ours, or cannot be written.
-        """
-        ...
-
-    def shipment(self, recording_uuid: str) -> AbstractContextManager[Shipment]:
-        """Be the one who ships this recording.
-
-        Raises:
-            PoolBusyError: Another does.
-        """
-        ...
-
-
 class PooledSize(NamedTuple):
     """How much of a table is in a pool; bytes where the pool can tell."""
 
@@ -327,18 +288,36 @@ class PooledSize(NamedTuple):
 
 
 class Pool(Protocol):
-    """A pool as it is read; a context manager, connected as long as it is open.
+    """A pool, shipped to or read; a context manager, connected as long as it is open.
 
     `run.purged_rows` is as the edge last said it: how many states a pool lacks is counted.
 
     Attributes:
-        address: Its URL without secrets.
+        address: Its URL without secrets: for messages, logs and the file of what was shipped.
     """
 
     address: str
 
-    def __enter__(self) -> Pool: ...
-    def __exit__(self, *exception: object) -> None: ...
+    def __enter__(self) -> Pool:
+        """Connect; who ships makes the tables where there are none.
+
+        Raises:
+            PoolUnavailableError: Nobody answers there now.
+            PoolError: It is no pool that can be used, or of another version.
+        """
+        ...
+
+    def __exit__(self, *exception: object) -> None:
+        """Disconnect; what was not written is gone."""
+        ...
+
+    def shipment(self, recording_uuid: str) -> AbstractContextManager[Shipment]:
+        """Be the one who ships this recording, to a pool that was opened for it.
+
+        Raises:
+            PoolBusyError: Another does.
+        """
+        ...
 
     def listed(self, name: str) -> Iterator[tuple[str, Sequence[Any]]]:
         """The columns `LISTED` of all rows of such a table, behind their recording's UUID."""

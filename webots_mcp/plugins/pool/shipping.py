@@ -37,10 +37,10 @@ from webots_mcp.plugins.pool.pool_interface import (
     BATCH_ROWS,
     CHUNKS,
     Batch,
+    Pool,
     Row,
     Shipment,
     Table,
-    Target,
     fitted,
     is_whole,
     row_bytes,
@@ -100,13 +100,13 @@ class Order:
 
     Attributes:
         recording: From where.
-        open_target: Opens the pool, each time that it is connected to.
+        open_pool: Opens the pool to ship to it, each time that it is connected to.
         full: States as well.
         pictures: The files of pictures as well.
     """
 
     recording: Recording
-    open_target: Callable[[], Target]
+    open_pool: Callable[[], Pool]
     full: bool = False
     pictures: bool = False
 
@@ -216,19 +216,18 @@ def _shipper(order: Order, report: Report) -> Generator[Shipper]:
     """
     with order.recording.reader() as connection:
         uuid = Source(connection).uuid()  # first: nothing is asked of the pool in vain
-    with order.open_target() as target, ExitStack() as stack:
-        target.prepare()
-        shipment = _entered(stack, target, uuid)
-        yield Shipper(order, report, uuid, target.address, shipment)
+    with order.open_pool() as pool, ExitStack() as stack:
+        shipment = _entered(stack, pool, uuid)
+        yield Shipper(order, report, uuid, pool.address, shipment)
 
 
-def _entered(stack: ExitStack, target: Target, uuid: str) -> Shipment:
+def _entered(stack: ExitStack, pool: Pool, uuid: str) -> Shipment:
     """Wait a moment for a server that has not noticed yet that the shipper before was killed."""
     for wait_s in _HANDOVER_S:
         with suppress(PoolBusyError):
-            return stack.enter_context(target.shipment(uuid))
+            return stack.enter_context(pool.shipment(uuid))
         time.sleep(wait_s)
-    return stack.enter_context(target.shipment(uuid))
+    return stack.enter_context(pool.shipment(uuid))
 
 
 class ReplacedError(PoolError):

@@ -34,6 +34,7 @@ from webots_mcp.store.parameters import described
 from webots_mcp.store.questions.compare import compare_runs
 from webots_mcp.store.questions.runs import RunInfo, run_info
 from webots_mcp.store.questions.trends import RunTrends, StateTrend, Trend, trends
+from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 from webots_mcp.store.robots import Session, fetch_session
 from webots_mcp.store.run_rows import fetch_run
@@ -97,6 +98,8 @@ class Chapter:
         range: The whole run; None where it has no state row.
         numbers: How many numeric signals have values.
         changed_most: Those that changed, what changed most first.
+        found: What was found in the values and in what was noted, each event by itself.
+        images: The pictures.
         findings: What was found, and what was not.
         unsearched: What was not looked for, or not everywhere, and why.
     """
@@ -119,6 +122,8 @@ class Chapter:
     log: Grid | None = None
     numbers: int = 0
     changed_most: Sequence[str] = ()
+    found: Found | None = None
+    images: Sequence[Event] = ()
     notes: Sequence[str] = ()
 
     @property
@@ -173,7 +178,8 @@ def chapter_of(
         log = room.fit("log", _log(connection, run_id), newest=True)
         return Chapter(info, None, title, f"{_first_words(info)} {error}.", facts,
                        parameters=parameters, log=log)  # fmt: skip
-    found = _found(connection, whole, deadline_s)
+    each_alone = _found(connection, whole, deadline_s)
+    found = each_alone.in_groups(known_signals(connection, whole))
     stored = _stored(connection, whole, deadline_s / 3)
     moments = [_moment(each, stored) for each in _outstanding(connection, found)]
     course = trends(connection, whole, limit=500, deadline_s=deadline_s / 3)
@@ -194,11 +200,13 @@ def chapter_of(
         parameters=parameters,
         events=room.fit("events", _events(connection, found)),
         trends=room.fit("trends", _trends(told_trends)),
-        commands=room.fit("commands", _commands(connection, whole), newest=True),
+        commands=room.fit("commands", _commands(connection, stored), newest=True),
         timeline=room.fit("timeline", _timeline(connection, stored), newest=True),
         log=room.fit("log", _log(connection, run_id), newest=True),
         numbers=told_trends.total,
         changed_most=[each.name for each in told_trends.numbers if each.shape != "constant"],
+        found=each_alone,
+        images=[each for each in stored.events if each.kind == "image"],
         notes=tuple(
             dict.fromkeys((*found.notes, *course.notes, *_unread(told_trends), *why_not))
         ),
@@ -272,7 +280,8 @@ def _found(connection: sqlite3.Connection, whole: TimeRange, deadline_s: float) 
     kinds = tuple(
         kind.name for kind in KINDS if kind.usual(usual) and kind.counted and not kind.routine
     )
-    return search_events(connection, whole, EventOptions(kinds=kinds), deadline_s=deadline_s)
+    options = EventOptions(kinds=kinds)
+    return search_events(connection, whole, options, group=False, deadline_s=deadline_s)
 
 
 def _stored(connection: sqlite3.Connection, whole: TimeRange, deadline_s: float) -> Found:
@@ -346,11 +355,9 @@ def _timeline(connection: sqlite3.Connection, stored: Found) -> Grid:
     return Grid(("at [s]", "for [s]", "kind", "what"), rows, notes, left_out=left_out)
 
 
-def _commands(connection: sqlite3.Connection, whole: TimeRange) -> Grid:
-    found = search_events(
-        connection, whole, EventOptions(kinds=("command",)), around=(), group=False
-    )
-    answer = found.told(connection, MOST_EVENTS)
+def _commands(connection: sqlite3.Connection, stored: Found) -> Grid:
+    commands = stored.only([each for each in stored.events if each.kind == "command"])
+    answer = commands.told(connection, MOST_EVENTS)
     rows = [
         Row([
             time_at(each.start_s), str(each.details["id"]), each.name or "",
@@ -431,7 +438,8 @@ def _held(mode: StateTrend) -> list[Held]:
 
 def _travelled(connection: sqlite3.Connection, run_id: int) -> tuple[list[str], list[str]]:
     """How far it went, in words, and why that is not known."""
-    found = compare_runs(connection, [run_id])
+    nothing_else = EventOptions(kinds=("bridge_event",))
+    found = compare_runs(connection, [run_id], options=nothing_else)
     known = {each.name: each.spread[0] for each in found.measures}
     distance, speed = known.get("distance_m"), known.get("mean_speed_m_s")
     why_not = [

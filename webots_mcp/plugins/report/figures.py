@@ -139,8 +139,9 @@ def _why_none(known: Sequence[dict[str, Signal]], names: Sequence[str]) -> str:
 class _Drawn:
     """The figures of a report by their keys, and why others could not be drawn."""
 
-    def __init__(self, connection: sqlite3.Connection) -> None:
+    def __init__(self, connection: sqlite3.Connection, chapters: Sequence[Chapter]) -> None:
         self._connection = connection
+        self._found = {each.info.run_id: each.found for each in chapters if each.found}
         self.drawn: dict[str, Figure] = {}
         self.not_drawn: list[str] = []
 
@@ -163,10 +164,11 @@ class _Drawn:
             self.not_drawn.append(f"{what}: {error}")
 
     def _signals(self, ranges: Sequence[TimeRange], names: Sequence[str]) -> Figure:
-        return signals_figure(*compose_signals(self._connection, ranges, names, room=_ROOM))
+        composed = compose_signals(self._connection, ranges, names, found=self._found, room=_ROOM)
+        return signals_figure(*composed)
 
     def _way(self, ranges: Sequence[TimeRange]) -> Figure:
-        plot, notes = compose_trajectory(self._connection, ranges)
+        plot, notes = compose_trajectory(self._connection, ranges, found=self._found)
         return way_figure(plot, notes, obstacles_of(self._connection, ranges))
 
     def around(self, chapter: Chapter, moment: Moment) -> None:
@@ -195,7 +197,7 @@ def _drawn_of(
     *,
     with_moments: bool,
 ) -> _Drawn:
-    drawn = _Drawn(connection)
+    drawn = _Drawn(connection, chapters)
     ranges = [each.range for each in chapters if each.range is not None]
     if len(ranges) > 1:
         drawn.overlaid(ranges, both)

@@ -8,8 +8,9 @@ import time
 from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from webots_mcp import __version__
 from webots_mcp.contract import make_folder, whole_file
@@ -20,12 +21,13 @@ from webots_mcp.plugins.report.chapter import Chapter, chapter_of
 from webots_mcp.plugins.report.comparison import Beside, beside
 from webots_mcp.plugins.report.figures import Figures, figures_of, moment_key
 from webots_mcp.plugins.report.words import clock, counted, size, time_at
-from webots_mcp.store.detection.events import search_events
-from webots_mcp.store.detection.kinds import Event, EventOptions
-from webots_mcp.store.reading.ranges import TimeRange
+from webots_mcp.store.detection.kinds import Event
 from webots_mcp.store.reading.segment import in_one_snapshot
 from webots_mcp.store.recording import left_out_so_far
 from webots_mcp.store.run_rows import fetch_run, inside, opened
+
+if TYPE_CHECKING:
+    from jinja2 import Template
 
 # The pictures of a run: as many as have room, downscaled, inside the page.
 
@@ -57,13 +59,8 @@ class Pictures(NamedTuple):
     unusable: int
 
 
-def pictures_of(
-    connection: sqlite3.Connection, whole: TimeRange, data_dir: Path, room_bytes: float
-) -> Pictures:
+def pictures_of(found: Sequence[Event], data_dir: Path, room_bytes: float) -> Pictures:
     """Pictures that are spread evenly over the run, the first and the newest among them."""
-    found = search_events(
-        connection, whole, EventOptions(kinds=("image",)), around=(), group=False
-    ).events
     tried = [_picture(event, data_dir) for event in spread(found, MOST_PICTURES)]
     made = [picture for picture in tried if picture is not None]
     return Pictures(_within(made, room_bytes), len(found), len(tried) - len(made))
@@ -181,12 +178,14 @@ def make_report(
     done.step()
     page = Page(_title(chapters), time.time(), max_mb, chapters, compared, figures)
     rest_bytes = max_mb * 1e6 - len(render(page))
+    share_bytes = rest_bytes / len(chapters)
     for chapter in chapters:
-        pictures = _pictures(connection, chapter, data_dir, rest_bytes / len(chapters))
+        pictures = pictures_of(chapter.images, data_dir, share_bytes)
         page.pictures[chapter.info.run_id] = pictures
+        rest_bytes -= sum(picture.size_bytes for picture in pictures.shown)
         done.step()
-    page = replace(page, left_out=_left_out(page))
-    page = replace(page, size_bytes=len(render(page)))
+    size_bytes = round(max_mb * 1e6 - rest_bytes)
+    page = replace(page, left_out=_left_out(page), size_bytes=size_bytes)
     html = render(page)
     done.step()
     return Report(html, page.title, _holds(page), tuple(page.left_out))
@@ -219,14 +218,6 @@ def _require_sound(run_ids: Sequence[int], max_mb: float) -> None:
 
 def _title(chapters: Sequence[Chapter]) -> str:
     return " and ".join(chapter.title for chapter in chapters)
-
-
-def _pictures(
-    connection: sqlite3.Connection, chapter: Chapter, data_dir: Path, room_bytes: float
-) -> Pictures:
-    if chapter.range is None:
-        return Pictures((), 0, 0)
-    return pictures_of(connection, chapter.range, data_dir, room_bytes)
 
 
 def _left_out(page: Page) -> list[str]:
@@ -294,17 +285,8 @@ def _spelled_out(value: object) -> object:
 
 def render(page: Page) -> bytes:
     """The file. Every text of the recording is escaped: it is shown, and never run."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
-    environment = Environment(
-        loader=FileSystemLoader(_TEMPLATES),
-        autoescape=True,
-        finalize=_spelled_out,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     told: Mapping[str, Any] = {
         "page": page,
         "policy": _POLICY,
@@ -316,7 +298,22 @@ def render(page: Page) -> bytes:
         "script": Markup(figure_part("figure.js")),
         "figure_style": Markup(figure_part("figure.css")),
     }
-    return environment.get_template("report.html").render(told).encode("utf-8", "replace")
+    return _template().render(told).encode("utf-8", "replace")
+
+
+@cache
+def _template() -> Template:
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+    environment = Environment(
+        loader=FileSystemLoader(_TEMPLATES),
+        autoescape=True,
+        finalize=_spelled_out,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("report.html")
 
 
 def file_name(run_ids: Sequence[int]) -> str:

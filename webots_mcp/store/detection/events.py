@@ -129,6 +129,14 @@ class Found:
         counts = count_by_kind(events)
         return replace(self, entries=entries, verdicts=replace(self.verdicts, found=dict(counts)))
 
+    def in_groups(self, known: dict[str, Signal]) -> Found:
+        """The same with many alike as one, where each was searched for by itself."""
+        events = grouped(self.events, known)
+        counts = count_by_kind(events)
+        found = {kind: counts[kind] for kind in self.verdicts.found}
+        verdicts = replace(self.verdicts, found=found)
+        return replace(self, entries=tuple(placed(events)), verdicts=verdicts)
+
     def told(self, connection: sqlite3.Connection, limit: int) -> Events:
         """An answer of at most `limit` events: see `choose`.
 

@@ -25,16 +25,12 @@ from webots_mcp.store.detection.kinds import Alike, Event, EventKind, NotSearcha
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.catalogue import resolve_signals, say_unknown
 from webots_mcp.store.reading.frame import Frame, read_frame
-from webots_mcp.store.reading.ranges import frame_of_purged, recorded_share
+from webots_mcp.store.reading.ranges import recorded_share
 from webots_mcp.store.reading.segment import Segment, kept_parts
 from webots_mcp.store.signals import Signal
 
 _MOST_VALUES: Final = 8
 _ROWS_BEFORE: Final = 20  # a range: what was there last, for `changed` and `rate`
-_SOME_BEFORE: Final = (
-    "SELECT min(sim_time_s) FROM (SELECT sim_time_s FROM state WHERE run_id = ? "
-    f"AND sim_time_s < ? ORDER BY sim_time_s DESC LIMIT {_ROWS_BEFORE})"
-)
 
 
 def condition_events(search: Search) -> Iterator[Event]:
@@ -70,12 +66,9 @@ def condition_events(search: Search) -> Iterator[Event]:
 def _read(search: Search, segment: Segment, condition: Condition) -> Frame:
     """The rows of a segment, and those before it as far as the condition remembers."""
     run_id, start_s = segment.run_id, segment.start_s
-    (known_from_s,) = search.connection.execute(_SOME_BEFORE, (run_id, start_s)).fetchone()
-    if (run := frame_of_purged(search.connection, run_id)) is not None:
-        place = int(run.places([start_s])[0])
-        before = run.rows(place - _ROWS_BEFORE, place)
-        known_from_s = before.bounds_s[0] if len(before) else None
-    known_from_s = start_s if known_from_s is None else known_from_s
+    place = int(search.whole.places([start_s])[0])
+    before = search.whole.rows(place - _ROWS_BEFORE, place)
+    known_from_s = before.bounds_s[0] if len(before) else start_s
     longer = replace(segment, start_s=min(known_from_s, start_s - condition.remembers_s))
     every_call = bool(kept_parts(search.connection, run_id, longer.start_s, segment.end_s))
     frame = read_frame(search.connection, longer, search.deadline, every_call=every_call)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import copy
 import sqlite3
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property, partial
+from functools import cached_property
 from typing import Any, Final
 
 from webots_mcp.naming import listed
@@ -22,7 +22,7 @@ from webots_mcp.store.detection.kinds import (
 from webots_mcp.store.detection.motion import Motion, motion_in
 from webots_mcp.store.reading.catalogue import resolve_signals
 from webots_mcp.store.reading.frame import Frame, read_frame
-from webots_mcp.store.reading.ranges import UP_TO, RunClock, recorded_bounds
+from webots_mcp.store.reading.ranges import recorded_bounds
 from webots_mcp.store.reading.segment import Deadline, Segment, just_after
 from webots_mcp.store.signals import Signal
 
@@ -156,10 +156,10 @@ class Search:
         place = (self.segment.run_id, start_s, end_s, self.wall_time_at(start_s))
         return Event(kind, *place, name, details, ongoing)
 
-    @cached_property
-    def wall_time_at(self) -> Callable[[float], float]:
-        """Of the last row at or before a time; looked up once of events that begin together."""
-        return cache(partial(RunClock(self.connection, self.segment.run_id).wall_s, UP_TO))
+    def wall_time_at(self, time_s: float) -> float:
+        """Of the last row at or before a simulation time, else of the first one."""
+        place = int(np.searchsorted(self.whole.times, time_s, "right")) - 1
+        return float(self.whole.wall_times[max(place, 0)]) if len(self.whole) else 0.0
 
     def not_searched(self, kind: str, *reasons: str) -> None:
         """Note why a kind was not looked for, or where it was not."""

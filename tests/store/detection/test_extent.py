@@ -94,19 +94,6 @@ def test_a_change_lasts_until_the_next_one_also_beyond_the_range(
     assert (cruise.start_s, cruise.end_s, cruise.ongoing) == (300.0, 399.9, False)
 
 
-def test_a_signal_that_few_rows_of_the_run_hold_is_not_silent_in_the_others(
-    empty: sqlite3.Connection,
-) -> None:
-    recorder = start_run(empty)
-    for step in range(2000):
-        late = {"late_m": 1.0 + step} if step >= 1500 else {}
-        recorder.publish(round(step * 0.1, 6), {"x": step, **late})
-    recorder.end_run("finished")
-    make_chunks(empty, 100_000)
-    asked = find_range(empty, Scope(start_s=70.0, end_s=80.0))
-    assert find_events(empty, asked, EventOptions(kinds=("missing",))).events == ()
-
-
 def test_what_a_short_stretch_costs_does_not_grow_with_the_run(empty: sqlite3.Connection) -> None:
     recorder = start_run(empty)
     costs = [after_so_many_rows(recorder, empty, rows) for rows in (2048, 10_240)]

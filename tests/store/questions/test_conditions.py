@@ -109,6 +109,17 @@ def test_what_never_had_a_value_was_not_looked_for(
     }
 
 
+def test_of_several_runs_all_rows_are_counted_and_the_same_is_said_once(
+    rover: sqlite3.Connection,
+) -> None:
+    found = ask(rover, "target > 1e6", since_wall_time=0.0, until_wall_time=2e9)
+
+    assert found.verdicts.not_found["condition"] == "true in none of 2050 rows"
+    dropped, others = (note for note in found.notes if "row" in note)
+    assert dropped.startswith("run 1: ") and "some were dropped" in dropped
+    assert others.startswith("run 2, 3: ")
+
+
 @pytest.mark.parametrize(
     ("interval", "said"),
     [(1, "nothing was missed"), (5, "one publish() call in 5 is a row"), (None, "may be fewer")],

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import random
 import sqlite3
 from collections.abc import Callable
 from typing import Any
@@ -119,30 +117,6 @@ def test_metres_that_no_robot_drives_are_doubted(empty: sqlite3.Connection) -> N
     why = compare_runs(empty, [1, 2]).unknown["distance_m, mean_speed_m_s"]
     assert why.startswith("run 1: pose.0 is taken as metres")
     assert "pose_mm" in why
-
-
-def circling_slowly(seed: int, noise_m: float) -> State:
-    """Circles of 20 mm at 30 mm/s."""
-    noise = random.Random(seed)
-
-    def state(time_s: float) -> dict[str, Any]:
-        x, y = (0.02 * turn(1.5 * time_s) for turn in (math.cos, math.sin))
-        return {"pose": [0.01 * time_s + x + noise.gauss(0, noise_m), y + noise.gauss(0, noise_m)]}
-
-    return state
-
-
-def test_bends_that_noise_hides_are_told_as_a_doubt_of_the_distance(
-    empty: sqlite3.Connection,
-) -> None:
-    for seed, noise_m in enumerate((0.0, 0.08, 0.03)):
-        record(empty, "a", circling_slowly(seed, noise_m), end_s=60)
-    found = compare_runs(empty, [1, 2, 3])
-    why = found.unknown["distance_m, mean_speed_m_s"]
-    assert "run 1" not in why
-    for run in ("run 2: the path may be up to ", "run 3: the path may be up to "):
-        assert run in why
-    assert "noise of about 30 mm hides" in why
 
 
 def test_a_run_without_a_mode_was_in_no_mode_for_no_known_time(empty: sqlite3.Connection) -> None:

@@ -106,14 +106,3 @@ def test_a_comparison_names_the_parameters_in_which_the_runs_differ(
     assert "ki" not in first.parameters
     second, fourth = compare_runs(connection, [2, 4]).groups
     assert "gait" not in second.parameters | fourth.parameters
-
-
-def test_a_value_that_no_bridge_has_written_keeps_no_run_from_being_found(file: Path) -> None:
-    damaged = file.with_name("damaged.db")
-    with closing(connect(file, "reader")) as source, closing(sqlite3.connect(damaged)) as copy:
-        source.backup(copy)
-    with closing(connect(damaged, "writer")) as connection:
-        connection.execute("UPDATE parameter_value SET value = 'no JSON' WHERE run_id = 1")
-        found = list_runs(connection, parameters={"ki": 0.5}, limit=1)
-        assert [run.run_id for run in found.runs] == [4]
-        assert found.total == 3

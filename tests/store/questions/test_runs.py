@@ -208,25 +208,6 @@ def test_a_run_of_one_moment_is_named_as_what_the_others_are_cut_to(
     ) in compare_runs(empty, [1, 2]).notes
 
 
-@pytest.mark.parametrize(("noise_m", "speed_m_s", "way_m"), [(0.01, 0, 0), (0.0005, 0.1, 14)])
-def test_the_noise_of_a_position_is_no_way(
-    empty: sqlite3.Connection, noise_m: float, speed_m_s: float, way_m: float
-) -> None:
-    noise = random.Random(7)
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    session_id = recorder.session(robot_id, "x")
-    empty.execute("BEGIN")
-    for _ in range(2):
-        recorder.run(session_id, robot_id)
-        for step in range(4376):
-            x, y = (noise.gauss(speed_m_s * step * 0.032, noise_m), noise.gauss(1, noise_m))
-            recorder.publish(step * 0.032, {"pose": [x, y]})
-    empty.execute("COMMIT")
-    for distance_m in measures(compare_runs(empty, [1, 2]))["distance_m"]:
-        assert distance_m == pytest.approx(way_m, abs=0.03 * way_m + 0.6)
-
-
 @pytest.mark.parametrize("name", ["bearing_rad", "heading_deg", "level_m"])
 def test_what_is_left_of_adding_equal_numbers_is_no_difference(
     empty: sqlite3.Connection, name: str

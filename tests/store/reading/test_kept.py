@@ -161,6 +161,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="has no SIGKILL")
 def test_what_was_not_written_of_a_stretch_before_a_kill_is_not_told_as_kept(
     tmp_path: Path,

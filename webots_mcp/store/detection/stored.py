@@ -249,6 +249,7 @@ def command_events(search: Search) -> Iterator[Event]:
 
 def _sim_time_at(search: Search, wall_s: float) -> float | None:
     """Of the last row of the segment at or before a wall time; None without any."""
+    _note_unread(search, "command", search.whole.cut_at_s)
     rows = search.whole.between(search.segment.holds_from_s, search.segment.holds_to_s)
     place = int(np.searchsorted(rows.wall_times, wall_s, "right"))
     return float(rows.times[place - 1]) if place else None

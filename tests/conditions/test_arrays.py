@@ -17,43 +17,33 @@ from tests.frames import frame_of, frame_of_states
 from webots_mcp.conditions import parse_condition
 from webots_mcp.errors import ConditionFailedError
 from webots_mcp.naming import find_position
-from webots_mcp.store.detection.condition import OnArrays, first_failure
+from webots_mcp.store.detection.condition import holds_in
 
-Failing = tuple[int, str]
 COMPARISON: dict[str, Any] = {
     "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge,
     "==": operator.eq, "!=": operator.ne,
 }  # fmt: skip
 
 
-def by_closures(text: str, history: Rows) -> tuple[list[bool], Failing | None]:
-    """What holds up to the first row of which it cannot be asked, and which that is."""
+def by_closures(text: str, history: Rows) -> list[bool]:
     evaluator = parse_condition(text).evaluator()
-    held: list[bool] = []
-    try:
-        for time_s, state in history:
-            held.append(evaluator.holds(state, time_s))
-    except ConditionFailedError as error:
-        return held, (len(held), str(error))
-    return held, None
+    return [evaluator.holds(state, time_s) for time_s, state in history]
 
 
-def by_arrays(text: str, history: Rows) -> tuple[list[bool], Failing | None]:
+def by_arrays(text: str, history: Rows) -> list[bool]:
     condition, frame = parse_condition(text), frame_of_states(history)
-    names = {name for _, state in history for name in state}
-    asked = OnArrays(condition.scanned, frame, find_position(names))
-    outcome = asked.condition(condition.tree)
-    failed = first_failure(outcome.failures)
-    held = outcome.holds.tolist()
-    return (held, None) if failed is None else (held[: failed.row], (failed.row, failed.why))
+    position = find_position({name for _, state in history for name in state})
+    return holds_in(condition.scanned, condition.tree, frame, position).tolist()
 
 
 def agree(text: str, history: Rows) -> None:
-    (held, failed), (expected, failing) = by_arrays(text, history), by_closures(text, history)
-    assert held == expected
-    assert (failed and failed[0]) == (failing and failing[0])
-    if failed and failing:
-        assert failed[1].partition(": ")[0] == failing[1].partition(": ")[0]  # the same place
+    try:
+        expected = by_closures(text, history)
+    except ConditionFailedError as error:
+        with pytest.raises(ConditionFailedError, match=re.escape(str(error).partition(": ")[0])):
+            by_arrays(text, history)
+    else:
+        assert by_arrays(text, history) == expected
 
 
 @settings(deadline=None, max_examples=200)
@@ -120,7 +110,7 @@ def test_rows_are_judged_alike_where_chunks_are_left_closed(sign: str, limit: fl
     condition = parse_condition(f"x {sign} {limit}")
 
     frame = frame_of(np.arange(len(course)) / 10, {"x": course})
-    held = OnArrays(condition.scanned, frame).condition(condition.tree).holds
+    held = holds_in(condition.scanned, condition.tree, frame, None)
 
     expected = COMPARISON[sign](course, limit) & ~np.isnan(course)
     assert (held == expected).all()

@@ -46,14 +46,3 @@ def test_any_text(text: str, states: list[dict[str, Any]]) -> None:
         except ConditionFailedError:
             return
         assert set(condition.signals) <= set(evaluator.values(state))
-
-
-@settings(deadline=None)
-@given(st.floats(0, 100), st.lists(st.floats(allow_nan=True), min_size=1, max_size=20))
-def test_any_time(first_s: float, times: list[float]) -> None:
-    texts = ("x < 1 for 1", "rate(x) < 1", "displacement(1) < 1", "changed(x)")
-    evaluators = [parse_condition(text).evaluator() for text in texts]
-
-    for time_s in (first_s, *times):
-        for evaluator in evaluators:
-            assert type(evaluator.holds({"x": 1.0, "y": 2}, time_s)) is bool

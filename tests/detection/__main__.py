@@ -12,21 +12,10 @@ from typing import Final
 from tests.detection.drawing import KINDS
 from tests.detection.goals import missed_goals
 from tests.detection.measuring import measure, measure_widened
-from tests.detection.pairs import measure_pairs
-from tests.detection.table import (
-    LEGEND,
-    render,
-    render_agreement,
-    render_pairs,
-    render_travelled,
-    render_widened,
-)
-from tests.detection.travelling import measure_travelled
+from tests.detection.table import LEGEND, render, render_agreement, render_widened
 
-_TRAVELLED: Final = "travelled"
-_PAIRS: Final = "pairs"
 _WIDENED: Final = "widened"  # of the kinds that are named beside it, else of all
-_ALL: Final = (*KINDS, _WIDENED, _TRAVELLED, _PAIRS)
+_ALL: Final = (*KINDS, _WIDENED)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -34,8 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     chosen = options.kinds or _ALL
     started_s = time.monotonic()
-    parts = (_judged, _widened, _travelled, _compared)
-    done = [told for part in parts if (told := part(chosen, options)) is not None]
+    done = [told for part in (_judged, _widened) if (told := part(chosen, options)) is not None]
     _show("")
     failed = sum(missed for _, missed in done)
     took_s = time.monotonic() - started_s
@@ -64,20 +52,6 @@ def _widened(chosen: Sequence[str], options: argparse.Namespace) -> tuple[str, i
     shown = "\n".join([*report.wrong, ""]) if options.wrong else ""
     lost = sum(alone > both for alone, both in report.widened.values())
     return f"{shown}{render_widened(report)}", lost
-
-
-def _travelled(chosen: Sequence[str], options: argparse.Namespace) -> tuple[str, int] | None:
-    if _TRAVELLED not in chosen or options.long:
-        return None
-    lines = list(measure_travelled(options.cases, options.seed, _show))
-    return render_travelled(lines), sum(bool(each.missed) for each in lines)
-
-
-def _compared(chosen: Sequence[str], options: argparse.Namespace) -> tuple[str, int] | None:
-    if _PAIRS not in chosen or options.long:
-        return None
-    pairs = measure_pairs(options.seed, say=_show)
-    return render_pairs(pairs), len(pairs.missed)
 
 
 def _print(text: str) -> None:

@@ -12,7 +12,6 @@ from typing import Final
 from tests.detection.labelled import Measure
 from webots_mcp.store.detection.events import find_events
 from webots_mcp.store.detection.kinds import Event, EventOptions
-from webots_mcp.store.questions.compare import Comparison, compare_runs
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 # Without a deadline that a busy machine would meet; how long it took is measured beside.
@@ -32,8 +31,6 @@ _KINDS: Final[dict[Measure, tuple[str, ...]]] = {
 }
 # Signals that are never searched, and periods that are not drawn.
 _OTHERS: Final = re.compile(r"not in \d+ of |not with a period of more than 5 s ")
-# By how much a distance may be too short, of some runs or of all.
-_LONGER: Final = re.compile(r"(?:run ([\d, ]+): )?the path may be up to ([\d.]+) (%|m) longer")
 _OF_ROBOT: Final = frozenset[Measure]({"standstill", "stuck", "leap", "gap"})
 
 
@@ -158,53 +155,3 @@ def _is_one(one: Claim, other: Claim) -> bool:
     """Two events that overlap are one where they differ in kind or in the item of an array."""
     alike = (one.run_id, one.name) == (other.run_id, other.name) and one.source != other.source
     return alike and other.start_s <= one.end_s and one.start_s <= other.end_s
-
-
-@dataclass(frozen=True)
-class ToldDistance:
-    """How far a robot is said to have travelled, and by how much that may be too little."""
-
-    distance_m: float
-    longer_m: float
-
-
-def told_distances(
-    connection: sqlite3.Connection, run_ids: Sequence[int]
-) -> list[ToldDistance | None]:
-    """Of each of the runs, 2 to 10 of them, over the same stretch."""
-    comparison = compare_runs(connection, run_ids, deadline_s=UNHURRIED_S)
-    way = next((each for each in comparison.measures if each.name == "distance_m"), None)
-    spread = way.spread if way else [None] * len(run_ids)
-    doubts = comparison.unknown.get("distance_m, mean_speed_m_s", "")
-    return [
-        each and ToldDistance(each.median, _longer_m(doubts, run_id, each.median))
-        for run_id, each in zip(run_ids, spread, strict=True)
-    ]
-
-
-def _longer_m(doubts: str, run_id: int, distance_m: float) -> float:
-    """What the sentence about a run says, or the one about all."""
-    for runs, figure, unit in _LONGER.findall(doubts):
-        if not runs or str(run_id) in runs.split(", "):
-            return float(figure) * (distance_m / 100 if unit == "%" else 1)
-    return 0.0
-
-
-def compared_edits(connection: sqlite3.Connection) -> Comparison:
-    """The runs before the last edit and those after it."""
-    return compare_runs(connection, limit=_ALL, deadline_s=UNHURRIED_S)
-
-
-def claimed_differences(comparison: Comparison) -> Iterable[tuple[str, float]]:
-    """What is claimed to be different since the last edit: names, and how much more it is."""
-    figures = [(each.name, each.spread, each.different) for each in comparison.measures]
-    figures += [(each.name, each.mean, each.different) for each in comparison.differences]
-    for name, spread, different in figures:
-        before, after = spread[0], spread[-1]
-        if different[-1] and before is not None and after is not None:
-            yield name, after.median - before.median
-
-
-def undecided(comparison: Comparison) -> list[str]:
-    """What may be different, but for which more runs are wanted."""
-    return [each.name for each in comparison.measures if each.runs_wanted[-1] is not None]

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 from tests.detection.goals import MEDIAN_ERROR, missed_goals
 from tests.detection.judging import Tally, median, nine_in_ten
 from tests.detection.measuring import Key, Report
-from tests.detection.pairs import Pairs
-from tests.detection.travelling import Travelled
 
 _COLUMNS: Final = (
     "recording", "judged", "condition", "runs", "truth", "recall", "precision", "begin", "best",
@@ -73,47 +70,6 @@ def _line(key: Key, tally: Tally) -> tuple[str, ...]:
         f"{tally.slowest_s:.2f}",
         ", ".join(missed_goals(key, tally)),
     )
-
-
-def render_travelled(lines: Iterable[Travelled]) -> str:
-    """A line for each noise."""
-    head = (
-        "noise mm",
-        "runs",
-        "at rest: worst m",
-        "on the way: ratio",
-        "slowly: ratio",
-        "at most",
-        "unknown",
-        "below the goal",
-    )
-    return _aligned([head, *(_travelled(each) for each in lines)])
-
-
-def _travelled(each: Travelled) -> tuple[str, ...]:
-    worst_m = f"{max(each.rest_m):.3f}" if each.rest_m else "-"
-    told, most = zip(*each.slow, strict=True) if each.slow else ((), ())
-    ratios = (_range(of) for of in (each.ratios, told, most))
-    runs = str(len(each.rest_m) + len(each.ratios) + len(each.slow) + each.unknown)
-    noise = f"{1000 * each.noise_m:g}"
-    return noise, runs, worst_m, *ratios, str(each.unknown), ", ".join(each.missed)
-
-
-def _range(ratios: Sequence[float]) -> str:
-    return f"{min(ratios):.3f} to {max(ratios):.3f}" if ratios else "-"
-
-
-def render_pairs(pairs: Pairs) -> str:
-    """What was claimed of like runs, and how often +10 % was found."""
-    false = [names for names in pairs.claimed if names]
-    names = Counter(name for names in false for name in names)
-    most = ", ".join(f"{name} {count}" for name, count in names.most_common(6))
-    same = f"A/A: {len(false)} of {len(pairs.claimed)} pairs with a difference that is none"
-    faster = (
-        f"+10 % speed: found in {pairs.found} of {pairs.faster} pairs, more runs wanted for it in "
-        f"{pairs.undecided}"
-    )
-    return "\n".join([f"{same} ({most})" if most else same, faster])
 
 
 def _share(value: float | None) -> str:

@@ -7,11 +7,10 @@ from dataclasses import replace
 
 import pytest
 
-from tests.detection.asking import Answer, Claim, claims_of
+from tests.detection.asking import Claim
 from tests.detection.goals import missed_goals
 from tests.detection.judging import Tally, judge
 from tests.detection.labelled import Incident
-from webots_mcp.store.detection.kinds import Event
 
 STOPS = (Incident("standstill", 10.0, 20.0), Incident("standstill", 40.0, 50.0))
 
@@ -49,17 +48,6 @@ def test_what_is_told_is_found_or_false_and_the_rest_is_missed(
     assert missed_goals(("drive", "standstill", ""), found) == goals
 
 
-def test_where_nothing_happened_each_run_is_clean_or_not() -> None:
-    found = tally(judge([], [], 0.1), judge([], [stand(1, 5), stand(6, 9)], 0.1))
-    assert (found.recall, found.precision, found.false, found.minutes) == (None, 0.5, 2, 4.0)
-
-
-def test_a_miss_is_told_apart_from_one_that_the_answer_admits() -> None:
-    silent_miss, admitted_miss = judge(STOPS, [], 0.1), judge(STOPS, [], 0.1)
-    assert tally(silent_miss).said_share == 0.0
-    assert tally(admitted_miss, admitted=True).said_share == 1.0
-
-
 def test_ten_dropouts_told_as_one_count_as_the_ten_that_they_are() -> None:
     drops = [Incident("dropout", at, at, "ir") for at in range(10)]
     told = Claim("dropout", 1, 0.0, 9.0, "ir", count=10)
@@ -78,23 +66,6 @@ def test_a_swing_that_a_gap_cuts_in_two_may_be_told_twice() -> None:
     assert found.period_errors == pytest.approx([0.05])
     assert found.amplitude_errors == pytest.approx([0.1])
     assert judge([replace(swing, split=False)], [claim, replace(claim)], 0.1).false == 1
-
-
-def test_what_several_items_of_an_array_tell_at_once_is_one_claim() -> None:
-    events = [
-        Event("missing", 1, 3.0, 9.0, 0.0, name) for name in ("lidar.min", "lidar.max", "front")
-    ]
-    events.append(Event("missing", 1, 20.0, 22.0, 0.0, "lidar.min"))
-    claims = claims_of(events, "missing")
-    assert [(each.name, each.start_s) for each in claims] == [
-        ("lidar", 3.0), ("front", 3.0), ("lidar", 20.0),
-    ]  # fmt: skip
-
-
-def test_an_answer_admits_what_it_says_it_did_not_search() -> None:
-    answer = Answer((), {"stuck": "no position is known"}, 0.0)
-    assert answer.admits("stuck") and answer.admits("standstill") and not answer.admits("swing")
-    assert not Answer((), {"oscillation": "not in 3 of 4 signals"}, 0.0).admits("swing")
 
 
 def test_a_begin_that_noise_hides_is_judged_by_what_can_be_known_of_it() -> None:

@@ -209,7 +209,7 @@ class Compiler(Nodes):
         self._plain = plain
         self.readers: dict[str, Read] = {}
         self.columns: dict[str, int] = {}
-        self.memories: list[Memory] = []
+        self.memories: list[Memory[Any]] = []
         self.position: PositionReader | None = None
         self.remembers_s = 0.0
         self._require_shallow(tree)
@@ -280,13 +280,13 @@ class Compiler(Nodes):
         self._durations.difference_update(places)
         condition, seconds = node.elts
         held = self._keep(Lasting(self._condition(condition), self._seconds(seconds, "for")))
-        return held.holds
+        return held.read
 
     def _flag_of(self, node: ast.Call) -> Holds:
         value = self._value(self._only(node))
         if function_of(node) == "missing":
             return lambda state: value(state) is None
-        return self._keep(Changed(value)).holds
+        return self._keep(Changed(value)).read
 
     def _flag(self, node: ast.expr) -> Holds:
         """A signal by itself: a flag that is true, or a number other than 0."""
@@ -393,7 +393,7 @@ class Compiler(Nodes):
 
         return applied
 
-    def _keep(self, memory: Any) -> Any:
+    def _keep(self, memory: Memory[Any]) -> Memory[Any]:
         """After those that it is made of: they are up to date when it is its turn."""
         self.memories.append(memory)
         return memory

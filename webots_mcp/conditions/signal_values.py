@@ -231,25 +231,22 @@ def _may_be_number(value: Value) -> bool:
     return value.__class__ is not str and value.__class__ is not bool
 
 
-class Memory(ABC):
-    """Something that is kept from state to state."""
+class Memory(ABC, Generic[Answer]):
+    """Something that is asked of every state, and what follows from the answers."""
 
-    @abstractmethod
-    def update(self, state: State, sim_time_s: float) -> None:
-        """Take in a state."""
+    def __init__(self, ask: Callable[[State], Answer]) -> None:
+        self._ask = ask
+        self._error: ConditionFailedError | None = None
+        self._result: Any = None
+        self.forget()
 
     @abstractmethod
     def forget(self) -> None:
         """A new run has begun."""
 
-
-class _Asking(Memory, Generic[Answer]):
-    """Asks something of every state and keeps what follows from the answers."""
-
-    def __init__(self, ask: Callable[[State], Answer]) -> None:
-        self._ask = ask
-        self._error: ConditionFailedError | None = None
-        self.forget()
+    @abstractmethod
+    def _take_in(self, answer: Answer, sim_time_s: float) -> None:
+        """Keep what follows from an answer."""
 
     def update(self, state: State, sim_time_s: float) -> None:
         """Take in a state; why it could not be asked is raised when the result is read."""
@@ -261,125 +258,98 @@ class _Asking(Memory, Generic[Answer]):
         else:
             self._take_in(answer, sim_time_s)
 
-    @abstractmethod
-    def _take_in(self, answer: Answer, sim_time_s: float) -> None:
-        """Keep what follows from an answer."""
-
-    def _check(self) -> None:
+    def read(self, state: State) -> Any:
+        """The result as of the state that was taken in last; else the error says why not."""
         if self._error is not None:
             raise self._error
+        return self._result
 
 
-class _Holding(_Asking[Answer]):
-    """Whether something holds, as of the state that was taken in last."""
-
-    _holds = False
-
-    def holds(self, state: State) -> bool:
-        """It could be asked of that state; else the error says why not."""
-        self._check()
-        return self._holds
-
-
-class Changed(_Holding[Value]):
+class Changed(Memory[Value]):
     """Whether a value is another than the last one that was there."""
 
     def forget(self) -> None:
         """What comes first is no change."""
         self._last: Value = None
-        self._holds = False
+        self._result = False
 
     def _take_in(self, answer: Value, sim_time_s: float) -> None:
         """A missing value is not a change, and neither is the return of the value before."""
-        self._holds = answer is not None and self._last is not None and answer != self._last
+        self._result = answer is not None and self._last is not None and answer != self._last
         if answer is not None:
             self._last = answer
 
 
-class Rate(_Asking[int | float | None]):
+class Rate(Memory["int | float | None"]):
     """How fast a value changes, per second, from one state that has it to the next."""
 
     def forget(self) -> None:
         """There is a rate from the second value on."""
         self._last: tuple[float, float] | None = None
-        self._rate: float | None = None
+        self._result = None
 
     def _take_in(self, answer: int | float | None, sim_time_s: float) -> None:
         """While time stands still the rate stays as it is."""
         if answer is None:
-            self._rate = None
+            self._result = None
         elif self._last is None:
             self._last = (sim_time_s, answer)
         elif (passed_s := sim_time_s - self._last[0]) > SAME_TIME_S:
             rate = (answer - self._last[1]) / passed_s
-            self._rate = rate if -math.inf < rate < math.inf else None
+            self._result = rate if -math.inf < rate < math.inf else None
             self._last = (sim_time_s, answer)
 
-    def read(self, state: State) -> float | None:
-        """As of the state that was taken in last."""
-        self._check()
-        return self._rate
 
-
-class Displacement(Memory):
+class Displacement(Memory["tuple[float, float] | None"]):
     """Metres between where the robot is and where it was so many seconds ago."""
 
     def __init__(
         self, place: Callable[[State], tuple[float, float] | None], seconds: float
     ) -> None:
-        self._place = place
         self._seconds = seconds
         self._apart_s = seconds / PLACES_KEPT
-        self.forget()
+        super().__init__(place)
 
     def forget(self) -> None:
         """There is a displacement once the run has lasted for that time."""
         self._places: deque[tuple[float, float, float]] = deque()
-        self._here: tuple[float, float] | None = None
-        self._sim_time_s = 0.0
+        self._result = None
 
-    def update(self, state: State, sim_time_s: float) -> None:
+    def _take_in(self, answer: tuple[float, float] | None, sim_time_s: float) -> None:
         """Keeps 200 places at most; the one it compares with is older by half a percent at most."""
-        self._sim_time_s = sim_time_s
-        self._here = place = self._place(state)
-        if place is None:
+        self._result = None
+        if answer is None:
             return
         places = self._places
         if not places or sim_time_s - places[-1][0] >= self._apart_s:
-            places.append((sim_time_s, *place))
+            places.append((sim_time_s, *answer))
             then_s = sim_time_s - self._seconds + SAME_TIME_S
             while len(places) > 1 and places[1][0] <= then_s:
                 places.popleft()
-
-    def read(self, state: State) -> float | None:
-        """As of the state that was taken in last."""
-        if self._here is None:
-            return None
-        was_s, was_x, was_y = self._places[0]
-        age_s = self._sim_time_s - was_s
-        if not -SAME_TIME_S <= age_s - self._seconds <= self._seconds + SAME_TIME_S:
-            return None
-        return math.hypot(self._here[0] - was_x, self._here[1] - was_y)
+        was_s, was_x, was_y = places[0]
+        older_s = sim_time_s - was_s - self._seconds
+        if -SAME_TIME_S <= older_s <= self._seconds + SAME_TIME_S:
+            self._result = math.hypot(answer[0] - was_x, answer[1] - was_y)
 
 
-class Lasting(_Holding[bool]):
+class Lasting(Memory[bool]):
     """Whether a condition held in every state of at least so many seconds."""
 
     def __init__(self, condition: Callable[[State], bool], seconds: float) -> None:
-        super().__init__(condition)
         self._seconds = seconds
+        super().__init__(condition)
 
     def forget(self) -> None:
         """It holds since no time at all."""
         self._since_s: float | None = None
-        self._holds = False
+        self._result = False
 
     def _take_in(self, answer: bool, sim_time_s: float) -> None:
         """Between two states in both of which it holds it counts as unbroken."""
         if not answer:
             self._since_s = None
-            self._holds = False
+            self._result = False
             return
         if self._since_s is None:
             self._since_s = sim_time_s
-        self._holds = sim_time_s - self._since_s >= self._seconds - SAME_TIME_S
+        self._result = sim_time_s - self._since_s >= self._seconds - SAME_TIME_S

@@ -78,16 +78,6 @@ def test_a_spike_is_found_and_a_step_is_none() -> None:
     assert (spike.sim_time_s, spike.value) == (20.0, 3.0)
 
 
-def test_slow_change_counts_and_noise_does_not() -> None:
-    def effect(course: Array) -> float:
-        mean = float(course.mean())
-        return time_effect(times_of(course), course, mean, float(((course - mean) ** 2).sum()))
-
-    assert effect(np.random.default_rng(3).normal(size=800)) < 0.05
-    assert effect(np.arange(800.0)) > 0.9
-    assert effect(np.ones(800)) == 0.0
-
-
 @given(few)
 def test_the_time_effect_is_that_of_eight_stretches(course: Array) -> None:
     times, mean = times_of(course), statistics.fmean(course.tolist())

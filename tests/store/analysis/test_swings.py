@@ -135,15 +135,6 @@ def test_what_only_looks_like_it_does_not_swing(times: Array, values: Array) -> 
     assert swings_of(times, values) == []
 
 
-@pytest.mark.parametrize("course", ["constant", "ramp", "turns"])
-def test_more_time_never_finds_less(course: str) -> None:
-    times = np.arange(0, 600, 0.032)
-    values = swinging(times, course, 2.0)
-    for start_s, end_s in ((55, 80), (30, 120), (0, 300), (0, 600)):
-        part = (times >= start_s) & (times < end_s)
-        assert len(swings_of(times[part], values[part])) == 1, (start_s, end_s)
-
-
 @pytest.mark.parametrize("phase", np.arange(0.25, 2 * np.pi, 0.5))
 @pytest.mark.parametrize("at_end", [False, True])
 def test_a_swing_that_reaches_an_end_of_the_range_is_told_up_to_there(

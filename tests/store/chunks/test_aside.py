@@ -79,19 +79,6 @@ def test_they_are_made_once_and_what_broke_off_goes_on(recording: Recording) -> 
     assert told == []
 
 
-def test_rows_that_robots_record_after_that_are_read_beside_them(recording: Recording) -> None:
-    make_missing_chunks(recording, write=False)
-    with closing(connect(recording.database, "writer")) as robot:
-        robot.execute(
-            "INSERT INTO state (run_id, sim_time_s, wall_time_s, data) "
-            "SELECT run_id, sim_time_s + 1, wall_time_s + 1, '{\"new\": 5}' FROM state "
-            "ORDER BY id DESC LIMIT 1"
-        )
-    with recording.reader() as connection:
-        (run,) = trends(connection, find_range(connection, Scope(last_s=2)), ["new"]).runs
-        assert run.numbers[0].mean == 5
-
-
 @pytest.mark.skipif(not unprivileged.POSSIBLE, reason="permissions do not stop this user here")
 def test_a_question_of_the_command_line_makes_them_where_nothing_can_be_written(
     recording: Recording, tmp_path: Path

@@ -44,15 +44,6 @@ def test_a_text_now_and_then_among_numbers_hides_no_change_of_the_mode(
     assert "not between numbers of mixed" in found.verdicts.not_searched["change"]
 
 
-def test_a_mode_that_is_a_number_as_text_changes(empty: sqlite3.Connection) -> None:
-    recorder = start_run(empty)
-    for step in range(90):
-        recorder.publish(step * 0.1, {"level": str(step // 30)})
-    found = changes(empty)
-    assert [each.details["after"] for each in found.events] == ["1", "2"]
-    assert found.verdicts.not_searched == {}
-
-
 def test_of_a_mode_that_is_a_number_the_way_to_its_changes_is_named(
     empty: sqlite3.Connection,
 ) -> None:

@@ -94,27 +94,6 @@ def test_a_change_lasts_until_the_next_one_also_beyond_the_range(
     assert (cruise.start_s, cruise.end_s, cruise.ongoing) == (300.0, 399.9, False)
 
 
-def test_two_limits_on_one_signal_are_two_events(standing: sqlite3.Connection) -> None:
-    limits = (Threshold("battery_v", below=5.0), Threshold("battery_v", below=4.0))
-    options = EventOptions(kinds=("threshold",), thresholds=limits)
-    found = find_events(standing, find_range(standing, Scope(start_s=250.0, end_s=255.0)), options)
-    told = [(event.details["below"], event.start_s, event.end_s) for event in found.events]
-    assert sorted(told) == [(4.0, 200.0, 299.9), (5.0, 200.0, 299.9)]
-
-
-def test_a_signal_that_few_rows_of_the_run_hold_is_not_silent_in_the_others(
-    empty: sqlite3.Connection,
-) -> None:
-    recorder = start_run(empty)
-    for step in range(2000):
-        late = {"late_m": 1.0 + step} if step >= 1500 else {}
-        recorder.publish(round(step * 0.1, 6), {"x": step, **late})
-    recorder.end_run("finished")
-    make_chunks(empty, 100_000)
-    asked = find_range(empty, Scope(start_s=70.0, end_s=80.0))
-    assert find_events(empty, asked, EventOptions(kinds=("missing",))).events == ()
-
-
 def test_what_a_short_stretch_costs_does_not_grow_with_the_run(empty: sqlite3.Connection) -> None:
     recorder = start_run(empty)
     costs = [after_so_many_rows(recorder, empty, rows) for rows in (2048, 10_240)]

@@ -9,8 +9,7 @@ import pytest
 
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp.store.detection.events import Events, find_events
-from webots_mcp.store.detection.kinds import Event, EventOptions
-from webots_mcp.store.detection.stored import MOST_CHANGES
+from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 CYCLE_S, STAND_S, CYCLES = 20.0, 6.0, 10
@@ -43,10 +42,6 @@ def found(recorder: Recorder, *kinds: str, **options: Any) -> Events:
     return find_events(connection, find_range(connection, Scope()), asked, **options)
 
 
-def of_kind(events: Events, kind: str) -> list[Event]:
-    return [each for each in events.events if each.kind == kind]
-
-
 def test_standstills_of_one_mode_are_one_event_with_what_they_share(docking: Recorder) -> None:
     told = found(docking, "standstill")
     group, last = told.events
@@ -58,21 +53,6 @@ def test_standstills_of_one_mode_are_one_event_with_what_they_share(docking: Rec
     assert "commanded_m_s 0" in group.details["why_not_stuck"]
     assert last.ongoing and last.count == 1
     assert told.verdicts.found == {"standstill": CYCLES}
-
-
-def test_alike_events_are_told_one_by_one_where_that_is_asked_for(docking: Recorder) -> None:
-    told = found(docking, "standstill", group=False)
-    assert [each.count for each in told.events] == [1] * CYCLES
-    assert told.verdicts.found == {"standstill": CYCLES}
-
-
-def test_a_flag_that_flickers_is_one_event_with_its_values(docking: Recorder) -> None:
-    told = found(docking, "change")
-    near = next(each for each in told.events if each.name == "near")
-    assert near.count == 1333 > MOST_CHANGES
-    assert near.details["to"] == {"false": "667 times, 133.2 s", "true": "666 times, 66.6 s"}
-    assert told.verdicts.not_searched == {}
-    assert told.verdicts.found["change"] == sum(each.count for each in told.events)
 
 
 def test_a_mode_that_changes_now_and_then_is_told_change_by_change(
@@ -97,12 +77,6 @@ def test_lines_that_differ_in_their_numbers_only_are_one_event(empty: sqlite3.Co
     lines, gone = found(recorder, "log").events
     assert (lines.count, lines.details["message"]) == (50, "slip of 0.00 m")
     assert gone.details["message"] == "the gear is gone"
-
-
-def test_what_matters_is_told_beside_thousands_of_changes(docking: Recorder) -> None:
-    told = found(docking, limit=8)
-    assert of_kind(told, "standstill") and of_kind(told, "run")
-    assert told.left_out == {} or set(told.left_out) == {"change"}
 
 
 def test_commands_with_another_outcome_are_not_alike(empty: sqlite3.Connection) -> None:

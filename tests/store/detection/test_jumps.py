@@ -34,34 +34,52 @@ def jumps(connection: sqlite3.Connection, **options: Any) -> list[Event]:
     return list(find_events(connection, find_range(connection, Scope()), asked).events)
 
 
-def test_what_went_on_smoothly_during_a_gap_did_not_jump(
-    empty: sqlite3.Connection, looked_at: str
-) -> None:
-    def driving(time_s: float) -> dict[str, Any]:
-        return {"pose": [0.3 * time_s, 0.0], "battery_v": 12 - 0.01 * time_s + 1e-4 * (time_s % 7)}
-
-    record(empty, driving, gap=True)
-    assert jumps(empty) == []
+def step_at_100_s(time_s: float) -> dict[str, Any]:
+    return {"temp_c": 20 + 0.01 * time_s + (50 if time_s >= 100 else 0)}
 
 
-def test_a_jump_at_the_border_of_two_chunks_is_found(
-    empty: sqlite3.Connection, looked_at: str
-) -> None:
-    record(empty, lambda t: {"temp_c": 20 + 0.01 * t + (50 if t >= 100 else 0)})
-    assert [(event.name, event.start_s) for event in jumps(empty)] == [("temp_c", 100.0)]
+def quick_swing_with_a_dropout() -> Callable[[float], dict[str, Any]]:
+    dice = random.Random(3)
+
+    def steering(time_s: float) -> dict[str, Any]:
+        swing = 0.25 * math.sin(4 * (time_s - 100)) if 0 <= time_s - 100 < 2.5 * math.pi else 0.0
+        return {"steering": 9.0 if time_s == 105.0 else 0.7 + swing + dice.gauss(0, 0.005)}
+
+    return steering
 
 
-def test_a_value_that_is_elsewhere_after_a_gap_jumped(empty: sqlite3.Connection) -> None:
-    record(empty, lambda t: {"temp_c": 20 + 0.01 * t + (50 if t >= 100 else 0)}, gap=True)
-    assert [event.name for event in jumps(empty)] == ["temp_c"]
+# What is published, whether rows are missing from 95 to 105 s, and which jumps are told.
+COURSES: dict[str, tuple[Callable[[float], dict[str, Any]], bool, list[tuple[str, float]]]] = {
+    "goes on smoothly during a gap": (
+        lambda t: {"pose": [0.3 * t, 0.0], "battery_v": 12 - 0.01 * t + 1e-4 * (t % 7)}, True, [],
+    ),
+    "at the border of two chunks": (step_at_100_s, False, [("temp_c", 100.0)]),
+    "elsewhere after a gap": (step_at_100_s, True, [("temp_c", 105.0)]),
+    "back only after a gap": (  # nobody knows what it did in between
+        lambda t: {"steer": 0.2 * (94.9 <= t < 95) + 0.1 * (40 <= t < 60)}, True, [],
+    ),
+    **{
+        f"over the end of a scale of {turn:.3g}": (
+            lambda t, name=name, turn=turn: {name: math.remainder(0.01 * turn * t, turn), "x": t},
+            False, [],
+        )
+        for name, turn in (("course", math.tau), ("course_deg", 360.0))
+    },
+    "a swing with two rows at each turn, at the same height": (
+        lambda t: {"steer": (0.1, 0.2, 0.2, 0.1)[round(10 * t) % 4] if 40 <= t < 44 else 0.0},
+        False, [],
+    ),
+    "a dropout in a quick swing": (quick_swing_with_a_dropout(), False, [("steering", 105.0)]),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "turn"), [("course", math.tau), ("course_deg", 360.0)])
-def test_a_heading_that_goes_over_the_end_of_its_scale_does_not_jump(
-    empty: sqlite3.Connection, looked_at: str, name: str, turn: float
-) -> None:
-    record(empty, lambda t: {name: math.remainder(0.01 * turn * t, turn), "x": t})
-    assert jumps(empty) == []
+@pytest.mark.parametrize(("state", "gap", "expected"), COURSES.values(), ids=COURSES)
+def test_a_value_jumps_where_it_does_and_nowhere_else(
+    empty: sqlite3.Connection, looked_at: str, state: Callable[[float], dict[str, Any]],
+    expected: list[tuple[str, float]], *, gap: bool,
+) -> None:  # fmt: skip
+    record(empty, state, gap=gap)
+    assert [(event.name, event.start_s) for event in jumps(empty)] == expected
 
 
 def test_a_signal_that_the_asker_names_is_searched_for_swings(empty: sqlite3.Connection) -> None:
@@ -75,12 +93,6 @@ def test_a_signal_that_the_asker_names_is_searched_for_swings(empty: sqlite3.Con
     assert swing.details["period_s"] == pytest.approx(2.0, rel=0.02)
 
 
-def test_a_value_that_is_back_only_after_a_gap_did_not_drop_out(empty: sqlite3.Connection) -> None:
-    """Nobody knows what it did in between."""
-    record(empty, lambda t: {"steer": 0.2 * (94.9 <= t < 95) + 0.1 * (40 <= t < 60)}, gap=True)
-    assert jumps(empty) == []
-
-
 def test_a_jump_exactly_at_the_begin_of_a_range_is_in_it(
     empty: sqlite3.Connection, looked_at: str
 ) -> None:
@@ -88,41 +100,6 @@ def test_a_jump_exactly_at_the_begin_of_a_range_is_in_it(
     for start_s, end_s, count in ((100.0, 150.0, 1), (50.0, 100.0, 0), (99.9, 100.0, 0)):
         asked = find_range(empty, Scope(start_s=start_s, end_s=end_s))
         assert len(find_events(empty, asked, EventOptions(kinds=("jump",))).events) == count
-
-
-def test_dropouts_everywhere_in_a_long_range_are_found(
-    empty: sqlite3.Connection, looked_at: str
-) -> None:
-    record(empty, lambda t: {"front": 0.0 if round(10 * t) % 70 == 33 else 2 + 0.1 * math.sin(t)})
-    (dropouts,) = jumps(empty)
-    assert dropouts.count == sum(step % 70 == 33 for step in range(2000))
-
-
-def test_a_swing_whose_rows_meet_the_same_values_again_does_not_drop_out(
-    empty: sqlite3.Connection,
-) -> None:
-    """Two rows lie at each of its turns, at the same height."""
-    heights = (0.1, 0.2, 0.2, 0.1)
-
-    def swinging(time_s: float) -> dict[str, Any]:
-        step = round(time_s * 10)
-        return {"steer": heights[step % 4] if 400 <= step < 440 else 0.0}
-
-    record(empty, swinging)
-    assert jumps(empty) == []
-
-
-def test_a_quick_swing_after_a_long_rest_is_a_motion_and_a_dropout_in_it_is_a_jump(
-    empty: sqlite3.Connection, looked_at: str
-) -> None:
-    dice = random.Random(3)
-
-    def steering(time_s: float) -> dict[str, Any]:
-        swing = 0.25 * math.sin(4 * (time_s - 100)) if 0 <= time_s - 100 < 2.5 * math.pi else 0.0
-        return {"steering": 9.0 if time_s == 105.0 else 0.7 + swing + dice.gauss(0, 0.005)}
-
-    record(empty, steering)
-    assert [(event.name, event.start_s) for event in jumps(empty)] == [("steering", 105.0)]
 
 
 SWINGS: dict[str, Callable[[float], float]] = {

@@ -10,12 +10,9 @@ import pytest
 
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp.store.chunk_making import make_chunks
-from webots_mcp.store.detection.events import asked_kinds, find_events
-from webots_mcp.store.detection.kinds import EventOptions, Ledger
-from webots_mcp.store.detection.search import Search, events_touching
-from webots_mcp.store.reading.catalogue import known_signals
+from webots_mcp.store.detection.events import find_events
+from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.reading.ranges import Scope, find_range
-from webots_mcp.store.reading.segment import Deadline
 
 SWING_S = (100.0, 130.0)
 BORDER_S = 307.2  # of two chunks of 1,024 rows
@@ -47,37 +44,6 @@ def test_swings_and_leaps_are_searched_in_the_whole_of_a_long_run(long: sqlite3.
     (leap,) = (each for each in found.events if each.kind == "jump")
     assert leap.start_s == pytest.approx(LEAP_S)
     assert "not before" not in str(found.verdicts.not_searched)
-
-
-def test_where_the_robot_stood_it_is_told_as_stuck_too_though_the_time_is_over_by_then(
-    empty: sqlite3.Connection,
-) -> None:
-    """Both are found at once: as many statements as are enough for `standstill` are for both."""
-    recorder = start_run(empty)
-    for step in range(600):
-        there_m = 0.03 * (min(step, 200) + max(step - 400, 0))
-        recorder.publish(step * 0.1, {"pose": [there_m, 0.0], "commanded_m_s": 0.3})
-    statements: list[str] = []
-    empty.set_trace_callback(statements.append)
-
-    def found_kinds(kinds: tuple[str, ...], enough: float) -> list[str]:
-        statements.clear()
-        options, deadline = (
-            EventOptions(kinds=kinds),
-            Deadline(1.0, lambda: len(statements) / enough),
-        )
-        asked = find_range(empty, Scope())
-        known = known_signals(empty, asked)
-        looked_for, (segment,) = asked_kinds(options), asked.segments
-        search = Search(empty, segment, known, looked_for, options, deadline, Ledger())
-        return [each.kind for each in events_touching(search)]
-
-    assert found_kinds(("standstill",), math.inf) == ["standstill"]
-    times = range(1, len(statements) + 1)
-    enough = [each for each in times if found_kinds(("standstill",), each) == ["standstill"]]
-    assert enough
-    assert all(found_kinds(("standstill", "stuck"), each) == ["stuck"] for each in enough)
-    empty.set_trace_callback(None)
 
 
 def test_the_position_of_a_run_is_the_one_that_it_published(empty: sqlite3.Connection) -> None:

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from tests.recordings.rover import start_run
-from webots_mcp.errors import UnknownSignalError
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.detection.events import Events, find_events
 from webots_mcp.store.detection.kinds import Event, EventOptions
@@ -158,16 +157,6 @@ def test_a_silence_that_is_exactly_as_long_as_asked_for_is_told(
         assert told(found) == [("front", 20.0, 20.5)]
 
 
-def test_a_signal_that_never_had_a_value_is_not_said_to_be_silent_for_good(
-    empty: sqlite3.Connection,
-) -> None:
-    record(empty, lambda t: {"front": None, "x": t})
-    assert told(ask(empty, "missing")) == []
-    assert trends(empty, find_range(empty, Scope())).runs[0].without_value == ("front",)
-    with pytest.raises(UnknownSignalError):
-        resolve_signals(known_signals(empty, find_range(empty, Scope())), ["frount"])
-
-
 @pytest.mark.parametrize("kind", ["flat", "jump", "oscillation"])
 def test_numbers_that_are_too_large_to_be_judged_are_said_to_be_so(
     empty: sqlite3.Connection, kind: str
@@ -227,14 +216,6 @@ def test_losses_shorter_than_what_counts_are_counted_beside(
     (said,) = answer.notes
     too_short = "without a value for less than missing_s=1 s, so not counted as missing"
     assert said == f"run 1: {too_short}: {note}"
-
-
-def test_how_long_a_silence_counts_is_the_askers_to_say(empty: sqlite3.Connection) -> None:
-    record(empty, losing_the_line)
-    options = EventOptions(kinds=("missing",), missing_s=0.15)
-    answer = find_events(empty, find_range(empty, Scope()), options, group=False)
-    assert {round(event.start_s, 1) for event in answer.events} == {start for start, _ in LOST_S}
-    assert answer.notes == ()
 
 
 def test_what_comes_now_and_then_is_not_silent_meanwhile_and_the_answer_says_so(

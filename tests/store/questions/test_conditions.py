@@ -120,11 +120,6 @@ def test_of_several_runs_all_rows_are_counted_and_the_same_is_said_once(
     assert others.startswith("run 2, 3: ")
 
 
-def test_a_misspelt_signal_is_told_from_how_many(rover: sqlite3.Connection) -> None:
-    with pytest.raises(UnknownSignalError, match=r"there is .* \(the nearest of \d+\)"):
-        ask(rover, "bmuper < 3")
-
-
 @pytest.mark.parametrize(
     ("interval", "said"),
     [(1, "nothing was missed"), (5, "one publish() call in 5 is a row"), (None, "may be fewer")],
@@ -140,18 +135,6 @@ def test_the_answer_says_whether_the_rows_are_all_that_was_published(
     assert said in note
 
 
-def test_where_rows_were_dropped_it_is_not_said_that_nothing_was_missed(
-    counting: Recorder,
-) -> None:
-    counting.publish(0.0, {"n": 1})
-    counting.connection.execute("UPDATE session SET throttle_interval = 1")
-    counting.insert("event", **counting.at(0.0), kind="dropped")
-
-    (note,) = ask(counting.connection, "n > 0").notes
-
-    assert note == "run 1: rows were dropped, so their values are missing"
-
-
 def test_a_wrong_question_is_refused_with_what_would_do(rover: sqlite3.Connection) -> None:
     with pytest.raises(InvalidConditionError, match="column 16"):
         ask(rover, "sensors.bumper = true")
@@ -161,17 +144,6 @@ def test_a_wrong_question_is_refused_with_what_would_do(rover: sqlite3.Connectio
         ask(rover, "mode < 3")
     found = find_events(rover, find_range(rover, Scope()), EventOptions(kinds=("condition",)))
     assert "give where" in found.verdicts.not_searched["condition"]
-
-
-def test_what_there_was_no_time_for_is_named_by_time(rover: sqlite3.Connection) -> None:
-    found = find_events(
-        rover,
-        find_range(rover, Scope(run_id=1)),
-        EventOptions(kinds=("condition",), where="sensors.bumper"),
-        deadline_s=0.0,
-    )
-
-    assert "time limit reached" in found.verdicts.not_searched["condition"]
 
 
 @settings(

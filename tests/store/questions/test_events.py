@@ -15,7 +15,6 @@ from tests.frames import frame_of
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from tests.store.questions.asking import ask, spans
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
-from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.detection.events import asked_kinds, find_events
 from webots_mcp.store.detection.jump import find_jumps
 from webots_mcp.store.detection.kinds import Event, EventOptions, Ledger, Threshold
@@ -35,21 +34,6 @@ def test_a_robot_that_should_move_and_does_not_is_stuck(
     assert stuck.details["mode"] == "cruise" and stuck.details["commanded"] == 0.2
     assert stuck.around["mode"] == "cruise"
     assert stuck.wall_time_s == pytest.approx(WALL_START_S + 20.0, abs=0.5)
-
-
-def test_standing_in_a_mode_that_rests_is_not_stuck(rover: sqlite3.Connection) -> None:
-    moving = ask(
-        rover, "stuck", commanded="target", moving_modes=("back_up",), min_commanded_m_s=9.0
-    )
-    assert moving.events == ()
-
-
-def test_mode_changes_have_their_duration(rover: sqlite3.Connection, looked_at: str) -> None:
-    events = ask(rover, "change", signals=("mode",)).events
-    assert [(e.start_s, e.end_s, e.details["after"]) for e in events] == [
-        (52.0, 60.0, "back_up"), (60.0, 95.0, "avoid"), (95.0, pytest.approx(119.9), "cruise"),
-    ]  # fmt: skip
-    assert not any(event.ongoing for event in events)  # the run has ended
 
 
 def above(limit: float, for_s: float = 0.0) -> dict[str, Any]:
@@ -75,18 +59,6 @@ def test_what_happened_to_the_rover_is_found(
     assert found == [
         (name, *(pytest.approx(each, abs=0.2) for each in ends)) for name, *ends in expected
     ]
-
-
-def test_numbers_too_large_to_reckon_with_cross_a_threshold_and_are_not_silent(
-    empty: sqlite3.Connection, looked_at: str
-) -> None:
-    recorder = start_run(empty)
-    for step in range(300):
-        recorder.publish(step / 10, {"big": 1e301 if 100 <= step < 200 else 1.0})
-    make_chunks(empty)
-    high = Threshold("big", above=5.0)
-    assert spans(ask(empty, "threshold", thresholds=(high,))) == [(10.0, 19.9)]
-    assert ask(empty, "missing").events == ()
 
 
 def test_commands_logs_and_notices_are_on_the_same_clock(rover: sqlite3.Connection) -> None:
@@ -217,12 +189,6 @@ def test_between_two_signals_the_time_is_looked_at(
         found = events_touching(search)
         told += ledger.verdicts(kinds, found).not_searched.values()
     assert any(re.search(r"time limit reached, \d+ signals left: ask for", each) for each in told)
-
-
-def test_a_run_that_is_only_cruising_has_no_trouble(rover: sqlite3.Connection) -> None:
-    found = find_range(rover, Scope(run_id=3))
-    events = find_events(rover, found, limit=200)
-    assert {event.kind for event in events.events} == {"run"}
 
 
 def test_options_without_sense_are_refused(rover: sqlite3.Connection) -> None:

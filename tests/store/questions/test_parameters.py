@@ -13,9 +13,7 @@ from tests.bridge.conftest import STEP_MS
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plotting.question import plot
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.parameters import parameters_of
 from webots_mcp.store.questions.compare import compare_runs
 from webots_mcp.store.questions.runs import list_runs
 
@@ -68,14 +66,6 @@ def test_runs_show_what_is_not_as_declared_and_what_differs_between_them(
     ]
 
 
-def test_of_many_changes_the_last_two_are_told(connection: sqlite3.Connection) -> None:
-    kp = parameters_of(connection, [3])[3]["kp"]
-    for number in range(3):
-        kp.add(kp.settings[-1]._replace(sim_time_s=1.0 + number, value=5.0 + number))
-    kp.add(kp.settings[-1])
-    assert kp.described == "3, then 2 others, 6 from 2.000 s on, 7 from 3.000 s on"
-
-
 @pytest.mark.parametrize(
     ("wanted", "run_ids"),
     [
@@ -116,21 +106,3 @@ def test_a_comparison_names_the_parameters_in_which_the_runs_differ(
     assert "ki" not in first.parameters
     second, fourth = compare_runs(connection, [2, 4]).groups
     assert "gait" not in second.parameters | fourth.parameters
-
-
-def test_a_picture_names_them_too(connection: sqlite3.Connection) -> None:
-    picture = plot(connection, signals=["error"], run_ids=[1, 3], image_format="svg")
-    assert "run 1 (kp 2.0" in picture.caption
-    assert "run 3 (kp " in picture.caption
-    assert "kp" not in plot(connection, signals=["error"], run_ids=[3]).caption
-
-
-def test_a_value_that_no_bridge_has_written_keeps_no_run_from_being_found(file: Path) -> None:
-    damaged = file.with_name("damaged.db")
-    with closing(connect(file, "reader")) as source, closing(sqlite3.connect(damaged)) as copy:
-        source.backup(copy)
-    with closing(connect(damaged, "writer")) as connection:
-        connection.execute("UPDATE parameter_value SET value = 'no JSON' WHERE run_id = 1")
-        found = list_runs(connection, parameters={"ki": 0.5}, limit=1)
-        assert [run.run_id for run in found.runs] == [4]
-        assert found.total == 3

@@ -14,7 +14,6 @@ from tests.recordings.rover import WALL_PER_SIM, Recorder, record_rover, start_r
 from webots_mcp.errors import (
     InvalidInputError,
     NothingRecordedError,
-    UnknownRobotError,
     UnknownRunError,
 )
 from webots_mcp.store.analysis.summary import Spread
@@ -121,13 +120,6 @@ def test_runs_are_measured_over_the_same_stretch(rover: sqlite3.Connection) -> N
     assert found["stuck per min"] == [pytest.approx(1.0, abs=0.01), 0.0]
 
 
-def test_of_one_run_each_no_difference_is_claimed(rover: sqlite3.Connection) -> None:
-    comparison = compare_runs(rover, [2, 3])
-    verdicts = [each.different for each in (*comparison.measures, *comparison.differences)]
-    assert all(verdict == [False, None] for verdict in verdicts)
-    assert "one run each" in comparison.notes[0]
-
-
 def record_group(
     recorder: Recorder, robot_id: int, code: str, runs: int, speed_m_s: float, dice: random.Random
 ) -> None:
@@ -216,38 +208,6 @@ def test_a_run_of_one_moment_is_named_as_what_the_others_are_cut_to(
     ) in compare_runs(empty, [1, 2]).notes
 
 
-def test_a_swing_that_was_cut_comes_first(empty: sqlite3.Connection) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    for swing in (0.4, 0.02):
-        recorder.run(recorder.session(robot_id, "x"), robot_id)
-        for step in range(200):
-            state = {f"other_{i}": i * 0.1 + swing * 0.5 + step * 0.01 for i in range(6)}
-            recorder.publish(step * 0.1, {**state, "heading_error": swing * math.sin(step * 0.3)})
-    first, *_ = compare_runs(empty, [1, 2]).differences
-    assert first.name == "heading_error"
-    assert first.deviation_ratio[1] == pytest.approx(0.05)
-
-
-@pytest.mark.parametrize(("noise_m", "speed_m_s", "way_m"), [(0.01, 0, 0), (0.0005, 0.1, 14)])
-def test_the_noise_of_a_position_is_no_way(
-    empty: sqlite3.Connection, noise_m: float, speed_m_s: float, way_m: float
-) -> None:
-    noise = random.Random(7)
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    session_id = recorder.session(robot_id, "x")
-    empty.execute("BEGIN")
-    for _ in range(2):
-        recorder.run(session_id, robot_id)
-        for step in range(4376):
-            x, y = (noise.gauss(speed_m_s * step * 0.032, noise_m), noise.gauss(1, noise_m))
-            recorder.publish(step * 0.032, {"pose": [x, y]})
-    empty.execute("COMMIT")
-    for distance_m in measures(compare_runs(empty, [1, 2]))["distance_m"]:
-        assert distance_m == pytest.approx(way_m, abs=0.03 * way_m + 0.6)
-
-
 @pytest.mark.parametrize("name", ["bearing_rad", "heading_deg", "level_m"])
 def test_what_is_left_of_adding_equal_numbers_is_no_difference(
     empty: sqlite3.Connection, name: str
@@ -262,15 +222,6 @@ def test_what_is_left_of_adding_equal_numbers_is_no_difference(
     (found,) = compare_runs(empty, [1, 2], names=[name]).differences
     assert medians(found.deviation) == [0, 0]
     assert (found.effect, found.deviation_ratio) == ([0, 0], [None, None])
-
-
-def test_runs_before_and_after_the_last_edit_are_compared(rover: sqlite3.Connection) -> None:
-    comparison = compare_runs(rover)
-    before, after = comparison.groups
-    assert [run.run_id for run in before.runs] == [1, 2]
-    assert [run.run_id for run in after.runs] == [3]
-    assert comparison.compared_s == pytest.approx(29.9, abs=0.01)
-    assert measures(comparison)["mean_speed_m_s"] == pytest.approx([0.2, 0.3], abs=0.001)
 
 
 def test_a_signal_that_only_one_run_has_is_named(empty: sqlite3.Connection) -> None:
@@ -288,33 +239,12 @@ def test_a_signal_that_only_one_run_has_is_named(empty: sqlite3.Connection) -> N
         compare_runs(empty)
 
 
-def test_runs_of_two_robots_can_be_compared(empty: sqlite3.Connection) -> None:
-    for name, x in (("a", 1.0), ("b", 3.0)):
-        recorder = start_run(empty, name)
-        for step in range(30):
-            recorder.publish(float(step), {"filler_" + name: 0, "x": x + step % 2, "scan": None})
-    comparison = compare_runs(empty, [1, 2], names=["x", "scan"])
-    (x, *_) = comparison.differences
-    assert medians(x.mean) == [1.5, 3.5]
-    assert "these are runs of different robots: a, b" in comparison.notes
-    assert comparison.only_in == {}
-
-
 @pytest.mark.parametrize("run_ids", [[], [1, 1], list(range(1, 12))])
 def test_a_comparison_without_sense_is_refused(
     rover: sqlite3.Connection, run_ids: list[Any]
 ) -> None:
     with pytest.raises(InvalidInputError, match="1 to 10 different runs"):
         compare_runs(rover, run_ids)
-
-
-def test_unknown_runs_and_robots_are_named(rover: sqlite3.Connection) -> None:
-    with pytest.raises(UnknownRunError, match="99"):
-        compare_runs(rover, [1, 99])
-    with pytest.raises(UnknownRobotError):
-        list_runs(rover, robot="rovre")
-    with pytest.raises(InvalidInputError, match="limit"):
-        list_runs(rover, limit=0)
 
 
 @pytest.mark.parametrize(("name", "turn"), [("heading", math.tau), ("heading_deg", 360.0)])

@@ -52,30 +52,12 @@ def test_a_recording_gap_is_visible_as_such(rover: sqlite3.Connection, looked_at
     assert empty and all(90 <= t < 95 for t in empty)
 
 
-def test_few_rows_come_as_they_are(rover: sqlite3.Connection) -> None:
-    run = ask(rover, "pose.0", "ir", start_s=10.0, end_s=11.0)
-    assert (run.step_s, run.rows) == (None, 10)
-    assert column(run, "pose.0").last == [pytest.approx(2.0 + 0.02 * i) for i in range(10)]
-
-
-def test_an_angle_has_a_circular_mean(rover: sqlite3.Connection, looked_at: str) -> None:
-    heading = column(ask(rover, "heading", start_s=60.0, end_s=90.0, max_points=3), "heading")
-    assert all(abs(abs(mean or 0) - math.pi) < 0.01 for mean in heading.mean)
-    assert heading.min[0] is not None and heading.min[0] < -2.6
-
-
 def test_modes_come_as_change_points(rover: sqlite3.Connection, looked_at: str) -> None:
     run = ask(rover, "mode", "sensors.bumper", start_s=45.0)
     mode, bumper = run.changes
     assert mode.points == [(0.0, "cruise"), (52.0, "back_up"), (60.0, "avoid"), (95.0, "cruise")]
     assert mode.time_by_value_s == pytest.approx({"avoid": 35.0, "cruise": 31.9, "back_up": 8.0})
     assert bumper.points == [(40.0, True), (52.0, False)]
-
-
-def test_odd_values_are_named(rover: sqlite3.Connection) -> None:
-    front = column(ask(rover, "sensors.front", start_s=99.0, end_s=106.0), "sensors.front")
-    assert front.replaced == {"nan": 40}
-    assert sum(front.count) == 30
 
 
 def test_a_value_that_is_no_number_is_named_within_its_array(empty: sqlite3.Connection) -> None:
@@ -90,34 +72,6 @@ def test_a_value_that_is_no_number_is_named_within_its_array(empty: sqlite3.Conn
     assert column(run, "short.1").replaced == {}
     assert column(run, "short.2").replaced == {"nan": 9}
     assert column(run, "long.mean").replaced == {}, "it is the mean of the others"
-
-
-def test_a_reduced_array_is_a_signal_like_any_other(
-    rover: sqlite3.Connection, looked_at: str
-) -> None:
-    run = ask(rover, "lidar.min", "lidar.argmin", start_s=50.0, end_s=80.0)
-    lidar = column(run, "lidar.min")
-    assert lidar.whole.min == pytest.approx(1.55)
-    assert column(run, "lidar.argmin").whole.max == 7
-
-
-def test_values_and_chunks_give_the_same_whole(rover: sqlite3.Connection, looked_at: str) -> None:
-    battery = column(ask(rover, "battery_v", start_s=3.3, end_s=117.7), "battery_v").whole
-    expected = [12.6 - 0.001 * i / 10 for i in range(33, 1177) if not 900 <= i < 950]
-    mean = math.fsum(expected) / len(expected)
-    assert battery.present == len(expected)
-    assert battery.mean == pytest.approx(mean)
-    squares = math.fsum((value - mean) ** 2 for value in expected)
-    assert battery.squares == pytest.approx(squares, rel=1e-6)
-
-
-def test_a_wall_range_gives_each_run_its_part(rover: sqlite3.Connection) -> None:
-    found = find_range(
-        rover, Scope(since_wall_time=1_700_000_050.0, until_wall_time=1_700_000_070.0)
-    )
-    answer = query_history(rover, found, ["battery_v"], max_points=20)
-    assert [run.run_id for run in answer.runs] == [1, 2]
-    assert sum(len(run.sim_time_s) for run in answer.runs) <= 20
 
 
 def test_a_deadline_that_passed_is_admitted(rover: sqlite3.Connection) -> None:
@@ -149,20 +103,6 @@ def test_absurd_questions_are_refused(rover: sqlite3.Connection) -> None:
         query_history(rover, found, ["nothing"])
     with pytest.raises(InvalidInputError, match="limit"):
         query_rows(rover, found, ["ir"], limit=0)
-
-
-def test_rows_that_are_in_no_chunk_are_in_the_answer(
-    empty: sqlite3.Connection, looked_at: str
-) -> None:
-    recorder = start_run(empty)
-    for step in range(600):
-        recorder.publish(step * 0.1, {"x": float(step), "mode": f"m{step // 200}"})
-        if step == 450:
-            make_chunks(empty, 10_000)
-    run = ask(empty, "x", "mode", start_s=0.05)
-    assert column(run, "x").whole[:2] == (599, 599)
-    assert column(run, "x").whole.last == 599.0
-    assert [point.value for point in run.changes[0].points] == ["m0", "m1", "m2"]
 
 
 def test_integers_beyond_64_bits_stay_what_they_are_in_rows(empty: sqlite3.Connection) -> None:

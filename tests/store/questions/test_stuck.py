@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
-from tests.store.questions.asking import ask, spans
+from tests.store.questions.asking import ask
 from webots_mcp.store.detection.events import find_events
 from webots_mcp.store.detection.kinds import Event, EventOptions
 from webots_mcp.store.detection.motion import ModeUses, RunNoise, find_motion
@@ -40,19 +40,6 @@ def test_a_mode_of_an_earlier_run_in_which_it_moved_is_evidence(empty: sqlite3.C
     assert stuck.details["evidence_for"] == "in mode S3, in which it moved at 0.2 m/s in run 1"
 
 
-def test_an_earlier_run_without_a_position_tells_nothing_of_its_modes(
-    empty: sqlite3.Connection,
-) -> None:
-    earlier = start_run(empty)
-    for step in range(40):
-        earlier.publish(step * 1.0, {"mode": "S3"})
-    recorder = Recorder(empty, WALL_START_S + 1000)
-    recorder.run(1, 1)
-    for step in range(100):
-        recorder.publish(step * 0.1, {"mode": "S3", "gps": {"x": 1, "y": 0}})
-    assert ask(empty, "stuck", bounds={"run_id": 2}).events == ()
-
-
 @pytest.mark.parametrize("period_s", [0.6, 1.5, 2.0])
 def test_a_stuck_robot_that_wiggles_is_so_from_its_first_row_to_its_last(
     empty: sqlite3.Connection, period_s: float
@@ -71,13 +58,6 @@ def test_where_nothing_stood_the_answer_says_what_came_nearest(empty: sqlite3.Co
     for step in range(300):
         recorder.publish(step * 0.1, {"gps": {"x": step * 0.03, "y": 0}})
     assert "in 3 s: 0.9 m" in ask(empty, "stuck").verdicts.not_found["stuck"]
-
-
-def test_a_recording_gap_ends_a_standstill(empty: sqlite3.Connection) -> None:
-    recorder = start_run(empty)
-    for step in (*range(100), *range(200, 300)):
-        recorder.publish(step * 0.1, {"gps": {"x": 1.0, "y": 0.0}})
-    assert spans(ask(empty, "standstill")) == [(0.0, 9.9), (20.0, 29.9)]
 
 
 def test_without_a_position_stuck_cannot_be_searched_and_the_answer_says_so(

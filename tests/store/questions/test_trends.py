@@ -49,28 +49,6 @@ def test_mean_and_deviation_are_exact_from_values_and_from_chunks(
     assert battery.summary.present == len(values)
 
 
-def test_a_stuck_robot_rests(rover: sqlite3.Connection) -> None:
-    x = one(rover, "pose.0", end_s=52.0)
-    assert x.flat_since_s == pytest.approx(40.0, abs=0.3)
-    assert "flat at 8 since" in x.says
-
-
-def test_a_swinging_heading_is_described_across_the_turn(rover: sqlite3.Connection) -> None:
-    heading = one(rover, "heading", start_s=60.0, end_s=90.0)
-    (swing,) = heading.swings
-    assert heading.shape == "oscillating"
-    assert swing.period_s == pytest.approx(2.0, rel=0.02)
-    assert swing.amplitude == pytest.approx(0.5, rel=0.03)
-    assert abs(heading.mean or 0) == pytest.approx(math.pi, abs=0.02)
-
-
-def test_a_spike_is_told(rover: sqlite3.Connection) -> None:
-    ir = one(rover, "ir", start_s=60.0, end_s=80.0)
-    assert ir.spikes is not None
-    assert [(spike.sim_time_s, spike.value) for spike in ir.spikes] == [(70.0, 5.0)]
-    assert "1 spike, the largest 5 at 70 s" in ir.says
-
-
 def record(
     connection: sqlite3.Connection, *, rows: int, interval_s: float, **courses: Course
 ) -> None:
@@ -195,12 +173,6 @@ def test_rows_without_the_signal_are_rows_without_a_value(
     assert f"no {'usable ' * (looked_at == 'chunks')}value in 1000 of 2000 rows" in lidar.says
 
 
-def test_missing_values_are_told(rover: sqlite3.Connection, looked_at: str) -> None:
-    front = one(rover, "sensors.front", start_s=90.0)
-    assert front.missing == 40
-    assert f"no {'usable ' * (looked_at == 'chunks')}value in 40 of 250 rows" in front.says
-
-
 def test_what_changed_most_comes_first(rover: sqlite3.Connection, looked_at: str) -> None:
     run = ask(rover)
     names = [trend.name for trend in run.numbers]
@@ -223,33 +195,6 @@ def test_a_clock_is_never_what_changed_most(empty: sqlite3.Connection, looked_at
     assert set(names[3:]) == {"time_s", "robotTime", "loop_steps"}
 
 
-def test_modes_are_counted_with_their_times(rover: sqlite3.Connection, looked_at: str) -> None:
-    mode, bumper = ask(rover, "mode", "sensors.bumper").states
-    assert (mode.changes, mode.last, mode.since_s) == (3, "cruise", 95.0)
-    assert mode.time_by_value_s == pytest.approx({"cruise": 76.9, "avoid": 35.0, "back_up": 8.0})
-    assert (bumper.changes, bumper.last) == (2, False)
-
-
-def test_a_mode_alone_is_told_with_the_rows_that_it_is_of(
-    rover: sqlite3.Connection, looked_at: str
-) -> None:
-    """Of a long run it was "no row in that range"."""
-    (whole,) = trends(rover, find_range(rover, Scope(run_id=1))).runs
-    (run,) = trends(rover, find_range(rover, Scope(run_id=1)), ["mode"]).runs
-    assert (run.rows, run.resolution_s, run.cut_at_s) == (whole.rows, None, None)
-    assert run.states == tuple(each for each in whole.states if each.name == "mode")
-
-
-def test_a_signal_without_a_value_in_the_range_is_named(rover: sqlite3.Connection) -> None:
-    run = ask(rover, "sensors.front", start_s=101.0, end_s=103.0)
-    assert run.numbers == () and run.without_value == ("sensors.front",)
-
-
-def test_an_empty_range_has_empty_trends(rover: sqlite3.Connection) -> None:
-    run = ask(rover, start_s=91.0, end_s=94.0)
-    assert run.numbers == () and run.rows == 0
-
-
 @pytest.mark.parametrize("step", [0.15, 5.0])
 def test_what_stepped_from_one_rest_to_another_is_flat_since_the_step(
     empty: sqlite3.Connection, looked_at: str, step: float
@@ -261,14 +206,6 @@ def test_what_stepped_from_one_rest_to_another_is_flat_since_the_step(
     make_chunks(empty, 100_000)
     (x,) = trends(empty, find_range(empty, Scope())).runs[0].numbers
     assert x.flat_since_s == 70.3
-
-
-def test_numbers_too_large_to_reckon_with_are_not_called_missing(
-    empty: sqlite3.Connection, looked_at: str
-) -> None:
-    record(empty, rows=300, interval_s=0.1, big=lambda _: 1e308, x=lambda time_s: time_s)
-    make_chunks(empty)
-    assert ask(empty).without_value == ("big (its numbers are beyond 1e100)",)
 
 
 def test_whole_numbers_that_name_a_mode_have_times_and_no_slope(

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import itertools
 import sqlite3
-import sys
 from collections.abc import Iterator
-from functools import partial
 
 import pytest
 
@@ -15,8 +13,7 @@ from tests.recordings.rover import start_run
 from webots_mcp.store.detection.events import asked_kinds
 from webots_mcp.store.detection.kinds import Event, EventOptions, Ledger, Verdicts
 from webots_mcp.store.detection.search import Search, events_touching
-from webots_mcp.store.questions.series import RunHistory, query_history, query_rows
-from webots_mcp.store.questions.trends import trends
+from webots_mcp.store.questions.series import query_rows
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.frame_summary import change_points
 from webots_mcp.store.reading.ranges import Scope, find_range
@@ -100,39 +97,6 @@ def test_since_when_a_mode_is_in_force_is_looked_for_backwards(
     assert all(each.unread_from_s is None for each in told), "ten seconds are read at once"
     assert any("mode" in each.since_before for each in told)
     assert told[-1].points["mode"][0].sim_time_s == 1500.0
-
-
-def test_who_had_no_time_at_all_says_so_of_text_as_of_numbers(
-    unsummed: sqlite3.Connection,
-) -> None:
-    found = find_range(unsummed, Scope(start_s=100.0))
-    for names in (["mode"], ["x"], ["mode", "x"]):
-        (history,) = query_history(unsummed, found, names, deadline_s=0.0).runs
-        (trend,) = trends(unsummed, found, names, deadline_s=0.0).runs
-        assert (history.cut_at_s, trend.cut_at_s) == (100.0, 100.0)
-        assert (history.rows, trend.rows) == (0, 0)
-        assert trend.without_value == (), "nobody has looked"
-        assert not any(each.time_by_value_s for each in history.changes)
-
-
-def test_no_mode_is_told_behind_the_end_of_the_numbers_beside_it(
-    unsummed: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = find_range(unsummed, Scope())
-    ends_s = set[float]()
-    for looks in SOME[::4]:
-        for question in (query_history, trends):
-            with monkeypatch.context() as patch:
-                counted = partial(Deadline, clock=itertools.count().__next__)
-                patch.setattr(sys.modules[question.__module__], "Deadline", counted)
-                (run,) = question(unsummed, whole, ["mode", "x"], deadline_s=looks).runs
-            end_s = run.cut_at_s
-            if end_s is None:
-                continue
-            ends_s.add(end_s)
-            states = run.changes if isinstance(run, RunHistory) else run.states
-            assert all(sum(each.time_by_value_s.values()) <= end_s + 1e-6 for each in states)
-    assert len(ends_s) > 2
 
 
 def test_a_page_without_a_row_for_which_the_time_was_over_is_no_last_page(

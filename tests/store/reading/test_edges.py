@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
 from webots_mcp.store.chunk_making import make_chunks
-from webots_mcp.store.detection.events import find_events, timeline
+from webots_mcp.store.detection.events import find_events
 from webots_mcp.store.detection.kinds import Event, EventOptions
-from webots_mcp.store.logs import window_of
 from webots_mcp.store.questions.series import query_rows
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.reading.segment import moment_of, shown_time
@@ -90,29 +89,6 @@ def test_a_shown_time_finds_its_row_and_no_other_within_the_millisecond(
     assert rows_of(clock, start_s=shown_s)[0] == row
     assert rows_of(clock, start_s=shown_s, end_s=shown_s + 0.001) == [row]
     assert rows_of(clock, end_s=shown_s)[-1] == row - 1
-
-
-def test_a_change_at_the_start_of_a_range_is_in_it(clock: sqlite3.Connection) -> None:
-    shown_s = shown_time(TIMES[70])
-    whole = find_range(clock, Scope(start_s=shown_s, end_s=shown_s + 0.1))
-    for found in (
-        find_events(clock, whole, EventOptions(kinds=("change",))).events,
-        timeline(clock, whole, EventOptions(kinds=("change",))).events,
-    ):
-        assert [(e.start_s, e.details) for e in found] == [
-            (TIMES[70], {"before": "b", "after": "a"})
-        ]
-
-
-def test_log_lines_are_bounded_as_rows_are() -> None:
-    late = next(time_s for time_s in TIMES if time_s < shown_time(time_s))
-    early = next(time_s for time_s in TIMES if time_s > shown_time(time_s))
-    for time_s in (late, early):
-        shown_s = shown_time(time_s)
-        from_there = window_of(Scope(start_s=shown_s), 90.0)
-        up_to_there = window_of(Scope(end_s=shown_s), 90.0)
-        assert from_there.start_s <= time_s
-        assert not time_s < up_to_there.end_s
 
 
 def test_a_range_that_begins_with_the_first_row_is_within_the_recording(

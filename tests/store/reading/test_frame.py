@@ -18,9 +18,9 @@ from webots_mcp.connection import connect, create_schema
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.chunks import decoded_of, statistics_of
-from webots_mcp.store.reading.frame import Frame, Zones, read_frame
+from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import whole_run
-from webots_mcp.store.reading.segment import Deadline, Segment
+from webots_mcp.store.reading.segment import Deadline
 
 VALUES = st.one_of(
     st.floats(-1e6, 1e6), st.integers(-1000, 1000), st.booleans(), st.none(), st.sampled_from("abc")
@@ -49,10 +49,6 @@ def framed(connection: sqlite3.Connection) -> Frame:
     segment = whole_run(connection, 1)
     assert segment is not None
     return read_frame(connection, segment, Deadline(60))
-
-
-def as_lists(zones: Zones) -> dict[str, list[str]]:
-    return {name: [*map(str, getattr(zones, name).tolist())] for name in vars(zones)}
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
@@ -162,15 +158,6 @@ def test_a_group_with_a_count_of_rows_that_cannot_be_is_not_read_and_it_is_said(
     assert [str(part) for part in frame.unread] == [
         "not read from 0.800 to 1.500 s: its row group is damaged"
     ]
-
-
-def test_a_range_in_wall_time_holds_only_its_rows(empty: sqlite3.Connection) -> None:
-    recorder = start_run(empty)
-    for step in range(6):  # simulation time stands still
-        recorder.publish(1.0, {"a": step})
-        empty.execute("UPDATE state SET wall_time_s = ? WHERE id = ?", (100.0 + step, step + 1))
-    segment = Segment(1, 0.0, 2.0, wall_start_s=102.0, wall_end_s=104.0)
-    assert read_frame(empty, segment, Deadline(60)).values("a") == [2, 3]
 
 
 def test_what_there_was_no_time_for_is_said(empty: sqlite3.Connection) -> None:

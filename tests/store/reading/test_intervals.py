@@ -42,32 +42,6 @@ def spans(connection: sqlite3.Connection, **options: Any) -> Spans:
     return sorted((each.name, each.start_s, each.end_s) for each in found.events)
 
 
-def test_a_value_that_flickers_is_beyond_no_threshold_for_long(
-    empty: sqlite3.Connection, looked_at: str
-) -> None:
-    record(empty, [{"alt_m": 10.0 * (step % 2)} for step in range(2000)], 0.02)
-    limits = (Threshold("alt_m", above=5, for_s=0.03), Threshold("alt_m", below=5, for_s=0.03))
-    assert spans(empty, kinds=("threshold",), thresholds=limits) == []
-
-
-def test_a_sensor_that_is_slower_than_the_rows_is_not_silent(
-    empty: sqlite3.Connection, looked_at: str
-) -> None:
-    slow = [{"front_m": 1.0 + step / 999} if step % 2 else {} for step in range(2000)]
-    record(empty, slow, 0.02)
-    assert spans(empty, kinds=("missing",), missing_s=0.03) == []
-
-
-def test_a_signal_that_is_not_published_any_more_is_silent(
-    empty: sqlite3.Connection, looked_at: str
-) -> None:
-    stops = [{"lidar_m": 1.0 + step % 5} if step < 250 else {} for step in range(400)]
-    record(empty, stops, 0.1)
-    ((name, start_s, end_s),) = spans(empty, kinds=("missing",))
-    assert (name, start_s) == ("lidar_m", 25.0)
-    assert end_s == pytest.approx(39.9, abs=0.1)
-
-
 def test_what_holds_throughout_is_one_span_across_every_border(
     empty: sqlite3.Connection, looked_at: str
 ) -> None:

@@ -20,7 +20,6 @@ from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.detection.events import EventOptions, find_events
-from webots_mcp.store.export import Source
 from webots_mcp.store.questions.series import query_history, query_rows
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.frame import read_frame
@@ -162,6 +161,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="has no SIGKILL")
 def test_what_was_not_written_of_a_stretch_before_a_kill_is_not_told_as_kept(
     tmp_path: Path,
@@ -185,23 +185,6 @@ def test_what_was_not_written_of_a_stretch_before_a_kill_is_not_told_as_kept(
             assert numbers == list(range(int(numbers[0] or 0), int(numbers[-1] or 0) + 1))
             rest = find_range(connection, Scope(robot=robot, start_s=last_s + STEP_MS / 1000))
             assert not rest.segments[0].full_rate
-
-
-def test_an_answer_says_what_is_kept_and_why(connection: sqlite3.Connection) -> None:
-    (note,) = [note for note in ranges(connection)[0].notes if "full rate" in note]
-    assert f"n == {HIT}" in note
-    assert "the gear is gone" in note
-    assert ranges(connection)[1].notes == ()
-
-
-def test_a_range_that_is_wider_than_a_stretch_says_how_to_use_each_call(
-    connection: sqlite3.Connection,
-) -> None:
-    start_s, end_s = stretch(connection)
-    wide = find_range(connection, Scope(robot="throttled", start_s=start_s - 5, end_s=end_s))
-    inside = find_range(connection, Scope(robot="throttled", start_s=start_s + 1, end_s=end_s - 1))
-    assert any("ask for such a stretch alone to use every row" in note for note in wide.notes)
-    assert not any("each call" in note for note in inside.notes)
 
 
 def test_means_and_counts_of_a_longer_range_are_not_those_of_the_stretch(
@@ -275,24 +258,6 @@ def test_the_newest_state_and_the_end_of_a_crashed_run_are_those_of_its_last_cal
     )
     assert page.values["n"][-1] == LAST
     assert page.values["n"] == list(range(LAST + 1 - len(page.ids), LAST + 1))
-
-
-def test_stretches_are_events_with_their_reason(connection: sqlite3.Connection) -> None:
-    options = EventOptions(kinds=("kept_stretch",))
-    first, last = find_events(connection, ranges(connection)[0], options, limit=10).events
-    assert (first.start_s, first.end_s) == stretch(connection)
-    assert "gear is gone" in last.details["reason"]
-    assert not last.ongoing
-
-
-def test_an_export_has_each_call_once_and_in_order(
-    connection: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("webots_mcp.store.export.CHUNK_ROWS", 7)
-    kept, every = (Source.of(connection, each.segments, 1, None) for each in inside(connection))
-    numbers = [row.values["n"] for row in kept.rows()]
-    assert numbers == [row.values["n"] for row in every.rows()]
-    assert len(numbers) == kept.total
 
 
 @pytest.mark.parametrize(

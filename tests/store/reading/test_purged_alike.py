@@ -16,8 +16,6 @@ from webots_mcp.store.purge import prune
 from webots_mcp.store.reading.ranges import Scope, find_range, recorded_bounds
 from webots_mcp.store.retention import Limit, Retention
 
-LEFT = pytest.mark.parametrize("left", [40, 0])
-
 
 def around_a_purge(
     connection: sqlite3.Connection, folder: Path, left: int, asked: Callable[[], Any]
@@ -43,111 +41,77 @@ def paused(empty: sqlite3.Connection) -> Recorder:
     return recorder
 
 
-@LEFT
-def test_events_have_the_wall_times_of_their_rows(
-    paused: Recorder, tmp_path: Path, left: int
-) -> None:
-    def asked() -> list[float]:
-        return [event.wall_time_s for event in ask(paused.connection, "change").events]
-
-    before, after = around_a_purge(paused.connection, tmp_path, left, asked)
-    assert after == before and len(before) == 4
+def span_in_the_pause(recorder: Recorder) -> tuple[float, float]:
+    since = recorder.run_start_s + 1000.0
+    scope = Scope(run_id=1, since_wall_time=since, until_wall_time=since + 3600)
+    (segment,) = find_range(recorder.connection, scope).segments
+    return segment.start_s, segment.end_s
 
 
-@LEFT
-def test_a_range_in_wall_time_holds_the_same_rows(
-    paused: Recorder, tmp_path: Path, left: int
-) -> None:
-    since = paused.run_start_s + 1000.0  # in the pause
-
-    def asked() -> tuple[float, float]:
-        scope = Scope(run_id=1, since_wall_time=since, until_wall_time=since + 3600)
-        (segment,) = find_range(paused.connection, scope).segments
-        return segment.start_s, segment.end_s
-
-    before, after = around_a_purge(paused.connection, tmp_path, left, asked)
-    assert after == pytest.approx(before)
+def notes_on(recorder: Recorder, **bounds: float) -> tuple[str, ...]:
+    return find_range(recorder.connection, Scope(run_id=1, **bounds)).notes  # pyright: ignore[reportArgumentType]
 
 
-@LEFT
-def test_a_run_begins_with_its_first_row(paused: Recorder, tmp_path: Path, left: int) -> None:
-    before, after = around_a_purge(
-        paused.connection, tmp_path, left, lambda: recorded_bounds(paused.connection, 1)
-    )
-    assert after == before == (5.0, 2995.0)
+def begins_of(recorder: Recorder, kind: str, **asked: Any) -> list[float]:
+    return [event.start_s for event in ask(recorder.connection, kind, **asked).events]
 
 
-@LEFT
-def test_a_range_between_two_rows_is_said_to_be_one(
-    paused: Recorder, tmp_path: Path, left: int
-) -> None:
-    def asked() -> tuple[str, ...]:
-        return find_range(paused.connection, Scope(run_id=1, start_s=506, end_s=514)).notes
-
-    before, after = around_a_purge(paused.connection, tmp_path, left, asked)
-    assert after == before == ("no row: nothing was recorded between 505 and 515 s of run 1",)
-
-
-@LEFT
-def test_a_change_in_the_first_row_of_a_range_is_seen_beside_the_row_before(
-    paused: Recorder, tmp_path: Path, left: int
-) -> None:
-    paused.connection.execute("DELETE FROM state WHERE sim_time_s = 595")
-
-    def asked() -> list[float]:
-        bounds = {"run_id": 1, "start_s": 605.0, "end_s": 700.0}
-        found = ask(paused.connection, "condition", bounds=bounds, where="changed(mode)")
-        return [event.start_s for event in found.events]
-
-    before, after = around_a_purge(paused.connection, tmp_path, left, asked)
-    assert after == before == [605.0]
-
-
-@LEFT
-def test_a_bound_holds_the_row_that_is_shown_as_of_it(
-    empty: sqlite3.Connection, tmp_path: Path, left: int
-) -> None:
-    recorder = start_run(empty)
-    for step in range(100):
-        recorder.publish(step - 1e-9, {"x": step})
-    recorder.end_run("finished")
-
-    def asked() -> float:
-        return find_range(empty, Scope(run_id=1, start_s=50, end_s=60)).segments[0].start_s
-
-    before, after = around_a_purge(empty, tmp_path, left, asked)
-    assert after == before == 50 - 1e-9
-
-
-@LEFT
-def test_rows_that_hits_have_added_are_counted_among_all_rows(
-    paused: Recorder, tmp_path: Path, left: int
-) -> None:
-    paused.connection.execute("UPDATE session SET throttle_interval = 5")
+def hit_twice(recorder: Recorder) -> None:
+    recorder.connection.execute("UPDATE session SET throttle_interval = 5")
     for time_s in (505.0, 515.0):
-        paused.insert("event", **paused.at(time_s), kind="breakpoint", name="x > 3", data="{}")
-
-    def asked() -> tuple[str, ...]:
-        return find_range(paused.connection, Scope(run_id=1, end_s=1000)).notes
-
-    before, after = around_a_purge(paused.connection, tmp_path, left, asked)
-    assert after == before and "up to 2 of 100 rows of run 1" in before[-1]
+        recorder.insert("event", **recorder.at(time_s), kind="breakpoint", name="x > 3", data="{}")
 
 
-@LEFT
-def test_a_command_that_nobody_claimed_lies_where_it_was_given(
-    paused: Recorder, tmp_path: Path, left: int
-) -> None:
-    paused.insert(
+def grasp_unclaimed(recorder: Recorder) -> None:
+    recorder.insert(
         "command", robot_id=1, action="grasp", params="{}", status="expired",
-        created_wall_time_s=paused.run_start_s + 250, expires_wall_time_s=paused.run_start_s + 260,
+        created_wall_time_s=recorder.run_start_s + 250,
+        expires_wall_time_s=recorder.run_start_s + 260,
     )  # fmt: skip
 
-    def asked() -> list[float]:
-        return [event.start_s for event in ask(paused.connection, "command").events]
 
-    before, after = around_a_purge(paused.connection, tmp_path, left, asked)
-    assert after == before == [495.0]
+def nothing(recorder: Recorder) -> None:
+    pass
+
+
+# What is recorded besides, what is asked, and the answer; None where it only has to stay the same.
+QUESTIONS: dict[str, tuple[Callable[[Recorder], object], Callable[[Recorder], Any], Any]] = {
+    "wall times of events": (
+        nothing, lambda r: [e.wall_time_s for e in ask(r.connection, "change").events], None,
+    ),
+    "a range in wall time": (nothing, span_in_the_pause, None),
+    "the ends of a run": (nothing, lambda r: recorded_bounds(r.connection, 1), (5.0, 2995.0)),
+    "a range between two rows": (
+        nothing, lambda r: notes_on(r, start_s=506, end_s=514),
+        ("no row: nothing was recorded between 505 and 515 s of run 1",),
+    ),
+    "a change in the first row of a range": (
+        lambda r: r.connection.execute("DELETE FROM state WHERE sim_time_s = 595"),
+        lambda r: begins_of(
+            r, "condition", bounds={"run_id": 1, "start_s": 605.0, "end_s": 700.0},
+            where="changed(mode)",
+        ),
+        [605.0],
+    ),
+    "rows that hits have added": (
+        hit_twice, lambda r: "up to 2 of 100 rows of run 1" in notes_on(r, end_s=1000)[-1], True,
+    ),
+    "a command that nobody claimed": (
+        grasp_unclaimed, lambda r: begins_of(r, "command"), [495.0],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("left", [40, 0])
+@pytest.mark.parametrize(("besides", "asked", "expected"), QUESTIONS.values(), ids=QUESTIONS)
+def test_the_answer_is_the_same_before_and_after_a_purge(
+    paused: Recorder, tmp_path: Path, left: int,
+    besides: Callable[[Recorder], object], asked: Callable[[Recorder], Any], expected: Any,
+) -> None:  # fmt: skip
+    besides(paused)
+    before, after = around_a_purge(paused.connection, tmp_path, left, lambda: asked(paused))
+    assert after == before
+    assert expected is None or before == expected
 
 
 def test_rows_that_came_late_and_outlived_newer_ones_stand_for_none_of_these(

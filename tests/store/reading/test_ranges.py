@@ -21,7 +21,6 @@ from webots_mcp.errors import (
     UnknownRobotError,
     UnknownRunError,
 )
-from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading.ranges import Scope, find_range, parse_wall_time
 from webots_mcp.store.reading.segment import Segment
 
@@ -145,25 +144,6 @@ def paused() -> Iterator[sqlite3.Connection]:
                 recorder.insert("state", **values, wall_time_s=wall_s, data="{}")
             recorder.wall_s = WALL_START_S + 100
         yield connection
-
-
-@pytest.mark.parametrize("set_back_at", [2000, 1500, 1024])  # in no chunk, in one, between two
-def test_where_the_clock_was_set_back_the_newest_rows_of_a_wall_time_are_meant(
-    empty: sqlite3.Connection, set_back_at: int
-) -> None:
-    """The last 4 s were the whole run, all before the clock was set back included."""
-    recorder = start_run(empty)
-    for step in range(2100):
-        recorder.run_start_s = WALL_START_S + (3600 if step < set_back_at else 0)
-        recorder.publish(step * 0.1, {"x": step})
-    make_chunks(empty, 10_000)
-    newest_s = recorder.wall_s
-    for since_s, first, rows in ((newest_s - 4, 2019, 81), (newest_s + 3390, 0, set_back_at)):
-        found = find_range(empty, Scope(since_wall_time=since_s))
-        (segment,) = found.segments
-        ids = rows_in(empty, segment)
-        assert (ids[0] - 1, len(ids)) == (first, rows)
-        assert f"clock was set back at {set_back_at / 10:g} s" in found.notes[0]
 
 
 def test_wall_time_may_be_iso_text() -> None:

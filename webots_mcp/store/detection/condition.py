@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import ast
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import partial, reduce
 from itertools import starmap
-from typing import Any, Final, NamedTuple, TypeAlias, cast
+from typing import Any, Final, NamedTuple, cast
 
-from webots_mcp.conditions import Condition, parse_condition
-from webots_mcp.conditions.compiler import ARITHMETIC, COMPARISONS
+from webots_mcp.conditions import Condition, Evaluator, parse_condition
+from webots_mcp.conditions.compiler import ARITHMETIC, COMPARISONS, Compiler
 from webots_mcp.conditions.scoring import Aggregate
 from webots_mcp.conditions.signal_values import PLACES_KEPT, SAME_TIME_S
 from webots_mcp.conditions.syntax import FLAGS, Nodes, Scanned, function_of, is_signal
@@ -24,16 +25,12 @@ from webots_mcp.store.detection.kinds import Alike, Event, EventKind, NotSearcha
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.catalogue import resolve_signals, say_unknown
 from webots_mcp.store.reading.frame import Frame, read_frame
-from webots_mcp.store.reading.ranges import frame_of_purged, recorded_share
+from webots_mcp.store.reading.ranges import recorded_share
 from webots_mcp.store.reading.segment import Segment, kept_parts
 from webots_mcp.store.signals import Signal
 
 _MOST_VALUES: Final = 8
 _ROWS_BEFORE: Final = 20  # a range: what was there last, for `changed` and `rate`
-_SOME_BEFORE: Final = (
-    "SELECT min(sim_time_s) FROM (SELECT sim_time_s FROM state WHERE run_id = ? "
-    f"AND sim_time_s < ? ORDER BY sim_time_s DESC LIMIT {_ROWS_BEFORE})"
-)
 
 
 def condition_events(search: Search) -> Iterator[Event]:
@@ -69,12 +66,9 @@ def condition_events(search: Search) -> Iterator[Event]:
 def _read(search: Search, segment: Segment, condition: Condition) -> Frame:
     """The rows of a segment, and those before it as far as the condition remembers."""
     run_id, start_s = segment.run_id, segment.start_s
-    (known_from_s,) = search.connection.execute(_SOME_BEFORE, (run_id, start_s)).fetchone()
-    if (run := frame_of_purged(search.connection, run_id)) is not None:
-        place = int(run.places([start_s])[0])
-        before = run.rows(place - _ROWS_BEFORE, place)
-        known_from_s = before.bounds_s[0] if len(before) else None
-    known_from_s = start_s if known_from_s is None else known_from_s
+    place = int(search.whole.places([start_s])[0])
+    before = search.whole.rows(place - _ROWS_BEFORE, place)
+    known_from_s = before.bounds_s[0] if len(before) else start_s
     longer = replace(segment, start_s=min(known_from_s, start_s - condition.remembers_s))
     every_call = bool(kept_parts(search.connection, run_id, longer.start_s, segment.end_s))
     frame = read_frame(search.connection, longer, search.deadline, every_call=every_call)
@@ -91,10 +85,10 @@ def where_held(
     Raises:
         InvalidInputError: The values are not of the kinds that it can be asked of.
     """
-    holds, failures = OnArrays(condition.scanned, frame, position).condition(condition.tree)
-    if failed := first_failure(failures):
-        place = f"in run {frame.run_id}, at {frame.times[failed.row]:.3f} s"
-        raise InvalidInputError(f"{failed.why} ({place})")
+    try:
+        holds = holds_in(condition.scanned, condition.tree, frame, position)
+    except ConditionFailedError as error:
+        raise InvalidInputError(str(error)) from error
     return runs_of(holds & frame.was_read() & (np.arange(len(frame)) >= first), frame.times)
 
 
@@ -213,7 +207,8 @@ THRESHOLD: Final = EventKind(
 #
 # In each row the outcome is that of the closures that the controller asks of each state; see
 # docs/conditions.md. A value is NaN where a row has no number. Integers beyond 2^53 are those of
-# 64-bit floats.
+# 64-bit floats. Where a text stands in the place of a number, the closures themselves are asked,
+# row by row: they know in which row that is an error.
 
 
 _FOLDING: Final = {"min": "minimum", "max": "maximum"}
@@ -223,22 +218,8 @@ _MIRRORED: Final[dict[type[ast.cmpop], type[ast.cmpop]]] = {
 }  # fmt: skip
 
 
-class Failure(NamedTuple):
-    """Rows of which something cannot be asked: the place in the text, and why not of one row."""
-
-    rows: Flags
-    place: str
-    why: Callable[[int], str]
-
-
-Failures: TypeAlias = tuple[Failure, ...]
-
-
-class Outcome(NamedTuple):
-    """Whether a condition holds in each row; False where it fails."""
-
-    holds: Flags
-    failures: Failures = ()
+class _MixedKindsError(Exception):
+    """A text stands where a number is needed, at least in one row."""
 
 
 class Texts(NamedTuple):
@@ -253,7 +234,6 @@ class Values(NamedTuple):
 
     numbers: Any  # NaN where it is none
     texts: Texts | None = None
-    failures: Failures = ()
 
     @property
     def missing(self) -> Flags:
@@ -261,46 +241,78 @@ class Values(NamedTuple):
         lacking = np.isnan(self.numbers)
         return lacking if self.texts is None else lacking & (self.texts.codes == 0)
 
-    def shown(self, row: int) -> str:
-        """In one row, for messages."""
-        if self.texts is not None and (code := int(_at(self.texts.codes, row))) > 0:
-            return f"the text {str(self.texts.labels[code])[:50]!r}"
-        return f"the number {float(_at(self.numbers, row)):.15g}"
 
-
-@dataclass(frozen=True)
-class Failed:
-    """The first row of which a condition could not be asked."""
-
-    row: int
-    why: str
-
-
-class OnArrays(Nodes):
-    """Asks the nodes of a parsed condition, or of a number within a score, of the rows of a frame.
+def holds_in(
+    scanned: Scanned, tree: ast.expr, frame: Frame, position: tuple[str, str] | None
+) -> Flags:
+    """In which rows of a frame a condition holds.
 
     Args:
         scanned: What the tree was parsed from.
+        tree: Of a condition.
         frame: The rows.
         position: The names of x and y, for displacements; None where none are known.
+
+    Raises:
+        ConditionFailedError: The values are not of the kinds that it can be asked of.
+    """
+    try:
+        return _OnArrays(scanned, frame, position).condition(tree)
+    except _MixedKindsError:
+        answers = _one_by_one(Compiler(scanned, tree, _as_it_is), frame, position)
+        return np.fromiter(answers, np.bool_, len(frame))
+
+
+def numbers_in(
+    scanned: Scanned, tree: ast.expr, frame: Frame, position: tuple[str, str] | None
+) -> Array:
+    """The number within a score in each row, NaN where it has none; as `holds_in`."""
+    try:
+        return _OnArrays(scanned, frame, position).number(tree)
+    except _MixedKindsError:
+        answers = _one_by_one(Compiler(scanned, tree, _as_it_is, number=True), frame, position)
+        found = (math.nan if answer is None else float(answer) for answer in answers)
+        return np.fromiter(found, np.float64, len(frame))
+
+
+def _as_it_is(value: Any) -> Any:
+    return value
+
+
+def _one_by_one(
+    compiled: Compiler, frame: Frame, position: tuple[str, str] | None
+) -> Iterator[Any]:
+    """What the closures of the controller say of each row."""
+    evaluator = Evaluator(compiled, _as_it_is)
+    columns = {name: frame.values(name) for name in [*compiled.readers, *(position or ())]}
+    for row, time_s in enumerate(frame.times.tolist()):
+        values = ((name, column[row]) for name, column in columns.items())
+        state = {name: value for name, value in values if value is not None}
+        try:
+            yield evaluator.holds(state, time_s)
+        except ConditionFailedError as error:
+            place = f"in run {frame.run_id}, at {time_s:.3f} s"
+            raise ConditionFailedError(f"{error} ({place})") from None
+
+
+class _OnArrays(Nodes):
+    """Asks the nodes of a parsed condition, or of a number within a score, of the rows of a frame.
+
+    It raises `_MixedKindsError` where the outcome in a row may be an error.
     """
 
-    def __init__(
-        self, scanned: Scanned, frame: Frame, position: tuple[str, str] | None = None
-    ) -> None:
+    def __init__(self, scanned: Scanned, frame: Frame, position: tuple[str, str] | None) -> None:
         super().__init__(scanned)
         self._frame = frame
         self._position = position
 
-    def condition(self, node: ast.expr) -> Outcome:
+    def condition(self, node: ast.expr) -> Flags:
         """Whether it holds in each row."""
-        outcome = self._condition(node)
-        return Outcome(self._in_each_row(outcome.holds), outcome.failures)
+        return self._in_each_row(self._condition(node))
 
-    def number(self, node: ast.expr) -> Values:
+    def number(self, node: ast.expr) -> Array:
         """Its numbers; NaN where it has none."""
-        found = self._number(node)
-        return found._replace(numbers=self._in_each_row(found.numbers))
+        return self._in_each_row(self._number(node))
 
     def _in_each_row(self, found: Any) -> Any:
         """A constant is the same in each row."""
@@ -308,82 +320,37 @@ class OnArrays(Nodes):
 
     # -- conditions ----------------------------------------------------------------------------
 
-    def _condition(self, node: ast.expr) -> Outcome:
+    def _condition(self, node: ast.expr) -> Flags:
         if isinstance(node, ast.BoolOp):
-            return _in_turn(
-                map(self._condition, node.values), together=isinstance(node.op, ast.And)
-            )
+            combine = np.logical_and if isinstance(node.op, ast.And) else np.logical_or
+            return reduce(combine, map(self._condition, node.values))
         if isinstance(node, ast.UnaryOp):
-            holds, failures = self._condition(node.operand)
-            return _outcome(~holds, failures)
+            return ~self._condition(node.operand)
         if isinstance(node, ast.Compare):
             return self._comparison(node)
         if isinstance(node, ast.Tuple):
             held, seconds = self.condition(node.elts[0]), _seconds(node.elts[1])
-            return self._remembered(held.failures, lasting, held.holds, seconds)
+            return lasting(self._frame.times, held, seconds)
         if function_of(node) == "missing":
-            asked = self._value(cast("ast.Call", node).args[0])
-            return _outcome(asked.missing, asked.failures)
+            return self._value(cast("ast.Call", node).args[0]).missing
         if function_of(node) == "changed":
             asked = self._value(cast("ast.Call", node).args[0])
             codes = asked.texts.codes if asked.texts else np.intp(0)
-            ways = self._in_each_row(asked.numbers), self._in_each_row(codes)
-            return self._remembered(asked.failures, changed, *ways)
-        return self._flag(node)
+            both = self._in_each_row(asked.numbers), self._in_each_row(codes)
+            return changed(self._frame.times, *both)
+        numbers = self._numbers_of(node)
+        return ~np.isnan(numbers) & (numbers != 0)
 
-    def _remembered(self, failures: Failures, ask: Callable[..., Flags], *of: Any) -> Outcome:
-        """What depends on the rows before; those that fail are passed over."""
-        return _outcome(self._over_asked(failures, ask, *of), failures)
-
-    def _over_asked(self, failures: Failures, ask: Callable[..., Any], *of: Any) -> Any:
-        if not failures:
-            return ask(self._frame.times, *of)
-        asked = np.ones(len(self._frame), np.bool_)
-        for failure in failures:
-            asked &= ~failure.rows
-        parts = [each[asked] if np.ndim(each) else each for each in of]
-        found = ask(self._frame.times[asked], *parts)
-        whole = np.zeros(len(asked), found.dtype)
-        whole[asked] = found
-        return whole
-
-    def _flag(self, node: ast.expr) -> Outcome:
-        value = self._signal(node)
-        holds = ~np.isnan(value.numbers) & (value.numbers != 0)
-        return _outcome(holds, self._no_text(value, node, "by itself is no condition"))
-
-    def _comparison(self, node: ast.Compare) -> Outcome:
+    def _comparison(self, node: ast.Compare) -> Flags:
         sides = [node.left, *node.comparators]
         simple = self._by_zones(sides[0], sides[1], type(node.ops[0])) if len(sides) == 2 else None
         if simple is not None:
             return simple
         values = [self._value(side) for side in sides]
-        steps = zip(node.ops, values, values[1:], sides, strict=False)
-        return _in_turn(starmap(self._compared, steps), together=True)
+        steps = zip(map(type, node.ops), values, values[1:], strict=False)
+        return reduce(np.logical_and, starmap(_compared, steps))
 
-    def _compared(self, operator: ast.cmpop, left: Values, right: Values, at: ast.expr) -> Outcome:
-        op = type(operator)
-        sign, compare = COMPARISONS[op]
-        holds = compare(left.numbers, right.numbers)
-        if op is ast.NotEq:
-            holds = holds & ~np.isnan(left.numbers) & ~np.isnan(right.numbers)
-        failures = left.failures + right.failures
-        if left.texts is None and right.texts is None:
-            return _outcome(holds, failures)
-        one, other = _ranked(left.texts, right.texts)
-        holds = holds | (compare(one, other) & (one > 0) & (other > 0))
-        mixed = (one > 0) & ~np.isnan(right.numbers) | (other > 0) & ~np.isnan(left.numbers)
-        if op is ast.NotEq:
-            holds = holds | mixed
-        elif op is not ast.Eq:
-
-            def why(row: int) -> str:
-                return f"{left.shown(row)} {sign} {right.shown(row)}?"
-
-            failures += self._failing(mixed, at, why)
-        return _outcome(holds, failures)
-
-    def _by_zones(self, left: ast.expr, right: ast.expr, op: type[ast.cmpop]) -> Outcome | None:
+    def _by_zones(self, left: ast.expr, right: ast.expr, op: type[ast.cmpop]) -> Flags | None:
         """A signal beside a number: decoded is only where a chunk's extremes leave it open."""
         if is_signal(right):
             left, right, op = right, left, _MIRRORED[op]
@@ -393,7 +360,7 @@ class OnArrays(Nodes):
         name = self._signal_name(left)
         if name not in self._frame or self._texts(name) is not None:
             return None
-        return Outcome(compared(self._frame, name, op, float(cast("float", number))))
+        return compared(self._frame, name, op, float(cast("float", number)))
 
     # -- values --------------------------------------------------------------------------------
 
@@ -402,54 +369,51 @@ class OnArrays(Nodes):
             return Values(np.float64(FLAGS[node.id]))
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             return Values(np.float64(math.nan), Texts(np.intp(1), (None, node.value)))
-        return self._signal(node) if is_signal(node) else self._number(node)
-
-    def _number(self, node: ast.expr) -> Values:
-        if isinstance(node, ast.Constant):
-            return Values(np.float64(cast("float", node.value)))
         if is_signal(node):
-            value = self._signal(node)
-            return Values(value.numbers, None, self._no_text(value, node, "is no number"))
+            name = self._signal_name(node)
+            return Values(self._numbers(name), self._texts(name))
+        return Values(self._number(node))
+
+    def _number(self, node: ast.expr) -> Any:
+        if isinstance(node, ast.Constant):
+            return np.float64(cast("float", node.value))
+        if is_signal(node):
+            return self._numbers_of(node)
         if isinstance(node, ast.BinOp):
-            return _worked_out(
-                ARITHMETIC[type(node.op)], self._number(node.left), self._number(node.right)
-            )
+            both = self._number(node.left), self._number(node.right)
+            return _worked_out(ARITHMETIC[type(node.op)], *both)
         if isinstance(node, ast.UnaryOp):
-            found = self._number(node.operand)
-            return found._replace(numbers=-found.numbers) if _is_minus(node) else found
+            number = self._number(node.operand)
+            return -number if isinstance(node.op, ast.USub) else number
         return self._call(cast("ast.Call", node))
 
-    def _call(self, node: ast.Call) -> Values:
+    def _call(self, node: ast.Call) -> Any:
         name = function_of(node)
         if name == "displacement":
             return self._displacement(_seconds(node.args[0]))
         numbers = [self._number(each) for each in node.args]
         if name == "abs":
-            return numbers[0]._replace(numbers=np.abs(numbers[0].numbers))
+            return np.abs(numbers[0])
         if name == "rate":
-            (found,) = numbers
-            values = self._in_each_row(found.numbers)
-            return Values(self._over_asked(found.failures, rate, values), None, found.failures)
-        fold = getattr(np, _FOLDING[str(name)])
-        found = numbers[0]
-        for each in numbers[1:]:
-            found = _worked_out(fold, found, each)
-        return found
+            return rate(self._frame.times, self._in_each_row(numbers[0]))
+        return reduce(partial(_worked_out, getattr(np, _FOLDING[str(name)])), numbers)
 
-    def _displacement(self, seconds: float) -> Values:
+    def _displacement(self, seconds: float) -> Any:
         if self._position is None:
-            return Values(np.float64(math.nan))
+            return np.float64(math.nan)
         metres = metres_in(self._position[0])
         x, y = (self._numbers(name) for name in self._position)
         near = (np.abs(x) <= FARTHEST_M) & (np.abs(y) <= FARTHEST_M)
         found = np.full(len(x), math.nan)
         places = self._frame.times[near], x[near] * metres, y[near] * metres
         found[near] = displacement(*places, seconds)
-        return Values(found)
+        return found
 
-    def _signal(self, node: ast.expr) -> Values:
+    def _numbers_of(self, node: ast.expr) -> Array:
         name = self._signal_name(node)
-        return Values(self._numbers(name), self._texts(name))
+        if self._texts(name) is not None:
+            raise _MixedKindsError
+        return self._numbers(name)
 
     def _numbers(self, name: str) -> Array:
         if name not in self._frame:
@@ -462,22 +426,6 @@ class OnArrays(Nodes):
             return None
         texts = Texts(*self._frame.texts(name))
         return texts if len(texts.labels) > 1 else None
-
-    # -- failures ------------------------------------------------------------------------------
-
-    def _no_text(self, value: Values, node: ast.expr, why: str) -> Failures:
-        if value.texts is None:
-            return value.failures
-
-        def said(row: int) -> str:
-            return f"{value.shown(row)} {why}"
-
-        return value.failures + self._failing(value.texts.codes > 0, node, said)
-
-    def _failing(self, rows: Any, node: ast.expr, why: Callable[[int], str]) -> Failures:
-        rows = self._in_each_row(rows)
-        place = self._scanned.place(self._column(node))
-        return (Failure(rows, place, why),) if rows.any() else ()
 
 
 def compared(frame: Frame, name: str, op: type[ast.cmpop], limit: float) -> Flags:
@@ -495,16 +443,6 @@ def compared(frame: Frame, name: str, op: type[ast.cmpop], limit: float) -> Flag
         found = found & ~np.isnan(numbers) if op is ast.NotEq else found
         holds[start : start + len(numbers)] = found
     return holds
-
-
-def first_failure(failures: Failures) -> Failed | None:
-    """The first row that fails, and what is asked first of it; None where none does."""
-    found = [failure for failure in failures if failure.rows.any()]
-    if not found:
-        return None
-    first = min(found, key=lambda failure: int(failure.rows.argmax()))
-    row = int(first.rows.argmax())
-    return Failed(row, f"{first.place}: {first.why(row)}")
 
 
 def position_in(frame: Frame, known: Mapping[str, Signal]) -> tuple[str, str] | None:
@@ -529,13 +467,11 @@ def aggregated(
     Raises:
         ConditionFailedError: The values are not of the kinds that it can be asked of.
     """
-    rows, lasts_s = OnArrays(aggregate.scanned, frame, position), np.diff(frame.times)
+    asked, lasts_s = (aggregate.scanned, aggregate.tree, frame, position), np.diff(frame.times)
     if aggregate.function == "time":
-        holds, failures = rows.condition(aggregate.tree)
-        _raise_first(failures)
+        holds = holds_in(*asked)
         return float(lasts_s[holds[:-1]].sum()) if len(frame) else None
-    numbers, _, failures = rows.number(aggregate.tree)
-    _raise_first(failures)
+    numbers = numbers_in(*asked)
     there = ~np.isnan(numbers)
     found = numbers[there]
     if not len(found):
@@ -548,11 +484,6 @@ def aggregated(
     if known_s.sum() > 0:
         return float((numbers[:-1][there[:-1]] * known_s).sum() / known_s.sum())
     return float(found.mean())
-
-
-def _raise_first(failures: Failures) -> None:
-    if failed := first_failure(failures):
-        raise ConditionFailedError(failed.why)
 
 
 # -- of the rows before ------------------------------------------------------------------------
@@ -633,40 +564,34 @@ def _apart(times: Array, least_s: float, *, strictly: bool = False) -> Indexes:
     return np.array(taken)
 
 
-# -- all of a kind -----------------------------------------------------------------------------
+# -- of values --------------------------------------------------------------------------------
 
 
-def _in_turn(outcomes: Iterable[Outcome], *, together: bool) -> Outcome:
-    """All, or any, of them: the next is asked only where those before leave it open."""
-    holds, failures = np.bool_(together), ()
-    for outcome in outcomes:
-        is_open = holds if together else ~holds
-        failures += tuple(
-            failure._replace(rows=failure.rows & is_open) for failure in outcome.failures
-        )
-        holds = holds & outcome.holds if together else holds | outcome.holds
-    return _outcome(holds, failures)
+def _compared(op: type[ast.cmpop], left: Values, right: Values) -> Flags:
+    _, compare = COMPARISONS[op]
+    holds: Any = compare(left.numbers, right.numbers)
+    if op is ast.NotEq:
+        holds = holds & ~np.isnan(left.numbers) & ~np.isnan(right.numbers)
+    if left.texts is None and right.texts is None:
+        return holds
+    one, other = _ranked(left.texts, right.texts)
+    holds = holds | (compare(one, other) & (one > 0) & (other > 0))
+    mixed = (one > 0) & ~np.isnan(right.numbers) | (other > 0) & ~np.isnan(left.numbers)
+    if op is ast.NotEq:
+        return holds | mixed
+    if op is not ast.Eq and np.any(mixed):
+        raise _MixedKindsError
+    return holds
 
 
-def _outcome(holds: Any, failures: Failures) -> Outcome:
-    for failure in failures:
-        holds = holds & ~failure.rows
-    return Outcome(holds, failures)
-
-
-def _worked_out(apply: Callable[[Any, Any], Any], left: Values, right: Values) -> Values:
+def _worked_out(apply: Callable[[Any, Any], Any], left: Any, right: Any) -> Any:
     with np.errstate(all="ignore"):
-        found = apply(left.numbers, right.numbers)
-    usable = np.where(np.isfinite(found), found, math.nan)
-    return Values(usable, None, left.failures + right.failures)
+        found = apply(left, right)
+    return np.where(np.isfinite(found), found, math.nan)
 
 
 def _seconds(node: ast.expr) -> float:
     return float(cast("Any", node).value)
-
-
-def _is_minus(node: ast.UnaryOp) -> bool:
-    return isinstance(node.op, ast.USub)
 
 
 def _ranked(left: Texts | None, right: Texts | None) -> tuple[Any, Any]:
@@ -692,7 +617,3 @@ def _verdicts(op: type[ast.cmpop], low: Array, high: Array, limit: float) -> tup
     compare = COMPARISONS[op][1]
     least, most = (low, high) if op in (ast.Gt, ast.GtE) else (high, low)
     return compare(least, limit), ~(compare(most, limit) | np.isnan(most))
-
-
-def _at(values: Any, row: int) -> Any:
-    return values[row] if np.ndim(values) else values

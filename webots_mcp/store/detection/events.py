@@ -54,6 +54,7 @@ _ROW_AT: Final = (  # of a run of which the table has all rows
 # those of one kind and moment. Pages and cursors go on from it.
 Place = tuple[float, int, float, str, int]
 MOST_ENTRIES: Final = 500
+_NO_CURSOR: Final = "{!r} is not a cursor: give the `cursor` of an answer unchanged"
 
 
 @dataclass(frozen=True)
@@ -332,9 +333,7 @@ def _read_cursor(text: str) -> dict[str, Place | None]:
         read: dict[str, Any] = json.loads(text)
         return {kind: place and read_place(place) for kind, place in read.items()}
     except (ValueError, TypeError, AttributeError) as error:
-        raise InvalidInputError(
-            f"cursor={text[:80]!r} is not a cursor: give the `cursor` of an answer unchanged"
-        ) from error
+        raise InvalidInputError(f"cursor={_NO_CURSOR.format(text[:80])}") from error
 
 
 def read_place(value: Any) -> Place:
@@ -361,22 +360,6 @@ def _with_values(connection: sqlite3.Connection, event: Event, context: Sequence
     return replace(event, around=values)
 
 
-@dataclass(frozen=True)
-class Timeline:
-    """A page of the timeline.
-
-    Attributes:
-        cursor: Give it as `after` for the next page; None after the last event.
-        verdicts: What became of each kind in the whole range.
-    """
-
-    robot: str
-    events: tuple[Event, ...]
-    cursor: str | None
-    verdicts: Verdicts
-    notes: tuple[str, ...]
-
-
 @in_one_snapshot
 def timeline(
     connection: sqlite3.Connection,
@@ -386,7 +369,7 @@ def timeline(
     limit: int = 50,
     after: str | None = None,
     deadline_s: float = QUESTION_DEADLINE_S,
-) -> Timeline:
+) -> Events:
     """Events, commands, log lines and pictures of a range in the order in which they happened.
 
     Args:
@@ -397,6 +380,9 @@ def timeline(
         limit: 1 to 500.
         after: The `cursor` of the page before.
         deadline_s: After it, what was found so far is the answer, and the notes say so.
+
+    Returns:
+        A page; its `cursor` leads to the next one, and nothing is left out of both.
 
     Raises:
         InvalidInputError: `limit` is out of bounds, or `after` is no cursor.
@@ -410,22 +396,16 @@ def timeline(
     border = _read_page_cursor(after) if after else None
     left = [entry for entry in found.entries if border is None or entry[0] > border]
     page = left[:limit]
-    return Timeline(
-        robot=time_range.robot,
-        events=tuple(event for _, event in page),
-        cursor=json.dumps(page[-1][0]) if len(left) > limit else None,
-        verdicts=found.verdicts,
-        notes=found.notes,
-    )
+    cursor = json.dumps(page[-1][0]) if len(left) > limit else None
+    events = tuple(event for _, event in page)
+    return Events(time_range.robot, events, found.verdicts, {}, cursor, found.notes)
 
 
 def _read_page_cursor(text: str) -> Place:
     try:
         return read_place(json.loads(text))
     except (ValueError, TypeError) as error:
-        raise InvalidInputError(
-            f"{text!r} is not a cursor: give the `cursor` of the previous page unchanged"
-        ) from error
+        raise InvalidInputError(_NO_CURSOR.format(text[:80])) from error
 
 
 # -- the registry of kinds: all that reports, counts or draws events reads it ----------------------

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import copy
 import sqlite3
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property, partial
+from functools import cached_property
 from typing import Any, Final
 
 from webots_mcp.naming import listed
@@ -22,13 +22,16 @@ from webots_mcp.store.detection.kinds import (
 from webots_mcp.store.detection.motion import Motion, motion_in
 from webots_mcp.store.reading.catalogue import resolve_signals
 from webots_mcp.store.reading.frame import Frame, read_frame
-from webots_mcp.store.reading.ranges import UP_TO, RunClock, recorded_bounds
+from webots_mcp.store.reading.ranges import frame_of_purged, recorded_bounds
 from webots_mcp.store.reading.segment import Deadline, Segment, just_after
 from webots_mcp.store.signals import Signal
 
 FARTHER: Final = 8.0  # times as far is looked for the ends of what reaches out of a segment
 MOST_NAMED: Final = 5
 NO_TIME: Final = "time limit reached: ask for this kind alone"
+_ROW: Final = "SELECT wall_time_s FROM state WHERE run_id = ?"
+_LAST_ROW: Final = f"{_ROW} AND sim_time_s <= ? ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+_FIRST_ROW: Final = f"{_ROW} ORDER BY sim_time_s, id LIMIT 1"
 _OF_SEGMENT: Final = ("recorded", "frame")
 
 
@@ -157,9 +160,18 @@ class Search:
         return Event(kind, *place, name, details, ongoing)
 
     @cached_property
-    def wall_time_at(self) -> Callable[[float], float]:
-        """Of the last row at or before a time; looked up once of events that begin together."""
-        return cache(partial(RunClock(self.connection, self.segment.run_id).wall_s, UP_TO))
+    def _purged(self) -> Frame | None:
+        return frame_of_purged(self.connection, self.segment.run_id)
+
+    def wall_time_at(self, time_s: float) -> float:
+        """Of the last row at or before a simulation time; else of the first one, or 0."""
+        if self._purged is not None and len(self._purged):
+            place = int(np.searchsorted(self._purged.times, time_s, "right")) - 1
+            return float(self._purged.wall_times[max(place, 0)])
+        run_id = self.segment.run_id
+        row = self.connection.execute(_LAST_ROW, (run_id, time_s)).fetchone()
+        row = row or self.connection.execute(_FIRST_ROW, (run_id,)).fetchone()
+        return float(row[0]) if row else 0.0
 
     def not_searched(self, kind: str, *reasons: str) -> None:
         """Note why a kind was not looked for, or where it was not."""

@@ -26,7 +26,6 @@ from webots_mcp.store.reading.frame_summary import (
     frame_around,
     rhythm_in,
 )
-from webots_mcp.store.reading.ranges import frame_of_purged
 from webots_mcp.store.reading.segment import Segment, kept_stretches
 from webots_mcp.store.run_rows import count_kept_frames
 
@@ -61,10 +60,6 @@ _COMMANDS: Final = (
 _RUN_WALLS: Final = (
     "SELECT started_wall_time_s, coalesce((SELECT min(n.started_wall_time_s) FROM run n "
     "WHERE n.robot_id = r.robot_id AND n.id > r.id), 9e99) FROM run r WHERE id = ?"
-)
-_SIM_AT_WALL: Final = (
-    "SELECT sim_time_s FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ? "
-    "AND wall_time_s <= ? ORDER BY sim_time_s DESC, id DESC LIMIT 1"
 )
 
 
@@ -254,15 +249,10 @@ def command_events(search: Search) -> Iterator[Event]:
 
 def _sim_time_at(search: Search, wall_s: float) -> float | None:
     """Of the last row of the segment at or before a wall time; None without any."""
-    here = search.segment
-    span = (here.holds_from_s, here.holds_to_s)
-    if (run := frame_of_purged(search.connection, here.run_id)) is not None:
-        rows = run.between(*span)
-        place = int(np.searchsorted(rows.wall_times, wall_s, "right"))
-        return float(rows.times[place - 1]) if place else None
-    asked = (here.run_id, *span, wall_s)
-    (time_s,) = search.connection.execute(_SIM_AT_WALL, asked).fetchone() or (None,)
-    return time_s
+    _note_unread(search, "command", search.whole.cut_at_s)
+    rows = search.whole.between(search.segment.holds_from_s, search.segment.holds_to_s)
+    place = int(np.searchsorted(rows.wall_times, wall_s, "right"))
+    return float(rows.times[place - 1]) if place else None
 
 
 def _bounds(segment: Segment) -> tuple[float, ...]:

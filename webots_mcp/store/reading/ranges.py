@@ -21,14 +21,12 @@ from __future__ import annotations
 import math
 import sqlite3
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Final, Literal
 
 from webots_mcp.errors import InvalidRangeError, NothingRecordedError
-from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.chunks import WALL_TIMES
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.segment import (
     HAS_LOST_ROWS,
@@ -419,7 +417,7 @@ def _in_wall_time(
     runs = [run for (run,) in connection.execute(_RUNS_IN, wanted).fetchall()]
     notes: list[str] = []
     walls = (wall_start_s, wall_end_s)
-    cuts = (_cut(connection, run, *walls, notes) for run in reversed(runs[:MOST_RUNS]))
+    cuts = (_cut(connection, run, *walls) for run in reversed(runs[:MOST_RUNS]))
     segments = tuple(segment for segment in cuts if segment is not None)
     notes += [] if segments else [f"no row of robot {subject.robot!r} in that wall time"]
     for segment in segments:
@@ -430,63 +428,29 @@ def _in_wall_time(
 
 
 def _cut(
-    connection: sqlite3.Connection,
-    run_id: int,
-    wall_start_s: float,
-    wall_end_s: float,
-    notes: list[str],
+    connection: sqlite3.Connection, run_id: int, wall_start_s: float, wall_end_s: float
 ) -> Segment | None:
-    """The part of a run in [wall_start_s, wall_end_s); of several, the newest."""
+    """The part of a run from its first to its last row in [wall_start_s, wall_end_s)."""
     recorded = recorded_bounds(connection, run_id)
-    walls = (wall_start_s, wall_end_s)
-    parts = rising_parts(connection, run_id, recorded) if recorded else []
-    if back := ", ".join(_told(start_s) for start_s, _ in parts[-2::-1]):
-        notes.append(
-            f"run {run_id}: its clock was set back at {back} s: of the parts in between, the "
-            "newest with such wall times is meant"
-        )
-    founds = (simulation_times(connection, run_id, part, walls) for part in parts)
-    found = next((each for each in founds if each), None)
-    if found is None:
+    if recorded is None:
         return None
-    start_s, last_s = found
-    segment = Segment(run_id, start_s, just_after(last_s), *walls, open_start=True, open_end=True)
-    return _rated(connection, segment)
+    whole = Segment(
+        run_id, recorded[0], just_after(recorded[1]), wall_start_s, wall_end_s,
+        open_start=True, open_end=True,
+    )  # fmt: skip
+    frame = read_frame(connection, whole, Deadline())
+    if frame.cut_at_s is not None:  # who reads the rows says what there is no time for
+        return _rated(connection, whole)
+    if not len(frame):
+        return None
+    start_s, last_s = frame.bounds_s
+    return _rated(connection, replace(whole, start_s=start_s, end_s=just_after(last_s)))
 
 
-# -- wall times as a person gives them, and what of a run lies between two of them -----------------
+# -- wall times as a person gives them -------------------------------------------------------------
 
 
-_ENDS: Final = (
-    "SELECT started_sim_time_s, started_wall_time_s, last_sim_time_s, last_wall_time_s "
-    "FROM run WHERE id = ?"
-)
 _IS_PURGED: Final = "SELECT 1 FROM run WHERE id = ? AND purged_rows > 0"
-_FIRST_ROW: Final = (
-    "SELECT sim_time_s, wall_time_s FROM state WHERE run_id = ? ORDER BY sim_time_s, id LIMIT 1"
-)
-UP_TO: Final = (  # of the last row at or before a simulation time
-    "SELECT wall_time_s FROM state WHERE run_id = ? AND sim_time_s <= ? "
-    "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
-)
-_FROM: Final = (  # of the first row at or after a simulation time
-    "SELECT wall_time_s FROM state WHERE run_id = ? AND sim_time_s >= ? "
-    "ORDER BY sim_time_s, id LIMIT 1"
-)
-_SET_BACK_S: Final = 1.0  # less is what keeps a clock right
-# Whether wall time falls with simulation time: by what chunks come to, and by rows in none.
-_FALLS: Final = (
-    "SELECT 1 FROM (SELECT min, max, first, last, lag(last) OVER (ORDER BY at_s, id) AS before "
-    "FROM (SELECT g.start_sim_time_s AS at_s, 0 AS id, min, max, first, last FROM chunk c "
-    "JOIN row_group g ON g.id = c.group_id "
-    f"WHERE c.run_id = :run AND c.signal_id = {WALL_TIMES} AND g.is_complete = 1 UNION ALL "
-    "SELECT sim_time_s, id, wall_time_s, wall_time_s, wall_time_s, wall_time_s FROM state "
-    "WHERE run_id = :run AND sim_time_s > coalesce((SELECT max(end_sim_time_s) FROM row_group "
-    "WHERE run_id = :run AND is_complete = 1), -9e999))) "
-    f"WHERE first < before - {_SET_BACK_S} OR min < first - {_SET_BACK_S} "
-    f"OR max > last + {_SET_BACK_S} LIMIT 1"
-)
-_BISECTIONS: Final = 60
 _LONGEST_SHOWN: Final = 80
 
 
@@ -519,110 +483,11 @@ def _iso_seconds(text: str) -> float:
         ) from error
 
 
-def rising_parts(
-    connection: sqlite3.Connection, run_id: int, recorded: tuple[float, float]
-) -> list[tuple[float, float]]:
-    """Simulation times between which the wall clock of a run was not set back, the newest first.
-
-    Args:
-        connection: Any.
-        run_id: Which.
-        recorded: Simulation times of its first and newest row.
-    """
-    if not connection.execute(_FALLS, {"run": run_id}).fetchone():
-        return [recorded]
-    frame = _all_rows(connection, run_id)
-    after = np.flatnonzero(np.diff(frame.wall_times) < -_SET_BACK_S) + 1
-    starts = [recorded[0], *frame.times[after].tolist()]
-    return list(zip(starts, [*frame.times[after - 1].tolist(), recorded[1]], strict=True))[::-1]
-
-
-def simulation_times(
-    connection: sqlite3.Connection,
-    run_id: int,
-    recorded: tuple[float, float],
-    walls: tuple[float, float],
-) -> tuple[float, float] | None:
-    """First and last simulation time of a run in [start, end) of wall time; None without any.
-
-    Wall time rises with simulation time there, so both are found by bisection.
-
-    Args:
-        connection: Any.
-        run_id: Which.
-        recorded: Simulation times between which to look; see `rising_parts`.
-        walls: Unix times.
-    """
-    clock = RunClock(connection, run_id)
-
-    def begun(time_s: float) -> bool:
-        return clock.wall_s(UP_TO, time_s) >= walls[0]
-
-    def over(time_s: float) -> bool:
-        return clock.wall_s(_FROM, time_s) >= walls[1]
-
-    first_s, newest_s = recorded
-    if not begun(newest_s) or over(first_s):
-        return None
-    start_s = first_s if begun(first_s) else _turning_point(first_s, newest_s, begun)[1]
-    last_s = _turning_point(first_s, newest_s, over)[0] if over(newest_s) else newest_s
-    return (start_s, last_s) if start_s <= last_s else None  # else between two rows
-
-
 def frame_of_purged(connection: sqlite3.Connection, run_id: int) -> Frame | None:
     """All rows of a run that has lost some from `state`; None where that table has all of them."""
     if not connection.execute(_IS_PURGED, (run_id,)).fetchone():
         return None
-    return _all_rows(connection, run_id)
-
-
-def _all_rows(connection: sqlite3.Connection, run_id: int) -> Frame:
     return read_frame(connection, Segment(run_id, -math.inf, math.inf), Deadline())
-
-
-class RunClock:
-    """The wall times of a run; of rows that are in no chunk either as if it had risen evenly."""
-
-    def __init__(self, connection: sqlite3.Connection, run_id: int) -> None:
-        self._connection = connection
-        self._run_id = run_id
-        *start, last_s, last_wall_s = connection.execute(_ENDS, (run_id,)).fetchone()
-        self._frame = frame_of_purged(connection, run_id)
-        first_row: tuple[float, float] | None = None
-        if self._frame is None:
-            first_row = connection.execute(_FIRST_ROW, (run_id,)).fetchone()
-        elif len(self._frame):
-            first_row = self._frame.bounds_s[0], float(self._frame.rows(0, 1).wall_times[0])
-        self._start_s, self._start_wall_s = start
-        self._rows_from_s, self._rows_from_wall_s = first_row or (last_s, last_wall_s)
-
-    def wall_s(self, query: str, time_s: float) -> float:
-        """At a simulation time; before the recording that of its start."""
-        if time_s >= self._rows_from_s and self._frame is not None and len(self._frame):
-            from_s = time_s if query == _FROM else math.nextafter(time_s, math.inf)
-            place = int(self._frame.places([from_s])[0]) - (query != _FROM)
-            place = min(place, len(self._frame) - 1)
-            return float(self._frame.rows(place, place + 1).wall_times[0])
-        if time_s >= self._rows_from_s:
-            row = self._connection.execute(query, (self._run_id, time_s)).fetchone()
-            return float(row[0]) if row else self._rows_from_wall_s
-        if time_s <= self._start_s:
-            return self._start_wall_s
-        share = (time_s - self._start_s) / (self._rows_from_s - self._start_s)
-        return self._start_wall_s + share * (self._rows_from_wall_s - self._start_wall_s)
-
-
-def _turning_point(
-    before_s: float, after_s: float, has_turned: Callable[[float], bool]
-) -> tuple[float, float]:
-    """The last time before and the first after something turned from false to true."""
-    for _ in range(_BISECTIONS):
-        middle_s = (before_s + after_s) / 2
-        if has_turned(middle_s):
-            after_s = middle_s
-        else:
-            before_s = middle_s
-    return before_s, after_s
 
 
 # -- which robot and which run a question is about -------------------------------------------------

@@ -83,8 +83,6 @@ class Retention:
             commands. 0 keeps runs for ever.
         kept_state: Rows of kept stretches: those that the throttle dropped, and those that went
             from `state`. A stretch that loses a row is none any more.
-        unshipped: What is beyond these limits stays until it is shipped to a pool; of more than
-            this size the oldest goes all the same.
     """
 
     state: Limit = Limit(size_bytes=1_000_000_000, spared_rows=50_000)
@@ -94,17 +92,10 @@ class Retention:
     image: Limit = Limit(size_bytes=1_000_000_000, spared_rows=50)
     outlive: float = 10.0
     kept_state: Limit = Limit(size_bytes=100_000_000)
-    unshipped: Limit = Limit(size_bytes=0)
 
     def __post_init__(self) -> None:
         if not (self.outlive == 0 or 1 <= self.outlive < math.inf):
             raise InvalidInputError(f"outlive={self.outlive} must be 1 or more, or 0 for ever")
-        waiting = self.unshipped
-        if waiting.size_bytes is None or (waiting.rows, waiting.age_s) != (None, None):
-            raise InvalidInputError(
-                "rows that wait to be shipped are kept up to a size, so that an unreachable pool "
-                "does not fill the disk: --keep-until-shipped 2GB"
-            )
 
 
 DEFAULT: Final = Retention()
@@ -133,10 +124,9 @@ Asked = Mapping[str, "Limit | float | None"]
 """Limits by the names that they have in `Retention`; None is back to the default."""
 
 SERVE: Final = "serve"
-KINDS: Final = ("state", "kept_state", "chunk", "log", "event", "image", "unshipped")
+KINDS: Final = ("state", "kept_state", "chunk", "log", "event", "image")
 _KIND_OF: Final = {**{kind: kind for kind in KINDS}, "outlive": "run"}
 _NAME_OF: Final = {kind: name for name, kind in _KIND_OF.items()}
-_SHOWN: Final = {"unshipped": "until_shipped"}  # only where it was set
 _READ: Final = (
     "SELECT kind, size_bytes, row_count, age_s, outlive_factor, set_by, set_wall_time_s "
     "FROM retention_limit"
@@ -252,11 +242,10 @@ def described(connection: sqlite3.Connection) -> dict[str, str]:
     """Each limit in force as a person reads it, with who set it and when."""
     settings, retention = read_settings(connection), in_force(connection)
     return {
-        _SHOWN.get(kind, f"{kind}s"): _said(settings[name])
+        f"{kind}s": _said(settings[name])
         if name in settings
         else f"{_text(getattr(retention, name))} (default)"
         for name, kind in _KIND_OF.items()
-        if kind not in _SHOWN or name in settings
     }
 
 
@@ -298,13 +287,12 @@ _PART: Final = re.compile(r"(\d+(?:\.\d+)?)\s*([a-z]+)", re.IGNORECASE)
 _BYTES: Final = {"b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12}
 _SECONDS: Final = {"s": 1, "min": 60, "h": 3600, "d": 86_400, "w": 604_800}
 NO_LIMIT: Final = "all"  # is kept
-_OPTIONS: Final = {"kept_state": "--keep-stretches", "unshipped": "--keep-until-shipped"}
 _ROWS: Final = {"row": 1, "rows": 1}
 
 
 def option_of(kind: str) -> str:
     """The option of the command line that limits a kind of row."""
-    return _OPTIONS.get(kind, f"--keep-{kind}s")
+    return "--keep-stretches" if kind == "kept_state" else f"--keep-{kind}s"
 
 
 def parse_limit(text: str, default: Limit) -> Limit:

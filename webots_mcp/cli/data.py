@@ -240,36 +240,23 @@ def import_(
         Path,
         Parameter(
             "SOURCE",
-            help="A folder with status.json, logs/, camera/, ...; a recording, a webots.db; or a "
-            "bundle, a .zip of 'webots-mcp export'.",
+            help="A recording, a webots.db; or a bundle, a .zip of 'webots-mcp export'.",
         ),
     ],
     /,
     *,
-    robot: Annotated[
-        str,
-        Parameter(
-            "--robot",
-            metavar="NAME",
-            help="The name to record under, which no robot may have yet (imported).",
-        ),
-    ] = "imported",
     recorded: Where = HERE,
     json: Json = False,
 ) -> None:
-    """Import another recording, or the data folder of a bridge that writes JSON files.
+    """Import another recording.
 
     A recording that is over comes with all of its runs and trial sets, a bundle with its run; what
     is there already is left as it is, so that it may be imported again.
-
-    Of such a folder status.json, logs/controller.log, commands.json and the .png files of camera/
-    and screenshots/ become one finished run; if a file is damaged, nothing does. It has no
-    simulation times: they are counted in seconds of wall time from its earliest entry.
     """
     from webots_mcp.store.merging import is_bundle, unpacked
 
     if not source.is_file():
-        return _import_folder(recorded, source, robot, as_json=json)
+        raise InvalidInputError(f"{source} cannot be imported: there is no such file")
     if is_bundle(source):
         with unpacked(source) as database:
             found = _take_in(recorded, database)
@@ -278,21 +265,6 @@ def import_(
     if json:
         return print_json({"source": str(source), **found})
     print(f"{source}: {_taken_in(found)}")
-
-
-def _import_folder(recorded: Where, folder: Path, robot: str, *, as_json: bool) -> None:
-    from webots_mcp.store.json_folder import import_folder, read_folder
-
-    read_folder(folder)  # first: no database is made for what cannot be imported
-    with recorded.writer(create=True) as (recording, connection):
-        with shown_progress("importing") as progress:
-            made = import_folder(connection, folder, recording.data_dir, robot, progress)
-        if as_json:
-            return print_json({"source": str(folder), **made._asdict()})
-        print(
-            f"run {made.run_id} of robot {made.robot!r}: states {made.states}, log lines "
-            f"{made.lines}, pictures {made.pictures}, commands {made.commands}"
-        )
 
 
 def _take_in(recorded: Where, source: Path) -> dict[str, Any]:

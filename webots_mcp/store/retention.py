@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 import sqlite3
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.connection import transaction
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.liveness import process_alive
 from webots_mcp.store.run_rows import fetch_run
 
 # A run that a person named, described or marked is not retention's to judge.
@@ -115,9 +113,8 @@ def mark_kept(connection: sqlite3.Connection, run_ids: Sequence[int], *, keep: b
 
 # The limits of a database belong to it, not to who maintains it: set once, they hold for all.
 #
-# `prune` and `retain` set what a person asks for. A server sets limits that are not set yet, or
-# that a server set which no longer runs; while another server runs, it reports the limits in
-# force.
+# `prune` and `retain` set what a person asks for. A server sets limits that no person has set, and
+# reports those that hold.
 
 
 Asked = Mapping[str, "Limit | float | None"]
@@ -137,10 +134,6 @@ _SET: Final = (
     "VALUES (?, ?, ?, ?, ?, ?, ?)"
 )
 _RESET: Final = "DELETE FROM retention_limit WHERE kind = ?"
-_SERVER: Final = (
-    "SELECT CAST(holder AS BLOB) FROM lease WHERE name = 'maintainer' AND holder LIKE 'server %' "
-    "AND typeof(until_wall_time_s) IN ('real', 'integer') AND until_wall_time_s > ?"
-)
 
 
 class Setting(NamedTuple):
@@ -202,24 +195,16 @@ def set_limits(connection: sqlite3.Connection, asked: Asked, set_by: str) -> Non
                 connection.execute(_SET, (kind, None, None, None, value, set_by, now_s))
 
 
-def ask_at_start(connection: sqlite3.Connection, asked: Asked) -> list[str]:
-    """Set what a starting server may set; returns for each limit that it may not what holds."""
-    if not _another_server(connection):
-        settings = read_settings(connection)
-        mine = {
-            name: value
-            for name, value in asked.items()
-            if name not in settings or settings[name].set_by == SERVE
-        }
-        set_limits(connection, _changed(mine, settings), SERVE)
-    return unheeded(connection, asked)
-
-
-def ask_where_unset(connection: sqlite3.Connection, asked: Asked) -> None:
-    """Set limits that are not set: of a database created after the server started."""
+def ask(connection: sqlite3.Connection, asked: Asked) -> list[str]:
+    """Set what a server may set: what no person has; returns for each other limit what holds."""
     settings = read_settings(connection)
-    if new := {name: value for name, value in asked.items() if name not in settings}:
-        set_limits(connection, new, SERVE)
+    mine = {
+        name: value
+        for name, value in asked.items()
+        if name not in settings or settings[name].set_by == SERVE
+    }
+    set_limits(connection, mine, SERVE)
+    return unheeded(connection, asked)
 
 
 def unheeded(connection: sqlite3.Connection, asked: Asked) -> list[str]:
@@ -249,14 +234,6 @@ def described(connection: sqlite3.Connection) -> dict[str, str]:
     }
 
 
-def _changed(asked: Asked, settings: Mapping[str, Setting]) -> Asked:
-    return {
-        name: value
-        for name, value in asked.items()
-        if name not in settings or value is None or _text(settings[name].value) != _text(value)
-    }
-
-
 def _said(setting: Setting) -> str:
     when = time.strftime("%Y-%m-%d %H:%M", time.localtime(setting.set_wall_time_s))
     return f"{_text(setting.value)} (set by {setting.set_by}, {when})"
@@ -266,18 +243,6 @@ def _text(value: Limit | float) -> str:
     if isinstance(value, Limit):
         return limit_text(value)
     return f"{value:g} times as long as chunks" if value else NO_LIMIT
-
-
-def _another_server(connection: sqlite3.Connection) -> bool:
-    """Whether a server that runs maintains the database; one that was killed holds its lease on."""
-    now_s = time.time()
-    holders: Iterable[tuple[bytes]] = connection.execute(_SERVER, (now_s,)).fetchall()
-    pids = [pid for (holder,) in holders for pid in holder.split()[1:2]]
-    return any(pid.isdigit() and _lives(int(pid), now_s) for pid in pids)
-
-
-def _lives(pid: int, now_s: float) -> bool:
-    return pid != os.getpid() and process_alive(pid, None, now_s)
 
 
 # Limits as a person writes them: `500MB,30d`, `100000rows`, `all`.

@@ -20,9 +20,9 @@ def test_what_is_no_place_or_the_place_of_something_else_is_not_taken(branch: st
     assert find_position(numbers(branch, "rover")) == ("rover.x", "rover.y")
 
 
-def test_a_nested_position_is_taken_before_other_branches() -> None:
-    found = find_position(numbers("base", "odometry.position"))
-    assert found == ("odometry.position.x", "odometry.position.y")
+@pytest.mark.parametrize("place", ["odometry.position", "currentPosition"])
+def test_a_branch_that_is_called_a_place_is_taken_before_others(place: str) -> None:
+    assert find_position(numbers("base", place)) == (f"{place}.x", f"{place}.y")
 
 
 @pytest.mark.parametrize(
@@ -43,13 +43,6 @@ def test_a_position_is_found_however_its_words_are_joined(x: str, y: str) -> Non
     others = {"targetPose.x", "targetPose.y", "ballX", "ballY", "gyro.0", "gyro.1", "max", "y2"}
     assert find_position({x, y, *others}) == (x, y)
     assert find_position(others) is None
-
-
-def test_a_branch_that_is_called_a_place_is_taken_before_others_in_camel_case_too() -> None:
-    assert find_position(numbers("base", "currentPosition")) == (
-        "currentPosition.x",
-        "currentPosition.y",
-    )
 
 
 @pytest.mark.parametrize("name", [

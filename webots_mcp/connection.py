@@ -9,7 +9,7 @@ import os
 import re
 import sqlite3
 import time
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator
 from contextlib import closing, contextmanager
 from functools import cache
 from pathlib import Path
@@ -228,13 +228,6 @@ def is_unwritable(error: Exception) -> bool:
 
 SCHEMA_FILE: Final = Path(__file__).with_name("schema.sql")
 
-OLDER_SCHEMA: Final = 9  # of the recordings before the values lay in chunks
-_FROM_OLDER: Final = (
-    "{file} has schema {version}, of an older webots-mcp, and this one knows {known}: move it "
-    "aside, so that a new one is begun, and {then}"
-)
-_THEN: Final = "take it in with 'webots-mcp import FILE'"
-_IF_OLDEST: Final = "read it with the webots-mcp that made it"
 _MADE: Final = re.compile(r'CREATE (?:UNIQUE )?(?:TABLE|VIEW|INDEX|TRIGGER) "?(\w+)', re.IGNORECASE)
 _TOKENS: Final = re.compile(
     r"('(?:[^']|'')*'|\"[^\"]*\"|`[^`]*`|\[[^\]]*\]|\w+|/\*.*?\*/|--[^\n]*|[^\s\w])", re.DOTALL
@@ -297,12 +290,9 @@ def require_current(connection: sqlite3.Connection) -> None:
         )
     if version < SCHEMA_VERSION:
         raise SchemaTooOldError(
-            _FROM_OLDER.format(
-                file=_file(connection, "main"),
-                version=version,
-                known=SCHEMA_VERSION,
-                then=_THEN if version == OLDER_SCHEMA else _IF_OLDEST,
-            )
+            f"{_file(connection, 'main')} has schema {version}, of an older webots-mcp, and this "
+            f"one knows {SCHEMA_VERSION}: move it aside, so that a new one is begun, and read it "
+            "with the webots-mcp that made it"
         )
 
 
@@ -328,33 +318,23 @@ def shipped_statements() -> tuple[str, ...]:
 @cache
 def shipped_objects() -> dict[str, str]:
     """By their names, the statements that make tables, views and indexes."""
-    return _by_name(shipped_statements())
-
-
-def _by_name(statements: Iterable[str]) -> dict[str, str]:
-    made = ((_MADE.match(each), each.rstrip()) for each in statements)
+    made = ((_MADE.match(each), each.rstrip()) for each in shipped_statements())
     return {match[1].lower(): each for match, each in made if match}
 
 
-def require_shipped(
-    connection: sqlite3.Connection,
-    statements: Iterable[str] | None = None,
-    *,
-    schema: str = "main",
-) -> None:
+def require_shipped(connection: sqlite3.Connection, *, schema: str = "main") -> None:
     """Raise where a table, view or index of ours is not what we ship, or something runs on one.
 
     A table or view that is missing is as wrong; an index is not.
 
     Args:
         connection: Nothing but PRAGMAs was asked of that database yet.
-        statements: Those that make what we ship, in another version; None for this one.
         schema: The name that the database was attached under.
 
     Raises:
         ForeignDatabaseError: The text names what it is, and what to do.
     """
-    shipped = shipped_objects() if statements is None else _by_name(statements)
+    shipped = shipped_objects()
     texts = set(shipped.values())
     found = connection.execute(_OBJECTS.format(schema)).fetchall()
     names = {name.lower() for _, name, _, _ in found}

@@ -338,7 +338,7 @@ CREATE TABLE lease (
 	PRIMARY KEY (name)
 );
 CREATE TABLE retention_limit (
-	kind TEXT NOT NULL /* state, kept_state, chunk, log, event, image, run or unshipped */, 
+	kind TEXT NOT NULL /* state, kept_state, chunk, log, event, image or run */, 
 	size_bytes BIGINT /* on the disk; of pictures their files */, 
 	row_count BIGINT, 
 	age_s FLOAT /* since it was recorded, in wall time */, 

@@ -67,7 +67,7 @@ from webots_mcp.store.chunk_making import make_chunks, make_missing_chunks
 from webots_mcp.store.purge import Upkeep
 from webots_mcp.store.questions.sql import describe_schema
 from webots_mcp.store.recording import OpenReaders, Recording
-from webots_mcp.store.retention import Asked, ask_where_unset
+from webots_mcp.store.retention import Asked, ask
 
 INSTRUCTIONS: Final = (
     "A flight recorder and remote control for Webots robot simulations. Begin with "
@@ -156,7 +156,7 @@ def _lifespan(
 
     def work(connection: Connection) -> None:
         if unasked:
-            ask_where_unset(connection, unasked)
+            ask(connection, unasked)
             unasked.clear()
         reap_if_dead(connection)
         make_chunks(connection, pause_s=_PAUSE_S)

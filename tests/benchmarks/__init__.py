@@ -1,4 +1,4 @@
-"""What the bridge and the server cost, in comparison with JSON files and raw sqlite3.
+"""What the bridge and the server cost, in comparison with raw sqlite3.
 
     python -m tests.benchmarks [--quick] [--rows ROWS] [--kills KILLS] [--only NAME]
 

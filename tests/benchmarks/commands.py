@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable
-from contextlib import ExitStack, closing, contextmanager, suppress
+from collections.abc import Generator, Iterable
+from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -126,23 +125,19 @@ def measure_crowd(bench: Bench) -> Iterable[Line]:
         ]
         for robot in robots:
             robot.receive()
-        rows, files = partial(_read_rows, database), partial(_read_files, bench.folder)
         contenders = {
-            "bridge": driving(robots, f"bridge {steps}", partial(_reading, rows)),
+            "bridge": driving(robots, f"bridge {steps}", partial(_reading, database)),
             "served": driving(robots, f"bridge {steps}", partial(running_server, database)),
-            "files": driving(robots, f"files {steps}", partial(_reading, files)),
             "noise": driving(robots, f"noise {steps}"),
         }
         bench.say("8 ms steps")
         taken = alternate(contenders, bench.count(5, least=2))
-    ours, served, by_files, noise = (
+    ours, served, noise = (
         Samples([[s for answer in block for s in answer["durations"]] for block in taken[name]])
         for name in contenders
     )
     put_off = fmean(answer["put_off"] for block in taken["bridge"] for answer in block)
-    beside = f"JSON files {duration(by_files.p999)}"
-    yield Line("p99.9", duration(ours.p999), beside, ours.p999 / by_files.p999)
-    beside = f"json.dumps alone {duration(noise.worst)}, JSON files {duration(by_files.worst)}"
+    beside = f"json.dumps alone {duration(noise.worst)}"
     for what, taken_by in (("worst", ours), ("worst, and a server that looks back", served)):
         yield Line(what, duration(taken_by.worst), beside, taken_by.worst * 1e3, "ms", Target(5))
     beside = "another writer held the lock, and nothing waited for it"
@@ -150,13 +145,14 @@ def measure_crowd(bench: Bench) -> Iterable[Line]:
 
 
 @contextmanager
-def _reading(read: Callable[[], None]) -> Generator[None]:
+def _reading(database: Path) -> Generator[None]:
     """Read ten times a second as long as the `with` block lasts."""
     over = threading.Event()
 
     def run() -> None:
         while not over.wait(_READ_INTERVAL_S):
-            read()
+            with closing(connect(database, "reader")) as connection:
+                connection.execute(_RANGE).fetchall()
 
     thread = threading.Thread(target=run)
     thread.start()
@@ -165,17 +161,6 @@ def _reading(read: Callable[[], None]) -> Generator[None]:
     finally:
         over.set()
         thread.join()
-
-
-def _read_rows(database: Path) -> None:
-    with closing(connect(database, "reader")) as connection:
-        connection.execute(_RANGE).fetchall()
-
-
-def _read_files(folder: Path) -> None:
-    for file in folder.glob("files */status.json"):
-        with suppress(ValueError):  # half written: this way has no better answer
-            json.loads(file.read_text())
 
 
 BENCHMARKS = (measure_round_trip, measure_claims, measure_crowd)

@@ -8,11 +8,10 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import fmean, median
+from statistics import median
 from typing import TypeVar
 
 T = TypeVar("T")
-Statistic = Callable[[list[float]], float]
 _COLUMNS = ("what", "ours", "beside", "measured", "target", "")
 
 
@@ -129,11 +128,6 @@ class Samples:
         """The median of a typical block."""
         return median(median(block) for block in self.blocks)
 
-    @property
-    def mean(self) -> float:
-        """The mean of a typical block."""
-        return median(fmean(block) for block in self.blocks)
-
     def above(self, fraction: float) -> float:
         """The value below which that fraction of all values lies."""
         values = sorted(value for block in self.blocks for value in block)
@@ -150,10 +144,10 @@ class Samples:
         return self.above(1)
 
 
-def ratio(ours: Samples, theirs: Samples, statistic: Statistic = median) -> float:
+def ratio(ours: Samples, theirs: Samples) -> float:
     """The median of the ratios of neighbouring blocks: what drifts meanwhile falls out."""
     pairs = zip(ours.blocks, theirs.blocks, strict=True)
-    return median(statistic(our) / statistic(their) for our, their in pairs)
+    return median(median(our) / median(their) for our, their in pairs)
 
 
 # -- the table -----------------------------------------------------------------------------------

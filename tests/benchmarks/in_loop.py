@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
-from statistics import fmean, median
+from statistics import median
 from typing import Any
 
 from tests.benchmarks.core import (
@@ -29,11 +29,9 @@ from tests.benchmarks.core import (
 )
 from tests.benchmarks.ways import (
     BridgeWay,
-    JsonFiles,
     RawSqlite,
     Rover,
     State,
-    Way,
     encoder,
     make_states,
 )
@@ -90,23 +88,18 @@ def measure_loop(bench: Bench) -> Iterable[Line]:
 def _ways(bench: Bench, encoding: str) -> Iterable[Line]:
     with ExitStack() as stack:
         robot, place = Rover(), bench.place(encoding)
-        ways: dict[str, Way] = {
+        ways = {
             "bridge": stack.enter_context(closing(BridgeWay(robot, place))),
-            "files": JsonFiles(place),
             "raw": stack.enter_context(closing(RawSqlite(place))),
         }
         taken = _between_steps(bench, {name: _both(robot, way) for name, way in ways.items()})
-    ours, files, raw = taken["bridge"], taken["files"], taken["raw"]
+    ours, raw = taken["bridge"], taken["raw"]
     step = f"publish and get_command, {encoding}"
     yield compared(f"{step}, p50", ours.p50, "raw sqlite3", raw.p50, ratio(ours, raw), 2)
-    yield compared(f"{step}, p50", ours.p50, "JSON files", files.p50, ratio(ours, files), 0.35)
-    mean = ratio(ours, files, fmean)
-    yield compared(f"{step}, mean", ours.mean, "JSON files", files.mean, mean)
-    rare = ours.p999 / files.p999
-    yield compared(f"{step}, p99.9", ours.p999, "JSON files", files.p999, rare)
+    yield compared(f"{step}, p99.9", ours.p999, "raw sqlite3", raw.p999, ours.p999 / raw.p999)
 
 
-def _both(robot: Rover, way: Way) -> Call:
+def _both(robot: Rover, way: BridgeWay | RawSqlite) -> Call:
     def step(state: State) -> None:
         robot.step(8)
         way.publish(state)

@@ -71,15 +71,12 @@ def crowd_robot(folder: str, number: str) -> None:
     """
     from pathlib import Path
 
-    from tests.benchmarks.ways import BridgeWay, JsonFiles, Rover, make_states
+    from tests.benchmarks.ways import BridgeWay, Rover, make_states
 
     robot, states = Rover(f"rover {number}"), make_states()
-    files = Path(folder, f"files {number}")
-    files.mkdir()
-    bridge, by_files = BridgeWay(robot, Path(folder)), JsonFiles(files)
+    bridge = BridgeWay(robot, Path(folder))
     ways = {
         "bridge": (bridge.publish, bridge.get_command),
-        "files": (by_files.publish, by_files.get_command),
         "noise": (json.dumps, lambda: None),
     }
     say("ready")

@@ -9,29 +9,13 @@ import time
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from tests.benchmarks.core import NotMeasurableError
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import encoding
 
 ORJSON: Final[Any] = encoding.orjson
-
-
-class Way(Protocol):
-    """What a controller's loop calls."""
-
-    def publish(self, state: State) -> object:
-        """Record a state."""
-        ...
-
-    def get_command(self) -> object:
-        """Look for a command."""
-        ...
-
-    def close(self) -> None:
-        """No more calls."""
-        ...
 
 
 class BridgeWay:
@@ -62,36 +46,6 @@ def encoder(*, orjson: bool) -> Generator[str]:
         yield "orjson" if orjson else "standard library JSON"
     finally:
         encoding.orjson = ORJSON
-
-
-class JsonFiles:
-    """The JSON-file way: a file written anew for each state, a file read for each look.
-
-    It is what a controller does that shares its state by files: `open`, `json.dump` with an
-    indent, `close`; and `exists`, `open`, `json.load` to see whether a command is there.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._status = folder / "status.json"
-        self._commands = folder / "commands.json"
-        self._commands.write_text(json.dumps({"id": 3, "action": "resume", "params": {}}))
-        self._done = 3
-
-    def publish(self, state: State) -> None:
-        """Write the state."""
-        with open(self._status, "w") as file:  # noqa: PTH123
-            json.dump(state, file, indent=2)
-
-    def get_command(self) -> dict[str, Any] | None:
-        """Read the command; None if it is the one that was done already."""
-        if not self._commands.exists():
-            return None
-        with open(self._commands) as file:  # noqa: PTH123
-            command = json.load(file)
-        return command if command["id"] > self._done else None
-
-    def close(self) -> None:
-        """Nothing is open."""
 
 
 class RawSqlite:

@@ -14,9 +14,8 @@ from pathlib import Path
 import pytest
 
 from tests.diagnosis.conftest import Look
-from tests.older_recording import make_older
+from tests.older_recording import OLDER_SCHEMA, make_older
 from tests.recordings.rows import Recorded, RecordedRobot
-from webots_mcp.connection import OLDER_SCHEMA
 from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.queue import CommandQueue
 from webots_mcp.waiting_file import waiting_path

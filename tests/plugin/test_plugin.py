@@ -253,30 +253,6 @@ def test_paths_are_those_in_the_rootdir_wherever_pytest_is_started(
     pytester.runpytest_inprocess("-p", "no:cacheprovider").assert_outcomes(passed=3)
 
 
-def test_a_fixture_of_the_users_own_wins(pytester: pytest.Pytester) -> None:
-    pytester.makeconftest(
-        """
-        import pytest
-
-        @pytest.fixture
-        def webots_recording():
-            return "a gramophone record"
-
-        @pytest.fixture
-        def webots_robot(webots_robot_factory):
-            return webots_robot_factory("spot")
-        """
-    )
-    pytester.makepyfile(
-        """
-        def test_mine(webots_recording, webots_bridge):
-            assert webots_recording == "a gramophone record"
-            assert webots_bridge.robot_name == "spot"
-        """
-    )
-    pytester.runpytest_inprocess().assert_outcomes(passed=1)
-
-
 def test_no_fixture_takes_a_name_that_a_test_suite_may_use_itself(
     pytester: pytest.Pytester,
 ) -> None:

@@ -15,7 +15,6 @@ from webots_mcp.errors import (
     UnknownSignalError,
 )
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.purge import prune
 from webots_mcp.store.retention import Limit, Retention
 from webots_mcp.testing import RobotRecording
@@ -114,15 +113,6 @@ def test_an_unknown_signal_is_told_with_near_names(story: RobotRecording) -> Non
         story.signal("sensors.frnt")
 
 
-def test_a_signal_seen_only_at_the_beginning_is_known(
-    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: RobotRecording
-) -> None:
-    for step in range(300):
-        webots_robot.step(16)
-        webots_bridge.publish({"booting": True} if step == 0 else {"n": step})
-    assert webots_recording.signal("booting").values() == [True] + [None] * 299
-
-
 def test_a_name_that_means_several_signals_is_refused_by_signal_and_taken_by_signals(
     webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: RobotRecording
 ) -> None:
@@ -208,15 +198,3 @@ def test_what_could_not_be_looked_for_is_not_told_to_be_absent(
         webots_bridge.publish({"mode": "cruise", "step": step})
     with pytest.raises(NothingRecordedError, match="stuck could not be looked for: no position"):
         webots_recording.find_events("stuck")
-
-
-def test_what_could_not_be_read_shows_nothing(story: RobotRecording) -> None:
-    with closing(story._connect("writer")) as connection:  # pyright: ignore[reportPrivateUsage]
-        assert chunk_whole_run(connection, 1)
-        connection.execute("DELETE FROM state")
-        connection.execute("UPDATE row_group SET stored_row_count = 0")
-        damage = "UPDATE chunk SET numbers = x'00', codes = x'00' WHERE signal_id IN "
-        connection.execute(damage + "(SELECT id FROM signal WHERE name = 'mode')")
-    with pytest.raises(AssertionError, match=r"the chunk of mode is damaged.*nothing shows"):
-        story.signal("mode").assert_never("backwards")
-    story.signal("sensors.front_m").assert_never_below(0.0)

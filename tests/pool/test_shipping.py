@@ -13,11 +13,12 @@ from typing import Any
 import pytest
 
 from tests import unprivileged
+from tests.older_recording import OLDER_SCHEMA
 from tests.pool.conftest import Shipped
 from tests.pool.parquet import bucket
 from tests.pool.rows import BeforeWrite, pooled, shipping
 from tests.recordings.runs import states
-from webots_mcp.connection import OLDER_SCHEMA, connect, create_schema
+from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import host_name, new_uuid
 from webots_mcp.errors import (
     DatabaseError,
@@ -32,7 +33,6 @@ from webots_mcp.plugins.pool.shipping import LAST_GROUP, Order, Report, Source, 
 from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.merging import merge
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.retention_plan import read_shipped
 
 
 def test_a_pool_at_full_rate_holds_every_row_as_the_recording_does(shipped: Shipped) -> None:
@@ -254,22 +254,6 @@ def test_a_second_shipper_of_the_same_recording_is_refused(shipped: Shipped) -> 
         shipped.ship()
 
 
-def test_the_folder_tells_retention_what_is_shipped(shipped: Shipped) -> None:
-    shipped.add_run()
-    shipped.ship()
-    (told,) = read_shipped(shipped.folder / "webots.db", shipped.uuid).values()
-    assert told.last_ids["log"] == 30
-    assert "state" not in told.last_ids
-    assert told.complete_wall_time_s > 0
-    assert read_shipped(shipped.folder / "webots.db", new_uuid()) == {}
-    file = shipped.folder / "webots.db-shipped.json"
-    assert file.stat().st_mode & 0o777 == 0o600  # as the database
-    file.write_text("{")
-    assert read_shipped(shipped.folder / "webots.db", shipped.uuid) == {}
-    shipped.ship()
-    assert read_shipped(shipped.folder / "webots.db", shipped.uuid)
-
-
 def test_a_pool_that_is_away_is_tried_again_and_then_gets_everything(shipped: Shipped) -> None:
     shipped.add_run()
     url = bucket.empty()
@@ -318,7 +302,6 @@ def test_a_recording_that_nobody_can_write_is_shipped(shipped: Shipped) -> None:
     uuid, rows = shipped.uuid, shipped.rows()
     assert not ship_unwritable(shipped, full=True).strip()
     assert pooled(shipped.pool, uuid) == rows
-    assert not list(shipped.folder.glob("*shipped.json"))
 
 
 @pytest.mark.skipif(not unprivileged.POSSIBLE, reason="root may write everywhere")

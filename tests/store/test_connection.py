@@ -34,11 +34,7 @@ def test_a_transaction_stores_everything_or_nothing() -> None:
             raise KeyError
         assert not connection.in_transaction
         assert connection.execute(COUNT).fetchone() == (1,)
-
-
-def test_an_error_that_ended_the_transaction_itself_is_the_one_that_is_told() -> None:
-    with memory_connection() as connection:
-        connection.execute(LEASE, ("a",))
+        # What has ended the transaction itself is what is told.
         with pytest.raises(sqlite3.IntegrityError), transaction(connection):
             connection.execute(LEASE.replace("INSERT", "INSERT OR ROLLBACK"), ("a",))
         assert not connection.in_transaction

@@ -18,7 +18,6 @@ from webots_mcp import MCPBridge
 from webots_mcp.connection import connect, create_schema
 from webots_mcp.liveness import process_identity
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.json_folder import import_folder
 
 
 def is_random_uuid(text: str) -> bool:
@@ -122,13 +121,3 @@ def test_two_processes_are_told_apart_and_one_that_ended_is_none() -> None:
         assert None is not told != process_identity(os.getpid())
         other.communicate(b"\n")
     assert process_identity(other.pid) is None
-
-
-def test_an_imported_folder_is_named_as_well(tmp_path: Path) -> None:
-    folder = tmp_path / "old"
-    folder.mkdir()
-    (folder / "status.json").write_text('{"x": 1, "timestamp": 1700000000.0}')
-    with closing(connect(tmp_path / "webots.db", "writer", create=True)) as connection:
-        create_schema(connection)
-        import_folder(connection, folder, tmp_path)
-        assert len(uuids(connection, "session")) == len(uuids(connection, "run")) == 1

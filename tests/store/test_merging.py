@@ -12,11 +12,9 @@ from typing import Any
 import pytest
 
 from tests.recordings.runs import Recorded
-from webots_mcp import MCPBridge
 from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import new_uuid
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.merging import merge, settled
 from webots_mcp.store.parameters import (
@@ -241,29 +239,3 @@ def test_trial_sets_come_in_the_order_in_which_they_were_begun(
     merge(target, tmp_path / "here", source)
     taken = target.execute("SELECT plan FROM trial_set ORDER BY id").fetchall()
     assert taken == [(plan,) for plan in plans]
-
-
-def test_camera_frames_come_with_their_kept_stretch(
-    target: sqlite3.Connection, tmp_path: Path
-) -> None:
-    source = tmp_path / "filmed" / "webots.db"
-    robot = InProcessSupervisor("rover")
-    camera = robot.getDevice("camera")
-    camera.enable(16)
-    with MCPBridge(robot, database=source) as bridge:
-        bridge.keep_camera(camera)
-        for number in range(100):
-            robot.step(16)
-            bridge.publish({"n": number})
-        bridge.keep("a look")
-
-    merge(target, tmp_path / "here", source)
-
-    kept = target.execute(
-        "SELECT i.path, i.size_bytes FROM image i JOIN kept_stretch k ON k.run_id = i.run_id "
-        "AND i.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s WHERE i.kind = 'kept'"
-    ).fetchall()
-    assert len(kept) >= 7
-    assert [(tmp_path / "here" / path).stat().st_size for path, _ in kept] == [
-        size for _, size in kept
-    ]

@@ -71,28 +71,31 @@ def target(tmp_path: Path) -> Iterator[sqlite3.Connection]:
 
 
 @NONE_OR_SOME_LEFT
-def test_every_answer_about_a_purged_run_is_what_it_was_there(
+def test_a_purged_run_comes_once_with_every_answer_and_is_left_as_it_is(
     target: sqlite3.Connection, source: Path, tmp_path: Path
 ) -> None:
+    tables = ("state", "signal", "row_group", "chunk", "run")
     with closing(connect(source, "reader")) as there:
         (uuid,) = there.execute("SELECT uuid FROM run WHERE id = 1").fetchone()
-        run = merge(target, tmp_path / "here", source)[uuid]
+        merged = merge(target, tmp_path / "here", source)
+        run = merged[uuid]
         before, after = run_info(there, 1), run_info(target, run)
         assert after.purged_rows == before.purged_rows > 0
         assert answers(target, run, PART) == answers(there, 1, PART)
         assert target.execute(SIGNALS).fetchall() == there.execute(SIGNALS).fetchall()
-
-
-@NONE_OR_SOME_LEFT
-def test_what_was_taken_in_is_left_as_it_is_by_who_makes_chunks(
-    target: sqlite3.Connection, source: Path, tmp_path: Path
-) -> None:
-    run = merge(target, tmp_path / "here", source, run_id=1).popitem()[1]
-    tables = [f"SELECT * FROM {table} WHERE run_id = {run}" for table in ("row_group", "chunk")]
-    before = [target.execute(each).fetchall() for each in tables]
-    assert len(before[0]) >= 5
+        known, here = framed(there, 1), framed(target, run)
+        for name in ("battery_v", "mode", "pose.0"):
+            assert here.values(name) == known.values(name)
+    assert len(here) == ROWS and here.unread == ()
+    left = target.execute("SELECT id FROM state WHERE run_id = ? ORDER BY id", (run,)).fetchall()
+    assert [row_id for (row_id,) in left] == here.ids.tolist()[ROWS - len(left) :]
+    everything = [target.execute(f"SELECT * FROM {table}").fetchall() for table in tables]
+    assert merge(target, tmp_path / "here", source) == merged
+    assert [target.execute(f"SELECT * FROM {each}").fetchall() for each in tables] == everything
+    made = [f"SELECT * FROM {table} WHERE run_id = {run}" for table in ("row_group", "chunk")]
+    chunks = [target.execute(each).fetchall() for each in made]
     assert make_chunks(target, 100_000).done
-    assert [target.execute(each).fetchall() for each in tables] == before
+    assert [target.execute(each).fetchall() for each in made] == chunks
 
 
 def test_rows_that_were_in_no_chunk_there_are_put_into_one_here(
@@ -111,30 +114,6 @@ def test_rows_that_were_in_no_chunk_there_are_put_into_one_here(
 
     chunked = "SELECT sum(row_count), max(end_sim_time_s) FROM row_group WHERE run_id = ?"
     assert target.execute(chunked, (run,)).fetchone() == (ROWS + 300, (ROWS + 299) * 0.2)
-
-
-@NONE_OR_SOME_LEFT
-def test_the_chunks_of_a_purged_run_come_and_name_the_rows_that_are_left(
-    target: sqlite3.Connection, source: Path, tmp_path: Path
-) -> None:
-    run = merge(target, tmp_path / "here", source, run_id=1).popitem()[1]
-    with closing(connect(source, "reader")) as there:
-        before, after = framed(there, 1), framed(target, run)
-        for name in ("battery_v", "mode", "pose.0"):
-            assert after.values(name) == before.values(name)
-    assert len(after) == ROWS and after.unread == ()
-    left = target.execute("SELECT id FROM state WHERE run_id = ? ORDER BY id", (run,)).fetchall()
-    assert [row_id for (row_id,) in left] == after.ids.tolist()[ROWS - len(left) :]
-
-
-@NONE_OR_SOME_LEFT
-def test_a_purged_run_comes_once(target: sqlite3.Connection, source: Path, tmp_path: Path) -> None:
-    tables = ("state", "signal", "row_group", "chunk", "run")
-    merged = merge(target, tmp_path / "here", source)
-    everything = [target.execute(f"SELECT * FROM {table}").fetchall() for table in tables]
-
-    assert merge(target, tmp_path / "here", source) == merged
-    assert [target.execute(f"SELECT * FROM {each}").fetchall() for each in tables] == everything
 
 
 def test_a_purged_run_goes_as_a_bundle_from_one_to_the_next(source: Path, tmp_path: Path) -> None:

@@ -17,41 +17,29 @@ from webots_mcp.store.robots import list_robots, resolve_robot
 from webots_mcp.store.run_rows import count_runs, current_run, fetch_run, runs_of
 
 
-def ended(recorded: Recorded, name: str) -> None:
-    recorded.robot(name, ended_wall_time_s=time.time(), end_reason="finished")
-
-
-def test_the_only_live_robot_is_meant_when_none_is_named(recorded: Recorded) -> None:
-    ended(recorded, "old")
-    recorded.robot("rover")
-    assert resolve_robot(recorded.connection, None, time.time()).name == "rover"
-
-
-def test_the_only_robot_ever_seen_is_meant_when_none_is_live(recorded: Recorded) -> None:
-    ended(recorded, "rover")
-    robot = resolve_robot(recorded.connection, None, time.time())
-    assert (robot.name, robot.live) == ("rover", False)
-
-
-def test_two_live_robots_are_listed_instead_of_guessed(recorded: Recorded) -> None:
-    recorded.robot("rover")
-    recorded.robot("rover#2", supervisor=0)
-    with pytest.raises(AmbiguousRobotError, match=r"'rover' \(Supervisor, live\), 'rover#2'"):
-        resolve_robot(recorded.connection, None, time.time())
-
-
-def test_two_robots_of_the_past_are_listed_instead_of_guessed(recorded: Recorded) -> None:
-    ended(recorded, "a")
-    ended(recorded, "b")
-    with pytest.raises(AmbiguousRobotError, match=r"none is live: .*; start the simulation, or"):
-        resolve_robot(recorded.connection, None, time.time())
-
-
-def test_a_misspelt_robot_is_answered_with_near_names(recorded: Recorded) -> None:
-    recorded.robot("rover")
-    recorded.robot("crane")
-    with pytest.raises(UnknownRobotError, match="did you mean 'rover'"):
-        resolve_robot(recorded.connection, "rovr", time.time())
+@pytest.mark.parametrize(
+    ("live", "past", "asked", "said"),
+    [
+        (["rover"], ["old"], None, "rover"),
+        ([], ["rover"], None, "rover"),
+        (["rover", "rover#2"], [], None, r"'rover' \(Supervisor, live\), 'rover#2'"),
+        ([], ["a", "b"], None, "none is live: .*; start the simulation, or"),
+        (["rover", "crane"], [], "rovr", "did you mean 'rover'"),
+    ],
+)
+def test_which_robot_is_meant_and_what_is_said_where_it_could_be_several(
+    recorded: Recorded, live: list[str], past: list[str], asked: str | None, said: str
+) -> None:
+    for name in past:
+        recorded.robot(name, ended_wall_time_s=time.time(), end_reason="finished")
+    for name in live:
+        recorded.robot(name)
+    if asked is None and len(live or past) == 1:
+        robot = resolve_robot(recorded.connection, asked, time.time())
+        assert (robot.name, robot.live) == (said, bool(live))
+        return
+    with pytest.raises((AmbiguousRobotError, UnknownRobotError), match=said):
+        resolve_robot(recorded.connection, asked, time.time())
 
 
 def test_an_empty_database_has_no_robot_to_offer(recorded: Recorded) -> None:

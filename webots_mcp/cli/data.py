@@ -240,76 +240,35 @@ def import_(
         Path,
         Parameter(
             "SOURCE",
-            help="A folder with status.json, logs/, camera/, ...; a recording, a webots.db; or a "
-            "bundle, a .zip of 'webots-mcp export'.",
+            help="A recording, a webots.db; or a bundle, a .zip of 'webots-mcp export'.",
         ),
     ],
     /,
     *,
-    robot: Annotated[
-        str,
-        Parameter(
-            "--robot",
-            metavar="NAME",
-            help="The name to record under, which no robot may have yet (imported).",
-        ),
-    ] = "imported",
     recorded: Where = HERE,
     json: Json = False,
 ) -> None:
-    """Import another recording, or the data folder of a bridge that writes JSON files.
+    """Import another recording.
 
     A recording that is over comes with all of its runs and trial sets, a bundle with its run; what
-    is there already is left as it is, so that it may be imported again. One of the schema before
-    is only read; of states that were deleted there nothing is left to search, and answers say so.
-
-    Of such a folder status.json, logs/controller.log, commands.json and the .png files of camera/
-    and screenshots/ become one finished run; if a file is damaged, nothing does. It has no
-    simulation times: they are counted in seconds of wall time from its earliest entry.
+    is there already is left as it is, so that it may be imported again.
     """
     from webots_mcp.store.merging import is_bundle, unpacked
 
     if not source.is_file():
-        return _import_folder(recorded, source, robot, as_json=json)
+        raise InvalidInputError(f"{source} cannot be imported: there is no such file")
     if is_bundle(source):
         with unpacked(source) as database:
-            found = _import_recording(recorded, database)
+            found = _take_in(recorded, database)
     else:
-        found = _import_recording(recorded, source)
+        found = _take_in(recorded, source)
     if json:
         return print_json({"source": str(source), **found})
     print(f"{source}: {_taken_in(found)}")
 
 
-def _import_folder(recorded: Where, folder: Path, robot: str, *, as_json: bool) -> None:
-    from webots_mcp.store.json_folder import import_folder, read_folder
-
-    read_folder(folder)  # first: no database is made for what cannot be imported
-    with recorded.writer(create=True) as (recording, connection):
-        with shown_progress("importing") as progress:
-            made = import_folder(connection, folder, recording.data_dir, robot, progress)
-        if as_json:
-            return print_json({"source": str(folder), **made._asdict()})
-        print(
-            f"run {made.run_id} of robot {made.robot!r}: states {made.states}, log lines "
-            f"{made.lines}, pictures {made.pictures}, commands {made.commands}"
-        )
-
-
-def _import_recording(recorded: Where, source: Path) -> dict[str, Any]:
+def _take_in(recorded: Where, source: Path) -> dict[str, Any]:
     """What the import has brought, of the runs that are in both recordings now."""
-    from webots_mcp.store.migrate import converted, copy_breakpoints, is_older
-
-    if not is_older(source):
-        return _take_in(recorded, source, source.parent)
-    with converted(source) as database:
-        found = _take_in(recorded, database, source.parent)
-        with recorded.writer() as (_, connection):
-            copy_breakpoints(connection, database)
-    return found
-
-
-def _take_in(recorded: Where, source: Path, pictures: Path) -> dict[str, Any]:
     from webots_mcp.store.merging import merge, settled
 
     settled(source)  # first: no database is made for what is no recording
@@ -318,7 +277,7 @@ def _take_in(recorded: Where, source: Path, pictures: Path) -> dict[str, Any]:
             raise InvalidInputError(f"{source} is the recording itself: choose another file")
         (newest,) = connection.execute("SELECT coalesce(max(id), 0) FROM run").fetchone()
         changes = connection.total_changes
-        runs = sorted(merge(connection, recording.data_dir, source, pictures=pictures).values())
+        runs = sorted(merge(connection, recording.data_dir, source).values())
         return {
             "new_run_ids": [run_id for run_id in runs if run_id > newest],
             "known_run_ids": [run_id for run_id in runs if run_id <= newest],
@@ -439,7 +398,6 @@ def _as_data(wanted: Plan) -> dict[str, Any]:
             for table, rows in wanted.rows_by_table().items()
         ],
         "spared": [vars(each) for each in wanted.spared],
-        "unshipped": [vars(each) for each in wanted.unshipped],
         "retained": {"run_ids": wanted.kept_run_ids, "size_bytes": wanted.kept_bytes},
     }  # fmt: skip
 
@@ -461,12 +419,6 @@ def _print_plan(wanted: Plan, going: str) -> None:
             f"beyond the limit, but spared: {each.rows} rows of {each.table}, about "
             f"{size_text(each.size_bytes)}, {each.why}"
             for each in wanted.spared
-        ]
-    )
-    print_notes(
-        [
-            f"goes although it is {each.why}: {each.rows} rows of {each.table}"
-            for each in wanted.unshipped
         ]
     )
     if wanted.kept_run_ids:

@@ -9,7 +9,7 @@ import re
 import sys
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, Final, ParamSpec, TypeAlias
@@ -312,16 +312,15 @@ def make_chunks_first(recording: Recording) -> None:
 
 _BACK: Final = "default"
 _RUNS: Final = "outlive"
-_SIZE: Final = "unshipped"  # whose size alone can be given
 
 
 def _option(name: str, text: str) -> Parameter:
     """The option of a limit, with what holds where nobody has set one."""
     value = getattr(DEFAULT, name)
     default = f"{value:g}" if name == _RUNS else limit_text(value)
-    if isinstance(value, Limit) and value.limits and name != _SIZE:
+    if isinstance(value, Limit) and value.limits:
         default += f"; an age spares the newest {value.spared_rows:,}"
-    shown = {_RUNS: "TIMES", _SIZE: "SIZE"}.get(name, "LIMIT")
+    shown = "TIMES" if name == _RUNS else "LIMIT"
     return Parameter(_name_of(name), metavar=shown, help=text.format(default))
 
 
@@ -353,14 +352,6 @@ class Limits:
     image: Annotated[
         str | None, _option("image", "Keep so much of pictures with their files ({}).")
     ] = None
-    unshipped: Annotated[
-        str | None,
-        _option(
-            "unshipped",
-            "Of what is beyond these limits, keep this size until 'webots-mcp ship' has shipped it "
-            "({}).",
-        ),
-    ] = None
     outlive: Annotated[
         str | None,
         _option(
@@ -386,11 +377,9 @@ def _value(name: str, text: str) -> Limit | float | None:
     try:
         if name == _RUNS:
             return _times_of(text)
-        limit = parse_limit(text, getattr(DEFAULT, name))
-        replace(DEFAULT, **{name: limit})  # refuses one that has to be a size
+        return parse_limit(text, getattr(DEFAULT, name))
     except InvalidInputError as error:
         raise InvalidInputError(f"{_name_of(name)}: {error}") from error
-    return limit
 
 
 def _times_of(text: str) -> float:

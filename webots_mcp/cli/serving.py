@@ -133,11 +133,11 @@ def _ask_for(limits: Asked, database: Database, data_dir: Path) -> None:
     """Set the limits where that is this server's to do; say which others hold."""
     from webots_mcp.errors import NoDatabaseError
     from webots_mcp.store.recording import Recording
-    from webots_mcp.store.retention import ask_at_start
+    from webots_mcp.store.retention import ask
 
     try:
         with Recording(database, data_dir).writer() as connection:
-            notes = ask_at_start(connection, limits)
+            notes = ask(connection, limits)
     except NoDatabaseError:
         return  # they are set when there is one
     except WebotsMCPError as error:  # which the tools tell, in an answer

@@ -9,7 +9,7 @@ import math
 import re
 import sqlite3
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import PurePath
@@ -500,39 +500,22 @@ class _Texts:
     """The newest texts of the last minute, from which they can be taken."""
 
     def __init__(self, most: int) -> None:
-        self._most = most
-        self._added: deque[tuple[float, str]] = deque()
-        self._left: Counter[str] = Counter()
-        self._taken: Counter[str] = Counter()
+        self._added: deque[tuple[float, str]] = deque(maxlen=most)
 
     def __iter__(self) -> Iterator[str]:
-        self._forget()
-        return iter(list(self._left))
+        since_s = time.monotonic() - _COMPARED_S
+        while self._added and self._added[0][0] < since_s:
+            self._added.popleft()
+        return iter(list(dict.fromkeys(text for _, text in self._added)))
 
     def add(self, text: str) -> None:
         self._added.append((time.monotonic(), text))
-        self._left[text] += 1
-        self._forget()
 
     def take(self, text: str) -> bool:
-        self._forget()
-        if text not in self._left:
+        if text not in iter(self):
             return False
-        self._taken[text] += 1
-        _take_one(self._left, text)
+        del self._added[[each for _, each in self._added].index(text)]
         return True
-
-    def _forget(self) -> None:
-        since_s = time.monotonic() - _COMPARED_S
-        while self._added and (len(self._added) > self._most or self._added[0][0] < since_s):
-            _, text = self._added.popleft()
-            _take_one(self._taken if text in self._taken else self._left, text)
-
-
-def _take_one(counter: Counter[str], text: str) -> None:
-    counter[text] -= 1
-    if not counter[text]:
-        del counter[text]
 
 
 def _ends_with(text: str, said: str) -> bool:

@@ -521,7 +521,7 @@ class RetentionLimit(SQLModel, table=True):
         sa_column=Column(
             Text,
             primary_key=True,
-            comment="state, kept_state, chunk, log, event, image, run or unshipped",
+            comment="state, kept_state, chunk, log, event, image or run",
         )
     )
     size_bytes: int | None = _column(BigInteger, "on the disk; of pictures their files")

@@ -20,13 +20,12 @@ from typing import Any, Final
 
 from webots_mcp.connection import LONGEST_WRITE_S, Step, is_busy
 from webots_mcp.contract import KEPT_FRAME
-from webots_mcp.errors import DatabaseError, InvalidInputError, NothingRecordedError, warn
+from webots_mcp.errors import DatabaseError, InvalidInputError, NothingRecordedError
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.retention import DEFAULT, KEPT, Retention, in_force
 from webots_mcp.store.retention_plan import (
     OLD_COMMANDS,
     Going,
-    Holdings,
     Plan,
     Portion,
     plan,
@@ -185,7 +184,6 @@ def purge(
     wanted: Plan,
     data_dir: Path,
     spare_pages: int = 0,
-    holdings: Holdings | None = None,
 ) -> Iterator[Purged]:
     """Carry out a plan, write by write; the caller rests wherever this yields.
 
@@ -194,7 +192,6 @@ def purge(
         wanted: The plan.
         data_dir: The folder that the paths of pictures are relative to.
         spare_pages: So many free pages stay in the file, for the rows to come.
-        holdings: Those of the plan; what has gone is counted again.
 
     Yields:
         What was deleted so far; always the same object, and once at least.
@@ -211,10 +208,6 @@ def purge(
         yield from work.in_turn([work.carry_out(its) for its in steps.values() if its])
         if steps.get("kept_state"):
             yield from work.forget_frames()
-    if holdings is not None:
-        for step in wanted.steps:
-            if step.portion is not None:
-                holdings.recount(step.portion)
     yield from work.give_back()
 
 
@@ -446,9 +439,7 @@ class Upkeep:
         self._budget_s = budget_s
         self._next_plan_s = 0.0
         self._connection: sqlite3.Connection | None = None
-        self._holdings: Holdings | None = None
         self._under_way: Iterator[Purged] | None = None
-        self._has_warned = False
 
     def __call__(self, connection: sqlite3.Connection) -> None:
         """Delete for a moment, if anything is beyond the limits.
@@ -458,7 +449,6 @@ class Upkeep:
         """
         if connection is not self._connection:
             self._connection, self._under_way, self._next_plan_s = connection, None, 0.0
-            self._holdings = Holdings(connection)
         try:
             self._work(connection)
         except BaseException:
@@ -477,22 +467,11 @@ class Upkeep:
             time.sleep(purged.rest_s)
         self._under_way = None
 
-    def _warn_of(self, wanted: Plan) -> None:
-        """Once, until there is nothing of the kind any more."""
-        if wanted.unshipped and not self._has_warned:
-            tables = ", ".join(f"{each.table} {each.rows}" for each in wanted.unshipped)
-            warn(
-                f"rows are deleted that were not shipped yet ({tables}), because more wait than "
-                "--keep-until-shipped keeps: look whether 'webots-mcp ship --follow' runs"
-            )
-        self._has_warned = bool(wanted.unshipped)
-
     def _planned(self, connection: sqlite3.Connection) -> Iterator[Purged]:
         started_s = time.monotonic()
-        wanted = plan(connection, self._limits(connection), holdings=self._holdings)
-        self._warn_of(wanted)
+        wanted = plan(connection, self._limits(connection))
         took_s = time.monotonic() - started_s
         self._next_plan_s = started_s + max(self._interval_s, took_s / PLANNING_SHARE)
         pages = int(connection.execute("PRAGMA page_count").fetchone()[0])
         spare_pages = min(pages // SPARE_SHARE, MOST_SPARE_PAGES)
-        return purge(connection, wanted, self._data_dir, spare_pages, self._holdings)
+        return purge(connection, wanted, self._data_dir, spare_pages)

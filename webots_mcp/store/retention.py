@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-import os
 import re
 import sqlite3
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.connection import transaction
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.liveness import process_alive
 from webots_mcp.store.run_rows import fetch_run
 
 # A run that a person named, described or marked is not retention's to judge.
@@ -83,8 +81,6 @@ class Retention:
             commands. 0 keeps runs for ever.
         kept_state: Rows of kept stretches: those that the throttle dropped, and those that went
             from `state`. A stretch that loses a row is none any more.
-        unshipped: What is beyond these limits stays until it is shipped to a pool; of more than
-            this size the oldest goes all the same.
     """
 
     state: Limit = Limit(size_bytes=1_000_000_000, spared_rows=50_000)
@@ -94,17 +90,10 @@ class Retention:
     image: Limit = Limit(size_bytes=1_000_000_000, spared_rows=50)
     outlive: float = 10.0
     kept_state: Limit = Limit(size_bytes=100_000_000)
-    unshipped: Limit = Limit(size_bytes=0)
 
     def __post_init__(self) -> None:
         if not (self.outlive == 0 or 1 <= self.outlive < math.inf):
             raise InvalidInputError(f"outlive={self.outlive} must be 1 or more, or 0 for ever")
-        waiting = self.unshipped
-        if waiting.size_bytes is None or (waiting.rows, waiting.age_s) != (None, None):
-            raise InvalidInputError(
-                "rows that wait to be shipped are kept up to a size, so that an unreachable pool "
-                "does not fill the disk: --keep-until-shipped 2GB"
-            )
 
 
 DEFAULT: Final = Retention()
@@ -124,19 +113,17 @@ def mark_kept(connection: sqlite3.Connection, run_ids: Sequence[int], *, keep: b
 
 # The limits of a database belong to it, not to who maintains it: set once, they hold for all.
 #
-# `prune` and `retain` set what a person asks for. A server sets limits that are not set yet, or
-# that a server set which no longer runs; while another server runs, it reports the limits in
-# force.
+# `prune` and `retain` set what a person asks for. A server sets limits that no person has set, and
+# reports those that hold.
 
 
 Asked = Mapping[str, "Limit | float | None"]
 """Limits by the names that they have in `Retention`; None is back to the default."""
 
 SERVE: Final = "serve"
-KINDS: Final = ("state", "kept_state", "chunk", "log", "event", "image", "unshipped")
+KINDS: Final = ("state", "kept_state", "chunk", "log", "event", "image")
 _KIND_OF: Final = {**{kind: kind for kind in KINDS}, "outlive": "run"}
 _NAME_OF: Final = {kind: name for name, kind in _KIND_OF.items()}
-_SHOWN: Final = {"unshipped": "until_shipped"}  # only where it was set
 _READ: Final = (
     "SELECT kind, size_bytes, row_count, age_s, outlive_factor, set_by, set_wall_time_s "
     "FROM retention_limit"
@@ -147,10 +134,6 @@ _SET: Final = (
     "VALUES (?, ?, ?, ?, ?, ?, ?)"
 )
 _RESET: Final = "DELETE FROM retention_limit WHERE kind = ?"
-_SERVER: Final = (
-    "SELECT CAST(holder AS BLOB) FROM lease WHERE name = 'maintainer' AND holder LIKE 'server %' "
-    "AND typeof(until_wall_time_s) IN ('real', 'integer') AND until_wall_time_s > ?"
-)
 
 
 class Setting(NamedTuple):
@@ -212,24 +195,16 @@ def set_limits(connection: sqlite3.Connection, asked: Asked, set_by: str) -> Non
                 connection.execute(_SET, (kind, None, None, None, value, set_by, now_s))
 
 
-def ask_at_start(connection: sqlite3.Connection, asked: Asked) -> list[str]:
-    """Set what a starting server may set; returns for each limit that it may not what holds."""
-    if not _another_server(connection):
-        settings = read_settings(connection)
-        mine = {
-            name: value
-            for name, value in asked.items()
-            if name not in settings or settings[name].set_by == SERVE
-        }
-        set_limits(connection, _changed(mine, settings), SERVE)
-    return unheeded(connection, asked)
-
-
-def ask_where_unset(connection: sqlite3.Connection, asked: Asked) -> None:
-    """Set limits that are not set: of a database created after the server started."""
+def ask(connection: sqlite3.Connection, asked: Asked) -> list[str]:
+    """Set what a server may set: what no person has; returns for each other limit what holds."""
     settings = read_settings(connection)
-    if new := {name: value for name, value in asked.items() if name not in settings}:
-        set_limits(connection, new, SERVE)
+    mine = {
+        name: value
+        for name, value in asked.items()
+        if name not in settings or settings[name].set_by == SERVE
+    }
+    set_limits(connection, mine, SERVE)
+    return unheeded(connection, asked)
 
 
 def unheeded(connection: sqlite3.Connection, asked: Asked) -> list[str]:
@@ -252,19 +227,10 @@ def described(connection: sqlite3.Connection) -> dict[str, str]:
     """Each limit in force as a person reads it, with who set it and when."""
     settings, retention = read_settings(connection), in_force(connection)
     return {
-        _SHOWN.get(kind, f"{kind}s"): _said(settings[name])
+        f"{kind}s": _said(settings[name])
         if name in settings
         else f"{_text(getattr(retention, name))} (default)"
         for name, kind in _KIND_OF.items()
-        if kind not in _SHOWN or name in settings
-    }
-
-
-def _changed(asked: Asked, settings: Mapping[str, Setting]) -> Asked:
-    return {
-        name: value
-        for name, value in asked.items()
-        if name not in settings or value is None or _text(settings[name].value) != _text(value)
     }
 
 
@@ -279,18 +245,6 @@ def _text(value: Limit | float) -> str:
     return f"{value:g} times as long as chunks" if value else NO_LIMIT
 
 
-def _another_server(connection: sqlite3.Connection) -> bool:
-    """Whether a server that runs maintains the database; one that was killed holds its lease on."""
-    now_s = time.time()
-    holders: Iterable[tuple[bytes]] = connection.execute(_SERVER, (now_s,)).fetchall()
-    pids = [pid for (holder,) in holders for pid in holder.split()[1:2]]
-    return any(pid.isdigit() and _lives(int(pid), now_s) for pid in pids)
-
-
-def _lives(pid: int, now_s: float) -> bool:
-    return pid != os.getpid() and process_alive(pid, None, now_s)
-
-
 # Limits as a person writes them: `500MB,30d`, `100000rows`, `all`.
 
 
@@ -298,13 +252,12 @@ _PART: Final = re.compile(r"(\d+(?:\.\d+)?)\s*([a-z]+)", re.IGNORECASE)
 _BYTES: Final = {"b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12}
 _SECONDS: Final = {"s": 1, "min": 60, "h": 3600, "d": 86_400, "w": 604_800}
 NO_LIMIT: Final = "all"  # is kept
-_OPTIONS: Final = {"kept_state": "--keep-stretches", "unshipped": "--keep-until-shipped"}
 _ROWS: Final = {"row": 1, "rows": 1}
 
 
 def option_of(kind: str) -> str:
     """The option of the command line that limits a kind of row."""
-    return _OPTIONS.get(kind, f"--keep-{kind}s")
+    return "--keep-stretches" if kind == "kept_state" else f"--keep-{kind}s"
 
 
 def parse_limit(text: str, default: Limit) -> Limit:

@@ -1,8 +1,7 @@
 """What a recording holds and what of it is beyond the limits: a plan lists it.
 
-State rows and chunks are counted by their row groups, which know what they take on the disk. Other
-rows are counted once, when they have come: a `Holdings` that is kept reads only what is new. All is
-counted in portions small enough to be deleted one after the other.
+State rows and chunks are counted by their row groups, which know what they take on the disk, other
+rows one by one, in portions small enough to be deleted one after the other.
 """
 
 from __future__ import annotations
@@ -14,14 +13,11 @@ import time
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from pydantic import TypeAdapter
-from pydantic.dataclasses import dataclass as pydantic_dataclass
-
-from webots_mcp.contract import FINAL_STATUSES, KEPT_FRAME, whole_file
+from webots_mcp.contract import FINAL_STATUSES, KEPT_FRAME
 from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.chunk_making import INDEX_BYTES, disk_bytes
 from webots_mcp.store.chunks import STATE_IDS, WALL_TIMES, Decoded, Group, values_in
@@ -29,7 +25,9 @@ from webots_mcp.store.retention import DEFAULT, KEPT, Limit, Retention
 
 TABLES: Final = ("state", "chunk", "kept_state", "log", "event", "image")
 _COUNTED: Final = ("kept_state", "log", "event", "image")
+_LONG: Final = ("state", "kept_state")  # rows, of which a few fill a page
 _BLOCK_IDS: Final = 512
+_SAMPLE: Final = 100
 
 _RUNS: Final = (
     f"SELECT id, robot_id, row_count, started_wall_time_s, last_wall_time_s, {KEPT}, "
@@ -37,21 +35,20 @@ _RUNS: Final = (
     " AS is_current, is_chunked FROM run WHERE typeof(started_wall_time_s) IN ('real', 'integer') "
     "AND typeof(last_wall_time_s) IN ('real', 'integer') ORDER BY started_wall_time_s, id"
 )
-_STORED: Final = "SELECT id, stored_row_count FROM row_group WHERE is_complete = 1"
 _GROUPS: Final = (
-    "SELECT g.id, g.run_id, g.max_state_id, g.row_count, g.stored_row_bytes, g.chunk_bytes, "
-    "coalesce(i.min, 0), w.min, w.max FROM row_group g "
+    "SELECT g.id, g.run_id, g.max_state_id, g.row_count, g.stored_row_count, "
+    "g.stored_row_bytes, g.chunk_bytes, coalesce(i.min, 0), w.min, w.max FROM row_group g "
     "LEFT JOIN chunk i ON i.run_id = g.run_id AND i.group_id = g.id "
     f"AND i.signal_id = {STATE_IDS} "
     "LEFT JOIN chunk w ON w.run_id = g.run_id AND w.group_id = g.id "
-    f"AND w.signal_id = {WALL_TIMES} WHERE g.is_complete = 1 AND g.id > ?"
+    f"AND w.signal_id = {WALL_TIMES} WHERE g.is_complete = 1"
 )
 _PLACE: Final = (
     "SELECT id, start_sim_time_s, end_sim_time_s, last_state_id, max_state_id, row_count "
     "FROM row_group WHERE id = ?"
 )
 _SUMS: Final = (
-    "run_id, min(id), max(id), json_group_array({payload}), min(CAST(wall_time_s AS REAL)), "
+    "run_id, min(id), max(id), {payloads}, count(*), min(CAST(wall_time_s AS REAL)), "
     "max(CAST(wall_time_s AS REAL))"
 )
 _IN_NO_GROUP: Final = (
@@ -61,7 +58,7 @@ _IN_NO_GROUP: Final = (
     "AND is_complete = 1), 0)"
 )
 _BLOCKS: Final = (
-    f"SELECT {_SUMS} FROM {{table}} WHERE id > ? {{own}} GROUP BY id / {_BLOCK_IDS}, run_id"
+    f"SELECT {_SUMS} FROM {{table}} WHERE id > 0 {{own}} GROUP BY id / {_BLOCK_IDS}, run_id"
 )
 _ROWS: Final = (
     "SELECT id, CAST(wall_time_s AS REAL) FROM {table} WHERE +run_id = ? AND id BETWEEN ? "
@@ -118,117 +115,69 @@ class Portion(NamedTuple):
         return max(self.size_bytes / max(self.rows, 1), 1.0)
 
 
-class Holdings:
-    """What a recording holds; whoever keeps it reads only what has come since.
+def _portions(connection: sqlite3.Connection, runs: dict[int, Run]) -> dict[str, list[Portion]]:
+    """What these runs hold, by table, the newest first."""
+    found: dict[str, list[Portion]] = {table: [] for table in TABLES}
+    for portion in (*_grouped(connection, runs), *_in_no_group(connection, runs)):
+        found[portion.table].append(portion)
+    for table in _COUNTED:
+        own = _OWN if table == "image" else ""
+        query = _BLOCKS.format(table=table, own=own, payloads=_payloads(connection, table))
+        rows = connection.execute(query).fetchall()
+        found[table] = [_portion(connection, table, row) for row in rows if row[0] in runs]
+    frame_bytes: dict[int, float] = dict(connection.execute(_FRAMES).fetchall())
+    found["kept_state"] = _with_frames(found["kept_state"], frame_bytes)
+    for portions in found.values():
+        portions.sort(key=lambda each: -each.last_id)
+    return found
 
-    Rows that others delete are noticed when they should go.
-    """
 
-    def __init__(self, connection: sqlite3.Connection) -> None:
-        self._connection = connection
-        self._page_bytes = int(connection.execute("PRAGMA page_size").fetchone()[0])
-        self._payloads: dict[str, str] = {"image": _FILE_BYTES}
-        self._groups: dict[int, tuple[Any, ...]] = {}
-        self._in_no_group: dict[int, tuple[Run, Portion | None]] = {}
-        self._counted: dict[str, dict[int, Portion]] = {table: {} for table in _COUNTED}
-        self._last_ids: dict[str, int] = dict.fromkeys(_COUNTED, 0)
+def _grouped(connection: sqlite3.Connection, runs: dict[int, Run]) -> Iterator[Portion]:
+    """The states and chunks of row groups."""
+    for facts in connection.execute(_GROUPS).fetchall():
+        group_id, run_id, last_id, rows, left, row_bytes, chunk_bytes, first_id, *walls = facts
+        if run_id not in runs:
+            continue
+        of = (run_id, group_id, int(first_id), last_id)
+        times = (runs[run_id].last_wall_time_s if wall is None else wall for wall in walls)
+        oldest_s, newest_s = times
+        if left:
+            yield Portion("state", *of, left, left * row_bytes, oldest_s, newest_s)
+        yield Portion("chunk", *of, rows, chunk_bytes, oldest_s, newest_s, is_held=left > 0)
 
-    def portions(self, runs: dict[int, Run]) -> dict[str, list[Portion]]:
-        """What these runs hold, by table, the newest first."""
-        found: dict[str, list[Portion]] = {table: [] for table in TABLES}
-        for portion in (*self._grouped(runs), *self._states_in_no_group(runs)):
-            found[portion.table].append(portion)
-        for table, held in self._counted.items():
-            self._count_new(table, held)
-            found[table] = [portion for portion in held.values() if portion.run_id in runs]
-        frame_bytes: dict[int, float] = dict(self._connection.execute(_FRAMES).fetchall())
-        found["kept_state"] = _with_frames(found["kept_state"], frame_bytes)
-        for portions in found.values():
-            portions.sort(key=lambda each: -each.last_id)
-        return found
 
-    def recount(self, portion: Portion) -> None:
-        """Count a portion again from which rows may have gone."""
-        if (held := self._counted.get(portion.table)) is not None:
-            held.pop(portion.first_id, None)
-            where = "AND run_id = ? AND id BETWEEN ? AND ?"
-            bounds = (portion.run_id, portion.first_id, portion.last_id)
-            held |= {each.first_id: each for each in self._blocks(portion.table, where, 0, *bounds)}
-        self._in_no_group.pop(portion.run_id, None)
+def _in_no_group(connection: sqlite3.Connection, runs: dict[int, Run]) -> Iterator[Portion]:
+    """The newest states of each run."""
+    query = _IN_NO_GROUP.format(payloads=_payloads(connection, "state"))
+    for run_id in runs:
+        row = connection.execute(query, {"run": run_id}).fetchone()
+        if row[0] is not None:
+            yield _portion(connection, "state", row)
 
-    def _grouped(self, runs: dict[int, Run]) -> Iterator[Portion]:
-        last_id = max(self._groups, default=0)
-        for group_id, *facts in self._connection.execute(_GROUPS, (last_id,)):
-            self._groups[group_id] = tuple(facts)
-            self._in_no_group.pop(facts[0], None)
-        stored = dict(self._connection.execute(_STORED).fetchall())
-        self._groups = {each: facts for each, facts in self._groups.items() if each in stored}
-        for group_id, facts in self._groups.items():
-            run_id, last_id, rows, row_bytes, chunk_bytes, first_id, *walls = facts
-            if run_id not in runs:
-                continue
-            of = (run_id, group_id, int(first_id), last_id)
-            times = (runs[run_id].last_wall_time_s if wall is None else wall for wall in walls)
-            oldest_s, newest_s = times
-            if left := stored[group_id]:
-                yield Portion("state", *of, left, left * row_bytes, oldest_s, newest_s)
-            yield Portion("chunk", *of, rows, chunk_bytes, oldest_s, newest_s, is_held=left > 0)
 
-    def _states_in_no_group(self, runs: dict[int, Run]) -> Iterator[Portion]:
-        """The newest rows of each run; those of one that is in chunks are counted once."""
-        query = _IN_NO_GROUP.format(payload=self._payload("state"))
-        for run in runs.values():
-            known, portion = self._in_no_group.get(run.id, (None, None))
-            if known != run or not run.is_chunked:
-                row = self._connection.execute(query, {"run": run.id}).fetchone()
-                portion = None if row[0] is None else self._portion("state", row)
-                self._in_no_group[run.id] = run, portion
-            if portion is not None:
-                yield portion
+def _portion(connection: sqlite3.Connection, table: str, row: Sequence[Any]) -> Portion:
+    """A portion of rows that were looked at one by one."""
+    run_id, first_id, last_id, payloads, rows, oldest_s, newest_s = row
+    size_bytes = float(payloads) if table == "image" else rows * INDEX_BYTES
+    (page_bytes,) = connection.execute("PRAGMA page_size").fetchone()
+    if table in _LONG:
+        size_bytes += disk_bytes(json.loads(payloads), page_bytes)
+    elif table != "image":  # of a million rows their mean tells as much as a look at each
+        size_bytes += disk_bytes([round(payloads / rows)] * _SAMPLE, page_bytes) * rows / _SAMPLE
+    return Portion(table, run_id, 0, first_id, last_id, rows, size_bytes, oldest_s, newest_s)
 
-    def _count_new(self, table: str, held: dict[int, Portion]) -> None:
-        newest = {each.run_id: each for each in held.values()}
-        for each in self._blocks(table, "", self._last_ids[table]):
-            self._last_ids[table] = max(self._last_ids[table], each.last_id)
-            before = newest.get(each.run_id)
-            if before is not None and before.rows + each.rows <= _BLOCK_IDS:
-                each = before._replace(
-                    last_id=each.last_id,
-                    rows=before.rows + each.rows,
-                    size_bytes=before.size_bytes + each.size_bytes,
-                    newest_s=max(before.newest_s, each.newest_s),
-                    oldest_s=min(before.oldest_s, each.oldest_s),
-                )
-            held[each.first_id] = newest[each.run_id] = each
 
-    def _blocks(self, table: str, where: str, after: int, *values: int) -> Iterator[Portion]:
-        """The rows after an id, in portions."""
-        own = where + (f" {_OWN}" if table == "image" else "")
-        query = _BLOCKS.format(table=table, own=own, payload=self._payload(table))
-        for row in self._connection.execute(query, (after, *values)).fetchall():
-            yield self._portion(table, row)
-
-    def _portion(self, table: str, row: Sequence[Any]) -> Portion:
-        """A portion of rows that were looked at one by one."""
-        run_id, first_id, last_id, payloads, oldest_s, newest_s = row
-        each: list[int] = json.loads(payloads)
-        size_bytes = float(sum(each))
-        if table != "image":
-            size_bytes = disk_bytes(each, self._page_bytes) + INDEX_BYTES * len(each)
-        ids = (first_id, last_id)
-        return Portion(table, run_id, 0, *ids, len(each), size_bytes, oldest_s, newest_s)
-
-    def _payload(self, table: str) -> str:
-        """SQL for the bytes of a record: each column takes a byte or two in its head too."""
-        if table not in self._payloads:
-            parts = ["2"]
-            for name, kind, is_key in self._connection.execute(_COLUMNS, (table,)).fetchall():
-                if kind == "TEXT":
-                    parts.append(f"coalesce(length(CAST({name} AS BLOB)) + 1, 1)")
-                elif not is_key:
-                    parts.append("9" if kind == "FLOAT" else "3")
-            self._payloads[table] = " + ".join(parts)
-        return self._payloads[table]
+def _payloads(connection: sqlite3.Connection, table: str) -> str:
+    """SQL for the bytes of records: of long ones each, of short ones their sum."""
+    if table == "image":
+        return f"sum({_FILE_BYTES})"
+    parts = ["2"]  # each column takes a byte or two in the head of the record too
+    for name, kind, is_key in connection.execute(_COLUMNS, (table,)).fetchall():
+        if kind == "TEXT":
+            parts.append(f"coalesce(length(CAST({name} AS BLOB)) + 1, 1)")
+        elif not is_key:
+            parts.append("9" if kind == "FLOAT" else "3")
+    return f"{'json_group_array' if table in _LONG else 'sum'}({' + '.join(parts)})"
 
 
 def _with_frames(stretches: list[Portion], frame_bytes: dict[int, float]) -> list[Portion]:
@@ -322,11 +271,6 @@ class Going:
     bound: int = 0
 
     @property
-    def row_bytes(self) -> float:
-        """About what one of them takes; at least a byte."""
-        return max(self.size_bytes / max(self.rows, 1), 1.0)
-
-    @property
     def is_whole(self) -> bool:
         """Whether all of the portion goes."""
         return self.portion is not None and self.bound >= self.portion.last_id
@@ -353,7 +297,6 @@ class Plan:
         kept_run_ids: Runs that a person named, described or marked: nothing of them goes, and
             they do not count.
         kept_bytes: About what they take.
-        unshipped: Of what goes, what no pool holds, because more waits than is kept until then.
     """
 
     steps: tuple[Going, ...]
@@ -361,7 +304,6 @@ class Plan:
     spared: tuple[Spared, ...]
     kept_run_ids: tuple[int, ...]
     kept_bytes: int
-    unshipped: tuple[Spared, ...] = ()
 
     @property
     def rows(self) -> int:
@@ -390,7 +332,6 @@ def plan(
     connection: sqlite3.Connection,
     retention: Retention = DEFAULT,
     now_s: float | None = None,
-    holdings: Holdings | None = None,
 ) -> Plan:
     """Find what is beyond the limits; nothing is changed.
 
@@ -398,27 +339,22 @@ def plan(
         connection: Any.
         retention: The limits.
         now_s: Unix time, from which ages are counted; None for now.
-        holdings: What was counted before, so that only new rows are looked at; None for a look at
-            all logs, events, pictures and kept stretches.
     """
     now_s = time.time() if now_s is None else now_s
-    return _Planner(connection, retention, now_s, holdings or Holdings(connection)).plan()
+    return _Planner(connection, retention, now_s).plan()
 
 
 class _Planner:
     """The recording at one moment, against the limits."""
 
-    def __init__(
-        self, connection: sqlite3.Connection, retention: Retention, now_s: float, held: Holdings
-    ) -> None:
+    def __init__(self, connection: sqlite3.Connection, retention: Retention, now_s: float) -> None:
         self._connection = connection
         self._retention = retention
         self._now_s = now_s
         self._runs = read_runs(connection)
-        self._held = held.portions(self._runs)
+        self._held = _portions(connection, self._runs)
         self._rows: dict[Portion, tuple[Array, Array]] = {}  # of the few that are looked into
         self._spared = dict[tuple[str, str], list[float]]()
-        self._unshipped = dict[tuple[str, str], list[float]]()
         self._forgotten = self._find_forgotten() if retention.outlive else set[int]()
 
     def plan(self) -> Plan:
@@ -432,16 +368,16 @@ class _Planner:
                 steps.append(Going("run", run_id, 1, 0, self._runs[run_id].last_wall_time_s))
         for robot_id in {run.robot_id: None for run in self._runs.values()}:
             steps += self._commands(robot_id)
-        if limit_bytes := self._retention.unshipped.size_bytes:
-            steps = self._after_shipping(steps, limit_bytes)
         kept = [self._kept(table, is_kept=True) for table in TABLES]
         return Plan(
             tuple(steps),
             {table: round(_size_of(portions)) for table, portions in self._held.items()},
-            _listed(self._spared),
+            tuple(
+                Spared(table, int(rows), round(size_bytes), why)
+                for (table, why), (rows, size_bytes) in self._spared.items()
+            ),
             tuple(run.id for run in self._runs.values() if run.is_kept),
             round(sum(map(_size_of, kept))),
-            _listed(self._unshipped),
         )
 
     def _kept(self, table: str, *, is_kept: bool) -> list[Portion]:
@@ -491,15 +427,22 @@ class _Planner:
             aged = min(old, max(portion.rows - max(limit.spared_rows - rows, 0), 0))
             going = max(over, aged)
             why = f"too old, but among the newest {limit.spared_rows}"
-            _add(self._spared, portion, old - going, why)
+            self._spare(portion, old - going, why)
             rows += portion.rows
             if table == "chunk":
                 going = portion.rows if over or aged == portion.rows else 0
                 if portion.is_held and portion.group_id not in whole_groups:
-                    _add(self._spared, portion, going, "the states are still there")
+                    self._spare(portion, going, "the states are still there")
                     going = 0
             if going:
                 yield self._step(portion, going)
+
+    def _spare(self, portion: Portion, rows: int, why: str) -> None:
+        """Note so many rows, by table and reason."""
+        if rows > 0:
+            sums = self._spared.setdefault((portion.table, why), [0, 0.0])
+            sums[0] += rows
+            sums[1] += rows * portion.row_bytes
 
     def _bound(self, held: Sequence[Portion], limit: Limit) -> int:
         """The id up to which rows have to go, of all runs, for a size and a number of rows."""
@@ -564,136 +507,6 @@ class _Planner:
         if rows := int(self._connection.execute(query, values).fetchone()[0]):
             yield Going("command", robot_id, rows, rows * _COMMAND_BYTES, before_s)
 
-    def _after_shipping(self, steps: Sequence[Going], left_bytes: float) -> list[Going]:
-        """Without what waits to be shipped: the newest of it stays, up to that size."""
-        pools = shipped_of(self._connection)
-        going = list[Going]()
-        runs = set[int]()  # that have to wait for their rows
-        for step in sorted(steps, key=lambda each: (each.table == "run", -each.newest_s)):
-            waiting = self._waiting(step, pools)
-            stays = min(waiting, int(left_bytes / step.row_bytes))
-            if step.table == "run":
-                stays = int(step.owner_id in runs or (waiting > 0 and left_bytes > 0))
-            elif step.table == "chunk" and stays:
-                stays = step.rows
-            left_bytes -= stays * step.row_bytes if step.table != "run" else 0
-            if stays and step.table != "command":
-                runs.add(step.owner_id)
-            _add(self._spared, step, stays, "not shipped yet")
-            lost = max(waiting - stays, 0)
-            _add(self._unshipped, step, lost, "not shipped: beyond what is kept for shipping")
-            if stays < step.rows:
-                less = replace(step, rows=step.rows - stays)
-                going.append(self._step(less.portion, less.rows) if less.portion else less)
-        return [step for table in dict.fromkeys(s.table for s in steps)
-                for step in reversed(going) if step.table == table]  # fmt: skip
-
-    def _waiting(self, step: Going, pools: Sequence[Shipped]) -> int:
-        """How many of a step's rows are not in all pools."""
-        if step.portion is None:
-            return step.rows if step.newest_s > complete_until_s(pools) else 0
-        shipped = self._up_to(step.portion, last_shipped(pools, step.table))
-        return max(step.rows - shipped, 0)
-
-
-def _add(
-    found: dict[tuple[str, str], list[float]], of: Portion | Going, rows: int, why: str
-) -> None:
-    """Note so many rows, by table and reason."""
-    if rows > 0:
-        sums = found.setdefault((of.table, why), [0, 0.0])
-        sums[0] += rows
-        sums[1] += rows * of.row_bytes
-
-
-def _listed(found: dict[tuple[str, str], list[float]]) -> tuple[Spared, ...]:
-    return tuple(
-        Spared(table, int(rows), round(size_bytes), why)
-        for (table, why), (rows, size_bytes) in found.items()
-    )
-
 
 def _size_of(portions: Sequence[Portion]) -> float:
     return sum(portion.size_bytes for portion in portions)
-
-
-# What pools hold of a recording: a small file next to the database, written by `webots-mcp ship`.
-#
-# The progress itself is at the pool. This file only spares what is not there yet: where it is lost
-# or cannot be written, rows are kept that need not be, within the limit of `--keep-until-shipped`.
-
-
-_NAME: Final = "{}-shipped.json"
-_FILE: Final = "SELECT file FROM pragma_database_list WHERE name = 'main'"
-_UUID: Final = "SELECT uuid FROM recording"
-
-
-@pydantic_dataclass(frozen=True)
-class Shipped:
-    """What one pool holds of a recording.
-
-    Attributes:
-        recording: Its UUID.
-        last_ids: By table, up to which row it was shipped; what is not in it is not shipped.
-        complete_wall_time_s: All that was recorded before was shipped; 0 before the first time.
-        wall_time_s: When this was so.
-    """
-
-    recording: str
-    last_ids: dict[str, int]
-    complete_wall_time_s: float
-    wall_time_s: float
-
-
-_BY_ADDRESS: Final = TypeAdapter(dict[str, Shipped])
-
-
-def last_shipped(pools: Sequence[Shipped], table: str) -> float:
-    """Up to which row all pools hold a table; infinite where none wants it."""
-    if not pools:
-        return 0.0
-    return min(each.last_ids.get(table, math.inf) for each in pools)
-
-
-def complete_until_s(pools: Sequence[Shipped]) -> float:
-    """All that was recorded before is in all pools."""
-    return min((each.complete_wall_time_s for each in pools), default=0.0)
-
-
-def shipped_of(connection: sqlite3.Connection) -> list[Shipped]:
-    """What each pool holds of the recording; nothing where none was shipped to."""
-    (name,) = connection.execute(_FILE).fetchone()
-    row = connection.execute(_UUID).fetchone()
-    return list(read_shipped(Path(name), row[0]).values()) if name and row else []
-
-
-def read_shipped(database: Path, recording: str) -> dict[str, Shipped]:
-    """The same by the pools' addresses; a damaged file says nothing."""
-    return {
-        address: shipped
-        for address, shipped in _read(_file_of(database)).items()
-        if shipped.recording == recording
-    }
-
-
-def write_shipped(database: Path, address: str, shipped: Shipped) -> None:
-    """Say what a pool holds now.
-
-    Raises:
-        OSError: The folder cannot be written.
-    """
-    file = _file_of(database)
-    stored = {**_read(file), address: shipped}
-    with whole_file(file) as aside:
-        aside.write_bytes(_BY_ADDRESS.dump_json(stored, indent=1))
-
-
-def _file_of(database: Path) -> Path:
-    return database.with_name(_NAME.format(database.name))
-
-
-def _read(file: Path) -> dict[str, Shipped]:
-    try:
-        return _BY_ADDRESS.validate_json(file.read_bytes())
-    except (OSError, ValueError):
-        return {}

@@ -332,29 +332,27 @@ def inside(data_dir: Path, path: str) -> Path:
 
 
 @contextlib.contextmanager
-def opened(file: Path, formats: tuple[str, ...] = ("PNG", "JPEG")) -> Generator[Image]:
+def opened(file: Path) -> Generator[Image]:
     """A picture, not decoded yet; errors of its user inside the block are reported alike.
 
     Pillow is imported here, at the first picture: it would add to the server's start.
 
     Args:
         file: A regular file.
-        formats: Those that are allowed, as Pillow names them.
 
     Raises:
-        InvalidInputError: It is not a complete picture of these formats, or is too large.
+        InvalidInputError: It is not a complete PNG or JPEG, or is too large.
     """
     from PIL import Image as Pictures
 
     try:
         _require_at_most(MAX_FILE_BYTES, "bytes", file.stat().st_size)
-        picture: Any = Pictures.open(file, formats=formats)
+        picture: Any = Pictures.open(file, formats=("PNG", "JPEG"))
         with picture:
             _require_at_most(MAX_PIXELS, "pixels", picture.width * picture.height)
             yield picture
     except Exception as error:  # Pillow raises nearly anything about a file that is damaged
-        usable = f"usable {' or '.join(formats)}"
-        raise InvalidInputError(f"{file} is not a {usable}: {error}") from error
+        raise InvalidInputError(f"{file} is not a usable PNG or JPEG: {error}") from error
 
 
 def _require_at_most(limit: int, of: str, found: int) -> None:

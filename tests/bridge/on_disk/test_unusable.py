@@ -21,7 +21,7 @@ from tests.bridge.conftest import (
 )
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import backlog, recorder
-from webots_mcp.connection import OLDER_SCHEMA, connect, create_schema
+from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME, SCHEMA_VERSION
 from webots_mcp.errors import DatabaseError
 from webots_mcp.standin import InProcessSupervisor
@@ -162,8 +162,7 @@ def test_a_database_of_another_application_is_left_alone(
     ("version", "next_step"),
     [
         (SCHEMA_VERSION + 1, "pip install --upgrade"),
-        (OLDER_SCHEMA, "move it aside"),
-        (OLDER_SCHEMA - 1, "move it aside"),
+        (SCHEMA_VERSION - 1, "move it aside"),
     ],
 )
 def test_another_schema_is_said_and_the_robot_drives_on(

@@ -124,23 +124,6 @@ def test_what_chunks_could_not_hold_is_said() -> None:
         assert note.startswith("6 values of run 1 are incomplete: their rows were deleted")
 
 
-def test_a_damaged_chunk_is_said_and_costs_its_signal_alone() -> None:
-    with memory_connection() as connection:
-        recorder = start_run(connection)
-        for step in range(300):
-            recorder.publish(step * 1.0, {"x": step, "y": step})
-        recorder.end_run("finished")
-        purged(connection)
-        connection.execute(
-            "UPDATE chunk SET numbers = x'00112233445566' WHERE signal_id = "
-            "(SELECT id FROM signal WHERE name = 'x')"
-        )
-        found, notes = exported(connection, "jsonl")
-        assert [json.loads(line)["y"] for line in found.splitlines()] == list(range(300))
-        (note,) = notes
-        assert "the chunk of x is damaged" in note
-
-
 @pytest.mark.parametrize("form", FOR_VIEWERS)
 def test_a_file_for_viewers_says_as_well_what_could_not_be_given_back(
     form: str, tmp_path: Path
@@ -158,6 +141,7 @@ def test_a_file_for_viewers_says_as_well_what_could_not_be_given_back(
         )
         wanted = find_range(connection, Scope(run_id=1))
         file = tmp_path / f"run.{form}"
+        assert [line["scan.mean"] for line in lines(connection)] == [0.5] * 3
         lost, damaged = export_for_viewers(connection, tmp_path, wanted, form, file).notes
     assert lost.startswith("3 values of run 1 are incomplete: their rows were deleted")
     assert "the chunk of x is damaged" in damaged

@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
-import sqlite3
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -21,16 +17,13 @@ from webots_mcp.store.purge import Upkeep
 from webots_mcp.store.retention import (
     DEFAULT,
     Limit,
-    ask_at_start,
-    ask_where_unset,
+    ask,
     in_force,
     set_limits,
-    unheeded,
 )
 
 Say = Callable[..., str]
 MB = 1_000_000
-SERVE = [sys.executable, "-m", "webots_mcp", "serve"]
 
 
 @pytest.fixture
@@ -40,15 +33,6 @@ def say(filed: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
         return capsys.readouterr().out
 
     return said
-
-
-@contextmanager
-def another_server(connection: sqlite3.Connection, pid: int) -> Generator[None]:
-    until = time.time() + 60
-    lease = ("maintainer", f"server {pid} abc", until)
-    connection.execute("INSERT INTO lease VALUES (?, ?, ?)", lease)
-    yield
-    connection.execute("DELETE FROM lease")
 
 
 def test_retain_sets_a_limit_and_deletes_nothing(say: Say, filed: Recorded) -> None:
@@ -98,10 +82,10 @@ def test_a_server_sets_what_nobody_has_set_and_what_an_earlier_server_had(
 ) -> None:
     db = filed.connection
     for size in (60 * MB, 5 * MB):
-        assert ask_at_start(db, {"state": Limit(size_bytes=size)}) == []
+        assert ask(db, {"state": Limit(size_bytes=size)}) == []
         assert in_force(db).state.size_bytes == size
     set_limits(db, {"state": Limit(size_bytes=80 * MB), "outlive": 3.0}, "retain")
-    (states,) = ask_at_start(db, {"state": Limit(size_bytes=5 * MB), "outlive": 3.0})
+    (states,) = ask(db, {"state": Limit(size_bytes=5 * MB), "outlive": 3.0})
     assert states.startswith(
         "--keep-states 5.0 MB is not in force: the database keeps 80.0 MB (set by retain, "
     )
@@ -109,40 +93,15 @@ def test_a_server_sets_what_nobody_has_set_and_what_an_earlier_server_had(
     assert in_force(db).state.size_bytes == 80 * MB
 
 
-def test_beside_a_server_that_runs_the_limits_stay_as_they_are(filed: Recorded) -> None:
-    db, others = filed.connection, {"state": Limit(size_bytes=5 * MB)}
-    ask_at_start(db, {"state": Limit(size_bytes=60 * MB)})
-    with another_server(db, os.getppid()):
-        assert "the database keeps 60.0 MB (set by serve" in ask_at_start(db, others)[0]
-    ask_where_unset(db, others)
-    assert in_force(db).state.size_bytes == 60 * MB
-    assert unheeded(db, others)
-
-
-def test_a_server_that_was_killed_is_none(filed: Recorded) -> None:
-    db = filed.connection
-    ask_at_start(db, {"state": Limit(size_bytes=60 * MB)})
-    ended = subprocess.Popen([sys.executable, "-c", ""])
-    ended.wait()
-    with another_server(db, ended.pid):
-        assert ask_at_start(db, {"state": Limit(size_bytes=5 * MB)}) == []
-
-
-def test_a_second_server_says_which_limit_holds(filed: Recorded, tmp_path: Path) -> None:
-    line, where = [*SERVE, "--data-dir", str(tmp_path)], filed.connection
-    with subprocess.Popen(
-        [*line, "--keep-states", "60MB"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as first:
-        while not where.execute("SELECT 1 FROM lease WHERE holder LIKE 'server %'").fetchone():
-            assert first.poll() is None
-            time.sleep(0.02)
-        second = subprocess.run(
-            [*line, "--keep-states", "5MB"], stdin=subprocess.DEVNULL, capture_output=True,
-            timeout=60, check=False,
-        )  # fmt: skip
-        first.communicate()
-    assert b"--keep-states 5.0 MB is not in force: the database keeps 60.0 MB" in second.stderr
-    assert in_force(where).state.size_bytes == 60 * MB
+def test_a_server_says_that_what_a_person_has_set_holds(filed: Recorded, tmp_path: Path) -> None:
+    set_limits(filed.connection, {"state": Limit(size_bytes=60 * MB)}, "retain")
+    line = [sys.executable, "-m", "webots_mcp", "serve", "--data-dir", str(tmp_path)]
+    server = subprocess.run(
+        [*line, "--keep-states", "5MB"], stdin=subprocess.DEVNULL, capture_output=True,
+        timeout=60, check=False,
+    )  # fmt: skip
+    assert b"--keep-states 5.0 MB is not in force: the database keeps 60.0 MB" in server.stderr
+    assert in_force(filed.connection).state.size_bytes == 60 * MB
 
 
 @pytest.mark.parametrize("wrong", ["'state', -1", "'state', 'many'", "'soup', 1"])

@@ -52,7 +52,6 @@ from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.chunks import reached
 from webots_mcp.store.merging import settled
 from webots_mcp.store.recording import Recording, name_of
-from webots_mcp.store.retention_plan import Shipped, read_shipped, write_shipped
 from webots_mcp.store.run_rows import MAX_FILE_BYTES, PICTURES, inside
 
 THOROUGH_S: Final = 30.0  # between two looks at all of what may change, and not only the newest
@@ -369,7 +368,6 @@ class Shipper:
         Returns:
             Whether the pool holds all that was there when the round began.
         """
-        started_s = time.time()
         with self._order.recording.reader() as connection:
             source = Source(connection)
             self._require_the_same(source)
@@ -390,8 +388,6 @@ class Shipper:
                 whole = whole_runs(ended - source.foreign).items()
                 self._put(None, {name: n | self._progress.get(name, 0) for name, n in whole})
             self._send()
-        if not is_frozen:
-            self._leave_word(started_s, is_whole=is_complete and thorough)
         return is_complete
 
     def note_states_in_no_chunk(self) -> None:
@@ -632,20 +628,6 @@ class Shipper:
         for batch in self._batches:
             self._report.rows[batch.table.name] += len(batch.rows)
         self._batches, self._numbers, self._size = [], {}, 0
-
-    def _leave_word(self, started_s: float, *, is_whole: bool) -> None:
-        """Tell retention, by a file beside the database."""
-        database = self._order.recording.database
-        assert isinstance(database, Path)
-        before = read_shipped(database, self._uuid).get(self.address)
-        complete_s = before.complete_wall_time_s if before else 0.0
-        shipped_tables = (table("row_group"), *self._appended())
-        last_ids = {each.name: self._progress.get(each.name, 0) for each in shipped_tables}
-        shipped = Shipped(self._uuid, last_ids, started_s if is_whole else complete_s, time.time())
-        try:
-            write_shipped(database, self.address, shipped)
-        except OSError as error:
-            self._report.note(f"retention cannot learn here what is shipped: {error}")
 
 
 @contextmanager

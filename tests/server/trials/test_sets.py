@@ -11,7 +11,7 @@ from mcp import Client
 
 from tests.bridge.conftest import Recording
 from tests.processes.conftest import Start, has_states
-from tests.server.conftest import STEP_MS, Connect, ask, fail, pictures_of, text_of
+from tests.server.conftest import Connect, ask, fail, pictures_of, text_of
 from tests.server.story import rows_of
 from tests.server.trials.conftest import SPEEDS, TunableDriver, trials, value_of
 from webots_mcp import MCPBridge
@@ -182,34 +182,6 @@ async def test_wheels_that_were_told_once_to_turn_without_end_turn_in_every_tria
         assert (fast["speed"], slow["speed"]) == (4.0, 2.0)
         assert fast["score"] > 1.8 * slow["score"] > 0.05
         assert "notes" not in answer
-
-
-class StandsAfterAReset(TunableDriver):
-    """A robot that goes on in its first run only."""
-
-    def run(self) -> None:
-        before_s = 0.0
-        while self.robot.step(STEP_MS) != -1:
-            now_s = self.robot.getTime()
-            self.resets += now_s < before_s
-            before_s = now_s
-            self.bridge.publish({"pose": [0.0 if self.resets else now_s, 0.0, 0.0]})
-            self.bridge.get_command()
-
-
-async def test_trials_of_a_robot_that_only_moved_before_them_say_so_before_they_are_ranked(
-    connect: Connect, file: Path
-) -> None:
-    driving = StandsAfterAReset(file)
-    driving.start()
-    async with connect() as client:
-        await ask(client, "webots_run", for_s=1)
-        answer = await trials(client, parameters={"kp": [1.0, 2.0]}, score="max(pose[0])", for_s=1)
-    driving.stop()
-    assert answer["verdict"] == "all 2 scores are 0: no tried value changed the score"
-    (note,) = answer["notes"]
-    assert "in run 1, before the trials, but stood still in all 2" in note
-    assert list(answer).index("notes") < list(answer).index("ranked")
 
 
 async def test_a_cancelled_call_ends_the_trial_that_runs_and_no_other_begins(

@@ -73,7 +73,6 @@ REFUSED = [
     ("logs --start 9 --end 3", "reversed"),
     ("logs --robot rovr", "did you mean 'rover'"),
     ("logs --text \udcff", "--text must be a valid string"),
-    ("logs --follow --before 3", "leave out --before"),
     ("logs --level loud", "--level"),
     ("sql 'DELETE FROM run'", "only one reading statement"),
     ("sql 'WITH a AS (SELECT 1) DELETE FROM run'", "only reading is allowed"),

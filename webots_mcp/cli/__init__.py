@@ -11,6 +11,7 @@ import contextlib
 import json
 import os
 import sys
+import traceback
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
@@ -62,6 +63,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         _discard_output()
     except OSError as error:
         return _fail(EXIT_SYSTEM, str(error), given)
+    except Exception as error:  # noqa: BLE001  (raised again unless it is about a value)
+        return _fail(EXIT_SYSTEM, _explain_value(error), given)
     return 0
 
 
@@ -143,6 +146,23 @@ def _explain_missing(error: ModuleNotFoundError) -> str:
     return (
         f"this command needs packages that a bridge does without, and they are missing: {names}. "
         f"Install them with\n\n    {install_line(wanted)}\n"
+    )
+
+
+def _explain_value(error: Exception) -> str:
+    """What is most likely wrong with the recording, and where it shows.
+
+    Raises:
+        Exception: Again, where it is not about a value of a row.
+    """
+    from webots_mcp.store.recording import is_over_a_value
+
+    if not is_over_a_value(error):
+        raise error
+    frame, what = traceback.extract_tb(error.__traceback__)[-1], type(error).__name__
+    return (
+        "a row holds what no bridge has written, or webots-mcp has a defect: "
+        f"{what} in {frame.name}, line {frame.lineno}: {error}"
     )
 
 

@@ -24,7 +24,6 @@ from webots_mcp.store.detection.events import search_events
 from webots_mcp.store.detection.kinds import Event, EventOptions
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.segment import in_one_snapshot
-from webots_mcp.store.recording import left_out_so_far
 from webots_mcp.store.run_rows import fetch_run, inside, opened
 
 # The pictures of a run: as many as have room, downscaled, inside the page.
@@ -242,7 +241,7 @@ def _left_out(page: Page) -> list[str]:
             gone = f" ({counted(pictures.unusable, 'file')} cannot be read)"
             gone = gone if pictures.unusable else ""
             said.append(f"{missing:,} of the pictures {of_run}{gone}")
-    return [*said, *page.figures.left_out, *left_out_so_far()]
+    return [*said, *page.figures.left_out]
 
 
 def _holds(page: Page) -> dict[str, int]:

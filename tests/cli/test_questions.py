@@ -15,8 +15,7 @@ import pytest
 from tests.cli.conftest import Cli, line_with
 from tests.recordings.rows import Recorded
 from tests.server.story import copy_of
-from webots_mcp.cli import names
-from webots_mcp.cli.commands import app_for, described
+from webots_mcp.cli import app_for, described, names
 from webots_mcp.cli.terminal import as_typed, commands_by_tool, print_table
 
 # What is typed about a recording of three runs, and what lines of the answer hold, as patterns.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -89,33 +88,6 @@ async def test_why_a_controller_never_recorded_is_told_before_there_is_a_run(
     arguments = [sys.executable, "-m", "webots_mcp", "logs", "--data-dir", str(data)]
     told = subprocess.run(arguments, capture_output=True, text=True, check=True, env=os.environ)
     assert "console: ModuleNotFoundError" in told.stdout
-
-
-async def test_what_waits_for_a_run_is_told_beside_several_robots_of_the_past(
-    connect: Connect, recorded: Recorded
-) -> None:
-    said = {"instance": "here:1234", "wall_time_s": time.time(), "level": "info"}
-    insert(recorded.connection, "console_line", {
-        **said, "source": "console", "message": "No module named 'arm'", "logger": "stdout"
-    })  # fmt: skip
-    robots = [recorded.robot(name) for name in ("hunter", "runner")]
-    async with connect() as client:
-        assert "2 robots are live" in await fail(client, "webots_get_logs")
-        for robot in robots:
-            robot.beat(ended_wall_time_s=robot.now, end_reason="finished")
-        answer = await ask(client, "webots_get_logs")
-    assert answer["lines"]["rows"] == [[None, "info", "console: No module named 'arm'", None]]
-
-
-async def test_without_a_webots_of_the_recording_it_is_said_that_no_console_is_followed(
-    connect: Connect, recorded: Recorded, tmp_path: Path, start_webots: StartWebots
-) -> None:
-    recorded.robot()
-    world = write_project(tmp_path / "another", "print('ready', flush=True)")
-    wait_for_line(start_webots("--stdout", f"--port={free_port()}", world), "ready")
-    async with connect() as client:
-        answer = await ask(client, "webots_get_logs", source="webots")
-    assert "no Webots of this recording runs on this machine" in answer["hint"]
 
 
 async def test_a_webots_whose_controllers_record_elsewhere_is_not_followed(

@@ -12,7 +12,7 @@ import anyio
 
 import webots_mcp
 from webots_mcp import MemoryDatabase, pytest_plugin, testing
-from webots_mcp.cli.commands import described
+from webots_mcp.cli import described
 from webots_mcp.connection import connect, create_schema
 from webots_mcp.server import create_server
 

@@ -21,7 +21,7 @@ def test_that_line_too_is_wrapped_where_the_terminal_is_narrow() -> None:
 
 
 def test_short_members_stand_together_and_objects_by_themselves() -> None:
-    answer = {**HEAD, "outcome": "done", "steps": 5, "left_out": None, "route": "bridge",
+    answer = {**HEAD, "outcome": "done", "steps": 5, "route": "bridge",
               "result": {"mode": "pause", "pose": {"x": 1.0, "y": -0.25}}}  # fmt: skip
     assert list(answer_lines(answer))[1:] == [
         "outcome done, steps 5, route bridge",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -17,7 +16,6 @@ import pytest
 from tests.recordings.rows import Recorded, RecordedRobot
 from webots_mcp.cli import main, names
 from webots_mcp.queue import CommandQueue
-from webots_mcp.store.logs import Follower
 
 
 @pytest.fixture
@@ -116,16 +114,6 @@ def test_status_tells_what_runs_and_what_could_not_be_recorded(
     assert head[-4:] == ["rows_waiting", "waiting_in", "rows_dropped", "last_error"]
 
 
-def test_status_as_json_holds_the_same(
-    rover: RecordedRobot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["status", "--json", "--database", str(tmp_path / "webots.db")]) == 0
-    robots = json.loads(capsys.readouterr().out)["robots"]
-    robot = dict(zip(robots["columns"], robots["rows"][0], strict=True))
-    assert (robot["robot"], robot["live"], robot["run_id"]) == (rover.name, True, rover.run_id)
-    assert (robot["status"], robot["rows_dropped"]) == ("running", 1)
-
-
 @pytest.mark.parametrize("arguments", [["status"], ["tail"]])
 def test_without_a_database_one_line_says_so_and_the_exit_code_is_2(
     arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -159,23 +147,6 @@ def test_the_tail_ends_with_the_newest_lines_of_every_kind(
         assert words in line
 
 
-def test_the_tail_of_one_robot_leaves_out_the_others(
-    recorded: Recorded,
-    rover: RecordedRobot,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    recorded.robot("crane").log(1.0, "not mine")
-    arguments = ["tail", "--no-follow", "--data-dir", str(tmp_path)]
-    assert main([*arguments, "--robot", rover.name]) == 0
-    assert "not mine" not in capsys.readouterr().out
-    assert main([*arguments, "--robot", "rovr"]) == 2
-    assert "did you mean 'rover'" in capsys.readouterr().err
-    assert main([*arguments, "-n", "0"]) == 0
-    assert capsys.readouterr().out == ""
-    assert main([*arguments, "--interval", "0"]) == 2
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for a child there")
 def test_the_tail_follows_until_ctrl_c_and_says_so(rover: RecordedRobot, tmp_path: Path) -> None:
     with run("tail", "--interval", "0.05", "--data-dir", str(tmp_path)) as process:
@@ -186,17 +157,6 @@ def test_the_tail_follows_until_ctrl_c_and_says_so(rover: RecordedRobot, tmp_pat
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=60)
     assert (process.returncode, out, err) == (130, "", "webots-mcp: ended by Ctrl-C\n")
-
-
-def test_a_follower_sees_each_line_once(rover: RecordedRobot) -> None:
-    follower = Follower(rover.connection)
-    assert [line.kind for line in follower.look()] == ["state"]
-    assert follower.look() == []
-    command = CommandQueue(rover.connection).enqueue(rover.id, "go")
-    assert [line.text for line in follower.look()] == [f"#{command.id} go {{}}"]
-    CommandQueue(rover.connection).cancel(command.id, "no")
-    assert [line.text for line in follower.look()] == [f"#{command.id} go cancelled no"]
-    assert follower.look() == []
 
 
 def test_a_reader_that_has_seen_enough_ends_the_tail_quietly(
@@ -211,28 +171,6 @@ def test_a_reader_that_has_seen_enough_ends_the_tail_quietly(
             rover.log(2.0, "into the void")
         assert process.stderr is not None
         assert (process.wait(timeout=30), process.stderr.read()) == (0, "")
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="there only a line that is written tells")
-def test_the_tail_ends_with_its_reader_also_where_nothing_is_recorded(
-    rover: RecordedRobot, tmp_path: Path
-) -> None:
-    with run("tail", "--interval", "600", "--data-dir", str(tmp_path)) as process:
-        assert process.stdout is not None and process.stderr is not None
-        process.stdout.readline()
-        process.stdout.close()
-        assert (process.wait(timeout=30), process.stderr.read()) == (0, "")
-
-
-@pytest.mark.parametrize(
-    ("data_dir", "why"), [("nowhere", "there is no folder"), ("notes.txt", "is not a folder")]
-)
-def test_a_data_folder_that_is_none_is_said_to_be_none(
-    data_dir: str, why: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "notes.txt").touch()
-    assert main(["status", "--data-dir", str(tmp_path / data_dir)]) == 2
-    assert why in capsys.readouterr().err
 
 
 def test_an_argument_too_many_is_named(capsys: pytest.CaptureFixture[str]) -> None:

@@ -73,11 +73,3 @@ def test_each_shell_has_a_script_that_knows_every_command(
     assert [name for name in COMMANDS if name not in script] == []
     assert main(["completion", shell, "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {"shell": shell, "script": script[:-1]}
-
-
-def test_an_unknown_shell_is_refused_with_those_there_are(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    assert main(["completion", "tcsh"]) == 2
-    refused = capsys.readouterr().err
-    assert all(shell in refused for shell in ("bash", "zsh", "fish", "powershell"))

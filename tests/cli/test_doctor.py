@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import json
-import re
-import sys
 from pathlib import Path
 
 import pytest
@@ -33,15 +30,6 @@ def test_what_is_wrong_ends_with_1_and_what_mends_it_with_its_page(
     assert "move it aside" in out
     assert "(docs/troubleshooting.md#schema)" in out
     assert "Server" not in out
-
-
-def test_as_json_it_is_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    make_older(tmp_path / "webots.db")
-    assert main(["doctor", "--no-server", "--json", "--data-dir", str(tmp_path)]) == 1
-    checks = {each["check"]: each for each in json.loads(capsys.readouterr().out)["checks"]}
-    assert checks["Schema"]["verdict"] == "wrong"
-    assert checks["Schema"]["page"] == "docs/troubleshooting.md#schema"
-    assert checks["Python"].keys() == {"check", "verdict", "seen"}
 
 
 def test_where_it_cannot_look_it_ends_with_2(capsys: pytest.CaptureFixture[str]) -> None:
@@ -79,26 +67,3 @@ def test_what_a_controller_said_cannot_steer_a_terminal(
     out = capsys.readouterr().out
     assert "no program '/x/webots-mcp'" in out
     assert "\x1b" not in out
-
-
-class Terminal(io.StringIO):
-    def isatty(self) -> bool:
-        return True
-
-
-def test_on_a_terminal_no_line_is_longer_than_it_is_wide_and_no_word_is_lost(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    line = ["doctor", "--no-server", "--database", str(tmp_path / "webots.db")]
-    main(line)
-    piped = capsys.readouterr().out
-    terminal = Terminal()
-    monkeypatch.setattr(sys, "stdout", terminal)
-    monkeypatch.setenv("COLUMNS", "80")
-    main(line)
-    shown = terminal.getvalue()
-    assert max(map(len, piped.splitlines())) > 80
-    for text in shown.splitlines():
-        assert len(text) <= 80 or len(text.split()[-1]) > 48, text
-    without_sizes = [re.sub(r"[\d.]+", "0", text).split() for text in (shown, piped)]
-    assert without_sizes[0] == without_sizes[1]

@@ -17,7 +17,6 @@ import pytest
 
 from tests.trials.test_killed import wait_until
 from tests.webots.conftest import CONTROLLER, free_port, started, webots, write_project
-from webots_mcp.launch import require_world
 
 __all__ = ["webots"]
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="the program `webots` is a script")
@@ -128,12 +127,6 @@ def test_it_says_why_nobody_records(
     _assert_told(launch, project(controller), "--mode", "fast", text=said)
 
 
-def test_it_says_that_controllers_do_not_begin_in_a_pause(
-    launch: Launch, project: Callable[..., Path]
-) -> None:
-    _assert_told(launch, project(), "--mode", "pause", text="it begins paused")
-
-
 def test_an_extern_controller_that_is_missing_is_named(
     launch: Launch, project: Callable[..., Path]
 ) -> None:
@@ -173,14 +166,6 @@ def test_without_a_free_port_webots_says_so_and_ends(
     assert f"Could not initialize TCP server on port {first}" in said
 
 
-def test_a_name_alone_is_that_of_a_world_of_the_project_around_here(
-    project: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    world = project()
-    monkeypatch.chdir(world.parent.parent / "controllers")
-    assert require_world("arena.wbt") == (world, world.parent.parent)
-
-
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -208,17 +193,6 @@ def test_a_world_that_cannot_be_meant_is_refused(
     _, told = process.communicate(timeout=60)
     assert process.returncode == 2
     assert said.format(folder) in told
-
-
-def test_without_webots_the_places_that_were_looked_at_are_named(
-    launch: Launch, project: Callable[..., Path], webots: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    webots.unlink()
-    monkeypatch.setenv("WEBOTS_HOME", "/opt/nowhere")
-    process = launch(project())
-    _, told = process.communicate(timeout=60)
-    assert process.returncode == 2
-    assert "no program 'webots' in WEBOTS_HOME (/opt/nowhere), on the PATH or in /usr/" in told
 
 
 def test_a_folder_where_nothing_can_be_recorded_is_told_before_webots_runs(
@@ -287,26 +261,3 @@ def test_the_stand_in_runs_a_file_for_an_extern_robot(
     process = launch(world, "--stand-in", "--mode", "fast", "--robot", f"rover={file}")
     process.communicate(timeout=60)
     assert process.returncode == 3
-
-
-@pytest.mark.parametrize(
-    ("options", "why"),
-    [
-        (["--robot", "rover=x.py"], "--robot is for --stand-in"),
-        (["--stand-in", "--robot", "rover"], "--robot 'rover' is not NAME=FILE"),
-    ],
-)
-def test_a_file_for_a_robot_is_refused_where_it_cannot_be_run(
-    launch: Launch, project: Callable[..., Path], options: list[str], why: str
-) -> None:
-    process = launch(project(), *options)
-    _, told = process.communicate(timeout=60)
-    assert (process.returncode, why in told) == (2, True)
-
-
-def test_what_only_webots_has_is_refused_for_the_stand_in(
-    launch: Launch, project: Callable[..., Path]
-) -> None:
-    process = launch(project(), "--stand-in", "--stream")
-    _, told = process.communicate(timeout=60)
-    assert (process.returncode, "--stream and --port are Webots' own" in told) == (2, True)

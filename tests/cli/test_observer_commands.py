@@ -56,13 +56,6 @@ def test_in_place_changes_the_world_itself_and_undo_brings_it_back(arena: Path) 
     assert (arena / WORLD).read_bytes() == world
 
 
-def test_a_dry_run_writes_nothing_and_says_what_it_would(arena: Path) -> None:
-    before = snapshot(arena)
-    ended = run("--observer", WORLD, "--dry-run", cwd=arena)
-    assert f"would be written: {COPY}" in ended.stdout
-    assert snapshot(arena) == before
-
-
 def test_a_copy_that_somebody_changed_is_not_written_over_unasked(arena: Path) -> None:
     run("--observer", WORLD, cwd=arena)
     (arena / COPY).write_bytes((arena / COPY).read_bytes().replace(b"ROVER", b"MINE"))
@@ -73,12 +66,6 @@ def test_a_copy_that_somebody_changed_is_not_written_over_unasked(arena: Path) -
     assert snapshot(arena) == before
     assert run("--observer", WORLD, "--yes", cwd=arena).returncode == 0
     assert b"MINE" not in (arena / COPY).read_bytes()
-
-
-def test_an_extern_observer_needs_no_controller(arena: Path) -> None:
-    ended = run("--observer", WORLD, "--extern", cwd=arena)
-    assert "webots-mcp observe" in ended.stdout
-    assert not (arena / CONTROLLER).exists()
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shlex
 import stat
@@ -15,9 +14,8 @@ import pytest
 from tests.cli.conftest import Cli, line_with
 from tests.recordings.rows import Recorded
 from tests.server.story import copy_of
-from webots_mcp.cli import names
-from webots_mcp.cli.commands import app_for, described
-from webots_mcp.cli.terminal import as_typed, commands_by_tool, print_table
+from webots_mcp.cli import app_for, described, names
+from webots_mcp.cli.terminal import as_typed, commands_by_tool
 
 # What is typed about a recording of three runs, and what lines of the answer hold, as patterns.
 ANSWERED = [
@@ -73,7 +71,6 @@ REFUSED = [
     ("logs --start 9 --end 3", "reversed"),
     ("logs --robot rovr", "did you mean 'rover'"),
     ("logs --text \udcff", "--text must be a valid string"),
-    ("logs --follow --before 3", "leave out --before"),
     ("logs --level loud", "--level"),
     ("sql 'DELETE FROM run'", "only one reading statement"),
     ("sql 'WITH a AS (SELECT 1) DELETE FROM run'", "only reading is allowed"),
@@ -126,20 +123,6 @@ def test_json_is_one_object_for_other_programs(told: Cli, typed: str) -> None:
     assert isinstance(answer, dict) and answer
 
 
-def test_json_names_the_fields_of_what_it_has(told: Cli, tmp_path: Path) -> None:
-    run = told.json("trends pose.0 --run 3")["runs"][0]
-    assert (run["row_count"], run["numbers"]["columns"][0]) == (600, "signal")
-    assert told.json("compare 1 3")["measures"]["columns"][:2] == ["name", "median"]
-    signals = told.json("signals 'po*' --run 1")["signals"]
-    assert [row[:2] for row in signals["rows"]] == [["pose.0", "num"], ["pose.1", "num"]]
-    assert told.json("sql \"SELECT 1e999, 'a'\"")["result"]["rows"] == [["inf", "a"]]
-    drawn = told.json(f"plot pose.0 --run 1 -o {tmp_path / 'a.png'}")
-    assert drawn["file"] == str(tmp_path / "a.png") and "pose.0" in drawn["caption"]
-    lines = told("tail -n 3 --no-follow --json").splitlines()
-    kinds = {"wall_time_s", "robot", "run_id", "sim_time_s", "kind", "text"}
-    assert [set(json.loads(line)) for line in lines] == [kinds] * 3
-
-
 @pytest.mark.parametrize(("name", "start"), [("a.png", b"\x89PNG"), ("a.svg", b"<svg")])
 def test_plot_writes_a_picture(told: Cli, tmp_path: Path, name: str, start: bytes) -> None:
     file = tmp_path / name
@@ -156,53 +139,6 @@ def test_a_plot_of_runs_takes_its_signal_wherever_it_stands(
 ) -> None:
     said = told(f"plot {typed.format(tmp_path / 'a.png')}")
     assert "pose.0" in said and "run 1" in said and "run 3" in said
-
-
-def test_compare_says_how_runs_ended_with_which_code_and_what_only_some_of_them_have(
-    tmp_path: Path, cli: Cli
-) -> None:
-    recorded = Recorded(tmp_path / "webots.db")
-    published = {"arm": {"grip": 1.0, "reach": 2.0}, "rover": {"speed": 3.0}}
-    for name, reason in zip(published, ("finished", "crashed"), strict=True):
-        robot = recorded.robot(name)
-        for step in range(60):
-            robot.state(step / 10, published[name])
-        robot.end_run(reason)
-    recorded.close()
-    said = cli("compare 1 2")
-    assert line_with(said, "sha256 aaaaaaaa")
-    assert line_with(said, "run 1 ", "finished") and line_with(said, "run 2 ", "crashed")
-    assert line_with(said, '["run 1"]', '["run 2"]')
-    assert "differences:" not in said
-
-
-def test_logs_are_those_of_all_runs_or_of_a_range(tmp_path: Path, cli: Cli) -> None:
-    recording = Recorded(tmp_path / "webots.db")
-    robot = recording.robot("rover")
-    robot.state(1.0, {"x": 1})
-    robot.log(1.0, "begun")
-    robot.log(2.0, "battery low", level="warning")
-    robot.end_run("reset")
-    robot.begin_run("reset")
-    robot.state(5.0, {"x": 1})
-    robot.log(1.0, "begun again")
-    robot.log(4.5, "wheel lost", level="error")
-    recording.close()
-    told = cli.json("logs -n 2")
-    for typed, messages in (
-        ("", ["begun", "battery low", "begun again", "wheel lost"]),
-        ("--level warning", ["battery low", "wheel lost"]),
-        ("--run 1", ["begun", "battery low"]),
-        ("--last 1", ["wheel lost"]),
-        ("--end 2", ["begun again"]),
-        ("--text BEGUN -n 1", ["begun again"]),
-        (f"--before {told['cursor']}", ["begun", "battery low"]),
-    ):
-        lines = cli.json(f"logs {typed}")["lines"]
-        assert [row[lines["columns"].index("message")] for row in lines["rows"]] == messages
-    table = cli("logs -n 1")
-    assert line_with(table, "4.5", "error", "2", "wheel lost")
-    assert "the newest 1 of 4: ask again with --before for older ones" in table
 
 
 def test_a_person_reads_log_lines_whole_and_as_many_as_were_asked_for(
@@ -230,18 +166,6 @@ def test_a_label_is_given_shown_and_taken_away(story: Path, tmp_path: Path, cli:
 
 
 # -- words ----------------------------------------------------------------------------------------
-
-
-def test_several_robots_are_told_apart_by_an_option(tmp_path: Path, cli: Cli) -> None:
-    recording = Recorded(tmp_path / "webots.db")
-    for name in ("rover", "crane"):
-        recording.robot(name).state(1.5, {"last_s": 1.0, "mode": "cruise"})
-    recording.close()
-    assert "say which one with --robot " in cli.refused("trends")
-    said = " ".join(cli("compare --robot rover").split())
-    assert "give two or more RUN ('webots-mcp runs' has them)" in said
-    said = " ".join(cli("logs --robot rover").split())
-    assert "bridge.log('text', level='info') records one" in said, "a line of Python"
 
 
 def test_a_flag_that_is_to_be_turned_off_is_named_by_the_option_that_does(
@@ -298,11 +222,6 @@ def test_each_command_that_stands_for_a_tool_exists() -> None:
     commands = commands_by_tool()
     assert commands["list_robots"] == "status" and commands["run_trials"] == "trials"
     assert {command.partition(" ")[0] for command in commands.values()} <= {*names()}
-
-
-def test_what_a_terminal_would_obey_is_spelled_out(capsys: pytest.CaptureFixture[str]) -> None:
-    print_table(("name", "empty"), [["red \x1b[31m alarm", None], ["two\nlines", None]])
-    assert capsys.readouterr().out == "name\nred \\x1b[31m alarm\ntwo\\nlines\n"
 
 
 def test_questions_load_neither_the_server_nor_what_draws(story: Path) -> None:

@@ -17,7 +17,6 @@ import pytest
 
 from tests.bridge.conftest import Recording
 from tests.cli.conftest import Cli
-from tests.recordings.rows import Recorded
 from tests.server.conftest import Driver
 from tests.server.test_parameters import TunableDriver
 
@@ -115,17 +114,6 @@ def test_a_run_that_takes_longer_is_waited_for_or_ended_with_the_lines_that_it_n
     assert recording.fate(2)[1]["ended"] == "interrupted"
 
 
-def test_an_action_that_nobody_registered_is_no_success(
-    tmp_path: Path, recording: Recording, cli: Cli
-) -> None:
-    silent = Driver(tmp_path / "webots.db", registers=False)
-    silent.start()
-    wait_for(lambda: recording.states() != [])
-    said = cli.refused("send resett")
-    silent.stop()
-    assert "no action 'resett'; this robot has reset, reset_state, " in said
-
-
 @pytest.mark.usefixtures("driver")
 def test_breakpoints_are_set_listed_hit_and_removed(recording: Recording, cli: Cli) -> None:
     wait_for(lambda: recording.states() != [])
@@ -137,31 +125,6 @@ def test_breakpoints_are_set_listed_hit_and_removed(recording: Recording, cli: C
     row = dict(zip(listed["columns"], listed["rows"][0], strict=True))
     assert (row["condition"], row["hit_count"], row["set_by"]) == ("steps > 3", 1, "cli")
     assert "breakpoint_id 1, armed false" in cli("breakpoint --remove 1")
-
-
-def test_a_breakpoint_of_a_robot_that_is_gone_is_stored_and_says_so(
-    tmp_path: Path, recording: Recording, cli: Cli
-) -> None:
-    gone = Driver(tmp_path / "webots.db")
-    gone.start()
-    wait_for(lambda: recording.states() != [])
-    gone.stop()
-    said = " ".join(cli("breakpoint 'stepz > 3'").split())
-    assert "breakpoint_id 1, condition stepz > 3, action pause, armed false" in said
-    assert "it is stored, but not armed yet" in said
-    assert "stepz is missing as long as it is not published; there is steps" in said
-    assert "reads them when it starts" in said
-
-
-def test_a_command_that_no_route_could_do_says_why_each_failed(tmp_path: Path, cli: Cli) -> None:
-    recorded = Recorded(tmp_path / "webots.db")
-    oldest = 1  # a process that began after a session was seen last is another one
-    recorded.robot(supervisor=True, pid=oldest, last_seen_wall_time_s=time.time() - 30)
-    said = cli.refused("pause --timeout 0.2")
-    assert "pause is not done (cancelled)" in said
-    assert "websocket: " in said
-    assert "keyboard: not tried: it presses keys in Webots' window, which needs --force\n" in said
-    recorded.close()
 
 
 @pytest.mark.usefixtures("driver")
@@ -229,20 +192,3 @@ def test_a_text_that_looks_like_a_number_stays_a_text(tunable: TunableDriver, cl
     assert tag.value == "true"
     runs = cli.json("runs --parameter tag=7 --parameter kp=3")["runs"]
     assert [row[runs["columns"].index("run_id")] for row in runs["rows"]] == [1]
-
-
-@pytest.mark.usefixtures("tunable")
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ("kp=fast", "'kp' is a number from 0 up to 10, not 'fast'"),
-        ("kp", "'kp' names no value: write kp=VALUE"),
-        ("kq=1", "no parameter 'kq'"),
-        ("gait=1", "one of 'trot', 'walk', not '1'"),
-        ("kp=1 --run 1", "parameters are set in the current one"),
-    ],
-)
-def test_a_wrong_setting_is_one_line_and_exit_code_2(cli: Cli, settings: str, words: str) -> None:
-    said = cli.refused(f"parameters {settings}")
-    assert words in said
-    assert said.count("\n") == 1

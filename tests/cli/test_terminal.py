@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -69,13 +68,6 @@ def test_no_command_lets_a_recording_steer_the_terminal(
     said = capsys.readouterr()
     assert said.out or said.err
     assert not OBEYED.search(said.out + said.err), ascii(said)
-
-
-def test_json_is_the_same_data(recorded: Recorded, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["runs", "--json", "--database", "webots.db"]) == 0
-    runs = json.loads(capsys.readouterr().out)["runs"]
-    run = dict(zip(runs["columns"], runs["rows"][0], strict=True))
-    assert run["robot"] == run["label"] == HOSTILE
 
 
 def test_pictures_and_reports_are_files_that_nothing_turns_round(recorded: Recorded) -> None:

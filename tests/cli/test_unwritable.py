@@ -94,13 +94,6 @@ def test_every_command_that_reads_reads_it_and_says_how(artifact: Path, tmp_path
     assert (tmp_path / "x.csv").read_text().count("\n") == 51
 
 
-def test_the_status_says_it_to_programs_as_well(artifact: Path) -> None:
-    ended = run("-m", "webots_mcp", "status", "--json", "--database", str(artifact))
-    facts = json.loads(ended.stdout)
-    assert facts["storage"].startswith(SAID)
-    assert [row[facts["robots"]["columns"].index("runs")] for row in facts["robots"]["rows"]] == [2]
-
-
 def test_what_waits_beside_it_is_said_not_to_be_in_it(recorded: Recorded) -> None:
     assert isinstance(recorded.database, Path)
     recorded.close()
@@ -153,15 +146,6 @@ def test_a_recording_with_a_log_beside_it_is_never_read_without_that_log(
     assert ended.returncode == 2
     assert "copy both to a folder of your own" in ended.stderr
     assert "Traceback" not in ended.stderr
-
-
-def test_where_the_log_can_be_read_in_place_nothing_is_missing(recorded: Recorded) -> None:
-    assert isinstance(recorded.database, Path)
-    with unprivileged.unwritable(recorded.database.parent):
-        ended = run("-m", "webots_mcp", "status", "--json", "--database", str(recorded.database))
-    facts = json.loads(ended.stdout)
-    assert [row[facts["robots"]["columns"].index("runs")] for row in facts["robots"]["rows"]] == [2]
-    assert "storage" not in facts
 
 
 @pytest.mark.parametrize("command", ["status", "tail"])

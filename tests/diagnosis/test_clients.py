@@ -33,15 +33,6 @@ def test_a_damaged_file_is_wrong(look: Look, tmp_path: Path, text: str) -> None:
     assert ".mcp.json (Claude Code) cannot be read" in found.seen
 
 
-def test_a_file_with_comments_is_read_as_its_client_reads_it(look: Look, tmp_path: Path) -> None:
-    (tmp_path / ".vscode").mkdir()
-    entry = {"command": sys.executable, "args": SERVE}
-    text = f'{{ // mine\n "servers": {{"webots": {json.dumps(entry)},}} }}'
-    (tmp_path / ".vscode" / "mcp.json").write_text(text, "utf-8")
-    found = look("Clients")
-    assert (found.verdict, "VS Code" in found.seen) == ("ok", True)
-
-
 @pytest.mark.parametrize(
     ("command", "arguments", "verdict", "seen"),
     [

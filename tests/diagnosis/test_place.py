@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests import unprivileged
-from tests.diagnosis.conftest import Look, found
+from tests.diagnosis.conftest import found
 from webots_mcp.diagnosis.recording_checks import Mount, judge_file_system
 
 LOCAL = Mount("/", "ext4")
@@ -81,7 +81,3 @@ def test_where_memory_cannot_be_shared_it_is_wrong_and_says_why(
 )
 def test_other_places_are_not_called_wrong(folder: str, mounts: list[Mount], verdict: str) -> None:
     assert judge_file_system(folder, mounts, is_wsl=False).verdict == verdict
-
-
-def test_this_machine_tells_what_the_folder_lies_on(look: Look) -> None:
-    assert look("File system").verdict in ("ok", "warning", "wrong")

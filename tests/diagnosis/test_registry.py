@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from tests.diagnosis.conftest import found
-from webots_mcp.contract import MemoryDatabase
 from webots_mcp.diagnosis import (
     PAGE,
     Check,
@@ -36,17 +35,6 @@ def test_a_recording_of_a_robot_that_has_finished_is_well(bridge_recording: Path
     bad = [each for each in diagnose(subject) if not each.is_well]
     assert {each.check.name for each in bad} <= ELSEWHERE, bad
     assert "wrong" not in {each.finding.verdict for each in bad}
-
-
-def test_a_recording_in_memory_is_looked_at_as_well() -> None:
-    memory = MemoryDatabase()
-    try:
-        checked = diagnose(subject_of(Recording(memory, memory.data_dir), "the test"))
-    finally:
-        memory.close()
-    by_name = {check.name: finding for check, finding in checked}
-    assert "nothing was recorded" in by_name["Database"].seen
-    assert by_name["Rows"].verdict == "not checked"
 
 
 def test_a_check_that_fails_says_so_and_the_others_go_on(tmp_path: Path) -> None:

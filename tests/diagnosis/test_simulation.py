@@ -145,15 +145,6 @@ def test_another_controller_that_computes_is_named(
     assert f"(process {busy.pid})" in seen
 
 
-def test_many_that_stand_in_one_simulation_are_told_once(
-    look: Look, recorded: Recorded, start: Start
-) -> None:
-    process = start(WAITS)
-    for n in range(40):
-        silent(recorded, process, f"robot{n}")
-    assert look("Simulation").seen.count("paused by hand") == 1
-
-
 def test_an_extern_controller_that_nobody_has_started_is_missed(
     look: Look, recorded: Recorded, start: Start, tmp_path: Path
 ) -> None:
@@ -229,8 +220,3 @@ def test_a_controller_that_records_nothing_and_hangs_is_found_as_a_child_of_its_
     running = found(file, "Running Webots")
     assert f"port {port}" in running.seen
     assert "was started without --stream and does not obey" in running.seen
-
-
-def test_which_webots_there_is_tells_its_place(webots: Path, look: Look) -> None:
-    installed = look("Webots")
-    assert (installed.verdict, str(webots) in installed.seen) == ("ok", True)

@@ -6,7 +6,6 @@ Run with `-s` to see the table. Tokens are counted by the package's own rule, `t
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from typing import Any, Final
 
@@ -225,29 +224,3 @@ async def test_whoever_has_400_signals_reads_what_is_left_out_of_2000_tokens(
         assert not result.is_error, text_of(result)
         assert tokens_in(text_of(result)) < ANSWER_TOKENS
         assert said in text_of(result)
-
-
-async def test_ten_runs_beside_each_other_fit_an_answer_that_names_what_is_left_out(
-    tmp_path: Path,
-) -> None:
-    recorded = Recorded(tmp_path / "webots.db")
-    rover = recorded.robot("rover")
-    for run in range(10):
-        if run:
-            rover.begin_run("reset")
-        for step in range(60):
-            mode = f"mode_{step // 5}_of_a_long_mission"
-            pose = {"x": 0.123456 * step * (run + 1), "y": 1 / (step + run + 1)}
-            rover.state(step * 0.5, {"pose": pose, "mode": mode})
-    recorded.close()
-    async with client_on(tmp_path / "webots.db") as client:
-        result = await client.call_tool("webots_compare_runs", {"run_ids": [*range(1, 11)]})
-        assert tokens_in(text_of(result)) < ANSWER_TOKENS
-        answer = json.loads(text_of(result))
-        shown = len(answer["measures"]["rows"])
-        said = re.search(r"(\d+) of (\d+) measures: limit shows the others", answer["hint"])
-        assert said and int(said[1]) == shown
-        whole = await client.call_tool(
-            "webots_compare_runs", {"run_ids": [*range(1, 11)], "limit": 100}
-        )
-        assert len(json.loads(text_of(whole))["measures"]["rows"]) == int(said[2])

@@ -77,16 +77,6 @@ def controller(recorded: Recorded, file: Path) -> Iterator[Callable[..., Recorde
         thread.join(timeout=60)
 
 
-async def test_a_result_comes_back_with_what_was_asked(
-    connect: Connect, controller: Callable[..., RecordedRobot]
-) -> None:
-    controller(("done", json.dumps({"speed": 2.0}), None))
-    async with connect() as client:
-        answer = await ask(client, "webots_send_command", action="set_speed", params={"speed": 2.0})
-    assert (answer["outcome"], answer["result"]) == ("done", {"speed": 2.0})
-    assert answer["waited_s"] < 5
-
-
 async def test_a_failure_is_an_error_whose_words_stay_in_a_data_field(
     connect: Connect, controller: Callable[..., RecordedRobot]
 ) -> None:
@@ -155,17 +145,6 @@ async def test_steering_through_a_plain_robot_is_refused_with_the_supervisor_to_
     assert "'referee' is a Supervisor of this simulation: ask it (robot='referee')" in beside
 
 
-async def test_where_the_supervisors_controller_has_ended_it_is_the_one_to_start(
-    connect: Connect, recorded: Recorded
-) -> None:
-    recorded.robot("referee", ended_wall_time_s=time.time(), end_reason="crashed")
-    recorded.robot("rover", supervisor=0)
-    async with connect() as client:
-        text = await fail(client, "webots_simulation_control", command="pause")
-    assert "'referee' is a Supervisor of this simulation, but its controller has ended" in text
-    assert "set the field" not in text
-
-
 @pytest.mark.parametrize("command", ["pause", "step"])
 async def test_without_a_name_steering_goes_to_the_only_live_supervisor(
     connect: Connect, controller: Callable[..., RecordedRobot], recorded: Recorded, command: str
@@ -199,16 +178,6 @@ async def test_a_failed_action_is_answered_with_where_its_docstring_stands_and_n
     async with connect() as client:
         answer = json.loads(await fail(client, "webots_send_command", action="go"))
     assert answer["hint"] == "webots_list_commands has the action's description"
-
-
-async def test_what_was_replaced_in_a_result_is_a_hint_and_no_error(
-    connect: Connect, controller: Callable[..., RecordedRobot]
-) -> None:
-    controller(("done", '{"v": null}', "replaced in the result: v (nan)"))
-    async with connect() as client:
-        answer = await ask(client, "webots_send_command", action="go")
-    assert (answer["hint"], answer["result"]) == ("replaced in the result: v (nan)", {"v": None})
-    assert "error" not in answer
 
 
 async def test_a_command_behind_a_handler_that_is_at_work_is_told_which(
@@ -276,17 +245,6 @@ async def test_waiting_reports_progress_every_second(connect: Connect, recorded:
         arguments = {"action": "go", "timeout_wall_s": 2.5}
         await client.call_tool("webots_send_command", arguments, progress_callback=on_progress)
     assert messages == [f"go: waiting for the controller for {n} s" for n in (1, 2)]
-
-
-async def test_an_action_that_was_never_registered_is_refused_with_near_names(
-    connect: Connect, recorded: Recorded
-) -> None:
-    robot = recorded.robot(actions=json.dumps({"set_speed": "Set it.", "turn_to": ""}))
-    async with connect() as client:
-        text = await fail(client, "webots_send_command", action="set_sped")
-    assert "did you mean 'set_speed'" in text
-    assert "turn_to" in text
-    assert list_commands(recorded.connection, robot.id, limit=1) == []
 
 
 @pytest.mark.parametrize(

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -92,33 +90,6 @@ async def test_why_a_controller_never_recorded_is_told_before_there_is_a_run(
     assert "console: ModuleNotFoundError" in told.stdout
 
 
-async def test_what_waits_for_a_run_is_told_beside_several_robots_of_the_past(
-    connect: Connect, recorded: Recorded
-) -> None:
-    said = {"instance": "here:1234", "wall_time_s": time.time(), "level": "info"}
-    insert(recorded.connection, "console_line", {
-        **said, "source": "console", "message": "No module named 'arm'", "logger": "stdout"
-    })  # fmt: skip
-    robots = [recorded.robot(name) for name in ("hunter", "runner")]
-    async with connect() as client:
-        assert "2 robots are live" in await fail(client, "webots_get_logs")
-        for robot in robots:
-            robot.beat(ended_wall_time_s=robot.now, end_reason="finished")
-        answer = await ask(client, "webots_get_logs")
-    assert answer["lines"]["rows"] == [[None, "info", "console: No module named 'arm'", None]]
-
-
-async def test_without_a_webots_of_the_recording_it_is_said_that_no_console_is_followed(
-    connect: Connect, recorded: Recorded, tmp_path: Path, start_webots: StartWebots
-) -> None:
-    recorded.robot()
-    world = write_project(tmp_path / "another", "print('ready', flush=True)")
-    wait_for_line(start_webots("--stdout", f"--port={free_port()}", world), "ready")
-    async with connect() as client:
-        answer = await ask(client, "webots_get_logs", source="webots")
-    assert "no Webots of this recording runs on this machine" in answer["hint"]
-
-
 async def test_a_webots_whose_controllers_record_elsewhere_is_not_followed(
     tmp_path: Path, start_webots: StartWebots, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -162,26 +133,3 @@ async def test_a_line_that_may_be_of_any_robot_of_a_simulation_is_told_of_each(
         other = await ask(client, "webots_get_logs", robot=elsewhere.name)
         assert other["lines"]["rows"] == []
         assert "'x'" in await fail(client, "webots_get_logs", source="x")
-
-
-async def test_the_command_line_follows_what_comes(recorded: Recorded, file: Path) -> None:
-    robot = recorded.robot()
-    robot.log(1.0, "first")
-    arguments = [sys.executable, "-m", "webots_mcp", "logs", "--follow", "--database", str(file)]
-    with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as process:
-        wait_for_line(process, "first")
-        robot.log(2.0, "second")
-        assert wait_for_line(process, "second") == "2 info 1 second\n"
-        process.terminate()
-
-
-async def test_programs_follow_an_object_for_each_line(recorded: Recorded, file: Path) -> None:
-    robot = recorded.robot()
-    robot.log(1.0, "first")
-    arguments = [sys.executable, "-m", "webots_mcp", "logs", "--follow", "--json", "--database"]
-    with subprocess.Popen([*arguments, file], stdout=subprocess.PIPE, text=True) as process:
-        assert json.loads(wait_for_line(process, "first"))["message"] == "first"
-        robot.log(2.0, "second", level="error")
-        row = json.loads(wait_for_line(process, "second"))
-        assert (row["sim_time_s"], row["level"], row["run_id"]) == (2.0, "error", 1)
-        process.terminate()

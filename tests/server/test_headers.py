@@ -28,16 +28,6 @@ async def test_every_answer_names_robot_run_time_age_and_status(
             assert asked_s - written_s - 0.01 < answer["age_s"] < time.time() - written_s + 0.01
 
 
-async def test_the_header_tells_the_time_before_the_first_state(
-    connect: Connect, recorded: Recorded
-) -> None:
-    recorded.robot()
-    async with connect() as client:
-        answer = await ask(client, "webots_get_robot_state")
-    assert answer["sim_time_s"] == 0.0
-    assert "bridge.publish" in answer["hint"]
-
-
 async def test_a_new_run_without_a_state_points_to_the_one_before(
     connect: Connect, recorded: Recorded
 ) -> None:
@@ -62,20 +52,3 @@ async def test_several_live_robots_are_listed_until_one_is_named(
         assert "did you mean 'crane'" in await fail(client, "webots_get_robot_state", robot="crne")
         rows = (await ask(client, "webots_list_robots"))["robots"]["rows"]
         assert [row[0] for row in rows] == ["rover", "crane"]
-
-
-async def test_an_earlier_run_can_be_read_and_is_named_as_such(
-    connect: Connect, recorded: Recorded
-) -> None:
-    robot = recorded.robot()
-    robot.state(5.0, {"x": 5})
-    robot.end_run("reset")
-    first = robot.run_id
-    robot.begin_run("reset")
-    robot.state(1.0, {"x": 1})
-    async with connect() as client:
-        answer = await ask(client, "webots_get_robot_state", run_id=first)
-        assert (answer["state"], answer["sim_time_s"]) == ({"x": 5}, 5.0)
-        assert answer["status"].startswith("stopped")
-        assert "earlier run; it ended by reset" in answer["why"]
-        assert "no run 77" in await fail(client, "webots_get_robot_state", run_id=77)

@@ -170,15 +170,6 @@ async def test_only_worlds_of_the_project_are_opened(
         assert said in await fail(client, tool, world=world)
 
 
-async def test_without_webots_the_places_that_were_looked_at_are_named(
-    begin: Begin, webots: Path
-) -> None:
-    webots.unlink()
-    async with begin() as client:
-        text = await fail(client, "webots_launch_world", world="arena.wbt")
-    assert "there is no program 'webots' in WEBOTS_HOME (not set), on the PATH or in" in text
-
-
 async def test_a_robot_that_is_no_supervisor_has_another_world_by_webots_itself(
     begin: Begin,
 ) -> None:
@@ -189,15 +180,6 @@ async def test_a_robot_that_is_no_supervisor_has_another_world_by_webots_itself(
         assert loaded["evidence"].startswith("Webots replied 'delete world'; run ")
         assert loaded["evidence"].endswith(" of rover began in field.wbt")
         assert loaded["run_id"] > first["run_id"]
-
-
-async def test_without_stream_it_is_said_how_to_have_another_world(begin: Begin) -> None:
-    async with begin(PLAIN) as client:
-        await ask(client, "webots_launch_world", world="arena.wbt")
-        text = await fail(client, "webots_load_world", world="field.wbt")
-    assert "bridge: load_world needs a Supervisor" in text
-    assert "was started without --stream" in text
-    assert "Open it in Webots (File, Open World), or end Webots and start it with that" in text
 
 
 async def test_a_world_of_the_same_name_in_another_project_is_not_opened_instead(

@@ -10,7 +10,6 @@ from mcp import Client
 
 from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask
-from tests.store.test_status import dead_pid
 from webots_mcp.server import create_server
 from webots_mcp.store.purge import prune
 from webots_mcp.store.retention import Limit, Retention
@@ -31,18 +30,6 @@ async def test_a_server_that_may_write_maintains_the_database(
         holder = recorded.connection.execute("SELECT holder FROM lease").fetchone()[0]
         assert holder.startswith("server ")
     assert recorded.connection.execute("SELECT count(*) FROM lease").fetchone() == (0,)
-
-
-async def test_sql_sees_how_a_killed_controllers_run_ended(
-    connect: Connect, recorded: Recorded
-) -> None:
-    robot = recorded.robot(pid=dead_pid())
-    robot.state(1.0, {"x": 1.0})
-    ended = "SELECT r.end_reason, s.end_reason FROM run r JOIN session s ON s.id = r.session_id"
-    async with connect():
-        with anyio.fail_after(60):
-            while recorded.connection.execute(ended).fetchone() != ("crashed", "crashed"):
-                await anyio.sleep(0.02)
 
 
 async def test_the_server_keeps_as_much_as_it_was_told(file: Path, recorded: Recorded) -> None:

@@ -119,16 +119,6 @@ async def test_a_robot_that_is_no_supervisor_is_steered_by_the_observer(begin: A
         assert answers["reload"]["evidence"].endswith("began")
 
 
-async def test_steps_by_the_observer_are_counted_by_the_time_that_passed(begin: Any) -> None:
-    async with begin(DRIVES, "--mode=fast") as client:
-        await until(client, "webots_get_world_info", moves)
-        await ask(client, "webots_simulation_control", command="pause")
-        answer = await ask(client, "webots_simulation_control", command="step", steps=20)
-        made = answer["result"]["steps"]
-        assert made >= 20  # the world does not wait for the observer
-        assert answer["result"]["advanced_s"] == pytest.approx(made * 0.016)
-
-
 async def test_a_controller_that_hangs_is_told_from_a_pause_and_ended_by_a_reload(
     begin: Any,
 ) -> None:

@@ -108,24 +108,3 @@ async def test_what_cannot_be_set_is_refused_before_anything_is_sent(
         listed = await ask(client, "webots_list_commands")
         assert "commands" not in listed
     assert tunable.kp.value == 2.0
-
-
-async def test_many_parameters_fit_a_short_answer_that_says_how_many_there_are(
-    connect: Connect, file: Path
-) -> None:
-    driving = TunableDriver(file)
-    for number in range(400):
-        driving.bridge.parameter(f"gain.{number}", 1.0, low=0, doc="a gain " * 20)
-    driving.start()
-    async with connect() as client:
-        answer = await ask(client, "webots_get_parameters")
-        assert answer["total"] == 403
-        assert len(table(answer)) < 403
-        assert "of 403: names shows others" in answer["hint"]
-        assert len(str(answer)) < 8000
-        answer = await ask(
-            client, "webots_set_parameters", values={f"gain.{n}": 2.0 for n in range(400)}
-        )
-        assert answer["outcome"] == "done"
-        assert len(str(answer)) < 8000
-    driving.stop()

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from tests.recordings.rows import Recorded
-from tests.server.conftest import Connect, ask, fail, pictures_of, text_of
+from tests.server.conftest import Connect, fail, pictures_of, text_of
 
 pytestmark = pytest.mark.anyio
 
@@ -148,37 +148,9 @@ async def test_the_frames_around_a_hit_are_shown_by_time_one_or_many(
     assert missing["pictures_sim_time_s"] == [0.0, 1.0, 2.0, 8.0, 9.0]
 
 
-async def test_a_kept_stretch_says_that_it_has_camera_frames(
-    connect: Connect, recorded: Recorded
-) -> None:
-    robot = recorded.robot()
-    for second in range(10):
-        robot.state(second, {"n": second})
-        robot.image(second, f"{second}.png", kind="kept")
-    robot.kept(2.0, 6.0, "a look")
-    async with connect() as client:
-        (event,) = (await ask(client, "webots_find_events", kinds=["kept_stretch"]))["events"][
-            "rows"
-        ]
-    assert "'frames': 5" in str(event)
-
-
 async def test_a_controller_that_saves_no_frames_is_told_how_to(
     connect: Connect, recorded: Recorded
 ) -> None:
     recorded.robot()
     async with connect() as client:
         assert "save_camera_frame" in text_of(await client.call_tool("webots_get_camera", {}))
-
-
-async def test_where_a_run_has_no_frame_those_that_have_some_are_named(
-    connect: Connect, recorded: Recorded
-) -> None:
-    robot = recorded.robot()
-    robot.image(1.0, "camera/a.png")
-    second = recorded.robot()
-    second.state(1.0, {"x": 1})
-    async with connect() as client:
-        for camera in ("", "eye", "left"):
-            told = text_of(await client.call_tool("webots_get_camera", {"camera": camera}))
-            assert f"there are some of run_id={robot.run_id}: eye" in told

@@ -10,7 +10,7 @@ import pytest
 from mcp import Client, MCPError
 from mcp.types import TextContent
 
-from tests.server.story import WAYS, Way, client_on, write_story
+from tests.server.story import client_on, write_story
 
 pytestmark = pytest.mark.anyio
 
@@ -42,21 +42,6 @@ def calls_in(text: str) -> list[ast.Call]:
     found = re.findall(r"webots_\w+\([^)]*\)", text)
     parsed = [ast.parse(each, mode="eval").body for each in found]
     return [call for call in parsed if isinstance(call, ast.Call)]
-
-
-@pytest.mark.parametrize("way", WAYS)
-async def test_each_way_of_connecting_lists_and_reads_the_prompts(story: Path, way: Way) -> None:
-    async with client_on(story, way) as client:
-        listed = {prompt.name: prompt for prompt in (await client.list_prompts()).prompts}
-        assert set(listed) == set(ARGUMENTS)
-        for name, arguments in ARGUMENTS.items():
-            assert listed[name].title and listed[name].description
-            described = {each.name: each for each in listed[name].arguments or []}
-            assert set(described) == set(arguments)
-            assert all(each.description for each in described.values())
-            required = {each.name for each in described.values() if each.required}
-            assert required == set(LEAST[name])
-            assert "'rover'" in await read(client, name, arguments)
 
 
 @pytest.mark.parametrize("arguments", [ARGUMENTS, LEAST], ids=["all", "least"])

@@ -65,16 +65,3 @@ async def _until_nothing_comes(filed: Recording) -> None:
     with anyio.fail_after(60):
         while time.time() - filed.rows("SELECT max(wall_time_s) FROM state")[0] < 0.5:
             await anyio.sleep(0.02)
-
-
-async def test_a_controller_that_was_killed_is_no_longer_running(
-    start: Callable[..., Simulation], filed: Recording, data_dir: Path
-) -> None:
-    simulation = start(LOOP, mode="realtime")
-    simulation.wait_for(lambda: has_states(filed), 20)
-    async with Client(create_server(data_dir / "webots.db", data_dir)) as client:
-        simulation.controller("rover").kill()
-        simulation.wait_for(lambda: simulation.controller("rover").exit_code is not None, 10)
-        answer = await ask(client, "webots_get_robot_state")
-    assert answer["status"].startswith("stopped")
-    assert "killed or crashed" in answer["why"]

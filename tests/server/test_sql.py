@@ -207,17 +207,6 @@ async def test_it_is_said_that_states_were_deleted_where_a_statement_asks_of_sta
     assert "hint" not in of_runs
 
 
-async def test_bytes_that_are_no_text_are_shown_as_such(file: Path, connect: Connect) -> None:
-    recorded = Recorded(file)
-    robot = recorded.robot()
-    robot.log(1.0, "hello")
-    recorded.connection.execute("UPDATE log SET message = CAST(x'41ff42' AS TEXT)")
-    recorded.close()
-    async with connect(read_only=True) as client:
-        answer = await ask(client, "webots_query_sql", sql="SELECT message FROM log")
-    assert answer["result"]["rows"] == [["A\ufffdB"]]
-
-
 def test_a_file_of_the_users_folder_is_not_taken_for_a_module(
     recording: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

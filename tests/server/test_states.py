@@ -10,7 +10,6 @@ import pytest
 from tests.recordings.rows import Recorded
 from tests.server.conftest import DATA_TOOLS, Connect, ask, fail
 from webots_mcp.questions.budget import tokens_of
-from webots_mcp.questions.robot_state import unnamed_devices
 from webots_mcp.store.chunk_making import chunk_whole_run
 
 pytestmark = pytest.mark.anyio
@@ -29,26 +28,6 @@ async def test_the_state_is_rounded_and_long_arrays_are_summarised(
     assert answer["state"]["lidar"]["argmin"] == 7
     assert "arrays over 16 items" in answer["shortened"]
     assert "webots_get_full_state" in answer["hint"]
-
-
-async def test_of_many_replaced_values_the_number_of_those_not_shown_is_said(
-    connect: Connect, recorded: Recorded
-) -> None:
-    names = [f"at_{number}" for number in range(50)]
-    replaced = {f"front.{name}": "nan" for name in names}
-    recorded.robot().state(1.0, {"front": dict.fromkeys(names)}, replaced=replaced)
-    async with connect() as client:
-        for tool in ("webots_get_full_state", "webots_get_sensors"):
-            replaced = (await ask(client, tool))["replaced"]
-            assert len(replaced) == 21
-            assert replaced["…"].startswith("30 more: ")
-
-
-def test_a_device_is_named_in_the_state_however_its_words_are_arranged() -> None:
-    names = ("ds0", "ds7", "front left sonar", "leftEncoder", "range_finder", "gps")
-    devices: dict[str, str] = dict.fromkeys(names, "DistanceSensor")
-    state = {"ds": [1, 2], "sonar": {"front_left": 1.0}, "encoder": {"left": 3}, "seen": {"gps": 1}}
-    assert list(unnamed_devices(state, devices)) == ["ds7", "range_finder"]
 
 
 async def test_a_state_without_sensors_says_where_to_look(
@@ -127,21 +106,6 @@ async def test_a_large_state_comes_in_pages_that_say_what_is_not_on_them(
     assert list(pages.items()) == list(state.items())
     assert asked["state"] == state
     assert TOKENS < tokens_of(asked) < 10_000
-
-
-async def test_of_a_state_with_long_arrays_all_members_stay_and_these_are_summed_up(
-    connect: Connect, recorded: Recorded
-) -> None:
-    lidar = [i / 7 for i in range(360)]
-    numbers = {f"signal_{i}": i / 7 for i in range(30)}
-    recorded.robot().state(1.0, {"lidar": lidar, "depth": lidar, **numbers})
-    async with connect() as client:
-        answer = await ask(client, "webots_get_full_state")
-    state = answer["state"]
-    assert (state["lidar"]["count"], state["depth"]["count"]) == (360, 360)
-    assert {name: state[name] for name in numbers} == numbers
-    assert "arrays over 16 items" in answer["shortened"]
-    assert "lidar, depth" in answer["hint"]
 
 
 async def test_the_full_state_has_events_and_the_recorders_health(

@@ -19,18 +19,6 @@ async def control(client: Client, command: str, **arguments: object) -> dict[str
     return await ask(client, "webots_simulation_control", command=command, **arguments)
 
 
-async def test_a_reset_begins_a_new_run(connect: Connect, driver: Driver) -> None:
-    async with connect() as client:
-        first = (await ask(client, "webots_get_robot_state"))["run_id"]
-        answer = await ask(client, "webots_world_reset")
-        assert answer["outcome"] == "done"
-        assert answer["run_id"] == answer["result"]["run_id"] > first
-        assert answer["status"] == "running"
-        earlier = await ask(client, "webots_get_world_info", run_id=first)
-        assert earlier["run"]["ended_by"] == "reset"
-    assert driver.is_alive()
-
-
 async def test_a_custom_action_answers_or_fails_with_its_own_words(
     connect: Connect, driver: Driver
 ) -> None:
@@ -148,13 +136,4 @@ async def test_watching_a_paused_robot_says_that_nothing_was_recorded_and_why(
         answer = await ask(client, "webots_monitor", duration_wall_s=1)
         assert answer["row_count"] == 0
         assert "paused" in answer["hint"]
-        assert driver.is_alive()
-
-
-async def test_a_read_only_server_watches_beside_one_that_steers(
-    connect: Connect, driver: Driver
-) -> None:
-    async with connect() as steering, connect(read_only=True) as watching:
-        await control(steering, "pause")
-        assert (await ask(watching, "webots_get_robot_state"))["status"] == "paused"
         assert driver.is_alive()

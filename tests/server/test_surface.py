@@ -158,34 +158,6 @@ async def test_the_schemas_of_answers_are_listed_where_they_are_asked_for(
             assert "verdicts" in await ask(client, "webots_find_events", what=what)
 
 
-async def test_what_a_tool_does_is_said_as_it_is(connect: Connect) -> None:
-    async with connect() as client:
-        notes = {tool.name: tool.annotations for tool in (await client.list_tools()).tools}
-    told = {name: note for name, note in notes.items() if note and not note.read_only_hint}
-    assert {name for name, note in told.items() if not note.destructive_hint} == {
-        "webots_annotate_run",
-        "webots_breakpoint",
-        "webots_set_parameters",
-        "webots_take_screenshot",
-    }
-    assert {name for name, note in told.items() if note.idempotent_hint} == {
-        "webots_annotate_run",
-        "webots_set_parameters",
-    }
-
-
-async def test_every_tool_says_what_it_is_and_whether_it_changes_anything(
-    connect: Connect,
-) -> None:
-    async with connect() as client:
-        for tool in (await client.list_tools()).tools:
-            assert tool.title
-            assert tool.description
-            assert tool.annotations is not None
-            assert tool.annotations.read_only_hint == (tool.name in READING)
-            assert tool.annotations.open_world_hint is False
-
-
 async def test_every_parameter_is_described_and_flat(connect: Connect) -> None:
     async with connect() as client:
         for tool in (await client.list_tools()).tools:

@@ -56,17 +56,6 @@ async def test_a_movement_has_its_distance_and_what_makes_it_doubtful(
         assert value in movement[name] if isinstance(value, str) else value == movement[name]
 
 
-async def test_a_robot_without_a_position_has_no_movement(
-    connect: Connect, rover: RecordedRobot
-) -> None:
-    rover.state(0.0, {"joints": [1, 2]})
-    rover.state(1.0, {"joints": [3, 4]}, at=rover.now + 1)
-    async with connect() as client:
-        answer = await ask(client, "webots_monitor", lookback_wall_s=60)
-    assert "movement" not in answer
-    assert answer["row_count"] == 2
-
-
 async def test_rows_before_the_window_do_not_count_even_at_the_same_simulation_time(
     connect: Connect, rover: RecordedRobot
 ) -> None:
@@ -78,17 +67,6 @@ async def test_rows_before_the_window_do_not_count_even_at_the_same_simulation_t
     (count,) = rows_of(trend["numbers"])
     assert answer["row_count"] == 4
     assert count["last"] == 9 and "from 6 to 9" in count["says"]
-
-
-async def test_what_was_logged_after_the_last_row_is_told(
-    connect: Connect, rover: RecordedRobot
-) -> None:
-    rover.state(1.0, {"x": 1})
-    rover.log(2.0, "the arm is blocked", level="error")
-    async with connect() as client:
-        answer = await ask(client, "webots_monitor", lookback_wall_s=5)
-    (event,) = [row for row in rows_of(answer["events"]) if row["kind"] == "log"]
-    assert event["details"]["message"] == "the arm is blocked"
 
 
 async def test_what_began_before_the_window_and_goes_on_is_told_with_its_begin(
@@ -120,19 +98,6 @@ async def test_over_a_reset_the_movement_is_told_run_by_run(
     assert second["run_id"] == first["run_id"] + 1
 
 
-async def test_each_run_moved_by_its_own_position(connect: Connect, rover: RecordedRobot) -> None:
-    drive(rover, [0, 0], [3, 4])
-    rover.end_run("reset")
-    rover.begin_run("reset")
-    for step in range(3):
-        rover.state(step * 0.5, {"gps": {"x": step, "y": 0}}, at=rover.now + step * 0.5)
-    async with connect() as client:
-        answer = await ask(client, "webots_monitor", lookback_wall_s=60)
-    first, second = answer["movement"]["runs"]
-    assert (first["position"], first["distance_m"]) == (["pose.0", "pose.1"], 5.0)
-    assert (second["position"], second["distance_m"]) == (["gps.x", "gps.y"], 2.0)
-
-
 def test_a_movement_says_from_when_on_rows_were_not_read(
     recorded: Recorded, rover: RecordedRobot, tmp_path: Path
 ) -> None:
@@ -144,22 +109,6 @@ def test_a_movement_says_from_when_on_rows_were_not_read(
         answer = movement(view, whole, 0)
     assert answer is not None
     assert answer["rows_missing_from_s"] < 1499.5
-
-
-def test_a_long_movement_is_summed_up_to_the_newest_row(
-    recorded: Recorded, rover: RecordedRobot, tmp_path: Path
-) -> None:
-    recorded.connection.execute("BEGIN")
-    for step in range(2004):  # there and back once, in steps of 1 cm
-        place = [0.01 * min(step, 2000 - step), 0]
-        rover.state(step * 0.1, {"pose": place}, at=rover.now + step * 0.1)
-    recorded.connection.execute("COMMIT")
-    with Recording(recorded.database, tmp_path).view(None, None) as view:
-        answer = movement(view, find_range(view.connection, Scope()))
-    assert answer is not None
-    assert answer["distance_m"] == pytest.approx(20.03, abs=0.03)
-    assert answer["to_m"] == pytest.approx([-0.03, 0])
-    assert "distance_note" not in answer
 
 
 async def test_a_robot_that_ended_is_not_waited_for_and_nothing_is_absent(

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from tests.trials.conftest import Run, command, rows, wait_for_trial
-from webots_mcp.steering.trial_plan import read_plan
 
 Plan = Callable[[str], Path]
 
@@ -118,13 +117,6 @@ def test_what_is_over_so_far_is_ranked_and_who_leads_is_told(
 
     plan('score = "last(x)"\nfor_s = 0.3\n[grid]\nspeed = [1.0]')
     assert "no trials of " in run("--so-far").stderr
-
-
-def test_the_example_tries_five_speeds_three_times() -> None:
-    plan = read_plan(Path(__file__).parents[2] / "examples" / "trials" / "speed.toml")
-
-    assert len(plan.trials) == 15
-    assert len({each["speed"] for each in plan.trials}) == 5
 
 
 @pytest.mark.parametrize(

@@ -8,12 +8,14 @@ what the system refuses (a full disk) or lacks (a package) with 1, Ctrl-C and SI
 from __future__ import annotations
 
 import contextlib
+import inspect
 import json
 import os
 import sys
-from collections.abc import Mapping, Sequence
+import traceback
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from webots_mcp.cli.terminal import (
     Typed,
@@ -22,14 +24,16 @@ from webots_mcp.cli.terminal import (
     ending_by_signals,
     speak_of,
     spelling_out,
+    value_name,
 )
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.naming import spelled_out
 
 if TYPE_CHECKING:
-    from cyclopts import CycloptsError
+    from cyclopts import App, Argument, CycloptsError
 
-__all__ = ["main"]
+    from webots_mcp.cli.commands import Command
+
 _NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
 EXIT_SYSTEM: Final = 1
 EXIT_BAD_INPUT: Final = 2
@@ -62,6 +66,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         _discard_output()
     except OSError as error:
         return _fail(EXIT_SYSTEM, str(error), given)
+    except Exception as error:  # noqa: BLE001  (raised again unless it is about a value)
+        return _fail(EXIT_SYSTEM, _explain_value(error), given)
     return 0
 
 
@@ -69,7 +75,7 @@ def _run(argv: Sequence[str]) -> int:
     """Call the command that was given; without one, show which there are."""
     from cyclopts import CycloptsError, UnusedCliTokensError
 
-    from webots_mcp.cli.commands import COMMANDS, app_for, called_value
+    from webots_mcp.cli.commands import COMMANDS
 
     app = app_for(argv)
     if argv and argv[0] in COMMANDS:
@@ -146,5 +152,105 @@ def _explain_missing(error: ModuleNotFoundError) -> str:
     )
 
 
+def _explain_value(error: Exception) -> str:
+    """What is most likely wrong with the recording, and where it shows.
+
+    Raises:
+        Exception: Again, where it is not about a value of a row.
+    """
+    from webots_mcp.store.recording import is_over_a_value
+
+    if not is_over_a_value(error):
+        raise error
+    frame, what = traceback.extract_tb(error.__traceback__)[-1], type(error).__name__
+    return (
+        "a row holds what no bridge has written, or webots-mcp has a defect: "
+        f"{what} in {frame.name}, line {frame.lineno}: {error}"
+    )
+
+
 def _discard_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+# -- commands as cyclopts knows them --
+
+_HELP: Final = """Flight recorder and remote control for Webots simulations.
+
+Controllers record into one SQLite database, an AI assistant reads it and steers the simulation
+over MCP. Try `webots-mcp demo` first; `webots-mcp COMMAND --help` explains a command.
+"""
+
+
+def app_for(argv: Sequence[str]) -> App:
+    """The application with the command that is called; with all of them for help and completion."""
+    from cyclopts import App, Group, Parameter
+
+    from webots_mcp import __version__
+    from webots_mcp.cli.commands import COMMANDS, GROUPS
+
+    app = App(
+        name="webots-mcp",
+        help=_HELP,
+        version=__version__,
+        version_flags=["--version"],
+        suppress_keyboard_interrupt=False,
+        default_parameter=Parameter(negative=(), show_default=False),
+    )
+    called = argv[0] if argv else ""
+    names = [called] if called in COMMANDS else list(COMMANDS)
+    groups = {name: Group(name, sort_key=place) for place, name in enumerate(GROUPS)}
+    for name in names:
+        command = COMMANDS[name]
+        app.command(_function_of(command), name=name, group=groups[command.group])
+    return app
+
+
+def _function_of(command: Command) -> Callable[..., Any]:
+    """Its function, with the parameters that are its options."""
+    found = command.declared()
+    if inspect.isfunction(found):
+        return found
+    from webots_mcp.cli.asking import command_of
+
+    return command_of(found)
+
+
+class Described(NamedTuple):
+    """A command as its help describes it; arguments by how they are typed."""
+
+    text: str
+    arguments: dict[str, str]
+
+
+def described() -> dict[str, Described]:
+    """Every command by its name."""
+    from webots_mcp.cli.commands import COMMANDS
+
+    app = app_for([])
+    return {
+        name: Described(
+            inspect.getdoc(_function_of(command)) or "",
+            {
+                _typed(each): each.parameter.help or ""
+                for each in app[name].assemble_argument_collection()
+                if each.show
+            },
+        )
+        for name, command in sorted(COMMANDS.items())
+    }
+
+
+def called_value(argument: Argument) -> str:
+    """The word for its value."""
+    metavar = getattr(argument.parameter, "metavar", None)  # cyclopts 4 has none
+    return metavar if isinstance(metavar, str) else value_name(argument.names[-1])
+
+
+def _typed(argument: Argument) -> str:
+    """All names of an option, with a word for its value."""
+    names = argument.names
+    if argument.hint is bool or not names[0].startswith("-"):
+        return ", ".join(names)
+    value = "|".join(argument.get_choices() or [called_value(argument)])
+    return ", ".join(f"{name} {value}" for name in names)

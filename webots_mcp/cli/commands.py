@@ -6,13 +6,8 @@ Only the command that is called is imported, so that it answers at once.
 from __future__ import annotations
 
 import importlib
-import inspect
-from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
-from cyclopts import App, Argument, Group, Parameter
-
-from webots_mcp.cli.terminal import value_name
 from webots_mcp.plugins import plugin_commands
 
 
@@ -26,15 +21,6 @@ class Command(NamedTuple):
     def declared(self) -> Any:
         """What the module has under its name: a `Question`, or a function."""
         return getattr(importlib.import_module(self.module), self.name)
-
-    def load(self) -> Callable[..., Any]:
-        """Its function, with the parameters that are its options."""
-        found = self.declared()
-        if inspect.isfunction(found):
-            return found
-        from webots_mcp.cli.asking import command_of
-
-        return command_of(found)
 
 
 NOW, PAST, STEER, DATA, SETUP = (
@@ -83,67 +69,3 @@ _OF_THE_CORE: Final = {
 COMMANDS: Final[dict[str, Command]] = _OF_THE_CORE | {
     each.name: Command(each.group, *each.function.split(":")) for each in plugin_commands()
 }
-_HELP: Final = """Flight recorder and remote control for Webots simulations.
-
-Controllers record into one SQLite database, an AI assistant reads it and steers the simulation
-over MCP. Try `webots-mcp demo` first; `webots-mcp COMMAND --help` explains a command.
-"""
-
-
-def app_for(argv: Sequence[str]) -> App:
-    """The application with the command that is called; with all of them for help and completion."""
-    from webots_mcp import __version__
-
-    app = App(
-        name="webots-mcp",
-        help=_HELP,
-        version=__version__,
-        version_flags=["--version"],
-        suppress_keyboard_interrupt=False,
-        default_parameter=Parameter(negative=(), show_default=False),
-    )
-    called = argv[0] if argv else ""
-    names = [called] if called in COMMANDS else list(COMMANDS)
-    groups = {name: Group(name, sort_key=place) for place, name in enumerate(GROUPS)}
-    for name in names:
-        command = COMMANDS[name]
-        app.command(command.load(), name=name, group=groups[command.group])
-    return app
-
-
-class Described(NamedTuple):
-    """A command as its help describes it; arguments by how they are typed."""
-
-    text: str
-    arguments: dict[str, str]
-
-
-def described() -> dict[str, Described]:
-    """Every command by its name."""
-    app = app_for([])
-    return {
-        name: Described(
-            inspect.getdoc(command.load()) or "",
-            {
-                _typed(each): each.parameter.help or ""
-                for each in app[name].assemble_argument_collection()
-                if each.show
-            },
-        )
-        for name, command in sorted(COMMANDS.items())
-    }
-
-
-def called_value(argument: Argument) -> str:
-    """The word for its value."""
-    metavar = getattr(argument.parameter, "metavar", None)  # cyclopts 4 has none
-    return metavar if isinstance(metavar, str) else value_name(argument.names[-1])
-
-
-def _typed(argument: Argument) -> str:
-    """All names of an option, with a word for its value."""
-    names = argument.names
-    if argument.hint is bool or not names[0].startswith("-"):
-        return ", ".join(names)
-    value = "|".join(argument.get_choices() or [called_value(argument)])
-    return ", ".join(f"{name} {value}" for name in names)

@@ -471,7 +471,7 @@ def completion(
     from cyclopts.completion import detect_shell
     from cyclopts.completion.detect import ShellDetectionError
 
-    from webots_mcp.cli.commands import app_for
+    from webots_mcp.cli import app_for
 
     try:
         shell = shell or detect_shell()

@@ -345,7 +345,7 @@ def _simulators(options: _Options, plan: WorldPlan) -> AbstractContextManager[Si
 def _cluster(options: _Options, plan: WorldPlan) -> Generator[Simulators]:
     from webots_mcp.plugins import cluster_offered, load
 
-    with load(cluster_offered().simulators)(
+    with load(cluster_offered())(
         options.scheduler,
         plan,
         is_stand_in=options.stand_in,

@@ -52,18 +52,6 @@ class PluginCommand(NamedTuple):
     function: str
 
 
-class Cluster(NamedTuple):
-    """Trials on other machines.
-
-    Attributes:
-        simulators: A context manager that gives `trials.running.Simulators`, of a scheduler.
-        worker: A thread of the server that hands the trials of a set out.
-    """
-
-    simulators: str
-    worker: str
-
-
 class Plugin(NamedTuple):
     """What a plugin adds to the core.
 
@@ -71,7 +59,8 @@ class Plugin(NamedTuple):
         commands: For the command line.
         questions: Modules that declare questions (`questions.declaring`), which are MCP tools.
         formats: Of exports.
-        cluster: Where else trials can run.
+        cluster: Where else trials can run: a context manager that gives
+            `steering.trial_run.Simulators`, of a scheduler.
         stand_in: Runs a world without Webots, in the foreground: `run(world, mode, duration_s,
             controllers)`, which returns the exit code.
     """
@@ -79,7 +68,7 @@ class Plugin(NamedTuple):
     commands: tuple[PluginCommand, ...] = ()
     questions: tuple[str, ...] = ()
     formats: tuple[ExportFormat, ...] = ()
-    cluster: Cluster | None = None
+    cluster: str | None = None
     stand_in: str | None = None
 
 
@@ -110,7 +99,7 @@ def export_formats() -> tuple[ExportFormat, ...]:
     return tuple(each for plugin in plugins() for each in plugin.formats)
 
 
-def cluster_offered() -> Cluster:
+def cluster_offered() -> str:
     """Where trials run on other machines."""
     return next(plugin.cluster for plugin in plugins() if plugin.cluster is not None)
 

@@ -8,18 +8,15 @@ from typing import Annotated, Any, Final, Literal, cast
 import anyio
 from anyio import to_thread
 from pydantic import Field
-from pydantic.json_schema import SkipJsonSchema
 
 from webots_mcp.contract import MAX_RUN_S, MAX_STEPS, Pace, Then
 from webots_mcp.errors import (
     CommandRefusedError,
     InvalidInputError,
-    NothingRecordedError,
-    WebotsMCPError,
 )
 from webots_mcp.launch import Launch, SessionStart, require_world
-from webots_mcp.questions.answers import CommandAnswer, RunAnswer, ShownPicture
-from webots_mcp.questions.budget import cut_text, seconds
+from webots_mcp.questions.answers import CommandAnswer, RunAnswer
+from webots_mcp.questions.budget import cut_text
 from webots_mcp.questions.declaring import (
     CHANGES,
     DESTROYS,
@@ -32,11 +29,9 @@ from webots_mcp.questions.declaring import (
     merged,
     question,
 )
-from webots_mcp.questions.pictures import load_picture
-from webots_mcp.steering.dispatch import ACTION, Dispatcher, find_target, require_possible
+from webots_mcp.steering.dispatch import ACTION, Dispatcher, require_possible
 from webots_mcp.steering.routes import Attempt, WorldRequest, project_of
-from webots_mcp.store.recording import Recording, look
-from webots_mcp.store.run_rows import camera_frames, inside
+from webots_mcp.store.recording import Recording
 from webots_mcp.webots.orders import Order
 from webots_mcp.webots.starting import Mode, Start, free_port
 
@@ -48,6 +43,7 @@ Force = Annotated[bool, Field(description="Press Webots' keys where nothing else
 
 _WAIT_S: Final = 10.0
 _RELOAD_WAIT_S: Final = 30.0
+_USUAL_WAIT_S: Final[dict[Order, float]] = {"reload": _RELOAD_WAIT_S, "step": MAX_WAIT_S}
 
 
 @question("Control the simulation", DESTROYS, core=True)
@@ -63,7 +59,7 @@ async def webots_simulation_control(
     port: Port = None,
     robot: RobotName = None,
     timeout_wall_s: Annotated[
-        WaitS | None, Field(description="10, for reload 30, for step up to 90.")
+        WaitS | None, Field(description="10, for reload 30, for step 90.")
     ] = None,
 ) -> CommandAnswer:
     """Pause, resume, run fast, step, reset or reload, and wait for the outcome.
@@ -77,9 +73,7 @@ async def webots_simulation_control(
         raise InvalidInputError(f"steps is for command='step', not for {command!r}: leave it out")
     steps = steps or 1
     params = {"steps": steps} if command == "step" else {}
-    waiting_s = timeout_wall_s or await to_thread.run_sync(
-        _usual_wait_s, recording, command, steps, robot
-    )
+    waiting_s = timeout_wall_s or _USUAL_WAIT_S.get(command, _WAIT_S)
     dispatcher = Dispatcher(recording, caller.report)
     attempt = Attempt(recording, dispatcher, robot, waiting_s, command, params, force, port)
     return await attempt.steer()
@@ -89,7 +83,7 @@ async def webots_simulation_control(
 async def webots_world_reload(
     recording: Recording,
     caller: Caller,
-    force: SkipJsonSchema[Force] = False,
+    force: Force = False,
     robot: RobotName = None,
     timeout_wall_s: TimeoutS = _RELOAD_WAIT_S,
 ) -> CommandAnswer:
@@ -123,23 +117,6 @@ async def webots_reset_controller_state(
     Runs its action reset_state, else the callbacks of bridge.on_reload().
     """
     return await Dispatcher(recording, caller.report).ask(robot, "reset_state", timeout_wall_s)
-
-
-def _usual_wait_s(recording: Recording, command: Order, steps: int, robot: str | None) -> float:
-    """Long enough for steps at half of real time, and for a reload."""
-    if command == "reload":
-        return _RELOAD_WAIT_S
-    if command != "step":
-        return _WAIT_S
-    with recording.reader() as connection:
-        try:
-            run = find_target(connection, robot, command).run
-        except CommandRefusedError:  # another way may do it
-            run = look(connection, robot).run
-        except NothingRecordedError:
-            run = None
-        step_ms = (run.basic_time_step_ms if run else None) or 32.0  # Webots' default
-    return min(_WAIT_S + 2 * steps * step_ms / 1000, MAX_WAIT_S)
 
 
 # -- Webots itself: started on a world, another world in it, ended --
@@ -276,8 +253,6 @@ def _described(launched: Launch) -> dict[str, Any]:
 # -- running until something is the case --
 
 _RUN_WAIT_S: Final = 60.0
-_PICTURE_WAIT_S: Final = 8.0
-_SAME_S: Final = 0.001  # times are told to the millisecond
 
 
 @question(
@@ -308,7 +283,6 @@ async def webots_run(
         Field(description="Set these first, all or none."),
     ] = None,
     then: Annotated[Then, Field(description="At that step; go_on: at the old pace.")] = "pause",
-    picture: Annotated[bool, Field(description="A screenshot of the end, too.")] = False,
     robot: RobotName = None,
     timeout_wall_s: TimeoutS = _RUN_WAIT_S,
 ) -> RunAnswer:
@@ -328,56 +302,7 @@ async def webots_run(
     }
     dispatcher = Dispatcher(recording, caller.report)
     asked = {name: value for name, value in params.items() if value is not None}
-    answer = cast("RunAnswer", await dispatcher.ask(robot, ACTION, timeout_wall_s, asked))
-    if picture and answer.outcome == "done":
-        await _add_picture(recording, dispatcher, answer)
-    return answer
-
-
-async def _add_picture(recording: Recording, dispatcher: Dispatcher, answer: RunAnswer) -> None:
-    """A screenshot beside the data, or a camera frame of that step, or why there is neither."""
-    try:
-        shot = await dispatcher.ask(answer.robot, "screenshot", _PICTURE_WAIT_S, {"quality": 90})
-        if shot.outcome != "done":
-            raise CommandRefusedError(
-                shot.error or shot.hint or f"the screenshot is {shot.outcome}"
-            )
-        file = inside(recording.data_dir, str(cast("dict[str, Any]", shot.result)["path"]))
-        facts: dict[str, Any] = {"file": str(file), "sim_time_s": shot.sim_time_s}
-        image, note = await to_thread.run_sync(load_picture, file)
-    except WebotsMCPError as error:
-        await to_thread.run_sync(_add_frame, recording, answer, str(error))
-        return
-    _attach(answer, image, facts, note, "webots_take_screenshot")
-
-
-def _add_frame(recording: Recording, answer: RunAnswer, why: str) -> None:
-    """What a camera saw at the step at which the run ended, where that was recorded."""
-    ran = answer.ran or {}
-    frame = None
-    if ran.get("run_id") is not None:
-        with recording.reader() as connection:
-            found = camera_frames(connection, ran["run_id"], at_s=ran["to_s"])
-        frame = next((each for each in found if abs(each.sim_time_s - ran["to_s"]) < _SAME_S), None)
-    if frame is None:
-        answer.picture = {"missing": why}
-        return
-    try:
-        image, note = load_picture(frame.file(recording.data_dir))
-    except WebotsMCPError as error:
-        answer.picture = {"missing": f"{why}; {error}"}
-        return
-    file = str(recording.data_dir / frame.path)
-    facts = {"camera": frame.device, "file": file, "sim_time_s": seconds(frame.sim_time_s)}
-    _attach(answer, image, facts | {"no_screenshot": why}, note, "webots_get_camera")
-
-
-def _attach(
-    answer: RunAnswer, image: ShownPicture, facts: dict[str, Any], note: str, again: str
-) -> None:
-    answer.pictures.append(image)
-    answer.picture = facts | ({"note": note} if note else {})
-    answer.picture["see"] = f"beside this answer; if your client drops it, {again}"
+    return cast("RunAnswer", await dispatcher.ask(robot, ACTION, timeout_wall_s, asked))
 
 
 WORLD: Final = merged(

@@ -54,7 +54,6 @@ _NO_RUN_YET: Final = (
     command="logs",
     options={"lines": "-n", "filter_text": "--text", "cursor": "--before"},
     core=True,
-    follows="lines",
 )
 def webots_get_logs(
     recording: Recording,

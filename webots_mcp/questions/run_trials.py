@@ -1,4 +1,4 @@
-"""Trying parameters in the running simulation or on a cluster, and ranking them by a score."""
+"""Trying parameters in the running simulation, and ranking them by a score."""
 
 from __future__ import annotations
 
@@ -42,11 +42,8 @@ from webots_mcp.questions.declaring import (
 from webots_mcp.questions.send_command import settable
 from webots_mcp.steering.dispatch import ACTION, find_target, known_names, require_possible
 from webots_mcp.steering.trial_plan import (
-    SCHEDULER,
     TrialPlan,
-    WorldPlan,
     combinations,
-    stored_world_plan,
 )
 from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.analysis.summary import Best, Ranked, Ranking
@@ -57,7 +54,6 @@ from webots_mcp.store.parameters import (
     best_of,
     count_planned,
     create_trial_set,
-    declared_for,
     fetch_trial_set,
     find_trial_set,
     is_at_work,
@@ -66,8 +62,8 @@ from webots_mcp.store.parameters import (
     stop_trial_set,
     trials_of,
 )
-from webots_mcp.store.questions.runs import require_kinds, unseen, way_of_run
-from webots_mcp.store.reading.segment import Deadline, Subject, in_one_snapshot
+from webots_mcp.store.questions.runs import require_kinds, unseen
+from webots_mcp.store.reading.segment import in_one_snapshot
 from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.robots import robot_name
 
@@ -133,9 +129,6 @@ async def webots_run_trials(
     trial_timeout_wall_s: Annotated[float, Field(gt=0, description="At most.")] = _TRIAL_S,
     trial_set: TrialSetId = None,
     cancel: Annotated[bool, Field(description="Stop it after this trial.")] = False,
-    scheduler: Annotated[
-        str | None, Field(description="tcp://HOST:8786: on a Dask cluster, a simulator each.")
-    ] = None,
     robot: RobotName = None,
     timeout_wall_s: TimeoutS = _WAIT_S,
 ) -> TrialsAnswer:
@@ -156,11 +149,11 @@ async def webots_run_trials(
         asked = {"score": score, "best": best, "for_s": for_s, "until": until, "repeats": repeats}
         asked |= {"timeout_s": trial_timeout_wall_s, "prune": prune}
         number = await to_thread.run_sync(
-            lambda: _begin(recording, workers, parameters, robot, scheduler, asked)
+            lambda: _begin(recording, workers, parameters, robot, asked)
         )
     else:
         number = trial_set
-        await to_thread.run_sync(_take_up, recording, workers, number, scheduler, cancel)
+        await to_thread.run_sync(_take_up, recording, workers, number, cancel)
     try:
         await _wait(recording, caller, number, timeout_wall_s)
     except anyio.get_cancelled_exc_class():
@@ -181,7 +174,6 @@ def _begin(
     workers: TrialWorkers,
     parameters: list[dict[str, _Value]] | dict[str, list[_Value]],
     robot: str | None,
-    scheduler: str | None,
     asked: dict[str, Any],
 ) -> int:
     """Enter a set of trials, after checking that they can be run, and begin it; returns its id.
@@ -193,8 +185,6 @@ def _begin(
             over.
     """
     sets = combinations(parameters) if isinstance(parameters, dict) else parameters
-    if scheduler is not None:
-        return _begin_on_cluster(recording, workers, sets, robot, scheduler, asked)
     require_possible(recording, robot, asked["until"], asked["for_s"], reset=True)
     if asked["prune"] is not None:
         require_possible(recording, robot, asked["prune"], None, reset=True)
@@ -207,32 +197,6 @@ def _begin(
         set_id = create_trial_set(connection, plan.text, plan.trials, view.robot.id)
     workers.begin(set_id)
     return set_id
-
-
-def _begin_on_cluster(
-    recording: Recording,
-    workers: TrialWorkers,
-    sets: list[dict[str, Any]],
-    robot: str | None,
-    scheduler: str,
-    asked: dict[str, Any],
-) -> int:
-    """The same in the world of a robot's newest run; the robot need not be live."""
-    with recording.reader() as connection:
-        view = look(connection, robot)
-        run = view.require_run()
-        if run.world is None:
-            raise InvalidInputError(f"the world file of run {run.id} is not recorded")
-        checked = _as_declared(declared_for(connection, view.robot.id), sets)
-        plan = WorldPlan(world=run.world, parameters=checked, robot=view.robot.name, **asked)
-        _require_scorable(connection, plan, view)
-    text = json.dumps({SCHEDULER: scheduler, **json.loads(plan.text)}, sort_keys=True)
-
-    def enter() -> int:
-        with recording.writer() as connection:
-            return create_trial_set(connection, text, plan.trials)
-
-    return workers.begin_on_cluster(scheduler, plan, enter)
 
 
 def _require_scorable(connection: sqlite3.Connection, plan: TrialPlan, view: View) -> None:
@@ -253,10 +217,8 @@ def _as_declared(
     ]
 
 
-def _take_up(
-    recording: Recording, workers: TrialWorkers, set_id: int, scheduler: str | None, cancel: bool
-) -> None:
-    """Continue a set, or end it, unless somebody works on it already.
+def _take_up(recording: Recording, workers: TrialWorkers, set_id: int, cancel: bool) -> None:
+    """Continue a set, or end it, unless another process works on it already.
 
     Raises:
         InvalidInputError: It cannot be continued here, or there is no such set.
@@ -264,38 +226,23 @@ def _take_up(
     with recording.reader() as connection:
         found = fetch_trial_set(connection, set_id)
         at_work = is_at_work(connection, found)
-    elsewhere = _names_world(found)
-    if scheduler is not None and not elsewhere:
-        raise InvalidInputError(f"trial set {set_id} runs in a robot's simulation, on no cluster")
-    if found.robot_id is None and not (elsewhere and (cancel or at_work or scheduler)):
-        why = f"has simulators of its own: {_goes_on(found)}" if elsewhere else _FROM_ELSEWHERE
+    if found.robot_id is None and not at_work:
         raise InvalidInputError(
-            f'trial set {set_id} {why}; webots_list_runs(what="trials", trial_set={set_id}) has '
-            "its trials"
+            f'trial set {set_id} {_goes_on(found)}; webots_list_runs(what="trials", '
+            f"trial_set={set_id}) has its trials"
         )
     if cancel:
         _stop(recording, set_id, CANCELLED)
-    if at_work:
+    if at_work or found.robot_id is None:
         return
-    if not elsewhere:
-        if not cancel:
-            _stop(recording, set_id, None)
-        workers.begin(set_id)  # also to restore the parameters of one that is cancelled
-    elif scheduler is not None and not cancel:
-        plan, is_stand_in = stored_world_plan(found.plan)
-        workers.begin_on_cluster(scheduler, plan, lambda: set_id, is_stand_in=is_stand_in)
-
-
-def _names_world(found: TrialSet) -> bool:
-    """Whether the trials of a set each have a simulator of their own."""
-    return "world" in json.loads(found.plan)
+    if not cancel:
+        _stop(recording, set_id, None)
+    workers.begin(set_id)  # also to restore the parameters of one that is cancelled
 
 
 def _goes_on(found: TrialSet) -> str:
-    """How to continue a set whose trials have simulators of their own."""
-    scheduler = json.loads(found.plan).get(SCHEDULER)
-    again = f"webots_run_trials(trial_set={found.id}, scheduler={scheduler or 'tcp://...'!r})"
-    return f"{again} continues it" if scheduler else f"{_GOES_ON}, or {again} on a cluster"
+    """How to continue a set that no robot's simulation runs."""
+    return _IN_SIMULATORS if "world" in json.loads(found.plan) else _FROM_ELSEWHERE
 
 
 def _stop(recording: Recording, set_id: int, reason: str | None) -> None:
@@ -325,20 +272,14 @@ async def _wait(recording: Recording, caller: Caller, set_id: int, timeout_wall_
 
 CANCELLED: Final = "it was cancelled"
 _TABLE_TOKENS: Final = 1_250
-_GOES_ON: Final = "the command 'webots-mcp trials PLAN' continues it"
+_IN_SIMULATORS: Final = (
+    "has simulators of its own: the command 'webots-mcp trials PLAN' continues it"
+)
 _FROM_ELSEWHERE: Final = "came from another recording, and its robot did not: begin a new set"
 _LONGEST_WHY: Final = 120
 _RANK_LOWER: Final = "that rank lower are not shown: webots_query_sql has all in table trial"
 _FIGURES: Final = ("score", "range", "scored", "pruned", "failed", "why", "runs")
 _MOST_NAMED_RUNS: Final = 5
-_STANDING_DEADLINE_S: Final = 1.0
-_MOVED_M: Final = 0.1  # a robot that travelled as far has moved
-_STILL_M: Final = 0.01  # a robot that travelled less has stood still
-_STILL_NOISES: Final = 4.0  # standard deviations of the position's noise that are not motion
-_BEFORE: Final = (
-    "SELECT id FROM run WHERE robot_id = ? AND id < ? "
-    "ORDER BY start_reason = 'reset', id DESC LIMIT 5"
-)
 
 
 # -- answers ----------------------------------------------------------------------------------
@@ -394,9 +335,7 @@ def _facts(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
         "verdict": ranking.verdict if over else None,
         "notes": notes_of(
             [
-                *_standing(connection, found, trials),
                 *[f"{left_out} sets {_RANK_LOWER}"] * (left_out > 0),
-                *_gone(connection, trials),
                 *unseen(connection, (each.run_id for each in trials if each.score is not None)),
             ]
         ),
@@ -417,7 +356,7 @@ def _state(found: TrialSet, left: int, *, at_work: bool) -> tuple[str, str | Non
     if not left:
         return "done", None
     if found.robot_id is None:
-        return "left", _goes_on(found) if _names_world(found) else _FROM_ELSEWHERE
+        return "left", f"it {_goes_on(found)}"
     return why, f"{again} continues with the {left} that are left"
 
 
@@ -453,51 +392,6 @@ def _row(ranked: Ranked, names: Sequence[str], runs: Sequence[int]) -> list[Any]
         why and cut_text(why, _LONGEST_WHY),
         list(runs[:_MOST_NAMED_RUNS]),
     ]
-
-
-def _standing(
-    connection: sqlite3.Connection, found: TrialSet, trials: Sequence[Trial]
-) -> list[str]:
-    """A note where a robot moved before its trials, but stood still in all of them."""
-    runs = [each.run_id for each in trials if each.is_over and each.run_id is not None]
-    if found.robot_id is None or not runs:
-        return []
-    robot, deadline = f"robot {found.robot_id}", Deadline(_STANDING_DEADLINE_S)
-    stood = 0
-    for run_id in runs:
-        way = way_of_run(connection, Subject(found.robot_id, robot, run_id), deadline)
-        if way is not None and way.length_m >= max(_STILL_M, _STILL_NOISES * way.noise_m):
-            return []
-        stood += way is not None
-    before = connection.execute(_BEFORE, (found.robot_id, min(runs))).fetchall()
-    for (run_id,) in before if stood else ():
-        way = way_of_run(connection, Subject(found.robot_id, robot, run_id), deadline)
-        if way is not None and way.length_m >= max(_MOVED_M, _STILL_NOISES * way.noise_m):
-            return [
-                f"the robot travelled {figure(way.length_m)} m in run {run_id}, before the trials, "
-                f"but stood still in all {stood} that were checked: a reset does not repeat what "
-                "its controller does once, before its loop (docs/trials.md: motors after a reset)"
-            ]
-    return []
-
-
-def _gone(connection: sqlite3.Connection, trials: Sequence[Trial]) -> list[str]:
-    """A note on trials whose rows were purged: their scores remain."""
-    asked = json.dumps([each.run_id for each in trials if each.run_id is not None])
-    purged = {number for (number,) in connection.execute(_PURGED, (asked,)).fetchall()}
-    deleted = [each.number for each in trials if each.score is not None and each.run_id is None]
-    gone = sorted({each.number for each in trials if each.run_id in purged} | {*deleted})
-    if not gone:
-        return []
-    listed = ", ".join(map(str, gone[:_MOST_NAMED_RUNS])) + (
-        f" and {len(gone) - _MOST_NAMED_RUNS} more" if len(gone) > _MOST_NAMED_RUNS else ""
-    )
-    return [f"rows of trial {listed} were purged since; the scores remain"]
-
-
-_PURGED: Final = (
-    "SELECT id FROM run WHERE purged_rows > 0 AND id IN (SELECT value FROM json_each(?))"
-)
 
 
 RUNS: Final = merged(

@@ -696,24 +696,12 @@ def _is_reloading(session: Session, now_s: float) -> bool:
 def _who_may(view: View, session: Session, action: str) -> str:
     others = [s for s in companions(view.connection, session, view.now_s) if s.supervisor]
     next_step = _MAKE_ONE
-    if ended := _ended_supervisors(view, session):
-        next_step = (
-            f"robot {ended[0]!r} is a Supervisor of this simulation, but its controller has ended: "
-            "start it again, or reload the world in Webots"
-        )
     if others:
         name = robot_name(view.connection, others[0].robot_id)
         next_step = f"robot {name!r} is a Supervisor of this simulation: ask it (robot={name!r})"
         if action == "run":
             next_step += f"; for conditions and parameters of {view.robot.name!r}, {_MAKE_ONE}"
     return f"{action} needs a Supervisor and robot {view.robot.name!r} is not one: {next_step}"
-
-
-def _ended_supervisors(view: View, session: Session) -> list[str]:
-    """Former Supervisors of the same simulation whose controller has ended."""
-    robots = [each for each in list_robots(view.connection, view.now_s) if not each.live]
-    seen = [(each.name, each.session) for each in robots if each.session is not None]
-    return [name for name, it in seen if it.supervisor and it.instance == session.instance]
 
 
 def _require_free(view: View, session: Session, action: str) -> None:

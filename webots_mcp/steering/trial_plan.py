@@ -21,7 +21,6 @@ from webots_mcp.store.analysis.summary import Best
 Search = Literal["tpe", "random"]
 MOST_TRIALS: Final = 10_000
 _MOST_SEED: Final = 2**63
-SCHEDULER: Final = "scheduler"  # in the text of a plan that an assistant has begun on a cluster
 _STEPS_TOLERANCE: Final = 1e-9
 _GRID: Final = "grid"
 _REQUIRED: Final = ("world", "score")
@@ -211,23 +210,6 @@ def read_plan(file: Path, search: Search | None = None) -> WorldPlan:
 def stored_plan(text: str) -> TrialPlan:
     """What the text of a plan says whose trials run in a robot's simulation."""
     return TrialPlan(**json.loads(text))
-
-
-def stored_world_plan(text: str) -> tuple[WorldPlan, bool]:
-    """What the text of a plan says whose trials have simulators of their own.
-
-    Returns:
-        The plan, and whether its trials run on the stand-in.
-
-    Raises:
-        InvalidInputError: Its world file is not there any more.
-    """
-    found = cast("dict[str, Any]", json.loads(text))
-    is_stand_in = bool(found.pop("stand_in", False))
-    found = {name: value for name, value in found.items() if name != SCHEDULER}
-    if found["ranges"]:
-        found["ranges"] = _read_ranges(found["ranges"])
-    return WorldPlan(**found), is_stand_in
 
 
 def _plan_of(found: dict[str, Any], folder: Path, search: Search | None) -> WorldPlan:

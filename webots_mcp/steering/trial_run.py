@@ -468,28 +468,12 @@ def run_trials(set_run: SetRun, set_id: int, report: Report) -> None:
         InvalidInputError: No trial of the set can succeed; nothing else is tried.
         StoppedError: The caller wanted to stop; running trials will be run again.
     """
-    run_taken_up(taken_up(set_run, set_id), set_id, report)
-
-
-def taken_up(set_run: SetRun, set_id: int) -> SetRun:
-    """The same, as the process that works on the set: `run_taken_up` has to follow.
-
-    Raises:
-        CommandRefusedError: Another process works on it.
-    """
     with set_run.recording.writer() as connection:
         job = Job(set_run.recording, take_up(connection, set_id))
         stop_trial_set(connection, set_id, None)
-    return replace(set_run, job=job)
-
-
-def run_taken_up(set_run: SetRun, set_id: int, report: Report) -> None:
-    """The rest of `run_trials`; it stores why a set stops."""
-    job = set_run.job
-    assert job is not None
     try:
         with job.renewed():
-            _run_left(set_run, set_id, report)
+            _run_left(replace(set_run, job=job), set_id, report)
     except (CommandRefusedError, InvalidInputError) as error:
         with job.writer() as connection:
             if fetch_trial_set(connection, set_id).stop_reason is None:

@@ -12,14 +12,13 @@ import logging
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Mapping
-from typing import Any, Final, Protocol
+from collections.abc import Mapping
+from typing import Any, Final
 
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, LeaseLostError, WebotsMCPError
-from webots_mcp.plugins import cluster_offered, load
 from webots_mcp.queue import Command, CommandQueue, fetch_command, find_command
 from webots_mcp.steering.dispatch import ACTION, find_target
-from webots_mcp.steering.trial_plan import TrialPlan, WorldPlan, stored_plan
+from webots_mcp.steering.trial_plan import TrialPlan, stored_plan
 from webots_mcp.store.parameters import (
     Result,
     Trial,
@@ -343,20 +342,6 @@ class TrialWorker(threading.Thread):
         return CommandQueue(connection).enqueue(noted.robot_id, action, params, requested_by=_ASKER)
 
 
-class SetWorker(Protocol):
-    """A thread that works on a trial set, here or on other machines."""
-
-    set_id: int
-
-    def is_alive(self) -> bool:
-        """Whether it is still working."""
-        ...
-
-    def stop(self) -> None:
-        """End soon, and leave the set as it is."""
-        ...
-
-
 class TrialWorkers:
     """The workers of a server.
 
@@ -366,7 +351,7 @@ class TrialWorkers:
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
-        self._workers: list[SetWorker] = []
+        self._workers: list[TrialWorker] = []
 
     def begin(self, set_id: int) -> None:
         """Work on a set.
@@ -376,34 +361,6 @@ class TrialWorkers:
         """
         worker = TrialWorker(self._recording, set_id)
         worker.start()
-        self._keep(worker)
-
-    def begin_on_cluster(
-        self,
-        scheduler: str,
-        plan: WorldPlan,
-        enter: Callable[[], int],
-        *,
-        is_stand_in: bool = False,
-    ) -> int:
-        """Work on a set whose trials have simulators of their own; returns its id.
-
-        Args:
-            scheduler: The address of the Dask scheduler.
-            plan: The plan of the trials.
-            enter: Enters the set and returns its id; called once its trials can be run.
-            is_stand_in: They run on the stand-in.
-
-        Raises:
-            CommandRefusedError, InvalidInputError: As the worker of the plugin.
-        """
-        worker_of = load(cluster_offered().worker)
-        worker = worker_of(self._recording, scheduler, plan, is_stand_in=is_stand_in)
-        set_id: int = worker.begin(enter)
-        self._keep(worker)
-        return set_id
-
-    def _keep(self, worker: SetWorker) -> None:
         self._workers = [each for each in self._workers if each.is_alive()] + [worker]
 
     def end(self, set_id: int) -> None:

@@ -33,7 +33,7 @@ COLUMNS: Final = (
 
 _DECLARED: Final = (
     "SELECT name, kind, default_value, low, high, choices, doc, unit, next_value FROM parameter "
-    "WHERE {} = ? ORDER BY id"
+    "WHERE session_id = ? ORDER BY id"
 )
 _KINDS: Final = "SELECT name, kind FROM parameter ORDER BY id"
 _NAMES: Final = "SELECT DISTINCT name FROM parameter ORDER BY name"
@@ -118,16 +118,7 @@ RunParameters = Mapping[str, RunParameter]
 
 def declared_by(connection: sqlite3.Connection, session_id: int) -> dict[str, Declared]:
     """The parameters that the controller of a session declares, in its order."""
-    return _declarations(connection, "session_id", session_id)
-
-
-def declared_for(connection: sqlite3.Connection, robot_id: int) -> dict[str, Declared]:
-    """The parameters that a robot's controllers have declared, each as the last of them did."""
-    return _declarations(connection, "robot_id", robot_id)
-
-
-def _declarations(connection: sqlite3.Connection, of: str, key: int) -> dict[str, Declared]:
-    return {row[0]: _declared(row) for row in connection.execute(_DECLARED.format(of), (key,))}
+    return {row[0]: _declared(row) for row in connection.execute(_DECLARED, (session_id,))}
 
 
 def parameters_of(

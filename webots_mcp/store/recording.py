@@ -14,7 +14,6 @@ import threading
 import time
 from collections.abc import Callable, Generator
 from contextlib import closing, contextmanager, suppress
-from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, cast
@@ -34,7 +33,6 @@ from webots_mcp.connection import (
     is_unwritable,
     require_current,
     schema_version,
-    shipped_statements,
     text_of,
 )
 from webots_mcp.contract import DATABASE_NAME, Database, MemoryDatabase
@@ -136,21 +134,17 @@ class OpenReaders:
     """
 
     def __init__(self) -> None:
-        self._idle: dict[bool, list[tuple[object, sqlite3.Connection]]] = {False: [], True: []}
+        self._idle: list[tuple[object, sqlite3.Connection]] = []
         self._is_closed = False
 
     @contextmanager
     def taken(
         self, database: Path, open_one: Callable[[], sqlite3.Connection]
     ) -> Generator[sqlite3.Connection]:
-        """One for a question; it is closed where the question fails.
-
-        Those that leave out invalid rows are kept apart: their views take longer than a question.
-        """
-        idle = self._idle[is_past_invalid_rows()]
+        """One for a question; it is closed where the question fails."""
         while True:
             try:
-                known, connection = idle.pop()
+                known, connection = self._idle.pop()
             except IndexError:
                 connection = open_one()
                 known = _identity(database, connection)
@@ -159,25 +153,23 @@ class OpenReaders:
                 break
             connection.close()
         try:
-            shadow_if_asked(connection)
             yield connection
         except BaseException:
             connection.close()
             raise
-        is_enough = len(idle) >= _MOST_IDLE
+        is_enough = len(self._idle) >= _MOST_IDLE
         if known is None or is_enough or isinstance(connection, FrozenConnection):
             connection.close()
         else:
-            idle.append((known, connection))
+            self._idle.append((known, connection))
         if self._is_closed:
             self.close()
 
     def close(self) -> None:
         """Close all that are not in use, and those when they are given back."""
         self._is_closed = True
-        for idle in self._idle.values():
-            while idle:
-                idle.pop()[1].close()
+        while self._idle:
+            self._idle.pop()[1].close()
 
 
 def _identity(database: Path, connection: sqlite3.Connection) -> object:
@@ -213,7 +205,6 @@ class Recording:
         """A connection that cannot write, and that no other uses meanwhile."""
         if self.readers is None or not isinstance(self.database, Path):
             with self._opened("reader") as connection:
-                shadow_if_asked(connection)
                 yield connection
             return
         with (
@@ -281,7 +272,7 @@ class Recording:
             raise NoDatabaseError(f"{error}. {GETTING_STARTED}") from error
         try:
             self._require_ours(connection)
-            if role == "reader" and isinstance(self.database, Path) and not is_past_invalid_rows():
+            if role == "reader" and isinstance(self.database, Path):
                 show_chunks_aside(connection, self.database)
         except BaseException:
             connection.close()
@@ -439,11 +430,9 @@ class Job:
             _log.warning("%s is not renewed: %s", self.lease.name, error)
 
 
-# Reading past rows that hold what no bridge writes: the one place that says what is invalid.
-#
-# Other programs may write to a recording, and SQLite takes any value in any column. Checking each
-# value would cost every question half of its time, so that a question is asked without it first;
-# one that fails over a value is asked again of `shadow`, which leaves out the invalid rows only.
+# What no bridge writes: the one place that says what is invalid. Other programs may write to a
+# recording, and SQLite takes any value in any column. A question that meets one fails and says so;
+# who makes chunks of rows that fail makes them of the views `valid_NAME`.
 
 
 MAX_DEPTH: Final = 100  # of JSON: the bridge records 20 levels
@@ -483,8 +472,6 @@ _TABLES: Final = ("robot", "session", "run", "state", "log", "event", "image", "
 _UNSTORABLE: Final = (
     TypeError, OverflowError, ValueError, RecursionError, sqlite3.DataError, sqlite3.IntegrityError,
 )  # fmt: skip
-# Where several tables are read as one, a view of `main` would go on to read the tables themselves.
-_IS_SHADOWED: Final = "SELECT 1 FROM sqlite_temp_master WHERE name = 'robot'"
 _COLUMNS: Final = 'SELECT name, type, "notnull", dflt_value, pk FROM pragma_table_info(?)'
 
 
@@ -504,9 +491,6 @@ class InvalidValues:
         return [*list(self._met)[:_SHOWN], *([f"and {more} more"] if more > 0 else [])]
 
 
-_reading: ContextVar[InvalidValues | None] = ContextVar("reading past invalid rows", default=None)
-
-
 def is_over_a_value(error: Exception) -> bool:
     """Whether work on rows failed over what no bridge writes, not over the file."""
     if is_damage(error):
@@ -515,27 +499,10 @@ def is_over_a_value(error: Exception) -> bool:
 
 
 @contextmanager
-def past_invalid_rows() -> Generator[InvalidValues]:
-    """Readers that are opened inside, in this context, do not see invalid rows and values."""
-    invalid = InvalidValues()
-    token = _reading.set(invalid)
-    try:
-        yield invalid
-    finally:
-        _reading.reset(token)
-
-
-def left_out_so_far() -> list[str]:
-    """What readers that were opened inside `past_invalid_rows` have left out until now."""
-    invalid = _reading.get()
-    return invalid.described() if invalid is not None else []
-
-
-@contextmanager
 def valid_rows(connection: sqlite3.Connection) -> Generator[InvalidValues]:
     """Inside, a writer has the view `valid_NAME` of each table, and reads any text."""
     invalid, text_factory = InvalidValues(), connection.text_factory
-    _show_valid(connection, invalid, prefix="valid_")
+    _show_valid(connection, invalid)
     try:
         yield invalid
     finally:
@@ -544,43 +511,19 @@ def valid_rows(connection: sqlite3.Connection) -> Generator[InvalidValues]:
             connection.execute(f"DROP VIEW temp.valid_{table}")
 
 
-def is_past_invalid_rows() -> bool:
-    """Whether this is inside `past_invalid_rows`."""
-    return _reading.get() is not None
-
-
-def shadow_if_asked(connection: sqlite3.Connection) -> None:
-    """Inside `past_invalid_rows` give a reader views of the valid rows under the tables' names."""
-    if (invalid := _reading.get()) is None:
-        return
-    if connection.execute(_IS_SHADOWED).fetchone() is None:
-        _shadow(connection, invalid)
-    else:  # by a question before, on a connection that is kept open
-        connection.create_function("note_invalid", 4, invalid.note)
-
-
-def _shadow(connection: sqlite3.Connection, invalid: InvalidValues) -> None:
-    connection.execute("PRAGMA query_only=OFF")  # a view of this connection alone
-    _show_valid(connection, invalid)
-    for sql in shipped_statements():
-        if sql.startswith("CREATE VIEW"):
-            connection.execute(sql.replace("CREATE VIEW", "CREATE TEMP VIEW", 1))
-    connection.execute("PRAGMA query_only=ON")
-
-
-def _show_valid(connection: sqlite3.Connection, invalid: InvalidValues, prefix: str = "") -> None:
+def _show_valid(connection: sqlite3.Connection, invalid: InvalidValues) -> None:
     connection.text_factory = _as_text
     connection.create_function("note_invalid", 4, invalid.note)
     connection.create_function("valid_json", 2, _is_valid_json, deterministic=True)
     for table in _TABLES:
-        connection.execute(_view(connection, table, prefix))
+        connection.execute(_view(connection, table))
 
 
 def _as_text(stored: bytes) -> str:
     return stored.decode("utf-8", "replace")
 
 
-def _view(connection: sqlite3.Connection, table: str, prefix: str) -> str:
+def _view(connection: sqlite3.Connection, table: str) -> str:
     columns = connection.execute(_COLUMNS, (table,)).fetchall()
     keys = [name for name, _, _, _, key in columns if key]
     row = " || '/' || ".join(keys)
@@ -602,13 +545,13 @@ def _view(connection: sqlite3.Connection, table: str, prefix: str) -> str:
             )
     for name, other in _REFERENCES.get(table, ()):
         there = (
-            f"EXISTS (SELECT 1 FROM temp.{prefix}{other} AS other WHERE other.id = {table}.{name})"
+            f"EXISTS (SELECT 1 FROM temp.valid_{other} AS other WHERE other.id = {table}.{name})"
         )
         left_out = f"note_invalid('{table}', {row}, '{name}', 'reference')"
         needed.append(f"CASE WHEN {there} THEN 1 ELSE {left_out} END")
     where = " AND ".join(needed) or "1"
     rows = f"SELECT {', '.join(shown)} FROM main.{table} WHERE {where}"
-    return f"CREATE TEMP VIEW {prefix}{table} AS {rows}"
+    return f"CREATE TEMP VIEW valid_{table} AS {rows}"
 
 
 def _check(table: str, name: str, kind: str) -> tuple[str, str]:

@@ -11,7 +11,7 @@ import pytest
 from mcp import MCPError
 
 from tests.recordings.rows import Recorded
-from tests.server.conftest import ask, text_of
+from tests.server.conftest import ask
 from tests.server.history.conftest import EVERY, refuse, tell
 from tests.server.story import client_on
 
@@ -68,19 +68,6 @@ async def test_bad_input_is_an_error_with_the_next_step(
     assert words in await refuse(story, tool, **arguments)
 
 
-async def test_without_a_database_every_tool_about_the_past_says_how_to_get_one(
-    tmp_path: Path,
-) -> None:
-    file = tmp_path / "folder" / "webots.db"
-    async with client_on(file) as client:
-        for tool, arguments in EVERY:
-            answer = await ask(client, tool, **arguments)
-            assert answer["status"] == "never seen", tool
-            assert "MCPBridge" in answer["hint"], tool
-        assert "MCPBridge" in text_of(await client.call_tool("webots_plot", {}))
-    assert not file.parent.exists()
-
-
 async def test_a_run_without_a_row_says_so_in_every_tool(tmp_path: Path) -> None:
     recorded = Recorded(tmp_path / "webots.db")
     recorded.robot().log(0.0, "hello")
@@ -91,17 +78,6 @@ async def test_a_run_without_a_row_says_so_in_every_tool(tmp_path: Path) -> None
                 assert (answer["robot"], answer["run_id"]) == ("rover", 1), tool
                 assert answer["hint"], tool
     recorded.close()
-
-
-async def test_sql_that_never_ends_is_ended(story: Path) -> None:
-    endless = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT x FROM c"
-    assert "end every recursion" in await refuse(
-        story, "webots_query_sql", sql=endless.replace("SELECT x FROM c", "SELECT count(*) FROM c")
-    )
-    answer = await tell(story, "webots_query_sql", sql=endless)
-    assert "only the first 100 rows" in answer["truncated"]
-    huge = "SELECT hex(zeroblob(900000000))"
-    assert "only reading" in await refuse(story, "webots_query_sql", sql=huge)
 
 
 async def test_empty_answers_say_why_and_what_to_try(story: Path) -> None:

@@ -6,8 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.recordings.rover import WALL_START_S
-from tests.recordings.rows import Recorded
 from tests.server.conftest import ask
 from tests.server.history.conftest import EVERY, STORY, tell
 from tests.server.story import client_on, copy_of, rows_of
@@ -25,17 +23,6 @@ async def test_every_answer_says_about_which_robot_and_run_and_as_of_when(story:
         assert (answer["robot"], answer["run_id"], answer["sim_time_s"]) == ("rover", 3, 59.9), tool
         assert answer["status"].startswith("stopped "), tool
         assert answer["age_s"] > 0, tool
-
-
-async def test_signals_come_in_pages_and_by_pattern(story: Path) -> None:
-    first = await tell(story, "webots_list_signals", limit=10)
-    second = await tell(story, "webots_list_signals", limit=10, cursor=first["cursor"])
-    names = [row["signal"] for part in (first, second) for row in rows_of(part["signals"])]
-    assert names == sorted(set(names))
-    assert len(names) == first["total"] == 15
-    assert "cursor" not in second
-    part = await tell(story, "webots_list_signals", pattern="lidar.*")
-    assert part["total"] == 5
 
 
 async def test_an_extreme_is_never_lost_in_a_bucket(story: Path) -> None:
@@ -74,20 +61,6 @@ async def test_raw_rows_come_in_pages_that_neither_repeat_nor_miss_one(story: Pa
     assert len(times) == len(set(times)) == 1150
 
 
-async def test_a_wall_time_range_reaches_over_runs(story: Path) -> None:
-    answer = await tell(
-        story,
-        "webots_query_history",
-        signals=["pose.0"],
-        since_wall_time=WALL_START_S,
-        until_wall_time=WALL_START_S + 70,
-    )
-    assert [run["run_id"] for run in answer["runs"]] == [1, 2]
-    iso = {"since_wall_time": "2023-11-14T22:13:20Z", "until_wall_time": "2023-11-14T22:14:30Z"}
-    same = await tell(story, "webots_query_history", signals=["pose.0"], **iso)
-    assert same["runs"] == answer["runs"]
-
-
 async def test_trends_say_in_one_line_what_a_person_would_notice(story: Path) -> None:
     answer = await tell(story, "webots_get_trends", run_id=STORY)
     (run,) = answer["runs"]
@@ -102,21 +75,6 @@ async def test_trends_say_in_one_line_what_a_person_would_notice(story: Path) ->
     told = run["constant"].split(", ")
     assert "target 3" in told and len(told) == 4
     assert not says.keys() & {each.split(" ")[0] for each in told}
-
-
-async def test_the_times_in_more_values_than_are_shown_are_told_together(
-    tmp_path: Path,
-) -> None:
-    recorded = Recorded(tmp_path / "webots.db")
-    robot = recorded.robot()
-    for row in range(301):
-        robot.state(row * 0.1, {"mode": f"mode {row // 10 % 10}"})
-    recorded.close()
-    async with client_on(tmp_path / "webots.db") as client:
-        (run,) = (await ask(client, "webots_get_trends"))["runs"]
-    (mode,) = rows_of(run["states"])
-    assert mode["time_by_value_s"].keys() >= {"mode 0", "mode 5", "… 4 more values"}
-    assert sum(mode["time_by_value_s"].values()) == pytest.approx(30.0)
 
 
 async def test_answers_are_the_same_before_and_after_chunks_are_made(

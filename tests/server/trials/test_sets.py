@@ -7,21 +7,15 @@ from pathlib import Path
 
 import anyio
 import pytest
-from mcp import Client
 
-from tests.bridge.conftest import Recording
-from tests.processes.conftest import Start, has_states
-from tests.server.conftest import STEP_MS, Connect, ask, fail, pictures_of, text_of
+from tests.server.conftest import Connect, ask, fail, pictures_of, text_of
 from tests.server.story import rows_of
-from tests.server.trials.conftest import SPEEDS, TunableDriver, trials, value_of
+from tests.server.trials.conftest import TunableDriver, trials, value_of
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect as database
-from webots_mcp.questions.budget import tokens_of
-from webots_mcp.server import create_server
-from webots_mcp.standin import InProcessSupervisor, Mode, Simulation
+from webots_mcp.standin import InProcessSupervisor
 
 pytestmark = pytest.mark.anyio
-DISTANCE = "max(pose.x) - min(pose.x) + max(pose.y) - min(pose.y)"
 
 
 @pytest.mark.parametrize("mode", ["auto", "legacy"])
@@ -89,22 +83,6 @@ async def test_a_trial_in_which_prune_holds_ends_there_and_ranks_below_those_wit
         assert "there is distance" in said
 
 
-async def test_without_repeats_each_set_is_tried_once_and_nothing_is_said_of_noise(
-    connect: Connect, tunable: TunableDriver
-) -> None:
-    async with connect() as client:
-        answer = await trials(
-            client, parameters=[{"kp": 3.0}, {"kp": 1.0}], until="distance > 0.3", best="lowest",
-            score="duration", for_s=None,
-        )  # fmt: skip
-        best, other = rows_of(answer["ranked"])
-        assert (best["kp"], other["kp"]) == (3.0, 1.0)
-        assert best["score"] < other["score"] == pytest.approx(0.304)
-        assert answer["over"] == answer["trials"] == 2
-        assert "noise" not in answer
-        assert "were not both repeated" in answer["verdict"]
-
-
 async def test_out_of_wall_time_they_go_on_and_a_second_call_waits(
     connect: Connect, tunable: TunableDriver
 ) -> None:
@@ -152,66 +130,6 @@ async def test_cancel_stops_after_the_current_trial_and_sets_the_parameters_back
         assert again["state"] == "done"
 
 
-WHEELS_TOLD_ONCE = """
-import math
-
-speed = bridge.parameter("speed", 1.0, low=0.0, high=10.0, unit="rad/s")
-motors = [robot.getDevice(f"{side} wheel motor") for side in ("left", "right")]
-gps = robot.getDevice("gps")
-gps.enable(16)
-for motor in motors:
-    motor.setPosition(math.inf)
-while robot.step(16) != -1:
-    for motor in motors:
-        motor.setVelocity(speed.value)
-    x, y, _ = gps.getValues()
-    bridge.publish({"pose": {"x": x, "y": y}})
-    bridge.get_command()
-"""
-
-
-async def test_wheels_that_were_told_once_to_turn_without_end_turn_in_every_trial(
-    start: Start, filed: Recording, data_dir: Path
-) -> None:
-    arena = start(WHEELS_TOLD_ONCE)
-    arena.wait_for(lambda: has_states(filed), 30)
-    async with Client(create_server(data_dir / "webots.db", data_dir)) as client:
-        asked = {"parameters": {"speed": [2.0, 4.0]}, "score": DISTANCE, "for_s": 1, "repeats": 2}
-        answer = await trials(client, **asked, timeout_wall_s=90)
-        fast, slow = rows_of(answer["ranked"])
-        assert (fast["speed"], slow["speed"]) == (4.0, 2.0)
-        assert fast["score"] > 1.8 * slow["score"] > 0.05
-        assert "notes" not in answer
-
-
-class StandsAfterAReset(TunableDriver):
-    """A robot that goes on in its first run only."""
-
-    def run(self) -> None:
-        before_s = 0.0
-        while self.robot.step(STEP_MS) != -1:
-            now_s = self.robot.getTime()
-            self.resets += now_s < before_s
-            before_s = now_s
-            self.bridge.publish({"pose": [0.0 if self.resets else now_s, 0.0, 0.0]})
-            self.bridge.get_command()
-
-
-async def test_trials_of_a_robot_that_only_moved_before_them_say_so_before_they_are_ranked(
-    connect: Connect, file: Path
-) -> None:
-    driving = StandsAfterAReset(file)
-    driving.start()
-    async with connect() as client:
-        await ask(client, "webots_run", for_s=1)
-        answer = await trials(client, parameters={"kp": [1.0, 2.0]}, score="max(pose[0])", for_s=1)
-    driving.stop()
-    assert answer["verdict"] == "all 2 scores are 0: no tried value changed the score"
-    (note,) = answer["notes"]
-    assert "in run 1, before the trials, but stood still in all 2" in note
-    assert list(answer).index("notes") < list(answer).index("ranked")
-
-
 async def test_a_cancelled_call_ends_the_trial_that_runs_and_no_other_begins(
     connect: Connect, tunable: TunableDriver
 ) -> None:
@@ -241,38 +159,6 @@ async def test_a_cancelled_call_ends_the_trial_that_runs_and_no_other_begins(
         assert tunable.resets > resets
 
 
-async def test_what_a_set_does_not_name_is_as_it_was_before_the_trials(
-    connect: Connect, tunable: TunableDriver
-) -> None:
-    async with connect() as client:
-        await ask(client, "webots_set_parameters", values={"kp": 7.0})
-        sets = [{"kp": 3.0, "gait": "walk"}, {"gait": "trot"}, {}]
-        answer = await trials(client, parameters=sets, repeats=2, score="max(distance) / 0.16")
-        scores = [(row["kp"], row["range"]) for row in rows_of(answer["ranked"])]
-        assert scores == [
-            (None, [pytest.approx(7.0)] * 2),
-            (None, [pytest.approx(7.0)] * 2),
-            (3.0, [pytest.approx(3.0)] * 2),
-        ]
-
-
-async def test_trials_that_change_nothing_end(connect: Connect, tunable: TunableDriver) -> None:
-    async with connect() as client:
-        answer = await trials(client, parameters=[{}], repeats=2)
-        assert (answer["state"], answer["over"]) == ("done", 2)
-        assert (await trials(client, parameters={"kp": [1.0]}))["state"] == "done"
-
-
-async def test_a_controller_that_knows_a_reset_only_by_its_time_notices_each(
-    connect: Connect, tunable: TunableDriver
-) -> None:
-    async with connect() as client:
-        for _ in range(2):
-            await trials(client, parameters={"kp": [1.0, 2.0]})
-        told = await ask(client, "webots_list_runs")
-        assert tunable.resets == told["total"] - 1
-
-
 async def test_a_trial_that_nobody_ran_because_the_controller_ended_says_why(
     connect: Connect, file: Path
 ) -> None:
@@ -287,52 +173,3 @@ async def test_a_trial_that_nobody_ran_because_the_controller_ended_says_why(
             answer = await ask(client, "webots_run_trials", trial_set=1, timeout_wall_s=30)
             assert "no live controller" in answer["state"]
             assert (answer["over"], answer["trials"]) == (0, 1)
-
-
-async def test_a_hundred_trials_are_told_in_a_short_answer(
-    connect: Connect, tunable: TunableDriver
-) -> None:
-    grid = {"kp": [0.37 * n for n in range(1, 51)], "gait": ["trot", "walk"]}
-    async with connect() as client:
-        answer = await trials(client, parameters=grid, for_s=0.032, timeout_wall_s=90)
-        while answer["state"] == "under way":
-            answer = await ask(client, "webots_run_trials", trial_set=1, timeout_wall_s=90)
-        assert answer["over"] == 100
-        assert tokens_of(answer) < 2_000
-        kps = [row["kp"] for row in rows_of(answer["ranked"])]
-        assert len(kps) > 40
-        assert any(f"{100 - len(kps)} sets that rank lower" in note for note in answer["notes"])
-        assert kps == sorted(kps, reverse=True)
-
-
-async def test_of_many_trials_that_fail_the_first_are_told_and_how_many_more(
-    connect: Connect, tunable: TunableDriver
-) -> None:
-    grid = {"kp": [float(n) for n in range(100)]}
-    async with connect() as client:
-        score = "1 / (last(distance) * 0)"
-        answer = await trials(client, parameters=grid, score=score, for_s=0.02, timeout_wall_s=90)
-        while answer["state"] == "under way":
-            answer = await ask(client, "webots_run_trials", trial_set=1, timeout_wall_s=90)
-        assert answer["failed"] == 100, answer
-        assert answer["verdict"] == "no trial has a score"
-        assert tokens_of(answer) < 2_000
-        shown = len(rows_of(answer["ranked"]))
-        if shown < 100:
-            assert answer["notes"][0].startswith(f"{100 - shown} sets that rank lower")
-
-
-async def test_five_speeds_of_the_rover_three_times_each(
-    simulation: Simulation, data_dir: Path
-) -> None:
-    async with Client(create_server(data_dir / "webots.db", data_dir)) as client:
-        answer = await trials(
-            client, parameters=SPEEDS, repeats=3, score=DISTANCE, for_s=1, timeout_wall_s=90
-        )
-        assert (answer["state"], answer["over"]) == ("done", 15)
-        rows = rows_of(answer["ranked"])
-        assert [row["speed"] for row in rows] == [5.0, 4.0, 3.0, 2.0, 1.0]
-        assert all(len(row["runs"]) == 3 for row in rows)
-        assert "repeat each 4 times" in answer["verdict"]
-        assert simulation.mode is Mode.PAUSE
-        assert await value_of(client, "speed") == 1.0

@@ -1,10 +1,5 @@
 """Trials on the workers of a Dask cluster. Needs the extra `cluster`."""
 
-from webots_mcp.plugins import Cluster, Plugin
+from webots_mcp.plugins import Plugin
 
-PLUGIN = Plugin(
-    cluster=Cluster(
-        simulators=f"{__name__}.dask_cluster:cluster",
-        worker=f"{__name__}.dask_cluster:ClusterWorker",
-    )
-)
+PLUGIN = Plugin(cluster=f"{__name__}.dask_cluster:cluster")

@@ -23,7 +23,6 @@ from webots_mcp.plugins.report.figures import Figures, figures_of, moment_key
 from webots_mcp.plugins.report.words import clock, counted, size, time_at
 from webots_mcp.store.detection.kinds import Event
 from webots_mcp.store.reading.segment import in_one_snapshot
-from webots_mcp.store.recording import left_out_so_far
 from webots_mcp.store.run_rows import fetch_run, inside, opened
 
 if TYPE_CHECKING:
@@ -233,7 +232,7 @@ def _left_out(page: Page) -> list[str]:
             gone = f" ({counted(pictures.unusable, 'file')} cannot be read)"
             gone = gone if pictures.unusable else ""
             said.append(f"{missing:,} of the pictures {of_run}{gone}")
-    return [*said, *page.figures.left_out, *left_out_so_far()]
+    return [*said, *page.figures.left_out]
 
 
 def _holds(page: Page) -> dict[str, int]:

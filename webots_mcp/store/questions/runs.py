@@ -37,10 +37,9 @@ from webots_mcp.store.detection.motion import (
     doubt_of_length,
     doubt_of_unit,
     in_metres,
-    motion_in,
 )
 from webots_mcp.store.parameters import HAD_VALUES, as_filter, notable_parameters
-from webots_mcp.store.reading.catalogue import catalogue, known_signals
+from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.frame_source import Unread
 from webots_mcp.store.reading.frame_summary import change_points
@@ -310,22 +309,6 @@ def way_in(frame: Frame, position: tuple[Signal, Signal]) -> Way:
     x, y = (in_metres(each, frame.numbers(each.name)) for each in position)
     there = np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M
     return Way(frame.times[there], x[there], y[there], frame.cut_at_s, frame.unread)
-
-
-def way_of_run(
-    connection: sqlite3.Connection, subject: Subject, deadline: Deadline
-) -> PathLength | None:
-    """How far a robot went in a run; None where no position is recorded, or not all was read."""
-    whole = whole_run(connection, subject.run_id)
-    if whole is None:
-        return None
-    asked = TimeRange(subject.robot_id, subject.robot, (whole,), "simulation")
-    frame = read_frame(connection, whole, deadline)
-    position = motion_in(frame, known_signals(connection, asked), EventOptions()).position
-    if position is None:
-        return None
-    way = way_in(frame, position)
-    return None if way.unread or len(way.times) < 2 else way.length
 
 
 @dataclass(frozen=True)

@@ -107,6 +107,7 @@ def measure_room(bench: Bench) -> Iterable[Line]:
     yield _room("SQLite, chunks", chunks, rows, states)
     with ExitStack() as stack:
         urls = {"Parquet": lambda: str(bench.place(f"files{len(list(bench.folder.iterdir()))}"))}
+        server: Server | None = None
         try:
             server = stack.enter_context(running_server())
             urls["PostgreSQL"] = lambda: server.url(server.new_database())
@@ -123,13 +124,22 @@ def measure_room(bench: Bench) -> Iterable[Line]:
             with closing(connect_recording(here / DATABASE_NAME, "writer", create=True)) as db:
                 create_schema(db)
                 with open_pool(url) as pool:
-                    sizes = sum(each.size_bytes or 0 for each in pool.sizes()
-                                if each.table in _VALUES)  # fmt: skip
                     wanted = meant(pool, Choice(since="0"))
                     fetched_s = processor_s(partial(fetch, pool, db, here, wanted))
-            yield _room(what, sizes, rows, states)
+            yield _room(what, _size_of(url, server), rows, states)
             yield Line(f"{what}: ship", "", "", 1e6 * shipped_s / rows, "us/row")
             yield Line(f"{what}: fetch", "", "", 1e6 * fetched_s / rows, "us/row")
+
+
+def _size_of(url: str, server: Server | None) -> int:
+    """Of the tables that hold what was published, in bytes, with their indexes."""
+    if "://" not in url:
+        files = (each for name in _VALUES for each in Path(url).rglob(f"table={name}/**/*.parquet"))
+        return sum(each.stat().st_size for each in files)
+    assert server is not None
+    sizes = ", ".join(f"pg_total_relation_size('{name}')" for name in _VALUES if name != "value")
+    database = url.partition("@/")[2].partition("?")[0]
+    return sum(server.execute(database, f"SELECT {sizes}")[0])
 
 
 def _room(what: str, size: int, rows: int, states: int) -> Line:

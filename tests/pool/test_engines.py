@@ -234,9 +234,6 @@ def test_what_is_there_is_listed(pool: Pool, story: sqlite3.Connection) -> None:
     ]  # fmt: skip
     (trials,) = pooled_trial_sets(pool)
     assert (trials.uuid, trials.trials, sorted(trials.runs)) == ("set", 3, [(uuid, 1), (uuid, 2)])
-    sizes = {size.table: size for size in pool.sizes()}
-    assert (sizes["state"].rows, sizes["trial"].rows, sizes["breakpoint"].rows) == (2050, 3, 0)
-    assert (sizes["state"].size_bytes or 0) > 2050
     assert pool.progress(uuid) == {"shipped": 1}
 
 

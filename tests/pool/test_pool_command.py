@@ -31,7 +31,7 @@ def ask(lab: Lab, runs: Recorded, capsys: pytest.CaptureFixture[str]) -> Ask:
     return run
 
 
-def test_robots_runs_trial_sets_and_sizes_are_listed(ask: Ask) -> None:
+def test_robots_runs_and_trial_sets_are_listed(ask: Ask) -> None:
     robots = [line.split()[:4] for line in ask("pool", "POOL").splitlines()]
     assert robots[0] == ["robot", "recordings", "runs", "rows"]
     assert sorted(robots[1:]) == [["drone", "1", "1", "4"], ["rover", "1", "2", "16"]]
@@ -39,7 +39,6 @@ def test_robots_runs_trial_sets_and_sizes_are_listed(ask: Ask) -> None:
     assert "wall 3" not in ask("pool", "POOL", "runs", "--robot", "rover")
     assert "2 robots in all: -n shows more" in ask("pool", "POOL", "-n", "1")
     assert ask("pool", "POOL", "trials").splitlines()[1].split()[3:5] == ["3", "2"]
-    assert "event" in ask("pool", "POOL", "sizes")
 
 
 def test_programs_read_json(ask: Ask, runs: Recorded) -> None:
@@ -48,7 +47,6 @@ def test_programs_read_json(ask: Ask, runs: Recorded) -> None:
     (uuid,) = runs.connection.execute("SELECT uuid FROM run WHERE id = 2").fetchone()
     assert (run["uuid"], run["row_count"], found["total"]) == (uuid, 6, 1)
     assert json.loads(ask("pool", "POOL", "trials", "--json"))["total"] == 1
-    assert json.loads(ask("pool", "POOL", "sizes", "--json"))["tables"]
 
 
 def test_a_select_is_answered_with_its_first_rows(ask: Ask) -> None:

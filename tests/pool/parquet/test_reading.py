@@ -116,15 +116,6 @@ def test_what_is_there_is_listed(pool: ParquetPool, told: dict[str, Told]) -> No
     }
 
 
-def test_sizes_are_those_of_the_rows_and_of_the_files(pool: ParquetPool, many: Many) -> None:
-    sizes = {each.table: each for each in pool.sizes()}
-    assert sizes["state"].rows == sum(200 + 3 * n for n in range(RECORDINGS))
-    assert sizes["trial"].rows == 0
-    for name, size in sizes.items():
-        files = many.pool.rglob(f"table={name}/**/*.parquet")
-        assert size.size_bytes == sum(file.stat().st_size for file in files)
-
-
 def test_an_object_store_is_asked_as_a_folder_is(reader: sqlite3.Connection) -> None:
     url = bucket.empty()
     ship(reader, url)

@@ -200,12 +200,6 @@ class Storage:
             full = f"{escape(self.root.rstrip('/'))}/{pattern}"
             return sorted(map(self._relative, self.files.glob(full)))
 
-    def sizes(self) -> dict[str, int]:
-        """All objects, with their bytes."""
-        with self._answering(""):
-            found = self.files.find(self.root, detail=True)
-        return {self._relative(path): int(about["size"] or 0) for path, about in found.items()}
-
     def names(self) -> list[str]:
         """What is right below the root."""
         with self._answering(""), suppress(FileNotFoundError):

@@ -34,7 +34,6 @@ from webots_mcp.plugins.pool.parquet_files import (
     files_of,
     folder_of,
     is_cut,
-    name_of,
     package,
     part_file,
     picture_file,
@@ -47,7 +46,6 @@ from webots_mcp.plugins.pool.parquet_files import (
 from webots_mcp.plugins.pool.pool_interface import (
     LISTED,
     Batch,
-    PooledSize,
     Row,
     Table,
     batches,
@@ -258,20 +256,6 @@ class ParquetPool:
             }
         for uuid, progress in self._all.items():
             yield from ((uuid, row) for row in progress.listed.get(name, {}).values())
-
-    def sizes(self) -> Iterator[PooledSize]:
-        """How much of each table there is; the end of each file is read for it."""
-        dataset, found = package("pyarrow.dataset"), self._storage.sizes()
-        for each in tables():
-            named = f"/table={name_of(each)}/"
-            files = {path: size for path, size in found.items() if named in path}
-            rows = 0
-            if files:
-                paths = [*map(self._storage.full, files)]
-                with _clear_damage(f"a file of {name_of(each)}"):
-                    whole = dataset.dataset(paths, filesystem=self._storage.files, format="parquet")
-                    rows = whole.count_rows()
-            yield PooledSize(name_of(each), rows, sum(files.values()))
 
     def progress(self, recording_uuid: str) -> dict[str, int]:
         """How far the recording was shipped."""

@@ -126,7 +126,7 @@ def _named(uuids: Sequence[str]) -> str:
 def pool(
     url: Annotated[str, Parameter("URL", help="postgresql://HOST/DATABASE, a folder, s3://...")],
     part: Annotated[
-        Literal["robots", "runs", "trials", "sizes"],
+        Literal["robots", "runs", "trials"],
         Parameter("PART", help="What to list (robots)."),
     ] = "robots",
     /,
@@ -158,8 +158,6 @@ def pool(
         if sql is not None:
             answer = opened.select(sql, max_rows)
             return print_json(asdict(answer)) if json else _print_answer(answer)
-        if part == "sizes":
-            return _print_sizes(opened, as_json=json)
         listed = _listed(opened, part, choice)
     total = len(listed.found)
     if json:
@@ -213,21 +211,6 @@ def _listed(pool: Pool, part: str, choice: Choice) -> _List:
         for run in runs
     ]  # fmt: skip
     return _List("runs", runs, columns, rows)
-
-
-def _print_sizes(pool: Pool, *, as_json: bool) -> None:
-    from webots_mcp.store.retention import size_text
-
-    found = list(pool.sizes())
-    if as_json:
-        return print_json({"tables": [each._asdict() for each in found]})
-    sizes = [each.size_bytes for each in found if each.size_bytes is not None]
-    rows: list[list[Any]] = [
-        [each.table, each.rows, None if each.size_bytes is None else size_text(each.size_bytes)]
-        for each in found
-    ]
-    print_table(("table", "rows", "size"), rows)
-    print_notes([f"{size_text(sum(sizes))} in all"] if sizes else [])
 
 
 def _print_answer(answer: Result) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias, cast
 from urllib.parse import parse_qsl
 
 from webots_mcp.errors import InvalidInputError
@@ -279,14 +279,6 @@ class Shipment(Protocol):
         ...
 
 
-class PooledSize(NamedTuple):
-    """How much of a table is in a pool; bytes where the pool can tell."""
-
-    table: str
-    rows: int
-    size_bytes: int | None
-
-
 class Pool(Protocol):
     """A pool, shipped to or read; a context manager, connected as long as it is open.
 
@@ -321,10 +313,6 @@ class Pool(Protocol):
 
     def listed(self, name: str) -> Iterator[tuple[str, Sequence[Any]]]:
         """The columns `LISTED` of all rows of such a table, behind their recording's UUID."""
-        ...
-
-    def sizes(self) -> Iterator[PooledSize]:
-        """How much of each table there is."""
         ...
 
     def progress(self, recording_uuid: str) -> dict[str, int]:

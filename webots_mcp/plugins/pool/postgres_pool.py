@@ -25,13 +25,11 @@ from webots_mcp.plugins.pool.duckdb_statement import answered
 from webots_mcp.plugins.pool.pool_interface import (
     LISTED,
     Batch,
-    PooledSize,
     Row,
     SQLValue,
     Table,
     batches,
     redacted,
-    tables,
 )
 from webots_mcp.plugins.pool.postgres_schema import (
     OWNER,
@@ -53,9 +51,6 @@ _REFUSED: Final = (
     psycopg.errors.StatementTooComplex,
 )  # fmt: skip
 _FETCHED: Final = 2000  # rows that are asked of the server at a time
-_COUNTED_BYTES: Final = 200_000_000  # larger tables are not counted, which would take long
-_SIZE: Final = """
-SELECT pg_total_relation_size(oid), reltuples::bigint FROM pg_class WHERE oid = %s::regclass"""
 _AS_THEY_ARE: Final = ("bool", "int2", "int4", "int8", "oid", "float4", "float8", "bytea")
 _PARAMETER: Final = "08P01"  # one SQLSTATE of what the client did wrong: it gave no values
 _ASKED_WRONG: Final = ("22", "25006", "42", "57014", "0A", _PARAMETER)  # that a question has
@@ -112,14 +107,6 @@ class PostgresPool:
         columns = ", ".join(map(_quoted, LISTED[name]))
         for owner, *row in self._asked(f"SELECT {OWNER}::text, {columns} FROM {name}"):
             yield owner, row
-
-    def sizes(self) -> Iterator[PooledSize]:
-        """Bytes with those of indexes; rows of large tables as PostgreSQL last estimated them."""
-        for each in (*(each.name for each in tables()), "picture"):
-            ((size_bytes, rows),) = self._asked(_SIZE, (each,))
-            if size_bytes < _COUNTED_BYTES or rows < 0:
-                ((rows,),) = self._asked(f"SELECT count(*) FROM {each}")
-            yield PooledSize(each, rows, size_bytes)
 
     def progress(self, recording_uuid: str) -> dict[str, int]:
         """How far the recording was shipped."""

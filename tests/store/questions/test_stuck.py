@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
-from tests.store.questions.asking import ask
+from tests.store.questions.asking import ask, spans
 from webots_mcp.store.detection.events import find_events
 from webots_mcp.store.detection.kinds import Event, EventOptions
 from webots_mcp.store.detection.motion import ModeUses, RunNoise, find_motion
@@ -58,6 +58,13 @@ def test_where_nothing_stood_the_answer_says_what_came_nearest(empty: sqlite3.Co
     for step in range(300):
         recorder.publish(step * 0.1, {"gps": {"x": step * 0.03, "y": 0}})
     assert "in 3 s: 0.9 m" in ask(empty, "stuck").verdicts.not_found["stuck"]
+
+
+def test_a_recording_gap_ends_a_standstill(empty: sqlite3.Connection) -> None:
+    recorder = start_run(empty)
+    for step in (*range(100), *range(200, 300)):
+        recorder.publish(step * 0.1, {"gps": {"x": 1.0, "y": 0.0}})
+    assert spans(ask(empty, "standstill")) == [(0.0, 9.9), (20.0, 29.9)]
 
 
 def test_without_a_position_stuck_cannot_be_searched_and_the_answer_says_so(

@@ -366,3 +366,34 @@ def test_how_long_runs_are_kept_cannot_be_written_the_wrong_way_round(
 )
 def test_sizes_are_written_as_they_are_read(size: float, text: str) -> None:
     assert size_text(size) == text
+
+
+def test_what_is_no_recording_is_not_imported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "other.db"
+    file.write_text("notes")
+    assert str(file) in complaint(capsys, "import", str(file), "--data-dir", str(tmp_path / "new"))
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("log", [None, "[99:00:00] b\n"])
+def test_a_folder_that_cannot_be_imported_leaves_no_database(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], log: str | None
+) -> None:
+    peer = Peer(tmp_path / "peer")
+    peer.folder.mkdir(exist_ok=True)
+    if log is not None:
+        peer.write("logs/controller.log", log)
+    complaint(capsys, "import", str(peer.folder), "--data-dir", str(tmp_path / "new"))
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [(("--format", "mcap"), "give a file with -o"), (("-o", "a.mcap", "--trials", "1"), "a table")],
+)
+def test_what_viewers_read_is_neither_for_a_pipe_nor_of_trials(
+    database: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...], told: str
+) -> None:
+    assert told in complaint(capsys, "export", "--database", str(database), *more)

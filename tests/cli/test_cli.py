@@ -16,6 +16,7 @@ import pytest
 from tests.recordings.rows import Recorded, RecordedRobot
 from webots_mcp.cli import main, names
 from webots_mcp.queue import CommandQueue
+from webots_mcp.store.logs import Follower
 
 
 @pytest.fixture
@@ -183,3 +184,31 @@ def test_the_server_keeps_stdout_for_the_protocol(tmp_path: Path) -> None:
         out, err = process.communicate("", timeout=60)
     assert (process.returncode, out) == (0, "")
     assert "Traceback" not in err
+
+
+def test_the_tail_of_one_robot_leaves_out_the_others(
+    recorded: Recorded,
+    rover: RecordedRobot,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    recorded.robot("crane").log(1.0, "not mine")
+    arguments = ["tail", "--no-follow", "--data-dir", str(tmp_path)]
+    assert main([*arguments, "--robot", rover.name]) == 0
+    assert "not mine" not in capsys.readouterr().out
+    assert main([*arguments, "--robot", "rovr"]) == 2
+    assert "did you mean 'rover'" in capsys.readouterr().err
+    assert main([*arguments, "-n", "0"]) == 0
+    assert capsys.readouterr().out == ""
+    assert main([*arguments, "--interval", "0"]) == 2
+
+
+def test_a_follower_sees_each_line_once(rover: RecordedRobot) -> None:
+    follower = Follower(rover.connection)
+    assert [line.kind for line in follower.look()] == ["state"]
+    assert follower.look() == []
+    command = CommandQueue(rover.connection).enqueue(rover.id, "go")
+    assert [line.text for line in follower.look()] == [f"#{command.id} go {{}}"]
+    CommandQueue(rover.connection).cancel(command.id, "no")
+    assert [line.text for line in follower.look()] == [f"#{command.id} go cancelled no"]
+    assert follower.look() == []

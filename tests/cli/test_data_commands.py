@@ -356,3 +356,13 @@ def test_a_recording_to_import_that_is_not_there_is_told(
     said = complaint(capsys, "import", str(tmp_path / name), "--data-dir", str(tmp_path / "new"))
     assert f"{tmp_path / name} cannot be imported: there is no such file" in said
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [(("--format", "mcap"), "give a file with -o"), (("-o", "a.mcap", "--trials", "1"), "a table")],
+)
+def test_what_viewers_read_is_neither_for_a_pipe_nor_of_trials(
+    database: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...], told: str
+) -> None:
+    assert told in complaint(capsys, "export", "--database", str(database), *more)

@@ -67,3 +67,12 @@ def test_what_a_controller_said_cannot_steer_a_terminal(
     out = capsys.readouterr().out
     assert "no program '/x/webots-mcp'" in out
     assert "\x1b" not in out
+
+
+def test_as_json_it_is_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    make_older(tmp_path / "webots.db")
+    assert main(["doctor", "--no-server", "--json", "--data-dir", str(tmp_path)]) == 1
+    checks = {each["check"]: each for each in json.loads(capsys.readouterr().out)["checks"]}
+    assert checks["Schema"]["verdict"] == "wrong"
+    assert checks["Schema"]["page"] == "docs/troubleshooting.md#schema"
+    assert checks["Python"].keys() == {"check", "verdict", "seen"}

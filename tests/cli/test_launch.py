@@ -261,3 +261,26 @@ def test_the_stand_in_runs_a_file_for_an_extern_robot(
     process = launch(world, "--stand-in", "--mode", "fast", "--robot", f"rover={file}")
     process.communicate(timeout=60)
     assert process.returncode == 3
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        (["--robot", "rover=x.py"], "--robot is for --stand-in"),
+        (["--stand-in", "--robot", "rover"], "--robot 'rover' is not NAME=FILE"),
+    ],
+)
+def test_a_file_for_a_robot_is_refused_where_it_cannot_be_run(
+    launch: Launch, project: Callable[..., Path], options: list[str], why: str
+) -> None:
+    process = launch(project(), *options)
+    _, told = process.communicate(timeout=60)
+    assert (process.returncode, why in told) == (2, True)
+
+
+def test_what_only_webots_has_is_refused_for_the_stand_in(
+    launch: Launch, project: Callable[..., Path]
+) -> None:
+    process = launch(project(), "--stand-in", "--stream")
+    _, told = process.communicate(timeout=60)
+    assert (process.returncode, "--stream and --port are Webots' own" in told) == (2, True)

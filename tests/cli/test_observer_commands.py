@@ -83,3 +83,9 @@ def test_what_cannot_be_done_is_refused(arena: Path, arguments: tuple[str, ...],
     assert ended.returncode == 2
     assert said in ended.stderr
     assert snapshot(arena) == before
+
+
+def test_an_extern_observer_needs_no_controller(arena: Path) -> None:
+    ended = run("--observer", WORLD, "--extern", cwd=arena)
+    assert "webots-mcp observe" in ended.stdout
+    assert not (arena / CONTROLLER).exists()

@@ -17,6 +17,7 @@ import pytest
 
 from tests.bridge.conftest import Recording
 from tests.cli.conftest import Cli
+from tests.recordings.rows import Recorded
 from tests.server.conftest import Driver
 from tests.server.test_parameters import TunableDriver
 
@@ -192,3 +193,14 @@ def test_a_text_that_looks_like_a_number_stays_a_text(tunable: TunableDriver, cl
     assert tag.value == "true"
     runs = cli.json("runs --parameter tag=7 --parameter kp=3")["runs"]
     assert [row[runs["columns"].index("run_id")] for row in runs["rows"]] == [1]
+
+
+def test_a_command_that_no_route_could_do_says_why_each_failed(tmp_path: Path, cli: Cli) -> None:
+    recorded = Recorded(tmp_path / "webots.db")
+    oldest = 1  # a process that began after a session was seen last is another one
+    recorded.robot(supervisor=True, pid=oldest, last_seen_wall_time_s=time.time() - 30)
+    said = cli.refused("pause --timeout 0.2")
+    assert "pause is not done (cancelled)" in said
+    assert "websocket: " in said
+    assert "keyboard: not tried: it presses keys in Webots' window, which needs --force\n" in said
+    recorded.close()

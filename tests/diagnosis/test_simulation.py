@@ -220,3 +220,12 @@ def test_a_controller_that_records_nothing_and_hangs_is_found_as_a_child_of_its_
     running = found(file, "Running Webots")
     assert f"port {port}" in running.seen
     assert "was started without --stream and does not obey" in running.seen
+
+
+def test_many_that_stand_in_one_simulation_are_told_once(
+    look: Look, recorded: Recorded, start: Start
+) -> None:
+    process = start(WAITS)
+    for n in range(40):
+        silent(recorded, process, f"robot{n}")
+    assert look("Simulation").seen.count("paused by hand") == 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -133,3 +134,19 @@ async def test_a_line_that_may_be_of_any_robot_of_a_simulation_is_told_of_each(
         other = await ask(client, "webots_get_logs", robot=elsewhere.name)
         assert other["lines"]["rows"] == []
         assert "'x'" in await fail(client, "webots_get_logs", source="x")
+
+
+async def test_what_waits_for_a_run_is_told_beside_several_robots_of_the_past(
+    connect: Connect, recorded: Recorded
+) -> None:
+    said = {"instance": "here:1234", "wall_time_s": time.time(), "level": "info"}
+    insert(recorded.connection, "console_line", {
+        **said, "source": "console", "message": "No module named 'arm'", "logger": "stdout"
+    })  # fmt: skip
+    robots = [recorded.robot(name) for name in ("hunter", "runner")]
+    async with connect() as client:
+        assert "2 robots are live" in await fail(client, "webots_get_logs")
+        for robot in robots:
+            robot.beat(ended_wall_time_s=robot.now, end_reason="finished")
+        answer = await ask(client, "webots_get_logs")
+    assert answer["lines"]["rows"] == [[None, "info", "console: No module named 'arm'", None]]

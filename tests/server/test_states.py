@@ -156,3 +156,16 @@ async def test_a_signal_that_could_not_be_read_is_not_said_to_have_no_value(
     (run,) = answer["runs"]
     assert run["numbers"]["n"] == {}
     assert "the chunk of n is damaged" in answer["notes"][0]
+
+
+async def test_of_many_replaced_values_the_number_of_those_not_shown_is_said(
+    connect: Connect, recorded: Recorded
+) -> None:
+    names = [f"at_{number}" for number in range(50)]
+    replaced = {f"front.{name}": "nan" for name in names}
+    recorded.robot().state(1.0, {"front": dict.fromkeys(names)}, replaced=replaced)
+    async with connect() as client:
+        for tool in ("webots_get_full_state", "webots_get_sensors"):
+            replaced = (await ask(client, tool))["replaced"]
+            assert len(replaced) == 21
+            assert replaced["…"].startswith("30 more: ")

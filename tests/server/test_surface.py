@@ -199,3 +199,31 @@ async def test_over_stdio_a_server_without_a_database_starts_and_says_what_to_do
     assert answer["status"] == "never seen"
     assert str(file) in answer["hint"]
     assert not file.parent.exists()
+
+
+async def test_what_a_tool_does_is_said_as_it_is(connect: Connect) -> None:
+    async with connect() as client:
+        notes = {tool.name: tool.annotations for tool in (await client.list_tools()).tools}
+    told = {name: note for name, note in notes.items() if note and not note.read_only_hint}
+    assert {name for name, note in told.items() if not note.destructive_hint} == {
+        "webots_annotate_run",
+        "webots_breakpoint",
+        "webots_set_parameters",
+        "webots_take_screenshot",
+    }
+    assert {name for name, note in told.items() if note.idempotent_hint} == {
+        "webots_annotate_run",
+        "webots_set_parameters",
+    }
+
+
+async def test_every_tool_says_what_it_is_and_whether_it_changes_anything(
+    connect: Connect,
+) -> None:
+    async with connect() as client:
+        for tool in (await client.list_tools()).tools:
+            assert tool.title
+            assert tool.description
+            assert tool.annotations is not None
+            assert tool.annotations.read_only_hint == (tool.name in READING)
+            assert tool.annotations.open_world_hint is False

@@ -122,3 +122,27 @@ async def test_a_robot_that_ended_is_not_waited_for_and_nothing_is_absent(
     assert (answer["row_count"], answer["window_s"] < 30) == (0, True)
     (kinds,) = (k for k, why in answer["verdicts"]["not_searched"].items() if "no row" in why)
     assert {"gap", "missing", "flat", "jump", "standstill", "stuck"} <= set(kinds.split(", "))
+
+
+async def test_what_was_logged_after_the_last_row_is_told(
+    connect: Connect, rover: RecordedRobot
+) -> None:
+    rover.state(1.0, {"x": 1})
+    rover.log(2.0, "the arm is blocked", level="error")
+    async with connect() as client:
+        answer = await ask(client, "webots_monitor", lookback_wall_s=5)
+    (event,) = [row for row in rows_of(answer["events"]) if row["kind"] == "log"]
+    assert event["details"]["message"] == "the arm is blocked"
+
+
+async def test_each_run_moved_by_its_own_position(connect: Connect, rover: RecordedRobot) -> None:
+    drive(rover, [0, 0], [3, 4])
+    rover.end_run("reset")
+    rover.begin_run("reset")
+    for step in range(3):
+        rover.state(step * 0.5, {"gps": {"x": step, "y": 0}}, at=rover.now + step * 0.5)
+    async with connect() as client:
+        answer = await ask(client, "webots_monitor", lookback_wall_s=60)
+    first, second = answer["movement"]["runs"]
+    assert (first["position"], first["distance_m"]) == (["pose.0", "pose.1"], 5.0)
+    assert (second["position"], second["distance_m"]) == (["gps.x", "gps.y"], 2.0)

@@ -191,3 +191,19 @@ def test_a_search_that_is_none_is_refused_before_anything_is_written(
 
     assert said in refused(*options)
     assert not (project / "data").exists()
+
+
+def test_values_keep_to_their_ranges() -> None:
+    ranges = {
+        "whole": Range(1, 9, step=2),
+        "half": Range(0.0, 2.0, step=0.5),
+        "log": Range(0.001, 1000.0, log=True),
+        "order": Range(1, 1000, step=1, log=True),
+    }
+
+    found = [each.values for each in tried(a_plan("random", ranges=ranges), lambda _: 0.0)]
+
+    assert {each["whole"] for each in found} == {1, 3, 5, 7, 9}
+    assert {each["half"] for each in found} == {0.0, 0.5, 1.0, 1.5, 2.0}
+    assert 10 < sum(each["log"] < 1 for each in found) < 30
+    assert all(isinstance(each["order"], int) for each in found)

@@ -104,3 +104,38 @@ async def test_what_find_events_does_not_show_is_named_by_time_and_a_cursor_show
             assert all(" from " in each for each in answer["not_shown"].values())
             asked["cursor"] = answer["cursor"]
     assert told == Counter(answer["verdicts"]["found"]) and "image" not in told
+
+
+async def test_an_error_that_many_warnings_follow_is_counted_among_what_is_not_shown(
+    recorded: Recorded, connect: Connect
+) -> None:
+    robot = recorded.robot()
+    robot.state(0.0, {"n": 0})
+    robot.log(1.0, "the motor driver failed", "error")
+    for number in range(60):
+        letters = chr(97 + number % 26) * 5 + chr(97 + number // 26)
+        robot.log(2.0 + number, f"{letters} is not what {letters} was {letters * 3}", "warning")
+    robot.state(70.0, {"n": 1})
+    async with connect(read_only=True) as client:
+        for tool, asked in (("webots_find_events", {}), ("webots_monitor", {"lookback_wall_s": 9})):
+            not_shown = (await ask(client, tool, **asked))["not_shown"]
+            assert not_shown["log"].endswith(" s, errors among them: 1")
+
+
+async def test_what_is_left_out_of_several_runs_is_named_by_run_because_each_has_its_own_time(
+    recorded: Recorded, connect: Connect
+) -> None:
+    robot = recorded.robot()
+    for run in (1, 2):
+        if run == 2:
+            robot.end_run("reset")
+            robot.run_id = robot.begin_run("reset")
+        for step in range(1, 5):
+            robot.state(3.0 * step / run, {"n": step})
+            robot.log(3.0 * step / run, f"it slips {step}", "warning")
+    async with connect(read_only=True) as client:
+        asked: dict[str, Any] = {"kinds": ["log"], "since_wall_time": 0, "group": False}
+        both = await ask(client, "webots_find_events", limit=1, **asked)
+        one = await ask(client, "webots_find_events", kinds=["log"], group=False, limit=1)
+    assert both["not_shown"] == {"log": "7 from 3.0 s of run 1 to 4.5 s of run 2"}
+    assert one["not_shown"] == {"log": "3 from 1.5 to 4.5 s"}

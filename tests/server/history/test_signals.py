@@ -95,3 +95,14 @@ async def test_answers_are_the_same_before_and_after_chunks_are_made(
         assert {k: v for k, v in before.items() if k not in changing} == {
             k: v for k, v in after.items() if k not in changing
         }, tool
+
+
+async def test_signals_come_in_pages_and_by_pattern(story: Path) -> None:
+    first = await tell(story, "webots_list_signals", limit=10)
+    second = await tell(story, "webots_list_signals", limit=10, cursor=first["cursor"])
+    names = [row["signal"] for part in (first, second) for row in rows_of(part["signals"])]
+    assert names == sorted(set(names))
+    assert len(names) == first["total"] == 15
+    assert "cursor" not in second
+    part = await tell(story, "webots_list_signals", pattern="lidar.*")
+    assert part["total"] == 5

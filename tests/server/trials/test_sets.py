@@ -13,6 +13,7 @@ from tests.server.story import rows_of
 from tests.server.trials.conftest import TunableDriver, trials, value_of
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect as database
+from webots_mcp.questions.budget import tokens_of
 from webots_mcp.standin import InProcessSupervisor
 
 pytestmark = pytest.mark.anyio
@@ -173,3 +174,19 @@ async def test_a_trial_that_nobody_ran_because_the_controller_ended_says_why(
             answer = await ask(client, "webots_run_trials", trial_set=1, timeout_wall_s=30)
             assert "no live controller" in answer["state"]
             assert (answer["over"], answer["trials"]) == (0, 1)
+
+
+async def test_a_hundred_trials_are_told_in_a_short_answer(
+    connect: Connect, tunable: TunableDriver
+) -> None:
+    grid = {"kp": [0.37 * n for n in range(1, 51)], "gait": ["trot", "walk"]}
+    async with connect() as client:
+        answer = await trials(client, parameters=grid, for_s=0.032, timeout_wall_s=90)
+        while answer["state"] == "under way":
+            answer = await ask(client, "webots_run_trials", trial_set=1, timeout_wall_s=90)
+        assert answer["over"] == 100
+        assert tokens_of(answer) < 2_000
+        kps = [row["kp"] for row in rows_of(answer["ranked"])]
+        assert len(kps) > 40
+        assert any(f"{100 - len(kps)} sets that rank lower" in note for note in answer["notes"])
+        assert kps == sorted(kps, reverse=True)

@@ -105,6 +105,11 @@ def test_a_lidar_of_three_beams_has_three_sectors() -> None:
     assert read(Lidar([3.0, math.inf, 2.0], 3))["sector_min_m"] == [3.0, math.inf, 2.0]
 
 
+def test_what_is_no_number_hides_no_nearer_one() -> None:
+    ranges = [5.0] * 2 + [math.nan, 0.25] + [5.0] * 12
+    assert read(Lidar(ranges, 16))["min_m"] == 0.25
+
+
 def test_a_lidar_that_sees_nothing_says_so() -> None:
     summary = read(Lidar([math.inf] * 8, 8))
     assert (summary["min_m"], summary["min_index"]) == (math.inf, None)

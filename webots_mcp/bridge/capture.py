@@ -84,7 +84,6 @@ class _Channel:
         self._descriptor = _DESCRIPTORS[name]
         self._lines = PrintedLines()
         self._lock = threading.RLock()  # of the lines; a print within a recording takes it again
-        self._is_recording = False
         self._stream: Any = getattr(sys, name)
         self._redirect()
         self._thread = threading.Thread(target=self._follow, name=f"webots-mcp {name}", daemon=True)
@@ -157,15 +156,8 @@ class _Channel:
             self._record_lines()
 
     def _record_lines(self) -> None:
-        """Record the waiting lines; what the recording itself prints follows them."""
-        if self._is_recording:
-            return
-        self._is_recording = True
-        try:
-            while self._lines.waiting:
-                self._record(self._name, self._lines.remove())
-        finally:
-            self._is_recording = False
+        if self._lines.waiting:
+            self._record(self._name, self._lines.remove())
 
 
 class _Tee:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import base64
 import enum
 import math
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
@@ -39,7 +38,7 @@ def convert(value: Any) -> object:
         NoCounterpartError: It has no counterpart, or more items than a row takes.
         Exception: Whatever the value raises while it is read.
     """
-    if type(value) in (type, memoryview) or isinstance(value, type) or _is_of_c(value):
+    if type(value) in (type, memoryview) or isinstance(value, type):
         raise NoCounterpartError(f"type {kind_name(value)}")
     if type(value).__name__ in _WEBOTS_RECORDS:
         attributes: dict[str, object] = value.__dict__
@@ -81,18 +80,6 @@ def _require_short(array: Any) -> None:
 def is_number_array(value: Any) -> bool:
     """Whether it is a numpy array, or a scalar, of nothing but numbers or booleans."""
     return getattr(getattr(value, "dtype", None), "kind", None) in ("b", "i", "u", "f")
-
-
-def _is_of_c(value: object) -> bool:
-    """Whether it is data of ctypes: it may hold pointers, and reading one can crash the controller.
-
-    All of it derives from one class, which has no public name. It is never imported here.
-    """
-    ctypes = sys.modules.get("ctypes")
-    if ctypes is None:
-        return False
-    is_reference = type(value).__name__ == "CArgObject"  # what byref() gives
-    return is_reference or isinstance(value, ctypes.Structure.__mro__[1])
 
 
 # -- everything else ---------------------------------------------------------------------------

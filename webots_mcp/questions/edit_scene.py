@@ -121,7 +121,7 @@ async def webots_add_node(
 async def webots_remove_node(
     recording: Recording, caller: Caller, path: Path, robot: RobotName = None
 ) -> CommandAnswer:
-    """Remove a node with all in it; a reset brings it back if the answer says so."""
+    """Remove a node with all in it; a reload of the world brings it back, a reset does not."""
     return await _ask(recording, caller, robot, "remove_node", path=path)
 
 

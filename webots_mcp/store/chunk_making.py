@@ -40,7 +40,7 @@ from webots_mcp.store.chunks import (
     statistics_of,
     watermark,
 )
-from webots_mcp.store.recording import Recording, is_over_a_value, valid_rows
+from webots_mcp.store.recording import Recording, is_over_a_value
 from webots_mcp.store.robots import list_robots
 from webots_mcp.store.signals import Signal, enter_signals, registered, seen_in, tell_more
 
@@ -81,7 +81,7 @@ _NEWEST_ID: Final = "SELECT coalesce(max(id), 0) FROM state"
 _SET_CHUNKED: Final = "UPDATE run SET is_chunked = 1 WHERE id = ?"
 _ROBOT: Final = "SELECT robot_id FROM run WHERE id = ?"
 _TAIL: Final = (
-    f"SELECT {STATE_COLUMNS} FROM {{state}} WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
+    f"SELECT {STATE_COLUMNS} FROM state WHERE run_id = ? AND (sim_time_s, id) > (?, ?) "
     "AND id <= ? ORDER BY sim_time_s, id LIMIT ?"
 )
 _COUNT: Final = (  # answered by the index alone
@@ -89,7 +89,7 @@ _COUNT: Final = (  # answered by the index alone
     "AND id <= ? LIMIT ?)"
 )
 _LATE: Final = (  # by their ids, by which it is known up to where they were looked at
-    f"SELECT * FROM (SELECT {STATE_COLUMNS} FROM {{state}} WHERE id > ? AND id <= ? "
+    f"SELECT * FROM (SELECT {STATE_COLUMNS} FROM state WHERE id > ? AND id <= ? "
     "AND +run_id = ? AND (sim_time_s, id) <= (?, ?) ORDER BY id LIMIT ?) ORDER BY sim_time_s, id"
 )
 _TEMPORARY: Final = (
@@ -295,21 +295,44 @@ class _RunChunks:
 
 
 def _read(connection: sqlite3.Connection, query: str, values: tuple[object, ...]) -> StateColumns:
-    """Rows as columns; where one holds what no bridge writes, without all such rows."""
-    columns = StateColumns()
+    """Rows as columns; where one holds what no bridge writes, without such rows."""
+    columns, text_factory = StateColumns(), connection.text_factory
+    connection.text_factory = _text_or_bytes
     try:
-        columns.add(
-            connection.execute(query.format(state="state"), (*values, GROUP_ROWS)).fetchall()
+        rows = connection.execute(query, (*values, GROUP_ROWS)).fetchall()
+    finally:
+        connection.text_factory = text_factory
+    try:
+        columns.add(rows)
+    except Exception as error:
+        valid = [row for row in rows if _is_valid(row)]
+        if not is_over_a_value(error) or len(valid) == len(rows):
+            raise
+        columns = StateColumns()
+        columns.add(valid)
+        first = next(row[0] for row in rows if row not in valid)
+        warn(
+            f"{len(rows) - len(valid)} states from state {first} on are left out of the chunks: "
+            f"another program wrote what no bridge writes ({error})"
         )
+    return columns
+
+
+def _text_or_bytes(stored: bytes) -> str | bytes:
+    try:
+        return stored.decode()
+    except UnicodeDecodeError:
+        return stored
+
+
+def _is_valid(row: tuple[Any, ...]) -> bool:
+    try:
+        StateColumns().add([row])
     except Exception as error:
         if not is_over_a_value(error):
             raise
-        columns = StateColumns()
-        with valid_rows(connection) as invalid:
-            rows = connection.execute(query.format(state="valid_state"), (*values, GROUP_ROWS))
-            columns.add(rows.fetchall())
-        warn(f"left out of the chunks: {'; '.join(invalid.described())}")
-    return columns
+        return False
+    return True
 
 
 def _signals_of(

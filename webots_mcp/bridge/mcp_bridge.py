@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from webots_mcp.bridge.commands import ClaimedCommand, Handler
 from webots_mcp.bridge.encoding import text_of
 from webots_mcp.bridge.error_report import ErrorReport, describe
-from webots_mcp.bridge.keeping import Throttle
 from webots_mcp.bridge.parameters import Parameter, V
 from webots_mcp.bridge.pictures import MOST_FRAMES
-from webots_mcp.bridge.session import Attachment, Session
+from webots_mcp.bridge.session import Attachment, Session, Throttle
 from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.contract import (
     ENDED_BY,

@@ -15,7 +15,7 @@ from webots_mcp.bridge.devices import DeviceReader, restart_motors
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.journal import Changes, Heartbeat, Journal, SignalNames
-from webots_mcp.bridge.keeping import Keeper, Throttle
+from webots_mcp.bridge.keeping import Keeper
 from webots_mcp.bridge.parameters import Parameters
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.pictures import Album
@@ -30,6 +30,45 @@ _IDLE_S: Final = 0.5  # a loop that recorded nothing for so long is blocked or w
 _UNSEEN_S: Final = 1.0  # of simulation time; less may be one step whose end an interrupt hid
 _BYTES_OF_A_CHARACTER: Final = 6  # of JSON: a number of 10 characters and its key take 100 bytes
 _UNMOVED_S: Final = 10.0  # of wall time
+
+
+class Throttle:
+    """Admits one call in `interval`, and each call that is wanted for another reason.
+
+    Attributes:
+        interval: One call in this many is recorded.
+
+    Raises:
+        ValueError: The interval is less than 1.
+    """
+
+    def __init__(self, interval: int) -> None:
+        if interval < 1:
+            raise ValueError(f"throttle_interval must be 1 or more, got {interval!r}")
+        self.interval = interval
+        self._wanted = False
+        self._calls_before_run = 0
+        self.calls = 0
+        self.skipped = 0
+        self.stale = False  # the newest published state is not the newest recorded one
+
+    def begin_run(self) -> None:
+        """Count from here, so that equal runs are recorded at equal times."""
+        self._calls_before_run = self.calls
+
+    def want(self) -> None:
+        """Admit the next call, whatever its number."""
+        self._wanted = True
+
+    def admits(self, force: object) -> bool:
+        """Count a call; True if it is to be recorded, which any true value of `force` demands."""
+        self.calls += 1
+        if (self.calls - self._calls_before_run) % self.interval and not (force or self._wanted):
+            self.skipped += 1
+            self.stale = True
+            return False
+        self._wanted = self.stale = False
+        return True
 
 
 class Session:

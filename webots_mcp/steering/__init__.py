@@ -1,1 +1,1 @@
-"""Steering a simulation: commands, other routes to Webots, trials, edits of the scene."""
+"""Steering a simulation: commands, other routes to Webots, and trials."""

@@ -50,7 +50,7 @@ class Signal:
         id: In the register; None for one that was seen only in rows after the watermark.
         path: For `json_extract(state.data, path)`.
         reduction: None, or how the long array at `path` becomes one number.
-        role: What it tells of the robot's motion, as `signal_roles` decides; None of most.
+        role: What it tells of the robot's motion, as `signal_register` decides; None of most.
         is_choice: Its whole numbers, of which there are few, name what a robot does.
     """
 

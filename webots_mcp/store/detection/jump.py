@@ -111,7 +111,7 @@ class Jump:
 
 
 def find_jumps(frame: Frame, name: str, score: float) -> list[Jump]:
-    """Steps whose modified z-score (see `features.find_spikes`) is above the score.
+    """Steps whose modified z-score (see `find_spikes`) is above the score.
 
     Compared is with the steps that are not zero and do not come back at once, of which there have
     to be ten: for counters and commanded values a step is what they do. Of a value that otherwise

@@ -27,7 +27,7 @@ class Event:
     """Something that happened in a run.
 
     Attributes:
-        kind: The name of one of `registry.KINDS`.
+        kind: The name of one of `events.KINDS`.
         end_s: Equal to the start for what has no duration; of a change when the value ended.
         ongoing: It lasts up to the newest row of a run that goes on; of a command, it is not
             finished.
@@ -194,7 +194,7 @@ class Alike:
 
 @dataclass(frozen=True)
 class EventKind:
-    """A kind of event. One of these, entered in `registry.KINDS`, is all that a new kind takes.
+    """A kind of event. One of these, entered in `events.KINDS`, is all that a new kind takes.
 
     Attributes:
         name: Its name in questions and answers.

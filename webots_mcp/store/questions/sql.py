@@ -3,8 +3,8 @@
 What keeps it harmless: an authorizer that lets a statement read and call functions and nothing
 else, one statement, a deadline by a progress handler, and limits on rows, bytes and the length of
 a value. The deadline is looked at between the steps of SQLite's virtual machine; where one step
-must not outlast it either, `sql_process` runs the statement. The connection may be any; one in the
-role "reader" cannot write anyway.
+must not outlast it either, a process of its own runs the statement. The connection may be any; one
+in the role "reader" cannot write anyway.
 """
 
 from __future__ import annotations

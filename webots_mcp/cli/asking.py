@@ -9,13 +9,12 @@ import inspect
 import json
 import shlex
 import types
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Annotated, Any, Final, Literal, Union, cast, get_args, get_origin
+from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin
 
 import anyio
 from pydantic import ValidationError
-from pydantic.json_schema import SkipJsonSchema
 
 from webots_mcp.cli.options import (
     Json,
@@ -97,9 +96,7 @@ def command_of(question: Question) -> Callable[..., None]:
     )
     in_range = SCOPE if question.has_scope else ()
     parameters = [
-        _parameter(question, each)
-        for each in question.parameters
-        if _is_shown(each) and each.name not in in_range
+        _parameter(question, each) for each in question.parameters if each.name not in in_range
     ]
     parameters.sort(key=lambda each: (each.kind, *_place(question, each.name)))
     keyword = inspect.Parameter.KEYWORD_ONLY
@@ -327,17 +324,6 @@ def _value_name(argument: str) -> str | None:
 def _place(question: Question, argument: str) -> list[int]:
     """Where it stands among those without an option's name."""
     return [place for place, name in enumerate(question.positional) if name == argument]
-
-
-def _is_shown(declared: inspect.Parameter) -> bool:
-    """Whether it is no parameter that only other servers' clients give."""
-    return not any(
-        isinstance(each, cast("type", SkipJsonSchema)) for each in _metadata(declared.annotation)
-    )
-
-
-def _metadata(annotation: Any) -> Iterable[Any]:
-    return getattr(annotation, "__metadata__", ())
 
 
 def _plain(annotation: Any) -> Any:

@@ -39,7 +39,6 @@ from pydantic import (
     create_model,
 )
 from pydantic.fields import FieldInfo
-from pydantic.json_schema import SkipJsonSchema
 from pydantic_core import ErrorDetails
 
 from webots_mcp import contract
@@ -262,27 +261,19 @@ class MergedQuestion(Question):
         meaning: What that argument means.
         parts: The questions by its values. The first is asked where it is left out, unless
             `must_choose`.
-        unlisted: Arguments that are taken, and stand in no schema: another says the same.
     """
 
     choice: str = ""
     meaning: str = ""
     parts: Mapping[str, Question] = field(default_factory=dict[str, Question])
     must_choose: bool = False
-    unlisted: tuple[str, ...] = ()
 
     @functools.cached_property
     def parameters(self) -> list[inspect.Parameter]:
         """The choice, and each argument of a part once, in the words of the first that has it."""
         chosen = Annotated[Literal[tuple(self.parts)], Field(description=self.meaning)]
         default = _NOT_GIVEN if self.must_choose else next(iter(self.parts))
-        common = [
-            each.replace(annotation=SkipJsonSchema[each.annotation])
-            if each.name in self.unlisted
-            else each
-            for each in self._common()
-        ]
-        return [_keyword(self.choice, chosen, default), *common]
+        return [_keyword(self.choice, chosen, default), *self._common()]
 
     def _common(self) -> Iterable[inspect.Parameter]:
         declared: dict[str, list[inspect.Parameter]] = {}
@@ -338,7 +329,6 @@ def merged(
     text: str,
     name: str | None = None,
     title: str | None = None,
-    unlisted: tuple[str, ...] = (),
 ) -> MergedQuestion:
     """Merge questions that all read, or that all change something.
 
@@ -350,7 +340,6 @@ def merged(
         text: What the tool does.
         name: Its own name; then nothing is asked by default.
         title: Its own title.
-        unlisted: Arguments that stand in no schema.
     """
     effects = [part.effect for part in parts.values()]
     if len({effect.reads for effect in effects}) != 1:
@@ -378,7 +367,6 @@ def merged(
         meaning=meaning,
         parts=parts,
         must_choose=name is not None,
-        unlisted=unlisted,
     )
 
 

@@ -7,7 +7,6 @@ from typing import Annotated, Any, Final
 
 from pydantic import AfterValidator, Field
 
-from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.answers import EventsAnswer, KindVerdicts, Table, TimelineAnswer
 from webots_mcp.questions.budget import (
     DETAIL_BUDGET_TOKENS,
@@ -33,7 +32,6 @@ from webots_mcp.questions.declaring import (
     merged,
     question,
 )
-from webots_mcp.store.detection.condition import thresholds_on
 from webots_mcp.store.detection.events import (
     KINDS,
     Events,
@@ -43,7 +41,7 @@ from webots_mcp.store.detection.events import (
     stored_kinds,
     timeline,
 )
-from webots_mcp.store.detection.kinds import Event, EventOptions, Threshold, Verdicts, both_of
+from webots_mcp.store.detection.kinds import Event, EventOptions, Verdicts, both_of
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import Recording, View
 
@@ -97,11 +95,6 @@ def webots_find_events(
         ),
     ] = None,
     signals: AnyNames = None,
-    above: Annotated[
-        float | None, Field(description="As with where: the signals were above this ...")
-    ] = None,
-    below: Annotated[float | None, Field(description="... or below this")] = None,
-    for_s: Annotated[float, Field(ge=0, description="... for at least so long.")] = 0,
     stuck_s: Annotated[
         float, Field(gt=0, description="Still: at least so long ...")
     ] = EventOptions.stuck_s,
@@ -123,12 +116,10 @@ def webots_find_events(
     verdicts: what was found, what was not, what was not looked for and why. What is not shown is
     counted; the next are seen with cursor.
     """
-    thresholds = thresholds_on(signals or (), above, below, for_s)
     options = EventOptions(
-        kinds=_kinds(kinds, thresholds, where),
+        kinds=tuple(kinds or (("condition",) if where is not None else ())),
         where=where,
         signals=tuple(signals or ("*",)),
-        thresholds=thresholds,
         stuck_s=stuck_s,
         stuck_m=stuck_m,
         missing_s=missing_s,
@@ -142,19 +133,6 @@ def webots_find_events(
             EventsAnswer,
             lambda: _found(view, range_in(view, scope), options, group, limit, cursor),
         )
-
-
-def _kinds(
-    kinds: Sequence[str] | None, thresholds: Sequence[Threshold], where: str | None
-) -> tuple[str, ...]:
-    """Who gives a threshold or a condition asks about that, unless other kinds are named."""
-    if kinds and "threshold" in kinds and not thresholds:
-        raise InvalidInputError(
-            "kinds=['threshold'] needs signals, and above or below; where='pose.x > 1' finds the "
-            "same stretches as kind 'condition'"
-        )
-    given = ("threshold",) * bool(thresholds) + ("condition",) * (where is not None)
-    return tuple(kinds or ()) or given
 
 
 def _found(
@@ -268,10 +246,6 @@ def webots_get_timeline(
     A log of what was noted, from the start of the run on. To search for what went wrong, also what
     nobody noted: webots_find_events.
     """
-    if "threshold" in (kinds or ()):
-        raise InvalidInputError(
-            "a threshold has no place here: ask webots_find_events(where='pose.x > 1')"
-        )
     options = EventOptions(kinds=tuple(kinds or stored_kinds()), log_level=log_level)
     with recording.view(scope.robot, scope.run_id) as view:
         return answer_about(
@@ -308,7 +282,6 @@ EVENTS: Final = merged(
     choice="what",
     meaning="timeline: all that was noted, in order.",
     parts={"events": webots_find_events, "timeline": webots_get_timeline},
-    unlisted=("above", "below", "for_s"),
     text="""\
 What went wrong, since when, how often: searches the values, by default of the whole run.
 

@@ -53,7 +53,6 @@ async def test_the_schema_of_a_refused_recording_is_refused_by_name(tmp_path: Pa
             {"since_wall_time": 1700000100, "until_wall_time": 1.7e9},
             "until_wall_time=1700000000",
         ),
-        ("webots_find_events", {"kinds": ["threshold"]}, "above or below"),
         ("webots_get_timeline", {"cursor": "xyz"}, "is not a cursor"),
         ("webots_compare_runs", {"run_ids": [1, 99]}, "no run 99"),
         ("webots_plot", {"signals": ["nope"]}, "no signal 'nope'"),

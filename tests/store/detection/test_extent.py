@@ -15,7 +15,7 @@ from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.detection.events import find_events
-from webots_mcp.store.detection.kinds import Event, EventOptions, Threshold
+from webots_mcp.store.detection.kinds import Event, EventOptions
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 STOPS_S = 200.0  # the robot drives, then stands, at 300 s it drives on
@@ -56,14 +56,13 @@ def _stand(connection: sqlite3.Connection) -> None:
 
 
 def told(connection: sqlite3.Connection, kind: str, **bounds: Any) -> list[Event]:
-    low = (Threshold("battery_v", below=5.0, for_s=2.0),)
     names = {"missing": "front_m", "flat": "heading_deg", "change": "mode"}
     name = (names | {"oscillation": "steering_rad"}).get(kind, "*")
-    options = EventOptions(kinds=(kind,), signals=(name,), thresholds=low)
+    options = EventOptions(kinds=(kind,), signals=(name,), where="battery_v < 5")
     return list(find_events(connection, find_range(connection, Scope(**bounds)), options).events)
 
 
-@pytest.mark.parametrize("kind", ["stuck", "threshold", "missing", "flat", "oscillation"])
+@pytest.mark.parametrize("kind", ["stuck", "condition", "missing", "flat", "oscillation"])
 @pytest.mark.parametrize(
     ("start_s", "end_s"), [(250.0, 255.0), (250.0, 250.5), (150.0, 250.0), (295.0, 350.0)]
 )
@@ -77,7 +76,7 @@ def test_a_range_that_holds_a_part_tells_the_true_begin_and_end(
     assert not event.ongoing
 
 
-@pytest.mark.parametrize("kind", ["stuck", "threshold", "missing", "flat"])
+@pytest.mark.parametrize("kind", ["stuck", "condition", "missing", "flat"])
 def test_what_was_over_before_the_range_is_not_in_it(
     standing: sqlite3.Connection, kind: str
 ) -> None:

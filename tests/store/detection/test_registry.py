@@ -59,17 +59,15 @@ def test_a_kind_that_is_entered_once_is_found_compared_told_and_drawn(
 
 def test_nothing_but_its_own_module_and_the_registry_names_a_kind() -> None:
     """`log`, `run`, `missing` and the like are words of other things too."""
-    names = {"oscillation", "jump", "threshold", "flat"}
+    names = {"oscillation", "jump", "flat"}
     folder = Path(webots_mcp.__file__).parent
-    own = {"jump.py", "condition.py", "sensors.py"}
+    own = {"jump.py", "sensors.py"}
     naming = {
         path.relative_to(folder).as_posix(): named
         for path in folder.rglob("*.py")
         if path.name not in own and (named := names & set(strings_in(path)))
     }
-    # A threshold is what the asker gives: the tool and the command line refuse or imply the kind.
-    allowed = {"questions/events.py"}
-    assert {path: named for path, named in naming.items() if path not in allowed} == {}
+    assert naming == {}
 
 
 def strings_in(path: Path) -> Iterator[str]:
@@ -80,5 +78,5 @@ def strings_in(path: Path) -> Iterator[str]:
 
 def test_options_name_kinds_of_the_registry() -> None:
     names = [kind.name for kind in events.asked_kinds(EventOptions())]
-    assert "image" not in names and "threshold" not in names and "stuck" in names
+    assert "image" not in names and "condition" not in names and "stuck" in names
     assert len(set(events.kind_names())) == len(events.KINDS)

@@ -16,7 +16,7 @@ from tests.memory import memory_connection
 from tests.recordings.rover import start_run
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.detection.events import find_events
-from webots_mcp.store.detection.kinds import Event, EventOptions, Threshold
+from webots_mcp.store.detection.kinds import Event, EventOptions
 from webots_mcp.store.purge import prune
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.retention import Limit, Retention
@@ -26,7 +26,6 @@ NOISE = np.random.default_rng(1).normal(0, 0.01, (ROWS, 3)).tolist()
 KINDS = {
     "standstill": 2,
     "stuck": 1,
-    "threshold": 1,
     "condition": 1,
     "missing": 1,
     "flat": 3,
@@ -78,8 +77,7 @@ def purge(connection: sqlite3.Connection, folder: Path) -> None:
 
 
 def ask(connection: sqlite3.Connection, kind: str) -> list[Event]:
-    low = (Threshold("battery_v", below=10.0),)
-    options = EventOptions(kinds=(kind,), thresholds=low, where="battery_v < 10 and pose.0 > 1")
+    options = EventOptions(kinds=(kind,), where="battery_v < 10 and pose.0 > 1")
     found = find_events(
         connection, find_range(connection, Scope()), options, around=(), group=False
     )

@@ -10,17 +10,19 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.recordings.rover import Recorder, start_run
+from webots_mcp.conditions.signal_values import SAME_TIME_S
 from webots_mcp.errors import InvalidConditionError, InvalidInputError, UnknownSignalError
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.detection.events import Events, find_events
-from webots_mcp.store.detection.kinds import EventOptions, Threshold
+from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 
 def ask(connection: sqlite3.Connection, where: str, **bounds: Any) -> Events:
     found = find_range(connection, Scope(**(bounds or {"run_id": 1})))
-    return find_events(connection, found, EventOptions(kinds=("condition",), where=where))
+    options = EventOptions(kinds=("condition",), where=where)
+    return find_events(connection, found, options, group=False)
 
 
 def spans(events: Events) -> list[tuple[float, float]]:
@@ -151,26 +153,24 @@ def test_a_wrong_question_is_refused_with_what_would_do(rover: sqlite3.Connectio
 )
 @given(
     st.lists(st.sampled_from([0.0, 1.0, 2.0, None]), min_size=1, max_size=30),
-    st.sampled_from([0.0, 0.2, 0.5]),
-    st.booleans(),
+    st.sampled_from([0.1, 0.2, 0.5]),
+    st.sampled_from(["<", ">"]),
 )
-def test_thresholds_are_a_short_form_of_a_condition(
-    empty: sqlite3.Connection, values: list[float | None], for_s: float, above: bool
+def test_a_duration_leaves_out_what_is_shorter_and_begins_when_it_is_over(
+    empty: sqlite3.Connection, values: list[float | None], for_s: float, sign: str
 ) -> None:
     empty.execute("DELETE FROM robot")
     recorder = start_run(empty)
     for step, value in enumerate([*values, 1.0]):
         recorder.publish(step * 0.1, {"x": value})
-    whole = find_range(empty, Scope(run_id=recorder.run_id))
-    limit = Threshold("x", **{"above" if above else "below": 1.0}, for_s=for_s)
-    short = find_events(empty, whole, EventOptions(kinds=("threshold",), thresholds=(limit,)))
-    text = f"x {'>' if above else '<'} 1" + (f" for {for_s}" if for_s else "")
 
-    held = ask(empty, text, run_id=recorder.run_id)
+    found = ask(empty, f"x {sign} 1", run_id=recorder.run_id)
+    lasting = ask(empty, f"x {sign} 1 for {for_s}", run_id=recorder.run_id)
 
-    told = [(event.start_s + for_s, event.end_s) for event in short.events]
-    assert [(event.start_s, event.end_s) for event in held.events] == [
-        (pytest.approx(start_s), end_s) for start_s, end_s in told
+    assert [(event.start_s, event.end_s) for event in lasting.events] == [
+        (pytest.approx(event.start_s + for_s), event.end_s)
+        for event in found.events
+        if event.duration_s >= for_s - SAME_TIME_S
     ]
 
 

@@ -17,7 +17,7 @@ from tests.store.questions.asking import ask, spans
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.store.detection.events import asked_kinds, find_events
 from webots_mcp.store.detection.jump import find_jumps
-from webots_mcp.store.detection.kinds import Event, EventOptions, Ledger, Threshold
+from webots_mcp.store.detection.kinds import Event, EventOptions, Ledger
 from webots_mcp.store.detection.search import Search, events_touching
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import Scope, find_range
@@ -36,18 +36,12 @@ def test_a_robot_that_should_move_and_does_not_is_stuck(
     assert stuck.wall_time_s == pytest.approx(WALL_START_S + 20.0, abs=0.5)
 
 
-def above(limit: float, for_s: float = 0.0) -> dict[str, Any]:
-    return {"thresholds": (Threshold("pose.0", above=limit, for_s=for_s),)}
-
-
 @pytest.mark.parametrize(
     ("kind", "options", "expected"),
     [
         ("gap", {}, [(None, 89.9, 95.0)]),
         ("missing", {}, [("sensors.front", 100.0, 103.9)]),
         ("flat", {"signals": ("pose.0", "target"), "flat_s": 5.0}, [("pose.0", 40.0, 52.0)]),
-        ("threshold", above(7.5, 5.0), [("pose.0", 37.6, 56.9), ("pose.0", 75.1, 119.9)]),
-        ("threshold", above(7.5, 50.0), []),
         ("jump", {"signals": ("ir", "mode")}, [("ir", 70.0, 70.1), ("position", 110.0, 110.0)]),
         ("oscillation", {}, [("heading", 60.0, 89.9)]),
     ],
@@ -194,16 +188,12 @@ def test_between_two_signals_the_time_is_looked_at(
 def test_options_without_sense_are_refused(rover: sqlite3.Connection) -> None:
     with pytest.raises(InvalidInputError, match="kind"):
         ask(rover, "stcuk")
-    with pytest.raises(InvalidInputError, match="above or below"):
-        Threshold("ir")
     with pytest.raises(InvalidInputError, match="stuck_s"):
         EventOptions(stuck_s=0)
     with pytest.raises(UnknownSignalError):
         ask(rover, "stuck", mode="moood")
     with pytest.raises(InvalidInputError, match="matches 2 signals"):
         ask(rover, "stuck", position=("pose", "pose.1"))
-    with pytest.raises(UnknownSignalError):
-        ask(rover, "threshold", thresholds=(Threshold("nothing", above=1.0),))
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -222,11 +212,10 @@ def test_a_wall_range_over_several_runs_knows_the_signals_of_each(
         recorder.run(session_id, robot_id, "reset" if run else "start")
         for step in range(30):
             recorder.publish(step * 0.1, {name: float(step >= 20)})
-    above = tuple(Threshold(name, above=0.5) for name in ("alt_m", "depth_m", "temp_c"))
-    found = ask(empty, "threshold", bounds={"since_wall_time": WALL_START_S}, thresholds=above)
-    assert [(e.run_id, e.name, e.start_s) for e in found.events] == [
-        (1, "alt_m", 2.0), (2, "depth_m", 2.0), (3, "temp_c", 2.0),
-    ]  # fmt: skip
+    names = ("alt_m", "depth_m", "temp_c")
+    where = " or ".join(f"{name} > 0.5" for name in names)
+    found = ask(empty, "condition", bounds={"since_wall_time": WALL_START_S}, where=where)
+    assert [(e.run_id, e.start_s) for e in found.events] == [(1, 2.0), (2, 2.0), (3, 2.0)]
 
 
 def test_a_gap_is_an_event_also_where_the_range_lies_within_it(

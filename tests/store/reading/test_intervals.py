@@ -15,10 +15,8 @@ from tests.recordings.rover import start_run
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.detection.events import find_events
-from webots_mcp.store.detection.kinds import EventOptions, Threshold
+from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.reading.ranges import Scope, find_range
-
-Spans = list[tuple[str | None, float, float]]
 
 
 def record(
@@ -31,25 +29,22 @@ def record(
     connection.execute("COMMIT")
 
 
-def spans(connection: sqlite3.Connection, **options: Any) -> Spans:
+def spans(connection: sqlite3.Connection, where: str) -> list[tuple[float, float]]:
     found = find_events(
         connection,
         find_range(connection, Scope()),
-        EventOptions(**options),
+        EventOptions(kinds=("condition",), where=where),
         limit=10_000,
         around=(),
     )
-    return sorted((each.name, each.start_s, each.end_s) for each in found.events)
+    return sorted((each.start_s, each.end_s) for each in found.events)
 
 
 def test_what_holds_throughout_is_one_span_across_every_border(
     empty: sqlite3.Connection, looked_at: str
 ) -> None:
     record(empty, [{"alt_m": 0.0 if step in (5, 333) else 9.0} for step in range(500)], 0.1)
-    high = (Threshold("alt_m", above=5, for_s=1.0),)
-    assert spans(empty, kinds=("threshold",), thresholds=high) == [
-        ("alt_m", 0.6, 33.2), ("alt_m", 33.4, 49.9),
-    ]  # fmt: skip
+    assert spans(empty, "alt_m > 5 for 1") == [(1.6, 33.2), (34.4, 49.9)]
 
 
 LEVELS = st.sampled_from([0.0, 10.0, None, ()])  # the last: the row does not hold the signal
@@ -62,14 +57,10 @@ def test_chunks_and_rows_tell_the_same_spans(stretches: list[tuple[Any, int]]) -
     levels = [level for level, rows in stretches for _ in range(rows)]
     states = [{} if level == () else {"alt_m": level} for level in levels]
     states += [{"alt_m": 0.0}]
-    limits = {"above": 5.0}, {"below": 5.0}
-    asked: dict[str, Any] = {
-        "kinds": ("threshold",),
-        "thresholds": [Threshold("alt_m", for_s=1.0, **limit) for limit in limits],
-    }
+    asked = ("alt_m > 5 for 1", "alt_m < 5 for 1")
     with memory_connection() as connection, pytest.MonkeyPatch.context() as patch:
         record(connection, states, 1.0)
-        from_rows = spans(connection, **asked)
+        from_rows = [spans(connection, where) for where in asked]
         patch.setattr(chunk_making, "GROUP_ROWS", 3)
         assert chunk_whole_run(connection, 1)
-        assert spans(connection, **asked) == from_rows
+        assert [spans(connection, where) for where in asked] == from_rows

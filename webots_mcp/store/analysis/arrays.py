@@ -129,14 +129,6 @@ def _runs(starts: Indexes, stops: Indexes, times: Array) -> Runs:
     return Runs(starts, stops, times[starts], times[stops - 1])
 
 
-def extremes_in(runs: Runs, numbers: Array) -> tuple[Array, Array]:
-    """The least and the greatest number of each run, given those of all rows."""
-    if not len(runs):
-        return np.zeros(0), np.zeros(0)
-    edges, padded = np.stack((runs.starts, runs.stops), 1).ravel(), np.append(numbers, 0.0)
-    return np.minimum.reduceat(padded, edges)[::2], np.maximum.reduceat(padded, edges)[::2]
-
-
 def runs_alike(numbers: Array, times: Array) -> Runs:
     """Where a number stays exactly the same in two rows at least; NaN is never the same."""
     edges = np.flatnonzero(np.append(True, numbers[1:] != numbers[:-1]))

@@ -16,7 +16,6 @@ from webots_mcp.liveness import dead_sessions
 from webots_mcp.naming import flatten
 from webots_mcp.store.chunks import parse
 from webots_mcp.store.detection import condition, jump, sensors, standstill, stored
-from webots_mcp.store.detection import condition as threshold
 from webots_mcp.store.detection import jump as oscillation
 from webots_mcp.store.detection.kinds import (
     Event,
@@ -419,7 +418,6 @@ KINDS: Final[list[EventKind]] = [
     stored.CHANGE,
     standstill.STANDSTILL,
     standstill.STUCK,
-    threshold.THRESHOLD,
     condition.CONDITION,
     sensors.MISSING,
     sensors.FLAT,

@@ -54,20 +54,6 @@ class Event:
         return self.end_s - self.start_s
 
 
-@dataclass(frozen=True)
-class Threshold:
-    """A signal above or below a value for at least `for_s` simulated seconds."""
-
-    signal: str
-    above: float | None = None
-    below: float | None = None
-    for_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        if (self.above is None) == (self.below is None):
-            raise InvalidInputError(f"threshold on {self.signal!r}: give either above or below")
-
-
 def both_of(names: Sequence[str] | None) -> tuple[str, str] | None:
     """The signals of x and y that were named, if any.
 
@@ -87,7 +73,7 @@ class EventOptions:
 
     Attributes:
         kinds: Names of the kinds that are looked for; without any the usual ones, which pictures
-            and thresholds are not.
+            are not.
         signals: Names, with `*`, of the signals that are looked at.
         position: The two signals of the position in metres; None finds them by name (`pose.0`
             and `pose.1`, `position.x` and `position.y`, `gps.0` and so on).
@@ -101,7 +87,6 @@ class EventOptions:
         stuck_m: Who stays within this distance (more where the noise of the position is more) is at
             a standstill, and stuck who should move besides, ...
         stuck_s: ... for so long.
-        thresholds: For the kind "threshold".
         where: For the kind "condition"; see docs/conditions.md.
         missing_s: Without a value for so long, though it mostly has one.
         flat_s: Exactly the same number for so long, though it mostly changes; for a signal that
@@ -123,7 +108,6 @@ class EventOptions:
     min_commanded_m_s: float = 0.01
     stuck_m: float = 0.05
     stuck_s: float = 3.0
-    thresholds: tuple[Threshold, ...] = ()
     where: str | None = None
     missing_s: float = 1.0
     flat_s: float = 20.0

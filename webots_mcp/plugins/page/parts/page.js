@@ -150,9 +150,11 @@ async function draw() {
       by("empty").hidden = Boolean(drawing.signals);
       by("notes").replaceChildren(...drawing.notes.map((note) => element("p", { textContent: note })));
       tick(drawing.names);
-      if (drawing.settled && !wanted.signals) change({ signals: drawing.names }); // others change most later
+      if (drawing.settled && !wanted.signals) { // others change most later: these stay
+        change({ signals: drawing.names });
+        if (!wanted.view) drawnOf = JSON.stringify([{ ...parameters, signals: JSON.stringify(wanted.signals) }, shown.started]);
+      }
       replayRange(drawing.bounds);
-      if (wanted.signals && !wanted.view) drawnOf = JSON.stringify([{ ...parameters, signals: JSON.stringify(wanted.signals) }, shown.started]);
     } catch (error) {
       by("notes").textContent = error.message;
       drawnOf = key;

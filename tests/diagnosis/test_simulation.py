@@ -104,7 +104,7 @@ def test_where_nobody_computes_it_was_most_likely_paused_by_hand(
     assert found.fix == "press play in Webots"
 
 
-@pytest.mark.parametrize("options", [(), ("--stream", "--mode=fast")])
+@pytest.mark.parametrize("options", [(), ("--stream", "--mode=realtime")])
 def test_that_webots_obeys_by_its_websocket_is_named_where_it_does(
     look: Look,
     recorded: Recorded,
@@ -124,7 +124,7 @@ def test_that_webots_obeys_by_its_websocket_is_named_where_it_does(
     assert found.fix == "press play in Webots" + obeys * bool(options)
     running = look("Running Webots").seen
     assert f"port {port} (process " in running
-    assert ("arena.wbt, mode fast) obeys orders" in running) == bool(options)
+    assert ("arena.wbt, mode realtime) obeys orders" in running) == bool(options)
 
 
 def test_a_controller_that_computes_holds_itself_up(

@@ -218,7 +218,8 @@ def test_it_moves_while_the_robot_moves_and_its_buttons_steer(
 ) -> None:
     tab = opened(driven)
     tab.says("running")
-    tab.page.get_by_label("pose.y", exact=True).first.check()  # those shown unasked change as the robot goes on
+    # A chosen one: those shown unasked change as the robot goes on.
+    tab.page.get_by_label("pose.y", exact=True).first.check()
     reached = tab.column("pose.y", "t")[-1]
     tab.until("pose.y", reached + 1)
     tab.page.get_by_role("button", name="Pause").click()

@@ -31,6 +31,9 @@ def begin():
 """
 
 
+WITHOUT_POLLING = "from webots_mcp.bridge import capture\ncapture._POLLS = False\n"
+
+
 @pytest.fixture
 def run(script: Script, data_dir: Path) -> Callable[[str], subprocess.Popen[str]]:
     return lambda program: script(CAPTURED + program, data_dir)
@@ -39,11 +42,13 @@ def run(script: Script, data_dir: Path) -> Callable[[str], subprocess.Popen[str]
 Run = Callable[[str], "subprocess.Popen[str]"]
 
 
-def test_prints_of_python_of_c_and_of_children_appear_and_are_recorded(
-    run: Run, filed: Recording
+@pytest.mark.parametrize("system", ["", WITHOUT_POLLING], ids=["this system", "as on Windows"])
+def test_prints_of_python_of_c_and_of_children_come_in_order_and_are_recorded(
+    run: Run, filed: Recording, system: str
 ) -> None:
     process = run(
-        """
+        system
+        + """
 bridge = begin()
 print("python")
 os.write(1, b"descriptor\\n")
@@ -51,14 +56,13 @@ print("python again", flush=True)
 subprocess.run([sys.executable, "-c", "print('a child')"])
 print("an error", file=sys.stderr)
 sys.stdout.write("no newline")
-bridge.close()
 """
     )
     out, err = process.communicate(timeout=60)
-    lines = ["a child", "descriptor", "no newline", "python", "python again"]
-    assert sorted(out.replace("no newline", "no newline\n").split("\n")) == ["", *lines]
+    lines = ["python", "descriptor", "python again", "a child", "no newline"]
+    assert out == "\n".join(lines)
     assert err == "an error\n"
-    assert sorted(filed.rows(LINES)) == lines
+    assert filed.rows(LINES) == lines
     rows = "SELECT level, source, logger, message FROM log WHERE logger = 'stderr'"
     assert filed.rows(rows) == [("warning", "controller", "stderr", "an error")]
 
@@ -100,6 +104,28 @@ def test_an_exception_that_ends_the_controller_is_recorded_with_its_traceback(
     printed = filed.rows("SELECT message FROM log WHERE logger = 'stderr' ORDER BY id")
     assert printed[0].startswith("Traceback")
     assert printed[-1] == "ZeroDivisionError: division by zero"
+
+
+def test_a_reader_that_reads_nothing_keeps_no_print_waiting(
+    run: Run, filed: Recording, tmp_path: Path
+) -> None:
+    """150 kB are more than one pipe holds: without the bridge they would wait."""
+    done = tmp_path / "done"
+    process = run(
+        f"""
+begin()
+for n in range(150):
+    print(n, "x" * 1000, flush=True)
+Path({str(done)!r}).touch()
+sys.stdin.readline()
+"""
+    )
+    assert process.stdin is not None
+    while not done.exists():
+        assert process.poll() is None
+    out, _ = process.communicate("go on\n", timeout=30)
+    assert [line.split()[0] for line in out.splitlines()] == [str(n) for n in range(150)]
+    assert len(filed.rows(LINES)) == 150
 
 
 def test_a_flood_of_lines_is_passed_on_whole_and_what_was_not_recorded_is_counted(
@@ -175,10 +201,12 @@ os._exit(7)
     assert filed.rows(LINES) == ["before"]
 
 
-def test_what_cannot_be_recorded_is_passed_on_all_the_same(run: Run) -> None:
+@pytest.mark.parametrize("strict", ["", "1"])
+def test_what_cannot_be_recorded_is_passed_on_all_the_same(run: Run, strict: str) -> None:
     """More of it than the pipe holds."""
     process = run(
-        """
+        f"""
+os.environ["WEBOTS_MCP_STRICT"] = {strict!r}
 import threading
 from webots_mcp.bridge.journal import Journal
 
@@ -278,6 +306,43 @@ print("".join(Own.written), end="", file=real)
     )
     assert process.communicate(timeout=60)[0] == "to my own\n"
     assert filed.rows(LINES) == ["to my own", "to my own"]
+
+
+@posix
+def test_a_process_without_stdout_is_recorded_all_the_same(run: Run, filed: Recording) -> None:
+    process = run(
+        """
+os.close(1)
+bridge = begin()
+bridge.publish({"n": 1}, force=True)
+print("into the void", flush=True)
+"""
+    )
+    assert process.communicate(timeout=60) == ("", "")
+    assert filed.states() == [{"n": 1}]
+    assert "into the void" in filed.rows(LINES)
+
+
+@posix
+def test_an_old_place_that_is_gone_ends_neither_controller_nor_record(
+    run: Run, filed: Recording
+) -> None:
+    process = run(
+        """
+begin()
+sys.stdin.readline()
+for n in range(3):
+    print(n, flush=True)
+"""
+    )
+    with process:
+        assert process.stdout is not None
+        assert process.stdin is not None
+        process.stdout.close()
+        process.stdin.write("go on\n")
+    assert process.returncode == 0
+    assert [line for line in filed.rows(LINES) if line.isdigit()] == ["0", "1", "2"]
+    assert "(stdout cannot be written any more: Broken pipe)" in filed.rows(LINES)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="where a pipe can be made so large")

@@ -1,17 +1,18 @@
 """Recording what a controller prints: `capture_output=True`.
 
-What Python prints is recorded by the print itself, and appears where it did before. The file
-descriptors 1 and 2 are redirected into pipes in addition, so that the output of C code and of child
-processes is recorded too: a thread forwards and records it, which never calls Webots' API. So a
-process that is killed loses what C code printed in its last milliseconds, and what Python and C
-print at the same time may change places where it appears.
+The file descriptors 1 and 2 are redirected into pipes, so that the output of C code is recorded
+too. The data is forwarded to the original destination, in order, and its lines are recorded. A
+`print` in Python does that itself before it returns; for the output of C code a thread does it,
+which never calls Webots' API. So a process that is killed loses what C code printed in its last
+milliseconds, and what was never flushed.
 
-Lines are recorded as any log line is, within milliseconds also while the database is locked.
+While the original destination accepts no data, the output waits in the pipe (1 MB on Linux, 64 kB
+elsewhere); a print blocks only when the pipe is full too. Lines are recorded as any log line is,
+within milliseconds also while the database is locked.
 """
 
 from __future__ import annotations
 
-import io
 import logging
 import os
 import sys
@@ -25,12 +26,14 @@ from webots_mcp.errors import warn
 
 _DESCRIPTORS: Final = {"stdout": 1, "stderr": 2}
 _PIPE_BYTES: Final = 1 << 20
-_READ_BYTES: Final = 1 << 16
+_CHUNK_BYTES: Final = 4096  # PIPE_BUF: a writable pipe takes so many bytes without blocking
+_MOST_UNFORWARDED_BYTES: Final = 1 << 16  # beyond it, data is left in the pipe
+_MOST_SELECTABLE: Final = 1024  # FD_SETSIZE: select() cannot watch a higher descriptor
 _LAST_WAIT_S: Final = 1.0  # on closing, for a destination that accepts no data
+_PATIENCE_S: Final = 0.02  # how long a print waits for the thread that is recording
+_POLLS: Final = os.name == "posix"  # Windows has no select() for pipes
 
 Record = Callable[[str, Sequence[str]], object]
-
-_of_parents: list[_Channel] = []  # kept, since dropping a stream would print what its buffer holds
 
 
 class Capture:
@@ -53,10 +56,13 @@ class Capture:
             return
         Capture._current = self
         for name in _DESCRIPTORS:
-            try:
-                self._channels.append(_Channel(name, self._record))
-            except (OSError, ValueError) as error:  # noqa: PERF203
-                warn(f"{name} cannot be recorded: {error}")
+            self._begin(name)
+
+    def _begin(self, name: str) -> None:
+        try:
+            self._channels.append(_Channel(name, self._record))
+        except (OSError, ValueError) as error:
+            warn(f"{name} cannot be recorded: {error}")
 
     def close(self) -> None:
         """Restore the original streams, and record the rest."""
@@ -64,8 +70,7 @@ class Capture:
 
     def abandon(self) -> None:
         """In a forked child: its output goes to the original destination, unrecorded."""
-        _of_parents.extend(self._channels)
-        self._end(_Channel.restore)
+        self._end(_Channel.abandon)
 
     def _end(self, end: Callable[[_Channel], object]) -> None:
         if Capture._current is self:
@@ -83,31 +88,156 @@ class _Channel:
         self._record = record
         self._descriptor = _DESCRIPTORS[name]
         self._lines = PrintedLines()
-        self._lock = threading.RLock()  # of the lines; a print within a recording takes it again
+        # Two locks, so that forwarding goes on while lines are being recorded.
+        self._lock = threading.RLock()  # guards reading the pipe and forwarding
+        self._recording = threading.Lock()
+        self._recorder: int | None = None  # the thread that holds `_recording`
+        self._unforwarded = bytearray()
+        self._destination_failed = False
+        self._ended = False
         self._stream: Any = getattr(sys, name)
+        self._tee: _Tee | None = None
+        self._reaches_descriptor = _writes_to(self._stream, self._descriptor)
         self._redirect()
         self._thread = threading.Thread(target=self._follow, name=f"webots-mcp {name}", daemon=True)
         self._thread.start()
-        self._tee: _Tee | None = None
         if self._stream is not None:
-            target = _past_the_pipe(self._stream, self._descriptor, self._destination)
-            self._tee = _Tee(target, self._printed)
+            self._tee = _Tee(self._stream, self._printed)
             setattr(sys, name, self._tee)
 
     def close(self) -> None:
         """Restore the stream, forward and record what is still in the pipe."""
         _flush(self._stream)
         _flush_c()  # before restoring: C's buffer must still go through the pipe
-        if self._tee is not None:
-            _flush(self._tee.stream)
-            self._tee.stream = self._stream  # other code may still have the tee
-        self.restore()
-        self._thread.join(_LAST_WAIT_S)
+        self._restore()
+        deadline_s = time.monotonic() + _LAST_WAIT_S
+        while self._has_unforwarded() and time.monotonic() < deadline_s:
+            self._thread.join(0.02)
         with self._lock:
             self._lines.end()
-            self._record_lines()
+        self._record_lines(_PATIENCE_S)
 
-    def restore(self) -> None:
+    def abandon(self) -> None:
+        """In a forked child: locks, thread and unforwarded data belong to the parent."""
+        self._restore()
+        os.close(self._read_end)
+        os.close(self._destination)
+
+    # -- forwarding ----------------------------------------------------------------------------
+
+    def _printed(self, text: str) -> None:
+        """Called when Python has printed something."""
+        if not self._reaches_descriptor:  # a replaced stream, as that of Webots on Windows
+            with self._lock:
+                self._lines.take(text.encode("utf-8", "replace"))
+        elif _POLLS:
+            self._pump()
+        self._record_lines(_PATIENCE_S)
+
+    def _follow(self) -> None:
+        """The thread's loop, until every writer has closed the pipe, child processes included."""
+        while not (self._pump() if _POLLS else self._forward_blocking()):
+            self._record_in_thread()
+            if _POLLS:
+                full = len(self._unforwarded) >= _MOST_UNFORWARDED_BYTES
+                destination = [self._destination] if self._unforwarded else []
+                _wait_for([] if full else [self._read_end], destination)
+        with self._lock:
+            self._ended = True
+            os.close(self._read_end)
+            os.close(self._destination)
+        self._record_in_thread()
+
+    def _has_unforwarded(self) -> bool:
+        """Whether some output has not reached the destination yet."""
+        if not _POLLS:
+            return self._thread.is_alive()
+        return not self._pump() and bool(self._unforwarded)
+
+    def _pump(self) -> bool:
+        """Forward what has arrived, as far as that does not block; True at the end of the pipe."""
+        with self._lock:
+            while not self._ended:
+                self._forward()
+                if len(self._unforwarded) >= _MOST_UNFORWARDED_BYTES:
+                    return False
+                try:
+                    data = os.read(self._read_end, _MOST_UNFORWARDED_BYTES)
+                except BlockingIOError:
+                    return False
+                self._unforwarded += data
+                self._lines.take(data)
+                if not data:
+                    return not self._unforwarded
+        return True
+
+    def _forward(self) -> None:
+        while self._unforwarded and (not _POLLS or _wait_for([], [self._destination], 0)):
+            try:
+                written = os.write(self._destination, self._unforwarded[:_CHUNK_BYTES])
+            except BlockingIOError:
+                return
+            except OSError as error:
+                if not self._destination_failed:
+                    self._destination_failed = True
+                    self._lines.add_note(
+                        f"{self._name} cannot be written any more: {error.strerror}"
+                    )
+                written = len(self._unforwarded)  # discarded: the lines are still recorded
+            del self._unforwarded[:written]
+
+    def _forward_blocking(self) -> bool:
+        """Forward the next data, where a pipe cannot be polled."""
+        # Outside of the lock: this read blocks, and a print needs the lock meanwhile.
+        data = os.read(self._read_end, _MOST_UNFORWARDED_BYTES)
+        with self._lock:
+            self._lines.take(data)
+            self._unforwarded += data
+            self._forward()
+        return not data
+
+    def _record_in_thread(self) -> None:
+        """Record in the thread, which must survive any error: it has to go on forwarding."""
+        try:
+            self._record_lines()
+        except Exception as error:  # noqa: BLE001  (only strict mode raises)
+            warn(f"{self._name} could not be recorded: {error}")
+
+    def _record_lines(self, patience_s: float = 0) -> None:
+        """Record the waiting lines; output of the recording itself follows with the next line.
+
+        Args:
+            patience_s: How long to wait for another thread that is recording.
+        """
+        if self._recorder == threading.get_ident():
+            return  # a warning printed while recording must not record itself
+        while self._recording.acquire(timeout=patience_s):
+            try:
+                self._recorder = threading.get_ident()
+                if self._lines.waiting:
+                    self._record(self._name, self._lines.remove())
+            finally:
+                self._recorder = None
+                self._recording.release()
+            if not self._lines.waiting:
+                return
+
+    # -- redirecting ---------------------------------------------------------------------------
+
+    def _redirect(self) -> None:
+        _flush(self._stream)
+        self._destination = os.dup(self._descriptor)
+        self._read_end, write_end = os.pipe()
+        if max(self._read_end, self._destination) >= _MOST_SELECTABLE:
+            raise OSError("too many files are open")
+        _enlarge(write_end)
+        if _POLLS:
+            os.set_blocking(self._read_end, False)
+        os.dup2(write_end, self._descriptor)
+        self._pipe = os.fstat(write_end)
+        os.close(write_end)
+
+    def _restore(self) -> None:
         """Restore the stream and the descriptor, unless other code has redirected them since."""
         if getattr(sys, self._name) is self._tee:
             setattr(sys, self._name, self._stream)
@@ -118,84 +248,36 @@ class _Channel:
         if is_ours:
             os.dup2(self._destination, self._descriptor)
 
-    def _redirect(self) -> None:
-        _flush(self._stream)
-        self._destination = os.dup(self._descriptor)
-        self._read_end, write_end = os.pipe()
-        _enlarge(write_end)
-        os.dup2(write_end, self._descriptor)
-        self._pipe = os.fstat(write_end)
-        os.close(write_end)
-
-    def _printed(self, text: str) -> None:
-        """Called when Python prints something."""
-        self._take(text.encode("utf-8", "replace"))
-
-    def _follow(self) -> None:
-        """The thread's loop, until every writer has closed the pipe, child processes included."""
-        while data := os.read(self._read_end, _READ_BYTES):
-            try:
-                self._take(data)
-            except Exception as error:  # noqa: BLE001  (only strict mode raises)
-                self._lines.add_note(f"not recorded: {error}")
-            self._forward(data)
-        os.close(self._read_end)
-        os.close(self._destination)
-
-    def _forward(self, data: bytes) -> None:
-        """Write to the original destination; what it does not take any more is recorded alone."""
-        try:
-            while data:
-                data = data[os.write(self._destination, data) :]
-        except OSError:
-            return
-
-    def _take(self, data: bytes) -> None:
-        with self._lock:
-            self._lines.take(data)
-            self._record_lines()
-
-    def _record_lines(self) -> None:
-        if self._lines.waiting:
-            self._record(self._name, self._lines.remove())
-
 
 class _Tee:
-    """A Python stream that reports each write at once.
-
-    Attributes:
-        stream: Where it writes.
-    """
+    """A Python stream that reports each write at once."""
 
     def __init__(self, stream: Any, printed: Callable[[str], object]) -> None:
-        self.stream = stream
+        self._stream = stream
         self._printed = printed
 
     def write(self, text: str) -> int:
-        try:
-            count = self.stream.write(text)
-        finally:
-            self._printed(text)
+        count = self._stream.write(text)
+        self._printed(text)
         return count
 
     def writelines(self, lines: Iterable[str]) -> None:
         for line in lines:
             self.write(line)
 
+    def flush(self) -> None:
+        self._stream.flush()
+        self._printed("")
+
     def __getattr__(self, name: str) -> Any:
-        return getattr(self.stream, name)
+        return getattr(self._stream, name)
 
 
-def _past_the_pipe(stream: Any, descriptor: int, destination: int) -> Any:
-    """A stream like Python's own that writes to the destination; a replaced one stays as it is."""
+def _writes_to(stream: Any, descriptor: int) -> bool:
     try:
-        if stream.fileno() != descriptor:
-            return stream
-    except (AttributeError, OSError, ValueError):  # such as the stream of Webots on Windows
-        return stream
-    file = os.fdopen(destination, "wb", 0 if stream.write_through else -1, closefd=False)
-    ways = {"line_buffering": stream.line_buffering, "write_through": stream.write_through}
-    return io.TextIOWrapper(file, stream.encoding, stream.errors, **ways)
+        return stream.fileno() == descriptor
+    except (AttributeError, OSError, ValueError):
+        return False
 
 
 def _flush(stream: Any) -> None:
@@ -208,8 +290,14 @@ def _flush(stream: Any) -> None:
 
 def _flush_c() -> None:
     """Flush the buffer of the C library, which else stays until the process ends."""
-    if os.name == "posix" and (ctypes := sys.modules.get("ctypes")) is not None:
+    if _POLLS and (ctypes := sys.modules.get("ctypes")) is not None:
         ctypes.CDLL(None).fflush(None)
+
+
+def _wait_for(readable: list[int], writable: list[int], timeout_s: float | None = None) -> bool:
+    import select  # only where output is captured
+
+    return any(select.select(readable, writable, [], timeout_s))
 
 
 def _enlarge(pipe: int) -> None:

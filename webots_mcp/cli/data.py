@@ -249,7 +249,8 @@ def import_(
     from webots_mcp.store.merging import is_bundle, unpacked
 
     if not source.is_file():
-        raise InvalidInputError(f"{source} cannot be imported: there is no such file")
+        why = "it is a folder: name the file in it" if source.is_dir() else "there is no such file"
+        raise InvalidInputError(f"{source} cannot be imported: {why}")
     if is_bundle(source):
         with unpacked(source) as database:
             found = _take_in(recorded, database)

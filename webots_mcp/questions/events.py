@@ -7,6 +7,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import AfterValidator, Field
 
+from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.answers import EventsAnswer, KindVerdicts, Table, TimelineAnswer
 from webots_mcp.questions.budget import (
     DETAIL_BUDGET_TOKENS,
@@ -116,6 +117,11 @@ def webots_find_events(
     verdicts: what was found, what was not, what was not looked for and why. What is not shown is
     counted; the next are seen with cursor.
     """
+    if kinds and where is not None and "condition" not in kinds:
+        raise InvalidInputError(
+            f"where={where!r} is looked for as the kind 'condition', which kinds lacks: "
+            "leave kinds out, or name 'condition' among them"
+        )
     options = EventOptions(
         kinds=tuple(kinds or (("condition",) if where is not None else ())),
         where=where,

@@ -47,6 +47,7 @@ async def test_the_schema_of_a_refused_recording_is_refused_by_name(tmp_path: Pa
     ("tool", "arguments", "words"),
     [
         ("webots_find_events", {"start_s": 3, "end_s": 3}, "empty"),
+        ("webots_find_events", {"where": "x > 1", "kinds": ["jump"]}, "which kinds lacks"),
         ("webots_get_trends", {"since_wall_time": "yesterday"}, "ISO 8601"),
         (
             "webots_get_trends",

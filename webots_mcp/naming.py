@@ -136,10 +136,10 @@ def reduce_array(array: list[Any]) -> tuple[Value, ...]:
 
 
 def mean_of(numbers: Collection[int | float]) -> float | None:
-    """Their mean; None of no numbers, and where their sum is beyond all floats."""
+    """Their mean, the same by each version of Python; None of none, and where it is no float."""
     try:
-        mean = sum(numbers) / len(numbers) if numbers else math.inf
-    except OverflowError:
+        mean = math.fsum(numbers) / len(numbers) if numbers else math.inf
+    except (OverflowError, ValueError):
         return None
     return mean if math.isfinite(mean) else None
 

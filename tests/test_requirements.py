@@ -92,4 +92,6 @@ def test_of_what_is_named_once_for_each_python_ours_is_needed(
         return [new, old]
 
     monkeypatch.setattr("importlib.metadata.requires", requires)
-    assert missing_requirements() == [old if sys.version_info < (3, 11) else new]
+    assert missing_requirements() == [
+        "no-such-a<2" if sys.version_info < (3, 11) else "no-such-a>=2"
+    ]

@@ -93,7 +93,7 @@ def _requirements(extra: str | None) -> list[str]:
     except metadata.PackageNotFoundError:  # used without being installed
         return []
     wanted = [each for each in requirements if _extra_of(each) == extra and _is_for_us(each)]
-    return wanted if extra is None else [each.partition(";")[0].strip() for each in wanted]
+    return [each.partition(";")[0].strip() for each in wanted]
 
 
 def _extra_of(requirement: str) -> str | None:

@@ -15,7 +15,6 @@ from types import TracebackType
 from typing import Any, Final, Literal
 
 from websockets.exceptions import ConnectionClosed
-from websockets.http11 import Request
 from websockets.sync.server import Server, ServerConnection, serve
 
 Manner = Literal["well", "busy", "cut off", "in other words"]
@@ -61,12 +60,17 @@ class WebotsServer:
         free = self._free
 
         class Busy(ServerConnection):
-            """Shakes hands, and then reads nothing, pings neither."""
+            """Shakes hands, and then sends nothing, no pong either."""
 
-            def process_event(self, event: Any) -> None:
-                if not isinstance(event, Request):
-                    free.wait()
-                super().process_event(event)
+            is_busy = False
+
+            def handshake(self, *arguments: Any, **options: Any) -> None:
+                super().handshake(*arguments, **options)
+                self.is_busy = True
+
+            def send_data(self) -> None:
+                if not self.is_busy or free.is_set():
+                    super().send_data()
 
         self._server: Server = serve(
             self._serve, "127.0.0.1", port, max_size=None, compression=None, ping_interval=None,

@@ -131,6 +131,20 @@ def test_another_program_at_the_port_is_no_webots() -> None:
         thread.join()
 
 
+def test_who_hangs_up_in_the_handshake_is_no_webots() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as door:
+
+        def hang_up() -> None:
+            with door.accept()[0] as client:
+                client.recv(4096)
+
+        thread = threading.Thread(target=hang_up)
+        thread.start()
+        with pytest.raises(CommandRefusedError, match="is no Webots"):
+            give_order(WebotsAddress("127.0.0.1", door.getsockname()[1]), "pause", 5)
+        thread.join()
+
+
 @_CUTS_OFF
 def test_a_connection_that_ends_in_mid_frame_is_an_error_with_a_reason() -> None:
     with (

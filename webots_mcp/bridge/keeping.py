@@ -94,7 +94,7 @@ class Keeper:
         self._left_out: tuple[float, str] | None = None  # this run's last call that was not held
         self._stretch: Stretch | None = None
         self._going_on = False
-        self._asked: deque[str] = deque(maxlen=_MOST_REASONS)
+        self._asked: deque[tuple[Run, str]] = deque(maxlen=_MOST_REASONS)
         self._unwritten: deque[tuple[Run, RingRow]] = deque()
         self._unwritten_frames: deque[tuple[Stretch, Frame]] = deque()
         self._lock = threading.RLock()  # of all that is held: any thread may publish
@@ -159,8 +159,6 @@ class Keeper:
     def go_on(self) -> None:
         """Begin the requested stretches, write some rows, and end the stretch when it is over."""
         with self._lock:
-            if self._clock.run is not self._run:
-                self._begin_run()
             self._keep_asked()
             self._write_some()
             if self._stretch is not None and self._clock.sim_time_s >= self._stretch.end_s:
@@ -173,31 +171,15 @@ class Keeper:
     def ask(self, reason: str) -> None:
         """Request a stretch, which the next round of the loop begins; from any thread."""
         if self.enabled:
-            self._asked.append(reason)
+            self._asked.append((self._clock.run, reason))
             self.busy = True
 
     def keep(self, reason: str) -> bool:
         """Keep the last seconds and the next ones; False where that is not possible."""
         with self._lock:
-            if not self.enabled or not self._may_keep():
-                return False
-            now_s = self._clock.sim_time_s
-            rows = self._ring.take()
-            before_s = min(now_s - self._last_s, rows[0].sim_time_s if rows else now_s)
-            start_s, stretch = max(self._ring.starts_s, before_s), self._stretch
-            if stretch is None or start_s > stretch.end_s:
-                stretch = self._stretch = Stretch(self._run, start_s)
-            self._kept_s += now_s + KEEP_AFTER_S - max(start_s, stretch.end_s)
-            stretch.end_s = now_s + KEEP_AFTER_S
-            stretch.add_reason(reason)
-            if self._left_out is not None and self._left_out[0] >= start_s:
-                stretch.gaps = stretch.gaps or self._left_out[1]
-            self._unwritten.extend((self._run, row) for row in rows)
-            for frame in self.frames.take(start_s):
-                self._keep_frame(stretch, frame)
-            self._going_on = self.busy = True
-            self._record(stretch)
-            return True
+            if self._clock.run is not self._run:
+                self._begin_run()
+            return self._keep_around(self._clock.sim_time_s, reason)
 
     @property
     def why_not(self) -> str:
@@ -225,13 +207,33 @@ class Keeper:
 
     # -- inside --------------------------------------------------------------------------------
 
-    def _keep_asked(self) -> None:
-        while self._asked:
-            self.keep(self._asked.popleft())
+    def _keep_around(self, now_s: float, reason: str) -> bool:
+        if not self.enabled or not self._may_keep():
+            return False
+        rows = self._ring.take()
+        before_s = min(now_s - self._last_s, rows[0].sim_time_s if rows else now_s)
+        start_s, stretch = max(self._ring.starts_s, before_s), self._stretch
+        if stretch is None or start_s > stretch.end_s:
+            stretch = self._stretch = Stretch(self._run, start_s)
+        self._kept_s += now_s + KEEP_AFTER_S - max(start_s, stretch.end_s)
+        stretch.end_s = now_s + KEEP_AFTER_S
+        stretch.add_reason(reason)
+        if self._left_out is not None and self._left_out[0] >= start_s:
+            stretch.gaps = stretch.gaps or self._left_out[1]
+        self._unwritten.extend((self._run, row) for row in rows)
+        for frame in self.frames.take(start_s):
+            self._keep_frame(stretch, frame)
+        self._going_on = self.busy = True
+        self._record(stretch)
+        return True
 
-    def _may_keep(self) -> bool:
+    def _keep_asked(self) -> None:
         if self._clock.run is not self._run:
             self._begin_run()
+        while self._asked:
+            self.keep(self._asked.popleft()[1])
+
+    def _may_keep(self) -> bool:
         if self._kept_s < MOST_KEPT_S:
             return True
         if self._kept_s < float("inf"):
@@ -240,8 +242,11 @@ class Keeper:
         return False
 
     def _begin_run(self) -> None:
-        """A new run has begun: forget what the ring holds of the last one."""
-        self._end_stretch(self._clock.ended_sim_time_s)
+        """A new run has begun: keep what was asked for in the last one, and forget its ring."""
+        ended_s = self._clock.ended_sim_time_s
+        while self._asked and self._asked[0][0] is self._run:
+            self._keep_around(ended_s, self._asked.popleft()[1])
+        self._end_stretch(ended_s)
         self._run, self._stretch, self._kept_s = self._clock.run, None, 0.0
         self._left_out = None
         self._ring.begin(self._run.started_sim_time_s)

@@ -247,6 +247,7 @@ class Recorder:
 
     def close(self, reason: str, sim_time_s: float) -> None:
         """End run and session, write the waiting rows (for up to a second), and disconnect."""
+        self._locked(self._look_after_files)  # what went into a deleted file is counted as dropped
         if self.off is None:
             self.end(reason, sim_time_s)
         until_s = time.monotonic() + 1

@@ -161,7 +161,7 @@ def connected(address: WebotsAddress, timeout_s: float) -> Generator[Stream]:
         CommandRefusedError: Nothing listens there, it is not Webots, it does not answer, or it
             hung up.
     """
-    from websockets.exceptions import InvalidHandshake
+    from websockets.exceptions import WebSocketException
     from websockets.sync.client import connect
 
     try:
@@ -179,7 +179,7 @@ def connected(address: WebotsAddress, timeout_s: float) -> Generator[Stream]:
             f"what listens at {address} did not answer within {timeout_s:g} s: Webots' main thread "
             "is busy, or it is no Webots"
         ) from error
-    except InvalidHandshake as error:
+    except WebSocketException as error:  # it refuses, or hangs up in the handshake
         raise CommandRefusedError(f"what listens at {address} is no Webots ({error})") from error
     except OSError as error:
         raise CommandRefusedError(f"no Webots listens at {address} ({error})") from error

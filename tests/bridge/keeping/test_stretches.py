@@ -116,6 +116,20 @@ def test_a_reset_ends_the_stretch_and_the_new_run_has_none_of_the_old_one(
     assert new_kept == list(range(1000, 1060))
 
 
+def test_an_error_right_before_a_reset_keeps_the_seconds_before_it_in_its_own_run(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
+) -> None:
+    drive(robot, bridge, range(100))
+    bridge.log("the gear is gone", "error")
+    robot.simulationReset()
+    drive(robot, bridge, range(1000, 1010))
+
+    ((run_id, start_s, end_s, reason),) = recording.rows(STRETCHES)
+    assert (run_id, reason) == (1, "error: the gear is gone")
+    assert (start_s, end_s) == (0, pytest.approx(100 * STEP_S))
+    assert kept_numbers(recording) == [list(range(100))]
+
+
 @pytest.mark.parametrize(("action", "keeps"), [("pause", True), ("keep", True), ("log", False)])
 def test_who_pauses_or_keeps_has_the_seconds_before_at_once(
     robot: InProcessSupervisor, make: Make, recording: Recording, action: Any, keeps: bool

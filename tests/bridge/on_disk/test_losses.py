@@ -91,6 +91,23 @@ def test_rows_that_went_into_a_deleted_file_are_counted_as_dropped(
 
 
 @POSIX
+def test_rows_of_a_file_that_was_deleted_just_before_the_end_are_counted_as_dropped(
+    bridge: MCPBridge, file: Path, filed: Recording
+) -> None:
+    heartbeat_now(bridge)
+    for n in range(3):
+        bridge.publish({"n": n})
+    for part in file.parent.glob(f"{DATABASE_NAME}*"):
+        part.unlink()
+    bridge.close()
+    assert bridge.stats().rows_dropped == 3
+    assert filed.rows("SELECT json_extract(data, '$.row_count') FROM event WHERE name IS NULL") == [
+        None,
+        3,
+    ]
+
+
+@POSIX
 @pytest.mark.usefixtures("retry_at_once")
 def test_recording_goes_on_after_the_write_ahead_log_was_deleted(
     bridge: MCPBridge, file: Path, filed: Recording

@@ -222,8 +222,10 @@ async def test_an_asker_who_goes_away_takes_the_command_with_it(
 ) -> None:
     robot = recorded.robot()
     async with connect() as client:
-        with anyio.move_on_after(0.3):
-            await client.call_tool("webots_send_command", {"action": "go"})
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(client.call_tool, "webots_send_command", {"action": "go"})
+            await until(lambda: list_commands(recorded.connection, robot.id, limit=1))
+            tasks.cancel_scope.cancel()
         (command,) = await until(
             lambda: list_commands(recorded.connection, robot.id, limit=1),
             lambda commands: any(each.is_final for each in commands),

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from tests.waiting import wait_for
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.bridge import encoding, recorder
 from webots_mcp.connection import connect
@@ -154,9 +155,7 @@ def keep_in_memory(bridge: MCPBridge) -> None:
 
 def catch_up(bridge: MCPBridge) -> None:
     """Write all that waits, whatever the maintainer is doing at this moment."""
-    deadline_s = time.monotonic() + 10
-    while not bridge._session.recorder.flush():  # pyright: ignore[reportPrivateUsage]
-        assert time.monotonic() < deadline_s
+    wait_for(bridge._session.recorder.flush)  # pyright: ignore[reportPrivateUsage]
     assert bridge.stats().rows_waiting == 0
 
 

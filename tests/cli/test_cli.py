@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.recordings.rows import Recorded, RecordedRobot
+from tests.waiting import wait_for
 from webots_mcp.cli import main, names
 from webots_mcp.queue import CommandQueue
 from webots_mcp.store.logs import Follower
@@ -167,9 +167,7 @@ def test_a_reader_that_has_seen_enough_ends_the_tail_quietly(
         assert process.stdout is not None
         process.stdout.readline()
         process.stdout.close()
-        deadline = time.monotonic() + 60
-        while process.poll() is None and time.monotonic() < deadline:
-            rover.log(2.0, "into the void")
+        wait_for(lambda: rover.log(2.0, "into the void") and process.poll() is not None)
         assert process.stderr is not None
         assert (process.wait(timeout=30), process.stderr.read()) == (0, "")
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.trials.test_killed import wait_until
+from tests.waiting import wait_for
 from tests.webots.conftest import CONTROLLER, free_port, started, webots, write_project
 
 __all__ = ["webots"]
@@ -85,7 +85,7 @@ def test_it_says_who_records_and_leaves_nothing_running_however_it_ends(
     process.send_signal(number)
     out, rest = process.communicate(timeout=60)
 
-    wait_until(lambda: not any(each.is_running() for each in family))
+    wait_for(lambda: not any(each.is_running() for each in family))
     if number != signal.SIGKILL:
         assert process.returncode == 128 + number
         assert "webots-mcp: ending Webots\n" in rest
@@ -225,7 +225,7 @@ def test_what_webots_says_is_recorded_also_where_no_controller_ever_recorded(
     def told() -> str:
         return subprocess.run(asking, capture_output=True, text=True, check=False).stdout
 
-    wait_until(lambda: "console: ValueError: no arm" in told())
+    wait_for(lambda: "console: ValueError: no arm" in told())
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -237,7 +237,7 @@ def test_the_stand_in_runs_a_world_where_no_webots_is(
     family = psutil.Process(process.pid).children(recursive=True)
     process.send_signal(number)
     out, rest = process.communicate(timeout=60)
-    wait_until(lambda: not any(each.is_running() for each in family))
+    wait_for(lambda: not any(each.is_running() for each in family))
     assert process.returncode == 0
     assert "Traceback" not in out + rest
     assert (tmp_path / "project" / "mcp_data" / "webots.db").exists()

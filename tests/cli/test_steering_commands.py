@@ -8,9 +8,8 @@ import shlex
 import signal
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -20,6 +19,7 @@ from tests.cli.conftest import Cli
 from tests.recordings.rows import Recorded
 from tests.server.conftest import Driver
 from tests.server.test_parameters import TunableDriver
+from tests.waiting import wait_for
 
 
 @pytest.fixture
@@ -33,14 +33,6 @@ def tunable(tmp_path: Path) -> Iterator[TunableDriver]:
     driving.start()
     yield driving
     driving.stop()
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    """Leave the processor to the others in between."""
-    deadline_s, moment = time.monotonic() + 60, threading.Event()
-    while not condition():
-        assert time.monotonic() < deadline_s
-        moment.wait(0.02)
 
 
 @pytest.mark.usefixtures("driver")

@@ -10,7 +10,6 @@ import struct
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -20,6 +19,7 @@ import psutil
 import pytest
 
 from tests.recordings.rows import Recorded
+from tests.waiting import wait_for
 from tests.webots.server import WebotsServer
 from webots_mcp import console
 from webots_mcp.console import follow_console, job_of
@@ -56,13 +56,6 @@ def messages(recorded: Recorded, source: str | None = None) -> list[str]:
     return [message for (message,) in recorded.connection.execute(query, (source,))]
 
 
-def until(condition: Callable[[], bool]) -> None:
-    last_s = time.monotonic() + 90  # on a slow machine who waits for a lease looks seldom
-    while not condition():
-        assert time.monotonic() < last_s, "it did not come about"
-        time.sleep(0.02)
-
-
 @pytest.fixture(autouse=True)
 def at_short_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody else records these lines, and nothing has to be spared."""
@@ -88,7 +81,7 @@ def followed(recorded: Recorded, follow: Callable[..., Any]) -> Iterator[tuple[W
     with WebotsServer(streams=False) as server:
         begin_run(recorded, server.port)
         follower = follow(server.port)
-        until(lambda: follower.problem is None)
+        wait_for(lambda: follower.problem is None)
         yield server, follower
 
 
@@ -100,10 +93,10 @@ def test_what_controllers_print_and_what_webots_says_become_rows_with_their_sour
         server.log("stdout", "INFO: rover: Starting controller: python3 -u rover.py")
         server.log("stdout", "hello\n")
         follow(server.port)
-        until(lambda: "hello" in messages(recorded))
+        wait_for(lambda: "hello" in messages(recorded))
         server.log("stderr", "Traceback (most recent call last):\n")
         server.log("stderr", "WARNING: 'rover' controller exited with status: 1.")
-        until(lambda: len(messages(recorded, "webots")) == 2)
+        wait_for(lambda: len(messages(recorded, "webots")) == 2)
     found = recorded.connection.execute(
         "SELECT level, source, message, logger FROM log WHERE logger IS NOT NULL ORDER BY id"
     )
@@ -124,7 +117,7 @@ def test_of_what_was_said_before_it_is_told_that_nobody_knows_when(
         for each in range(5):
             server.log("stdout", f"{each}\n")
         follow(server.port, os.getppid())  # which has run for a while
-        until(lambda: bool(messages(recorded)))
+        wait_for(lambda: bool(messages(recorded)))
     assert messages(recorded) == [
         "(the next 2 lines were printed before the console was followed, the last of 5: when "
         "they were printed is not known)",
@@ -140,15 +133,15 @@ def test_two_who_follow_write_each_line_once_and_one_takes_over_from_the_other(
         begin_run(recorded, server.port)
         instance, recording = instance_at(server.port), recording_of(recorded)
         with follow_console(instance, recording) as first:
-            until(lambda: first.problem is None)
+            wait_for(lambda: first.problem is None)
             with follow_console(instance, recording) as second:
-                until(lambda: second.problem == "another process follows it")
+                wait_for(lambda: second.problem == "another process follows it")
                 server.log("stdout", "once\n")
-                until(lambda: "once" in messages(recorded))
+                wait_for(lambda: "once" in messages(recorded))
                 first.stop()
-                until(lambda: not server.is_listened_to or second.problem is None)
+                wait_for(lambda: not server.is_listened_to or second.problem is None)
                 server.log("stdout", "then\n")
-                until(lambda: "then" in messages(recorded))
+                wait_for(lambda: "then" in messages(recorded))
         assert [each for each in messages(recorded) if each[0] != "("] == ["once", "then"]
     assert holder_of(recorded.connection, job_of(instance)) is None
 
@@ -156,7 +149,7 @@ def test_two_who_follow_write_each_line_once_and_one_takes_over_from_the_other(
 def test_a_flood_is_cut_and_counted(recorded: Recorded, followed: tuple[WebotsServer, Any]) -> None:
     server, _ = followed
     server.log("stdout", "begin\n")
-    until(lambda: "begin" in messages(recorded))
+    wait_for(lambda: "begin" in messages(recorded))
     server.log("stdout", "\n".join(f"stdout:{each}" for each in range(3_000)))
 
     def counted() -> tuple[int, int]:
@@ -165,7 +158,7 @@ def test_a_flood_is_cut_and_counted(recorded: Recorded, followed: tuple[WebotsSe
         left_out = re.findall(r"(\d+) lines of the console: more than 500 in a second", said)
         return len(re.findall(r"^(?:stdout:)?\d+$", said, re.M)), sum(map(int, left_out))
 
-    until(lambda: sum(counted()) == 3_000)
+    wait_for(lambda: sum(counted()) == 3_000)
     assert counted()[1] > 0  # how many depends on how many seconds it took to take them in
 
 
@@ -176,10 +169,10 @@ def test_a_huge_message_is_kept_in_part_and_that_is_said(
         begin_run(recorded, server.port)
         server.log("stdout", "begin\n")
         follow(server.port)
-        until(lambda: "begin" in messages(recorded))
+        wait_for(lambda: "begin" in messages(recorded))
         server.log("stdout", "x" * (6 << 20))
         server.log("stdout", "after it\n")
-        until(lambda: "after it" in messages(recorded))
+        wait_for(lambda: "after it" in messages(recorded))
     assert "bytes of the console in one burst" in " ".join(messages(recorded))
     assert max(map(len, messages(recorded))) == 10_000
 
@@ -191,14 +184,14 @@ def test_what_was_said_last_is_recorded_when_webots_hangs_up_and_webots_that_com
         port = server.port
         begin_run(recorded, port)
         follower = follow(port)
-        until(lambda: follower.problem is None)
+        wait_for(lambda: follower.problem is None)
         server.log("stderr", "FATAL: the end\n")
         server.hang_up()
-    until(lambda: "FATAL: the end" in messages(recorded))
-    until(lambda: follower.problem is not None)
+    wait_for(lambda: "FATAL: the end" in messages(recorded))
+    wait_for(lambda: follower.problem is not None)
     with WebotsServer(streams=False, port=port) as again:
         again.log("stdout", "back\n")
-        until(lambda: "back" in messages(recorded))
+        wait_for(lambda: "back" in messages(recorded))
 
 
 RUDE = {
@@ -232,7 +225,7 @@ def test_who_does_not_answer_is_named_and_asked_again(
 
         threading.Thread(target=answer, daemon=True).start()
         follower = follow(door.getsockname()[1])
-        until(lambda: len(callers) > 1)
+        wait_for(lambda: len(callers) > 1)
         assert "what listens at 127.0.0.1:" in follower.problem
         door.shutdown(socket.SHUT_RDWR)
     for caller in callers:
@@ -249,7 +242,7 @@ def test_a_frame_that_trickles_in_and_breaks_off_costs_only_itself(
         server.send_raw(bytes([byte]))
     server.hang_up()
     server.log("stdout", "again\n")  # who connects next is told
-    until(lambda: "again" in messages(recorded))
+    wait_for(lambda: "again" in messages(recorded))
     assert "half" not in " ".join(messages(recorded))
 
 
@@ -284,9 +277,9 @@ def test_a_killed_webots_ends_what_follows_it_and_its_successor_is_another(
     began_s = psutil.Process(first.pid).create_time()
     recorded.robot("rover", began_s - 0.9, instance=f"{host_name()}:{port}")
     follower = follow(port, first.pid)
-    until(lambda: follower.problem is None)
+    wait_for(lambda: follower.problem is None)
     say(first, "one")
-    until(lambda: "one" in messages(recorded))
+    wait_for(lambda: "one" in messages(recorded))
     first.send_signal(signal.SIGKILL)
     first.communicate()
     follower.join(timeout=30)
@@ -297,7 +290,7 @@ def test_a_killed_webots_ends_what_follows_it_and_its_successor_is_another(
     follow(port, second.pid)
     say(second, "two")
     waiting = "SELECT message FROM console_line"
-    until(lambda: recorded.connection.execute(waiting).fetchall() == [("two",)])
+    wait_for(lambda: recorded.connection.execute(waiting).fetchall() == [("two",)])
     second.kill()
     second.communicate()
     assert messages(recorded) == ["one"]
@@ -308,10 +301,10 @@ def test_a_database_that_comes_later_gets_what_was_said_before(tmp_path: Path) -
         server.log("stdout", "first\n")
         recording = Recording(tmp_path / "webots.db", tmp_path)
         with follow_console(instance_at(server.port), recording) as follower:
-            until(lambda: "no database" in (follower.problem or ""))
+            wait_for(lambda: "no database" in (follower.problem or ""))
             recorded = Recorded(tmp_path / "webots.db")
             begin_run(recorded, server.port)
-            until(lambda: "first" in messages(recorded))
+            wait_for(lambda: "first" in messages(recorded))
             recorded.close()
 
 
@@ -321,7 +314,7 @@ def test_lines_that_meet_a_locked_database_are_written_once_it_is_free(
     server, follower = followed
     recorded.connection.execute("BEGIN IMMEDIATE")
     server.log("stdout", "meanwhile\n")
-    until(lambda: "stayed locked" in (follower.problem or ""))
+    wait_for(lambda: "stayed locked" in (follower.problem or ""))
     recorded.connection.execute("ROLLBACK")
-    until(lambda: "meanwhile" in messages(recorded))
+    wait_for(lambda: "meanwhile" in messages(recorded))
     assert messages(recorded).count("meanwhile") == 1

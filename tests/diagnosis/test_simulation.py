@@ -14,6 +14,7 @@ import pytest
 
 from tests.diagnosis.conftest import Look, found
 from tests.recordings.rows import Recorded, RecordedRobot
+from tests.waiting import wait_for
 from tests.webots.conftest import (
     StartWebots,
     free_port,
@@ -70,12 +71,8 @@ def silent(
     return recorded.robot(name, now=began_s, pid=process.pid, process=identity, **session)
 
 
-def eventually(look: Callable[[], Finding], words: str) -> Finding:
-    """What is found as soon as it says so."""
-    until_s = time.monotonic() + 60
-    while words not in (finding := look()).seen:
-        assert time.monotonic() < until_s, finding
-    return finding
+def computes(finding: Finding) -> bool:
+    return "another controller computes" in finding.seen
 
 
 @pytest.mark.parametrize(
@@ -118,9 +115,7 @@ def test_that_webots_obeys_by_its_websocket_is_named_where_it_does(
     silent(recorded, start(WAITS), instance=f"{host_name()}:{port}")
     recorded.connection.execute("UPDATE run SET world = '/nowhere.wbt'")
     obeys = "; or webots_simulation_control('resume'): this Webots obeys it by its WebSocket"
-    found = look("Simulation")
-    while "another controller computes" in found.seen:  # it is still starting
-        found = look("Simulation")
+    found = wait_for(lambda: look("Simulation"), lambda it: not computes(it))  # once it has started
     assert found.fix == "press play in Webots" + obeys * bool(options)
     running = look("Running Webots").seen
     assert f"port {port} (process " in running
@@ -214,7 +209,7 @@ def test_a_controller_that_records_nothing_and_hangs_is_found_as_a_child_of_its_
     port = free_port()
     wait_for_line(start_webots("--stdout", f"--port={port}", world), "ready")
     file = tmp_path / "data" / "webots.db"
-    told = eventually(lambda: found(file, "Simulation"), "another controller computes")
+    told = wait_for(lambda: found(file, "Simulation"), computes)
     assert "spinner.py (process " in told.seen
     assert "reload the world" in (told.fix or "")
     running = found(file, "Running Webots")

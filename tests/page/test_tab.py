@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
@@ -13,6 +12,7 @@ import pytest
 
 from tests.page.conftest import Server, write_story
 from tests.recordings.long import build
+from tests.waiting import wait_for
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.plugins.page.page_data import choice_of, draw
@@ -93,9 +93,7 @@ def test_what_no_server_puts_into_chunks_is_beside_the_page(tmp_path: Path) -> N
     recording = Recording(tmp_path / DATABASE_NAME, tmp_path, read_only=True)
     chunk_maker = ChunkMaker(recording)
     chunk_maker.start()
-    while not chunk_maker.rounds:
-        assert chunk_maker.is_alive()
-        threading.Event().wait(0.01)
+    wait_for(lambda: chunk_maker.rounds or not chunk_maker.is_alive())
     chunk_maker.stop()
     assert chunk_maker.says == ""
     with recording.reader() as connection:

@@ -8,7 +8,6 @@ import shutil
 import sqlite3
 import subprocess
 import sys
-import time
 from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
@@ -21,6 +20,7 @@ from tests.recordings.answers import answers
 from tests.recordings.rounds import PART, record_rounds
 from tests.recordings.runs import Recorded
 from tests.store.export.test_export import publish
+from tests.waiting import wait_for
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, new_uuid
@@ -392,8 +392,7 @@ def test_a_fetch_that_is_killed_leaves_whole_runs_and_is_gone_on_with(
     words = ("fetch", "--from", lab.url, "--robot", "rover", "--data-dir", str(lab.here))
     line = [sys.executable, "-m", "webots_mcp", *words]
     with subprocess.Popen(line) as fetching, lab.opened() as here:
-        while not count(here, "run") and fetching.poll() is None:
-            time.sleep(0.001)
+        wait_for(lambda: count(here, "run") or fetching.poll() is not None, pause_s=0.001)
         fetching.kill()
         fetching.wait()
         some = count(here, "run")

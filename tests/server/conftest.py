@@ -14,6 +14,7 @@ from mcp import Client
 from mcp.types import CallToolResult, ImageContent, TextContent
 
 from tests.recordings.rows import Recorded
+from tests.waiting import until
 from tests.webots.conftest import start_webots as start_webots
 from tests.webots.conftest import webots as webots
 from webots_mcp import MCPBridge
@@ -78,6 +79,13 @@ async def ask(client: Client, tool: str, **arguments: Any) -> dict[str, Any]:
     assert result.structured_content is not None
     assert json.loads(text_of(result)) == result.structured_content
     return result.structured_content
+
+
+async def ask_until(
+    client: Client, tool: str, reached: Callable[[dict[str, Any]], object]
+) -> dict[str, Any]:
+    """The data of the first answer that is what is waited for."""
+    return await until(lambda: ask(client, tool), reached)
 
 
 async def fail(client: Client, tool: str, **arguments: Any) -> str:

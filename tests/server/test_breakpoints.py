@@ -5,21 +5,17 @@ from __future__ import annotations
 import json
 from typing import Any
 
-import anyio
 import pytest
 from mcp import Client
 
-from tests.server.conftest import Connect, Driver, ask, fail
+from tests.server.conftest import Connect, Driver, ask, ask_until, fail
 
 pytestmark = pytest.mark.anyio
 
 
 async def newest_state(client: Client) -> dict[str, Any]:
     """The answer about the robot's state, once there is one."""
-    with anyio.fail_after(60):
-        while "state" not in (answer := await ask(client, "webots_get_robot_state")):
-            await anyio.sleep(0.02)
-    return answer
+    return await ask_until(client, "webots_get_robot_state", lambda told: "state" in told)
 
 
 async def test_a_breakpoint_pauses_at_the_step_and_is_listed_and_removed(
@@ -30,10 +26,9 @@ async def test_a_breakpoint_pauses_at_the_step_and_is_listed_and_removed(
         answer = await ask(client, "webots_breakpoint", condition=f"steps == {at}")
         assert answer["armed"] is True
         assert "notes" not in answer and "hint" not in answer
-        with anyio.fail_after(60):
-            while (await ask(client, "webots_get_robot_state"))["status"] != "paused":
-                await anyio.sleep(0.02)
-        state = await ask(client, "webots_get_robot_state")
+        state = await ask_until(
+            client, "webots_get_robot_state", lambda told: told["status"] == "paused"
+        )
         assert state["state"]["steps"] == at
         assert state["why"] == f"breakpoint at {state['sim_time_s']:.3f} s: steps == {at}"
 

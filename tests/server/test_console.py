@@ -6,15 +6,16 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import anyio
 import pytest
 from mcp import Client
 
 from tests.recordings.rows import Recorded, insert
 from tests.server.conftest import Connect, ask, fail
+from tests.waiting import until
 from tests.webots.conftest import (
     CONTROLLER,
     StartWebots,
@@ -43,15 +44,23 @@ def looked_for_often(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(console, "_LOOK_EVERY_S", 0.5)
 
 
-async def lines_with(client: Client, text: str, **arguments: object) -> list[list[Any]]:
+Lines = list[list[Any]]
+
+
+def of_a_run(lines: Lines) -> bool:
+    return bool(lines) and lines[0][3] is not None
+
+
+async def lines_with(
+    client: Client, text: str, reached: Callable[[Lines], bool] = bool, **arguments: object
+) -> Lines:
     """Rows of log lines with a text, as soon as there is one."""
-    with anyio.fail_after(60):
-        while True:
-            answer = await client.call_tool("webots_get_logs", {"filter_text": text, **arguments})
-            found = (answer.structured_content or {}).get("lines")
-            if found and found["rows"]:
-                return found["rows"]
-            await anyio.sleep(0.1)
+
+    async def look() -> Lines | None:
+        answer = await client.call_tool("webots_get_logs", {"filter_text": text, **arguments})
+        return (answer.structured_content or {}).get("lines", {}).get("rows")
+
+    return await until(look, reached)
 
 
 async def test_a_server_records_what_the_controllers_of_its_project_print(
@@ -61,9 +70,7 @@ async def test_a_server_records_what_the_controllers_of_its_project_print(
     data = tmp_path / "project" / "mcp_data"
     async with Client(create_server(data / "webots.db", data)) as client:
         wait_for_line(start_webots("--stdout", f"--port={free_port()}", world), "ready")
-        with anyio.fail_after(60):
-            while (found := await lines_with(client, "ready", source="console"))[0][3] is None:
-                await anyio.sleep(0.1)  # it waits for the run
+        found = await lines_with(client, "ready", of_a_run, source="console")
         assert [row[1:] for row in found] == [["info", "console: ready", 1]]
         own = await lines_with(client, "Starting controller", source="webots")
         assert own[0][2].startswith("webots: INFO: ")

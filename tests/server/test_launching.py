@@ -9,13 +9,13 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import anyio
 import psutil
 import pytest
 from mcp import Client
 
 from tests.recordings.rows import Recorded
-from tests.server.conftest import ask, fail
+from tests.server.conftest import ask, ask_until, fail
+from tests.waiting import until
 from tests.webots.conftest import (
     CONTROLLER,
     StartWebots,
@@ -52,10 +52,8 @@ def begin(project: Path, webots: Path, monkeypatch: pytest.MonkeyPatch) -> Begin
     return client
 
 
-async def _ends(family: list[psutil.Process]) -> None:
-    with anyio.fail_after(30):
-        while any(each.is_running() and each.status() != psutil.STATUS_ZOMBIE for each in family):
-            await anyio.sleep(0.05)
+def _are_gone(family: list[psutil.Process]) -> bool:
+    return not any(each.is_running() and each.status() != psutil.STATUS_ZOMBIE for each in family)
 
 
 def _family(answer: dict[str, Any]) -> list[psutil.Process]:
@@ -94,14 +92,14 @@ async def test_a_world_is_started_changed_and_ended(begin: Begin, project: Path)
         ended = await ask(client, "webots_quit")
         assert (ended["outcome"], ended["route"]) == ("done", "process")
         assert ended["evidence"] == "its processes have ended, exit code 0"
-        await _ends(family)
+        await until(lambda: _are_gone(family))
         assert "rover" in await fail(client, "webots_quit")
 
 
 async def test_webots_ends_with_the_server_that_started_it(begin: Begin) -> None:
     async with begin() as client:
         family = _family(await ask(client, "webots_launch_world", world="arena.wbt", headless=True))
-    await _ends(family)
+    await until(lambda: _are_gone(family))
 
 
 async def test_where_nobody_records_the_answer_comes_in_time_and_says_why(begin: Begin) -> None:
@@ -136,7 +134,7 @@ async def test_a_robot_of_the_webots_that_was_started_here_names_what_is_to_end(
         family = _family(await ask(client, "webots_launch_world", world="arena.wbt"))
         ended = await ask(client, "webots_quit", robot="rover")
         assert (ended["outcome"], ended["route"]) == ("done", "process")
-        await _ends(family)
+        await until(lambda: _are_gone(family))
 
 
 async def test_webots_that_ends_at_its_start_is_an_error_with_what_it_said(
@@ -205,9 +203,7 @@ async def test_an_observer_opens_another_world_for_a_robot_that_is_no_supervisor
             world.write_bytes(with_observer(world.read_bytes()))
         apply(controller_change(project))
         await ask(client, "webots_launch_world", world="arena.wbt")
-        with anyio.fail_after(60):
-            while len((await ask(client, "webots_list_robots"))["robots"]["rows"]) < 2:
-                await anyio.sleep(0.05)
+        await ask_until(client, "webots_list_robots", lambda told: len(told["robots"]["rows"]) == 2)
         loaded = await ask(
             client, "webots_load_world", world="field.wbt", robot="rover", timeout_wall_s=60
         )
@@ -224,9 +220,7 @@ async def test_a_webots_that_somebody_else_started_is_ended_by_a_supervisor_alon
         world = project / "worlds" / "arena.wbt"
         process = start_webots("--stdout", "--mode=fast", f"--port={port}", world)
         wait_for_line(process, "ready")
-        with anyio.fail_after(60):
-            while (await ask(client, "webots_get_robot_state"))["status"] != "running":
-                await anyio.sleep(0.05)
+        await ask_until(client, "webots_get_robot_state", lambda told: told["status"] == "running")
         if controller == PLAIN:
             text = await fail(client, "webots_quit")
             assert "no Webots that was started by this server runs" in text

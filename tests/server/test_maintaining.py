@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import anyio
 import pytest
 from mcp import Client
 
 from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask
+from tests.waiting import until
 from webots_mcp.server import create_server
 from webots_mcp.store.purge import prune
 from webots_mcp.store.retention import Limit, Retention
@@ -24,9 +24,7 @@ async def test_a_server_that_may_write_maintains_the_database(
     for i in range(1024):
         robot.state(i * 1.0, {"x": float(i)})
     async with connect():
-        with anyio.fail_after(60):
-            while not recorded.connection.execute("SELECT 1 FROM chunk").fetchone():
-                await anyio.sleep(0.02)
+        await until(lambda: recorded.connection.execute("SELECT 1 FROM chunk").fetchone())
         holder = recorded.connection.execute("SELECT holder FROM lease").fetchone()[0]
         assert holder.startswith("server ")
     assert recorded.connection.execute("SELECT count(*) FROM lease").fetchone() == (0,)
@@ -38,9 +36,8 @@ async def test_the_server_keeps_as_much_as_it_was_told(file: Path, recorded: Rec
         robot.state(i * 1.0, {"x": float(i)})
     limits = {"state": Limit(rows=4)}
     async with Client(create_server(file, file.parent, limits=limits)):
-        with anyio.fail_after(60):
-            while recorded.connection.execute("SELECT count(*) FROM state").fetchone()[0] > 4:
-                await anyio.sleep(0.02)
+        counted = "SELECT count(*) FROM state"
+        await until(lambda: recorded.connection.execute(counted).fetchone()[0] <= 4)
     assert recorded.connection.execute("SELECT min(sim_time_s) FROM state").fetchone() == (1020.0,)
 
 

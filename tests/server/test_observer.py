@@ -7,12 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import anyio
 import pytest
 from anyio import to_thread
 from mcp import Client
 
 from tests.server.conftest import ask
+from tests.waiting import until
 from tests.webots.conftest import (
     CONTROLLER,
     StartWebots,
@@ -64,15 +64,15 @@ def begin(tmp_path: Path, start_webots: StartWebots) -> Callable[..., Client]:
     return started
 
 
-async def until(client: Client, tool: str, reached: Callable[[dict[str, Any]], Any]) -> Any:
+async def once(client: Client, tool: str, reached: Callable[[dict[str, Any]], Any]) -> Any:
     """What a tool answers once it is so."""
-    with anyio.fail_after(60):
-        while True:
-            result = await client.call_tool(tool, {})
-            answer: dict[str, Any] = result.structured_content or {}
-            if not result.is_error and answer.get("robot") and reached(answer):
-                return answer
-            await anyio.sleep(0.1)
+
+    async def look() -> dict[str, Any] | None:
+        result = await client.call_tool(tool, {})
+        answer = result.structured_content or {}
+        return answer if not result.is_error and answer.get("robot") else None
+
+    return await until(look, reached)
 
 
 def in_world(answer: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -87,14 +87,14 @@ def moves(answer: dict[str, Any]) -> bool:
 
 async def test_a_controller_that_knows_nothing_of_us_is_seen_and_asked_about(begin: Any) -> None:
     async with begin(DRIVES, "--mode=fast") as client:
-        world = await until(client, "webots_get_world_info", moves)
+        world = await once(client, "webots_get_world_info", moves)
         assert (world["observer"], world["robot"]) == ("mcp_observer", "mcp_observer")
         assert (
             in_world(world)["ROVER"] | {"type": "Robot", "name": "rover"}
             == in_world(world)["ROVER"]
         )
         assert world["title"]
-        await until(client, "webots_get_robot_state", lambda at: at["sim_time_s"] > 5)
+        await once(client, "webots_get_robot_state", lambda at: at["sim_time_s"] > 5)
         position = ["world.ROVER.x_m", "world.ROVER.y_m"]
         trends = await ask(client, "webots_get_trends", signals=[*position])
         assert trends["robot"] == "mcp_observer"
@@ -106,8 +106,8 @@ async def test_a_controller_that_knows_nothing_of_us_is_seen_and_asked_about(beg
 
 async def test_a_robot_that_is_no_supervisor_is_steered_by_the_observer(begin: Any) -> None:
     async with begin(PLAIN) as client:
-        await until(client, "webots_get_world_info", lambda at: at.get("in_world"))
-        await until(client, "webots_get_robot_state", lambda at: at["robot"] == "rover")
+        await once(client, "webots_get_world_info", lambda at: at.get("in_world"))
+        await once(client, "webots_get_robot_state", lambda at: at["robot"] == "rover")
         answers: dict[str, dict[str, Any]] = {}
         for command in ("pause", "resume", "fast", "step", "resume", "reset", "reload"):
             answers[command] = await ask(
@@ -127,7 +127,7 @@ async def test_a_controller_that_hangs_is_told_from_a_pause_and_ended_by_a_reloa
         def is_silent(answer: dict[str, Any]) -> bool:
             return answer["robot"] == "rover" and answer["status"].startswith("stopped")
 
-        stopped = await until(client, "webots_get_world_info", is_silent)
+        stopped = await once(client, "webots_get_world_info", is_silent)
         assert "not paused, as robot 'mcp_observer' sees" in stopped["why"]
         found = (await ask(client, "webots_diagnose"))["failed"]
         (simulation,) = [each for each in found if each["check"] == "Simulation"]
@@ -143,10 +143,10 @@ async def test_a_controller_that_hangs_is_told_from_a_pause_and_ended_by_a_reloa
 
 async def test_a_pause_by_hand_is_taken_back_by_the_observer(begin: Any) -> None:
     async with begin(DRIVES, "--stream") as client:
-        await until(client, "webots_get_world_info", moves)
+        await once(client, "webots_get_world_info", moves)
         (webots,) = await to_thread.run_sync(instances)
         await to_thread.run_sync(give_order, webots.address, "pause", 10.0)
-        stopped = await until(
+        stopped = await once(
             client, "webots_get_robot_state", lambda at: at["status"].startswith("stopped")
         )
         assert "paused in Webots, as robot 'mcp_observer' sees" in stopped["why"]

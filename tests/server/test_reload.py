@@ -7,13 +7,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import anyio
 import pytest
 from mcp import Client
 
 from tests.bridge.conftest import Recording
 from tests.processes.conftest import data_dir, filed, has_states, start  # fixtures
 from tests.server.conftest import ask, fail
+from tests.waiting import until
 from webots_mcp.server import create_server
 from webots_mcp.standin import Simulation
 
@@ -62,6 +62,5 @@ async def test_a_person_who_pauses_in_webots_is_one_of_the_reasons_told(
 
 async def _until_nothing_comes(filed: Recording) -> None:
     """Until the controller's loop is surely inside the step that does not return."""
-    with anyio.fail_after(60):
-        while time.time() - filed.rows("SELECT max(wall_time_s) FROM state")[0] < 0.5:
-            await anyio.sleep(0.02)
+    newest = "SELECT max(wall_time_s) FROM state"
+    await until(lambda: time.time() - filed.rows(newest)[0] > 0.5)

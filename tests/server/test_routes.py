@@ -9,12 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import anyio
 import pytest
 from mcp import Client
 
 from tests.recordings.rows import Recorded
-from tests.server.conftest import Connect, Driver, ask, fail
+from tests.server.conftest import Connect, Driver, ask, ask_until, fail
 from tests.webots.conftest import (
     CONTROLLER,
     StartWebots,
@@ -98,17 +97,13 @@ async def test_a_controller_that_hangs_is_freed_by_a_reload_of_webots(in_project
 
 
 async def _until_its_loop_is_silent(client: Client) -> None:
-    with anyio.fail_after(60):
-        while (await ask(client, "webots_get_world_info"))["status"] == "running":
-            await anyio.sleep(0.05)
+    await ask_until(client, "webots_get_world_info", lambda told: told["status"] != "running")
 
 
 async def test_a_loop_that_turns_is_asked_itself(in_project: Any) -> None:
     process, client = in_project(HANGS.replace("> 0.2", "> 1e9"), "--stream", ready="Starting")
     async with client:
-        with anyio.fail_after(60):
-            while (await ask(client, "webots_get_robot_state"))["status"] != "running":
-                await anyio.sleep(0.05)
+        await ask_until(client, "webots_get_robot_state", lambda told: told["status"] == "running")
         answer = await control(client, "pause")
         assert (answer["route"], answer["status"]) == ("bridge", "paused")
         assert "command_id" in answer

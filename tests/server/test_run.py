@@ -11,8 +11,9 @@ import pytest
 from mcp import Client
 
 from tests.recordings.rows import Recorded, insert
-from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail
+from tests.server.conftest import STEP_MS, Connect, Driver, ask, ask_until, fail
 from tests.server.story import rows_of
+from tests.waiting import until
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.steering.dispatch import Dispatcher, require_possible
 from webots_mcp.steering.routes import CLAIMING_S
@@ -135,22 +136,20 @@ async def test_an_interrupt_that_meets_the_waiting_itself_ends_the_run(
 
 async def _until_run_is(client: Client, outcome: str, action: str = "run") -> dict[str, Any]:
     """The newest command of that action, once it is that far."""
-    with anyio.fail_after(60):
-        while True:
-            answer = await ask(client, "webots_list_commands")
-            for row in rows_of(answer.get("commands")):
-                if row["action"] == action and row["outcome"] == outcome:
-                    return row
-            await anyio.sleep(0.02)
+
+    async def look() -> dict[str, Any] | None:
+        rows = rows_of((await ask(client, "webots_list_commands")).get("commands"))
+        wanted = (action, outcome)
+        return next((row for row in rows if (row["action"], row["outcome"]) == wanted), None)
+
+    return await until(look)
 
 
 async def test_what_cannot_end_is_refused_before_anything_is_sent(
     connect: Connect, driver: Driver
 ) -> None:
     async with connect() as client:
-        with anyio.fail_after(60):
-            while (await ask(client, "webots_get_robot_state"))["sim_time_s"] < 0.5:
-                await anyio.sleep(0.02)
+        await ask_until(client, "webots_get_robot_state", lambda told: told["sim_time_s"] >= 0.5)
         misspelt = await fail(client, "webots_run", until="step > 70")
         assert "steps" in misspelt
         assert "never published" in misspelt

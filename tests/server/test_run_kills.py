@@ -18,6 +18,7 @@ from mcp.types import CallToolResult
 from tests.bridge.conftest import Recording
 from tests.processes.conftest import Start, data_dir, filed, has_states, start  # fixtures
 from tests.server.conftest import ask, text_of
+from tests.waiting import until
 from webots_mcp.server import create_server
 from webots_mcp.standin import Mode, Simulation
 
@@ -62,9 +63,7 @@ def run_command(filed: Recording) -> int:
 
 async def until_claimed(filed: Recording) -> None:
     """Wait until the controller has the command."""
-    with anyio.fail_after(30):
-        while filed.rows("SELECT status FROM command") != ["claimed"]:
-            await anyio.sleep(0.02)
+    await until(lambda: filed.rows("SELECT status FROM command") == ["claimed"])
 
 
 async def test_a_killed_server_leaves_a_run_that_ends_as_asked_and_another_server_tells_of(

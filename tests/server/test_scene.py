@@ -15,6 +15,7 @@ from tests.bridge.conftest import Recording
 from tests.observer.conftest import OBSERVER
 from tests.recordings.rows import Recorded
 from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail
+from tests.waiting import until
 from webots_mcp import MCPBridge
 from webots_mcp.observer import observe
 from webots_mcp.standin import InProcessRobot, InProcessSimulation, InProcessSupervisor
@@ -180,10 +181,12 @@ async def test_an_observer_sees_and_changes_a_world_whose_robots_know_nothing_of
     observing.start()
     try:
         async with connect() as client:
-            with anyio.fail_after(30):
-                while "robot" not in await ask(client, "webots_list_robots"):
-                    rover.step(STEP_MS)
-                    await anyio.sleep(0.01)
+
+            async def look() -> dict[str, Any]:
+                rover.step(STEP_MS)
+                return await ask(client, "webots_list_robots")
+
+            await until(look, lambda told: "robot" in told)
             simulation.pause()
             robots = await ask(client, "webots_get_scene", types=["Robot"])
             assert {"rover", "rider"} < {row[3] for row in robots["result"]["rows"]}

@@ -11,6 +11,7 @@ import pytest
 from mcp import Client
 
 from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail, pictures_of, text_of
+from tests.waiting import until
 
 pytestmark = pytest.mark.anyio
 
@@ -97,8 +98,8 @@ async def test_watching_reports_what_was_recorded_meanwhile(
 
     answer: dict[str, Any] = {}
     async with connect() as client, anyio.create_task_group() as tasks:
-        tasks.start_soon(_steer, client, driver)
-        arguments = {"duration_wall_s": 2}
+        tasks.start_soon(_steer, client, driver, reports)
+        arguments = {"duration_wall_s": 3}
         watch = client.call_tool("webots_monitor", arguments, progress_callback=on_progress)
         answer |= json.loads(text_of(await watch))
     assert answer["row_count"] > 10
@@ -120,8 +121,8 @@ async def test_watching_reports_what_was_recorded_meanwhile(
     assert all(report.startswith("rover: ") for report in reports)
 
 
-async def _steer(client: Client, driver: Driver) -> None:
-    await anyio.sleep(0.7)
+async def _steer(client: Client, driver: Driver, reports: list[str]) -> None:
+    await until(lambda: reports)
     driver.bridge.log("too close", level="warning")
     driver.bridge.log("all is well")
     await control(client, "pause")

@@ -12,7 +12,7 @@ import pytest
 from mcp import Client
 
 from tests.recordings.rows import Recorded, RecordedRobot
-from tests.server.conftest import Connect, Driver, ask, fail
+from tests.server.conftest import Connect, Driver, ask, ask_until, fail
 from tests.server.story import rows_of
 from webots_mcp.connection import connect as open_database
 
@@ -112,15 +112,15 @@ async def test_a_command_whose_asker_went_away_says_that_it_goes_on(
 ) -> None:
     robot = recorded.robot()
     async with connect() as client:
-        claiming = claim_soon(file, robot)
-        with anyio.move_on_after(1):
-            await client.call_tool("webots_send_command", {"action": "go", "timeout_wall_s": 60})
-        claiming.join()
-        with anyio.fail_after(60):
-            while True:
-                (row,) = rows_of((await ask(client, "webots_list_commands"))["commands"])
-                if row.get("error"):
-                    break
+        async with anyio.create_task_group() as tasks:
+            asked = {"action": "go", "timeout_wall_s": 60}
+            tasks.start_soon(client.call_tool, "webots_send_command", asked)
+            await anyio.to_thread.run_sync(claim_soon(file, robot).join)
+            tasks.cancel_scope.cancel()
+        told = await ask_until(
+            client, "webots_list_commands", lambda told: rows_of(told["commands"])[0].get("error")
+        )
+        (row,) = rows_of(told["commands"])
         assert (row["outcome"], row["error"]) == (
             "claimed",
             "the client disconnected; the command continues",

@@ -6,7 +6,6 @@ import shutil
 import sqlite3
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from tests.waiting import wait_for
 from webots_mcp.cli import main
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 
@@ -80,13 +80,13 @@ def wait_for_trial(project: Path, number: int, runner: subprocess.Popen[Any]) ->
     """The process of a trial's simulator, once it runs; who runs it must not have ended before."""
     tables = "SELECT 1 FROM sqlite_master WHERE name = 'trial'"
     sql = f"SELECT pid FROM trial WHERE number = {number} AND status = 'running'"
-    until_s = time.monotonic() + 60
-    while time.monotonic() < until_s:
-        if rows(project, tables) and (found := rows(project, sql)):
-            return int(found[0][0])
-        assert runner.poll() is None, runner.communicate()[1]
-        time.sleep(0.01)
-    raise TimeoutError(f"trial {number} did not begin")
+
+    def look() -> list[Any]:
+        found = rows(project, tables) and rows(project, sql)
+        assert found or runner.poll() is None, runner.communicate()[1]
+        return found
+
+    return int(wait_for(look)[0][0])
 
 
 @pytest.fixture

@@ -7,15 +7,11 @@ import os
 import re
 import subprocess
 import sys
-import threading
-import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
 
 import psutil
 
-T = TypeVar("T")
+from tests.waiting import wait_for
 
 # Only workers need this package: the scheduler of a cluster lacks it.
 _RUN = """
@@ -26,17 +22,7 @@ from distributed.cli.dask_{0} import main
 main()
 """
 
-_PATIENCE_S = 120.0
 _ADDRESS = re.compile(r"Scheduler at:\s+(tcp://\S+)")
-
-
-def found(look: Callable[[], T | None]) -> T:
-    """What is there once it is; False and None are nothing."""
-    until_s, moment = time.monotonic() + _PATIENCE_S, threading.Event()
-    while not (thing := look()):
-        assert time.monotonic() < until_s
-        moment.wait(0.02)
-    return thing
 
 
 class Process:
@@ -67,7 +53,7 @@ class Process:
             assert self.process.poll() is None, text
             return re.search(pattern, text)
 
-        return found(look)
+        return wait_for(look, patience_s=120.0)
 
     def end(self) -> None:
         """Hard, with what it has started."""

@@ -19,7 +19,8 @@ from mcp import Client
 
 from tests.server.conftest import anyio_backend, ask, fail  # fixtures
 from tests.trials.conftest import Run, command, rows
-from tests.trials.dask_cluster import Cluster, found
+from tests.trials.dask_cluster import Cluster
+from tests.waiting import wait_for
 from webots_mcp import __version__
 from webots_mcp.plugins.cluster import dask_cluster as cluster
 from webots_mcp.plugins.cluster.dask_cluster import Needs, digest_of, packed, what_lacks
@@ -78,7 +79,7 @@ def test_a_worker_that_is_killed_costs_nothing_and_the_scores_are_those_of_this_
     workers = dask_cluster.start(4)
     plan(GRID.format(2))
     process = started("--scheduler", dask_cluster.address, "--json")
-    busy = found(lambda: next((each for each in workers if each.recording), None))
+    busy = wait_for(lambda: next((each for each in workers if each.recording), None))
     simulator = busy.kill()
     out, said = process.communicate(timeout=120)
 
@@ -89,7 +90,7 @@ def test_a_worker_that_is_killed_costs_nothing_and_the_scores_are_those_of_this_
     assert rows(project, counted) == [(6, 6, 6)]
     assert list((project / "data" / "trials").iterdir()) == []
     assert [each.trials for each in dask_cluster.workers] == [[], [], []]
-    found(lambda: not any(each.is_running() for each in simulator))
+    wait_for(lambda: not any(each.is_running() for each in simulator))
     plan(GRID.format(1).replace("1.0, 2.0, 5.0", "2.0"))
     assert scores(answer_of(run("--json")))[2.0] == scores(answer)[2.0]
 
@@ -201,14 +202,14 @@ async def test_who_handed_them_out_may_be_ended_and_an_assistant_sees_and_cancel
     options = ("--scheduler", address, "--jobs", "1")
     for number, code in ((signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)):
         process = started(*options)
-        found(lambda: any(each.recording for each in dask_cluster.workers))
+        wait_for(lambda: any(each.recording for each in dask_cluster.workers))
         process.send_signal(number)
         _, said = process.communicate(timeout=120)
         assert process.returncode == code
         assert "Traceback" not in said
-        found(lambda: not any(each.trials for each in dask_cluster.workers))
+        wait_for(lambda: not any(each.trials for each in dask_cluster.workers))
     process = started(*options)
-    found(lambda: any(each.recording for each in dask_cluster.workers))
+    wait_for(lambda: any(each.recording for each in dask_cluster.workers))
     async with Client(create_server(data_dir / "webots.db", data_dir)) as client:
         assert (await ask(client, "webots_get_trials"))["state"] == "under way"
         await ask(client, "webots_run_trials", trial_set=1, cancel=True, timeout_wall_s=60)
@@ -243,11 +244,11 @@ def test_a_scheduler_without_simulators_is_told_at_once_and_one_that_is_lost_as_
         its_address = worker.said(r"Start worker at:\s+(tcp://\S+)")[1]
         assert f"answers at {its_address}, but a worker" in refused("--scheduler", its_address)
         process = started("--scheduler", own.address)
-        found(lambda: worker.recording)
+        wait_for(lambda: worker.recording)
         children = worker.children
         own.scheduler.end()
         _, said = process.communicate(timeout=60)
-        found(lambda: not any(each.is_running() for each in children))
+        wait_for(lambda: not any(each.is_running() for each in children))
     finally:
         own.end()
 

@@ -8,8 +8,6 @@ import signal
 import sqlite3
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -18,6 +16,7 @@ import pytest
 
 from tests.processes.stopping import stop_between_writes
 from tests.trials.conftest import Run, command, rows, wait_for_trial
+from tests.waiting import wait_for
 from webots_mcp.liveness import process_identity
 from webots_mcp.steering.trial_run import TrialSimulator
 from webots_mcp.webots.starting import CommandLine
@@ -50,13 +49,6 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline_s, moment = time.monotonic() + 60, threading.Event()
-    while not condition():
-        assert time.monotonic() < deadline_s
-        moment.wait(0.02)
-
-
 def is_gone(pid: int) -> bool:
     return process_identity(pid) is None
 
@@ -75,7 +67,7 @@ def test_a_runner_that_is_killed_before_it_noted_a_simulator_has_started_none(
 ) -> None:
     pid = killed(tmp_path)
 
-    wait_until(lambda: is_gone(pid))
+    wait_for(lambda: is_gone(pid))
     assert not (tmp_path / "simulator.txt").exists()
 
 
@@ -83,9 +75,9 @@ def test_a_runner_that_is_killed_before_it_noted_a_simulator_has_started_none(
 def test_a_simulator_ends_with_its_runner(tmp_path: Path, deaf: bool) -> None:
     pid = killed(tmp_path, "start", deaf=deaf)
 
-    wait_until(lambda: is_gone(pid))
+    wait_for(lambda: is_gone(pid))
     simulator = int((tmp_path / "simulator.txt").read_text())
-    wait_until(lambda: is_gone(simulator))
+    wait_for(lambda: is_gone(simulator))
 
 
 @pytest.mark.parametrize("deaf", [False, True])
@@ -99,12 +91,12 @@ def test_a_simulator_whose_keeper_is_killed_ends(
         Path("simulator.txt"),
     )
     simulator.start()
-    wait_until(lambda: told.exists() and told.read_text() != "")
+    wait_for(lambda: told.exists() and told.read_text() != "")
     os.kill(simulator.pid, signal.SIGKILL)
 
     if sys.platform == "linux" and not deaf:  # by itself
-        wait_until(lambda: is_gone(int(told.read_text())))
-    wait_until(lambda: simulator.is_over)
+        wait_for(lambda: is_gone(int(told.read_text())))
+    wait_for(lambda: simulator.is_over)
     simulator.end()
     assert is_gone(int(told.read_text()))
 
@@ -136,7 +128,7 @@ def test_who_is_ended_in_the_middle_is_gone_on_from(
 
     assert process.returncode in codes, said
     assert "Traceback" not in said
-    wait_until(lambda: is_gone(pid))
+    wait_for(lambda: is_gone(pid))
     if codes == {128 + numbers[0]}:
         assert said.endswith(("ended by Ctrl-C\n", "ended by SIGTERM\n"))
         assert rows(project, "SELECT count(*) FROM trial WHERE status = 'running'") == [(0,)]

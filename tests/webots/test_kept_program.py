@@ -13,7 +13,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.trials.test_killed import wait_until
+from tests.waiting import wait_for
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.webots import program_keeper
 from webots_mcp.webots.starting import CommandLine, KeptProgram, Start, any_port, free_port
@@ -51,7 +51,7 @@ def in_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _told() -> tuple[int, str]:
-    wait_until(Path("program.txt").exists)
+    wait_for(Path("program.txt").exists)
     pid, display = Path("program.txt").read_text().split()
     return int(pid), display
 
@@ -86,8 +86,8 @@ def test_within_a_display_of_its_own_nothing_is_left_over(end: str, tmp_path: Pa
     elif kept is not None:
         kept.end()
         assert kept.exit_code == 7
-    wait_until(lambda: not any(each.is_running() for each in family))
-    wait_until(lambda: not list(tmp_path.glob("xvfb-run.*")))
+    wait_for(lambda: not any(each.is_running() for each in family))
+    wait_for(lambda: not list(tmp_path.glob("xvfb-run.*")))
 
 
 def _family(pid: int) -> list[psutil.Process]:

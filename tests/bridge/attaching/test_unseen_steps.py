@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.bridge.conftest import STEP_MS, Recording
+from tests.waiting import wait_for
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.bridge import session as session
 from webots_mcp.connection import connect
@@ -116,9 +116,7 @@ def test_while_no_call_comes_by_the_log_says_what_may_be_and_asks_webots_for_not
         monkeypatch.setattr(session, "_UNMOVED_S", 0.0)
         for _ in range(100):
             step()
-        deadline_s = time.monotonic() + 20
-        while not warnings(filed):
-            assert time.monotonic() < deadline_s
+        wait_for(lambda: warnings(filed))
         assert not asked.calls
         del vars(robot)["getTime"]
         assert warnings(filed) == [UNMOVED]

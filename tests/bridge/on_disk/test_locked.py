@@ -19,6 +19,7 @@ from tests.bridge.conftest import (
     send,
     write_lock,
 )
+from tests.waiting import wait_for
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import actions, backlog
 from webots_mcp.bridge.commands import ClaimedCommand
@@ -158,10 +159,7 @@ def test_rows_of_a_loop_that_stands_still_are_written_by_the_maintainer(
 ) -> None:
     with write_lock(file):
         bridge.publish({"n": 1})
-    deadline_s = time.monotonic() + 10
-    while not numbers(filed):
-        assert time.monotonic() < deadline_s
-    assert numbers(filed) == [1]
+    assert wait_for(lambda: numbers(filed)) == [1]
 
 
 def test_the_log_begins_anew_while_a_controller_runs(bridge: MCPBridge, file: Path) -> None:
@@ -180,7 +178,4 @@ def _header_of_log(file: Path) -> bytes:
 
 
 def poll_until(bridge: MCPBridge, reached: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + 5
-    while not reached():
-        bridge.get_command()
-        assert time.monotonic() < deadline_s
+    wait_for(lambda: (bridge.get_command(), reached())[1])

@@ -17,9 +17,10 @@ from mcp import Client, MCPError, StdioServerParameters
 
 from tests.bridge.conftest import Recording
 from tests.processes.stopping import stop_between_writes
-from tests.server.conftest import Connect, ask, fail
+from tests.server.conftest import Connect, ask, ask_until, fail
 from tests.server.story import rows_of
 from tests.server.trials.conftest import SPEEDS, TunableDriver, trials, value_of
+from tests.waiting import until
 from webots_mcp.connection import connect as database
 from webots_mcp.server import create_server
 from webots_mcp.standin import Simulation
@@ -41,9 +42,7 @@ async def _ask_in_vain(client: Client, arguments: dict[str, Any]) -> None:
 
 
 async def _until(filed: Recording, sql: str, found: object) -> None:
-    with anyio.fail_after(30):
-        while filed.rows(sql) != [found]:
-            await anyio.sleep(0.01)
+    await until(lambda: filed.rows(sql), lambda rows: rows == [found])
 
 
 async def test_a_set_whose_server_was_killed_is_gone_on_with_by_another(
@@ -159,8 +158,8 @@ async def test_a_killed_controller_fails_its_trial_and_the_set_says_why_it_stops
         assert "its controller ended before it finished" in row["why"]
         await to_thread.run_sync(simulation.reload)
         release.touch()
-        with anyio.fail_after(30):
-            while (await ask(client, "webots_get_robot_state"))["status"].startswith("stopped"):
-                await anyio.sleep(0.05)
+        await ask_until(
+            client, "webots_get_robot_state", lambda told: "stopped" not in told["status"]
+        )
         answer = await ask(client, "webots_run_trials", trial_set=1, timeout_wall_s=60)
         assert (answer["state"], answer["over"], answer["failed"]) == ("done", 5, 1)

@@ -6,10 +6,9 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import anyio
 import pytest
 
-from tests.server.conftest import Connect, ask, fail
+from tests.server.conftest import Connect, ask, ask_until, fail
 from tests.server.story import rows_of
 from tests.server.trials.conftest import HANGS_AT, TunableDriver, trials, value_of
 from webots_mcp.connection import connect as database
@@ -22,9 +21,7 @@ async def test_what_cannot_be_tried_is_refused_before_anything_is_done(
     connect: Connect, tunable: TunableDriver
 ) -> None:
     async with connect() as client:
-        with anyio.fail_after(60):
-            while (await ask(client, "webots_get_robot_state"))["sim_time_s"] < 0.1:
-                await anyio.sleep(0.01)
+        await ask_until(client, "webots_get_robot_state", lambda told: told["sim_time_s"] >= 0.1)
 
         async def refused(**changed: Any) -> str:
             asked = {"parameters": {"kp": [1.0]}, "score": "last(distance)", "for_s": 1} | changed
@@ -99,9 +96,7 @@ async def test_a_pause_by_somebody_else_stops_the_set_and_it_can_go_on(
             timeout_wall_s=0.2,
         )
         await ask(client, "webots_simulation_control", command="pause")
-        with anyio.fail_after(60):
-            while "stopped" not in (told := await ask(client, "webots_get_trials"))["state"]:
-                await anyio.sleep(0.02)
+        told = await ask_until(client, "webots_get_trials", lambda told: "stopped" in told["state"])
         assert told["state"].startswith("stopped: trial 1 was interrupted")
         assert told["over"] == 0
         assert f"webots_run_trials(trial_set={first['trial_set']}) continues" in told["hint"]
@@ -116,9 +111,7 @@ async def test_a_parameter_that_somebody_else_sets_stops_the_set(
         plan = {"parameters": {"kp": [1.0]}, "until": "gait == 'walk'", "for_s": 100_000}
         await trials(client, **plan, timeout_wall_s=0.2)
         await ask(client, "webots_set_parameters", values={"gait": "walk"})
-        with anyio.fail_after(60):
-            while "stopped" not in (told := await ask(client, "webots_get_trials"))["state"]:
-                await anyio.sleep(0.02)
+        told = await ask_until(client, "webots_get_trials", lambda told: "stopped" in told["state"])
         assert told["state"].startswith(
             "stopped: trial 1 was interrupted: gait was set to walk at "
         )

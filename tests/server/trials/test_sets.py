@@ -8,9 +8,10 @@ from pathlib import Path
 import anyio
 import pytest
 
-from tests.server.conftest import Connect, ask, fail, pictures_of, text_of
+from tests.server.conftest import Connect, ask, ask_until, fail, pictures_of, text_of
 from tests.server.story import rows_of
 from tests.server.trials.conftest import TunableDriver, trials, value_of
+from tests.waiting import until
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect as database
 from webots_mcp.questions.budget import tokens_of
@@ -143,13 +144,11 @@ async def test_a_cancelled_call_ends_the_trial_that_runs_and_no_other_begins(
                 "until": "distance < 0",
             }
             tasks.start_soon(client.call_tool, "webots_run_trials", {**asked, "repeats": 50})
-            with anyio.fail_after(60):
-                while await value_of(client, "kp") != 5.0:
-                    await anyio.sleep(0.01)
+            await until(lambda: value_of(client, "kp"), lambda kp: kp == 5.0)
             tasks.cancel_scope.cancel()
-        with anyio.fail_after(60):
-            while (left := await ask(client, "webots_get_trials"))["state"].startswith("stopping"):
-                await anyio.sleep(0.01)
+        left = await ask_until(
+            client, "webots_get_trials", lambda told: "stopping" not in told["state"]
+        )
         assert (left["state"], left["over"]) == ("stopped: it was cancelled", 0)
         (count,) = rows_of((await ask(client, "webots_query_sql", sql=tried))["result"])
         assert count["n"] == 1

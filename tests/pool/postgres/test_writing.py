@@ -129,6 +129,26 @@ def test_a_view_has_the_rows_that_it_has_in_the_recording(
     assert said
 
 
+def test_a_view_tells_a_moment_to_the_millisecond_that_sqlite_tells(
+    postgres: Server, pool: str, rover: sqlite3.Connection
+) -> None:
+    moments = [1_790_000_000 + n * 1234.567891 for n in range(400)]
+    moments += [1_790_000_000 + n + 0.2675 + sign * 1e-7 for n in range(50) for sign in (-1, 0, 1)]
+    rover.execute("UPDATE event SET wall_time_s = 0")  # only those below are compared
+    values = [(moment, f"moment {n}") for n, moment in enumerate(moments)]
+    rover.executemany(
+        "INSERT INTO event (run_id, sim_time_s, wall_time_s, kind, name) "
+        "SELECT max(id), 0, ?, 'bridge_event', ? FROM run",
+        values,
+    )
+    rover.commit()
+    ship(rover, postgres.url(pool))
+    query = "SELECT name, utc FROM robot_event WHERE name LIKE 'moment %'"
+    told = dict(rover.execute(query))
+    assert len(told) == len(moments)
+    assert dict(postgres.execute(pool, query)) == told
+
+
 def comparable(row: tuple[Any, ...]) -> str:
     return json.dumps([told(value) for value in row], sort_keys=True)
 

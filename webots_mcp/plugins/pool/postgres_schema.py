@@ -244,9 +244,13 @@ def _rounded(number: str, digits: int = 3) -> str:
     return f"round(({number})::numeric, {digits})::double precision"
 
 
+_EPOCH_MS: Final = "210866760000000::double precision"  # from the first Julian day to 1970
+
+
 def _utc(time: str) -> str:
-    moment = f"to_timestamp({_rounded(time)}) AT TIME ZONE 'UTC'"
-    return f"to_char({moment}, 'YYYY-MM-DD HH24:MI:SS.MS')"
+    """As text, rounded to milliseconds by the same additions that SQLite's strftime makes."""
+    seconds = f"(floor(({time}) * 1000 + {_EPOCH_MS} + 0.5) - {_EPOCH_MS}) / 1000"
+    return f"to_char(to_timestamp({seconds}) AT TIME ZONE 'UTC', 'YYYY-MM-DD HH24:MI:SS.MS')"
 
 
 def _robot_of(alias: str) -> str:

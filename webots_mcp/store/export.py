@@ -427,7 +427,7 @@ def value_at(state: dict[str, Any], name: str) -> Any:
 
 
 def _spread(prefix: str, items: Iterable[tuple[str, Any]], values: dict[str, Any]) -> None:
-    """As `leaves.flatten`, with which it shares the names; but a long array stays as it is."""
+    """As `naming.flatten`, with which it shares the names; but a long array stays as it is."""
     for key, value in items:
         name = prefix + key
         kind = cast("type[object]", type(value))

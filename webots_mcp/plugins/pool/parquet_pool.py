@@ -316,7 +316,7 @@ def schema_of(table: Table) -> Any:
         metadata = {key: str(text) for key, text in about.items() if text}
         nullable = name not in table.key
         fields.append(arrow.field(name, types[kind], nullable=nullable, metadata=metadata))
-    about = {"webots_mcp.table": table.name, "webots_mcp.connection": str(SCHEMA_VERSION)}
+    about = {"webots_mcp.table": table.name, "webots_mcp.schema": str(SCHEMA_VERSION)}
     return arrow.schema(fields, metadata=about)
 
 

@@ -269,6 +269,12 @@ class _Tee:
         self._stream.flush()
         self._printed("")
 
+    def __enter__(self) -> _Tee:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stream.close()
+
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
@@ -282,7 +288,7 @@ def _writes_to(stream: Any, descriptor: int) -> bool:
 
 def _flush(stream: Any) -> None:
     try:
-        if stream is not None:
+        if not getattr(stream, "closed", stream is None):  # closing has flushed it
             stream.flush()
     except (OSError, ValueError) as error:
         warn(f"earlier output could not be flushed: {error}")

@@ -52,7 +52,7 @@ def set_field(session: Session, command: ClaimedCommand) -> Progress:
     value = checked(place.path, place.type_name, params.get("value"))
     require_no_path(str(place.webots_field.getName()), value)
     before = read(place.field, place.entry)
-    is_remembered = session.scene.remember_field(_edit(place, before, value))
+    reset = session.scene.remember_field(_edit(place, before, value), place.node)
     write(place.field, value, place.entry)
     if params.get("stop") is True:
         place.node.resetPhysics()
@@ -73,7 +73,7 @@ def set_field(session: Session, command: ClaimedCommand) -> Progress:
     elif not is_same(place.type_name, now, value):
         facts["now"] = _shown(now)  # the simulation has changed it since
     session.journal.event("set_field", facts | _asked_by(command), place.path)
-    return facts | {"sim_time_s": session.clock.sim_time_s} | _effect_of_reset(is_remembered)
+    return facts | {"sim_time_s": session.clock.sim_time_s, "a_reset": reset}
 
 
 def _shown(value: Any) -> Any:
@@ -134,12 +134,6 @@ def _until_stepped(session: Session) -> Generator[None, None, bool]:
 
 def _asked_by(command: ClaimedCommand) -> dict[str, Any]:
     return {"command_id": command.id, "requested_by": command.requested_by}
-
-
-def _effect_of_reset(is_remembered: bool) -> dict[str, Any]:
-    if is_remembered:
-        return {"a_reset": "puts it back"}
-    return {"a_reset": f"does not undo it: at most {MOST_EDITS} changes are remembered"}
 
 
 def add_node(session: Session, command: ClaimedCommand) -> Progress:
@@ -244,15 +238,14 @@ def remove_node(session: Session, command: ClaimedCommand) -> Progress:
         "type": str(node.getTypeName()),
         "node": label(node),
     }
+    is_added = session.scene.is_added(node)
+    reset = _ADDED_BEFORE if is_added else "does not bring it back; a reload does"
     node.remove()
     if robot.getFromId(node_id) is not None:
         yield from _until_stepped(session)
     if robot.getFromId(node_id) is not None:
         raise CommandRefusedError(f"Webots did not remove {place.path}; {_SAYS}")
     session.journal.event("remove_node", facts | _asked_by(command), place.path)
-    reset = (
-        _ADDED_BEFORE if node_id in session.scene.added else "does not bring it back; a reload does"
-    )
     return facts | {"sim_time_s": session.clock.sim_time_s, "a_reset": reset}
 
 
@@ -347,14 +340,22 @@ class SceneEdits:
         self.fields: dict[tuple[int, str, int | None], FieldEdit] = {}
         self.added: set[int] = set()
 
-    def remember_field(self, edit: FieldEdit) -> bool:
-        """Remember that a field is about to be set; False if that will not be undone."""
+    def remember_field(self, edit: FieldEdit, node: Any) -> str:
+        """Remember that a field of a node is about to be set; what a reset will make of it."""
         key = (edit.node_id, edit.name, edit.entry)
         known = self.fields.get(key)
+        if self.is_added(node):
+            return "removes the node: it was added in this run"
         if known is None and len(self.fields) >= MOST_EDITS:
-            return False
+            return f"does not undo it: at most {MOST_EDITS} changes are remembered"
         self.fields[key] = edit if known is None else known._replace(value=edit.value)
-        return True
+        return "puts it back"
+
+    def is_added(self, node: Any | None) -> bool:
+        """Whether a node, or one that contains it, was added in this run."""
+        while node is not None and int(node.getId()) not in self.added:
+            node = node.getParentNode()
+        return node is not None
 
     def begin_run(self) -> None:
         """The world was reset: set the fields back that still hold what they were set to."""

@@ -107,8 +107,11 @@ def shorten(
 
 
 def compact_json(value: Any) -> str:
-    """JSON without blanks, as the model reads it."""
-    return json.dumps(value, ensure_ascii=False, separators=(",", ":"))
+    """JSON without blanks, as the model reads it; an infinity, which JSON has not, is null."""
+    try:
+        return json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    except ValueError:
+        return compact_json(json.loads(json.dumps(value), parse_constant=lambda _: None))
 
 
 def tokens_in(text: str) -> int:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import difflib
 import functools
 import inspect
+import json
 import re
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -227,13 +228,12 @@ class Question:
 
 
 def _reply(answer: Any) -> Reply:
-    """What a function has returned; a value that JSON cannot hold fails here."""
+    """What a function has returned; a text that UTF-8 cannot hold fails here."""
     if not isinstance(answer, Answer):
         return Reply(None, answer)
-    data = answer.model_dump(mode="json", exclude_none=True)
-    text = compact_json(data)
+    text = compact_json(answer.model_dump(mode="json", exclude_none=True))
     text.encode()  # what UTF-8 cannot hold would end the connection to a client
-    return Reply(data, [text])
+    return Reply(json.loads(text), [text])
 
 
 def question(
@@ -410,7 +410,7 @@ def _as_id(value: int) -> int:
 
 
 def _as_seconds(value: float) -> float:
-    if abs(value) > 1e12:
+    if not abs(value) <= 1e12:  # NaN is none either
         raise ValueError("be a number of seconds")
     return value
 

@@ -198,7 +198,11 @@ def _series(
         if tokens <= budget_tokens or points == 1:
             break
         points = max(1, int(points * 0.9 * budget_tokens / tokens))
-    hints = [hint for run in runs if (hint := _drop_signals(run, budget_tokens // len(runs)))]
+    # Told once for all runs: the names would take more room than the values.
+    dropped = (_drop_signals(run, budget_tokens // len(runs)) for run in runs)
+    left_out = [*dict.fromkeys(name for names in dropped for name in names)]
+    where = f"run {runs[0].run_id}" if len(runs) == 1 else "one run or more"
+    hints = [f"left out of {where}: {_others(left_out)}"] * bool(left_out)
     if max_points is not None and points < max_points:
         hints.append(f"{points} points instead of {max_points} fit: ask for fewer signals for more")
     hints += [] if runs else ["no row in that range: leave the range out, or see notes"]
@@ -217,8 +221,8 @@ def _told(part: Part) -> dict[str, Any]:
     return part.model_dump(mode="json", exclude_none=True)
 
 
-def _drop_signals(run: RunSeries, budget_tokens: int) -> str | None:
-    """Leave out the last signals where not even one point of each fits; says which."""
+def _drop_signals(run: RunSeries, budget_tokens: int) -> list[str]:
+    """Leave out the last signals where not even one point of each fits; their names."""
     over = tokens_of(_told(run)) - budget_tokens
     left_out: list[str] = []
     for series in (run.states or {}, run.numbers or {}):
@@ -227,7 +231,7 @@ def _drop_signals(run: RunSeries, budget_tokens: int) -> str | None:
                 break
             over -= tokens_of({name: _told(series.pop(name))})
             left_out.append(name)
-    return f"left out of run {run.run_id}: {_others(left_out[::-1])}" if left_out else None
+    return left_out[::-1]
 
 
 def _others(left_out: Sequence[str]) -> str:

@@ -338,6 +338,7 @@ _PAGE: Final = 500  # members, items or characters where it was not said how man
 _SHOWN_NAMES: Final = 6
 _MARGIN_TOKENS: Final = 200  # for hints
 _SHOWN_REPLACED: Final = 20
+_NULL: Final = "the value at this path is null"  # which an answer leaves out
 _ERROR_CHARACTERS: Final = 300
 
 PagePath = Annotated[
@@ -445,7 +446,7 @@ def _nothing_yet(view: View) -> str:
 def _page(part: Any, path: str, offset: int, limit: int, budget_tokens: int) -> dict[str, Any]:
     """What fits of a value; of an object, an array or a text from `offset` on."""
     if not isinstance(part, (dict, list, str)):
-        return {"path": path, "state": part}
+        return {"path": path, "state": part, "hint": _NULL if part is None else None}
     whole = cast("dict[str, Any] | list[Any] | str", part)
     hints, rule = list[str](), None
     if isinstance(whole, str):

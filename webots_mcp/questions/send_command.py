@@ -66,6 +66,10 @@ BREAKPOINT_COLUMNS: Final = (
     "id", "condition", "action", "after_hits", "hit_count", "newest_hit_run_id", "newest_hit_s",
     "set_by", "off_because",
 )  # fmt: skip
+_NOT_ASKED: Final = (
+    "no controller of this robot runs to ask any: those that its code had set ended with it, those "
+    "of webots_breakpoint stay and are armed when it starts again"
+)
 _ARMING_WAIT_S: Final = 5.0
 _LONGEST_CONDITION: Final = 300
 
@@ -124,10 +128,12 @@ def webots_list_breakpoints(recording: Recording, robot: RobotName = None) -> Br
         shown = fitting(rows)
         more = f"{len(shown)} of {len(rows)}: webots_query_sql has all in table breakpoint"
         none = "this robot has none: webots_breakpoint sets one"
+        hints = [more] * (len(shown) < len(rows))
+        hints += [none] * (not rows) + [_NOT_ASKED] * (not view.robot.live)
         return BreakpointsAnswer(
             **view.header(),
             breakpoints=table(BREAKPOINT_COLUMNS, shown),
-            hint=more if len(shown) < len(rows) else None if rows else none,
+            hint="; ".join(hints) or None,
         )
 
 

@@ -42,6 +42,7 @@ from webots_mcp.store.chunks import (
 )
 from webots_mcp.store.recording import Recording, is_over_a_value
 from webots_mcp.store.robots import list_robots
+from webots_mcp.store.run_rows import reading_texts
 from webots_mcp.store.signals import Signal, enter_signals, registered, seen_in, tell_more
 
 GROUP_ROWS: Final = 1024
@@ -296,12 +297,9 @@ class _RunChunks:
 
 def _read(connection: sqlite3.Connection, query: str, values: tuple[object, ...]) -> StateColumns:
     """Rows as columns; where one holds what no bridge writes, without such rows."""
-    columns, text_factory = StateColumns(), connection.text_factory
-    connection.text_factory = _text_or_bytes
-    try:
+    columns = StateColumns()
+    with reading_texts(connection):
         rows = connection.execute(query, (*values, GROUP_ROWS)).fetchall()
-    finally:
-        connection.text_factory = text_factory
     try:
         columns.add(rows)
     except Exception as error:
@@ -316,13 +314,6 @@ def _read(connection: sqlite3.Connection, query: str, values: tuple[object, ...]
             f"another program wrote what no bridge writes ({error})"
         )
     return columns
-
-
-def _text_or_bytes(stored: bytes) -> str | bytes:
-    try:
-        return stored.decode()
-    except UnicodeDecodeError:
-        return stored
 
 
 def _is_valid(row: tuple[Any, ...]) -> bool:

@@ -23,7 +23,7 @@ from typing import Any, Final, NamedTuple, TypeAlias, cast
 
 from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.errors import DatabaseError
+from webots_mcp.errors import DatabaseError, MalformedRowError
 from webots_mcp.naming import LONGEST_SPREAD_ARRAY, REDUCTIONS, Value, flatten
 from webots_mcp.store.analysis.arrays import Array, Indexes, inner, np
 
@@ -357,18 +357,25 @@ class StateColumns:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def add(self, rows: Sequence[tuple[Any, ...]]) -> None:
+    def add(self, rows: Sequence[tuple[Any, ...]], whose: str = "") -> None:
         """Add rows of `STATE_COLUMNS`; one whose data is no JSON object has no signals.
 
         Raises:
-            TypeError: Another program wrote what no bridge writes.
+            MalformedRowError: Another program wrote what no bridge writes.
         """
         if not rows:
             return
         before = len(self.ids)
         ids, times, walls, texts, replaced = zip(*rows, strict=True)
         if not _NUMBERS.issuperset(map(type, times + walls)) or {*map(type, texts)} != {str}:
-            raise TypeError("a state row has a time that is no number, or data that is no text")
+            number = next(
+                number for number, *moments, text, _ in rows
+                if type(text) is not str or not _NUMBERS.issuperset(map(type, moments))
+            )  # fmt: skip
+            raise MalformedRowError(
+                f"{whose}row {abs(number)} of table {'kept_' * (number < 0)}state has a time that "
+                "is no number, or data that is no text"
+            )
         self.ids += ids
         self.times += times
         self.wall_times += walls

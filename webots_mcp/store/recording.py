@@ -434,6 +434,7 @@ class Job:
 
 _UNSTORABLE: Final = (
     TypeError, OverflowError, ValueError, RecursionError, sqlite3.DataError, sqlite3.IntegrityError,
+    MalformedRowError,
 )  # fmt: skip
 
 

@@ -7,13 +7,18 @@ import itertools
 import json
 import sqlite3
 import stat
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from webots_mcp.contract import KEPT_FRAME
-from webots_mcp.errors import InvalidInputError, NothingRecordedError, UnknownRunError
+from webots_mcp.errors import (
+    InvalidInputError,
+    MalformedRowError,
+    NothingRecordedError,
+    UnknownRunError,
+)
 from webots_mcp.naming import nearest_first
 
 if TYPE_CHECKING:
@@ -58,14 +63,14 @@ class State:
 
     def value(self) -> dict[str, Any]:
         """The published dict, with "nan", "inf" and the like where JSON has to say null."""
-        value = cast("dict[str, Any]", json.loads(self.data))
+        value = cast("dict[str, Any]", _decoded(self, self.data))
         for path, kind in self.replaced_paths().items():
             put_back(value, path.split("."), kind)
         return value
 
     def replaced_paths(self) -> dict[str, str]:
         """Path of every replaced value, and what it was."""
-        return json.loads(self.replaced) if self.replaced else {}
+        return _decoded(self, self.replaced) if self.replaced else {}
 
 
 @dataclass(frozen=True)
@@ -82,7 +87,36 @@ class Event:
 
     def details(self) -> Any:
         """What was noticed, decoded; None where nothing was added."""
-        return json.loads(self.data) if self.data else None
+        return _decoded(self, self.data) if self.data else None
+
+
+def _decoded(row: State | Event, text: str) -> Any:
+    """The value of JSON text of a row; a MalformedRowError says which row has none."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        table = "kept_" * (row.id < 0) + type(row).__name__.lower()
+        where = f"run {row.run_id}: row {abs(row.id)} of table {table}"
+        raise MalformedRowError(f"{where} holds a value that cannot be read: {error}") from error
+
+
+def _text_or_bytes(stored: bytes) -> str | bytes:
+    try:
+        return stored.decode()
+    except UnicodeDecodeError:
+        return stored
+
+
+@contextlib.contextmanager
+def reading_texts(
+    connection: sqlite3.Connection, read: Callable[[bytes], Any] = _text_or_bytes
+) -> Generator[None]:
+    """Inside, a text that is no UTF-8 is read as bytes: SQLite would not say of which row."""
+    before, connection.text_factory = connection.text_factory, read
+    try:
+        yield
+    finally:
+        connection.text_factory = before
 
 
 _RUN_COLUMNS: Final = columns_of(Run)
@@ -178,7 +212,8 @@ def state_at(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> 
 
 
 def _state_up_to(connection: sqlite3.Connection, run_id: int, until: float | bytes) -> State | None:
-    row = connection.execute(_NEWEST_STATE, {"run": run_id, "until": until}).fetchone()
+    with reading_texts(connection):
+        row = connection.execute(_NEWEST_STATE, {"run": run_id, "until": until}).fetchone()
     return State(*row) if row else None
 
 

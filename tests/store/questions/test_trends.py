@@ -65,6 +65,22 @@ def record(
     make_chunks(connection, 100_000)
 
 
+def test_a_counter_of_large_numbers_counts_and_what_adding_leaves_is_constant(
+    empty: sqlite3.Connection, looked_at: str
+) -> None:
+    courses: dict[str, Course] = {
+        "counter": lambda time_s: 3_000_000_000_000_001 + int(time_s),
+        "sum": lambda time_s: 6.0 + time_s % 1 * 5e-15,
+    }
+    record(empty, rows=300, interval_s=0.1, **courses)
+    told = {each.name: each for each in ask(empty).numbers}
+    assert told["counter"].shape == "rising"
+    assert told["counter"].says.startswith(
+        "rises from 3000000000000001 to 3000000000000030 (0.97/s)"
+    )
+    assert told["sum"].shape == "constant"
+
+
 @pytest.mark.parametrize("looked_at", ["chunks"], indirect=True)
 def test_a_swing_faster_than_the_chunks_gets_no_period_of_an_alias(
     empty: sqlite3.Connection, looked_at: str, monkeypatch: pytest.MonkeyPatch

@@ -20,7 +20,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Generator, Iterable
-from contextlib import closing
+from contextlib import AbstractContextManager, closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
@@ -30,6 +30,7 @@ from webots_mcp.connection import connect, shipped_objects
 from webots_mcp.contract import DATABASE_NAME, Database
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
+from webots_mcp.store.run_rows import reading_texts
 
 MOST_ROWS: Final = 1000
 MAX_BYTES: Final = 20_000  # about 5,000 tokens
@@ -186,15 +187,9 @@ class Budget:
         self.left = max_bytes
         self.shortened = 0
 
-    @contextlib.contextmanager
-    def shortening(self, connection: sqlite3.Connection) -> Generator[None]:
+    def shortening(self, connection: sqlite3.Connection) -> AbstractContextManager[None]:
         """Cut texts as they are read: the whole row is never in memory; bad UTF-8 is shown."""
-        before = connection.text_factory
-        connection.text_factory = self._text
-        try:
-            yield
-        finally:
-            connection.text_factory = before
+        return reading_texts(connection, self._text)
 
     def take(self, row: Iterable[object]) -> tuple[Cell, ...]:
         """The values of a row as an answer has them; they are paid for."""

@@ -375,7 +375,8 @@ def _is_wide(swing: Swing, summary: Summary) -> bool:
 def _is_constant(summary: Summary) -> bool:
     """Whether it never changed but for what adding leaves: 6.000000000000005 is 6."""
     low, high = summary.min or 0.0, summary.max or 0.0
-    return high - low <= _DUST * max(abs(low), abs(high))
+    is_whole = low.is_integer() and high.is_integer()  # adding leaves nothing of a large counter
+    return high - low <= (0.0 if is_whole else _DUST * max(abs(low), abs(high)))
 
 
 def _relative_range(summary: Summary) -> float:
@@ -478,7 +479,7 @@ def _in_digits(value: float | None, summary: Summary) -> str:
         return "0"
     share = _relative_range(summary)
     digits = max(4, 2 - math.floor(math.log10(share))) if share else 4
-    return f"{value:.{min(digits, 15)}g}"
+    return f"{value:.{min(digits, 17)}g}"
 
 
 def _swinging(trend: Trend, unit: str) -> str:

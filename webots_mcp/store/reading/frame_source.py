@@ -27,6 +27,7 @@ from webots_mcp.store.chunks import (
     values_in,
 )
 from webots_mcp.store.reading.segment import Deadline
+from webots_mcp.store.run_rows import reading_texts
 
 _MOST_ROWS: Final = 2**20  # of a group: no maker puts more than 1,024 into one
 NOT_READ: Final = "not read from"  # how what says that a part is not in a frame begins
@@ -311,7 +312,7 @@ _NEWEST_IN: Final = (
     "ORDER BY sim_time_s, id"
 )
 _LATE: Final = (
-    f"SELECT {STATE_COLUMNS} FROM state WHERE id > ? AND +run_id = ? AND {_IN} "
+    f"SELECT {STATE_COLUMNS} FROM state WHERE +run_id = ? AND id > ? AND {_IN} "
     "AND (sim_time_s, id) <= (?, ?) ORDER BY sim_time_s, id"
 )
 _FEWER_THAN: Final = (
@@ -360,7 +361,7 @@ def rows_in_no_chunk(
     place = (at.end_s, at.last_state_id)
     columns = StateColumns()
     cut_s = read_rows(
-        connection, _LATE, (at.max_state_id, run_id, *span, *place), columns, deadline
+        connection, _LATE, (run_id, at.max_state_id, *span, *place), columns, deadline
     )
     if cut_s is not None or span[1] < at.end_s:
         return columns, cut_s
@@ -412,13 +413,14 @@ def read_rows(
 ) -> float | None:
     """Add the rows of a query; the time of the last one where the deadline passed before its end.
 
-    Without a row it is minus infinity.
+    Without a row it is minus infinity. The first of the values is the run.
     """
-    cursor = connection.execute(query, values)
-    while rows := cursor.fetchmany(ROWS_AT_ONCE):
-        if deadline.passed:
-            return columns.times[-1] if len(columns) else float("-inf")
-        columns.add(rows)
+    with reading_texts(connection):
+        cursor = connection.execute(query, values)
+        while rows := cursor.fetchmany(ROWS_AT_ONCE):
+            if deadline.passed:
+                return columns.times[-1] if len(columns) else float("-inf")
+            columns.add(rows, f"run {values[0]}: ")
     return None
 
 

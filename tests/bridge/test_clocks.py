@@ -26,14 +26,9 @@ pytestmark = pytest.mark.skipif(
 
 def set_clock(recording: Recording, by_s: float) -> None:
     """All that was stamped until now is as if the host's clock had been set forward by so much."""
-    change(
-        recording,
-        "UPDATE session SET started_wall_time_s = started_wall_time_s - ?1, "
-        "last_seen_wall_time_s = last_seen_wall_time_s - ?1, "
-        "moved_wall_time_s = moved_wall_time_s - ?1, "
-        "last_poll_wall_time_s = last_poll_wall_time_s - ?1",
-        by_s,
-    )
+    stamps = ("started_wall_time_s", "last_seen_wall_time_s", "moved_wall_time_s")
+    moved = (f"{stamp} = {stamp} - ({by_s})" for stamp in (*stamps, "last_poll_wall_time_s"))
+    change(recording, f"UPDATE session SET {', '.join(moved)}")
 
 
 def judge_all(recording: Recording) -> None:

@@ -52,8 +52,8 @@ def begin_run(recorded: Recorded, port: int, name: str = "rover") -> None:
 
 
 def messages(recorded: Recorded, source: str | None = None) -> list[str]:
-    query = "SELECT message FROM log WHERE ?1 IS NULL OR source = ?1 ORDER BY id"
-    return [message for (message,) in recorded.connection.execute(query, (source,))]
+    query = "SELECT message FROM log WHERE :source IS NULL OR source = :source ORDER BY id"
+    return [message for (message,) in recorded.connection.execute(query, {"source": source})]
 
 
 @pytest.fixture(autouse=True)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from itertools import accumulate
 
+import numpy as np
 import pytest
 
 from tests.store.analysis.driving import noisy_track
 from webots_mcp.store.analysis.standstill import find_standstills
+from webots_mcp.store.analysis.track import noise_of, track_of
 
 RADIUS_M = 0.05
 LEAST_S = 3.0
@@ -81,3 +83,15 @@ def test_who_twitches_in_a_place_stands_once(twitches_m: list[float], noise_m: f
     (found,) = find_standstills(track, RADIUS_M, LEAST_S)
     told_s = track.times[found.start], track.times[found.last]
     assert told_s == pytest.approx(ends_s, abs=0.25)
+
+
+def test_few_rows_with_long_gaps_between_them_are_judged_by_rows_alone() -> None:
+    random = np.random.default_rng(0)
+    for _ in range(300):
+        count = int(random.integers(3, 60))
+        steps_s = random.choice([0.016, 0.1, 0.5, 2.0, 7.0], count, p=[0.5, 0.3, 0.1, 0.05, 0.05])
+        x = np.cumsum(random.choice([0.0, 0.001, 0.02, 0.3], count) * steps_s)
+        x += random.normal(0, random.choice([0, 0.001, 0.01]), count)
+        track = track_of(np.cumsum(steps_s), x, np.zeros(count), noise_of(x))
+        found = find_standstills(track, RADIUS_M, float(random.choice([0.5, 2.0, 4.0])))
+        assert all(each.start <= each.last for each in found)

@@ -143,6 +143,8 @@ def _resting(
     last = stays[:, 1] - 1 - _settled(grid, stays[:, 1:] - 1 - np.arange(grid.window), limit_m)
     firsts = np.searchsorted(track.times, grid.times[first])
     lasts = np.searchsorted(track.times, grid.times[last], "right") - 1
+    seen = lasts >= firsts  # else it is between two rows
+    firsts, lasts, stays = firsts[seen], lasts[seen], stays[seen]
     # At the ends of the track smoothing leaves more of the noise.
     newest, slack = len(track.times) - 1, track.smoothed_rows // 2 + grid.rows
     firsts[(stays[:, 0] == 0) & (firsts <= slack)] = 0
@@ -427,6 +429,8 @@ def rest_within(rows: Rows, start: int, end: int) -> tuple[int, int] | None:
     explain more than noise does. The robot has to be certainly slower in the rest than on either
     side of it: a bend of a creep is no rest.
     """
+    if end - start < 2:
+        return None
     parts = min(_FINE_MEANS, end - start)
     first, last, _ = _best_rest(*_fine_places(rows, start, end, parts))
     rest = (start + (end - start) * first // parts, start + (end - start) * last // parts)

@@ -137,8 +137,9 @@ class CustomDataReader:
 
     def close(self) -> None:
         """The observer ends, or the world."""
+        taken = self._names_taken()
         for robot in self._robots.values():
-            robot.end("finished")
+            robot.end("superseded" if robot.body.name in taken else "finished")
         self._robots.clear()
 
     def _names_taken(self) -> set[str]:
@@ -313,11 +314,12 @@ class _Recording:
     def _report_missed(self) -> None:
         counted = self._sequence
         self._journal.event("missed", {"messages": counted.missed, "of": counted.total})
-        self._errors.warn(
+        self._errors.warn(  # also shown by status, as its newest error
             "missed",
             f"robot {self._body.name!r} overwrote {counted.missed} of {counted.total} messages in "
             "its customData before the observer read them (seq): see docs/any-language.md#rates",
         )
+        self._heartbeat.beat()
 
 
 class _Sequence:
@@ -344,8 +346,8 @@ class _Sequence:
         if type(given) is not int:
             return
         skipped = given - self.last - 1 if self.last is not None and given > self.last else 0
-        self.last = given
+        before, self.last = self.last, given
         self.missed += skipped
-        self.total += skipped + 1
+        self.total += skipped + (given != before)
         if skipped and self.missed >= self._report_from:
             self.is_to_be_reported, self._report_from = True, 2 * self.missed

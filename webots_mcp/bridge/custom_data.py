@@ -44,6 +44,7 @@ _STALE_S: Final = 1.0  # of simulation time in which a text from before a reset 
 _C_NUMBERS: Final = re.compile(
     r'"(?:\\.|[^"\\])*"|([-+]?)\b(?:(nan)\b(?:\(\w*\))?|inf(?:inity)?\b)', re.IGNORECASE
 )
+_END_REASON: Final = "SELECT end_reason FROM session WHERE id = ?"
 _OPEN_SESSIONS: Final = (
     "SELECT r.name, s.id, s.instance, s.host, s.pid, s.process, s.last_seen_wall_time_s "
     "FROM session s JOIN robot r ON r.id = s.robot_id WHERE s.ended_wall_time_s IS NULL"
@@ -137,9 +138,8 @@ class CustomDataReader:
 
     def close(self) -> None:
         """The observer ends, or the world."""
-        taken = self._names_taken()
         for robot in self._robots.values():
-            robot.end("superseded" if robot.body.name in taken else "finished")
+            robot.end("finished")
         self._robots.clear()
 
     def _names_taken(self) -> set[str]:
@@ -181,8 +181,9 @@ class _Robot:
 
     def look(self, now_s: float, *, is_due: bool, is_taken: bool) -> bool:
         """Record what is new; True where there is something and no session yet."""
-        if not self._is_asked_for:
+        if not self._is_asked_for:  # what is asked for at once is newer than the last step
             self._find_field()
+            return False
         if self._field is None or self._is_gone:
             return False
         if not self.body.is_there:
@@ -285,8 +286,10 @@ class _Recording:
         self._heartbeat.beat_if_due()
 
     def end(self, reason: str) -> None:
-        """End run and session."""
-        self.recorder.close(reason, self._clock.sim_time_s)
+        """End run and session; one that a bridge has ended already stays ended so."""
+        ids = self.recorder.registration
+        ended = self.recorder.fetch(_END_REASON, (ids.session_id,)) if ids else None
+        self.recorder.close((ended and ended[0][0]) or reason, self._clock.sim_time_s)
 
     def _begin_run(self) -> None:
         """The world was reset: what the field holds is of the time before it."""

@@ -289,13 +289,17 @@ def measure_custom_data(bench: Bench) -> Iterable[Line]:
 
                 return processor_s(work) / steps / len(nodes)
 
-            def insert(*, steps: int = steps) -> float:
-                return processor_s(lambda: [raw.publish(states[i % 64]) for i in range(steps)])
+            def insert(steps: int) -> float:
+                def work() -> None:
+                    for i in range(steps):
+                        raw.publish(states[i % len(states)])
+
+                return processor_s(work) / steps
 
             blocks = {
                 "writing": partial(rounds, *writing, texts),
                 "silent": partial(rounds, *silent, [""]),
-                "raw": lambda insert=insert, steps=steps: insert() / steps,
+                "raw": partial(insert, steps),
             }
             taken = {name: median(v) for name, v in alternate(blocks, bench.count(9, 2)).items()}
             ours = taken["writing"] - taken["silent"]

@@ -83,13 +83,12 @@ def signals_of(text: str) -> dict[str, Any]:
 
 
 def _with_json_numbers(text: str) -> str:
-    return _C_NUMBERS.sub(_json_number, text)
+    def spelled(found: re.Match[str]) -> str:
+        if found[0].startswith('"'):
+            return found[0]
+        return "NaN" if found[2] else f"{found[1].strip('+')}Infinity"
 
-
-def _json_number(found: re.Match[str]) -> str:
-    if found[0].startswith('"'):
-        return found[0]
-    return "NaN" if found[2] else "-Infinity" if found[1] == "-" else "Infinity"
+    return _C_NUMBERS.sub(spelled, text)
 
 
 class CustomDataReader:
@@ -166,12 +165,11 @@ class _Robot:
     def __init__(self, body: SeenRobot, observer: Session) -> None:
         self.body = body
         self._observer = observer
-        self._field: Any = None
+        self._field: Any = None  # where it has none, or is gone
         self._is_asked_for = False
         self._recording: _Recording | None = None
         self._text = self._text_left = ""  # the newest, and what is there of another's time
         self._read_again_s: float | None = None  # None where the field comes with the steps
-        self._is_gone = False
 
     @property
     def session_id(self) -> int | None:
@@ -184,10 +182,10 @@ class _Robot:
         if not self._is_asked_for:  # what is asked for at once is newer than the last step
             self._find_field()
             return False
-        if self._field is None or self._is_gone:
+        if self._field is None:
             return False
         if not self.body.is_there:
-            self._is_gone = True
+            self._field = None
             self.end("finished")
             return False
         before, self._text = self._text, self._read(now_s)
@@ -278,8 +276,7 @@ class _Recording:
             self._begin_run()
         if is_new:
             self._values, self._stale_until_s = signals_of(text), -1.0
-            self._sequence.count(self._values.get("seq"))
-            if self._sequence.is_to_be_reported:
+            if self._sequence.count(self._values.get("seq")):
                 self._report_missed()
         if is_new or is_due:
             self._record()
@@ -288,8 +285,9 @@ class _Recording:
     def end(self, reason: str) -> None:
         """End run and session; one that a bridge has ended already stays ended so."""
         ids = self.recorder.registration
-        ended = self.recorder.fetch(_END_REASON, (ids.session_id,)) if ids else None
-        self.recorder.close((ended and ended[0][0]) or reason, self._clock.sim_time_s)
+        for (ended,) in (ids and self.recorder.fetch(_END_REASON, (ids.session_id,))) or ():
+            reason = ended or reason
+        self.recorder.close(reason, self._clock.sim_time_s)
 
     def _begin_run(self) -> None:
         """The world was reset: what the field holds is of the time before it."""
@@ -332,25 +330,28 @@ class _Sequence:
         last: The newest; None before the first.
         missed: How many were overwritten before they were read.
         total: How many there were, as far as it is known.
-        is_to_be_reported: The number has doubled since the last report, which this count says.
     """
 
     def __init__(self) -> None:
         self.last: int | None = None
         self.missed = self.total = 0
-        self.is_to_be_reported = False
         self._report_from = 1
 
-    def count(self, given: object) -> None:
-        """Count a message; one whose number is not above the last begins anew."""
-        self.is_to_be_reported = False
+    def count(self, given: object) -> bool:
+        """Count a message; one whose number is not above the last begins anew.
+
+        Returns:
+            Whether the number of those missed has doubled since this was last said.
+        """
         if isinstance(given, float) and given.is_integer():  # 12.0, as some languages write it
             given = int(given)
         if type(given) is not int:
-            return
+            return False
         skipped = given - self.last - 1 if self.last is not None and given > self.last else 0
         before, self.last = self.last, given
         self.missed += skipped
         self.total += skipped + (given != before)
-        if skipped and self.missed >= self._report_from:
-            self.is_to_be_reported, self._report_from = True, 2 * self.missed
+        if self.missed < self._report_from:
+            return False
+        self._report_from = 2 * self.missed
+        return True

@@ -71,8 +71,8 @@ _GET_COMMAND: Final = (
     "MCPBridge.attach(robot), which does, before anything takes or replaces robot.step"
 )
 _READ_FASTER: Final = (
-    "make the observer's period the robot's step ('webots-mcp observe --period-ms'), or let the "
-    "robot write less often"
+    "give the observer's Robot node 'synchronization TRUE' and the robot's step in ms as "
+    "controllerArgs, or let the robot write less often"
 )
 _LONG_AT_WORK_S: Final = 30.0
 _NOT_POLLED_S: Final = 5.0

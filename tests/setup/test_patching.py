@@ -159,6 +159,7 @@ MODULES = {
     ("changed", "said"),
     [
         ({}, ""),
+        ({"deepbots/supervisor.py": FORMS["subclass"][0]}, ""),
         ({"c.py": "from os import path\n"}, "does not import Robot"),
         ({"runner.py": RUNNER + "from controller import Robot\nr = Robot()\n"},
          r"several of its modules make a robot: runner.py line 6, env.py line 4"),

@@ -123,7 +123,7 @@ def _imported(module: ast.Module, file: Path, controller: Path) -> list[Path]:
             folder = file.parents[node.level - 1] if node.level else controller.parent
             modules = [f"{node.module or ''}.{alias.name}".strip(".") for alias in node.names]
             names += [(folder, name) for name in (node.module or "", *modules)]
-    paths = [folder.joinpath(*name.split(".")) for folder, name in names if name]
+    paths = [folder.joinpath(*n.split(".")) for folder, n in names if n and not _robots_of(n)]
     files = [each for path in paths for each in (path.with_suffix(".py"), path / "__init__.py")]
     return [each for each in dict.fromkeys(files) if each.is_file()]
 

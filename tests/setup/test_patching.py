@@ -51,6 +51,9 @@ FORMS = {
         "from deepbots.supervisor import RobotSupervisorEnv\nclass Env(RobotSupervisorEnv):\n"
         "    def __init__(self, steps):\n        super().__init__()\n        self.n = steps\n",
         "        MCPBridge.attach(self)"),
+    "two classes": ("from controller import Robot\nclass A(Robot):\n  def __init__(self):\n"
+                    "    super().__init__()\nclass B(A):\n  def __init__(self):\n"
+                    "    super().__init__()\n", "    MCPBridge.attach(self)"),
     "driver": ("from vehicle import Driver\nd = Driver()\nwhile d.step() != -1: pass\n",
                "MCPBridge.attach(d)"),
     "subclass without constructor": ("from controller import Robot\nclass R(Robot): pass\nr = R()",

@@ -35,11 +35,7 @@ _WORDS: Final = re.compile(r'"(?:[^"\\]|\\.)*"|#[^\n]*|\w+')
 
 
 # By language: how the files of a controller end that are built before Webots starts it.
-_SOURCES: Final = {
-    "C": (".c",),
-    "C++": (".cpp", ".cc", ".cxx"),
-    "Java": (".java",),
-}
+_SOURCES: Final = {"C": (".c",), "C++": (".cpp", ".cc", ".cxx"), "Java": (".java",)}
 _CALLS: Final = {
     "C": 'wb_robot_set_custom_data("{...}")',
     "C++": 'robot->setCustomData("{...}")',

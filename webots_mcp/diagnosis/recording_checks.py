@@ -310,7 +310,7 @@ def rows(subject: Examined) -> Iterator[Finding]:
             seen = f"{session.rows_dropped} rows of {name} were dropped{why}"
             fix = "see free space and the folder's rights; what was dropped is lost"
             yield wrong(seen, fix) if view.robot.live else warning(seen, fix)
-        elif view.robot.kind == CUSTOM_DATA and view.robot.live and error:
+        elif view.robot.kind == CUSTOM_DATA and view.robot.live and error and "(seq)" in error:
             yield warning(error[:200], _READ_FASTER)
         elif waiting.get("rows_waiting"):
             yield warning(

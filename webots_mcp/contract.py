@@ -93,6 +93,7 @@ BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
 }
 
 OBSERVER: Final = "Observer"  # the kind of a robot that only looks at the others, and steers
+CUSTOM_DATA: Final = "customData"  # the kind of a robot that the observer records from this field
 OBSERVER_NAME: Final = "mcp_observer"  # of its Robot node and of its controller
 WORLD_EVENT: Final = "world"  # the event with the robots and solids that an observer sees
 MODE_EVENT: Final = "mode"  # the event with the simulation mode that an observer sees

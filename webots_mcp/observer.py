@@ -23,9 +23,11 @@ import sys
 import time
 import unicodedata
 from collections.abc import Callable, Collection, Generator
+from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple, TypeAlias
 
+from webots_mcp.bridge.custom_data import CustomDataReader
 from webots_mcp.bridge.mcp_bridge import MCPBridge
 from webots_mcp.bridge.scene import MOST_NODES, SceneNode, read_value, walk
 from webots_mcp.contract import LOOK_AT, MODE_EVENT, OBSERVER, WORLD_EVENT
@@ -120,6 +122,10 @@ class ObserverBridge(MCPBridge):
         """The mode in which the simulation is seen to be."""
         return self._session.simulation.mode_name
 
+    def read_custom_data(self) -> CustomDataReader:
+        """What records the robots that have no bridge of their own."""
+        return CustomDataReader(self._session)
+
     def failed(self, error: Exception) -> None:
         """Count what could not be seen, and say it once on stderr."""
         self._errors.failed("the observer", error)
@@ -149,7 +155,7 @@ def observe(robot: Any, period_ms: int = PERIOD_MS, **options: Any) -> None:
         CommandRefusedError: The robot has no supervisor's rights.
     """
     observer = Observer(robot, period_ms, **options)
-    with observer.bridge:
+    with observer.bridge, closing(observer.custom_data):
         while observer.go_on():
             pass
 
@@ -170,6 +176,7 @@ class Observer:
         self.bridge = ObserverBridge(robot, throttle_interval=1, keep_last_s=0, **options)
         self.bridge.count_steps_by_time()
         self.world = ObservedWorld(robot, self._period_ms, self._warn)
+        self.custom_data = self.bridge.read_custom_data()
         self._pace = StepPace(robot, self._period_ms)
         self._due_s = -math.inf
         self._mode = -1
@@ -194,9 +201,13 @@ class Observer:
             self.world.begin_run()
             self._due_s = -math.inf
         self._record_news()
-        if sim_time_s >= self._due_s and (seen := self.world.look(sim_time_s)):
+        is_due = sim_time_s >= self._due_s
+        if is_due and (seen := self.world.look(sim_time_s)):
             self._due_s = sim_time_s + self._period_ms / 1000 - 1e-6
             self.bridge.publish(seen)
+        self.custom_data.look(
+            [body for body in self.world.bodies.values() if body.is_robot], is_due=is_due
+        )
 
     def _record_news(self) -> None:
         """Record the mode and what there is where they are not as before, or long ago."""
@@ -282,6 +293,11 @@ class BodyPose(NamedTuple):
         """How far away another position is."""
         return math.dist((self.x_m, self.y_m, self.z_m), position)
 
+    def signals(self) -> dict[str, float]:
+        """It as it is recorded."""
+        _, x, y, z, heading = (round(value, _DIGITS) for value in self)
+        return {"x_m": x, "y_m": y, "z_m": z, "heading_rad": heading}
+
     def is_elsewhere(self, other: BodyPose) -> bool:
         """Whether a body has moved or turned between the two."""
         turned = abs(math.remainder(self.heading_rad - other.heading_rad, math.tau))
@@ -318,17 +334,30 @@ class ObservedBody:
         """A robot always; another solid once it has moved."""
         return self.is_robot or self.has_moved
 
+    @property
+    def is_there(self) -> bool:
+        """Whether its node is; else what the library knows is of another node now."""
+        node: Any = self.scene.node
+        return int(node.getId()) == self.scene.id
+
     def look(self, sim_time_s: float) -> bool:
         """See where it is now; False where its node is not there any more, or has no place."""
+        place = self._seen(sim_time_s) if self.is_there else None
+        if place is not None:
+            self._go_on(place)
+        return place is not None
+
+    def pose_now(self) -> dict[str, float] | None:
+        """Where it is now, as signals; None where it has no place."""
+        place = self._seen(0.0)
+        return None if place is None else place.signals()
+
+    def _seen(self, sim_time_s: float) -> BodyPose | None:
         node: Any = self.scene.node
-        if int(node.getId()) != self.scene.id:  # what the library knows is of another node now
-            return False
         pose = node.getPose()
         if not math.isfinite(pose[3]):
-            return False
-        place = BodyPose(sim_time_s, pose[3], pose[7], pose[11], math.atan2(pose[4], pose[0]))
-        self._go_on(place)
-        return True
+            return None
+        return BodyPose(sim_time_s, pose[3], pose[7], pose[11], math.atan2(pose[4], pose[0]))
 
     def _go_on(self, place: BodyPose) -> None:
         before = self.place
@@ -344,9 +373,8 @@ class ObservedBody:
         """What is recorded of it at a moment."""
         if self.place is None:
             return {}
-        _, x, y, z, heading = (round(value, _DIGITS) for value in self.place)
         speed = None if self.speed_mps is None else round(self.speed_mps, _DIGITS)
-        return {"x_m": x, "y_m": y, "z_m": z, "heading_rad": heading, SEEN_SPEED: speed}
+        return {**self.place.signals(), SEEN_SPEED: speed}
 
     def describe(self) -> dict[str, object]:
         """What does not change of it: where it is, too, as long as it has not moved."""

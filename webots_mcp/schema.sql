@@ -12,7 +12,7 @@ CREATE TABLE recording (
 CREATE TABLE robot (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
 	name TEXT NOT NULL /* Robot.name; #2 is appended where two live at once */, 
-	kind TEXT NOT NULL /* Robot or Supervisor */, 
+	kind TEXT NOT NULL /* Robot, Supervisor, Observer; customData: without a bridge */, 
 	devices TEXT /* JSON object: device name to its class */, 
 	first_seen_wall_time_s FLOAT NOT NULL, 
 	last_seen_wall_time_s FLOAT NOT NULL, 

@@ -5,6 +5,7 @@ A call in a row of equal calls costs less: all that it needs lies in the process
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -40,6 +41,7 @@ from webots_mcp.bridge.keeping import scale_down
 from webots_mcp.bridge.pictures import encode_png
 from webots_mcp.conditions import parse_condition
 from webots_mcp.contract import KEEP_LAST_S
+from webots_mcp.observer import Observer
 from webots_mcp.standin import InProcessSupervisor
 
 _NEVER = 1_000_000_000  # is a call recorded
@@ -260,7 +262,72 @@ def _evaluating(texts: list[str], calls: int) -> Callable[[], float]:
     return partial(processor_s, evaluate)
 
 
+_WATCHED_WORLD = "#VRML_SIM R2025a utf8\nWorldInfo { basicTimeStep 16 }\n"
+_WATCHED = 'Robot {{ name "{}" translation {} 0 0 {} }}\n'
+_WATCHING = 'supervisor TRUE synchronization FALSE controller "mcp_observer"'
+
+
+@benchmark("custom_data", "what a robot without a bridge adds to a round of its observer, a step")
+def measure_custom_data(bench: Bench) -> Iterable[Line]:
+    """Processor time; each robot writes another JSON object of 39 values before each step."""
+    texts, states = [json.dumps(state) for state in make_states()], make_states()
+    with closing(RawSqlite(bench.place("raw"))) as raw:
+        for robots in (1, 10, 50):
+            steps = bench.count(1000 // robots, least=3)
+            writing, silent = (
+                _watched(bench.place(f"{robots} {text}"), robots, text) for text in ("-", "")
+            )
+
+            def rounds(
+                observer: Observer, nodes: Any, given: list[str], *, steps: int = steps
+            ) -> float:
+                def work() -> None:
+                    for i in range(steps):
+                        for node in nodes:
+                            node.fields["customData"] = given[i % len(given)]
+                        observer.go_on()
+
+                return processor_s(work) / steps / len(nodes)
+
+            def insert(steps: int) -> float:
+                def work() -> None:
+                    for i in range(steps):
+                        raw.publish(states[i % len(states)])
+
+                return processor_s(work) / steps
+
+            blocks = {
+                "writing": partial(rounds, *writing, texts),
+                "silent": partial(rounds, *silent, [""]),
+                "raw": partial(insert, steps),
+            }
+            taken = {name: median(v) for name, v in alternate(blocks, bench.count(9, 2)).items()}
+            ours = taken["writing"] - taken["silent"]
+            what = f"of {robots} robots, each"
+            yield compared(what, ours, "raw sqlite3", taken["raw"], ours / taken["raw"], 4)
+            for observer, _ in (writing, silent):
+                observer.custom_data.close()
+                observer.bridge.close()
+
+
+def _watched(folder: Path, robots: int, text: str) -> tuple[Observer, list[Any]]:
+    """An observer in a world of robots that have written this, and their nodes."""
+    world = folder / "world.wbt"
+    nodes = [_WATCHED.format(number, number, "") for number in range(robots)]
+    nodes.append(_WATCHED.format("observer", -1, _WATCHING))
+    world.write_text("".join([_WATCHED_WORLD, *nodes]))
+    robot = InProcessSupervisor("observer", world=world)
+    observer = Observer(robot, 16, data_dir=folder)
+    watched = [each.node for each in robot.simulation.simulator.robots if each.name != "observer"]
+    for _ in range(2 * robots + 20):  # until all are found, and have their sessions
+        for node in watched:
+            node.fields["customData"] = text
+        observer.go_on()
+    return observer, watched
+
+
 BENCHMARKS = (
+    measure_custom_data,
     measure_loop,
     measure_throttled,
     measure_attach,

@@ -101,6 +101,21 @@ def test_json_holds_it_all(project: Path) -> None:
     assert controller["python"]["executable"] == sys.executable
 
 
+def test_each_controller_is_named_by_its_language_with_what_to_do(project: Path) -> None:
+    controllers = project / "controllers"
+    for name in ("walls/walls.c", "arm/arm.m", "läufer/roboter.py"):
+        (controllers / name).parent.mkdir(exist_ok=True)
+        (controllers / name).write_text(CONTROLLER, "utf-8")
+    (controllers / "läufer" / "läufer.py").write_text("import roboter\n", "utf-8")
+    said = run("--dry-run", cwd=project).stdout
+    assert "is C (Webots starts it once it is built): include webots_mcp.h" in said
+    assert "is MATLAB: write its values as JSON with wb_robot_set_custom_data('{...}')" in said
+    assert "these lines in controllers/läufer/roboter.py, the second after line 3," in said
+    found = json.loads(run("--dry-run", "--json", cwd=project).stdout)["controllers"]
+    assert [each["language"] for each in found] == ["MATLAB", "Python", "C"]
+    assert found[1]["after_line"] == 3
+
+
 def test_a_damaged_file_is_refused_and_the_others_are_written(project: Path) -> None:
     (project / ".vscode").mkdir()
     (project / ".vscode" / "mcp.json").write_text('{"servers": {\n  "a" 1}}')

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.setup.project_edits import IMPORT, AlreadyPatchedError, attach_line, patch, unpatch
+from webots_mcp.setup.project_edits import (
+    IMPORT,
+    AlreadyPatchedError,
+    attaching_place,
+    patch,
+    unpatch,
+)
 
 PLAIN = """from controller import Robot
 
@@ -39,20 +47,32 @@ FORMS = {
         "from controller import Robot\nclass A(Robot):\n  def __init__(me):\n"
         "    super(A, me).__init__()\nclass B(A):\n  pass\nB().run()\n",
         "    MCPBridge.attach(me)"),
+    "made elsewhere": (
+        "from deepbots.supervisor import RobotSupervisorEnv\nclass Env(RobotSupervisorEnv):\n"
+        "    def __init__(self, steps):\n        super().__init__()\n        self.n = steps\n",
+        "        MCPBridge.attach(self)"),
+    "two classes": ("from controller import Robot\nclass A(Robot):\n  def __init__(self):\n"
+                    "    super().__init__()\nclass B(A):\n  def __init__(self):\n"
+                    "    super().__init__()\n", "    MCPBridge.attach(self)"),
+    "driver": ("from vehicle import Driver\nd = Driver()\nwhile d.step() != -1: pass\n",
+               "MCPBridge.attach(d)"),
     "subclass without constructor": ("from controller import Robot\nclass R(Robot): pass\nr = R()",
                                      "MCPBridge.attach(r)"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_the_robot_is_attached_where_it_is_made(form: str) -> None:
+def test_the_robot_is_attached_where_it_is_made(form: str, tmp_path: Path) -> None:
     source, attach = FORMS[form]
     patched = patch(source.encode()).decode()
     assert [line for line in patched.splitlines() if line not in source.splitlines()] == [
         IMPORT, attach
     ]  # fmt: skip
     compile(patched, form, "exec")
-    assert attach_line(source.encode()) == attach.strip()
+    (tmp_path / "c.py").write_text(source)
+    place = attaching_place(tmp_path / "c.py")
+    assert place.statement == attach.strip()
+    assert [line.strip() for line in patched.splitlines()][place.line + 1] == place.statement
     assert unpatch(patched.encode()) == source.encode()
 
 
@@ -66,6 +86,9 @@ def test_a_patched_controller_is_not_patched_again() -> None:
     [
         ("x = 1\n", "does not import Robot"),
         ("from controller import Robot\n", "makes no Robot"),
+        ("from controller import Robot\nclass A(Robot): pass\nclass B(Robot): pass\n",
+         r"several classes .*lines 2, 3"),
+        ("from controller import Robot\nclass A(Robot): pass\n", r"A in line 2 has no constructor"),
         ("from controller import Robot\na = Robot()\nb = Robot()\n", r"several .*lines 2, 3"),
         ("from controller import Robot\nmain(Robot())\n", "not assigned to a name"),
         ("from controller import Robot\na[0] = Robot()\n", "no plain name"),
@@ -126,3 +149,36 @@ def test_whatever_stands_around_it_compiles_and_is_undone_to_the_byte(
     patched = patch(source)
     assert unpatch(patched) == source
     assert IMPORT.encode() in patched
+
+
+RUNNER = "from envs.env import Env\n\ndef run():\n    env = Env(10)\n"
+MODULES = {
+    "c.py": "import runner\nrunner.run()\n", "runner.py": RUNNER, "envs/__init__.py": "",
+    "envs/env.py": FORMS["made elsewhere"][0], "unused.py": PLAIN,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({}, ""),
+        ({"deepbots/supervisor.py": FORMS["subclass"][0]}, ""),
+        ({"c.py": "from os import path\n"}, "does not import Robot"),
+        ({"runner.py": RUNNER + "from controller import Robot\nr = Robot()\n"},
+         r"several of its modules make a robot: runner.py line 6, env.py line 4"),
+        ({"envs/env.py": PLAIN + "s = Robot()\n"}, r"env.py, which it imports: .*lines 3, 6"),
+        ({"envs/env.py": patch(PLAIN.encode()).decode()}, r"env.py, which .* already, in line 2"),
+    ],
+)  # fmt: skip
+def test_a_robot_of_an_imported_module_is_named_with_its_line(
+    changed: dict[str, str], said: str, tmp_path: Path
+) -> None:
+    for name, source in (MODULES | changed).items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(source)
+    if said:
+        with pytest.raises(InvalidInputError, match=said):
+            attaching_place(tmp_path / "c.py")
+        return
+    place = attaching_place(tmp_path / "c.py")
+    assert place == (tmp_path / "envs" / "env.py", 4, "MCPBridge.attach(self)")

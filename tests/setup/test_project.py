@@ -36,11 +36,22 @@ def test_the_first_file_that_is_there_is_started(project: Path) -> None:
         "compiled": ["compiled", "compiled.py"],
         "java": ["java.jar", "java.py"],
         "helpers": ["other.py"],
+        "built": ["built", "built.c"],
+        "walls": ["walls.cpp", "Makefile"],
+        "arm": ["src/Arm.java"],
+        "legs": ["legs.m"],
+        "bridge": ["package.xml"],
     }.items():
         (project / "controllers" / name).mkdir()
         for file in files:
+            (project / "controllers" / name / file).parent.mkdir(exist_ok=True)
             (project / "controllers" / name / file).touch()
     found = {each.name: each.language for each in controllers_of(project, "linux")}
-    assert found == {"python": "Python", "compiled": "a program", "java": "Java"}
+    assert found == {
+        "python": "Python", "compiled": "a program", "java": "Java", "built": "C", "walls": "C++",
+        "arm": "Java", "legs": "MATLAB", "bridge": "ROS",
+    }  # fmt: skip
+    unbuilt = {each.name for each in controllers_of(project, "linux") if not each.is_built}
+    assert unbuilt == {"walls", "arm"}
     on_windows = {each.name: each.language for each in controllers_of(project, "win32")}
     assert on_windows["compiled"] == "Python"

@@ -133,6 +133,24 @@ def test_custom_data_written_by_the_field_reaches_the_robot(robot: InProcessSupe
     assert robot.getCustomData() == "yours"
 
 
+def test_a_tracked_field_comes_with_the_steps(robot: InProcessSupervisor) -> None:
+    tracked, asked = (robot.getSelf().getField("customData") for _ in range(2))
+    assert tracked is not None and asked is not None
+    tracked.enableSFTracking(4 * STEP_MS)
+    robot.setCustomData("1")
+    robot.step(STEP_MS)
+    robot.setCustomData("2")
+    robot.step(STEP_MS)
+    assert tracked.getSFString() == "1"  # until its period is over
+    robot.step(3 * STEP_MS)
+    assert tracked.getSFString() == "2"
+    tracked.setSFString("3")
+    assert tracked.getSFString() == "3"
+    robot.step(STEP_MS)
+    tracked.disableSFTracking()
+    assert tracked.getSFString() == asked.getSFString() == "3"
+
+
 def test_a_picture_is_written_with_the_next_step_or_at_once_when_paused(
     robot: InProcessSupervisor, tmp_path: Path
 ) -> None:

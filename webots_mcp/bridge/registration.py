@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 
 from webots_mcp import liveness
 from webots_mcp.connection import transaction
-from webots_mcp.contract import host_name
+from webots_mcp.contract import CUSTOM_DATA, host_name
 from webots_mcp.liveness import process_identity
 from webots_mcp.pauses import PAUSED
 from webots_mcp.waiting_file import enter_robot, enter_session
@@ -20,6 +20,7 @@ from webots_mcp.waiting_file import enter_robot, enter_session
 # -- the identity of a process ---------------------------------------------------------------------
 
 
+_BY_PROCESS: Final = " process "
 _THIS_HOST: Final = ("", "localhost", "127.0.0.1", "::1", host_name().lower())
 
 
@@ -98,7 +99,7 @@ def _instance() -> str:
         return f"{host_name()}:{port}" if port else f"{host_name()}:{folder}"
     if "://" in url:
         return _simulator_of(url)
-    return f"{host_name()} process {os.getppid()}"
+    return f"{host_name()}{_BY_PROCESS}{os.getppid()}"
 
 
 def _simulator_of(url: str) -> str:
@@ -106,6 +107,11 @@ def _simulator_of(url: str) -> str:
     place = url.partition("://")[2].partition("/")[0]
     host, _, port = place.rpartition(":")
     return f"{host_name() if host.strip('[]').lower() in _THIS_HOST else host}:{port}"
+
+
+def same_simulation(instance: str, other: str) -> bool:
+    """Whether two instances are, or may be, one Webots: that of some extern ones is not known."""
+    return instance == other or any(_BY_PROCESS in each for each in (instance, other))
 
 
 def _is_extern() -> bool:
@@ -169,9 +175,11 @@ def _head(git: Path) -> str | None:
 
 
 _OPEN_SESSIONS: Final = (
-    "SELECT s.id, s.host, s.pid, s.process, s.last_seen_wall_time_s FROM session s "
+    "SELECT s.id, s.host, s.pid, s.process, s.last_seen_wall_time_s, s.instance, r.kind "
+    "FROM session s "
     "JOIN robot r ON r.id = s.robot_id WHERE r.name = ? AND s.ended_wall_time_s IS NULL"
 )
+_KIND: Final = "SELECT kind FROM robot WHERE name = ?"
 # A successor in the same Webots within seconds means a reload; so does one after an issued reload
 # command. A predecessor that was killed counts only where Webots starts the controllers: Webots
 # kills one that does not end within a second, while an extern one was killed by a person.
@@ -229,8 +237,11 @@ def register(
     with transaction(connection):
         liveness.reap(connection, now_s)
         name = _free_name(connection, identity, now_s)
+        before = connection.execute(_KIND, (name,)).fetchone()
         robot_id = enter_robot(connection, describe_robot(identity, name), now_s)
-        reloaded = _is_reload(connection, identity, robot_id, now_s)
+        # A bridge is not the reloaded successor of an observer's reading of customData.
+        is_same = before is None or (before[0] == CUSTOM_DATA) == (identity.kind == CUSTOM_DATA)
+        reloaded = is_same and _is_reload(connection, identity, robot_id, now_s)
         if reloaded and _is_started_by_webots(identity):
             connection.execute(_RELOADED_SESSION, (robot_id,))
             connection.execute(_RELOADED_RUN, (robot_id,))
@@ -283,9 +294,12 @@ def _paused_mode(connection: sqlite3.Connection, identity: Identity, robot_id: i
 
 
 def _is_living(
-    session: tuple[int, str, int, str | None, float], identity: Identity, now_s: float
+    session: tuple[int, str, int, str | None, float, str, str], identity: Identity, now_s: float
 ) -> bool:
-    session_id, host, pid, process, last_seen_s = session
+    """Whether a session keeps its name; an observer's, of `customData`, makes way for a bridge."""
+    session_id, host, pid, process, last_seen_s, instance, kind = session
+    if kind == CUSTOM_DATA != identity.kind and same_simulation(instance, identity.instance):
+        return False
     if (host, pid) == (identity.host, identity.pid):
         return session_id in _own_sessions
     return liveness.is_living(host, pid, process, last_seen_s, now_s)

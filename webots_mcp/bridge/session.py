@@ -87,16 +87,16 @@ class Session:
         from webots_mcp import __version__
 
         robot = (simulation.robot, simulation.supervisor)
-        self._identity = identify(*robot, __version__, throttle.interval, kind)
+        self.identity = identify(*robot, __version__, throttle.interval, kind)
         self.errors = errors
         self.simulation = simulation
         self.throttle = throttle
         self.clock = Clock(simulation)
-        self.recorder = Recorder(database, self._identity, self.clock, errors)
+        self.recorder = Recorder(database, self.identity, self.clock, errors)
         self.journal = Journal(self.recorder, self.clock)
         self.heartbeat = Heartbeat(self.recorder, self.clock)
         self.reloads = Reloads(errors.failed)
-        self.parameters = Parameters(self, self._identity.robot_name)
+        self.parameters = Parameters(self, self.identity.robot_name)
         self.scene = SceneEdits(self)
         self.album = Album(self, data_dir)
         self.keeper = Keeper(self, keep_last_s)
@@ -114,7 +114,7 @@ class Session:
     def robot_name(self) -> str:
         """The name under which the robot is recorded."""
         registration = self.recorder.registration
-        return registration.robot_name if registration else self._identity.robot_name
+        return registration.robot_name if registration else self.identity.robot_name
 
     def begin(self) -> None:
         """Begin the first run, and continue the previous session's reload or pause."""
@@ -207,7 +207,7 @@ class Session:
     def let_go(self) -> None:
         """Resume a paused simulation, which no command could resume later, and answer commands."""
         self.pause.close()
-        self.control.report_end(extern=self._identity.extern)
+        self.control.report_end(extern=self.identity.extern)
 
     @property
     def _end_reason(self) -> str:
@@ -218,7 +218,7 @@ class Session:
 
         The session stays usable, since the loop may also continue for a last few statements.
         """
-        self.control.report_end(extern=self._identity.extern)
+        self.control.report_end(extern=self.identity.extern)
         self.keeper.write_all()
         self.recorder.end(self._end_reason, self.clock.sim_time_s)
 

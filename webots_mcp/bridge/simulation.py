@@ -278,6 +278,15 @@ class Clock:
         self.start_moving()
         return True
 
+    def follow(self, other: Clock, run: Run) -> bool:
+        """Take the time of another clock; True if a run has begun there since `run`."""
+        is_new = other.run is not run
+        if is_new:
+            self.ended_sim_time_s = self.sim_time_s
+            self.run = Run("reset", other.sim_time_s)
+        self.sim_time_s, self.moved_s = other.sim_time_s, other.moved_s
+        return is_new
+
     def start_moving(self) -> None:
         """Count time as moving from now on; it counts as standing still only after a while."""
         self.moved_s = time.monotonic()

@@ -321,14 +321,18 @@ def _described(controller: ProjectController, project: Path) -> dict[str, Any]:
     from dataclasses import asdict
 
     from webots_mcp.setup import look_into
-    from webots_mcp.setup.project_edits import IMPORT, AlreadyPatchedError, attach_line
+    from webots_mcp.setup.project_edits import IMPORT, AlreadyPatchedError, attaching_place
 
     file = controller.file.relative_to(project)
     described: dict[str, Any] = {"file": file.as_posix(), "language": controller.language}
     if not controller.is_python:
-        return described
+        unbuilt = {} if controller.is_built else {"note": "Webots starts it once it is built"}
+        return described | unbuilt | {"advice": controller.advice}
     try:
-        described["lines"] = [IMPORT, attach_line(controller.file.read_bytes())]
+        place = attaching_place(controller.file)
+        described["lines"] = [IMPORT, place.statement]
+        described["lines_in"] = place.file.relative_to(project).as_posix()
+        described["after_line"] = place.line
     except AlreadyPatchedError as error:
         described["has_bridge"] = str(error)
     except (InvalidInputError, OSError) as error:
@@ -359,10 +363,16 @@ def _print_project(found: dict[str, Any], notes: list[str]) -> None:
 
 def _print_controller(described: dict[str, Any]) -> None:
     if "python" not in described:
-        print(f"  is {described['language']}: the bridge is for controllers in Python")
+        note = f" ({described['note']})" if "note" in described else ""
+        print(f"  is {described['language']}{note}: {described['advice']}")
         return
     if "lines" in described:
-        print("  needs these lines, the second where the robot is made (or: --patch)\n")
+        file = described["lines_in"]
+        place = f" in {file}" if file != described["file"] else ""
+        print(
+            f"  needs these lines{place}, the second after line {described['after_line']}, where "
+            f"the robot is made (or: --patch {file})\n"
+        )
         print("".join(f"      {line}\n" for line in described["lines"]))
     elif "unclear" in described:
         print(f"  where the lines belong is not clear: {described['unclear']}")

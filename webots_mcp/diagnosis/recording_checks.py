@@ -22,7 +22,12 @@ from webots_mcp.connection import (
     require_current,
     schema_version,
 )
-from webots_mcp.contract import DATA_DIR_VARIABLE, HEARTBEAT_LATE_S, SCHEMA_VERSION
+from webots_mcp.contract import (
+    CUSTOM_DATA,
+    DATA_DIR_VARIABLE,
+    HEARTBEAT_LATE_S,
+    SCHEMA_VERSION,
+)
 from webots_mcp.diagnosis import (
     Examined,
     Finding,
@@ -64,6 +69,10 @@ _LOCAL: Final = (
 _GET_COMMAND: Final = (
     "call bridge.get_command() in every round of the controller's loop, or use "
     "MCPBridge.attach(robot), which does, before anything takes or replaces robot.step"
+)
+_READ_FASTER: Final = (
+    "give the observer's Robot node 'synchronization TRUE' and the robot's step in ms as "
+    "controllerArgs, or let the robot write less often"
 )
 _LONG_AT_WORK_S: Final = 30.0
 _NOT_POLLED_S: Final = 5.0
@@ -280,6 +289,8 @@ def recording_now(subject: Examined) -> Iterator[Finding]:
         if session := view.session:
             python = session.versions.get("python")
             process = f"process {session.pid}{f', Python {python}' if python else ''}"
+            if view.robot.kind == CUSTOM_DATA:
+                process = f"recorded by the observer from customData, {process}"
             silent = ago(session.silent_s(view.now_s))
             yield ok(f"{view.robot.name} ({process}), last sign of life {silent}")
 
@@ -299,6 +310,8 @@ def rows(subject: Examined) -> Iterator[Finding]:
             seen = f"{session.rows_dropped} rows of {name} were dropped{why}"
             fix = "see free space and the folder's rights; what was dropped is lost"
             yield wrong(seen, fix) if view.robot.live else warning(seen, fix)
+        elif view.robot.kind == CUSTOM_DATA and view.robot.live and error and "(seq)" in error:
+            yield warning(error[:200], _READ_FASTER)
         elif waiting.get("rows_waiting"):
             yield warning(
                 f"{waiting['rows_waiting']} rows of {name} wait in {waiting['waiting_in']}{why}",
@@ -391,6 +404,9 @@ def get_command(subject: Examined) -> Iterator[Finding]:
     """Whether the loops of the living controllers ask for commands."""
     for view in subject.live:
         if (session := view.session) is None:
+            continue
+        if view.robot.kind == CUSTOM_DATA:
+            yield ok(f"{view.robot.name} has no bridge, and takes no commands")
             continue
         loop, polled_s = f"{view.robot.name}'s loop", session.last_poll_wall_time_s
         began_s = session.started_wall_time_s if polled_s is None else polled_s

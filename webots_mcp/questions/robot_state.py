@@ -9,6 +9,7 @@ from typing import Annotated, Any, Final, cast
 
 from pydantic import Field
 
+from webots_mcp.contract import CUSTOM_DATA
 from webots_mcp.diagnosis import Checked, diagnose, subject_of, worst
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.liveness import dead_sessions
@@ -75,6 +76,7 @@ _RECORDER_COLUMNS: Final = (
     "row_count", "why", "rows_waiting", "waiting_in", "rows_dropped", "last_error",
 )  # fmt: skip
 _LONGEST_ERROR: Final = 300
+_READ: Final = "the observer, from customData: it has no bridge and takes no commands"
 _ROBOT_COLUMNS: Final = (
     "robot", "kind", "live", "status", "run_id", "sim_time_s", "age_s", "runs", "actions",
 )  # fmt: skip
@@ -549,6 +551,7 @@ def _health(view: View) -> dict[str, Any] | None:
         "last_error": error,
         "heartbeat_age_s": round(session.silent_s(view.now_s), 2),
         "polls_commands": session.last_poll_wall_time_s is not None,
+        **({"recorded_by": _READ} if view.robot.kind == CUSTOM_DATA else {}),
         "controller": session.controller,
         "controller_sha256": session.controller_sha256,
         "git_commit": session.git_commit,

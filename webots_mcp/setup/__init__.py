@@ -34,12 +34,38 @@ _BRIDGE: Final = b"MCPBridge"
 _WORDS: Final = re.compile(r'"(?:[^"\\]|\\.)*"|#[^\n]*|\w+')
 
 
+# By language: how the files of a controller end that are built before Webots starts it.
+_SOURCES: Final = {"C": (".c",), "C++": (".cpp", ".cc", ".cxx"), "Java": (".java",)}
+_CALLS: Final = {
+    "C": 'wb_robot_set_custom_data("{...}")',
+    "C++": 'robot->setCustomData("{...}")',
+    "Java": 'robot.setCustomData("{...}")',
+    "MATLAB": "wb_robot_set_custom_data('{...}')",
+}
+_HEADER: Final = "include webots_mcp.h ('webots-mcp header' writes it), or "
+_ONE_LINE: Final = (
+    "write its values as JSON with {} in each step: an observer ('webots-mcp init --observer "
+    "WORLD') records them; see docs/any-language.md"
+)
+
+
 class ProjectController(NamedTuple):
-    """A controller's folder, the file of it that Webots starts, and what that is written in."""
+    """A controller's folder, the file of it that Webots starts, and what that is written in.
+
+    Where the sources of a program are there, `file` is one of them.
+    """
 
     name: str
     file: Path
     language: str
+    is_built: bool = True
+
+    @property
+    def advice(self) -> str:
+        """How it is recorded, where the bridge cannot be used in it."""
+        header = _HEADER if self.language in ("C", "C++") else ""
+        call = _CALLS.get(self.language, _CALLS["C"])
+        return f"{header}{_ONE_LINE.format(call)}"
 
     @property
     def is_python(self) -> bool:
@@ -86,10 +112,27 @@ def _started(folder: Path, platform: str) -> Iterator[ProjectController]:
         f"{name}.py": _PYTHON,
         f"{name}.m": "MATLAB",
     }
-    for file, language in kinds.items():
-        if language and (folder / file).is_file():
-            yield ProjectController(name, folder / file, language)
-            return
+    found = next((each for each, kind in kinds.items() if kind and (folder / each).is_file()), None)
+    source = _source(folder)
+    if found is None and source is not None:
+        yield source
+    elif found is not None and source is not None and kinds[found] == "a program":
+        yield source._replace(is_built=True)
+    elif found is not None:
+        yield ProjectController(name, folder / found, kinds[found] or "")
+    elif (folder / "package.xml").is_file():
+        yield ProjectController(name, folder / "package.xml", "ROS")
+
+
+def _source(folder: Path) -> ProjectController | None:
+    """What a controller is built from: the file of its name, else the first of a language."""
+    files = [*sorted(folder.glob("*.*")), *sorted(folder.glob("src/*.*"))]
+    files.sort(key=lambda file: file.stem != folder.name)
+    for file in files:
+        for language, endings in _SOURCES.items():
+            if file.suffix in endings:
+                return ProjectController(folder.name, file, language, is_built=False)
+    return None
 
 
 def has_bridge(controller: Path) -> bool:

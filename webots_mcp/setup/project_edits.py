@@ -22,8 +22,16 @@ from webots_mcp.setup import FileChange, read
 
 IMPORT: Final = "from webots_mcp import MCPBridge"
 _BRIDGE: Final = "MCPBridge"
-_ROBOTS: Final = ("Robot", "Supervisor")
-_MODULES: Final = ("controller", "controller.robot", "controller.supervisor")
+# Classes of robots by the package that they are of; those of deepbots are Webots' Supervisor, too.
+_ROBOTS: Final = {
+    "controller": ("Robot", "Supervisor"),
+    "vehicle": ("Driver", "Car"),
+    "deepbots": (
+        "DeepbotsSupervisorEnv", "RobotSupervisorEnv", "EmitterReceiverSupervisorEnv",
+        "CSVSupervisorEnv", "EmitterReceiverRobot", "CSVRobot",
+    ),
+}  # fmt: skip
+_MOST_MODULES: Final = 50
 _LINES: Final = re.compile(rb"[^\r\n]*(?:\r\n|\r|\n|\Z)")
 _ADDED: Final = re.compile(
     rb"\s*(?:from webots_mcp import MCPBridge|MCPBridge\.attach\([^()]+\))\s*"
@@ -36,6 +44,24 @@ class AlreadyPatchedError(InvalidInputError):
     """The controller makes a bridge."""
 
 
+class _NoRobotError(InvalidInputError):
+    """The module makes no robot; one that it imports may."""
+
+
+class AttachingPlace(NamedTuple):
+    """Where the robot of a controller is attached.
+
+    Attributes:
+        file: The controller's own, or that of a module in its folder.
+        line: After which the statement belongs.
+        statement: What attaches it.
+    """
+
+    file: Path
+    line: int
+    statement: str
+
+
 class _Place(NamedTuple):
     """The statement after which the robot is attached, what attaches it, and the import's."""
 
@@ -44,14 +70,62 @@ class _Place(NamedTuple):
     imported: ast.stmt
 
 
-def attach_line(source: bytes) -> str:
-    """The statement that attaches the robot of a controller.
+def attaching_place(controller: Path) -> AttachingPlace:
+    """Where a robot is attached: in the controller's file, or in a module that it imports.
+
+    Modules are looked for in the controller's folder, as Python does first.
 
     Raises:
         AlreadyPatchedError: It, or another of the kind, is there.
         InvalidInputError: It cannot be determined for certain; the message says why.
+        OSError: A file cannot be read.
     """
-    return _place(_parsed(source)).attach
+    why: InvalidInputError | None = None
+    found = list[AttachingPlace]()
+    files = [controller]
+    for file in files:
+        try:
+            module = _parsed(file.read_bytes())
+            files += [each for each in _imported(module, file, controller) if each not in files]
+            del files[_MOST_MODULES:]
+            place = _place(module)
+        except _NoRobotError as error:
+            why = why or error
+        except AlreadyPatchedError as error:
+            raise AlreadyPatchedError(_of_module(file, controller, error)) from error
+        except InvalidInputError as error:
+            raise InvalidInputError(_of_module(file, controller, error)) from error
+        else:
+            line = place.after.end_lineno or place.after.lineno
+            found.append(AttachingPlace(file, line, place.attach))
+        if file == controller and found:
+            return found[0]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        places = ", ".join(f"{each.file.name} line {each.line}" for each in found)
+        raise InvalidInputError(f"several of its modules make a robot: {places}")
+    assert why is not None
+    raise why
+
+
+def _of_module(file: Path, controller: Path, error: InvalidInputError) -> str:
+    return str(error) if file == controller else f"{file.name}, which it imports: {error}"
+
+
+def _imported(module: ast.Module, file: Path, controller: Path) -> list[Path]:
+    """The files in the controller's folder that a module imports."""
+    names = list[tuple[Path, str]]()
+    for node in ast.walk(module):
+        if isinstance(node, ast.Import):
+            names += [(controller.parent, alias.name) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            folder = file.parents[node.level - 1] if node.level else controller.parent
+            modules = [f"{node.module or ''}.{alias.name}".strip(".") for alias in node.names]
+            names += [(folder, name) for name in (node.module or "", *modules)]
+    paths = [folder.joinpath(*n.split(".")) for folder, n in names if n and not _robots_of(n)]
+    files = [each for path in paths for each in (path.with_suffix(".py"), path / "__init__.py")]
+    return [each for each in dict.fromkeys(files) if each.is_file()]
 
 
 def patch(source: bytes) -> bytes:
@@ -127,7 +201,7 @@ def _place(module: ast.Module) -> _Place:
         if (names := _robots_imported(node))
     ]
     if not imports:
-        raise InvalidInputError(
+        raise _NoRobotError(
             "it does not import Robot or Supervisor of the module controller at its top: "
             "where another module makes the robot, write the lines there"
         )
@@ -142,9 +216,10 @@ def _place(module: ast.Module) -> _Place:
     if len(made) > 1:
         lines = ", ".join(str(node.lineno) for node in made)
         raise InvalidInputError(f"it makes a robot in several places (lines {lines})")
-    if not made:
-        raise InvalidInputError("it makes no Robot() and no Supervisor()")
-    after, attach = _in_constructor(own, made[0]) or _assigned(nodes, made[0])
+    if made:
+        after, attach = _in_constructor(own, _dotted(made[0].func)) or _assigned(nodes, made[0])
+    else:
+        after, attach = _in_class(own)
     imported = imports[0][0]
     if imported.lineno <= after.lineno <= (imported.end_lineno or 0):
         raise InvalidInputError(
@@ -182,17 +257,22 @@ def _bound(node: ast.AST) -> list[str]:
 
 def _robots_imported(node: ast.AST) -> set[str]:
     """What a statement calls Webots' classes."""
-    if isinstance(node, ast.ImportFrom) and node.module in _MODULES and not node.level:
+    if isinstance(node, ast.ImportFrom) and not node.level:
+        robots = _robots_of(node.module or "")
         return {
             name
             for alias in node.names
-            for name in (_ROBOTS if alias.name == "*" else (alias.asname or alias.name,))
-            if alias.name in ("*", *_ROBOTS)
+            for name in (robots if alias.name == "*" else (alias.asname or alias.name,))
+            if alias.name in ("*", *robots)
         }
     if isinstance(node, ast.Import):
-        modules = [a.asname or a.name for a in node.names if a.name in _MODULES]
-        return {f"{module}.{robot}" for module in modules for robot in _ROBOTS}
+        modules = [(alias.asname or alias.name, alias.name) for alias in node.names]
+        return {f"{name}.{robot}" for name, module in modules for robot in _robots_of(module)}
     return set()
+
+
+def _robots_of(module: str) -> tuple[str, ...]:
+    return _ROBOTS.get(module.partition(".")[0], ())
 
 
 def _subclasses(nodes: list[ast.AST], classes: set[str]) -> dict[str, ast.ClassDef]:
@@ -219,9 +299,26 @@ def _refuse_rebound(nodes: list[ast.AST], classes: set[str], own: dict[str, ast.
             )
 
 
-def _in_constructor(own: dict[str, ast.ClassDef], made: ast.Call) -> tuple[ast.stmt, str] | None:
+def _in_class(own: dict[str, ast.ClassDef]) -> tuple[ast.stmt, str]:
+    """The same of the only class of a robot, which another module makes."""
+    bases = {_dotted(base) for cls in own.values() for base in cls.bases}
+    last = [name for name in own if name not in bases]
+    if not last:
+        raise _NoRobotError("it makes no Robot() and no Supervisor()")
+    if len(last) > 1:
+        lines = ", ".join(str(own[name].lineno) for name in last)
+        raise InvalidInputError(f"it has several classes of robots (lines {lines})")
+    if (place := _in_constructor(own, last[0])) is None:
+        raise InvalidInputError(
+            f"the class {last[0]} in line {own[last[0]].lineno} has no constructor: attach the "
+            "robot where it is made"
+        )
+    return place
+
+
+def _in_constructor(own: dict[str, ast.ClassDef], name: str | None) -> tuple[ast.stmt, str] | None:
     """`super().__init__()` of the robot's own class, where it has a constructor, and its self."""
-    name = _dotted(made.func) or ""
+    name = name or ""
     while cls := own.get(name):
         bases = [_dotted(base) for base in cls.bases]
         for statement in cls.body:

@@ -10,7 +10,7 @@ from controller.session import Message
 from webots_mcp.standin.arena import Body
 from webots_mcp.standin.devices import FetchedSensor
 from webots_mcp.standin.pictures import Label
-from webots_mcp.standin.simulator import Mode, Robot, Simulator
+from webots_mcp.standin.simulator import Mode, Robot, Simulator, TrackedKey
 from webots_mcp.standin.vrml import (
     NODE_TYPES,
     FieldDefinition,
@@ -70,8 +70,7 @@ def step_over(simulator: Simulator, robot: Robot) -> Message:
     values: list[tuple[Any, Any]] = [*robot.fresh.items()]
     robot.fresh.clear()
     requests = SupervisorRequests(simulator, robot)
-    due = robot.due_poses(simulator.time_ms)
-    values.extend((pose, requests.carry_out("node_get_pose", [*pose])) for pose in due)
+    values.extend((what, requests.sent(what)) for what in robot.due(simulator.time_ms))
     return ("stepped", simulator.time_s, int(simulator.mode), robot.delay_ms, values)
 
 
@@ -118,6 +117,12 @@ class SupervisorRequests:
             return method(*arguments)
         except _GoneError:
             return None
+
+    def sent(self, what: TrackedKey) -> Any:
+        """The pose or field that is sent with the steps; None where its node is gone."""
+        if isinstance(what[1], str):
+            return self.carry_out("field_get", [what, None])
+        return self.carry_out("node_get_pose", [*what])
 
     def _node(self, node_id: int) -> Node:
         node = self._world.node(node_id)

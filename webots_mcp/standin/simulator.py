@@ -18,8 +18,9 @@ from webots_mcp.standin.pictures import Label, Picture, save_picture
 from webots_mcp.standin.vrml import Node, WorldError
 from webots_mcp.standin.world import World
 
-PoseKey: TypeAlias = "tuple[int, int | None]"
-"""The ids of a node and of the one that it is seen from; None is the world."""
+TrackedKey: TypeAlias = "tuple[int, int | str | None]"
+"""The id of a node and its field, or for its pose the node that it is seen from (None: the world).
+"""
 
 
 class Mode(IntEnum):
@@ -54,8 +55,8 @@ class Robot:
         """By how much the last step came too late, for robots without synchronization."""
         self.fresh: dict[int, Any] = {}
         """Values that the controller has not been sent yet, by tag."""
-        self._tracked: dict[PoseKey, tuple[int, float]] = {}
-        """Poses that are sent with the steps: their periods, and when they are due, in ms."""
+        self._tracked: dict[TrackedKey, tuple[int, float]] = {}
+        """What is sent with the steps: the periods, and when each is due, in ms."""
 
     @property
     def name(self) -> str:
@@ -88,23 +89,23 @@ class Robot:
         """Whether it drives against something now."""
         return self.vehicle.touching
 
-    def track(self, pose: PoseKey, period_ms: int) -> None:
-        """Send a pose with the steps, at once and then once in a period; 0 ends that."""
-        self._tracked.pop(pose, None)
+    def track(self, what: TrackedKey, period_ms: int) -> None:
+        """Send it with the steps, at once and then once in a period; 0 ends that."""
+        self._tracked.pop(what, None)
         if period_ms:
-            self._tracked[pose] = (period_ms, 0.0)
+            self._tracked[what] = (period_ms, 0.0)
 
-    def due_poses(self, time_ms: float) -> list[PoseKey]:
-        """The tracked poses that are to be sent now."""
-        due = [pose for pose, (_, due_ms) in self._tracked.items() if time_ms >= due_ms]
-        for pose in due:
-            period_ms, _ = self._tracked[pose]
-            self._tracked[pose] = (period_ms, time_ms + period_ms)
+    def due(self, time_ms: float) -> list[TrackedKey]:
+        """The tracked poses and fields that are to be sent now."""
+        due = [what for what, (_, due_ms) in self._tracked.items() if time_ms >= due_ms]
+        for what in due:
+            period_ms, _ = self._tracked[what]
+            self._tracked[what] = (period_ms, time_ms + period_ms)
         return due
 
-    def make_poses_due(self) -> None:
+    def make_tracked_due(self) -> None:
         """After a reset they are due at once, as sensors are."""
-        self._tracked = {pose: (period_ms, 0.0) for pose, (period_ms, _) in self._tracked.items()}
+        self._tracked = {what: (period_ms, 0.0) for what, (period_ms, _) in self._tracked.items()}
 
     def forget_controller(self) -> None:
         """Make ready for another controller: no request, no sensor enabled, motors still."""
@@ -255,7 +256,7 @@ class Simulator:
         for robot in self.robots:
             robot.vehicle.reset()
             robot.ahead_ms = 0.0
-            robot.make_poses_due()
+            robot.make_tracked_due()
             for device in robot.devices.values():
                 device.make_due()
 

@@ -19,6 +19,7 @@ from webots_mcp.conditions import Condition, parse_condition
 from webots_mcp.conditions.signal_values import SAME_TIME_S
 from webots_mcp.contract import (
     BUILT_IN_ACTIONS,
+    CUSTOM_DATA,
     HEARTBEAT_LATE_S,
     ISSUED_TIME_TO_LIVE_S,
     LOOPING,
@@ -64,6 +65,7 @@ from webots_mcp.store.robots import (
     find_holder,
     handler_at_work,
     list_robots,
+    live_observer,
     robot_name,
     without_observers,
 )
@@ -678,6 +680,13 @@ def _require_action(view: View, action: str) -> None:
 def _require_live(view: View) -> Session:
     """The robot's session; during a reload the old one, since its successor runs the command."""
     session = view.session
+    if view.robot.kind == CUSTOM_DATA:
+        name, observer = view.robot.name, live_observer(view.connection, session, view.now_s)
+        raise CommandRefusedError(
+            f"robot {name!r} takes no commands: it has no bridge, the observer records it from its "
+            "customData. In Python give its controller MCPBridge.attach(robot); the simulation is "
+            f"steered by an observer{f' (robot={observer.name!r})' if observer else ''}"
+        )
     if session is not None and (view.robot.live or _is_reloading(session, view.now_s)):
         return session
     raise CommandRefusedError(

@@ -84,7 +84,7 @@ class Robot(SQLModel, table=True):
     name: str = _text(
         "Robot.name; #2 is appended where two live at once", nullable=False, unique=True
     )
-    kind: str = _text("Robot or Supervisor", nullable=False)
+    kind: str = _text("Robot, Supervisor, Observer; customData: without a bridge", nullable=False)
     devices: str | None = _text("JSON object: device name to its class")
     first_seen_wall_time_s: float = _number(nullable=False)
     last_seen_wall_time_s: float = _number(nullable=False)

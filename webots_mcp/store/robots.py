@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple
 
 from webots_mcp.contract import (
     BUILT_IN_ACTIONS,
+    CUSTOM_DATA,
     ENDED_BY,
     HEARTBEAT_INTERVAL_S,
     HEARTBEAT_LATE_S,
@@ -153,6 +154,7 @@ _ALL: Final = (
     "SELECT id, name, kind, devices, first_seen_wall_time_s, last_seen_wall_time_s "
     "FROM robot ORDER BY id"
 )
+_KIND: Final = "SELECT kind FROM robot WHERE id = ?"
 _NAME: Final = "SELECT name FROM robot WHERE id = ?"
 _SHOWN_NAMES: Final = 20
 _BESIDE: Final = (
@@ -349,6 +351,9 @@ _ENDED_BY: Final = (
     "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
 )
 _MOST_ERROR_CHARACTERS: Final = 300
+_READ_NO_MORE: Final = (
+    "it was recorded by the observer from its customData: the observer ended, or the robot is gone"
+)
 _RELOADED_EXTERN: Final = f"the world was reloaded, which ended its controller; {EXTERN}"
 # From inside these look alike; `diagnosis.webots_checks` looks at it from outside.
 SILENT: Final = (
@@ -469,6 +474,9 @@ def _unseen(session: Session) -> str | None:
 
 
 def _why_ended(connection: sqlite3.Connection, session: Session) -> str | None:
+    (kind,) = connection.execute(_KIND, (session.robot_id,)).fetchone() or (None,)
+    if kind == CUSTOM_DATA:
+        return _READ_NO_MORE
     if session.end_reason == "reload" and session.extern:
         return _RELOADED_EXTERN
     if session.end_reason == "finished" and (unseen := _unseen(session)):

@@ -92,6 +92,14 @@ class Field(Completed):
         else:
             self._session.set_field(self._key, None, _as_sent(value))
 
+    def enableSFTracking(self, samplingPeriod: int) -> None:
+        """Have the value of a single field sent with the steps: reading it is no request then."""
+        self._session.track(self._key, integer(samplingPeriod, position=2))
+
+    def disableSFTracking(self) -> None:
+        """Have it sent no more."""
+        self._session.track(self._key, 0)
+
     def _as_given(self, value: Any) -> Any:
         if self._type_name.endswith("Node"):
             return None if value is None else node_of(self._session, value)

@@ -26,7 +26,7 @@ ADDRESS_FILE: Final = "address"
 _LENGTH: Final = struct.Struct("!I")
 CUSTOM_DATA_TAG: Final = 0
 """Stands for the robot itself where devices have their tags."""
-PoseKey = tuple[int, int | None]
+TrackedKey = tuple[int, int | str | None]
 """The ids of a node and of the one that it is seen from; None is the world."""
 
 
@@ -176,7 +176,7 @@ class Session:
         """What receivers have by tag: bytes, direction and strength of each packet."""
         self.counts: dict[tuple[int, str], int] = {}
         """The number of entries of each field that was asked for, by node and name."""
-        self._tracked: set[PoseKey] = set()
+        self._tracked: set[TrackedKey] = set()
         self._field_sets: dict[Any, Any] = {}
         self._fetched: dict[int, tuple[Any, Any]] = {}
         self._stepped: Message | None = None
@@ -205,17 +205,17 @@ class Session:
         with self.lock:
             self._sent.append((tag, "send", packet))
 
-    def track(self, pose: PoseKey, period_ms: int) -> None:
-        """Have a pose sent with the steps, once in a period; 0 ends that."""
+    def track(self, what: TrackedKey, period_ms: int) -> None:
+        """Have a pose or field sent with the steps, once in a period; 0 ends that."""
         with self.lock:
-            self._changes[pose, "track"] = period_ms
-            self._values.pop(pose, None)
-            (self._tracked.add if period_ms else self._tracked.discard)(pose)
+            self._changes[what, "track"] = period_ms
+            self._values.pop(what, None)
+            (self._tracked.add if period_ms else self._tracked.discard)(what)
 
-    def tracked(self, pose: PoseKey) -> Any:
-        """A tracked pose as it came last; None where it has to be asked for."""
+    def tracked(self, what: TrackedKey) -> Any:
+        """What is tracked as it came last; None where it has to be asked for."""
         with self.lock:
-            return self._values.get(pose) if pose in self._tracked else None
+            return self._values.get(what) if what in self._tracked else None
 
     def value(self, tag: int, default: Any) -> Any:
         """The last value of a sensor."""
@@ -226,6 +226,7 @@ class Session:
         """Note a field change that goes out with the next step or field read."""
         with self.lock:
             self._field_sets[field, index] = value
+            self._values.pop(field, None)
 
     # Requests ------------------------------------------------------------------------------------
 
@@ -274,6 +275,8 @@ class Session:
         with self.lock:
             if (field, index) in self._field_sets:
                 return self._field_sets[field, index]
+            if index is None and (tracked := self.tracked(field)) is not None:
+                return tracked
             return self._ask("field_get", (field, index), self._take_field_sets(), None)
 
     def change_field(self, operation: str, field: tuple[int, str], *arguments: Any) -> Any:

@@ -1,0 +1,357 @@
+"""Robots without a bridge, as an observer records them from what they write into `customData`.
+
+A controller in any language says what it knows in one call (`wb_robot_set_custom_data` in C). The
+field holds one text, which supervisors see a step later. A JSON object gives the signals of a
+state, anything else the one signal `custom_data`. A robot has a session of its own once it has
+written something, and as long as no other process records it: a bridge that comes later takes its
+place.
+
+The field comes with the steps (`enableSFTracking`), so that reading it is no request; a long text
+is read once a second instead. Whatever a robot writes, a round of the observer goes on: long texts
+and what is no JSON are cut, and what fails for one robot is reported and stops no other.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from itertools import islice
+from typing import Any, Final, Protocol, cast
+
+from webots_mcp.bridge.encoding import encode
+from webots_mcp.bridge.error_report import ErrorReport, cut
+from webots_mcp.bridge.journal import Changes, Heartbeat, Journal, SignalNames
+from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.registration import same_simulation
+from webots_mcp.bridge.scene import SceneNode, find_field
+from webots_mcp.bridge.session import Session
+from webots_mcp.bridge.simulation import Clock
+from webots_mcp.contract import CUSTOM_DATA, HEARTBEAT_INTERVAL_S
+from webots_mcp.liveness import is_living
+
+TEXT: Final = "custom_data"  # the signal of what is no JSON object
+MISSED: Final = "seq_missed"  # how many messages of this run were overwritten before a reading
+SEEN: Final = "seen"  # the branch of the pose where a robot publishes one of its keys itself
+LONGEST_TEXT: Final = 65_536  # characters that are taken for JSON, and sent with each step
+_LONGEST_SIGNAL: Final = 1_000  # characters of what is no JSON
+_READ_LONG_AGAIN_S: Final = 1.0  # of wall time
+_MOST_FOUND: Final = 10  # robots whose fields are looked for in one round
+_STALE_S: Final = 1.0  # of simulation time in which a text from before a reset is not believed
+# Strings, which stay as they are, and what C prints of numbers that JSON lacks.
+_C_NUMBERS: Final = re.compile(
+    r'"(?:\\.|[^"\\])*"|([-+]?)\b(?:(nan)\b(?:\(\w*\))?|inf(?:inity)?\b)', re.IGNORECASE
+)
+_END_REASON: Final = "SELECT end_reason FROM session WHERE id = ?"
+_OPEN_SESSIONS: Final = (
+    "SELECT r.name, s.id, s.instance, s.host, s.pid, s.process, s.last_seen_wall_time_s "
+    "FROM session s JOIN robot r ON r.id = s.robot_id WHERE s.ended_wall_time_s IS NULL"
+)
+
+
+class SeenRobot(Protocol):
+    """A robot as an observer follows it: its node, and its fields `name` and `controller`."""
+
+    scene: SceneNode
+    name: str
+    controller: str
+
+    @property
+    def is_there(self) -> bool:
+        """Whether its node is still in the world."""
+        ...
+
+    def pose_now(self) -> dict[str, float] | None:
+        """Its pose as signals; None where it has none."""
+        ...
+
+
+def signals_of(text: str) -> dict[str, Any]:
+    """The members of a JSON object; of any other text the signal `custom_data`.
+
+    `nan` and `inf`, as C prints them, are read like JSON's NaN and Infinity.
+    """
+    value: Any = cut(text, _LONGEST_SIGNAL)
+    if len(text) <= LONGEST_TEXT:
+        for read in (str, _with_json_numbers):
+            with suppress(ValueError, RecursionError):
+                value = json.loads(read(text), strict=False)
+                break
+    return cast("dict[str, Any]", value) if isinstance(value, dict) else {TEXT: value}
+
+
+def _with_json_numbers(text: str) -> str:
+    def spelled(found: re.Match[str]) -> str:
+        if found[0].startswith('"'):
+            return found[0]
+        return "NaN" if found[2] else f"{found[1].strip('+')}Infinity"
+
+    return _C_NUMBERS.sub(spelled, text)
+
+
+class CustomDataReader:
+    """Reads what the robots of a world write, and records it for those that no other records.
+
+    Args:
+        observer: The session of the observer's own bridge.
+    """
+
+    def __init__(self, observer: Session) -> None:
+        self._observer = observer
+        self._robots: dict[int, _Robot] = {}  # by the id of the body
+        self._taken: set[str] = set()  # names of robots that other processes record
+        self._look_again_s = 0.0
+
+    def look(self, bodies: Iterable[SeenRobot], *, is_due: bool) -> None:
+        """Read all fields; record what is new, and where it is due what is as before.
+
+        Args:
+            bodies: The robots that are followed now.
+            is_due: Whether it is time for a row of each robot, also of one that wrote nothing.
+        """
+        now_s = time.monotonic()
+        if now_s >= self._look_again_s:
+            self._look_again_s = now_s + HEARTBEAT_INTERVAL_S
+            self._taken = self._names_taken()
+        robots = {id(body): body for body in bodies}
+        for key in self._robots.keys() - robots.keys():
+            self._robots.pop(key).end("finished")
+        for key in list(robots.keys() - self._robots.keys())[:_MOST_FOUND]:
+            self._robots[key] = _Robot(robots[key], self._observer)
+        waiting = [robot for robot in self._robots.values() if self._look_at(robot, now_s, is_due)]
+        if waiting:  # one in a round, since it takes milliseconds
+            self._taken = self._names_taken()
+            free = (robot for robot in waiting if robot.body.name not in self._taken)
+            for robot in islice(free, 1):
+                robot.begin()
+
+    def _look_at(self, robot: _Robot, now_s: float, is_due: bool) -> bool:
+        """Read one robot; True where it has written something and has no session yet."""
+        try:
+            return robot.look(now_s, is_due=is_due, is_taken=robot.body.name in self._taken)
+        except Exception as error:  # noqa: BLE001  (the other robots are read nevertheless)
+            self._observer.errors.failed(f"customData of {robot.body.name}", error)
+            return False
+
+    def close(self) -> None:
+        """The observer ends, or the world."""
+        for robot in self._robots.values():
+            robot.end("finished")
+        self._robots.clear()
+
+    def _names_taken(self) -> set[str]:
+        own = {robot.session_id for robot in self._robots.values()}
+        here, now_s = self._observer.identity.instance, time.time()
+        rows = self._observer.recorder.fetch(_OPEN_SESSIONS, ())
+        if rows is None:
+            return self._taken
+        return {
+            name
+            for name, session_id, instance, host, pid, process, seen_s in rows
+            if session_id not in own and same_simulation(instance, here)
+            and is_living(host, pid, process, seen_s, now_s)
+        }  # fmt: skip
+
+
+class _Robot:
+    """One robot, its field, and its recording once it has written something.
+
+    Attributes:
+        body: What the observer follows.
+    """
+
+    def __init__(self, body: SeenRobot, observer: Session) -> None:
+        self.body = body
+        self._observer = observer
+        self._field: Any = None  # where it has none, or is gone
+        self._is_asked_for = False
+        self._recording: _Recording | None = None
+        self._text = self._text_left = ""  # the newest, and what is there of another's time
+        self._read_again_s: float | None = None  # None where the field comes with the steps
+
+    @property
+    def session_id(self) -> int | None:
+        """Of its recording."""
+        registration = self._recording and self._recording.recorder.registration
+        return registration.session_id if registration else None
+
+    def look(self, now_s: float, *, is_due: bool, is_taken: bool) -> bool:
+        """Record what is new; True where there is something and no session yet."""
+        if not self._is_asked_for:  # what is asked for at once is newer than the last step
+            self._find_field()
+            return False
+        if self._field is None:
+            return False
+        if not self.body.is_there:
+            self._field = None
+            self.end("finished")
+            return False
+        before, self._text = self._text, self._read(now_s)
+        if is_taken:
+            self.end("superseded")
+            self._text_left = self._text
+            return False
+        if self._recording is None:
+            return self._text not in ("", self._text_left)
+        self._recording.look(self._text, is_new=self._text != before, is_due=is_due)
+        return False
+
+    def begin(self) -> None:
+        """Begin its session, with what it has written."""
+        self.body.scene.node.enablePoseTracking(self._step_ms)  # of the moment of each text
+        self._recording = _Recording(self.body, self._observer)
+        self._recording.look(self._text, is_new=True, is_due=True)
+
+    def end(self, reason: str) -> None:
+        """Nothing more comes of it, or another process records it from now on."""
+        if self._recording is not None:
+            self._recording.end(reason)
+            self._recording = None
+
+    @property
+    def _step_ms(self) -> int:
+        return max(int(1000 * self._observer.simulation.basic_time_step_s), 1)
+
+    def _find_field(self) -> None:
+        self._is_asked_for = True
+        self._field = find_field(self.body.scene.node, CUSTOM_DATA)
+        if self._field is None:
+            why = f"the PROTO of robot {self.body.name!r} hides its customData: it cannot be read"
+            self._observer.journal.log("info", "bridge", why)
+        else:
+            self._field.enableSFTracking(self._step_ms)
+
+    def _read(self, now_s: float) -> str:
+        """What the field holds; a long text is not sent with each step but read once a second."""
+        if self._read_again_s is not None and now_s < self._read_again_s:
+            return self._text
+        try:
+            text: str = self._field.getSFString()
+        except UnicodeDecodeError as error:  # Webots passes on whatever bytes a robot wrote
+            text = error.object.decode("utf-8", "replace")
+        is_long = len(text) > LONGEST_TEXT
+        if is_long and self._read_again_s is None:
+            self._field.disableSFTracking()
+        elif not is_long and self._read_again_s is not None:
+            self._field.enableSFTracking(self._step_ms)
+        self._read_again_s = now_s + _READ_LONG_AGAIN_S if is_long else None
+        return text
+
+
+class _Recording:
+    """The session of a robot, written by its observer."""
+
+    def __init__(self, body: SeenRobot, observer: Session) -> None:
+        identity = observer.identity._replace(
+            robot_name=body.name or "robot",
+            kind=CUSTOM_DATA,
+            supervisor=False,
+            devices={},
+            controller=body.controller or None,
+            controller_sha256=None,
+            git_commit=None,
+            versions={"webots_mcp": observer.identity.versions["webots_mcp"]},
+        )
+        self._body = body
+        self._followed, self._observed_run = observer.clock, observer.clock.run
+        self._clock = Clock(observer.simulation)
+        self._errors = ErrorReport(strict=False)
+        self.recorder = Recorder(observer.recorder.database, identity, self._clock, self._errors)
+        self._journal = Journal(self.recorder, self._clock)
+        self._heartbeat = Heartbeat(self.recorder, self._clock)
+        self._names, self._changes = SignalNames(self.recorder), Changes()
+        self._values: Mapping[str, Any] = {}
+        self._stale_until_s = -1.0
+        self._sequence = _Sequence()
+        registration = self.recorder.registration
+        if registration is not None and registration.reloaded:
+            self._clock.run.start_reason = "reload"
+        self._journal.event(self._clock.run.start_reason)
+
+    def look(self, text: str, *, is_new: bool, is_due: bool) -> None:
+        """Record a text that is new, or, where a row is due, the one that still stands there."""
+        if self._clock.follow(self._followed, self._observed_run):
+            self._begin_run()
+        if is_new:
+            self._values, self._stale_until_s = signals_of(text), -1.0
+            if self._sequence.count(self._values.get("seq")):
+                self._report_missed()
+        if is_new or is_due:
+            self._record()
+        self._heartbeat.beat_if_due()
+
+    def end(self, reason: str) -> None:
+        """End run and session; one that a bridge has ended already stays ended so."""
+        ids = self.recorder.registration
+        for (ended,) in (ids and self.recorder.fetch(_END_REASON, (ids.session_id,))) or ():
+            reason = ended or reason
+        self.recorder.close(reason, self._clock.sim_time_s)
+
+    def _begin_run(self) -> None:
+        """The world was reset: what the field holds is of the time before it."""
+        self._observed_run = self._followed.run
+        self.recorder.end_run("reset", self._clock.ended_sim_time_s)
+        self.recorder.run = self._clock.run
+        self._sequence = _Sequence()
+        self._changes.forget()
+        self._stale_until_s = self._clock.sim_time_s + _STALE_S
+        self._journal.event("reset")
+
+    def _record(self) -> None:
+        is_stale = self._clock.sim_time_s < self._stale_until_s
+        state = dict({} if is_stale else self._values)
+        pose = self._body.pose_now() or {}
+        state |= {SEEN: pose} if pose.keys() & state.keys() else pose
+        if self._sequence.last is not None:
+            state.setdefault(MISSED, self._sequence.missed)
+        encoded = encode(state)
+        self._journal.state(encoded)
+        for name, before, after in self._changes.look(state):
+            self._journal.event("change", {"from": before, "to": after}, name)
+        self._names.look(state, encoded.text)
+
+    def _report_missed(self) -> None:
+        counted = self._sequence
+        self._journal.event("missed", {"messages": counted.missed, "of": counted.total})
+        self._errors.warn(  # also shown by status, as its newest error
+            "missed",
+            f"robot {self._body.name!r} overwrote {counted.missed} of {counted.total} messages in "
+            "its customData before the observer read them (seq): see docs/any-language.md#rates",
+        )
+        self._heartbeat.beat()
+
+
+class _Sequence:
+    """Counts what was missed, by the key `seq` that a robot raises by 1 with each message.
+
+    Attributes:
+        last: The newest; None before the first.
+        missed: How many were overwritten before they were read.
+        total: How many there were, as far as it is known.
+    """
+
+    def __init__(self) -> None:
+        self.last: int | None = None
+        self.missed = self.total = 0
+        self._report_from = 1
+
+    def count(self, given: object) -> bool:
+        """Count a message; one whose number is not above the last begins anew.
+
+        Returns:
+            Whether the number of those missed has doubled since this was last said.
+        """
+        if isinstance(given, float) and given.is_integer():  # 12.0, as some languages write it
+            given = int(given)
+        if type(given) is not int:
+            return False
+        skipped = given - self.last - 1 if self.last is not None and given > self.last else 0
+        before, self.last = self.last, given
+        self.missed += skipped
+        self.total += skipped + (given != before)
+        if self.missed < self._report_from:
+            return False
+        self._report_from = 2 * self.missed
+        return True

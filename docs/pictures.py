@@ -10,11 +10,12 @@ import contextlib
 import json
 import re
 import shutil
+import sqlite3
 import subprocess
 import sys
 import tempfile
 from collections.abc import Generator
-from contextlib import redirect_stdout
+from contextlib import closing, redirect_stdout, suppress
 from io import BytesIO, StringIO
 from pathlib import Path
 from statistics import fmean
@@ -25,6 +26,7 @@ import resvg_py
 from PIL import Image
 
 from webots_mcp.cli import main as webots_mcp
+from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, THROTTLE_VARIABLE
 from webots_mcp.plugins.demo import demo_command as demo
 from webots_mcp.testing import RecordedSimulation
@@ -72,9 +74,18 @@ def recorded(folder: Path) -> RecordedSimulation:
 def drive(simulation: RecordedSimulation, data_dir: Path) -> None:
     """Let it drive to the breakpoint, at which its bridge pauses it and goes on answering."""
     simulation.resume()
-    simulation.wait_for((data_dir / DATABASE_NAME).exists, 60.0)
+    simulation.wait_for(lambda: _has_states(data_dir / DATABASE_NAME), 60.0)
     _run("breakpoint", BREAKPOINT, "--data-dir", str(data_dir))
     simulation.run_for(120.0)
+
+
+def _has_states(database: Path) -> bool:
+    """Whether a controller has recorded there; a database without tables is being made."""
+    if not database.exists():
+        return False
+    with closing(connect(database, "reader")) as connection, suppress(sqlite3.OperationalError):
+        return connection.execute("SELECT 1 FROM state LIMIT 1").fetchone() is not None
+    return False
 
 
 def draw_plots(data_dir: Path, images: Path) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from tests.page.conftest import LINE, NAME, Server, write_story
+from tests.waiting import wait_for
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
 
@@ -127,7 +128,7 @@ def test_a_zoom_reads_what_it_shows_and_the_address_brings_the_view_back(
         tab.page.mouse.wheel(0, -300)
     tab.page.keyboard.up("Control")
     tab.page.wait_for_function(f"() => {{ const x = ({VIEW})(); return x && x[1] - x[0] < 60 }}")
-    assert difference_s(tab.column("pose.0", "t")) < apart / 2
+    wait_for(lambda: difference_s(tab.column("pose.0", "t")) < apart / 2)
     before = tab.view()
     tab.page.reload()
     tab.page.wait_for_function(VIEW)

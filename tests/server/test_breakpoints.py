@@ -78,9 +78,8 @@ async def test_where_no_controller_runs_it_is_said_that_none_is_asked_and_which_
 ) -> None:
     driver.bridge.breakpoint("steps == 1000000")
     async with connect() as client:
-        await newest_state(client)
-        before = await ask(client, "webots_list_breakpoints")
-        assert before["breakpoints"]["rows"] and "hint" not in before
+        before = await ask_until(client, "webots_list_breakpoints", lambda a: a.get("breakpoints"))
+        assert "hint" not in before
         driver.stop()
         listed = await ask(client, "webots_list_breakpoints")
         assert "breakpoints" not in listed

@@ -69,6 +69,7 @@ def test_beyond_the_limit_the_oldest_rows_are_dropped_counted_and_told(
     with write_lock(file):
         for n in range(25):
             bridge.publish({"n": n})
+    catch_up(bridge)
     bridge.publish({"n": 25})
     catch_up(bridge)
     assert numbers(filed) == list(range(15, 26))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import PurePath
@@ -27,6 +28,8 @@ from webots_mcp.questions.budget import (
     short_name,
     shorten,
     shown,
+    some,
+    table,
     without_empty,
 )
 from webots_mcp.questions.declaring import (
@@ -54,6 +57,7 @@ from webots_mcp.store.questions.compare import (
     Group,
     compare_runs,
 )
+from webots_mcp.store.questions.first_difference import PartedSignal, Parting, first_difference
 from webots_mcp.store.questions.runs import (
     MOST_RUNS,
     Measure,
@@ -79,7 +83,12 @@ DIFFERENCE_COLUMNS: Final = (
     "signal", "unit", "mean", "mean_range", "deviation", "effect", "deviation_ratio", "different",
     "interval", "min", "max",
 )  # fmt: skip
+PARTED_COLUMNS: Final = (
+    "signal", "unit", "from_s", "values", "by", "largest", "largest_at_s", "tolerance", "beyond_s",
+    "row_count",
+)  # fmt: skip
 DEFAULT_DIFFERENCES: Final = 15
+_MOST_PARTED: Final = 10
 _SHOWN_HASH: Final = 10
 _MOST_ONLY_IN: Final = 10
 _OF_MEASURES: Final = (
@@ -153,6 +162,9 @@ def webots_compare_runs(
     min_effect_sd: Annotated[
         float, Field(gt=0, le=100, description="What matters, in deviations of like runs.")
     ] = MIN_EFFECT_SD,
+    first_difference: Annotated[
+        bool, Field(description="Where two runs part, to the last digit, row by row.")
+    ] = False,
     robot: RobotName = None,
 ) -> ComparisonAnswer:
     """Did my edit help? Runs beside each other; or how fast, how far and in which modes one ran.
@@ -164,13 +176,19 @@ def webots_compare_runs(
     """
     if run_ids and trial_set:
         raise InvalidInputError("give run_ids or trial_set, not both")
+    if first_difference and (not run_ids or len(run_ids) != 2 or position or mode):
+        raise InvalidInputError("first_difference takes two run_ids, and of the others signals")
     options = EventOptions(position=both_of(position), mode=mode)
     first = run_ids[0] if run_ids else _first_run(recording, trial_set) if trial_set else None
     with recording.view(robot, first) as view:
         return answer_about(
             view,
             ComparisonAnswer,
-            lambda: _compared(view, run_ids, trial_set, signals, limit, options, min_effect_sd),
+            lambda: (
+                _parting(view, run_ids or (), signals, limit)
+                if first_difference
+                else _compared(view, run_ids, trial_set, signals, limit, options, min_effect_sd)
+            ),
         )
 
 
@@ -265,6 +283,68 @@ def started(run: RunInfo) -> str:
 def _file(path: str | None) -> str | None:
     """The name of a file without its folder, of whichever system."""
     return path and PurePath(path.replace("\\", "/")).name
+
+
+def _parting(
+    view: View, run_ids: Sequence[int], names: Sequence[str] | None, limit: int | None
+) -> dict[str, Any]:
+    left_s = {"deadline_s": math.inf} if is_for_a_person() else {}
+    found = first_difference(view.connection, run_ids, names=tuple(names or ("*",)), **left_s)
+    return parting_facts(found, limit)
+
+
+def parting_facts(found: Parting, limit: int | None = None) -> dict[str, Any]:
+    """Where two runs part, as an answer has it."""
+    notes = notes_of([*found.unread, *found.notes])
+    unlike = {name: [_short_value(each) for each in pair] for name, pair in found.unlike.items()}
+    rows = fitting(
+        [_parted_row(each) for each in found.parted[: limit or _MOST_PARTED]],
+        room_tokens(limit, [unlike, notes]),
+    )
+    left, worst = len(found.parted) - len(rows), found.worst
+    grown = zip(map(seconds, found.marks_s), worst.growth if worst else (), strict=False)
+    only_in = {f"run {run_id}": some(names).split(", ") for run_id, names in found.only_in.items()}
+    return {
+        "verdict": found.verdict,
+        "unlike": unlike or None,
+        "compared": {
+            "row_count": found.rows,
+            "signal_count": found.signals,
+            "from_s": seconds(found.from_s),
+            "until_s": seconds(found.until_s),
+        },
+        "parted": without_empty(PARTED_COLUMNS, rows),
+        "total": len(found.parted),
+        "growth": worst and table(("until_s", worst.name), [[s, _exact(by)] for s, by in grown]),
+        "only_in": only_in or None,
+        "notes": notes,
+        "hint": f"{left} more signals part: limit or signals for others" if left else None,
+    }
+
+
+def _parted_row(each: PartedSignal) -> list[Any]:
+    return [
+        short_name(each.name),
+        each.unit,
+        seconds(each.from_s),
+        [short_name(value) if isinstance(value, str) else value for value in each.values],
+        _exact(each.by),
+        _exact(each.largest),
+        seconds(each.largest_at_s),
+        _exact(each.tolerance),
+        seconds(each.beyond_s),
+        each.rows,
+    ]
+
+
+def _exact(number: float | None) -> float | None:
+    """A difference as it is shown, however small."""
+    return None if number is None or not math.isfinite(number) else float(f"{number:.4g}")
+
+
+def _short_value(value: Any) -> Any:
+    is_hash = isinstance(value, str) and len(value) in (40, 64) and value.isalnum()
+    return value[:_SHOWN_HASH] if is_hash else shown(value)
 
 
 def _compared(

@@ -18,7 +18,7 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.naming import METRES, Value, listed
 from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
 from webots_mcp.store.chunks import FIRST_LABEL, IS_ABSENT, IS_NUMBER, MAX_TEXT, Decoded, Replaced
-from webots_mcp.store.parameters import RunParameter, parameters_of
+from webots_mcp.store.parameters import parameters_of
 from webots_mcp.store.questions.compare import COMPARE_DEADLINE_S
 from webots_mcp.store.questions.runs import OUT_OF_TIME
 from webots_mcp.store.reading.catalogue import held_by, resolve_signals, signals_of_frame
@@ -309,11 +309,15 @@ def _parted(
     """How a signal differs; None where it is the same in all rows that were read."""
     name = signal.name
     recorded = [frame.recorded(name) for frame in pair.frames]
-    known: dict[object, int] = {}
     one, other = pair.of([each.numbers for each in recorded])
-    codes = pair.of([_shared_codes(each, known) for each in recorded])
-    both = (codes[0] == IS_NUMBER) & (codes[1] == IS_NUMBER)
-    differs: Flags = (codes[0] != codes[1]) | (both & (one != other))
+    differs: Flags = one != other
+    both: Flags | None = None  # hold a number; None where all do
+    if any(each.codes is not None for each in recorded):
+        known: dict[object, int] = {}
+        codes: list[Indexes] = pair.of([_shared_codes(each, known) for each in recorded])
+        numbers: Flags = (codes[0] == IS_NUMBER) & (codes[1] == IS_NUMBER)
+        differs = (codes[0] != codes[1]) | (numbers & differs)
+        both = numbers
     if any(frame.unread_of(name) for frame in pair.frames):
         for read in pair.of([frame.was_read(name) for frame in pair.frames]):
             differs &= read
@@ -325,7 +329,8 @@ def _parted(
         apart: Array = np.abs(one[rows] - other[rows])
         if (turn := signal.turn) is not None:
             apart = np.minimum(apart % turn, turn - apart % turn)
-    apart[~both[rows]] = np.nan
+    if both is not None:
+        apart[~both[rows]] = np.nan
     is_number = ~np.isnan(apart)
     tolerance = _tolerance(signal, one, within) if is_number.any() else None
     beyond = ~is_number if tolerance is None else ~is_number | (apart > tolerance)

@@ -27,7 +27,7 @@ from webots_mcp.contract import (
     Database,
 )
 from webots_mcp.errors import InvalidInputError, NothingRecordedError, WebotsMCPError
-from webots_mcp.naming import Value
+from webots_mcp.naming import Value, listed
 from webots_mcp.parameter import Value as ParameterValue
 from webots_mcp.pauses import PAUSED
 from webots_mcp.queue import Command, CommandQueue, fetch_command, list_commands
@@ -49,6 +49,7 @@ from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.export import Source
 from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines
 from webots_mcp.store.parameters import parameters_of
+from webots_mcp.store.questions.first_difference import compare_repeats
 from webots_mcp.store.reading.catalogue import resolve_signals, signals_of_frame
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import Scope, find_range, find_subject, whole_run
@@ -429,6 +430,43 @@ class RobotRecording:
             window = Window(-math.inf, math.inf)
             asked = LogFilter(subject.run_id, window, text, lowest_level=level)
             return newest_lines(connection, asked, _NO_LIMIT)
+
+    def assert_repeats(
+        self, *, until_s: float = math.inf, within: float = 0.0, signals: Sequence[str] = ("*",)
+    ) -> None:
+        """Fail unless each run of the robot is the same as its first one, row by row.
+
+        A reset begins the next run; so does another simulation with the same `data_dir`.
+
+        Args:
+            until_s: The last simulation time that is compared.
+            within: So much may numbers differ, each in its own unit; texts and flags never.
+            signals: Names, with `*`; those of no wall clock.
+
+        Raises:
+            AssertionError: With from when on they part, in which signal, and how far; or nothing
+                shows it: there is one run, it ends before, or not all of it could be compared.
+            UnknownSignalError: A name matches none.
+            NoDatabaseError, NothingRecordedError: Nothing has been recorded yet.
+        """
+        with self._subject() as (connection, subject):
+            run_ids = [run.id for run in runs_of(connection, subject.robot_id)]
+            if len(run_ids) < 2:
+                raise AssertionError(f"run {run_ids[0]} is the only one: reset() begins another")
+            bounds = {"until_s": until_s if math.isfinite(until_s) else None, "within": within}
+            options = {**bounds, "names": tuple(signals), "deadline_s": math.inf}
+            found = compare_repeats(connection, run_ids, **options).partings
+        for each in found:
+            row_s = (each.until_s - each.from_s) / max(each.rows - 1, 1)
+            ends = math.isfinite(until_s) and each.until_s < until_s - 2 * row_s
+            if ends or not each.is_whole or any(one.beyond_s is not None for one in each.parted):
+                one, other = each.run_ids
+                why = [f"run {other} does not repeat run {one}: {each.verdict}"]
+                why += [f"that is before until_s={until_s:g}"] if ends else []
+                why += [
+                    f"only run {run} has {listed(names)}" for run, names in each.only_in.items()
+                ]
+                raise AssertionError("\n  ".join([*why, *each.unread, *each.notes]))
 
     # -- commands ------------------------------------------------------------------------------
 

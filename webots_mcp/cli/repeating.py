@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 from webots_mcp.cli.options import HERE, Count, Id, Json, Parameter, ToRobot, Where
 from webots_mcp.cli.terminal import ending_by_event, print_notes, print_table
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
+from webots_mcp.naming import listed
 
 if TYPE_CHECKING:
     from webots_mcp.store.questions.first_difference import Parting, Repeats
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 By = Literal["reset", "reload", "process"]
 _ROBOT: Final = ToRobot()
 _REACHED: Final = "simulation time reached"
+_OF_BEGINNING: Final = ("robot", "began_by")  # a second robot of a name has another one
 
 
 def diff(
@@ -82,7 +84,7 @@ def repeat(
     Each run is recorded and labelled. Runs after a reset or reload need a controller that is a
     Supervisor. Where they part and processes of their own do not, the reset is to blame.
     """
-    ways = list(dict.fromkeys(by or ["reset"]))
+    ways = sorted(dict.fromkeys(by or ["reset"]))  # processes first: others are judged by them
     if number < 2 or not 0 < for_s < float("inf"):
         raise InvalidInputError(f"-n {number} --for {for_s:g}: two runs or more, of some seconds")
     if (world or stand_in) and "process" not in ways:
@@ -164,15 +166,19 @@ def _live(way: str, asked: ToRobot, for_s: float, timeout_s: float) -> int:
     to = {"robot": asked.robot, "timeout_wall_s": timeout_s}
     if way == "reload":
         _require_done(ask(webots_simulation_control, {"command": way, **to}, asked).data)
-    answer = ask(webots_run, {"for_s": for_s, "reset": way == "reset", **to}, asked).data
-    if _require_done(answer).get("stopped") != _REACHED:
-        raise CommandRefusedError(f"a run did not reach its end: {_require_done(answer)}")
-    return _require_done(answer)["run_id"]
+    asked_for = {"for_s": for_s, "reset": way == "reset", **to}
+    answer = _require_done(ask(webots_run, asked_for, asked).data)
+    if answer.get("stopped") != _REACHED:
+        why = answer.get("stop_reason") or answer.get("stopped")
+        raise CommandRefusedError(f"a run did not reach its end: {why}")
+    return answer["run_id"]
 
 
 def _require_done(answer: Mapping[str, Any] | None) -> Mapping[str, Any]:
-    if answer is None or answer.get("outcome") != "done":
-        raise CommandRefusedError(f"a run was not begun: {answer}")
+    assert answer is not None  # no picture
+    if answer.get("outcome") != "done":
+        why = answer.get("error") or answer.get("hint") or "no answer in time"
+        raise CommandRefusedError(f"a run did not reach its end ({answer.get('outcome')}): {why}")
     return answer
 
 
@@ -192,22 +198,27 @@ def _compared(run_ids: list[int], way: str | None, asked: ToRobot, for_s: float)
 
 
 def _blame(found: Mapping[str, Repeats], across: Mapping[str, Parting]) -> str | None:
-    """Whose fault it is that runs part, where several ways of beginning tell."""
+    """Whose fault it is that runs part, where processes of their own tell.
+
+    Args:
+        found: By the way of beginning.
+        across: Of each way but the first, its first run and that of the first way.
+    """
     if len(found) < 2 or "process" not in found:
         return None
     if found["process"].are_equal is not True:
         return "processes of their own part as well, or tell nothing: a reset is not all of it"
-    ways = [way for way in found if way != "process"]
-    blamed = [way for way in ways if found[way].are_equal is False]
-    if not blamed:
-        blamed = [*found] if any(each.is_equal is False for each in across.values()) else []
+    unlike = dict.fromkeys(name for each in across.values() for name in each.unlike)
+    if named := [name for name in unlike if name not in _OF_BEGINNING]:
+        return f"nothing is blamed: runs were not alike to begin with ({listed(named)})"
+    blamed = [way for way in across if False in (found[way].are_equal, across[way].is_equal)]
     if blamed:
-        names = " and ".join(way for way in blamed if way != "process")
         return (
-            f"the {names} is to blame: processes of their own repeat to the last digit; it leaves "
-            "something of the run before, in the world or in the controller's own variables"
+            f"the {' and the '.join(blamed)} is to blame: processes of their own repeat to the "
+            "last digit; something of the run before is left, in the world or in the controller's "
+            "own variables"
         )
-    return None
+    return "what was compared is the same, however a run begins"
 
 
 def _as_json(found: Repeats) -> dict[str, Any]:
@@ -233,5 +244,7 @@ def _show(found: Repeats) -> None:
         growth = worst.growth if worst and len(worst.growth) == len(marks) else [None] * len(marks)
         rows.append([each.run_ids[1], first and first.from_s, first and str(first),
                      worst and worst.name, *growth])  # fmt: skip
-    print_table(("run", "parts_at_s", "first", "worst", *marks), rows)
-    print_notes([found.verdict, *(note for each in found.partings for note in each.notes)])
+    if any(each.parted for each in found.partings):
+        print_table(("run", "parts_at_s", "first", "worst", *marks), rows)
+    notes = dict.fromkeys(note for each in found.partings for note in (*each.unread, *each.notes))
+    print_notes([found.verdict, *notes])

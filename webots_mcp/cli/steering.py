@@ -444,11 +444,13 @@ class _Progress:
 
 def _show_trials(recording: Recording, set_id: int, plan: WorldPlan, *, as_json: bool) -> None:
     from webots_mcp.store.parameters import ranking_of, trials_of
+    from webots_mcp.store.questions.first_difference import repeats_of_trials
     from webots_mcp.store.questions.runs import unseen
 
     with recording.reader() as connection:
         found = trials_of(connection, set_id)
         notes = unseen(connection, (each.run_id for each in found if each.score is not None))
+        notes = [*repeats_of_trials(connection, found), *notes]
     ranking = ranking_of(found, plan.best)
     runs = {each.number: each.run_id for each in found}
     if as_json:

@@ -10,15 +10,16 @@ import json
 import math
 import sqlite3
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.conditions.signal_values import SAME_TIME_S
-from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.errors import InvalidInputError, NothingRecordedError, UnknownRunError
 from webots_mcp.naming import METRES, Value, listed
 from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
 from webots_mcp.store.chunks import FIRST_LABEL, IS_ABSENT, IS_NUMBER, MAX_TEXT, Decoded, Replaced
-from webots_mcp.store.parameters import parameters_of
+from webots_mcp.store.parameters import Trial, parameters_of, spelled
 from webots_mcp.store.questions.compare import COMPARE_DEADLINE_S
 from webots_mcp.store.questions.runs import OUT_OF_TIME
 from webots_mcp.store.reading.catalogue import held_by, resolve_signals, signals_of_frame
@@ -127,10 +128,13 @@ class Parting:
     @property
     def is_equal(self) -> bool | None:
         """Whether all is the same to the last digit; None where not all could be compared."""
-        if self.parted:
-            return False
-        is_whole = not (self.unread or self.alone or self.only_in)
-        return True if is_whole and self.rows and self.signals else None
+        return False if self.parted else True if self.is_whole else None
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all that either run holds was compared, up to the end of the shorter one."""
+        is_left_out = self.unread or self.alone or self.only_in
+        return bool(self.rows and self.signals and not is_left_out)
 
     @property
     def worst(self) -> PartedSignal | None:
@@ -159,9 +163,10 @@ class Parting:
             )
         first, worst = self.parted[0], self.worst
         more = sum(each.from_s == first.from_s for each in self.parted) - 1
-        is_at_once = first.from_s <= self.from_s
-        said = "unlike from the first row on, " if is_at_once else "equal to the last digit until "
-        said += f"{first.from_s:.3f} s; then {first}" + (f" and {more} more" if more else "")
+        said = f"equal to the last digit until {first.from_s:.3f} s; then "
+        if first.from_s <= self.from_s:
+            said = f"unlike from the first row on, at {first.from_s:.3f} s: "
+        said += f"{first}" + (f" and {more} more" if more else "")
         beyond = [each for each in self.parted if each.beyond_s is not None and each.by is not None]
         if beyond:
             return f"{said}; {min(beyond, key=lambda each: each.beyond_s or 0.0).beyond}"
@@ -431,6 +436,10 @@ def _unlike(connection: sqlite3.Connection, one: int, other: int) -> dict[str, t
 # Runs that should be alike, each compared with the first of them.
 
 
+_MOST_SETTINGS: Final = 5  # of a trial set that are looked at, and as many runs of each
+_TRIALS_DEADLINE_S: Final = 2.0
+
+
 class Repeats(NamedTuple):
     """What came of runs that repeat each other.
 
@@ -453,14 +462,14 @@ class Repeats(NamedTuple):
         """Whether they repeat, and else from when on and how far they part, in a sentence."""
         parted = [each for each in self.partings if each.parted]
         if not parted:
-            least = min(self.partings, key=lambda each: (each.rows, each.until_s))
-            whole = f"{len(self.run_ids)} runs: {least.verdict}"
-            return whole if self.are_equal or not least.rows else f"{whole}; not all was compared"
+            least = min(self.partings, key=lambda each: (each.is_whole, each.rows))
+            said = f"{len(self.run_ids)} runs: {least.verdict}"
+            return said if self.are_equal else f"{said}; not all of them was compared"
         first = min(parted, key=lambda each: each.parted[0].from_s)
         said = f"{len(parted)} of {len(self.partings)} repeats part from run {self.run_ids[0]}"
+        said += f"; run {first.run_ids[1]} first: {first.verdict}"
         worst = max((each.worst for each in parted if each.worst), key=_in_tolerances, default=None)
-        said += f", first run {first.run_ids[1]}: {first.verdict}"
-        return f"{said}; over all {worst.at_most}" if worst else said
+        return f"{said}; of all runs at most {worst.at_most}" if worst else said
 
 
 def compare_repeats(
@@ -470,3 +479,36 @@ def compare_repeats(
     first, *others = run_ids
     found = (first_difference(connection, (first, other), **options) for other in others)
     return Repeats(tuple(run_ids), tuple(found))
+
+
+def repeats_of_trials(connection: sqlite3.Connection, trials: Sequence[Trial]) -> list[str]:
+    """Whether the trials of a set that have the same parameters repeat each other, as notes.
+
+    Of the first five settings that have two scores or more, the first five runs are compared, up
+    to where the first of them ended.
+    """
+    settings: dict[str, list[Trial]] = {}
+    for each in trials:
+        if each.score is not None and each.run_id is not None:
+            settings.setdefault(spelled(each.values), []).append(each)
+    repeated = {name: each[:_MOST_SETTINGS] for name, each in settings.items() if len(each) > 1}
+    found, deadline = dict[str, Repeats](), Deadline(_TRIALS_DEADLINE_S)
+    for name, each in list(repeated.items())[:_MOST_SETTINGS]:
+        ends = [trial.ended_sim_time_s for trial in each if trial.ended_sim_time_s is not None]
+        run_ids = [trial.run_id for trial in each if trial.run_id is not None]
+        until_s = min(ends, default=None)
+        with suppress(NothingRecordedError, UnknownRunError):  # retention has deleted one
+            found[name] = compare_repeats(
+                connection, run_ids, until_s=until_s, deadline_s=deadline.left_s
+            )
+    if not found:
+        return []
+    of = f"{len(found)} of {len(repeated)} repeated settings" if repeated else ""
+    parted = {name: each for name, each in found.items() if each.are_equal is False}
+    if parted:
+        name, first = next(iter(parted.items()))
+        return [f"{len(parted)} of {of} do not repeat; {name or 'as they are'}: {first.verdict}"]
+    unknown = [each.verdict for each in found.values() if each.are_equal is None]
+    if unknown:
+        return [f"whether repeats are the same cannot be told; {unknown[0]}"]
+    return [f"the runs of {of} are the same to the last digit: more of them show nothing new"]

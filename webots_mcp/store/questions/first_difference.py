@@ -174,7 +174,7 @@ class Parting:
 
 
 def _in_tolerances(each: PartedSignal) -> float:
-    return (each.largest or 0.0) / (each.tolerance or math.ulp(0.0))
+    return (each.largest or 0.0) / (each.tolerance or 1.0)
 
 
 @in_one_snapshot
@@ -337,7 +337,7 @@ def _parted(
     if both is not None:
         apart[~both[rows]] = np.nan
     is_number = ~np.isnan(apart)
-    tolerance = _tolerance(signal, one, within) if is_number.any() else None
+    tolerance = _tolerance(signal, (one, other), within) if is_number.any() else None
     beyond = ~is_number if tolerance is None else ~is_number | (apart > tolerance)
     sizes = np.where(is_number, apart, 0.0)
     largest = int(np.argmax(sizes))
@@ -383,7 +383,7 @@ def _unit(signal: Signal) -> str | None:
     return signal.unit or ("m" if is_place else None)
 
 
-def _tolerance(signal: Signal, values: Array, within: float | None) -> float:
+def _tolerance(signal: Signal, values: Sequence[Array], within: float | None) -> float:
     if within is not None:
         return within
     unit = _unit(signal)
@@ -391,8 +391,8 @@ def _tolerance(signal: Signal, values: Array, within: float | None) -> float:
         return _MATTERS_M / METRES[unit]
     if signal.turn is not None:
         return _MATTERS_RAD * signal.turn / math.tau
-    sizes: Array = np.abs(values)
-    return _MATTERS_SHARE * float(np.max(sizes, where=np.isfinite(sizes), initial=0.0))
+    sizes = [np.max(np.abs(v), where=np.isfinite(v), initial=0.0) for v in values]
+    return _MATTERS_SHARE * float(max(sizes))
 
 
 def _marks(times: Array) -> tuple[float, ...]:
@@ -503,12 +503,14 @@ def repeats_of_trials(connection: sqlite3.Connection, trials: Sequence[Trial]) -
             )
     if not found:
         return []
-    of = f"{len(found)} of {len(repeated)} repeated settings" if repeated else ""
+    left = len(repeated) - len(found)
+    more = f"; {left} more repeated settings were not compared" if left else ""
     parted = {name: each for name, each in found.items() if each.are_equal is False}
-    if parted:
-        name, first = next(iter(parted.items()))
-        return [f"{len(parted)} of {of} do not repeat; {name or 'as they are'}: {first.verdict}"]
-    unknown = [each.verdict for each in found.values() if each.are_equal is None]
-    if unknown:
-        return [f"whether repeats are the same cannot be told; {unknown[0]}"]
-    return [f"the runs of {of} are the same to the last digit: more of them show nothing new"]
+    for name, each in parted.items():
+        said = f"{len(parted)} of {len(found)} settings do not repeat to the last digit"
+        return [f"{said}; {name or 'as they are'}: {each.verdict}{more}"]
+    for each in found.values():
+        if each.are_equal is None:
+            return [f"whether repeats are the same to the last digit is unknown; {each.verdict}"]
+    said = f"the repeats of {len(found)} settings are the same to the last digit"
+    return [f"{said}: more of them show nothing new{more}"]

@@ -222,15 +222,18 @@ def _blame(found: Mapping[str, Repeats], across: Mapping[str, Parting]) -> str |
 
 
 def _as_json(found: Repeats) -> dict[str, Any]:
+    from webots_mcp.questions.answers import ComparisonAnswer
     from webots_mcp.questions.compare_runs import parting_facts
 
+    answers = [ComparisonAnswer(**parting_facts(each)) for each in found.partings]
     return {
         "run_ids": found.run_ids,
         "are_equal": found.are_equal,
         "verdict": found.verdict if found.partings else None,
         "repeats": [
-            {"run_id": each.run_ids[1], "is_equal": each.is_equal, **parting_facts(each)}
-            for each in found.partings
+            {"run_id": parting.run_ids[1], "is_equal": parting.is_equal}
+            | answer.model_dump(mode="json", exclude_none=True)
+            for parting, answer in zip(found.partings, answers, strict=True)
         ],
     }
 

@@ -177,7 +177,7 @@ def webots_compare_runs(
     if run_ids and trial_set:
         raise InvalidInputError("give run_ids or trial_set, not both")
     if first_difference and (not run_ids or len(run_ids) != 2 or position or mode):
-        raise InvalidInputError("first_difference takes two run_ids, and of the others signals")
+        raise InvalidInputError("first_difference is of two runs, by signals alone; name both runs")
     options = EventOptions(position=both_of(position), mode=mode)
     first = run_ids[0] if run_ids else _first_run(recording, trial_set) if trial_set else None
     with recording.view(robot, first) as view:
@@ -310,11 +310,11 @@ def parting_facts(found: Parting, limit: int | None = None) -> dict[str, Any]:
         "compared": {
             "row_count": found.rows,
             "signal_count": found.signals,
+            "parted_count": len(found.parted),
             "from_s": seconds(found.from_s),
             "until_s": seconds(found.until_s),
         },
         "parted": without_empty(PARTED_COLUMNS, rows),
-        "total": len(found.parted),
         "growth": worst and table(("until_s", worst.name), [[s, _exact(by)] for s, by in grown]),
         "only_in": only_in or None,
         "notes": notes,

@@ -340,11 +340,11 @@ def test_repeats_are_judged_against_the_first_and_so_are_trials(empty: sqlite3.C
         return Trial(number, 1, "", number, values, "done", run_id, *ended)
 
     (same,) = repeats_of_trials(empty, [trial(1, 1.0, 1), trial(2, 1.0, 2), trial(3, 2.0, 3)])
-    assert same.startswith("the repeats of 1 settings are the same to the last digit: more")
+    assert same.startswith("repeats are the same to the last digit (1 of the settings")
     (early,) = repeats_of_trials(empty, [trial(1, 1.0, 1, 3.0), trial(2, 1.0, 3, 3.0)])
     assert "are the same to the last digit" in early, "what follows the end is no part of a trial"
     (parted,) = repeats_of_trials(empty, [trial(1, 1.0, 1), trial(2, 1.0, 3)])
-    assert parted.startswith("1 of 1 settings do not repeat to the last digit; speed 1.0: 1 of")
+    assert parted.startswith("repeats part in 1 of the 1 settings that were compared; speed 1.0: 1")
     assert repeats_of_trials(empty, [trial(1, 1.0, 1), trial(2, 2.0, 2)]) == []
     assert repeats_of_trials(empty, [trial(1, 1.0, 1), trial(2, 1.0, 99)]) == []
 

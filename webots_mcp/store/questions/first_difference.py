@@ -507,10 +507,10 @@ def repeats_of_trials(connection: sqlite3.Connection, trials: Sequence[Trial]) -
     more = f"; {left} more repeated settings were not compared" if left else ""
     parted = {name: each for name, each in found.items() if each.are_equal is False}
     for name, each in parted.items():
-        said = f"{len(parted)} of {len(found)} settings do not repeat to the last digit"
+        said = f"repeats part in {len(parted)} of the {len(found)} settings that were compared"
         return [f"{said}; {name or 'as they are'}: {each.verdict}{more}"]
     for each in found.values():
         if each.are_equal is None:
             return [f"whether repeats are the same to the last digit is unknown; {each.verdict}"]
-    said = f"the repeats of {len(found)} settings are the same to the last digit"
+    said = f"repeats are the same to the last digit ({len(found)} of the settings were compared)"
     return [f"{said}: more of them show nothing new{more}"]

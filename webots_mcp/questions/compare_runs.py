@@ -17,6 +17,7 @@ from webots_mcp.questions.budget import (
     WHOLE,
     answer_about,
     condensed,
+    cut_for_a_model,
     figure,
     figures,
     fitting,
@@ -89,6 +90,8 @@ PARTED_COLUMNS: Final = (
 )  # fmt: skip
 DEFAULT_DIFFERENCES: Final = 15
 _MOST_PARTED: Final = 10
+_MOST_UNLIKE: Final = 10
+_LONGEST_VERDICT: Final = 600
 _SHOWN_HASH: Final = 10
 _MOST_ONLY_IN: Final = 10
 _OF_MEASURES: Final = (
@@ -296,7 +299,9 @@ def _parting(
 def parting_facts(found: Parting, limit: int | None = None) -> dict[str, Any]:
     """Where two runs part, as an answer has it."""
     notes = notes_of([*found.unread, *found.notes])
-    unlike = {name: [_short_value(each) for each in pair] for name, pair in found.unlike.items()}
+    most = len(found.unlike) if is_for_a_person() else _MOST_UNLIKE
+    shown_unlike = list(found.unlike.items())[:most]
+    unlike = {short_name(name): [*map(_short_value, pair)] for name, pair in shown_unlike}
     rows = fitting(
         [_parted_row(each) for each in found.parted[: limit or _MOST_PARTED]],
         room_tokens(limit, [unlike, notes]),
@@ -305,7 +310,7 @@ def parting_facts(found: Parting, limit: int | None = None) -> dict[str, Any]:
     grown = zip(map(seconds, found.marks_s), worst.growth if worst else (), strict=False)
     only_in = {f"run {run_id}": some(names).split(", ") for run_id, names in found.only_in.items()}
     return {
-        "verdict": found.verdict,
+        "verdict": cut_for_a_model(found.verdict, _LONGEST_VERDICT),
         "unlike": unlike or None,
         "compared": {
             "row_count": found.rows,

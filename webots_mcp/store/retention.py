@@ -15,10 +15,12 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.run_rows import fetch_run
 
 # A run that a person named, described or marked is not retention's to judge.
-# Trials are labelled by the hundred without anybody's having judged them: their scores stay.
+# Trials and repeats are labelled by the hundred without anybody's having judged them: the scores of
+# trials stay.
 KEPT: Final = (
     "(keep <> 0 OR coalesce(note, '') <> '' "
-    "OR (coalesce(label, '') <> '' AND label NOT GLOB 'trial [0-9]* of set [0-9]*: *'))"
+    "OR (coalesce(label, '') <> '' AND label NOT GLOB 'trial [0-9]* of set [0-9]*: *' "
+    "AND label NOT GLOB 'repeat [0-9]* of [0-9]* by *'))"
 )
 _MARK: Final = "UPDATE run SET keep = ? WHERE id = ?"
 

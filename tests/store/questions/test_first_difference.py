@@ -247,8 +247,8 @@ def test_what_cannot_be_read_is_named_and_not_judged(
     assert (alike.is_equal, alike.unread) == (True, ())
     empty.execute("UPDATE chunk SET numbers = x'00' WHERE signal_id = 0 AND run_id = 2")
     lost = first_difference(empty, [1, 2])
-    assert (lost.rows, lost.is_equal) == (0, None)
-    assert "nothing to compare: no row of run 1 has a partner in run 2" in lost.verdict
+    assert (lost.rows, lost.is_equal, lost.alone) == (0, None, {}), "nobody knows their partners"
+    assert lost.verdict == "nothing was compared; not all of them could be read"
 
 
 def test_the_time_limit_leaves_signals_uncompared_and_says_so(empty: sqlite3.Connection) -> None:

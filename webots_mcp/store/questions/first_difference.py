@@ -25,14 +25,16 @@ from webots_mcp.store.questions.runs import OUT_OF_TIME
 from webots_mcp.store.reading.catalogue import held_by, resolve_signals, signals_of_frame
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import whole_run
-from webots_mcp.store.reading.segment import Deadline, Subject, in_one_snapshot
+from webots_mcp.store.reading.segment import Deadline, Subject, in_one_snapshot, just_after
 from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.signals import Signal
 
 _MATTERS_M: Final = 0.001
 _MATTERS_RAD: Final = 0.001
 _MATTERS_SHARE: Final = 0.001  # of the largest value, where there is no better scale
+_SHORT_ROWS: Final = 2  # between the last row and the time up to which rows are compared
 _MARKS: Final = 5  # times at which it is said how far a signal is apart
+_OF_READING: Final = 0.5  # of the time: for rows that are in no chunk yet
 _ABSENT: Final = "(absent)"
 _BEGAN_BY: Final = "began_by"
 _IN_PART: Final = (
@@ -110,6 +112,7 @@ class Parting:
         alone: Of each run that has rows without a partner, how many and when the first is.
         only_in: Of each run the signals that the other does not have.
         unread: What was not compared, and why.
+        is_short: A run ends clearly before the time up to which they were to be compared.
     """
 
     run_ids: tuple[int, int]
@@ -123,6 +126,7 @@ class Parting:
     alone: dict[int, tuple[int, float]]
     only_in: dict[int, tuple[str, ...]]
     unread: tuple[str, ...]
+    is_short: bool
     notes: tuple[str, ...]
 
     @property
@@ -132,8 +136,8 @@ class Parting:
 
     @property
     def is_whole(self) -> bool:
-        """Whether all that either run holds was compared, up to the end of the shorter one."""
-        is_left_out = self.unread or self.alone or self.only_in
+        """Whether all that was to be compared was; without a time, until the shorter run ends."""
+        is_left_out = self.unread or self.alone or self.only_in or self.is_short
         return bool(self.rows and self.signals and not is_left_out)
 
     @property
@@ -152,6 +156,8 @@ class Parting:
 
     def _said_of_values(self) -> str:
         one, other = self.run_ids
+        if self.unread and not (self.rows and self.signals):
+            return "nothing was compared"
         if not self.rows:
             return f"nothing to compare: no row of run {one} has a partner in run {other}"
         if not self.signals:
@@ -206,7 +212,8 @@ def first_difference(
     if len(run_ids) != 2 or run_ids[0] == run_ids[1]:
         raise InvalidInputError(f"give two different runs, not {list(run_ids)}")
     deadline = Deadline(deadline_s)
-    sides = [_read(connection, run_id, until_s, deadline) for run_id in run_ids]
+    first = _read(connection, run_ids[0], until_s, deadline.part(_OF_READING / 2))
+    sides = (first, _read(connection, run_ids[1], until_s, deadline.part(_OF_READING)))
     pair = _aligned([side.frame for side in sides])
     known = sides[0].known | sides[1].known
     meant = resolve_signals(known, names) if names != ("*",) else list(known.values())
@@ -229,6 +236,11 @@ def first_difference(
         )
         for side in sides
     }
+    notes, is_short = [*_of_rows(sides, pair), *[_IN_PART] * reduced], False
+    if until_s is not None and len(pair.times):
+        row_s = float(pair.times[-1] - pair.times[0]) / max(len(pair.times) - 1, 1)
+        is_short = bool(pair.times[-1] < until_s - _SHORT_ROWS * row_s - SAME_TIME_S)
+        notes += [f"it was to be compared until {until_s:g} s: a run is too short"] * is_short
     return Parting(
         run_ids=(run_ids[0], run_ids[1]),
         unlike=_unlike(connection, *run_ids),
@@ -241,7 +253,8 @@ def first_difference(
         alone=pair.alone,
         only_in={run_id: found for run_id, found in only_in.items() if found},
         unread=tuple(unread),
-        notes=(*_of_rows(sides, pair), *[_IN_PART] * reduced),
+        is_short=is_short,
+        notes=tuple(notes),
     )
 
 
@@ -297,10 +310,11 @@ def _aligned(frames: Sequence[Frame]) -> _Pair:
     found &= read[0]
     rows = (np.flatnonzero(found), places[found])
     alone: dict[int, tuple[int, float]] = {}
-    for frame, keys, others, is_read, paired in zip(
-        frames, (one, other), (other, one), read, rows, strict=True
-    ):
-        is_read[paired] = False
+    for at, (keys, others) in enumerate(((one, other), (other, one))):
+        frame, is_read = frames[at], read[at]
+        is_read[rows[at]] = False
+        for part in frames[1 - at].unread:  # where the partner may be
+            is_read[slice(*frame.places([part.start_s, just_after(part.end_s)]))] = False
         if len(keys) and len(others):
             is_read &= (keys >= others[0]) & (keys <= others[-1])
             if count := int(np.count_nonzero(is_read)):

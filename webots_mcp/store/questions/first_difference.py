@@ -231,10 +231,8 @@ def first_difference(
     if len(pair.times) and done < len(shared):
         unread += [f"{len(shared) - done} of {len(shared)} signals: {OUT_OF_TIME}"]
     only_in = {
-        side.frame.run_id: tuple(
-            each.name for each in meant if each.name in side.known and each not in shared
-        )
-        for side in sides
+        one.frame.run_id: tuple(e.name for e in meant if e.name in one.known.keys() - other.known)
+        for one, other in (sides, sides[::-1])
     }
     notes, is_short = [*_of_rows(sides, pair), *[_IN_PART] * reduced], False
     if until_s is not None and len(pair.times):

@@ -27,7 +27,7 @@ from webots_mcp.contract import (
     Database,
 )
 from webots_mcp.errors import InvalidInputError, NothingRecordedError, WebotsMCPError
-from webots_mcp.naming import Value, listed
+from webots_mcp.naming import Value
 from webots_mcp.parameter import Value as ParameterValue
 from webots_mcp.pauses import PAUSED
 from webots_mcp.queue import Command, CommandQueue, fetch_command, list_commands
@@ -449,21 +449,18 @@ class RobotRecording:
             UnknownSignalError: A name matches none.
             NoDatabaseError, NothingRecordedError: Nothing has been recorded yet.
         """
+        last_s = until_s if math.isfinite(until_s) else None
         with self._subject() as (connection, subject):
             run_ids = [run.id for run in runs_of(connection, subject.robot_id)]
             if len(run_ids) < 2:
                 raise AssertionError(f"run {run_ids[0]} is the only one: reset() begins another")
-            bounds = {"until_s": until_s if math.isfinite(until_s) else None, "within": within}
-            options = {**bounds, "names": tuple(signals), "deadline_s": math.inf}
-            found = compare_repeats(connection, run_ids, **options).partings
+            options = {"within": within, "names": signals, "deadline_s": math.inf}
+            found = compare_repeats(connection, run_ids, until_s=last_s, **options)
         for each in found:
             if not each.is_whole or any(one.beyond_s is not None for one in each.parted):
                 one, other = each.run_ids
-                why = [f"run {other} does not repeat run {one}: {each.verdict}"]
-                why += [
-                    f"only run {run} has {listed(names)}" for run, names in each.only_in.items()
-                ]
-                raise AssertionError("\n  ".join([*why, *each.unread, *each.notes]))
+                why = f"run {other} does not repeat run {one}: {each.verdict}"
+                raise AssertionError("\n  ".join([why, *each.notes]))
 
     # -- commands ------------------------------------------------------------------------------
 

@@ -37,7 +37,7 @@ ANSWERED = [
     ("compare 1 -n 3 3", r"^run 3 \[3\]", "the 3 that differ most of 13"),
     ("diff 1 3", "controller_sha256 .*aaaaaaaaaa.*bbbbbbbbbb", "^verdict not alike to begin with"),
     ("diff 1 2 --signal 'pose*'", "unlike: began_by", "^verdict equal to the last digit in the 300",
-     "row_count 300, signal_count 2", "run 1 goes on to 119.900 s"),
+     "row_count 300, signal_count 2, from_s 0, until_s 29.9", "one run goes on to 119.900 s"),
     ("signals --run 1", "pose.0 num .*12.78"),
     ("signals -n 1", "1 of 15: go on with --after"),
     ("sql 'SELECT id, label, 1e999 AS big FROM run ORDER BY id'", "id label big", "1 NULL inf"),

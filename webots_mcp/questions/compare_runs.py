@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import PurePath
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, cast
 
 from pydantic import Field
 
@@ -29,8 +29,6 @@ from webots_mcp.questions.budget import (
     short_name,
     shorten,
     shown,
-    some,
-    table,
     without_empty,
 )
 from webots_mcp.questions.declaring import (
@@ -53,12 +51,13 @@ from webots_mcp.store.analysis.summary import MIN_EFFECT_SD, Spread
 from webots_mcp.store.detection.kinds import EventOptions, both_of
 from webots_mcp.store.parameters import scored_runs
 from webots_mcp.store.questions.compare import (
+    COMPARE_DEADLINE_S,
     Comparison,
     Difference,
     Group,
     compare_runs,
 )
-from webots_mcp.store.questions.first_difference import PartedSignal, Parting, first_difference
+from webots_mcp.store.questions.first_difference import PartedSignal, Parting, compare_rows
 from webots_mcp.store.questions.runs import (
     MOST_RUNS,
     Measure,
@@ -84,13 +83,8 @@ DIFFERENCE_COLUMNS: Final = (
     "signal", "unit", "mean", "mean_range", "deviation", "effect", "deviation_ratio", "different",
     "interval", "min", "max",
 )  # fmt: skip
-PARTED_COLUMNS: Final = (
-    "signal", "unit", "from_s", "values", "by", "largest", "largest_at_s", "tolerance", "beyond_s",
-    "row_count",
-)  # fmt: skip
 DEFAULT_DIFFERENCES: Final = 15
 _MOST_PARTED: Final = 10
-_MOST_UNLIKE: Final = 10
 _LONGEST_VERDICT: Final = 600
 _SHOWN_HASH: Final = 10
 _MOST_ONLY_IN: Final = 10
@@ -184,15 +178,16 @@ def webots_compare_runs(
     options = EventOptions(position=both_of(position), mode=mode)
     first = run_ids[0] if run_ids else _first_run(recording, trial_set) if trial_set else None
     with recording.view(robot, first) as view:
-        return answer_about(
-            view,
-            ComparisonAnswer,
-            lambda: (
-                _parting(view, run_ids or (), signals, limit)
-                if first_difference
-                else _compared(view, run_ids, trial_set, signals, limit, options, min_effect_sd)
-            ),
-        )
+
+        def find() -> dict[str, Any]:
+            if not (first_difference and run_ids):
+                return _compared(view, run_ids, trial_set, signals, limit, options, min_effect_sd)
+            limit_s = math.inf if is_for_a_person() else COMPARE_DEADLINE_S
+            names = signals or ("*",)
+            found = compare_rows(view.connection, run_ids, names=names, deadline_s=limit_s)
+            return parting_facts(found, limit)
+
+        return answer_about(view, ComparisonAnswer, find)
 
 
 def _first_run(recording: Recording, set_id: int) -> int:
@@ -288,68 +283,40 @@ def _file(path: str | None) -> str | None:
     return path and PurePath(path.replace("\\", "/")).name
 
 
-def _parting(
-    view: View, run_ids: Sequence[int], names: Sequence[str] | None, limit: int | None
-) -> dict[str, Any]:
-    left_s = {"deadline_s": math.inf} if is_for_a_person() else {}
-    found = first_difference(view.connection, run_ids, names=tuple(names or ("*",)), **left_s)
-    return parting_facts(found, limit)
-
-
 def parting_facts(found: Parting, limit: int | None = None) -> dict[str, Any]:
     """Where two runs part, as an answer has it."""
-    notes = notes_of([*found.unread, *found.notes])
-    most = len(found.unlike) if is_for_a_person() else _MOST_UNLIKE
-    shown_unlike = list(found.unlike.items())[:most]
-    unlike = {short_name(name): [*map(_short_value, pair)] for name, pair in shown_unlike}
-    rows = fitting(
-        [_parted_row(each) for each in found.parted[: limit or _MOST_PARTED]],
-        room_tokens(limit, [unlike, notes]),
-    )
+    notes, most = notes_of(found.notes), None if is_for_a_person() else _MOST_PARTED
+    known = {short_name(n): shown([*pair]) for n, pair in list(found.unlike.items())[:most]}
+    parted = [each._asdict() for each in found.parted[: limit or _MOST_PARTED]]
+    rows = [[_cell(*each) for each in list(signal.items())[:-1]] for signal in parted]
+    rows = fitting(rows, room_tokens(limit, [known, notes]))
     left, worst = len(found.parted) - len(rows), found.worst
-    grown = zip(map(seconds, found.marks_s), worst.growth if worst else (), strict=False)
-    only_in = {f"run {run_id}": some(names).split(", ") for run_id, names in found.only_in.items()}
+    growth = (
+        [(f"until {s:.3f} s", _cell("", by)) for s, by in worst.growth.items()] if worst else []
+    )
     return {
         "verdict": cut_for_a_model(found.verdict, _LONGEST_VERDICT),
-        "unlike": unlike or None,
+        "unlike": known or None,
         "compared": {
-            "row_count": found.rows,
-            "signal_count": found.signals,
-            "parted_count": len(found.parted),
-            "from_s": seconds(found.from_s),
-            "until_s": seconds(found.until_s),
+            "row_count": found.rows, "signal_count": found.signals,
+            "from_s": seconds(found.from_s), "until_s": seconds(found.until_s),
         },
-        "parted": without_empty(PARTED_COLUMNS, rows),
-        "growth": worst and table(("until_s", worst.name), [[s, _exact(by)] for s, by in grown]),
-        "only_in": only_in or None,
+        "parted": without_empty(PartedSignal._fields[:-1], rows),
+        "growth": worst and {"signal": short_name(worst.signal), **dict(growth)},
         "notes": notes,
         "hint": f"{left} more signals part: limit or signals for others" if left else None,
-    }
+    }  # fmt: skip
 
 
-def _parted_row(each: PartedSignal) -> list[Any]:
-    return [
-        short_name(each.name),
-        each.unit,
-        seconds(each.from_s),
-        [short_name(value) if isinstance(value, str) else value for value in each.values],
-        _exact(each.by),
-        _exact(each.largest),
-        seconds(each.largest_at_s),
-        _exact(each.tolerance),
-        seconds(each.beyond_s),
-        each.rows,
-    ]
-
-
-def _exact(number: float | None) -> float | None:
-    """A difference as it is shown, however small."""
-    return None if number is None or not math.isfinite(number) else float(f"{number:.4g}")
-
-
-def _short_value(value: Any) -> Any:
-    is_hash = isinstance(value, str) and len(value) in (40, 64) and value.isalnum()
-    return value[:_SHOWN_HASH] if is_hash else shown(value)
+def _cell(name: str, value: Any) -> Any:
+    """A difference as it is shown, however small; the values themselves have all their digits."""
+    if name.endswith("_s"):
+        return seconds(value)
+    if isinstance(value, tuple):
+        return [short_name(e) if isinstance(e, str) else e for e in cast("tuple[Any, ...]", value)]
+    if not isinstance(value, float):
+        return value
+    return float(f"{value:.4g}") if math.isfinite(value) else None
 
 
 def _compared(

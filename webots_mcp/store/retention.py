@@ -15,12 +15,10 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.run_rows import fetch_run
 
 # A run that a person named, described or marked is not retention's to judge.
-# Trials and repeats are labelled by the hundred without anybody's having judged them: the scores of
-# trials stay.
+# Trials are labelled by the hundred without anybody's having judged them: their scores stay.
 KEPT: Final = (
     "(keep <> 0 OR coalesce(note, '') <> '' "
-    "OR (coalesce(label, '') <> '' AND label NOT GLOB 'trial [0-9]* of set [0-9]*: *' "
-    "AND label NOT GLOB 'repeat [0-9]* of [0-9]* by *'))"
+    "OR (coalesce(label, '') <> '' AND label NOT GLOB 'trial [0-9]* of set [0-9]*: *'))"
 )
 _MARK: Final = "UPDATE run SET keep = ? WHERE id = ?"
 

@@ -15,13 +15,15 @@ from tests.recordings.rover import Recorder
 from webots_mcp.errors import InvalidInputError, UnknownRunError, UnknownSignalError
 from webots_mcp.store import chunk_making
 from webots_mcp.store.chunk_making import make_chunks
-from webots_mcp.store.parameters import Trial
+from webots_mcp.store.parameters import Result, create_trial_set, finish_trial, trials_of
 from webots_mcp.store.purge import prune
 from webots_mcp.store.questions.first_difference import (
     Parting,
+    are_equal,
     compare_repeats,
-    first_difference,
-    repeats_of_trials,
+    compare_rows,
+    repeats_noted,
+    verdict_on,
 )
 from webots_mcp.store.retention import Limit, Retention
 
@@ -82,7 +84,7 @@ def at(row: int) -> float:
 
 
 def of(found: Parting, name: str) -> Any:
-    return next(each for each in found.parted if each.name == name)
+    return next(each for each in found.parted if each.signal == name)
 
 
 @pytest.fixture(params=["rows", "chunks", "purged"])
@@ -108,26 +110,27 @@ def test_one_bit_of_noise_is_found_to_the_row(
 ) -> None:
     record(empty, driving)
     record(empty, with_one_bit)
-    found = first_difference(kept(empty), [1, 2])
-    assert [each.name for each in found.parted] == ["compass.x", "pose.x", "mode"]
+    found = compare_rows(kept(empty), [1, 2])
+    assert [each.signal for each in found.parted] == ["compass.x", "pose.x", "mode"]
     compass, pose, mode = found.parted
     bit = math.ulp(math.sin(NOISE_ROW))
-    assert (compass.from_s, compass.by, compass.rows) == (at(NOISE_ROW), bit, 1)
+    assert (compass.from_s, compass.by, compass.row_count) == (at(NOISE_ROW), bit, 1)
     assert (compass.beyond_s, compass.largest) == (None, bit)
     assert (pose.from_s, pose.unit, pose.tolerance) == (at(NOISE_ROW + 1), "m", 0.001)
     assert pose.beyond_s == at(NOISE_ROW + 145), "1e-9 * 1.1 ** n > 0.001"
-    assert (pose.largest_at_s, pose.growth[-1]) == (at(ROWS), pose.largest)
+    assert pose.largest_at_s == at(ROWS)
     assert (mode.from_s, mode.values, mode.by) == (at(TURN_ROW), ("cruise", "turn"), None)
     assert found.worst is pose and found.is_equal is False
     assert found.verdict == (
         f"equal to the last digit until 3.216 s; then compass.x by {bit:.3g}; "
-        "pose.x beyond 0.001 m from 5.536 s on"
+        f"pose.x beyond 0.001 m from 5.536 s on; pose.x by at most {pose.largest:.3g} m"
     )
-    marks = [round(each - STEP_S, 3) for each in found.marks_s]
+    marks = [round(each - STEP_S, 3) for each in pose.growth]
     assert marks == [0.5, 1.0, 2.0, 5.0, round((ROWS - 1) * STEP_S, 3)]
-    assert pose.growth[:3] == (0, 0, 0) and 0 < pose.growth[3] < pose.growth[4]
-    assert first_difference(empty, [2, 1]).parted[1].from_s == at(NOISE_ROW + 1)
-    only = first_difference(empty, [1, 2], names=["mode"], until_s=at_s(TURN_ROW - 1))
+    *none, at_5_s, at_the_end = pose.growth.values()
+    assert none == [0, 0, 0] and 0 < at_5_s < at_the_end == pose.largest
+    assert compare_rows(empty, [2, 1]).parted[1].from_s == at(NOISE_ROW + 1)
+    only = compare_rows(empty, [1, 2], names=["mode"], until_s=at_s(TURN_ROW - 1))
     assert (only.is_equal, only.signals, only.rows) == (True, 1, TURN_ROW - 1)
 
 
@@ -140,13 +143,15 @@ def test_equal_runs_are_equal_until_the_shorter_ends(
 ) -> None:
     record(empty, driving)
     record(empty, driving, 400)
-    found = first_difference(kept(empty), [1, 2])
-    assert (found.is_equal, found.rows, found.signals, found.alone) == (True, 400, 5, {})
+    found = compare_rows(kept(empty), [1, 2])
+    assert (found.is_equal, found.rows, found.signals, found.is_whole) == (True, 400, 5, True)
     assert found.verdict == (
         "equal to the last digit in the 400 rows and 5 signals that were compared, until 6.400 s"
     )
-    assert found.notes == ("run 1 goes on to 8.000 s, which the other does not reach",)
-    assert compare_repeats(empty, [1, 2], until_s=3.0).are_equal is True
+    assert found.notes == ("one run goes on to 8.000 s, which the other does not",)
+    assert are_equal(compare_repeats(empty, [1, 2], until_s=3.0)) is True
+    (short,) = compare_repeats(empty, [1, 2], until_s=7.0)
+    assert (short.is_equal, short.notes[0]) == (None, "a run ends before 7 s")
 
 
 def test_a_row_without_a_partner_is_counted_and_compared_with_no_other(
@@ -156,13 +161,17 @@ def test_a_row_without_a_partner_is_counted_and_compared_with_no_other(
     record(empty, lambda row: None if row in (7, 100) else driving(row))
     record(empty, lambda row: driving(row) if row % 5 == 2 else None)
     kept(empty)
-    found = first_difference(empty, [1, 2])
-    assert (found.rows, found.alone, found.parted) == (ROWS - 2, {1: (2, at(7))}, ())
+    found = compare_rows(empty, [1, 2])
+    assert (found.rows, found.parted) == (ROWS - 2, ())
     assert found.is_equal is None, "the rows that are missing may have been others"
-    assert "2 rows of run 1, the first at 0.112 s, have no partner" in found.notes[0]
-    throttled = first_difference(empty, [3, 2])
+    assert found.notes[0].startswith("2 rows of run 1, the first at 0.112 s, have no partner")
+    assert found.verdict.endswith("signals that were compared, until 8.000 s; not all was compared")
+    throttled = compare_rows(empty, [3, 2])
     assert (throttled.rows, throttled.parted) == (99, ()), "one of a hundred is missing in run 2"
-    assert throttled.alone == {3: (1, at(7)), 2: (ROWS - 2 - 99 - 4, at(3))}
+    assert [each.partition(" s, have")[0] for each in throttled.notes[:2]] == [
+        "1 rows of run 3, the first at 0.112",
+        "395 rows of run 2, the first at 0.048",
+    ]
 
 
 def test_texts_flags_nulls_and_replaced_values_are_compared(empty: sqlite3.Connection) -> None:
@@ -176,8 +185,8 @@ def test_texts_flags_nulls_and_replaced_values_are_compared(empty: sqlite3.Conne
             "REPLACED": {"r": "nan" if row < 10 else "inf", "same": "nan"},
         },
     )
-    found = first_difference(empty, [1, 2])
-    assert {each.name: each.values for each in found.parted} == {
+    found = compare_rows(empty, [1, 2])
+    assert {each.signal: each.values for each in found.parted} == {
         "t": ("a", "b"),
         "f": (True, False),
         "n": (None, 1.5),
@@ -204,7 +213,7 @@ def test_what_was_not_alike_to_begin_with_comes_first(empty: sqlite3.Connection)
     empty.execute("UPDATE session SET versions = ?", (json.dumps({"python": "3.11.7"}),))
     empty.execute("UPDATE session SET versions = ?, git_commit = 'beef' WHERE id = 2", (versions,))
     empty.execute("UPDATE run SET world = '/w/b.wbt', basic_time_step_ms = 32 WHERE id = 2")
-    found = first_difference(empty, [1, 2])
+    found = compare_rows(empty, [1, 2])
     assert [*found.unlike] == [
         "parameter kp", "parameter ki", "controller_sha256", "git_commit", "world",
         "basic_time_step_ms", "version of python", "version of sqlite",
@@ -231,55 +240,61 @@ def test_what_cannot_be_read_is_named_and_not_judged(
     where = "AND" if "WHERE" in damage else "WHERE"
     (group,) = empty.execute("SELECT min(id) + 2 FROM row_group WHERE run_id = 2").fetchone()
     empty.execute(f"UPDATE chunk SET {damage} {where} run_id = 2 AND group_id >= {group}")
-    found = first_difference(empty, [1, 2])
+    found = compare_rows(empty, [1, 2])
     unread = {
-        each.partition("the chunk of ")[2].partition(" is damaged")[0] for each in found.unread
+        each.partition("the chunk of ")[2].partition(" is damaged")[0] for each in found.notes
     }
-    assert found.verdict.endswith("; not all of them could be read")
+    assert found.verdict.endswith("; not all was compared")
     if "numbers" in damage:
-        assert {each.name for each in found.parted} == {"mode"}
+        assert {each.signal for each in found.parted} == {"mode"}
         assert unread == {"pose.x", "pose.y", "compass.x"}
     else:
-        assert [each.name for each in found.parted] == ["compass.x", "pose.x"]
+        assert [each.signal for each in found.parted] == ["compass.x", "pose.x"]
         assert unread == {"mode", "bumper"}
-    assert all(each.startswith("run 2: not read from 3.216 to ") for each in found.unread[:1])
-    alike = first_difference(empty, [1, 2], until_s=3.0)
-    assert (alike.is_equal, alike.unread) == (True, ())
+    assert found.notes[0].startswith("run 2: not read from 3.216 to ")
+    alike = compare_rows(empty, [1, 2], until_s=3.0)
+    assert (alike.is_equal, alike.notes) == (True, ())
     empty.execute("UPDATE chunk SET numbers = x'00' WHERE signal_id = 0 AND run_id = 2")
-    lost = first_difference(empty, [1, 2])
-    assert (lost.rows, lost.is_equal, lost.alone) == (0, None, {}), "nobody knows their partners"
-    assert lost.verdict == "nothing was compared; not all of them could be read"
+    lost = compare_rows(empty, [1, 2])
+    assert (lost.rows, lost.is_equal, lost.verdict) == (0, None, "nothing could be compared")
+    assert "the chunk of simulation times is damaged" in lost.notes[0]
+    assert not any("of run 1" in each for each in lost.notes), "nobody knows their partners"
 
 
 def test_the_time_limit_leaves_signals_uncompared_and_says_so(empty: sqlite3.Connection) -> None:
     for _ in range(2):
         record(empty, driving)
     make_chunks(empty, 100_000)
-    found = first_difference(empty, [1, 2], deadline_s=0.0)
+    found = compare_rows(empty, [1, 2], deadline_s=0.0)
     assert found.is_equal is None
-    assert "equal" not in found.verdict and "not all of them could be read" in found.verdict
+    assert found.verdict == "nothing could be compared"
+    assert "5 signals: time limit reached" in found.notes[0]
 
 
 def test_only_signals_of_both_are_compared_and_the_others_named(empty: sqlite3.Connection) -> None:
     record(empty, driving)
     record(empty, lambda row: {"pose": driving(row)["pose"], "arm": 1}, robot="other")
     record(empty, lambda _: {"arm": 1}, robot="other")
-    found = first_difference(empty, [1, 2])
+    found = compare_rows(empty, [1, 2])
     assert (found.signals, found.is_equal) == (2, None)
-    assert found.only_in == {1: ("compass.x", "mode", "bumper"), 2: ("arm",)}
+    assert found.notes == ("only run 1 has compass.x, mode, bumper", "only run 2 has arm")
     assert found.unlike == {"robot": ("r", "other")}
-    assert "nothing to compare: no signal is in both" in first_difference(empty, [1, 3]).verdict
+    assert (
+        "nothing was compared: run 1 and run 3 have no signal in common"
+        in compare_rows(empty, [1, 3]).verdict
+    )
 
 
 def test_runs_are_aligned_by_simulation_time(empty: sqlite3.Connection) -> None:
     record(empty, with_one_bit)
     record(empty, driving, 300, first=150)  # attached late
     record(empty, driving, first=10_000)
-    found = first_difference(empty, [1, 2])
-    assert (found.from_s, found.rows, found.alone) == (at(150), 300, {})
+    found = compare_rows(empty, [1, 2])
+    assert (found.from_s, found.rows, found.is_whole) == (at(150), 300, True)
     assert found.parted[0].from_s == at(NOISE_ROW)
-    apart = first_difference(empty, [1, 3])
+    apart = compare_rows(empty, [1, 3])
     assert (apart.rows, apart.is_equal) == (0, None)
+    assert apart.notes == ("no row has a partner that could be read",)
 
 
 def test_rows_at_one_time_are_compared_in_their_order(empty: sqlite3.Connection) -> None:
@@ -289,10 +304,10 @@ def test_rows_at_one_time_are_compared_in_their_order(empty: sqlite3.Connection)
             recorder.publish(at_s(20), {"a": each + 10 * (changed and each == 2)})
         recorder.publish(at_s(21), {"a": 21})
     recorder.publish(at_s(21), {"a": 5})
-    found = first_difference(empty, [1, 2])
+    found = compare_rows(empty, [1, 2])
     (only,) = found.parted
-    assert (only.from_s, only.values, only.rows) == (at(20), (2.0, 12.0), 1)
-    assert found.alone == {2: (1, at(21))}
+    assert (only.from_s, only.values, only.row_count) == (at(20), (2.0, 12.0), 1)
+    assert found.notes[0].startswith("1 rows of run 2, the first at 0.336 s, have no partner")
 
 
 def test_what_matters_is_a_millimetre_a_thousandth_of_a_radian_or_of_the_value(
@@ -308,45 +323,46 @@ def test_what_matters_is_a_millimetre_a_thousandth_of_a_radian_or_of_the_value(
 
     for off in (0, 1):
         record(empty, state(off))
-    found = first_difference(empty, [1, 2])
+    found = compare_rows(empty, [1, 2])
     assert of(found, "front_mm").beyond_s == at(3)  # over 1 mm
     yaw, heading, force = (of(found, name) for name in ("yaw", "heading_deg", "force"))
     assert (yaw.beyond_s, yaw.unit) == (at(101), "rad")
     assert yaw.largest == pytest.approx(5e-3), "and no whole turn"
     assert heading.beyond_s == at(58) and heading.largest == pytest.approx(0.5)
     assert force.tolerance == pytest.approx(0.55) and force.beyond_s == at(6)
-    strict = first_difference(empty, [1, 2], within=2.0)
-    assert [each.name for each in strict.parted if each.beyond_s] == ["front_mm", "force"]
+    strict = compare_rows(empty, [1, 2], within=2.0)
+    assert [each.signal for each in strict.parted if each.beyond_s] == ["front_mm", "force"]
 
 
 def test_what_chunks_do_not_keep_is_said_not_to_be_compared(empty: sqlite3.Connection) -> None:
-    for last in "ab":
-        record(empty, lambda _, last=last: {"scan": [1.0] * 20, "log": "x" * 300 + last}, 20)
-    found = first_difference(empty, [1, 2])
-    assert found.parted == () and "only what is kept of them was compared" in found.notes[0]
+    for scan in ([1.0, 2.0, 3.0], [1.0, 3.0, 2.0]):
+        record(empty, lambda _, scan=scan: {"scan": [0.5] * 20 + scan}, 20)
+    found = compare_rows(empty, [1, 2])
+    assert found.parted == () and found.notes[0].startswith(
+        "of arrays of more than 16 items count, min,"
+    )
 
 
 def test_repeats_are_judged_against_the_first_and_so_are_trials(empty: sqlite3.Connection) -> None:
     for state in (driving, driving, with_one_bit):
         record(empty, state)
     found = compare_repeats(empty, [1, 2, 3])
-    assert found.are_equal is False and [each.is_equal for each in found.partings] == [True, False]
-    assert found.verdict.startswith("1 of 2 repeats part from run 1; run 3 first: equal to the")
-    assert "; of all runs at most pose.x up to " in found.verdict
+    assert are_equal(found) is False and [each.is_equal for each in found] == [True, False]
+    assert verdict_on(found).startswith(
+        "1 of 2 part from run 1; run 3: equal to the last digit unt"
+    )
 
-    def trial(number: int, speed: float, run_id: int, end_s: float = 8.0) -> Trial:
-        values = json.dumps({"speed": speed})
-        ended = (1.0, "for_s", end_s, None, None, None, None, None)
-        return Trial(number, 1, "", number, values, "done", run_id, *ended)
+    def noted(*run_ids: int) -> list[str]:
+        set_id = create_trial_set(empty, '{"best": "highest"}', [{"speed": 1.0} for _ in run_ids])
+        for trial, run_id in zip(trials_of(empty, set_id), run_ids, strict=True):
+            finish_trial(empty, trial, Result(run_id, 1.0, None, "for_s", 8.0))
+        return repeats_noted(empty, set_id)
 
-    (same,) = repeats_of_trials(empty, [trial(1, 1.0, 1), trial(2, 1.0, 2), trial(3, 2.0, 3)])
-    assert same.startswith("repeats are the same to the last digit (1 of the settings")
-    (early,) = repeats_of_trials(empty, [trial(1, 1.0, 1, 3.0), trial(2, 1.0, 3, 3.0)])
-    assert "are the same to the last digit" in early, "what follows the end is no part of a trial"
-    (parted,) = repeats_of_trials(empty, [trial(1, 1.0, 1), trial(2, 1.0, 3)])
-    assert parted.startswith("repeats part in 1 of the 1 settings that were compared; speed 1.0: 1")
-    assert repeats_of_trials(empty, [trial(1, 1.0, 1), trial(2, 2.0, 2)]) == []
-    assert repeats_of_trials(empty, [trial(1, 1.0, 1), trial(2, 1.0, 99)]) == []
+    (same,) = noted(1, 2)
+    assert same.startswith("repeats of speed 1.0: 2 runs: equal to the last digit in the 500 rows")
+    (parted,) = noted(1, 2, 3)
+    assert parted.startswith("repeats of speed 1.0: 1 of 2 part from run 1; run 3: equal to the ")
+    assert noted(1) == [] == repeats_noted(empty, create_trial_set(empty, "{}", [{}]))
 
 
 def test_what_cannot_be_compared_is_refused(empty: sqlite3.Connection) -> None:
@@ -354,8 +370,8 @@ def test_what_cannot_be_compared_is_refused(empty: sqlite3.Connection) -> None:
     record(empty, driving)
     for run_ids in ([1], [1, 1], [1, 2, 1]):
         with pytest.raises(InvalidInputError, match="two different runs"):
-            first_difference(empty, run_ids)
+            compare_rows(empty, run_ids)
     with pytest.raises(UnknownRunError):
-        first_difference(empty, [1, 9])
+        compare_rows(empty, [1, 9])
     with pytest.raises(UnknownSignalError, match="pose"):
-        first_difference(empty, [1, 2], names=["poze.x"])
+        compare_rows(empty, [1, 2], names=["poze.x"])

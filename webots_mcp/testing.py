@@ -449,17 +449,15 @@ class RobotRecording:
             UnknownSignalError: A name matches none.
             NoDatabaseError, NothingRecordedError: Nothing has been recorded yet.
         """
-        last_s = until_s if math.isfinite(until_s) else None
         with self._subject() as (connection, subject):
             run_ids = [run.id for run in runs_of(connection, subject.robot_id)]
             if len(run_ids) < 2:
                 raise AssertionError(f"run {run_ids[0]} is the only one: reset() begins another")
             options = {"within": within, "names": signals, "deadline_s": math.inf}
-            found = compare_repeats(connection, run_ids, until_s=last_s, **options)
+            found = compare_repeats(connection, run_ids, until_s=until_s, **options)
         for each in found:
             if not each.is_whole or any(one.beyond_s is not None for one in each.parted):
-                one, other = each.run_ids
-                why = f"run {other} does not repeat run {one}: {each.verdict}"
+                why = "run {1} does not repeat run {0}: ".format(*each.run_ids) + each.verdict
                 raise AssertionError("\n  ".join([why, *each.notes]))
 
     # -- commands ------------------------------------------------------------------------------

@@ -53,7 +53,7 @@ def in_processes(project: Path) -> tuple[str, ...]:
 def test_processes_of_their_own_repeat_to_the_last_digit(project: Path, repeat: Repeat) -> None:
     answer = repeat(*in_processes(project), "-n", "2", "--for", "1", "--json")
     found = answer["process"]
-    assert (found["run_ids"], found["are_equal"]) == ([1, 2], True)
+    assert (found["run_ids"], found["parted"]) == ([1, 2], [])
     assert "2 runs: equal to the last digit in the 62 rows and 2 signals" in found["verdict"]
 
 
@@ -61,7 +61,7 @@ def test_noise_of_a_controller_is_found_in_processes_too(project: Path, repeat: 
     controller = project / "controllers" / "rover" / "rover.py"
     controller.write_text(CONTROLLER.replace(*NOISY))
     answer = repeat(*in_processes(project), "-n", "3", "--for", "1", "--json")
-    assert answer["process"]["are_equal"] is False
+    assert answer["process"]["parted"] == [2, 3]
     for each in answer["process"]["repeats"]:
         assert each["verdict"].startswith("equal to the last digit until 0.416 s; then noise by ")
         signal, *growth = each["growth"].values()
@@ -75,10 +75,10 @@ def test_a_reset_that_leaves_something_is_to_blame_and_a_reload_is_not(
 ) -> None:
     options = ("--by", "reset", "--by", "reload", "--by", "process", "-n", "2", "--for", "1")
     answer = repeat(*options, "--stand-in", "--json")
-    assert [answer[way]["are_equal"] for way in ("reset", "reload", "process")] == [
+    assert [bool(answer[way]["parted"]) for way in ("reset", "reload", "process")] == [
+        True,
         False,
-        True,
-        True,
+        False,
     ]
     (reset,) = answer["reset"]["repeats"]
     assert reset["verdict"].startswith("unlike from the first row on, at 0.016 s: x by ")

@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from webots_mcp.store.questions.first_difference import Parting
 
 By = list[Literal["reset", "reload", "process"]] | None
+_Names = list[str] | None
+_World = Path | None
 _WAITING: Final = Waiting()
-_OF_BEGINNING: Final = ("robot", "began_by")  # a second robot of a name has another one
 
 
 def diff(
@@ -26,8 +27,7 @@ def diff(
     /,
     *,
     signals: Annotated[
-        list[str] | None,
-        Parameter("--signal", metavar="SIGNAL", negative=(), help="Only these, with '*'."),
+        _Names, Parameter("--signal", negative=(), help="Only these, with '*'.")
     ] = None,
     json: Json = False,
     recorded: Where = HERE,
@@ -47,9 +47,7 @@ def diff(
 
 
 def repeat(
-    world: Annotated[
-        Path | None, Parameter("WORLD", help="Of processes (the newest run's).")
-    ] = None,
+    world: Annotated[_World, Parameter("WORLD", help="Of processes (the newest run's).")] = None,
     /,
     *,
     for_s: Annotated[float, Parameter("--for", metavar="S", help="Simulated seconds of each.")],
@@ -75,12 +73,12 @@ def repeat(
         raise InvalidInputError(f"-n {number}: it takes two runs to see whether they are the same")
     if (world or stand_in) and "process" not in ways:
         raise InvalidInputError("WORLD and --stand-in are for --by process")
-    runs = {
-        way: _in_processes(world, asked, for_s, number, stand_in=stand_in)
-        if way == "process"
-        else [_live(way, asked, for_s) for _ in range(number)]
-        for way in ways
-    }
+    runs = dict[str, list[int]]()
+    for way in ways:
+        if way == "process":
+            runs[way] = _in_processes(world, asked, for_s, number, stand_in=stand_in)
+        else:
+            runs[way] = [_live(way, asked, for_s) for _ in range(number)]
     if len(ways) > 1:
         runs["the first of each"] = [run_ids[0] for run_ids in runs.values()]
     found: dict[str, list[Parting]] = {}
@@ -121,13 +119,13 @@ def _live(way: str, asked: Waiting, for_s: float) -> int:
     from webots_mcp.cli.asking import ask
     from webots_mcp.questions.control_simulation import webots_run, webots_world_reload
 
-    to = {"robot": asked.robot, "timeout_wall_s": asked.timeout_wall_s}
+    to: dict[str, Any] = {"robot": asked.robot, "timeout_wall_s": asked.timeout_wall_s}
     answer: dict[str, Any] = {}
     if way == "reload":
         answer = ask(webots_world_reload, to, asked).data or {}
     if way == "reset" or answer["outcome"] == "done":
-        run = {"for_s": for_s, "reset": way == "reset", **to}
-        answer = ask(webots_run, run, asked).data or {}
+        to |= {"for_s": for_s, "reset": way == "reset"}
+        answer = ask(webots_run, to, asked).data or {}
     if answer.get("stopped") != "simulation time reached":
         why = (answer.get(each) for each in ("error", "stopped", "stop_reason", "hint"))
         raise CommandRefusedError("; ".join(["a run did not reach its end", *filter(None, why)]))
@@ -136,36 +134,30 @@ def _live(way: str, asked: Waiting, for_s: float) -> int:
 
 def _blame(found: Mapping[str, Sequence[Parting]]) -> dict[str, str]:
     """Whose fault it is that runs part, where processes of their own tell."""
-    from webots_mcp.store.questions.first_difference import are_equal
-
     first, *ways = found
     if first != "process" or not ways:
         return {}
-    if not are_equal(found[first]):
+    if not all(each.is_equal for each in found[first]):
         return {"verdict": "processes of their own part as well, or tell nothing"}
     across = dict(zip(ways, found[ways.pop()], strict=False))
-    unlike = dict.fromkeys(name for each in across.values() for name in each.unlike)
-    blamed = [way for way in ways if False in (are_equal(found[way]), across[way].is_equal)]
-    if named := [name for name in unlike if name not in _OF_BEGINNING]:
-        return {
-            "verdict": f"runs were not alike to begin with ({listed(named)}): nothing is blamed"
-        }
-    if not blamed:
-        return {"verdict": "what was compared is the same, however a run begins"}
+    unlike = {name: None for each in across.values() for name in each.unlike}
+    blamed = [way for way in ways if any(each.parted for each in (across[way], *found[way]))]
+    if named := [name for name in unlike if name not in ("robot", "began_by")]:
+        return {"verdict": f"nothing is blamed: not alike to begin with ({listed(named)})"}
     said = f"the {' and the '.join(blamed)} is to blame, as processes of their own are the same: "
     said += "something of the run before is left, in the world or in the controller's own variables"
-    return {"verdict": said}
+    return {"verdict": said if blamed else "what was compared is the same, however a run begins"}
 
 
 def _answer(found: Sequence[Parting]) -> dict[str, Any]:
     from webots_mcp.questions.compare_runs import parting_facts
-    from webots_mcp.store.questions.first_difference import are_equal, verdict_on
+    from webots_mcp.store.questions.first_difference import verdict_on
 
     facts = [{"run_id": each.run_ids[1], **parting_facts(each)} for each in found]
     shown = ("run_id", "verdict", "growth", "notes")
     return {
         "run_ids": [found[0].run_ids[0], *(each["run_id"] for each in facts)],
-        "are_equal": are_equal(found),
+        "parted": [each.run_ids[1] for each in found if each.parted],
         "verdict": verdict_on(found),
         "repeats": [{name: each[name] for name in shown if each[name]} for each in facts],
     }

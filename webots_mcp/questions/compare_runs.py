@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import PurePath
-from typing import Annotated, Any, Final, cast
+from typing import Annotated, Any, Final
 
 from pydantic import Field
 
@@ -159,9 +159,7 @@ def webots_compare_runs(
     min_effect_sd: Annotated[
         float, Field(gt=0, le=100, description="What matters, in deviations of like runs.")
     ] = MIN_EFFECT_SD,
-    first_difference: Annotated[
-        bool, Field(description="Where two runs part, to the last digit, row by row.")
-    ] = False,
+    first_difference: Annotated[bool, Field(description="Where two part, row by row.")] = False,
     robot: RobotName = None,
 ) -> ComparisonAnswer:
     """Did my edit help? Runs beside each other; or how fast, how far and in which modes one ran.
@@ -183,8 +181,8 @@ def webots_compare_runs(
             if not (first_difference and run_ids):
                 return _compared(view, run_ids, trial_set, signals, limit, options, min_effect_sd)
             limit_s = math.inf if is_for_a_person() else COMPARE_DEADLINE_S
-            names = signals or ("*",)
-            found = compare_rows(view.connection, run_ids, names=names, deadline_s=limit_s)
+            names, connection = signals or ("*",), view.connection
+            found = compare_rows(connection, run_ids, names=names, deadline_s=limit_s)
             return parting_facts(found, limit)
 
         return answer_about(view, ComparisonAnswer, find)
@@ -287,36 +285,27 @@ def parting_facts(found: Parting, limit: int | None = None) -> dict[str, Any]:
     """Where two runs part, as an answer has it."""
     notes, most = notes_of(found.notes), None if is_for_a_person() else _MOST_PARTED
     known = {short_name(n): shown([*pair]) for n, pair in list(found.unlike.items())[:most]}
-    parted = [each._asdict() for each in found.parted[: limit or _MOST_PARTED]]
-    rows = [[_cell(*each) for each in list(signal.items())[:-1]] for signal in parted]
+    names, parted = PartedSignal._fields[1:-1], found.parted[: limit or _MOST_PARTED]
+    rows = [[short_name(each.signal), *map(_cell, names, each[1:-1])] for each in parted]
     rows = fitting(rows, room_tokens(limit, [known, notes]))
     left, worst = len(found.parted) - len(rows), found.worst
-    growth = (
-        [(f"until {s:.3f} s", _cell("", by)) for s, by in worst.growth.items()] if worst else []
-    )
     return {
         "verdict": cut_for_a_model(found.verdict, _LONGEST_VERDICT),
         "unlike": known or None,
-        "compared": {
-            "row_count": found.rows, "signal_count": found.signals,
-            "from_s": seconds(found.from_s), "until_s": seconds(found.until_s),
-        },
-        "parted": without_empty(PartedSignal._fields[:-1], rows),
-        "growth": worst and {"signal": short_name(worst.signal), **dict(growth)},
+        "compared": {"row_count": found.rows, "signal_count": found.signals,
+                     "from_s": seconds(found.from_s), "until_s": seconds(found.until_s)},
+        "parted": without_empty(("signal", *names), rows),
+        "growth": worst and {"signal": short_name(worst.signal), **worst.growth},
         "notes": notes,
         "hint": f"{left} more signals part: limit or signals for others" if left else None,
     }  # fmt: skip
 
 
 def _cell(name: str, value: Any) -> Any:
-    """A difference as it is shown, however small; the values themselves have all their digits."""
+    """A time, or a difference as it is shown, however small; values have all their digits."""
     if name.endswith("_s"):
         return seconds(value)
-    if isinstance(value, tuple):
-        return [short_name(e) if isinstance(e, str) else e for e in cast("tuple[Any, ...]", value)]
-    if not isinstance(value, float):
-        return value
-    return float(f"{value:.4g}") if math.isfinite(value) else None
+    return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
 def _compared(

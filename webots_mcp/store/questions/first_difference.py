@@ -31,14 +31,13 @@ from webots_mcp.store.signals import Signal
 
 _MATTERS: Final = 0.001  # of metres, of radians, of the largest value where there is no scale
 _SHORT_ROWS: Final = 2  # between the last row and the time up to which rows are compared
-_MARKS: Final = 5  # times at which it is said how far a signal is apart
-_MOST_REPEATS: Final = 5  # of trials that are compared
-_BEGAN_BY: Final = "began_by"
+_SHOWN: Final = 5  # times at which it is said how far a signal is apart, and like trials
+_LONGEST_TEXT: Final = 60  # of a value that is shown
 _REDUCED: Final = "of arrays of more than 16 items count, min, max, mean and argmin are compared"
 _FACTS: Final = (
     "SELECT b.name AS robot, substr(controller_sha256, 1, 10) AS controller_sha256, "
     "substr(git_commit, 1, 10) AS git_commit, world, basic_time_step_ms, throttle_interval, "
-    f"start_reason AS {_BEGAN_BY}, versions FROM run r JOIN session s ON s.id = r.session_id "
+    "start_reason AS began_by, versions FROM run r JOIN session s ON s.id = r.session_id "
     "JOIN robot b ON b.id = r.robot_id WHERE r.id = ?"
 )
 
@@ -53,7 +52,7 @@ class PartedSignal(NamedTuple):
         tolerance: What is beyond it matters; None of what is never a number in both.
         beyond_s: The first row in which it is, or in which one of them is no number.
         row_count: In how many rows it is not the same.
-        growth: How far at most up to some simulation times.
+        growth: How far at most until some simulation times.
     """
 
     signal: str
@@ -66,7 +65,7 @@ class PartedSignal(NamedTuple):
     tolerance: float | None
     beyond_s: float | None
     row_count: int
-    growth: dict[float, float]
+    growth: dict[str, float]
 
     @property
     def in_tolerances(self) -> float:
@@ -116,7 +115,7 @@ class Parting:
     @property
     def verdict(self) -> str:
         """Where they part, in a sentence; it says no more than was compared."""
-        begun = [name for name in self.unlike if name != _BEGAN_BY]
+        begun = [name for name in self.unlike if name != "began_by"]
         said = f"not alike to begin with ({listed(begun)}); " if begun else ""
         if not (self.rows and self.signals):
             return f"{said}nothing could be compared"
@@ -132,14 +131,9 @@ class Parting:
         if first.from_s <= self.from_s:
             said = f"unlike from the first row on, at {first.from_s:.3f} s: "
         said += first.said(first.by, "by") + (f" and {more} more" if more else "")
-        limits = {
-            e.said(e.tolerance, "beyond"): e.beyond_s
-            for e in self.parted
-            if e.tolerance is not None
-        }
-        beyond = [(since_s, what) for what, since_s in limits.items() if since_s is not None]
-        if beyond:
-            said += "; {1} from {0:.3f} s on".format(*min(beyond))
+        beyond = [e for e in self.parted if e.beyond_s is not None and e.tolerance is not None]
+        for each in sorted(beyond, key=lambda each: each.beyond_s or 0.0)[:1]:
+            said += f"; {each.said(each.tolerance, 'beyond')} from {each.beyond_s:.3f} s on"
         if worst and (worst is not first or first.largest != first.by):
             said += f"; {worst.said(worst.largest, 'by at most')}"
         return said
@@ -151,7 +145,7 @@ def compare_rows(
     run_ids: Sequence[int],
     *,
     names: Sequence[str] = ("*",),
-    until_s: float | None = None,
+    until_s: float = math.inf,
     within: float | None = None,
     deadline_s: float = COMPARE_DEADLINE_S,
 ) -> Parting:
@@ -161,7 +155,7 @@ def compare_rows(
         connection: Any.
         run_ids: Two different runs, of whichever robots.
         names: Signals, with `*`.
-        until_s: The last simulation time that is compared; None for all.
+        until_s: The last simulation time that is compared.
         within: What is beyond it matters, in the unit of each signal; None for 1 mm of lengths,
             0.001 rad of angles, and a thousandth of the largest value of all else.
         deadline_s: What was not read by then is not compared, and said.
@@ -177,8 +171,7 @@ def compare_rows(
     # Half of the time is for rows that are in no chunk yet.
     one, in_one = _read(connection, run_ids[0], until_s, deadline.part(0.25))
     other, in_other = _read(connection, run_ids[1], until_s, deadline.part(0.33))
-    known = in_one | in_other
-    meant = resolve_signals(known, names) if tuple(names) != ("*",) else list(known.values())
+    meant = resolve_signals(in_one | in_other, names)
     shared = [each for each in meant if each.name in in_one and each.name in in_other]
     pair = _aligned((one, other))
     found: dict[str, PartedSignal | None] = {}
@@ -195,7 +188,7 @@ def compare_rows(
     left_out += pair.alone or ["no row has a partner that could be read"] * (not len(pair.times))
     from_s, until = (float(pair.times[at]) if len(pair.times) else math.nan for at in (0, -1))
     row_s = (until - from_s) / max(len(pair.times), 1)
-    if until_s is not None and until < until_s - _SHORT_ROWS * row_s - SAME_TIME_S:
+    if until < until_s - _SHORT_ROWS * row_s - SAME_TIME_S and until_s < math.inf:
         left_out += [f"a run ends before {until_s:g} s"]
     remarks = [_REDUCED] * any(each.reduction for each in shared)
     if len(pair.times) and (last_s := max(one.bounds_s[1], other.bounds_s[1])) > until + row_s / 2:
@@ -208,14 +201,14 @@ def compare_rows(
 
 
 def _read(
-    connection: sqlite3.Connection, run_id: int, until_s: float | None, deadline: Deadline
+    connection: sqlite3.Connection, run_id: int, until_s: float, deadline: Deadline
 ) -> tuple[Frame, dict[str, Signal]]:
     """A run, and the signals that it has."""
     subject = Subject(fetch_run(connection, run_id).robot_id, "", run_id)
     segment = whole_run(connection, run_id)
     if segment is None:
         raise NothingRecordedError(f"run {run_id} has no state row: there is nothing to compare")
-    if until_s is not None and until_s < segment.end_s:
+    if until_s < segment.end_s:
         segment = segment.through(until_s)
     frame = read_frame(connection, segment, deadline)
     return frame, held_by(connection, frame, signals_of_frame(connection, subject, frame))
@@ -270,9 +263,8 @@ def _parted(signal: Signal, pair: _Pair, within: float | None) -> PartedSignal |
     if any(each.codes is not None for each in recorded):
         codes = pair.of([_shared_codes(each, labels) for each in recorded])
         differs = (codes[0] != codes[1]) | (differs & (codes[0] == IS_NUMBER))
-    if any(frame.unread_of(name) for frame in pair.frames):
-        for was_read in pair.of([frame.was_read(name) for frame in pair.frames]):
-            differs &= was_read
+    for was_read in pair.of([frame.was_read(name) for frame in pair.frames]):
+        differs &= was_read
     rows = np.flatnonzero(differs)
     if not len(rows):
         return None
@@ -283,35 +275,30 @@ def _parted(signal: Signal, pair: _Pair, within: float | None) -> PartedSignal |
             apart = np.minimum(apart % turn, turn - apart % turn)
     for each in codes:
         apart[each[rows] != IS_NUMBER] = np.nan
-    is_number = ~np.isnan(apart)
-    sizes, has_numbers = np.where(is_number, apart, 0.0), bool(is_number.any())
+    is_number = np.isfinite(apart)
+    sizes = np.where(is_number, apart, 0.0)
     largest = int(np.argmax(sizes))
     tolerance = _tolerance(signal, unit, (one, other)) if within is None else within
     beyond = ~is_number | (apart > tolerance)
     places = pair.of([np.arange(len(frame)) for frame in pair.frames])
     values = [_value(each, int(at[rows[0]])) for each, at in zip(recorded, places, strict=True)]
+    most: tuple[Any, Any, Any] = (float(sizes[largest]), float(times[largest]), tolerance)
+    grown = {f"until {s:.3f} s": sizes[times <= s].max(initial=0.0) for s in _marks(pair.times)}
     return PartedSignal(
-        name,
-        unit,
-        from_s=float(times[0]),
-        values=(values[0], values[1]),
-        by=float(apart[0]) if is_number[0] else None,
-        largest=float(sizes[largest]) if has_numbers else None,
-        largest_at_s=float(times[largest]) if has_numbers else None,
-        tolerance=tolerance if has_numbers else None,
-        beyond_s=float(times[int(np.argmax(beyond))]) if beyond.any() else None,
-        row_count=len(rows),
-        growth={s: float(sizes[times <= s].max(initial=0.0)) for s in _marks(pair.times)},
-    )
+        name, unit, float(times[0]), (values[0], values[1]),
+        float(apart[0]) if is_number[0] else None,
+        *(most if is_number.any() else (None, None, None)),
+        float(times[int(np.argmax(beyond))]) if beyond.any() else None, len(rows),
+        {until: float(f"{size:.4g}") for until, size in grown.items()},
+    )  # fmt: skip
 
 
 def _shared_codes(values: Decoded, known: dict[object, int]) -> Indexes:
     """Codes that are the same of the same label in both runs; a flag is no number."""
     if values.codes is None:
         return np.full(len(values.numbers), IS_NUMBER, np.intp)
-    labels = [known.setdefault((type(each), each), len(known)) for each in values.labels]
-    shared = [IS_NUMBER, IS_ABSENT, *(FIRST_LABEL + label for label in labels)]
-    return np.array(shared, np.intp)[values.codes]
+    labels = [known.setdefault((type(e), e), len(known) + FIRST_LABEL) for e in values.labels]
+    return np.array([IS_NUMBER, IS_ABSENT, *labels], np.intp)[values.codes]
 
 
 def _value(values: Decoded, row: int) -> Value:
@@ -320,7 +307,8 @@ def _value(values: Decoded, row: int) -> Value:
     if code == IS_NUMBER:
         return number if math.isfinite(number := float(values.numbers[row])) else f"({number})"
     label = Replaced("absent") if code == IS_ABSENT else values.labels[code - FIRST_LABEL]
-    return f"({label.why})" if isinstance(label, Replaced) else label
+    shown = f"({label.why})" if isinstance(label, Replaced) else label
+    return shown[:_LONGEST_TEXT] if isinstance(shown, str) else shown
 
 
 def _tolerance(signal: Signal, unit: str | None, values: Sequence[Array]) -> float:
@@ -337,7 +325,7 @@ def _marks(times: Array) -> list[float]:
     start_s, end_s = times[[0, -1]].tolist()
     after_s = (each * 10.0**power for power in range(-2, 9) for each in (1, 2, 5))
     before = [start_s + each for each in after_s if start_s + each < end_s - SAME_TIME_S]
-    return [*before[1 - _MARKS :], end_s]
+    return [*before[1 - _SHOWN :], end_s]
 
 
 def _unlike(connection: sqlite3.Connection, run_ids: Sequence[int]) -> dict[str, tuple[Any, Any]]:
@@ -364,12 +352,6 @@ def compare_repeats(
     return [compare_rows(connection, (run_ids[0], each), **options) for each in run_ids[1:]]
 
 
-def are_equal(found: Sequence[Parting]) -> bool | None:
-    """Whether all are the same to the last digit; None where not all could be compared."""
-    equal = {each.is_equal for each in found}
-    return False if False in equal else None if None in equal else True
-
-
 def verdict_on(found: Sequence[Parting]) -> str:
     """Whether runs repeat the first, and else from when on and how far they part, in a sentence."""
     parted = [each for each in found if each.parted]
@@ -384,6 +366,6 @@ def repeats_noted(connection: sqlite3.Connection, set_id: int) -> list[str]:
     with suppress(NothingRecordedError):
         for name, run_ids in scored_runs(connection, set_id).items():
             if len(run_ids) > 1:
-                found = compare_repeats(connection, run_ids[:_MOST_REPEATS], deadline_s=1.0)
+                found = compare_repeats(connection, run_ids[:_SHOWN], deadline_s=1.0)
                 return [f"repeats of {name or 'the same'}: {verdict_on(found)}"]
     return []

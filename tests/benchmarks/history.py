@@ -22,7 +22,7 @@ from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.detection.events import find_events, timeline
 from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.logs import LogFilter, Window, count_lines, newest_lines
-from webots_mcp.store.questions.first_difference import first_difference
+from webots_mcp.store.questions.first_difference import compare_rows
 from webots_mcp.store.questions.series import query_history
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.catalogue import list_signals
@@ -77,7 +77,7 @@ def measure_history(bench: Bench) -> Iterable[Line]:
         yield _stuck(db, rows)
     _repeat_run(file)
     with closing(connect(file, "reader")) as db:
-        ask = partial(first_difference, db, [1, 2], deadline_s=math.inf)
+        ask = partial(compare_rows, db, [1, 2], deadline_s=math.inf)
         assert ask().rows == rows
         ours_s = median(time_calls(lambda _: ask(), bench.count(5)))
         line = f"first difference of two runs, 39 signals, {rows:,} rows each"

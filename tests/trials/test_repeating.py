@@ -82,9 +82,7 @@ def test_a_reset_that_leaves_something_is_to_blame_and_a_reload_is_not(
     ]
     (reset,) = answer["reset"]["repeats"]
     assert reset["verdict"].startswith("unlike from the first row on, at 0.016 s: x by ")
-    assert answer["verdict"].startswith(
-        "the reset is to blame, as processes of their own are the same"
-    )
+    assert answer["verdict"].startswith("the reset is to blame: processes of their own repeat")
 
     said = repeat("--by", "reset", "-n", "3", "--for", "0.5")
     assert "reset:\n" in said and "verdict 2 of 2 part from run " in said

@@ -144,8 +144,7 @@ def _blame(found: Mapping[str, Sequence[Parting]]) -> dict[str, str]:
     blamed = [way for way in ways if any(each.parted for each in (across[way], *found[way]))]
     if named := [name for name in unlike if name not in ("robot", "began_by")]:
         return {"verdict": f"nothing is blamed: not alike to begin with ({listed(named)})"}
-    said = f"the {' and the '.join(blamed)} is to blame, as processes of their own are the same: "
-    said += "something of the run before is left, in the world or in the controller's own variables"
+    said = f"the {' and the '.join(blamed)} is to blame: processes of their own repeat"
     return {"verdict": said if blamed else "what was compared is the same, however a run begins"}
 
 

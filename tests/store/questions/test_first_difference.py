@@ -124,7 +124,7 @@ def test_one_bit_of_noise_is_found_to_the_row(
         f"equal to the last digit until 3.216 s; then compass.x by {bit:.3g}; "
         f"pose.x beyond 0.001 m from 5.536 s on; pose.x by at most {pose.largest:.3g} m"
     )
-    assert [*pose.growth] == [f"until {s} s" for s in ("0.516", "1.016", "2.016", "5.016", "8.000")]
+    assert [*pose.growth] == [f"until {s} s" for s in ("0.500", "1.000", "2.000", "5.000", "8.000")]
     *none, at_5_s, at_the_end = pose.growth.values()
     assert none == [0, 0, 0] and 0 < at_5_s < at_the_end == pytest.approx(pose.largest, rel=1e-3)
     assert compare_rows(empty, [2, 1]).parted[1].from_s == at(NOISE_ROW + 1)

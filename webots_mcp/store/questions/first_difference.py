@@ -321,8 +321,8 @@ def _tolerance(signal: Signal, unit: str | None, values: Sequence[Array]) -> flo
 
 
 def _marks(times: Array) -> list[float]:
-    """Times of a comparison 1, 2, 5, 10, ... seconds after its first row, and its end."""
-    start_s, end_s = times[[0, -1]].tolist()
+    """Times of a comparison 1, 2, 5, 10, ... seconds after its begin, and its end."""
+    start_s, end_s = math.floor(times[0]), float(times[-1])
     after_s = (each * 10.0**power for power in range(-2, 9) for each in (1, 2, 5))
     before = [start_s + each for each in after_s if start_s + each < end_s - SAME_TIME_S]
     return [*before[1 - _SHOWN :], end_s]

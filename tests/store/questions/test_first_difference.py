@@ -213,15 +213,15 @@ def test_what_was_not_alike_to_begin_with_comes_first(empty: sqlite3.Connection)
     empty.execute("UPDATE run SET world = '/w/b.wbt', basic_time_step_ms = 32 WHERE id = 2")
     found = compare_rows(empty, [1, 2])
     assert [*found.unlike] == [
-        "parameter kp", "parameter ki", "controller_sha256", "git_commit", "world",
-        "basic_time_step_ms", "version of python", "version of sqlite",
+        "controller_sha256", "git_commit", "world", "basic_time_step_ms", "parameter kp",
+        "parameter ki", "version of python", "version of sqlite",
     ]  # fmt: skip
     assert found.unlike["parameter ki"] == (
         "2, then 3 from 1.000 s on",
         "2, then 3 from 2.000 s on",
     )
     assert found.unlike["version of sqlite"] == (None, "3.45")
-    assert found.verdict.startswith("not alike to begin with (parameter kp, parameter ki, contr")
+    assert found.verdict.startswith("not alike to begin with (controller_sha256, git_commit, wo")
     assert "; equal to the last digit until 3.216 s" in found.verdict
 
 

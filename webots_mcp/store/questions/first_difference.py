@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.conditions.signal_values import SAME_TIME_S
-from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.errors import InvalidInputError, NothingRecordedError, UnknownRunError
 from webots_mcp.naming import METRES, Value, listed
 from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
 from webots_mcp.store.chunks import FIRST_LABEL, IS_ABSENT, IS_NUMBER, Decoded, Replaced
@@ -329,13 +329,13 @@ def _marks(times: Array) -> list[float]:
 
 
 def _unlike(connection: sqlite3.Connection, run_ids: Sequence[int]) -> dict[str, tuple[Any, Any]]:
-    """Parameters first, then what was recorded of code, world and programs."""
+    """What was recorded of code and world, the parameters, and versions of programs."""
     found: list[dict[str, Any]] = []
     for run_id, had in parameters_of(connection, run_ids).items():
         cursor = connection.execute(_FACTS, (run_id,))
         facts = dict(zip((each[0] for each in cursor.description), cursor.fetchone(), strict=True))
         versions = json.loads(facts.pop("versions") or "{}")
-        found += [{f"parameter {n}": each.described for n, each in had.items()} | facts]
+        found += [facts | {f"parameter {n}": each.described for n, each in had.items()}]
         found[-1] |= {f"version of {name}": value for name, value in versions.items()}
     one, other = found
     pairs = {name: (one.get(name), other.get(name)) for name in one | other}
@@ -363,7 +363,7 @@ def verdict_on(found: Sequence[Parting]) -> str:
 
 def repeats_noted(connection: sqlite3.Connection, set_id: int) -> list[str]:
     """Whether the trials with the best repeated parameters of a set are the same, as a note."""
-    with suppress(NothingRecordedError):
+    with suppress(NothingRecordedError, UnknownRunError):  # retention has deleted one
         for name, run_ids in scored_runs(connection, set_id).items():
             if len(run_ids) > 1:
                 found = compare_repeats(connection, run_ids[:_SHOWN], deadline_s=1.0)

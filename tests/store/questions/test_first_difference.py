@@ -346,7 +346,7 @@ def test_repeats_are_judged_against_the_first_and_so_are_trials(empty: sqlite3.C
     found = compare_repeats(empty, [1, 2, 3])
     assert [each.is_equal for each in found] == [True, False]
     assert verdict_on(found).startswith(
-        "1 of 2 part from run 1; run 3: equal to the last digit unt"
+        "1 of 2 others part from run 1; run 3: equal to the last dig"
     )
 
     def noted(*run_ids: int) -> list[str]:
@@ -358,7 +358,7 @@ def test_repeats_are_judged_against_the_first_and_so_are_trials(empty: sqlite3.C
     (same,) = noted(1, 2)
     assert same.startswith("repeats of speed 1.0: 2 runs: equal to the last digit in the 500 rows")
     (parted,) = noted(1, 2, 3)
-    assert parted.startswith("repeats of speed 1.0: 1 of 2 part from run 1; run 3: equal to the ")
+    assert parted.startswith("repeats of speed 1.0: 1 of 2 others part from run 1; run 3: ")
     assert noted(1) == [] == repeats_noted(empty, create_trial_set(empty, "{}", [{}]))
 
 

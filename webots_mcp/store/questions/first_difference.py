@@ -358,7 +358,7 @@ def verdict_on(found: Sequence[Parting]) -> str:
     if not parted:
         return f"{len(found) + 1} runs: {min(found, key=lambda e: (e.is_whole, e.rows)).verdict}"
     one, other = (first := min(parted, key=lambda each: each.parted[0].from_s)).run_ids
-    return f"{len(parted)} of {len(found)} part from run {one}; run {other}: {first.verdict}"
+    return f"{len(parted)} of {len(found)} others part from run {one}; run {other}: {first.verdict}"
 
 
 def repeats_noted(connection: sqlite3.Connection, set_id: int) -> list[str]:

@@ -95,8 +95,8 @@ def _repeat_run(file: Path) -> None:
             ("row_group", {"id": f"id + {groups}", "run_id": "2"}),
             ("chunk", {"id": "NULL", "group_id": f"group_id + {groups}", "run_id": "2"}),
         ):
-            names = [each[1] for each in connection.execute(f"PRAGMA table_info({table})")]
-            values = ", ".join(changed.get(name, name) for name in names)
+            names = [str(each[1]) for each in connection.execute(f"PRAGMA table_info({table})")]
+            values = ", ".join(changed.get(name) or name for name in names)
             connection.execute(f"INSERT INTO {table} SELECT {values} FROM {table}")
         connection.execute("COMMIT")
 

@@ -49,6 +49,7 @@ from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.export import Source
 from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines
 from webots_mcp.store.parameters import parameters_of
+from webots_mcp.store.questions.first_difference import compare_repeats
 from webots_mcp.store.reading.catalogue import resolve_signals, signals_of_frame
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import Scope, find_range, find_subject, whole_run
@@ -429,6 +430,35 @@ class RobotRecording:
             window = Window(-math.inf, math.inf)
             asked = LogFilter(subject.run_id, window, text, lowest_level=level)
             return newest_lines(connection, asked, _NO_LIMIT)
+
+    def assert_repeats(
+        self, *, until_s: float = math.inf, within: float = 0.0, signals: Sequence[str] = ("*",)
+    ) -> None:
+        """Fail unless each run of the robot is the same as its first one, row by row.
+
+        A reset begins the next run; so does another simulation with the same `data_dir`.
+
+        Args:
+            until_s: The last simulation time that is compared.
+            within: So much may numbers differ, each in its own unit; texts and flags never.
+            signals: Names, with `*`; those of no wall clock.
+
+        Raises:
+            AssertionError: With from when on they part, in which signal, and how far; or nothing
+                shows it: there is one run, it ends before, or not all of it could be compared.
+            UnknownSignalError: A name matches none.
+            NoDatabaseError, NothingRecordedError: Nothing has been recorded yet.
+        """
+        with self._subject() as (connection, subject):
+            run_ids = [run.id for run in runs_of(connection, subject.robot_id)]
+            if len(run_ids) < 2:
+                raise AssertionError(f"run {run_ids[0]} is the only one: reset() begins another")
+            options = {"within": within, "names": signals, "deadline_s": math.inf}
+            found = compare_repeats(connection, run_ids, until_s=until_s, **options)
+        for each in found:
+            if not each.is_whole or any(one.beyond_s is not None for one in each.parted):
+                why = "run {1} does not repeat run {0}: ".format(*each.run_ids) + each.verdict
+                raise AssertionError("\n  ".join([why, *each.notes]))
 
     # -- commands ------------------------------------------------------------------------------
 

@@ -41,7 +41,7 @@ def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("typed", "offered"),
     [
         ([""], set(COMMANDS)),
-        (["rep"], {"report"}),
+        (["repo"], {"report"}),
         (["report", "--over"], {"--overwrite"}),
         (["launch", "--mode", ""], {"fast", "realtime", "pause"}),
         (["launch", "wor"], {"worlds"}),

@@ -173,3 +173,51 @@ def test_a_simulation_begins_with_the_parameters_of_the_test(
     assert (waiting.status, reset.status) == ("done", "done")
     before, after = simulation.recording.runs()
     assert (before.parameters(), after.parameters()) == ({"kp": 5.0}, {"kp": 6.0})
+
+
+SWAYING = """
+import math
+from pathlib import Path
+from controller import Supervisor
+from webots_mcp import MCPBridge
+
+robot = Supervisor()
+bridge = MCPBridge(robot, throttle_interval=1)
+count = Path(__file__).with_suffix(".count")
+starts = int(count.read_text()) if count.exists() else 0
+count.write_text(str(starts + 1))
+while robot.step(16) != -1:
+    time_s = robot.getTime()
+    off = 1e-6 * starts * (time_s > 0.5) + 0.01 * (starts > 1) * (time_s > 0.7)
+    bridge.publish({"sway_m": math.sin(time_s) + off, "mode": "sway"})
+    bridge.get_command()
+"""
+
+
+def test_runs_that_do_not_repeat_fail_with_where_they_part(
+    webots_simulation: SimulationFactory, controller: Callable[[str], Path]
+) -> None:
+    files = {"rover": controller(SWAYING)}
+    simulation = webots_simulation(controllers=files)
+    recording = simulation.recording
+    simulation.run_for(1)
+    with pytest.raises(AssertionError, match=r"run 1 is the only one: reset\(\) begins another"):
+        recording.assert_repeats()
+    simulation.reset()
+    simulation.run_for(0.48)
+    recording.assert_repeats(until_s=0.48)
+    with pytest.raises(AssertionError, match=r"(?s)until 0.480 s;.*  a run ends before 1 s"):
+        recording.assert_repeats(until_s=1)
+    simulation.run_for(0.52)
+    with pytest.raises(
+        AssertionError,
+        match=r"run 2 does not repeat run 1: equal to the last digit until 0.512 s; then sway_m by "
+        r"1e-06 m; sway_m beyond 0 m from 0.512 s on",
+    ):
+        recording.assert_repeats(until_s=1)
+    recording.assert_repeats(until_s=1, within=0.001)
+    recording.assert_repeats(until_s=1, signals=["mode"])
+    simulation.reset()
+    simulation.run_for(1)
+    with pytest.raises(AssertionError, match=r"run 3 does not .*beyond 0.001 m from 0.704 s on"):
+        recording.assert_repeats(until_s=1, within=0.001)

@@ -51,6 +51,7 @@ DEFAULTS: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
     ("webots_monitor", {"lookback_wall_s": 3600}),
     ("webots_list_runs", {}),
     ("webots_compare_runs", {"run_ids": [1, 2]}),
+    ("webots_compare_runs", {"run_ids": [1, 2], "first_difference": True}),
     ("webots_plot", {}),
     ("webots_query_sql", {"sql": "SELECT * FROM state"}),
     ("webots_query_sql", {"sql": "SELECT * FROM robot_run"}),

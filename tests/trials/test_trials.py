@@ -31,6 +31,7 @@ def test_sets_are_tried_scored_ranked_and_their_runs_kept(
     assert "did not reach its end, only 0.3" in crashed["failures"][0]
     assert answer["better"] is None, "the others crashed, or agree"
     assert "repeat each 4 times" in answer["verdict"]
+    assert answer["notes"][0].startswith("repeats of speed 2.0: 2 runs: equal to the last digit in")
     runs = rows(
         project,
         "SELECT t.number, r.label, p.value, t.ended_by, t.ended_sim_time_s, t.pid FROM trial t "

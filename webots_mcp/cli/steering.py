@@ -214,7 +214,7 @@ _WORDS: Final = {"done": "score", "failed": "failed:", "pruned": "pruned:"}
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class _Options:
+class TrialOptions:
     """Where and how the trials run."""
 
     jobs: Annotated[
@@ -251,7 +251,7 @@ class _Options:
     ] = False
 
 
-_DEFAULTS: Final = _Options()
+_DEFAULTS: Final = TrialOptions()
 _WHERE: Final = Where()
 
 
@@ -259,7 +259,7 @@ def trials(
     plan: Annotated[Path, Parameter("PLAN", help="A .toml file: see docs/trials.md.")],
     /,
     *,
-    options: _Options = _DEFAULTS,
+    options: TrialOptions = _DEFAULTS,
     search: Annotated[
         Literal["tpe", "random"] | None,
         Parameter(
@@ -307,13 +307,13 @@ def trials(
         set_id = _begun_set(recording, plan, found, options)
     else:
         recording = recorded.recording(read_only=False)
-        set_id = _run(recording, found, options)
+        set_id = run_plan(recording, found, options)
     _show_trials(recording, set_id, found, as_json=json)
     if draw is not None:
         draw(recording, set_id)
 
 
-def _run(recording: Recording, plan: WorldPlan, options: _Options) -> int:
+def run_plan(recording: Recording, plan: WorldPlan, options: TrialOptions) -> int:
     """Run what is left of the plan's set; returns its id."""
     from webots_mcp.steering.trial_run import SetRun, require_optuna, run_trials
 
@@ -328,7 +328,7 @@ def _run(recording: Recording, plan: WorldPlan, options: _Options) -> int:
     return set_id
 
 
-def _simulators(options: _Options, plan: WorldPlan) -> AbstractContextManager[Simulators]:
+def _simulators(options: TrialOptions, plan: WorldPlan) -> AbstractContextManager[Simulators]:
     """Where the trials run; that there is such a program is seen before anything is written."""
     from webots_mcp.steering.trial_run import LocalSimulators, stand_in, webots
 
@@ -342,7 +342,7 @@ def _simulators(options: _Options, plan: WorldPlan) -> AbstractContextManager[Si
 
 
 @contextmanager
-def _cluster(options: _Options, plan: WorldPlan) -> Generator[Simulators]:
+def _cluster(options: TrialOptions, plan: WorldPlan) -> Generator[Simulators]:
     from webots_mcp.plugins import cluster_offered, load
 
     with load(cluster_offered())(
@@ -374,7 +374,7 @@ def _picture_of(file: Path | None) -> Callable[[Recording, int], None] | None:
     return draw
 
 
-def _set_of(recording: Recording, plan: WorldPlan, options: _Options) -> int:
+def _set_of(recording: Recording, plan: WorldPlan, options: TrialOptions) -> int:
     """The set that was begun with this plan, or a new one."""
     from webots_mcp.store.parameters import create_trial_set, find_trial_set
 
@@ -384,7 +384,7 @@ def _set_of(recording: Recording, plan: WorldPlan, options: _Options) -> int:
         return known or create_trial_set(connection, text, plan.trials)
 
 
-def _begun_set(recording: Recording, file: Path, plan: WorldPlan, options: _Options) -> int:
+def _begun_set(recording: Recording, file: Path, plan: WorldPlan, options: TrialOptions) -> int:
     """The set that was begun with this plan.
 
     Raises:
@@ -399,7 +399,7 @@ def _begun_set(recording: Recording, file: Path, plan: WorldPlan, options: _Opti
     return known
 
 
-def _text_of(plan: WorldPlan, options: _Options) -> str:
+def _text_of(plan: WorldPlan, options: TrialOptions) -> str:
     """By which a set is found again."""
     return json.dumps({"stand_in": options.stand_in, **json.loads(plan.text)}, sort_keys=True)
 
@@ -444,11 +444,13 @@ class _Progress:
 
 def _show_trials(recording: Recording, set_id: int, plan: WorldPlan, *, as_json: bool) -> None:
     from webots_mcp.store.parameters import ranking_of, trials_of
+    from webots_mcp.store.questions.first_difference import repeats_noted
     from webots_mcp.store.questions.runs import unseen
 
     with recording.reader() as connection:
         found = trials_of(connection, set_id)
         notes = unseen(connection, (each.run_id for each in found if each.score is not None))
+        notes = [*repeats_noted(connection, set_id), *notes]
     ranking = ranking_of(found, plan.best)
     runs = {each.number: each.run_id for each in found}
     if as_json:

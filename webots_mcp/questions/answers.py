@@ -383,6 +383,11 @@ class RunsAnswer(Answer):
 class ComparisonAnswer(NotedAnswer):
     """Runs beside each other; the first group is the reference."""
 
+    verdict: str | None = said("With first_difference: where the two part.")
+    unlike: dict[str, list[Any]] | None = said("What was not the same of them to begin with.")
+    compared: dict[str, Any] | None = said("Rows that both have at the same simulation time.")
+    parted: Table | None = said("In the order in which they part; beyond_s: the tolerance.")
+    growth: dict[str, Any] | None = said("Largest difference of the signal that parts most.")
     groups: Table | None = None
     compared_s: float | None = said(
         "All figures are about the first seconds of each run, this many."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import PurePath
@@ -16,6 +17,7 @@ from webots_mcp.questions.budget import (
     WHOLE,
     answer_about,
     condensed,
+    cut_for_a_model,
     figure,
     figures,
     fitting,
@@ -49,11 +51,13 @@ from webots_mcp.store.analysis.summary import MIN_EFFECT_SD, Spread
 from webots_mcp.store.detection.kinds import EventOptions, both_of
 from webots_mcp.store.parameters import scored_runs
 from webots_mcp.store.questions.compare import (
+    COMPARE_DEADLINE_S,
     Comparison,
     Difference,
     Group,
     compare_runs,
 )
+from webots_mcp.store.questions.first_difference import PartedSignal, Parting, compare_rows
 from webots_mcp.store.questions.runs import (
     MOST_RUNS,
     Measure,
@@ -80,6 +84,8 @@ DIFFERENCE_COLUMNS: Final = (
     "interval", "min", "max",
 )  # fmt: skip
 DEFAULT_DIFFERENCES: Final = 15
+_MOST_PARTED: Final = 10
+_LONGEST_VERDICT: Final = 600
 _SHOWN_HASH: Final = 10
 _MOST_ONLY_IN: Final = 10
 _OF_MEASURES: Final = (
@@ -153,6 +159,7 @@ def webots_compare_runs(
     min_effect_sd: Annotated[
         float, Field(gt=0, le=100, description="What matters, in deviations of like runs.")
     ] = MIN_EFFECT_SD,
+    first_difference: Annotated[bool, Field(description="Where two part, row by row.")] = False,
     robot: RobotName = None,
 ) -> ComparisonAnswer:
     """Did my edit help? Runs beside each other; or how fast, how far and in which modes one ran.
@@ -164,14 +171,21 @@ def webots_compare_runs(
     """
     if run_ids and trial_set:
         raise InvalidInputError("give run_ids or trial_set, not both")
+    if first_difference and (not run_ids or len(run_ids) != 2 or position or mode):
+        raise InvalidInputError("first_difference is of two runs, by signals alone; name both runs")
     options = EventOptions(position=both_of(position), mode=mode)
     first = run_ids[0] if run_ids else _first_run(recording, trial_set) if trial_set else None
     with recording.view(robot, first) as view:
-        return answer_about(
-            view,
-            ComparisonAnswer,
-            lambda: _compared(view, run_ids, trial_set, signals, limit, options, min_effect_sd),
-        )
+
+        def find() -> dict[str, Any]:
+            if not (first_difference and run_ids):
+                return _compared(view, run_ids, trial_set, signals, limit, options, min_effect_sd)
+            limit_s = math.inf if is_for_a_person() else COMPARE_DEADLINE_S
+            names, connection = signals or ("*",), view.connection
+            found = compare_rows(connection, run_ids, names=names, deadline_s=limit_s)
+            return parting_facts(found, limit)
+
+        return answer_about(view, ComparisonAnswer, find)
 
 
 def _first_run(recording: Recording, set_id: int) -> int:
@@ -265,6 +279,33 @@ def started(run: RunInfo) -> str:
 def _file(path: str | None) -> str | None:
     """The name of a file without its folder, of whichever system."""
     return path and PurePath(path.replace("\\", "/")).name
+
+
+def parting_facts(found: Parting, limit: int | None = None) -> dict[str, Any]:
+    """Where two runs part, as an answer has it."""
+    notes, most = notes_of(found.notes), None if is_for_a_person() else _MOST_PARTED
+    known = {short_name(n): shown([*pair]) for n, pair in list(found.unlike.items())[:most]}
+    names, parted = PartedSignal._fields[1:-1], found.parted[: limit or _MOST_PARTED]
+    rows = [[short_name(each.signal), *map(_cell, names, each[1:-1])] for each in parted]
+    rows = fitting(rows, room_tokens(limit, [known, notes]))
+    left, worst = len(found.parted) - len(rows), found.worst
+    return {
+        "verdict": cut_for_a_model(found.verdict, _LONGEST_VERDICT),
+        "unlike": known or None,
+        "compared": {"row_count": found.rows, "signal_count": found.signals,
+                     "from_s": seconds(found.from_s), "until_s": seconds(found.until_s)},
+        "parted": without_empty(("signal", *names), rows),
+        "growth": worst and {"signal": short_name(worst.signal), **worst.growth},
+        "notes": notes,
+        "hint": f"{left} more signals part: limit or signals for others" if left else None,
+    }  # fmt: skip
+
+
+def _cell(name: str, value: Any) -> Any:
+    """A time, or a difference as it is shown, however small; values have all their digits."""
+    if name.endswith("_s"):
+        return seconds(value)
+    return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
 def _compared(

@@ -62,6 +62,7 @@ from webots_mcp.store.parameters import (
     stop_trial_set,
     trials_of,
 )
+from webots_mcp.store.questions.first_difference import repeats_noted
 from webots_mcp.store.questions.runs import require_kinds, unseen
 from webots_mcp.store.reading.segment import in_one_snapshot
 from webots_mcp.store.recording import Recording, View, look
@@ -320,6 +321,7 @@ def _facts(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
     state, hint = _state(found, planned - over, at_work=is_at_work(connection, found))
     ranking = ranking_of(trials, best)
     rows = fitting(_rows(ranking, trials), _TABLE_TOKENS)
+    repeats = [] if state == "under way" else repeats_noted(connection, found.id)
     left_out = len(ranking.sets) - len(rows)
     return {
         "trial_set": found.id,
@@ -336,6 +338,7 @@ def _facts(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
         "notes": notes_of(
             [
                 *[f"{left_out} sets {_RANK_LOWER}"] * (left_out > 0),
+                *repeats,
                 *unseen(connection, (each.run_id for each in trials if each.score is not None)),
             ]
         ),

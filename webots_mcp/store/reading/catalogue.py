@@ -120,6 +120,14 @@ def signals_of_frame(
     return _without_placeholders(seen_with(known, subject.robot_id, frame.new_rows))
 
 
+def held_by(
+    connection: sqlite3.Connection, frame: Frame, known: dict[str, Signal]
+) -> dict[str, Signal]:
+    """Of the signals of a robot those that the run of a frame holds."""
+    stored, here = signals_in(connection, frame.run_id), frame.new_rows.values
+    return {name: each for name, each in known.items() if each.id in stored or name in here}
+
+
 def _without_placeholders(known: dict[str, Signal]) -> dict[str, Signal]:
     """Without names that only ever held null and have others below them.
 
@@ -235,9 +243,7 @@ def list_signals(
     whole = Segment(subject.run_id, -math.inf, math.inf)
     frame = read_frame(connection, whole, Deadline(deadline_s))
     known = signals_of_frame(connection, subject, frame)
-    stored = signals_in(connection, subject.run_id)
-    here = frame.new_rows.values
-    there = {name: each for name, each in known.items() if each.id in stored or name in here}
+    there = held_by(connection, frame, known)
     matching = resolve_signals(there, [pattern]) if pattern != "*" else list(there.values())
     matching.sort(key=lambda signal: signal.name)
     infos = tuple(_info(frame, signal) for signal in matching[:limit])

@@ -189,6 +189,10 @@ class Frame:
         """Times and numbers of the rows that have a usable one: not NaN, not beyond 1e100."""
         return usable_part(self.times, self.numbers(name))
 
+    def recorded(self, name: str) -> Decoded:
+        """The values as they were recorded: absent, null and what was replaced are told apart."""
+        return self._decoded(name)
+
     def coded(self, name: str) -> Coded:
         """The values of a signal, whatever they are, as codes."""
         return self._coded(name, numbers=True)

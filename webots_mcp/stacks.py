@@ -15,7 +15,7 @@ import json
 import os
 import re
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any, BinaryIO, Final, NamedTuple, cast
+from typing import BinaryIO, Final, NamedTuple
 
 VERSION: Final = "webots_mcp_stacks"
 FORMAT: Final = 1
@@ -25,7 +25,7 @@ _THREAD: Final = re.compile(
     r"^(?:Current thread|Thread) 0x([0-9a-f]+)[^\n]*\(most recent call first\):\n((?:  .*\n?)*)",
     re.MULTILINE,
 )
-_FRAME: Final = re.compile(r'^  File "(.*)", line (\S+) in (.*)$', re.MULTILINE)
+_CALL: Final = re.compile(r'^  File "(.*)", line (\S+) in (.*)$', re.MULTILINE)
 _INSTALLED: Final = re.compile(r"[/\\](?:site|dist)-packages[/\\]|^<frozen ")
 _DEBUGGER: Final = re.compile(r"(?:[/\\]|^)(?:bdb|pdb)\.py$|[/\\](?:pydevd|debugpy|_pydev)")
 _EARLY: Final = 0.9  # of the limit: the clock of files is coarse
@@ -63,70 +63,41 @@ class Stacks(NamedTuple):
 
     Attributes:
         wall_time_s: When, Unix time.
-        about: The first line of the file.
+        run: UUID of the run.
+        limit_s: How long the loop may be silent.
         calls: Of the loop's thread, the innermost first; never empty.
+        own: Of them, those of the controller's own code: neither the bridge's nor a library's.
+        is_hang: That code, or what it called, keeps the loop from its step; else it waits for
+            Webots in a step, or a person has stopped it with a debugger of Python.
+        is_in_step: It waits for Webots.
         text: All threads, as `faulthandler` wrote them.
     """
 
     wall_time_s: float
-    about: dict[str, Any]
+    run: str
+    limit_s: float
     calls: list[Call]
+    own: list[Call]
+    is_hang: bool
+    is_in_step: bool
     text: str
-
-    @property
-    def is_in_step(self) -> bool:
-        """Whether the loop waits for Webots in the library's step, called by its own code."""
-        inner = self.calls[: self.calls.index(own[0])] if (own := self._own) else self.calls
-        return any(c.function in STEPPING and c.file in self._named("step_files") for c in inner)
-
-    @property
-    def is_in_debugger(self) -> bool:
-        """Whether a person has stopped it with a debugger of Python."""
-        return any(_DEBUGGER.search(call.file) for call in self.calls)
-
-    @property
-    def is_hang(self) -> bool:
-        """Whether the controller's own code, or what it called, keeps the loop from its step."""
-        return not (self.is_in_step or self.is_in_debugger)
 
     def began_after(self, last_seen_wall_time_s: float) -> bool:
         """Whether the loop had been silent for the limit since that sign of life."""
         return self.wall_time_s - last_seen_wall_time_s >= _EARLY * self.limit_s
 
     @property
-    def limit_s(self) -> float:
-        """How long the loop had been silent when they were written."""
-        limit_s = self.about.get("limit_s")
-        return float(limit_s) if isinstance(limit_s, (int, float)) else 0.0
-
-    @property
     def place(self) -> str:
         """Where the loop was, the controller's own code first."""
-        own = self._own or self.calls
-        callers = " and ".join(call.as_caller for call in own[1 : 1 + _MOST_CALLERS])
-        text = f"{own[0]}{f', called from {callers}' if callers else ''}"
-        return text if own[0] is self.calls[0] else f"{text}; there in {self.calls[0]}"
+        place, *callers = self.own or self.calls
+        names = " and ".join(call.as_caller for call in callers[:_MOST_CALLERS])
+        text = f"{place}, called from {names}" if names else f"{place}"
+        return text if place is self.calls[0] else f"{text}; there in {self.calls[0]}"
 
     @property
     def message(self) -> str:
         """The log row."""
         return f"silent for more than {self.limit_s:g} s in {self.place}\n{self.text[:_MOST_TEXT]}"
-
-    @property
-    def _own(self) -> list[Call]:
-        """The calls of the controller's own code: neither the bridge's nor a library's."""
-        return [call for call in self.calls if self._is_own(call)]
-
-    def _is_own(self, call: Call) -> bool:
-        if (call.function in STEPPING and call.file in self._named("step_files")) or (
-            _INSTALLED.search(call.file)
-        ):
-            return False
-        return not call.file.startswith(tuple(self._named("libraries")))
-
-    def _named(self, key: str) -> list[str]:
-        found = self.about.get(key)
-        return [str(e) for e in cast("list[Any]", found)] if isinstance(found, list) else []
 
 
 def stacks_path(database: Path, session_uuid: str) -> Path:
@@ -146,18 +117,29 @@ def read_stacks(file: BinaryIO) -> Stacks | None:
     """What a file holds; None where nothing was written, or it cannot be read."""
     file.seek(0)
     head, _, rest = file.read(_MOST_BYTES).partition(b"\n")
+    text = rest.decode("utf-8", "replace")
     try:
         about = json.loads(head)
-    except (ValueError, RecursionError):
+        run, limit_s = str(about["run"]), float(about["limit_s"])
+        threads = {int(thread, 16): calls for thread, calls in _THREAD.findall(text)}
+        calls = [Call(*call) for call in _CALL.findall(threads[about["thread"]])]
+        steps, libraries = (tuple(map(str, about[name])) for name in ("step_files", "libraries"))
+    except (ValueError, TypeError, LookupError, RecursionError):
         return None
-    if not isinstance(about, dict) or cast("dict[str, Any]", about).get(VERSION) != FORMAT:
+    if not calls or about.get(VERSION) != FORMAT:
         return None
-    about, text = cast("dict[str, Any]", about), rest.decode("utf-8", "replace")
-    for thread, calls in _THREAD.findall(text):
-        found = [Call(*call) for call in _FRAME.findall(calls)]
-        if found and int(thread, 16) == about.get("thread"):
-            return Stacks(os.fstat(file.fileno()).st_mtime, about, found, text)
-    return None
+    waits = [call for call in calls if call.function in STEPPING and call.file in steps]
+    own = [call for call in calls if call not in waits and not _is_library(call.file, libraries)]
+    inner = calls[: calls.index(own[0])] if own else calls
+    is_in_step = any(call in waits for call in inner)
+    is_debugged = any(_DEBUGGER.search(call.file) for call in calls)
+    hangs = not (is_in_step or is_debugged)
+    written_s = os.fstat(file.fileno()).st_mtime
+    return Stacks(written_s, run, limit_s, calls, own, hangs, is_in_step, text)
+
+
+def _is_library(file: str, libraries: tuple[str, ...]) -> bool:
+    return file.startswith(libraries) or _INSTALLED.search(file) is not None
 
 
 def stacks_at(path: Path) -> Stacks | None:

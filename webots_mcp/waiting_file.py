@@ -196,7 +196,10 @@ _RECOUNT: Final = (
     "SELECT purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id), id FROM run "
     "WHERE session_id = ? AND ended_wall_time_s IS NOT NULL"
 )
-_RUN_SEEN: Final = "SELECT id, last_wall_time_s FROM run WHERE uuid = ?"
+_RUN_SEEN: Final = (
+    "SELECT r.id, r.last_wall_time_s FROM run r JOIN session s ON s.id = r.session_id "
+    "WHERE r.uuid = ? AND coalesce(s.last_poll_wall_time_s, s.moved_wall_time_s) IS NOT NULL"
+)
 _SET_ROWS: Final = "UPDATE run SET row_count = ? WHERE id = ?"
 _KNOWN_ROBOT: Final = (
     "INSERT INTO robot (name, kind, devices, first_seen_wall_time_s, last_seen_wall_time_s) "
@@ -519,7 +522,7 @@ def _adopt_stacks(connection: sqlite3.Connection, path: Path) -> int:
             if not lock(file.fileno()):
                 return 0
             stacks = read_stacks(file)
-            found = stacks and connection.execute(_RUN_SEEN, (stacks.about.get("run"),)).fetchone()
+            found = stacks and connection.execute(_RUN_SEEN, (stacks.run,)).fetchone()
             logged = 0
             if stacks and found and stacks.is_hang and stacks.began_after(found[1]):
                 values = {"sim_time": None, "wall_time": stacks.wall_time_s}

@@ -108,7 +108,7 @@ class Session:
         self.watch = Watch(self.clock, simulation.basic_time_step_s / 100)
         self.control = Control(self)
         self.publisher = Publisher(self)
-        self._watchdog = Watchdog(self, hang_after_s)
+        self._watchdog = Watchdog(self, database, hang_after_s)
         self._unseen_reported = False
         self._began_s: float | None = time.monotonic()  # None once `_look_after` has judged it
         self._maintainer = _start_maintainer(database, self._look_after)
@@ -130,7 +130,6 @@ class Session:
         if registration is not None:
             self._succeed_to(registration)
         self.breakpoints.begin()
-        self.simulation.measure_steps(measured=True)
         self._watchdog.begin()
 
     def _succeed_to(self, registration: Registration) -> None:
@@ -207,7 +206,6 @@ class Session:
         if self._maintainer is not None:
             self._maintainer.stop()  # first: its thread uses the recorder too
         self._watchdog.close()
-        self.simulation.measure_steps(measured=False)
         self.keeper.close()
         reason = reason or self._end_reason
         self.recorder.close(reason, self.clock.sim_time_s)

@@ -36,7 +36,7 @@ class Simulation:
         self.over = False
         self.supervisor: bool = _may_supervise(robot)
         self.meter = LoopMeter()
-        self._gate = StepGate(robot)
+        self._gate = StepGate(robot, self.meter)
 
     @property
     def time_s(self) -> float:
@@ -88,10 +88,6 @@ class Simulation:
             self._gate.open()
         else:
             self._gate.close(guard)
-
-    def measure_steps(self, *, measured: bool) -> None:
-        """Let the meter take the time of the controller's steps from now on, or no more."""
-        self._gate.measure(self.meter if measured else None)
 
     @property
     def step_files(self) -> list[str]:
@@ -193,9 +189,10 @@ class StepGate:
 
     Args:
         robot: A Webots `Robot`, or an instance of a subclass.
+        meter: Takes the time of its steps from now on, in place of a former bridge's.
     """
 
-    def __init__(self, robot: Any) -> None:
+    def __init__(self, robot: Any, meter: LoopMeter) -> None:
         self._robot = robot
         self._of_robot: dict[str, Any] = vars(robot)
         owner: Any = _owner_of_step(robot)
@@ -209,6 +206,7 @@ class StepGate:
                     setattr(cls, name, _guarded(name, method))
             code = getattr(cls.step.__wrapped__, "__code__", None)
             self.files += [code.co_filename] if code else []
+        vars(robot)[_METER] = meter
         self._own_step: Method = owner.step.__wrapped__
 
     def exchange(self) -> int:
@@ -223,12 +221,6 @@ class StepGate:
         """Let steps go to Webots directly again."""
         self._of_robot.pop(_GUARD, None)
 
-    def measure(self, meter: LoopMeter | None) -> None:
-        """Let a meter take the time of the steps; None: no longer."""
-        self._of_robot.pop(_METER, None)
-        if meter is not None:
-            self._of_robot[_METER] = meter
-
 
 def _guarded(name: str, method: Method) -> Method:
     ends, begins = name != "stepBegin", name != "stepEnd"
@@ -236,29 +228,20 @@ def _guarded(name: str, method: Method) -> Method:
     @functools.wraps(method)
     def ask_first(robot: Any, *args: Any, **kwargs: Any) -> int:
         meter: LoopMeter | None = robot._webots_mcp_meter  # faster than getattr: in every step
-        guard: Guard | None = robot._webots_mcp_guard
-        if meter is None and guard is None:
+        if meter is None:
             return method(robot, *args, **kwargs)
-        still = name == "step" and (0 in args or 0 in kwargs.values())
-        if meter is not None:
-            meter.leave_own()
+        meter.leave_own()
+        advances = name != "step" or not (0 in args or 0 in kwargs.values())
+        guard: Guard | None = robot._webots_mcp_guard
         if guard is None:
-            answer = method(robot, *args, **kwargs)
-            if meter is not None:
-                meter.leave_step(ends and not still)
-            return answer
+            return meter.leave_step(method(robot, *args, **kwargs), ends and advances)
 
         def make() -> int:
-            if meter is None:
-                return method(robot, *args, **kwargs)
             meter.leave_bridge()
-            answer = method(robot, *args, **kwargs)
-            meter.leave_step(ends and not still)
-            return answer
+            return meter.leave_step(method(robot, *args, **kwargs), ends and advances)
 
-        answer = guard(Step(begins and not still, ends and not still, make))
-        if meter is not None:
-            meter.leave_bridge()
+        answer = guard(Step(begins and advances, ends and advances, make))
+        meter.leave_bridge()
         return answer
 
     setattr(ask_first, _MARK, True)
@@ -312,15 +295,16 @@ class LoopMeter:
         self._own_s += taken_s
         self.at_s = now_s
 
-    def leave_step(self, has_ended: object) -> None:
-        """Webots has answered; `has_ended`: time has advanced by a step."""
+    def leave_step(self, answer: int, has_advanced: bool) -> int:
+        """Webots has answered; returns its answer."""
         now_s = time.perf_counter()
         self._step_s += now_s - self.at_s
         self.at_s = now_s
-        if has_ended:
+        if has_advanced:
             if self._steps < 0:
                 self._own_s = self._step_s = 0.0
             self._steps += 1
+        return answer
 
     def leave_bridge(self) -> None:
         """A call of the bridge ends, or it lets a step be made."""

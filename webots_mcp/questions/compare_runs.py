@@ -64,10 +64,11 @@ from webots_mcp.store.questions.runs import (
     run_info,
 )
 from webots_mcp.store.recording import Recording, View, look
+from webots_mcp.store.run_rows import round_ms
 
 RUN_COLUMNS: Final = (
     "run_id", "robot", "label", "parameters", "started", "began_by", "ended_by", "duration_s",
-    "real_time_factor", "row_count", "purged_rows", "notable", "controller", "sha256", "git_commit",
+    "real_time_factor", "own_ms", "step_wait_ms", "row_count", "purged_rows", "notable", "controller", "sha256", "git_commit",
     "world", "note",
 )  # fmt: skip
 GROUP_COLUMNS: Final = (
@@ -113,6 +114,7 @@ def webots_list_runs(
     """Runs, newest first: controller file and its hash, world, duration, pace, how it ended.
 
     A run is a stretch of rising simulation time: a start, reset or reload begins the next.
+    `own_ms` and `step_wait_ms`: of each step, wall time in the controller's code and in step().
     `notable` counts warnings, errors, dropped rows, failed commands. `parameters` are those that
     are not as the code declared them, or differ between these runs.
     """
@@ -158,7 +160,7 @@ def webots_compare_runs(
     """Did my edit help? Runs beside each other; or how fast, how far and in which modes one ran.
 
     Without run_ids: the runs before and after the last edit of the controller's file. Runs of one
-    code and parameters are one group. Distance, mean speed, time per mode, events per minute, and
+    code and parameters are one group. The controller's own ms per step, distance, mean speed, time per mode, events per minute, and
     the signals that differ most. `different`: true beyond the spread of like runs (4 of each or
     more), false where a difference that matters is excluded, null: it cannot be told yet.
     """
@@ -244,6 +246,7 @@ def _run_row(run: RunInfo) -> list[Any]:
         run.end_reason or _GOING_ON,
         seconds(run.duration_s),
         figure(run.real_time_factor),
+        *map(figure, round_ms(run.own_wall_s, run.step_wait_wall_s, run.steps)),
         run.row_count,
         run.purged_rows or None,
         shown(run.notable) or None,

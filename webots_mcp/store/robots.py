@@ -39,8 +39,8 @@ from webots_mcp.pauses import (
     breakpoint_at,
     change_since,
 )
-from webots_mcp.store.run_rows import Run, columns_of, newest_state, recent_interval_s, state_at
 from webots_mcp.stacks import LOGGER, Stacks, stacks_at, stacks_path
+from webots_mcp.store.run_rows import Run, columns_of, newest_state, recent_interval_s, state_at
 from webots_mcp.waiting_file import Entry, count_rows, next_entries, read_header, waiting_path
 
 # Controller processes: who they are, and whether they still live.
@@ -430,7 +430,7 @@ def judge(
     fresh = session.heartbeat_is_fresh(now_s)
     if fresh and _change_since_beat(connection, session) == RESUME:
         return Status(RUNNING)
-    if hang := _hang(connection, session, now_s):
+    if not _is_unseen(session, moved_s) and (hang := _hang(connection, session, now_s)):
         return _stopped(session, moved_s, now_s, hang)
     still_moving_s = _still_moving_s(connection, run)
     if not fresh and (backlog := find_backlog(connection, session)) is not None:
@@ -512,12 +512,13 @@ def _why_standing(
     for other in companions(connection, session, now_s) if stacks and stacks.is_in_step else ():
         if hang := _hang(connection, other, now_s):
             return _HELD_UP_BY.format(robot_name(connection, other.robot_id), hang)
-    unseen = moved_s is None and session.last_poll_wall_time_s is None
+    unseen = _is_unseen(session, moved_s)
     seen = _seen_by_observer(connection, session, now_s)
     if seen and not (unseen and seen.startswith(SEEN_RUNNING)):
         return seen
     if unseen:
-        return UNMOVED
+        at = f"; {stacks.limit_s:g} s after it began it was in {stacks.place}" if stacks else ""
+        return f"{UNMOVED}{at}"
     if moved_s is None:
         return _NOT_STARTED
     # A loop that hangs in a step beat last when it last moved: only a later beat shows it alive.
@@ -528,6 +529,11 @@ def _why_standing(
     if left is None:
         return WAITING_IN_STEP if stacks and stacks.is_in_step else SILENT
     return LEFT_PAUSED.format(robot_name(connection, left.robot_id))
+
+
+def _is_unseen(session: Session, moved_s: float | None) -> bool:
+    """Whether its bridge has seen nothing of the loop yet."""
+    return moved_s is None and session.last_poll_wall_time_s is None
 
 
 def find_stacks(connection: sqlite3.Connection, session: Session) -> Stacks | None:
@@ -581,7 +587,7 @@ def stopped_for(seconds: float) -> str:
 
 def _stopped(session: Session, moved_s: float | None, now_s: float, why: str | None) -> Status:
     seconds = session.age_s(moved_s or session.started_wall_time_s, now_s)
-    if why == UNMOVED:
+    if why and why.startswith(UNMOVED):
         return Status(f"not seen moving for {max(seconds, 0.0):.0f} s", why)
     return Status(stopped_for(seconds), why)
 

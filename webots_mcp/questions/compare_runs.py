@@ -68,8 +68,8 @@ from webots_mcp.store.run_rows import round_ms
 
 RUN_COLUMNS: Final = (
     "run_id", "robot", "label", "parameters", "started", "began_by", "ended_by", "duration_s",
-    "real_time_factor", "own_ms", "step_wait_ms", "row_count", "purged_rows", "notable", "controller", "sha256", "git_commit",
-    "world", "note",
+    "real_time_factor", "own_ms", "step_wait_ms", "row_count", "purged_rows", "notable",
+    "controller", "sha256", "git_commit", "world", "note",
 )  # fmt: skip
 GROUP_COLUMNS: Final = (
     "name", "robot", "runs", "labels", "parameters", "sha256", "ended_by",
@@ -160,9 +160,10 @@ def webots_compare_runs(
     """Did my edit help? Runs beside each other; or how fast, how far and in which modes one ran.
 
     Without run_ids: the runs before and after the last edit of the controller's file. Runs of one
-    code and parameters are one group. The controller's own ms per step, distance, mean speed, time per mode, events per minute, and
-    the signals that differ most. `different`: true beyond the spread of like runs (4 of each or
-    more), false where a difference that matters is excluded, null: it cannot be told yet.
+    code and parameters are one group. Distance, mean speed, time per mode, events per minute, the
+    loop's own ms per step, and the signals that differ most. `different`: true beyond the spread
+    of like runs (4 of each or more), false where a difference that matters is excluded, null: it
+    cannot be told yet.
     """
     if run_ids and trial_set:
         raise InvalidInputError("give run_ids or trial_set, not both")

@@ -340,8 +340,8 @@ class Measure:
     """What each run came to as a whole, over the compared stretch, by group.
 
     Attributes:
-        name: own_ms_per_step (wall time in the controller's own code, of the whole run), distance_m,
-            mean_speed_m_s, `share of MODE` (of the time), `KIND per min` (events).
+        name: distance_m, mean_speed_m_s, `share of MODE` (of the time), `KIND per min` (events),
+            own_ms_per_step (wall time in the controller's own code, of the whole run).
         spread: Over the runs of the group; None where it is not known of all of them.
         different: Whether the group differs from the first by more than like runs do; None where
             that cannot be decided, because both groups are one run each, a figure is missing, or

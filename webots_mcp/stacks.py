@@ -26,7 +26,7 @@ _THREAD: Final = re.compile(
     re.MULTILINE,
 )
 _CALL: Final = re.compile(r'^  File "(.*)", line (\S+) in (.*)$', re.MULTILINE)
-_INSTALLED: Final = re.compile(r"[/\\](?:site|dist)-packages[/\\]|^<frozen ")
+INSTALLED: Final = re.compile(r"[/\\](?:site|dist)-packages[/\\]|^<frozen ")
 _DEBUGGER: Final = re.compile(r"(?:[/\\]|^)(?:bdb|pdb)\.py$|[/\\](?:pydevd|debugpy|_pydev)")
 _EARLY: Final = 0.9  # of the limit: the clock of files is coarse
 _MOST_BYTES: Final = 200_000
@@ -139,7 +139,7 @@ def read_stacks(file: BinaryIO) -> Stacks | None:
 
 
 def _is_library(file: str, libraries: tuple[str, ...]) -> bool:
-    return file.startswith(libraries) or _INSTALLED.search(file) is not None
+    return file.startswith(libraries) or INSTALLED.search(file) is not None
 
 
 def stacks_at(path: Path) -> Stacks | None:

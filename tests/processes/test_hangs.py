@@ -59,9 +59,11 @@ def status(recording: Recording, robot: str = "rover") -> Status:
 def why(simulation: Simulation, recording: Recording, words: str, robot: str = "rover") -> str:
     """Why a robot stands still, as soon as these words say it."""
     return simulation.wait_for(
-        lambda: has_states(recording)
-        and words in (found := status(recording, robot).why or "")
-        and found
+        lambda: (
+            has_states(recording)
+            and words in (found := status(recording, robot).why or "")
+            and found
+        )
     )
 
 
@@ -105,7 +107,9 @@ def test_a_hang_is_named_with_its_line_while_it_lasts_and_once_when_its_process_
 def test_one_that_comes_back_is_logged_once_and_not_said_any_more(
     start: Start, filed: Recording, tmp_path: Path
 ) -> None:
-    simulation = start(HANGS.format(hang=f"while not Path({str(tmp_path / 'go')!r}).exists(): pass"))
+    simulation = start(
+        HANGS.format(hang=f"while not Path({str(tmp_path / 'go')!r}).exists(): pass")
+    )
     why(simulation, filed, "plan()")
     (tmp_path / "go").touch()
     simulation.wait_for(lambda: status(filed).is_moving and messages(filed))
@@ -224,9 +228,7 @@ def test_whose_time_a_loop_takes_is_known_of_each_run(
         f"while robot.step(16) != -1:\n    time.sleep(0.02)\n    {round_}\n"
     )
     sql = "SELECT own_wall_s, step_wait_wall_s, steps FROM run WHERE steps > 25"
-    ((own_s, wait_s, steps),) = simulation.wait_for(
-        lambda: has_states(filed) and filed.rows(sql)
-    )
+    ((own_s, wait_s, steps),) = simulation.wait_for(lambda: has_states(filed) and filed.rows(sql))
     taken_s = time.time() - filed.rows("SELECT started_wall_time_s FROM run")[0]
     assert own_s >= 0.02 * steps
     assert 0 < wait_s and own_s + wait_s < taken_s

@@ -63,6 +63,7 @@ _OF_THE_CORE: Final = {
     "breakpoint": Command(STEER, _STEERING, "breakpoint_"),
     "trials": Command(STEER, "webots_mcp.cli.steering", "trials"),
     "launch": Command(SETUP, "webots_mcp.cli.serving", "launch"),
+    "profile": Command(NOW, "webots_mcp.cli.profiling", "profile"),
     "plot": Command(PAST, "webots_mcp.cli.data", "plot"),
     "tail": Command(NOW, "webots_mcp.cli.data", "tail"),
 }

@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
 VERSION: Final = "webots_mcp_stacks"
@@ -26,6 +26,7 @@ _THREAD: Final = re.compile(
     re.MULTILINE,
 )
 _CALL: Final = re.compile(r'^  File "(.*)", line (\S+) in (.*)$', re.MULTILINE)
+_FOLDERS: Final = re.compile(r".*[/\\]")
 INSTALLED: Final = re.compile(r"[/\\](?:site|dist)-packages[/\\]|^<frozen ")
 _DEBUGGER: Final = re.compile(r"(?:[/\\]|^)(?:bdb|pdb)\.py$|[/\\](?:pydevd|debugpy|_pydev)")
 _EARLY: Final = 0.9  # of the limit: the clock of files is coarse
@@ -42,14 +43,8 @@ class Call(NamedTuple):
     line: str
     function: str
 
-    @property
-    def file_name(self) -> str:
-        """The file without its folders, of whichever system."""
-        path = PureWindowsPath(self.file) if "\\" in self.file else PurePosixPath(self.file)
-        return _cut(path.name)
-
     def __str__(self) -> str:
-        place = f"{self.file_name}:{self.line}"
+        place = f"{_cut(_FOLDERS.sub('', self.file))}:{self.line}"
         return place if self.function == "<module>" else f"{place}, {_cut(self.function)}()"
 
     @property
@@ -94,23 +89,15 @@ class Stacks(NamedTuple):
         text = f"{place}, called from {names}" if names else f"{place}"
         return text if place is self.calls[0] else f"{text}; there in {self.calls[0]}"
 
-    @property
-    def message(self) -> str:
-        """The log row."""
-        return f"silent for more than {self.limit_s:g} s in {self.place}\n{self.text[:_MOST_TEXT]}"
+    def log_values(self, sim_time_s: float | None) -> dict[str, float | str | None]:
+        """Of the log row, which is known by its time."""
+        text = f"silent for more than {self.limit_s:g} s in {self.place}\n{self.text[:_MOST_TEXT]}"
+        return {"sim_time": sim_time_s, "wall_time": self.wall_time_s, "message": text}
 
 
 def stacks_path(database: Path, session_uuid: str) -> Path:
     """Where the stacks of a session's process are written."""
     return Path(f"{database}-stacks-{session_uuid}.txt")
-
-
-def stacks_paths(database: Path) -> list[Path]:
-    """The files of all sessions of a database, of living ones too."""
-    try:
-        return sorted(database.parent.glob(f"{database.name}-stacks-*.txt"))
-    except OSError:
-        return []
 
 
 def read_stacks(file: BinaryIO) -> Stacks | None:

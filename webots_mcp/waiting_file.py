@@ -32,7 +32,7 @@ from typing import Any, BinaryIO, Final, Literal, NamedTuple, cast
 from webots_mcp import queue
 from webots_mcp.connection import in_transaction
 from webots_mcp.errors import SessionGoneError, warn
-from webots_mcp.stacks import LOGGER, read_stacks, stacks_paths
+from webots_mcp.stacks import LOGGER, read_stacks, stacks_path
 
 # What a controller writes while it runs: each kind of write by its name, with its statement.
 
@@ -246,9 +246,9 @@ def waiting_path(database: Path, session_uuid: str) -> Path:
     return Path(f"{database}-waiting-{session_uuid}.jsonl")
 
 
-def waiting_paths(database: Path) -> list[Path]:
-    """The files in which entries for a database wait, of living sessions too."""
-    before, after = f"{database.name}-waiting-", ".jsonl"
+def waiting_paths(database: Path, kind: Callable[[Path, str], Path] = waiting_path) -> list[Path]:
+    """The files in which entries for a database wait, of living sessions too; or those of a kind."""
+    before, after = kind(database, "*").name.split("*")
     try:
         with os.scandir(database.parent) as files:
             names = [f.name for f in files if f.name.startswith(before) and f.name.endswith(after)]
@@ -512,26 +512,23 @@ def adopt(connection: sqlite3.Connection, database: Path) -> int:
         sqlite3.Error: The database is locked; what is in is in, the rest waits.
     """
     count = sum(_adopt_file(connection, path) for path in waiting_paths(database))
-    return count + sum(_adopt_stacks(connection, path) for path in stacks_paths(database))
+    found = waiting_paths(database, stacks_path)
+    return count + sum(_adopt_stacks(connection, path) for path in found)
 
 
 def _adopt_stacks(connection: sqlite3.Connection, path: Path) -> int:
     """Log where the loop of a dead process was silent, and delete the file."""
-    try:
+    logged = 0
+    with contextlib.suppress(OSError):  # another took it in meanwhile, or it cannot be read
         with path.open("r+b") as file:
             if not lock(file.fileno()):
                 return 0
             stacks = read_stacks(file)
-            found = stacks and connection.execute(_RUN_SEEN, (stacks.run,)).fetchone()
-            logged = 0
-            if stacks and found and stacks.is_hang and stacks.began_after(found[1]):
-                values = {"sim_time": None, "wall_time": stacks.wall_time_s}
-                values |= {"message": stacks.message}
-                logged = connection.execute(STATEMENTS["stacks"], {"run": found[0], **values})
-                logged = logged.rowcount
+            run = stacks and connection.execute(_RUN_SEEN, (stacks.run,)).fetchone()
+            if stacks and run and stacks.is_hang and stacks.began_after(run[1]):
+                values = bind(run[0], None, stacks.log_values(None))
+                logged = connection.execute(STATEMENTS["stacks"], values).rowcount
         path.unlink()
-    except OSError:  # another took it in meanwhile, or it cannot be read
-        return 0
     return logged
 
 

@@ -16,12 +16,12 @@ from tests.bridge.conftest import Recording
 from tests.processes.conftest import PatientSimulation, Start, has_states
 from webots_mcp.connection import connect
 from webots_mcp.contract import HANG_VARIABLE
-from webots_mcp.stacks import stacks_paths
+from webots_mcp.stacks import stacks_path
 from webots_mcp.standin import Mode, Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 from webots_mcp.store.recording import Recording as Store
 from webots_mcp.store.robots import WAITING_IN_STEP, Status
-from webots_mcp.waiting_file import adopt
+from webots_mcp.waiting_file import adopt, waiting_paths
 
 Script = Callable[..., "subprocess.Popen[str]"]
 
@@ -89,7 +89,7 @@ def test_a_hang_is_named_with_its_line_while_it_lasts_and_once_when_its_process_
     said = why(simulation, filed, "plan()")
     simulation.close()  # which kills it
     assert isinstance(filed.database, Path)
-    (file,) = stacks_paths(filed.database)
+    (file,) = waiting_paths(filed.database, stacks_path)
     with closing(connect(filed.database, "writer")) as connection:
         adopt(connection, filed.database)
         adopt(connection, filed.database)
@@ -100,7 +100,7 @@ def test_a_hang_is_named_with_its_line_while_it_lasts_and_once_when_its_process_
     assert [text.startswith(f"silent for more than 0.5 s {place}") for text in messages(filed)] == [
         True
     ]
-    assert stacks_paths(filed.database) == []
+    assert waiting_paths(filed.database, stacks_path) == []
     assert f"it was {messages(filed)[0]}" in (status(filed).why or "")
 
 
@@ -119,7 +119,7 @@ def test_one_that_comes_back_is_logged_once_and_not_said_any_more(
 
     assert running.why is None
     assert [text.count("plan()") for text in messages(filed)] == [1]
-    assert isinstance(filed.database, Path) and stacks_paths(filed.database) == []
+    assert isinstance(filed.database, Path) and waiting_paths(filed.database, stacks_path) == []
 
 
 def test_neither_a_simulation_that_is_paused_nor_a_loop_that_is_held_hangs(
@@ -152,7 +152,7 @@ def test_the_controller_that_holds_up_the_world_is_named_to_the_others(
     begins = "from controller import Supervisor\nfrom webots_mcp import MCPBridge\n"
     programs = {
         "rover": "bridge = MCPBridge.attach(Supervisor())\nwhile bridge.robot.step(16) != -1: pass",
-        "other": "r = Supervisor()\nMCPBridge.attach(r)\nfor _ in range(30): r.step(16)\nwhile True: pass",
+        "other": "r = Supervisor()\nMCPBridge.attach(r)\nwhile r.getTime() < 1: r.step(16)\nwhile 1: pass",
     }
     for name, text in programs.items():
         (tmp_path / f"{name}.py").write_text(begins + text)
@@ -231,4 +231,4 @@ def test_whose_time_a_loop_takes_is_known_of_each_run(
     ((own_s, wait_s, steps),) = simulation.wait_for(lambda: has_states(filed) and filed.rows(sql))
     taken_s = time.time() - filed.rows("SELECT started_wall_time_s FROM run")[0]
     assert own_s >= 0.02 * steps
-    assert 0 < wait_s and own_s + wait_s < taken_s
+    assert wait_s > 0 and own_s + wait_s < taken_s

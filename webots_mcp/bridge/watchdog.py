@@ -30,13 +30,12 @@ if TYPE_CHECKING:
 _SHORTEST_S: Final = 0.05  # of the timer
 _SETTLED_S: Final = 0.2  # by then all threads have been written
 _MOST_LOGGED: Final = 20  # in a session: a loop that is slow by design would fill the log
-_LIBRARIES: Final = [
-    str(Path(file).parent) + os.sep for file in (Path(__file__).parent, os.__file__)
-]
+_OURS: Final = f"{Path(__file__).parents[1]}{os.sep}"
+_STDLIB: Final = f"{Path(os.__file__).parent}{os.sep}"
 _ALL: Final = 0x3FFF_FFFF & ~(1 << 8 | 1 << 18)  # but SIGKILL and SIGSTOP
 _BY_OTHERS: Final = (
-    "hangs of the loop are not looked for: this process uses faulthandler's only timer for "
-    f"something else ({HANG_VARIABLE}=0 leaves it to that without this line)"
+    "this process uses faulthandler's only timer for something else "
+    f"({HANG_VARIABLE}=0 leaves it to that without this line)"
 )
 
 
@@ -55,7 +54,9 @@ class Watchdog:
         self._is_on = limit_s > 0 and isinstance(database, Path)
         self._path = stacks_path(Path(str(database)), session.recorder.uuid)
         self._lock = threading.Lock()
-        self._thread = threading.get_ident()  # the loop's
+        about = {VERSION: FORMAT, "thread": threading.get_ident(), "limit_s": limit_s}
+        about |= {"step_files": session.simulation.step_files, "libraries": [_OURS, _STDLIB]}
+        self._about = about
         self._file = -1
         self._head = b""
         self._began_s = self._set_s = 0.0  # signs of life
@@ -71,16 +72,14 @@ class Watchdog:
     def look(self) -> None:
         """In the maintainer's thread: log what was written, and set the timer again."""
         with self._lock:
-            if self._is_on and _timer.is_others:
+            if not self._is_on or _timer.is_forking:
+                return
+            try:
+                self._look()
+            except (OSError, RuntimeError) as error:
                 self._end()
-                self._session.journal.log("info", "bridge", _BY_OTHERS)
-            elif self._is_on and not _timer.is_forking:
-                try:
-                    self._look()
-                except (OSError, RuntimeError) as error:
-                    self._end()
-                    why = f"where the loop hangs is not recorded: {error}"
-                    self._session.errors.warn("stacks", why)
+                text = f"hangs of the loop are not looked for: {error}"
+                self._session.journal.log("info", "bridge", text)
 
     def close(self) -> None:
         """Log what was written last, and remove the file."""
@@ -103,7 +102,9 @@ class Watchdog:
         self._is_on = False
 
     def _look(self) -> None:
-        if self._file < 0:
+        if _timer.is_others:
+            raise RuntimeError(_BY_OTHERS)
+        if self._file < 0 or not os.fstat(self._file).st_nlink:  # it may have been deleted
             # To the end of what it has by then, as the timer's thread writes there too.
             flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_BINARY", 0)
             self._file = os.open(self._path, flags, PRIVATE_FILE)
@@ -116,7 +117,7 @@ class Watchdog:
         alive_s = self._meter.at_s
         if alive_s == self._set_s:
             return
-        head = self._describe()
+        head = json.dumps(self._about | {"run": self._session.clock.run.uuid}).encode() + b"\n"
         if head != self._head or file.st_size != len(head):
             os.ftruncate(self._file, 0)
             os.write(self._file, head)
@@ -125,18 +126,6 @@ class Watchdog:
         left_s = self._limit_s + INTERVAL_S - (time.perf_counter() - alive_s)
         _timer.set(max(left_s, _SHORTEST_S), self._file)
         self._set_s = alive_s
-
-    def _describe(self) -> bytes:
-        """The first line: whose stacks follow."""
-        about = {
-            VERSION: FORMAT,
-            "run": self._session.clock.run.uuid,
-            "thread": self._thread,
-            "limit_s": self._limit_s,
-            "step_files": self._session.simulation.step_files,
-            "libraries": _LIBRARIES,
-        }
-        return json.dumps(about).encode() + b"\n"
 
     def _judge(self, written_s: float) -> None:
         """Log where the loop was, unless it waited for Webots or was not silent at all."""
@@ -149,8 +138,7 @@ class Watchdog:
             return
         self._logged += 1
         clock = self._session.clock
-        values = {"sim_time": clock.sim_time_s, "wall_time": written_s, "message": stacks.message}
-        self._session.recorder.record("stacks", clock.run, values)
+        self._session.recorder.record("stacks", clock.run, stacks.log_values(clock.sim_time_s))
 
     def _was_silent(self, wall_time_s: float) -> bool:
         """Whether the loop had begun, and gave no sign of life for the limit up to then.
@@ -187,11 +175,7 @@ class _Timer:
         self._module = module
         self._set = module.dump_traceback_later
         self._is_ours = self.is_forking = False
-        self.is_others = was_imported and (
-            _blocks_all_signals()
-            if sys.platform.startswith("linux")
-            else not module.is_enabled() or "_pytest" in sys.modules
-        )
+        self.is_others = was_imported and _is_set(was_enabled=module.is_enabled())
 
         @functools.wraps(self._set)
         def set_by_others(*args: Any, **kwargs: Any) -> None:
@@ -217,14 +201,13 @@ class _Timer:
         self.cancel()
 
 
-def _blocks_all_signals() -> bool:
-    """Whether a thread blocks the signals 1 to 30, as far as they can be."""
-    for status in Path("/proc/self/task").glob("*/status"):
-        with suppress(OSError):
-            blocked = re.search(r"^SigBlk:\s*(\w+)", status.read_text(), re.MULTILINE)
-            if blocked and int(blocked[1], 16) & _ALL == _ALL:
-                return True
-    return False
+def _is_set(*, was_enabled: bool) -> bool:
+    """Whether a thread blocks the signals 1 to 30, as far as they can be; else what is likely."""
+    if not sys.platform.startswith("linux"):
+        return not was_enabled or "_pytest" in sys.modules
+    threads = [status.read_text() for status in Path("/proc/self/task").glob("*/status")]
+    blocked = re.findall(r"^SigBlk:\s*(\w+)", "\n".join(threads), re.MULTILINE)
+    return any(int(mask, 16) & _ALL == _ALL for mask in blocked)
 
 
 _timer: Final = _Timer()

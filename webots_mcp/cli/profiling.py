@@ -11,9 +11,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Annotated, Final
 
-from cyclopts.validators import Number
-
-from webots_mcp.cli.options import HERE, Json, Parameter, Where, whole_number
+from webots_mcp.cli.options import HERE, Count, Json, Parameter, Where
 from webots_mcp.cli.terminal import print_json, print_table
 from webots_mcp.contract import find_project, host_name
 from webots_mcp.errors import CommandRefusedError
@@ -22,12 +20,13 @@ from webots_mcp.stacks import INSTALLED, STEPPING
 
 _FRAME: Final = re.compile(r"(.*) \((.*):(\d+)\)$")
 _OURS: Final = str(Path(__file__).parents[1])
-_SHOWN: Final = 10
-_WAITING, _BRIDGE, _OTHER = "waiting in step()", "in the bridge", "elsewhere"
+_SHOWN: Final = 12
+_WAITING: Final = ("waiting in step()", None)
+_BRIDGE: Final = ("in the bridge", None)
+_OTHER: Final = ("in no file of the controller", None)
 _NOT_PERMITTED: Final = (
-    "the system does not let py-spy look into process {}: on Linux 'sudo sysctl "
-    "kernel.yama.ptrace_scope=0' or, in a container, --cap-add SYS_PTRACE allows it; on macOS only "
-    "root may"
+    "py-spy may not look into process {}: allow it with 'sudo sysctl kernel.yama.ptrace_scope=0' "
+    "on Linux, with --cap-add SYS_PTRACE for a container, or ask as root (macOS)"
 )
 
 
@@ -35,15 +34,7 @@ def profile(
     robot: Annotated[str | None, Parameter("ROBOT", help="Which (the only live one).")] = None,
     /,
     *,
-    seconds: Annotated[
-        int,
-        Parameter(
-            "--for",
-            help="Seconds of wall time (10).",
-            converter=whole_number,
-            validator=Number(gte=1, lte=3600),
-        ),
-    ] = 10,
+    seconds: Annotated[Count, Parameter("--for", help="Seconds of wall time (10).")] = 10,
     json: Json = False,
     recorded: Where = HERE,
 ) -> None:
@@ -58,19 +49,17 @@ def profile(
         raise CommandRefusedError(f"no controller of {name} runs on this machine")
     controller = Path(session.controller or "/nowhere")
     own = str(find_project(controller.parent) or controller.parent)
-    samples = Counter[tuple[str, str]]()
+    samples = Counter[tuple[str, str | None]]()
     for stack, count in _sampled(session.pid, seconds):
         samples[_place_of(stack, own)] += count
     total = samples.total()
-    shares = {each: samples.pop((each, ""), 0) / total for each in (_WAITING, _BRIDGE, _OTHER)}
     columns = ("share", "line", "function", "samples")
-    rows = [[round(n / total, 3), *place, n] for place, n in samples.most_common(_SHOWN)]
+    rows = [[f"{n / total:.1%}", *place, n] for place, n in samples.most_common(_SHOWN)]
     if json:
-        shown = {"robot": name, "samples": total, "seconds": seconds, "columns": columns}
-        return print_json(shown | {"rows": rows, "besides": shares})
-    print_table(columns, [[f"{row[0]:.1%}", *row[1:]] for row in rows])
-    rest = ", ".join(f"{share:.1%} {where}" for where, share in shares.items())
-    print(f"{name}: {total} samples in {seconds} s of its main thread; besides {rest}")
+        found = {"robot": name, "seconds": seconds, "samples": total}
+        return print_json(found | {"columns": columns, "rows": rows})
+    print_table(columns, rows)
+    print(f"{name}: {total} samples of its main thread in {seconds} s")
 
 
 def _sampled(pid: int, seconds: int) -> list[tuple[str, int]]:
@@ -79,8 +68,7 @@ def _sampled(pid: int, seconds: int) -> list[tuple[str, int]]:
     Raises:
         CommandRefusedError: py-spy is not installed, or not permitted; the text says what to do.
     """
-    beside = Path(sys.executable).with_name("py-spy")
-    spy = shutil.which("py-spy") or shutil.which(beside)
+    spy = shutil.which("py-spy") or shutil.which(Path(sys.executable).with_name("py-spy"))
     if spy is None:
         raise CommandRefusedError(explain_extra("webots-mcp profile", "profile"))
     with tempfile.TemporaryDirectory() as folder:
@@ -89,23 +77,24 @@ def _sampled(pid: int, seconds: int) -> list[tuple[str, int]]:
         line = [spy, "record", f"--pid={pid}", f"--duration={seconds}", *how]
         ended = subprocess.run(line, capture_output=True, text=True, check=False)
         text = file.read_text("utf-8", "replace") if file.exists() else ""
-    found = [(stack, int(n)) for stack, _, n in (e.rpartition(" ") for e in text.splitlines())]
-    found = [(stack, count) for stack, count in found if "MainThread;" in stack]
-    if not found:
-        why = _NOT_PERMITTED.format(pid) if re.search("(?i)permi", ended.stderr) else ""
-        said = ended.stderr.strip().splitlines() or ["nothing was sampled"]
-        raise CommandRefusedError(why or f"py-spy could not sample process {pid}: {said[-1]}")
-    return found
+    found = [line.rpartition(" ") for line in text.splitlines() if "MainThread;" in line]
+    if found:
+        return [(stack, int(count)) for stack, _, count in found]
+    if re.search("permi", ended.stderr, re.IGNORECASE):
+        raise CommandRefusedError(_NOT_PERMITTED.format(pid))
+    *_, said = ended.stderr.strip().splitlines() or ["it has written nothing"]
+    raise CommandRefusedError(f"py-spy could not sample process {pid}: {said}")
 
 
-def _place_of(stack: str, own: str) -> tuple[str, str]:
+def _place_of(stack: str, own: str) -> tuple[str, str | None]:
     """The innermost line of the controller's own files, and its function."""
-    frames = [found.groups() for each in stack.split(";") if (found := _FRAME.match(each))]
-    inner = list[str]()
-    for function, file, line in reversed(frames):
-        if function.rpartition(".")[2] in STEPPING and not file.startswith(own):
-            return _WAITING, ""
-        if file.startswith(own) and not INSTALLED.search(file):
-            return (_BRIDGE, "") if inner else (f"{Path(file).name}:{line}", f"{function}()")
-        inner += [file] if file.startswith(_OURS) else []
-    return _OTHER, ""
+    in_bridge = False
+    for each in reversed(stack.split(";")):
+        function, file, line = found.groups() if (found := _FRAME.match(each)) else ("", "", "")
+        is_own = file.startswith(own) and not INSTALLED.search(file)
+        if function.rpartition(".")[2] in STEPPING and not is_own:
+            return _WAITING
+        if is_own:
+            return _BRIDGE if in_bridge else (f"{Path(file).name}:{line}", f"{function}()")
+        in_bridge = in_bridge or file.startswith(_OURS)
+    return _OTHER

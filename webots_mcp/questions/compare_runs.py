@@ -64,7 +64,6 @@ from webots_mcp.store.questions.runs import (
     run_info,
 )
 from webots_mcp.store.recording import Recording, View, look
-from webots_mcp.store.run_rows import round_ms
 
 RUN_COLUMNS: Final = (
     "run_id", "robot", "label", "parameters", "started", "began_by", "ended_by", "duration_s",
@@ -247,7 +246,8 @@ def _run_row(run: RunInfo) -> list[Any]:
         run.end_reason or _GOING_ON,
         seconds(run.duration_s),
         figure(run.real_time_factor),
-        *map(figure, round_ms(run.own_wall_s, run.step_wait_wall_s, run.steps)),
+        figure(run.own_ms),
+        figure(run.step_wait_ms),
         run.row_count,
         run.purged_rows or None,
         shown(run.notable) or None,

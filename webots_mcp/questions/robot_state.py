@@ -164,7 +164,7 @@ def _recorder(view: View) -> dict[str, Any]:
     return {
         "row_count": view.run.row_count if view.run else 0,
         "why": view.header().get("why"),
-        "pace": pace_of(cut_text(view.robot.name, _LONGEST_NAME), view.run) if view.run else None,
+        "pace": view.run and pace_of(view.connection, "it", view.run.id),
         "waiting_in": None,
         **rows_waiting(view.connection, session),
         "rows_dropped": session.rows_dropped if session else 0,
@@ -370,7 +370,7 @@ def webots_get_robot_state(
             state=short.value,
             shortened=short.rule,
             kept_at_full_rate=_kept(view),
-            pace=pace_of(view.robot.name, view.run) if view.run else None,
+            pace=pace_of(view.connection, view.robot.name, view.require_run().id),
             hint=hint,
         )
 

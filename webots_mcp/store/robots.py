@@ -375,7 +375,6 @@ WAITING_IN_STEP: Final = (
     "holds the world up, or an extern one is missing; from inside the simulation these look alike"
 )
 _HELD_UP_BY: Final = "its loop waits in step(), as the whole world does, for {}: {}"
-_HANGS: Final = "silent for {} s in {}{}"
 _STARTED: Final = "its controller has just started; simulation time has not moved yet"
 _NOT_STARTED: Final = (
     "its controller has started, but simulation time has not moved since: the simulation may be "
@@ -548,13 +547,8 @@ def _hang(connection: sqlite3.Connection, session: Session, now_s: float) -> str
     stacks = find_stacks(connection, session)
     if stacks is None or not stacks.is_hang:
         return None
-    silent_s = session.silent_s(now_s)
-    inside = handler_at_work(connection, session, now_s)
-    return _HANGS.format(
-        f"{silent_s:.{1 if silent_s < 10 else 0}f}",
-        stacks.place,
-        f" ({inside})" if inside else "",
-    )
+    hangs = f"silent for {session.silent_s(now_s):.3g} s in {stacks.place}"
+    return "; ".join(filter(None, (hangs, handler_at_work(connection, session, now_s))))
 
 
 def _seen_by_observer(connection: sqlite3.Connection, session: Session, now_s: float) -> str | None:

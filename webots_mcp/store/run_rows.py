@@ -43,9 +43,6 @@ class Run:
     end_reason: str | None
     row_count: int
     label: str | None
-    own_wall_s: float | None
-    step_wait_wall_s: float | None
-    steps: int | None
 
 
 @dataclass(frozen=True)
@@ -117,7 +114,10 @@ _LATER_THAN_ANY: Final = b"\xff"
 PACE_ROWS: Final = 6
 PACE_WINDOW_S: Final = 5.0
 _PACE_WINDOW_ROWS: Final = 500
-_FEWEST_STEPS: Final = 20  # of a mean
+# Mean wall time of a round of the loop, in its own code and in `step`; null where few were seen.
+OWN_MS: Final = "CASE WHEN steps >= 20 THEN 1e3 * own_wall_s / steps END"
+STEP_WAIT_MS: Final = "CASE WHEN steps >= 20 THEN 1e3 * step_wait_wall_s / steps END"
+_ROUND: Final = f"SELECT {OWN_MS}, {STEP_WAIT_MS}, steps FROM run WHERE id = ?"
 _SETS_PACE: Final = 0.8  # of a round's time
 _SHOWN_KEYS: Final = 20
 _SEARCHED_KEYS: Final = 1000  # for those like the one that is not there
@@ -203,32 +203,20 @@ def real_time_factor(connection: sqlite3.Connection, run_id: int) -> float | Non
     return (recent[0][0] - recent[-1][0]) / (recent[0][1] - recent[-1][1])
 
 
-def round_ms(
-    own_s: float | None, step_wait_s: float | None, steps: int | None
-) -> tuple[float, float] | tuple[None, None]:
-    """Mean wall time of a round of the loop, in its own code and in `step`, in ms.
-
-    Both are None where fewer than 20 rounds were seen.
-    """
-    if own_s is None or step_wait_s is None or steps is None or steps < _FEWEST_STEPS:
-        return None, None
-    return 1e3 * own_s / steps, 1e3 * step_wait_s / steps
-
-
-def pace_of(robot: str, run: Run) -> str | None:
-    """Who sets the pace of a run, in a sentence; None where too few rounds were seen."""
-    own_ms, wait_ms = round_ms(run.own_wall_s, run.step_wait_wall_s, run.steps)
-    if own_ms is None or wait_ms is None:
+def pace_of(connection: sqlite3.Connection, robot: str, run_id: int) -> str | None:
+    """Who sets the pace of a run, in a sentence; None where too few of its steps were seen."""
+    own_ms, wait_ms, steps = connection.execute(_ROUND, (run_id,)).fetchone()
+    if own_ms is None:
         return None
     share = own_ms / max(own_ms + wait_ms, 1e-9)
-    needs = f"{robot} needs {own_ms:.3g} of each {own_ms + wait_ms:.3g} ms"
     if share >= _SETS_PACE:
         why = "the controller, not the physics, sets the pace"
     elif share > 1 - _SETS_PACE:
         why = "controller and Webots (or another controller) take turns"
     else:
         why = "Webots, real time or another controller sets the pace, not this one"
-    return f"{needs}: {why} (mean of {run.steps} steps)"
+    needs = f"{robot} needs {own_ms:.3g} of each {own_ms + wait_ms:.3g} ms"
+    return f"{needs}: {why} (mean of {steps} steps)"
 
 
 def select(value: Any, path: str) -> Any:

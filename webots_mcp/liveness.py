@@ -170,6 +170,14 @@ def _linux_stat(pid: int) -> list[bytes]:
         return file.read().rpartition(b") ")[2].split()
 
 
+def is_stopped(pid: int) -> bool:
+    """Whether a signal or a debugger has stopped a process; only Linux shows that."""
+    try:
+        return _linux_stat(pid)[0] in (b"T", b"t")
+    except (OSError, IndexError):
+        return False
+
+
 def _windows_start(pid: int) -> float | None:
     """As `_posix_start`."""
     created = _windows_creation(pid)

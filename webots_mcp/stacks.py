@@ -1,10 +1,9 @@
 """Where a silent loop is: the stacks of a controller's threads, in a file next to the database.
 
 The bridge lets `faulthandler` write them where the loop gives no sign of life for longer than a
-limit. Its timer is a thread of C that needs no lock of the interpreter, so that it also works where
-C code never returns. The first line of the file is a JSON object: whose stacks they are, and which
-files are not the controller's own. What follows is empty, or what `faulthandler` wrote; its time is
-that of the file. The file stays locked while its process lives.
+limit. The first line of the file is a JSON object: whose stacks they are, and which files are not
+the controller's own. What follows is empty, or what `faulthandler` wrote; its time is that of the
+file. The file stays locked while its process lives.
 
 Standard library only, because the bridge imports it inside a robot's controller.
 """
@@ -14,6 +13,8 @@ from __future__ import annotations
 import json
 import os
 import re
+import time
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
@@ -30,6 +31,8 @@ _FOLDERS: Final = re.compile(r".*[/\\]")
 INSTALLED: Final = re.compile(r"[/\\](?:site|dist)-packages[/\\]|^<frozen ")
 _DEBUGGER: Final = re.compile(r"(?:[/\\]|^)(?:bdb|pdb)\.py$|[/\\](?:pydevd|debugpy|_pydev)")
 _EARLY: Final = 0.9  # of the limit: the clock of files is coarse
+_UNTOUCHED_S: Final = 3.0  # the maintainer's thread touches the file each second
+_WRITING_S: Final = 0.1
 _MOST_BYTES: Final = 200_000
 _MOST_TEXT: Final = 4000
 _MOST_CALLERS: Final = 3
@@ -129,13 +132,26 @@ def _is_library(file: str, libraries: tuple[str, ...]) -> bool:
     return file.startswith(libraries) or INSTALLED.search(file) is not None
 
 
-def stacks_at(path: Path) -> Stacks | None:
-    """What the file at that path holds; None where there is none."""
-    try:
-        with path.open("rb") as file:
-            return read_stacks(file)
-    except OSError:
-        return None
+def stacks_at(path: Path, pid: int, *, may_signal: bool) -> Stacks | None:
+    """What the file of a process holds; None where nothing was written.
+
+    Where no thread of that process could touch the file any more, C code keeps the interpreter's
+    lock. The process is sent the signal then on which it writes its stacks.
+
+    Args:
+        path: The file.
+        pid: The process.
+        may_signal: It runs on this machine, and is not stopped.
+    """
+    with suppress(OSError, ValueError, LookupError, TypeError), path.open("rb") as file:
+        found, about = read_stacks(file), json.loads((file.seek(0), file.readline())[1])
+        untouched_s = time.time() - os.fstat(file.fileno()).st_mtime
+        if found is None and may_signal and untouched_s > about["limit_s"] + _UNTOUCHED_S:
+            os.kill(pid, about["signal"])
+            time.sleep(_WRITING_S)
+            found = read_stacks(file)
+        return found
+    return None
 
 
 def _cut(name: str) -> str:

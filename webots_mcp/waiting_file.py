@@ -247,7 +247,7 @@ def waiting_path(database: Path, session_uuid: str) -> Path:
 
 
 def waiting_paths(database: Path, kind: Callable[[Path, str], Path] = waiting_path) -> list[Path]:
-    """The files in which entries for a database wait, of living sessions too; or those of a kind."""
+    """The files in which entries for a database wait, of living sessions too; or of a kind."""
     before, after = kind(database, "*").name.split("*")
     try:
         with os.scandir(database.parent) as files:

@@ -6,7 +6,6 @@ Webots is called only in the controller's own thread, and never after a quit.
 from __future__ import annotations
 
 import functools
-import math
 import time
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
@@ -273,26 +272,19 @@ class LoopMeter:
 
     Attributes:
         at_s: The newest sign of life, by `time.perf_counter`.
-        silence: From and to when the loop gave none for longer than the limit, the last time.
-        limit_s: Of a silence.
     """
 
-    __slots__ = ("_own_s", "_step_s", "_steps", "at_s", "limit_s", "silence")
+    __slots__ = ("_own_s", "_step_s", "_steps", "at_s")
 
     def __init__(self) -> None:
         self.at_s = time.perf_counter()
-        self.silence: tuple[float, float] = (0.0, 0.0)
-        self.limit_s = math.inf
         self._own_s = self._step_s = 0.0
         self._steps = -1  # until the first step has ended: what a controller does before is no loop
 
     def leave_own(self) -> None:
         """The controller's own code calls a step or the bridge."""
         now_s = time.perf_counter()
-        taken_s = now_s - self.at_s
-        if taken_s > self.limit_s:
-            self.silence = (self.at_s, now_s)
-        self._own_s += taken_s
+        self._own_s += now_s - self.at_s
         self.at_s = now_s
 
     def leave_step(self, answer: int, has_advanced: bool) -> int:
@@ -308,10 +300,7 @@ class LoopMeter:
 
     def leave_bridge(self) -> None:
         """A call of the bridge ends, or it lets a step be made."""
-        now_s = time.perf_counter()
-        if now_s - self.at_s > self.limit_s:
-            self.silence = (self.at_s, now_s)
-        self.at_s = now_s
+        self.at_s = time.perf_counter()
 
     def begin_run(self) -> None:
         """Count from here, the end of a step."""

@@ -25,7 +25,7 @@ from webots_mcp.contract import (
     host_name,
 )
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError, UnknownRobotError
-from webots_mcp.liveness import EXTERN, is_living, process_alive
+from webots_mcp.liveness import EXTERN, is_living, is_stopped, process_alive
 from webots_mcp.naming import SOLIDS, WORLD
 from webots_mcp.pauses import (
     HELD_ELSEWHERE,
@@ -507,7 +507,7 @@ def _why_standing(
     """Why the time of a living controller, which its bridge does not hold, stands still."""
     if inside := handler_at_work(connection, session, now_s):
         return inside
-    stacks = find_stacks(connection, session)
+    stacks = find_stacks(connection, session, now_s)
     for other in companions(connection, session, now_s) if stacks and stacks.is_in_step else ():
         if hang := _hang(connection, other, now_s):
             return _HELD_UP_BY.format(robot_name(connection, other.robot_id), hang)
@@ -535,16 +535,18 @@ def _is_unseen(session: Session, moved_s: float | None) -> bool:
     return moved_s is None and session.last_poll_wall_time_s is None
 
 
-def find_stacks(connection: sqlite3.Connection, session: Session) -> Stacks | None:
+def find_stacks(connection: sqlite3.Connection, session: Session, now_s: float) -> Stacks | None:
     """Where the loop of a session is silent now; None where it is not, or that is not known."""
     path = _path_of(connection, session, stacks_path)
-    stacks = stacks_at(path) if path else None
+    is_silent = session.host == host_name() and not session.heartbeat_is_fresh(now_s)
+    may_signal = is_silent and not is_stopped(session.pid)
+    stacks = stacks_at(path, session.pid, may_signal=may_signal) if path else None
     return stacks if stacks and stacks.began_after(session.last_seen_wall_time_s) else None
 
 
 def _hang(connection: sqlite3.Connection, session: Session, now_s: float) -> str | None:
     """That the loop is silent in the controller's code, and in which; None where it is not."""
-    stacks = find_stacks(connection, session)
+    stacks = find_stacks(connection, session, now_s)
     if stacks is None or not stacks.is_hang:
         return None
     hangs = f"silent for {session.silent_s(now_s):.3g} s in {stacks.place}"

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 _MOST_LOGGED: Final = 20  # in a session: a loop that is slow by design would fill the log
 _OURS: Final = f"{Path(__file__).parents[1]}{os.sep}"
 _STDLIB: Final = f"{Path(os.__file__).parent}{os.sep}"
+_WEBOTS: Final = ("controller", "vehicle")  # its packages
 _SIGNAL: Final = getattr(signal, "SIGRTMAX", 5) - 5  # 0, none, but on Linux
 
 
@@ -51,7 +52,10 @@ class Watchdog:
         self._path = stacks_path(Path(str(database)), session.recorder.uuid)
         self._lock = threading.Lock()
         self._about = {VERSION: FORMAT, "thread": threading.get_ident(), "limit_s": limit_s}
-        self._about |= {"step_files": session.simulation.step_files, "libraries": [_OURS, _STDLIB]}
+        files = session.simulation.step_files
+        folders = [folder for file in files if (folder := Path(file).parent).name in _WEBOTS]
+        libraries = [_OURS, _STDLIB, *(f"{folder}{os.sep}" for folder in folders)]
+        self._about |= {"step_files": files, "libraries": libraries}
         self._file = -1
         self._head = b""
         self._began_s = self._silent_since_s = 0.0  # signs of life

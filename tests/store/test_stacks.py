@@ -123,7 +123,8 @@ def test_what_a_dead_process_left_is_logged_where_its_loop_had_been_silent(
         ((1.0, 31.0, 1000), "r needs 1 of each 32 ms: Webots, real time or another controller"),
         ((16.0, 16.0, 1000), "r needs 16 of each 32 ms: controller and Webots (or another"),
         ((0.0, 0.0, 1000), "r needs 0 of each 0 ms: Webots"),
-        ((31.0, 1.0, 19), "None"),
+        ((0.31, 0.01, 19), "None"),
+        ((12.0, 0.1, 3), "r needs 4000 of each 4033 ms: the controller, not the physics"),
         ((None, None, None), "None"),
     ],
 )

@@ -429,9 +429,10 @@ def judge(
     fresh = session.heartbeat_is_fresh(now_s)
     if fresh and _change_since_beat(connection, session) == RESUME:
         return Status(RUNNING)
-    if not _is_unseen(session, moved_s) and (hang := _hang(connection, session, now_s)):
-        return _stopped(session, moved_s, now_s, hang)
     still_moving_s = _still_moving_s(connection, run)
+    if not _is_unseen(session, moved_s) and (hang := _hang(connection, session, now_s)):
+        is_slow = moved_s is not None and session.age_s(moved_s, now_s) <= still_moving_s
+        return Status(RUNNING, hang) if is_slow else _stopped(session, moved_s, now_s, hang)
     if not fresh and (backlog := find_backlog(connection, session)) is not None:
         moved_s = max(moved_s or 0.0, backlog.newest_wall_time_s)
         why = _WAITING.format(backlog.file_name, max(now_s - backlog.oldest_wall_time_s, 0.0))
@@ -549,7 +550,8 @@ def _hang(connection: sqlite3.Connection, session: Session, now_s: float) -> str
     stacks = find_stacks(connection, session, now_s)
     if stacks is None or not stacks.is_hang:
         return None
-    hangs = f"silent for {session.silent_s(now_s):.3g} s in {stacks.place}"
+    silent_s = session.silent_s(now_s)
+    hangs = f"silent for {silent_s:.{1 if silent_s < 10 else 0}f} s in {stacks.place}"
     return "; ".join(filter(None, (hangs, handler_at_work(connection, session, now_s))))
 
 

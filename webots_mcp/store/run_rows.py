@@ -115,8 +115,9 @@ PACE_ROWS: Final = 6
 PACE_WINDOW_S: Final = 5.0
 _PACE_WINDOW_ROWS: Final = 500
 # Mean wall time of a round of the loop, in its own code and in `step`; null where few were seen.
-OWN_MS: Final = "CASE WHEN steps >= 20 THEN 1e3 * own_wall_s / steps END"
-STEP_WAIT_MS: Final = "CASE WHEN steps >= 20 THEN 1e3 * step_wait_wall_s / steps END"
+_ENOUGH: Final = "steps >= 20 OR (steps > 0 AND own_wall_s + step_wait_wall_s >= 10)"
+OWN_MS: Final = f"CASE WHEN {_ENOUGH} THEN 1e3 * own_wall_s / steps END"
+STEP_WAIT_MS: Final = f"CASE WHEN {_ENOUGH} THEN 1e3 * step_wait_wall_s / steps END"
 _ROUND: Final = f"SELECT {OWN_MS}, {STEP_WAIT_MS}, steps FROM run WHERE id = ?"
 _SETS_PACE: Final = 0.8  # of a round's time
 _SHOWN_KEYS: Final = 20
@@ -215,7 +216,7 @@ def pace_of(connection: sqlite3.Connection, robot: str, run_id: int) -> str | No
         why = "controller and Webots (or another controller) take turns"
     else:
         why = "Webots, real time or another controller sets the pace, not this one"
-    needs = f"{robot} needs {own_ms:.3g} of each {own_ms + wait_ms:.3g} ms"
+    needs = f"{robot} needs {own_ms:.4g} of each {own_ms + wait_ms:.4g} ms"
     return f"{needs}: {why} (mean of {steps} steps)"
 
 

@@ -49,7 +49,7 @@ def test_without_the_sampler_or_a_controller_it_is_said_what_to_do(
 ) -> None:
     simulation = start(SLOW)
     simulation.wait_for(lambda: has_states(filed))
-    monkeypatch.setattr(shutil, "which", lambda _: None)
+    monkeypatch.setattr(shutil, "which", dict[object, str]().get)
     here = cli.on("--data-dir", data_dir)
     missing = here.ended("profile")[2]
     simulation.close()

@@ -104,7 +104,7 @@ def test_what_a_dead_process_left_is_logged_where_its_loop_had_been_silent(
     robot = recorded.robot(now=time.time() - 60)
     recorded.connection.execute("UPDATE run SET uuid = 'a run'")
     path = written(stacks_path(tmp_path / "webots.db", "gone"), "/p/nav.py:8:plan")
-    os.utime(path, (robot.now + silent_s,) * 2)
+    os.utime(path, (robot.now + silent_s, robot.now + silent_s))
     assert adopt(recorded.connection, tmp_path / "webots.db") == rows
     found = recorded.connection.execute("SELECT level, message FROM log").fetchall()
     assert [(level, message.split("\n")[0]) for level, message in found] == [

@@ -26,7 +26,8 @@ ALLOWED = {
     "signal_register": {"naming"},
     "conditions": {"conditions", "errors", "naming"},
     "parameter": {"errors", "naming"},
-    "waiting_file": {"connection", "errors", "queue"},
+    "stacks": set[str](),
+    "waiting_file": {"connection", "errors", "queue", "stacks"},
     "maintenance": {"connection", "errors", "liveness", "waiting_file"},
     "standin": {"standin", "contract"},
     "webots": {"connection", "contract", "errors", "liveness", "webots"},
@@ -44,6 +45,7 @@ STDLIB = {
     "pauses",
     "queue",
     "signal_register",
+    "stacks",
     "waiting_file",
 }
 ALLOWED["bridge"] = STDLIB | {"bridge", "__version__"}

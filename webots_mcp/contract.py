@@ -31,6 +31,7 @@ DATA_DIR_VARIABLE: Final = "WEBOTS_MCP_DATA_DIR"
 STRICT_VARIABLE: Final = "WEBOTS_MCP_STRICT"
 THROTTLE_VARIABLE: Final = "WEBOTS_MCP_THROTTLE_INTERVAL"
 KEEP_LAST_VARIABLE: Final = "WEBOTS_MCP_KEEP_LAST_S"
+HANG_VARIABLE: Final = "WEBOTS_MCP_HANG_AFTER_S"
 PARAMETERS_VARIABLE: Final = "WEBOTS_MCP_PARAMETERS"
 
 PRIVATE_FOLDER: Final = 0o700  # recordings hold pictures and logs: they are their owner's alone
@@ -103,6 +104,7 @@ BreakpointAction = Literal["pause", "log", "keep"]
 BREAKPOINT_ACTIONS: Final[tuple[BreakpointAction, ...]] = get_args(BreakpointAction)
 MAX_BREAKPOINTS: Final = 32  # of one robot that are armed
 KEEP_LAST_S: Final = 5.0  # before a moment, kept at full rate
+HANG_AFTER_S: Final = 3.0  # of wall time without a sign of life of the loop
 KEEP_AFTER_S: Final = 2.0  # after it
 LOOPING: Final = ("step", "run")  # actions that let the loop come round; one is under way at most
 ENDING: Final = ("load_world", "quit")  # actions that are done when the controller ends

@@ -42,8 +42,10 @@ _BEAT_SESSION: Final = (
     f"ended_wall_time_s = {_ALIVE.format('session', 'id', 'ended_wall_time_s')}, "
     f"end_reason = {_ALIVE.format('session', 'id', 'end_reason')} WHERE id = ?"
 )
+NO_TIMES: Final = (None, None, None)  # in place of `LoopTimes`: no round of the loop was seen
 _BEAT_RUN: Final = (
     "UPDATE run SET last_wall_time_s = ?, last_sim_time_s = ?, row_count = ?, "
+    "own_wall_s = ?, step_wait_wall_s = ?, steps = ?, "
     f"ended_wall_time_s = {_ALIVE.format('run', 'session_id', 'ended_wall_time_s')}, "
     f"end_reason = {_ALIVE.format('run', 'session_id', 'end_reason')} WHERE id = ?"
 )
@@ -168,6 +170,14 @@ def _linux_stat(pid: int) -> list[bytes]:
         return file.read().rpartition(b") ")[2].split()
 
 
+def is_stopped(pid: int) -> bool:
+    """Whether a signal or a debugger has stopped a process; only Linux shows that."""
+    try:
+        return _linux_stat(pid)[0] in (b"T", b"t")
+    except (OSError, IndexError):
+        return False
+
+
 def _windows_start(pid: int) -> float | None:
     """As `_posix_start`."""
     created = _windows_creation(pid)
@@ -195,6 +205,14 @@ def _windows_creation(pid: int) -> int | None:
     return int(times[0]) if known else 0
 
 
+class LoopTimes(NamedTuple):
+    """What the rounds of a run took of wall time, from one end of a step to the next."""
+
+    own_s: float
+    step_wait_s: float
+    steps: int
+
+
 class LoopStatus(NamedTuple):
     """What a heartbeat says of the loop."""
 
@@ -203,6 +221,7 @@ class LoopStatus(NamedTuple):
     moved_wall_time_s: float | None
     command: str | None
     mode_before: str | None
+    times: LoopTimes | None = None
 
 
 class RecordingStatus(NamedTuple):
@@ -235,7 +254,7 @@ def write_heartbeat(
     seen = (now, time.monotonic(), loop.last_poll_wall_time_s, loop.moved_wall_time_s)
     how = (loop.sim_time_s, loop.command, loop.mode_before)
     connection.execute(_BEAT_SESSION, (*seen, *how, *recording, session_id))
-    connection.execute(_BEAT_RUN, (now, loop.sim_time_s, rows, run_id))
+    connection.execute(_BEAT_RUN, (now, loop.sim_time_s, rows, *(loop.times or NO_TIMES), run_id))
 
 
 def reap(connection: sqlite3.Connection, now_s: float) -> None:

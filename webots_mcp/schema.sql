@@ -72,6 +72,9 @@ CREATE TABLE run (
 	purged_rows INTEGER DEFAULT 0 NOT NULL /* of the rows, those that retention has deleted */, 
 	is_chunked INTEGER DEFAULT 0 NOT NULL /* 1 once it has ended and none of its rows wait for a chunk */, 
 	uuid TEXT /* random (version 4); names the row among those of all machines */, 
+	own_wall_s FLOAT /* wall time in the controller's own code, over its steps; null where none was seen */, 
+	step_wait_wall_s FLOAT /* wall time in step(), waiting for Webots */, 
+	steps INTEGER /* from the end of one to the end of the next */, 
 	CONSTRAINT fk_run_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE CASCADE, 
 	CONSTRAINT fk_run_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE
 );

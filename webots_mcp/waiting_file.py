@@ -32,6 +32,7 @@ from typing import Any, BinaryIO, Final, Literal, NamedTuple, cast
 from webots_mcp import queue
 from webots_mcp.connection import in_transaction
 from webots_mcp.errors import SessionGoneError, warn
+from webots_mcp.stacks import LOGGER, read_stacks, stacks_path
 
 # What a controller writes while it runs: each kind of write by its name, with its statement.
 
@@ -41,6 +42,7 @@ Kind = Literal[
     "state",
     "event",
     "log",
+    "stacks",
     "image",
     "image forgotten",
     "run end",
@@ -82,6 +84,13 @@ STATEMENTS: Final[dict[Kind, str]] = {
         "INSERT INTO log (run_id, sim_time_s, wall_time_s, level, source, message, logger) "
         "VALUES (?, ?, ?, ?, ?, ?, ?)"
     ),
+    # Of stacks that several processes may find, known by their time.
+    "stacks": (
+        "INSERT INTO log (run_id, sim_time_s, wall_time_s, level, source, message, logger) "
+        "SELECT id, coalesce(:sim_time, last_sim_time_s), :wall_time, 'warning', 'bridge', "
+        f":message, '{LOGGER}' FROM run WHERE id = :run AND NOT EXISTS (SELECT 1 FROM log "
+        f"WHERE run_id = :run AND wall_time_s = :wall_time AND logger = '{LOGGER}')"
+    ),
     "image": (
         "INSERT INTO image (run_id, sim_time_s, wall_time_s, kind, device, path, width, height, "
         "size_bytes) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
@@ -90,7 +99,8 @@ STATEMENTS: Final[dict[Kind, str]] = {
     # Without a number of rows they are counted: a dead process could not say how many.
     "run end": (
         "UPDATE run SET end_reason = :reason, ended_wall_time_s = :now, last_wall_time_s = :now, "
-        "last_sim_time_s = :sim_time, row_count = coalesce(:rows, "
+        "last_sim_time_s = :sim_time, own_wall_s = :own, step_wait_wall_s = :step_wait, "
+        "steps = :steps, row_count = coalesce(:rows, "
         "purged_rows + (SELECT count(*) FROM state WHERE run_id = :run)) WHERE id = :run"
     ),
     "session end": (
@@ -186,6 +196,10 @@ _RECOUNT: Final = (
     "SELECT purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id), id FROM run "
     "WHERE session_id = ? AND ended_wall_time_s IS NOT NULL"
 )
+_RUN_SEEN: Final = (
+    "SELECT r.id, r.last_wall_time_s FROM run r JOIN session s ON s.id = r.session_id "
+    "WHERE r.uuid = ? AND coalesce(s.last_poll_wall_time_s, s.moved_wall_time_s) IS NOT NULL"
+)
 _SET_ROWS: Final = "UPDATE run SET row_count = ? WHERE id = ?"
 _KNOWN_ROBOT: Final = (
     "INSERT INTO robot (name, kind, devices, first_seen_wall_time_s, last_seen_wall_time_s) "
@@ -232,9 +246,9 @@ def waiting_path(database: Path, session_uuid: str) -> Path:
     return Path(f"{database}-waiting-{session_uuid}.jsonl")
 
 
-def waiting_paths(database: Path) -> list[Path]:
-    """The files in which entries for a database wait, of living sessions too."""
-    before, after = f"{database.name}-waiting-", ".jsonl"
+def waiting_paths(database: Path, kind: Callable[[Path, str], Path] = waiting_path) -> list[Path]:
+    """The files in which entries for a database wait, of living sessions too; or of a kind."""
+    before, after = kind(database, "*").name.split("*")
     try:
         with os.scandir(database.parent) as files:
             names = [f.name for f in files if f.name.startswith(before) and f.name.endswith(after)]
@@ -497,7 +511,25 @@ def adopt(connection: sqlite3.Connection, database: Path) -> int:
     Raises:
         sqlite3.Error: The database is locked; what is in is in, the rest waits.
     """
-    return sum(_adopt_file(connection, path) for path in waiting_paths(database))
+    count = sum(_adopt_file(connection, path) for path in waiting_paths(database))
+    found = waiting_paths(database, stacks_path)
+    return count + sum(_adopt_stacks(connection, path) for path in found)
+
+
+def _adopt_stacks(connection: sqlite3.Connection, path: Path) -> int:
+    """Log where the loop of a dead process was silent, and delete the file."""
+    logged = 0
+    with contextlib.suppress(OSError):  # another took it in meanwhile, or it cannot be read
+        with path.open("r+b") as file:
+            if not lock(file.fileno()):
+                return 0
+            stacks = read_stacks(file)
+            run = stacks and connection.execute(_RUN_SEEN, (stacks.run,)).fetchone()
+            if stacks and run and stacks.is_hang and stacks.began_after(run[1]):
+                values = bind(run[0], None, stacks.log_values(None))
+                logged = connection.execute(STATEMENTS["stacks"], values).rowcount
+        path.unlink()
+    return logged
 
 
 def _adopt_file(connection: sqlite3.Connection, path: Path) -> int:

@@ -156,6 +156,35 @@ def _equipped() -> InProcessSupervisor:
     return robot
 
 
+@benchmark("watch", "whose time a loop takes, and whether it hangs: what knowing that costs")
+def measure_watching(bench: Bench) -> Iterable[Line]:
+    steps = bench.count(20_000, least=100)
+    with closing(MCPBridge(_stepping(), data_dir=bench.folder)) as bridge:
+        robots = {"bridged": bridge.robot, "plain": _stepping()}
+
+        def block(robot: Any) -> list[float]:
+            return [processor_s(lambda: [robot.step(16) for _ in range(steps)]) / steps]
+
+        blocks = {name: partial(block, robot) for name, robot in robots.items()}
+        taken = {name: Samples(found) for name, found in alternate(blocks, bench.count(12)).items()}
+        look = bridge._session._watchdog.look  # pyright: ignore[reportPrivateUsage]
+        looks = bench.count(500, least=10)
+        look_s = processor_s(lambda: [look() for _ in range(looks)]) / looks
+    plain = taken["plain"].p50
+    yield added("a step, processor time", taken["bridged"].p50, "no bridge", plain, "us", 1)
+    yield added("once a second, in the maintainer's thread", look_s, "", 0, "us", 100)
+
+
+def _stepping() -> Any:
+    """A robot whose steps take no time, of a class of its own, which a bridge may change."""
+    members = {name: value for name, value in vars(Rover).items() if not name.startswith("__")}
+    return type("Robot", (), members | {"__init__": Rover.__init__, "step": _step})()
+
+
+def _step(_robot: object, _ms: int) -> int:
+    return 0
+
+
 @benchmark("fast", "steps per second kept in fast mode, one of five steps recorded")
 def measure_fast_mode(bench: Bench) -> Iterable[Line]:
     states = make_states()
@@ -331,6 +360,7 @@ BENCHMARKS = (
     measure_loop,
     measure_throttled,
     measure_attach,
+    measure_watching,
     measure_fast_mode,
     measure_frames,
     measure_conditions,

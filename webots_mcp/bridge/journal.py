@@ -121,9 +121,13 @@ class Heartbeat:
     def beat(self) -> None:
         """Write a heartbeat now: the loop is alive, and when it last saw time advance."""
         self._next_s = time.monotonic() + HEARTBEAT_INTERVAL_S
+        meter = self._clock.meter
+        meter.leave_bridge()  # a sign of life also from within a long pause
         polled_s, moved_s = _wall_time_s(self._last_poll_s), _wall_time_s(self._clock.moved_s)
         pause = (self.loop, self._mode_before)
-        self._recorder.beat(LoopStatus(self._clock.sim_time_s, polled_s, moved_s, *pause))
+        self._recorder.beat(
+            LoopStatus(self._clock.sim_time_s, polled_s, moved_s, *pause, meter.times)
+        )
 
     def change_loop(self, loop: str | None, mode_before: str | None = None) -> None:
         """Write the new status at once: a reader of the command's answer must not see the old one.

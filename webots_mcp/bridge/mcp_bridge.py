@@ -18,6 +18,8 @@ from webots_mcp.bridge.session import Attachment, Session, Throttle
 from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.contract import (
     ENDED_BY,
+    HANG_AFTER_S,
+    HANG_VARIABLE,
     KEEP_LAST_S,
     KEEP_LAST_VARIABLE,
     LOG_LEVELS,
@@ -38,7 +40,7 @@ if TYPE_CHECKING:
     from webots_mcp.bridge.capture import Capture
 
 _FALSE: Final = ("", "0", "false", "no", "off")
-_MOST_KEEP_LAST_S: Final = 3600.0
+_MOST_SECONDS: Final = 3600.0
 _KEEPING: Final = ("error", "critical")  # log levels
 
 
@@ -72,6 +74,10 @@ class MCPBridge:
             a crash or a hit, and cost a throttled call some microseconds, one of `auto_publish` up
             to 100 us on average for reading devices (see `stats().ring_interval`). 0 holds nothing;
             the environment variable `WEBOTS_MCP_KEEP_LAST_S` overrides it.
+        hang_after_s: Where the loop gives no sign of life for so many seconds of wall time, and
+            does not wait for Webots in `step`, the stacks of all threads are recorded. 0 turns it
+            off, as it is for a database in memory; the environment variable
+            `WEBOTS_MCP_HANG_AFTER_S` overrides it.
         capture_output: Also record what the process prints on stdout and stderr, as log lines of
             the logger `stdout` or `stderr`, up to 500 a second of each. The output still appears
             where it did before. Output of C code and of child processes is included; a child that
@@ -81,7 +87,8 @@ class MCPBridge:
 
     Raises:
         TypeError: `robot` is not a robot, or `database` is of another type.
-        ValueError: `throttle_interval` is less than 1, or `keep_last_s` not from 0 to 3600.
+        ValueError: `throttle_interval` is less than 1, or `keep_last_s` or `hang_after_s` not from
+            0 to 3600.
     """
 
     _kind: str | None = None  # the robot's kind, where a subclass sets one (the observer's)
@@ -93,10 +100,12 @@ class MCPBridge:
         throttle_interval: int = 5,
         *,
         keep_last_s: float = KEEP_LAST_S,
+        hang_after_s: float = HANG_AFTER_S,
         capture_output: bool = False,
         database: str | os.PathLike[str] | MemoryDatabase | None = None,
     ) -> None:
-        keep_last_s = _seconds(os.environ.get(KEEP_LAST_VARIABLE) or keep_last_s)
+        keep_last_s = _seconds("keep_last_s", KEEP_LAST_VARIABLE, keep_last_s)
+        hang_after_s = _seconds("hang_after_s", HANG_VARIABLE, hang_after_s)
         throttle = Throttle(int(os.environ.get(THROTTLE_VARIABLE) or throttle_interval))
         self.robot = robot
         self.database: Database
@@ -112,9 +121,9 @@ class MCPBridge:
         if (former := _bridges.get(id(robot))) is not None:
             former.close("superseded")
         where = (self.database, self.data_dir)
-        self._session = Session(
-            simulation, *where, throttle, keep_last_s, self._errors, kind=self._kind
-        )
+        limits = (throttle, keep_last_s, self._errors, self._kind, hang_after_s)
+        self._session = Session(simulation, *where, *limits)
+        self._meter = simulation.meter
         self._publisher = self._session.publisher
         self._session.begin()
         self._capture = self._capture_output() if capture_output else None
@@ -187,6 +196,7 @@ class MCPBridge:
                 state itself is never changed. When the call returns, the row is in the database.
             force: Record this call whatever its number.
         """
+        self._meter.leave_own()
         try:
             if self._attachment is None:
                 self._publisher.publish(state, force)
@@ -194,6 +204,8 @@ class MCPBridge:
                 self._publisher.publish_devices(state, include_time=True, force=force)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("publish", error)
+        finally:
+            self._meter.leave_bridge()
 
     def get_command(self) -> dict[str, Any] | None:
         """Run the pending commands of this robot; call it once in every round of the loop.
@@ -207,6 +219,7 @@ class MCPBridge:
             as keys; None where there was none. A command with an unknown action is returned too;
             its recorded answer is an error.
         """
+        self._meter.leave_own()
         try:
             command = self._serve()
             if self._attachment is not None:
@@ -216,6 +229,8 @@ class MCPBridge:
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("get_command", error)
             return None
+        finally:
+            self._meter.leave_bridge()
 
     def auto_publish(
         self, extra: Mapping[Any, Any] | None = None, include_time: bool = True
@@ -233,6 +248,7 @@ class MCPBridge:
             The state, without the devices where this call was throttled and did not read them. It
             also has the simulation time as `sim_time` (seconds). Empty where publishing failed.
         """
+        self._meter.leave_own()
         try:
             extra = extra or {}
             state = self._publisher.publish_devices(extra, include_time)
@@ -243,6 +259,8 @@ class MCPBridge:
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("auto_publish", error)
             return {}
+        finally:
+            self._meter.leave_bridge()
 
     def keep(self, reason: str) -> None:
         """Keep the last `keep_last_s` seconds at full rate, and the two that follow.
@@ -560,8 +578,7 @@ class MCPBridge:
         self.detach()
         if self._capture is not None:
             self._capture.abandon()
-        self._session.recorder.abandon()
-        self._session.keeper.abandon()
+        self._session.abandon()
 
     def _close_at_exit(self) -> None:
         """Close when the interpreter ends, and find out whether an exception ended it."""
@@ -572,10 +589,10 @@ class MCPBridge:
         self.close("crashed" if isinstance(error, Exception) else None)
 
 
-def _seconds(given: float | str) -> float:
-    seconds = float(given)
-    if not 0 <= seconds <= _MOST_KEEP_LAST_S:
-        raise ValueError(f"keep_last_s must be from 0 to {_MOST_KEEP_LAST_S:g}, got {given!r}")
+def _seconds(name: str, variable: str, given: float) -> float:
+    seconds = float(os.environ.get(variable) or given)
+    if not 0 <= seconds <= _MOST_SECONDS:
+        raise ValueError(f"{name} must be from 0 to {_MOST_SECONDS:g}, got {seconds!r}")
     return seconds
 
 

@@ -61,7 +61,7 @@ from webots_mcp.errors import (
     SchemaTooOldError,
     SessionGoneError,
 )
-from webots_mcp.liveness import LoopStatus, RecordingStatus, write_heartbeat
+from webots_mcp.liveness import NO_TIMES, LoopStatus, RecordingStatus, write_heartbeat
 from webots_mcp.signal_register import Seen, find_changes, write_changes
 from webots_mcp.waiting_file import (
     STATEMENTS,
@@ -236,6 +236,8 @@ class Recorder:
         # The count is given only where it is certain; else the statement counts the rows itself.
         rows = run.rows if run.counted and not self._backlog.waits else None
         values = {"reason": reason, "now": time.time(), "sim_time": sim_time_s, "rows": rows}
+        times = self._clock.meter.times or NO_TIMES
+        values |= dict(zip(("own", "step_wait", "steps"), times, strict=True))
         self.record("run end", run, values)
 
     def end(self, reason: str, sim_time_s: float) -> None:

@@ -23,6 +23,7 @@ from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration, identify
 from webots_mcp.bridge.scene_changes import SceneEdits
 from webots_mcp.bridge.simulation import QUIT, Clock, Simulation, Step
+from webots_mcp.bridge.watchdog import Watchdog
 from webots_mcp.contract import UNMOVED, UNSEEN, Database, MemoryDatabase
 from webots_mcp.maintenance import Maintainer
 
@@ -83,6 +84,7 @@ class Session:
         keep_last_s: float,
         errors: ErrorReport,
         kind: str | None = None,
+        hang_after_s: float = 0.0,
     ) -> None:
         from webots_mcp import __version__
 
@@ -106,6 +108,7 @@ class Session:
         self.watch = Watch(self.clock, simulation.basic_time_step_s / 100)
         self.control = Control(self)
         self.publisher = Publisher(self)
+        self._watchdog = Watchdog(self, database, hang_after_s)
         self._unseen_reported = False
         self._began_s: float | None = time.monotonic()  # None once `_look_after` has judged it
         self._maintainer = _start_maintainer(database, self._look_after)
@@ -127,6 +130,7 @@ class Session:
         if registration is not None:
             self._succeed_to(registration)
         self.breakpoints.begin()
+        self._watchdog.begin()
 
     def _succeed_to(self, registration: Registration) -> None:
         simulation, clock = self.simulation, self.clock
@@ -168,6 +172,7 @@ class Session:
     def begin_run(self) -> None:
         """Simulation time went back: end the old run at its newest known time, begin a new one."""
         self.recorder.end_run("reset", self.clock.ended_sim_time_s)
+        self.clock.meter.begin_run()
         self.recorder.run = self.clock.run
         self.throttle.begin_run()
         self.reloads.happened()
@@ -200,6 +205,7 @@ class Session:
         """Write the waiting rows and end, for the given or the known reason."""
         if self._maintainer is not None:
             self._maintainer.stop()  # first: its thread uses the recorder too
+        self._watchdog.close()
         self.keeper.close()
         reason = reason or self._end_reason
         self.recorder.close(reason, self.clock.sim_time_s)
@@ -208,6 +214,12 @@ class Session:
         """Resume a paused simulation, which no command could resume later, and answer commands."""
         self.pause.close()
         self.control.report_end(extern=self.identity.extern)
+
+    def abandon(self) -> None:
+        """In a forked child: leave the recording to the parent."""
+        self._watchdog.abandon()
+        self.recorder.abandon()
+        self.keeper.abandon()
 
     @property
     def _end_reason(self) -> str:
@@ -220,6 +232,7 @@ class Session:
         """
         self.control.report_end(extern=self.identity.extern)
         self.keeper.write_all()
+        self._watchdog.close()
         self.recorder.end(self._end_reason, self.clock.sim_time_s)
 
     def _look_after(self) -> None:
@@ -231,6 +244,7 @@ class Session:
         recorder, began_s = self.recorder, self._began_s
         if recorder.rows_waiting and time.monotonic() - recorder.last_use_s > _IDLE_S:
             recorder.flush()
+        self._watchdog.look()
         if began_s is None or time.monotonic() - began_s < _UNMOVED_S:
             return
         self._began_s = None

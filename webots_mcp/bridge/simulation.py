@@ -12,6 +12,8 @@ from typing import Any, Final, NamedTuple
 
 from webots_mcp.contract import new_uuid
 from webots_mcp.errors import CommandRefusedError
+from webots_mcp.liveness import LoopTimes
+from webots_mcp.stacks import STEPPING
 
 _ROBOT_METHODS: Final = ("step", "getTime", "getName", "getBasicTimeStep")
 _INSIDE: Final = ("robot", "supervisor", "inner", "env", "unwrapped", "_robot")  # in wrappers
@@ -32,7 +34,8 @@ class Simulation:
         self.robot = robot
         self.over = False
         self.supervisor: bool = _may_supervise(robot)
-        self._gate = StepGate(robot)
+        self.meter = LoopMeter()
+        self._gate = StepGate(robot, self.meter)
 
     @property
     def time_s(self) -> float:
@@ -84,6 +87,11 @@ class Simulation:
             self._gate.open()
         else:
             self._gate.close(guard)
+
+    @property
+    def step_files(self) -> list[str]:
+        """The files of the methods in which the controller waits for Webots."""
+        return self._gate.files
 
     def end(self) -> None:
         """Webots wants the controller to end: its API must not be called any more.
@@ -147,9 +155,9 @@ QUIT: Final = -1
 
 Method = Callable[..., int]
 
-_STEPPING: Final = ("step", "stepBegin", "stepEnd")
 _VEHICLE: Final = "vehicle"  # the package
 _GUARD: Final = "_webots_mcp_guard"  # of a robot; None of its class
+_METER: Final = "_webots_mcp_meter"  # likewise
 _MARK: Final = "_webots_mcp_asks"  # of a method
 
 
@@ -180,18 +188,24 @@ class StepGate:
 
     Args:
         robot: A Webots `Robot`, or an instance of a subclass.
+        meter: Takes the time of its steps from now on, in place of a former bridge's.
     """
 
-    def __init__(self, robot: Any) -> None:
+    def __init__(self, robot: Any, meter: LoopMeter) -> None:
         self._robot = robot
         self._of_robot: dict[str, Any] = vars(robot)
         owner: Any = _owner_of_step(robot)
         setattr(owner, _GUARD, None)
+        setattr(owner, _METER, None)
+        self.files: list[str] = []
         for cls in (owner, *_vehicles(robot)):
-            for name in _STEPPING:
+            for name in STEPPING:
                 method: Any = getattr(cls, name, None)
                 if method is not None and not hasattr(method, _MARK):
                     setattr(cls, name, _guarded(name, method))
+            code = getattr(cls.step.__wrapped__, "__code__", None)
+            self.files += [code.co_filename] if code else []
+        vars(robot)[_METER] = meter
         self._own_step: Method = owner.step.__wrapped__
 
     def exchange(self) -> int:
@@ -208,15 +222,26 @@ class StepGate:
 
 
 def _guarded(name: str, method: Method) -> Method:
+    ends, begins = name != "stepBegin", name != "stepEnd"
+
     @functools.wraps(method)
     def ask_first(robot: Any, *args: Any, **kwargs: Any) -> int:
-        guard: Guard | None = robot._webots_mcp_guard  # faster than getattr: runs in every step
-        if guard is None:
+        meter: LoopMeter | None = robot._webots_mcp_meter  # faster than getattr: in every step
+        if meter is None:
             return method(robot, *args, **kwargs)
-        make = functools.partial(method, robot, *args, **kwargs)
-        if name == "step" and 0 in (*args, *kwargs.values()):
-            return guard(Step(begins=False, ends=False, make=make))
-        return guard(Step(name != "stepEnd", name != "stepBegin", make))
+        meter.leave_own()
+        advances = name != "step" or not (0 in args or 0 in kwargs.values())
+        guard: Guard | None = robot._webots_mcp_guard
+        if guard is None:
+            return meter.leave_step(method(robot, *args, **kwargs), ends and advances)
+
+        def make() -> int:
+            meter.leave_bridge()
+            return meter.leave_step(method(robot, *args, **kwargs), ends and advances)
+
+        answer = guard(Step(begins and advances, ends and advances, make))
+        meter.leave_bridge()
+        return answer
 
     setattr(ask_first, _MARK, True)
     return ask_first
@@ -234,6 +259,58 @@ def _owner_of_step(robot: Any) -> Any:
     """
     owners = [cls for cls in type(robot).__mro__ if {"step", "getTime"} <= vars(cls).keys()]
     return owners[-1] if owners else type(robot)
+
+
+# -- whose time a round of the loop takes ----------------------------------------------------------
+
+
+class LoopMeter:
+    """Adds up the wall time in the controller's own code, in its steps and in the bridge's calls.
+
+    Each method is called where one of them is left for another. The loop's thread does all of this;
+    the maintainer's only reads.
+
+    Attributes:
+        at_s: The newest sign of life, by `time.perf_counter`.
+    """
+
+    __slots__ = ("_own_s", "_step_s", "_steps", "at_s")
+
+    def __init__(self) -> None:
+        self.at_s = time.perf_counter()
+        self._own_s = self._step_s = 0.0
+        self._steps = -1  # until the first step has ended: what a controller does before is no loop
+
+    def leave_own(self) -> None:
+        """The controller's own code calls a step or the bridge."""
+        now_s = time.perf_counter()
+        self._own_s += now_s - self.at_s
+        self.at_s = now_s
+
+    def leave_step(self, answer: int, has_advanced: bool) -> int:
+        """Webots has answered; returns its answer."""
+        now_s = time.perf_counter()
+        self._step_s += now_s - self.at_s
+        self.at_s = now_s
+        if has_advanced:
+            if self._steps < 0:
+                self._own_s = self._step_s = 0.0
+            self._steps += 1
+        return answer
+
+    def leave_bridge(self) -> None:
+        """A call of the bridge ends, or it lets a step be made."""
+        self.at_s = time.perf_counter()
+
+    def begin_run(self) -> None:
+        """Count from here, the end of a step."""
+        self._own_s = self._step_s = 0.0
+        self._steps = min(self._steps, 0)
+
+    @property
+    def times(self) -> LoopTimes | None:
+        """Of the run so far; None where no round of it was seen."""
+        return LoopTimes(self._own_s, self._step_s, self._steps) if self._steps > 0 else None
 
 
 _EPSILON_S: Final = 1e-9
@@ -286,6 +363,11 @@ class Clock:
             self.run = Run("reset", other.sim_time_s)
         self.sim_time_s, self.moved_s = other.sim_time_s, other.moved_s
         return is_new
+
+    @property
+    def meter(self) -> LoopMeter:
+        """Whose time the rounds of the loop take."""
+        return self._simulation.meter
 
     def start_moving(self) -> None:
         """Count time as moving from now on; it counts as standing still only after a while."""

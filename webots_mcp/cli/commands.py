@@ -65,6 +65,7 @@ _OF_THE_CORE: Final = {
     "trials": Command(STEER, "webots_mcp.cli.steering", "trials"),
     "repeat": Command(STEER, "webots_mcp.cli.repeating", "repeat"),
     "launch": Command(SETUP, "webots_mcp.cli.serving", "launch"),
+    "profile": Command(NOW, "webots_mcp.cli.profiling", "profile"),
     "plot": Command(PAST, "webots_mcp.cli.data", "plot"),
     "tail": Command(NOW, "webots_mcp.cli.data", "tail"),
 }

@@ -33,7 +33,7 @@ from webots_mcp.setup.client_entries import (
     words_of,
 )
 from webots_mcp.store.recording import View
-from webots_mcp.store.robots import SILENT, Session, companions
+from webots_mcp.store.robots import SILENT, WAITING_IN_STEP, Session, companions
 from webots_mcp.webots import find_webots, installations, shown_of
 from webots_mcp.webots.orders import address_of
 
@@ -76,7 +76,7 @@ def simulation(subject: Examined) -> Iterator[Finding]:
 
 def _is_unclear(view: View) -> bool:
     """Whether only the machine's processes can show which controller blocks the world."""
-    return (view.status.why or "").startswith((SILENT, SEEN_RUNNING))
+    return (view.status.why or "").startswith((SILENT, WAITING_IN_STEP, SEEN_RUNNING))
 
 
 def _judged(view: View) -> Finding:

@@ -58,6 +58,7 @@ class StateAnswer(Answer):
     state: Any = said("Data published by the controller.")
     shortened: str | None = said("Rule by which parts were left out.")
     kept_at_full_rate: str | None = said("The run's last kept stretch.")
+    pace: str | None = said("Whether controller or simulation sets the pace.")
 
 
 class SensorsAnswer(Answer):

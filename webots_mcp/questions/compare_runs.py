@@ -71,8 +71,8 @@ from webots_mcp.store.recording import Recording, View, look
 
 RUN_COLUMNS: Final = (
     "run_id", "robot", "label", "parameters", "started", "began_by", "ended_by", "duration_s",
-    "real_time_factor", "row_count", "purged_rows", "notable", "controller", "sha256", "git_commit",
-    "world", "note",
+    "real_time_factor", "own_ms", "step_wait_ms", "row_count", "purged_rows", "notable",
+    "controller", "sha256", "git_commit", "world", "note",
 )  # fmt: skip
 GROUP_COLUMNS: Final = (
     "name", "robot", "runs", "labels", "parameters", "sha256", "ended_by",
@@ -119,6 +119,7 @@ def webots_list_runs(
     """Runs, newest first: controller file and its hash, world, duration, pace, how it ended.
 
     A run is a stretch of rising simulation time: a start, reset or reload begins the next.
+    `own_ms` and `step_wait_ms`: of each step, wall time in the controller's code and in step().
     `notable` counts warnings, errors, dropped rows, failed commands. `parameters` are those that
     are not as the code declared them, or differ between these runs.
     """
@@ -165,9 +166,10 @@ def webots_compare_runs(
     """Did my edit help? Runs beside each other; or how fast, how far and in which modes one ran.
 
     Without run_ids: the runs before and after the last edit of the controller's file. Runs of one
-    code and parameters are one group. Distance, mean speed, time per mode, events per minute, and
-    the signals that differ most. `different`: true beyond the spread of like runs (4 of each or
-    more), false where a difference that matters is excluded, null: it cannot be told yet.
+    code and parameters are one group. Distance, mean speed, time per mode, events per minute, the
+    loop's own ms per step, and the signals that differ most. `different`: true beyond the spread
+    of like runs (4 of each or more), false where a difference that matters is excluded, null: it
+    cannot be told yet.
     """
     if run_ids and trial_set:
         raise InvalidInputError("give run_ids or trial_set, not both")
@@ -258,6 +260,8 @@ def _run_row(run: RunInfo) -> list[Any]:
         run.end_reason or _GOING_ON,
         seconds(run.duration_s),
         figure(run.real_time_factor),
+        figure(run.own_ms),
+        figure(run.step_wait_ms),
         run.row_count,
         run.purged_rows or None,
         shown(run.notable) or None,

@@ -59,6 +59,7 @@ from webots_mcp.store.run_rows import (
     State,
     count_runs,
     newest_events,
+    pace_of,
     real_time_factor,
     select,
 )
@@ -73,7 +74,7 @@ _DEVICES_TOKENS: Final = 300
 _COMPANIONS_TOKENS: Final = 200
 _LONGEST_NAME: Final = 100
 _RECORDER_COLUMNS: Final = (
-    "row_count", "why", "rows_waiting", "waiting_in", "rows_dropped", "last_error",
+    "row_count", "why", "pace", "rows_waiting", "waiting_in", "rows_dropped", "last_error",
 )  # fmt: skip
 _LONGEST_ERROR: Final = 300
 _READ: Final = "the observer, from customData: it has no bridge and takes no commands"
@@ -165,6 +166,7 @@ def _recorder(view: View) -> dict[str, Any]:
     return {
         "row_count": view.run.row_count if view.run else 0,
         "why": view.header().get("why"),
+        "pace": view.run and pace_of(view.connection, "it", view.run.id),
         "waiting_in": None,
         **rows_waiting(view.connection, session),
         "rows_dropped": session.rows_dropped if session else 0,
@@ -371,6 +373,7 @@ def webots_get_robot_state(
             state=short.value,
             shortened=short.rule,
             kept_at_full_rate=_kept(view),
+            pace=pace_of(view.connection, view.robot.name, view.require_run().id),
             hint=hint,
         )
 

@@ -155,6 +155,11 @@ class Run(SQLModel, table=True):
     purged_rows: int = _count("of the rows, those that retention has deleted")
     is_chunked: bool = _count("1 once it has ended and none of its rows wait for a chunk")
     uuid: str | None = _text(_UUID)
+    own_wall_s: float | None = _number(
+        "wall time in the controller's own code, over its steps; null where none was seen"
+    )
+    step_wait_wall_s: float | None = _number("wall time in step(), waiting for Webots")
+    steps: int | None = _column(Integer, "from the end of one to the end of the next")
 
 
 class State(SQLModel, table=True):

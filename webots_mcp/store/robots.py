@@ -7,6 +7,7 @@ import difflib
 import json
 import sqlite3
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -25,7 +26,7 @@ from webots_mcp.contract import (
     host_name,
 )
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError, UnknownRobotError
-from webots_mcp.liveness import EXTERN, is_living, process_alive
+from webots_mcp.liveness import EXTERN, is_living, is_stopped, process_alive
 from webots_mcp.naming import SOLIDS, WORLD
 from webots_mcp.pauses import (
     HELD_ELSEWHERE,
@@ -39,6 +40,7 @@ from webots_mcp.pauses import (
     breakpoint_at,
     change_since,
 )
+from webots_mcp.stacks import LOGGER, Stacks, stacks_at, stacks_path
 from webots_mcp.store.run_rows import Run, columns_of, newest_state, recent_interval_s, state_at
 from webots_mcp.waiting_file import Entry, count_rows, next_entries, read_header, waiting_path
 
@@ -350,6 +352,10 @@ _ENDED_BY: Final = (
     "AND level = 'error' AND source = 'controller' AND message GLOB ? "
     "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
 )
+_HUNG: Final = (
+    "SELECT message FROM log WHERE run_id = (SELECT max(id) FROM run WHERE session_id = ?) "
+    f"AND logger = '{LOGGER}' AND wall_time_s > ? ORDER BY id DESC LIMIT 1"
+)
 _MOST_ERROR_CHARACTERS: Final = 300
 _READ_NO_MORE: Final = (
     "it was recorded by the observer from its customData: the observer ended, or the robot is gone"
@@ -369,6 +375,11 @@ _LEFT_WAITING: Final = (
     "its last rows wait in {} next to the database, until a server that may write there (not "
     "--read-only) takes them in: what is shown here is older"
 )
+WAITING_IN_STEP: Final = (
+    "its loop waits in step(): Webots is paused by hand or at a breakpoint, another controller "
+    "holds the world up, or an extern one is missing; from inside the simulation these look alike"
+)
+_HELD_UP_BY: Final = "its loop waits in step(), as the whole world does, for {}: {}"
 _STARTED: Final = "its controller has just started; simulation time has not moved yet"
 _NOT_STARTED: Final = (
     "its controller has started, but simulation time has not moved since: the simulation may be "
@@ -424,6 +435,9 @@ def judge(
     if fresh and _change_since_beat(connection, session) == RESUME:
         return Status(RUNNING)
     still_moving_s = _still_moving_s(connection, run)
+    if not _is_unseen(session, moved_s) and (hang := _hang(connection, session, now_s)):
+        is_slow = moved_s is not None and session.age_s(moved_s, now_s) <= still_moving_s
+        return Status(RUNNING, hang) if is_slow else _stopped(session, moved_s, now_s, hang)
     if not fresh and (backlog := find_backlog(connection, session)) is not None:
         moved_s = max(moved_s or 0.0, backlog.newest_wall_time_s)
         why = _WAITING.format(backlog.file_name, max(now_s - backlog.oldest_wall_time_s, 0.0))
@@ -483,7 +497,11 @@ def _why_ended(connection: sqlite3.Connection, session: Session) -> str | None:
         return unseen
     if session.end_reason == "crashed" and (error := ended_by(connection, session.id)):
         return f"its controller ended by {error}"
-    return _ENDED.get(session.end_reason or "crashed")
+    why = _ENDED.get(session.end_reason or "crashed")
+    if session.end_reason in (None, "crashed"):
+        hung = connection.execute(_HUNG, (session.id, session.last_seen_wall_time_s)).fetchone()
+        why = f"{why}; it was {hung[0].partition(chr(10))[0]}" if hung else why
+    return why
 
 
 def ended_by(connection: sqlite3.Connection, session_id: int) -> str | None:
@@ -498,12 +516,17 @@ def _why_standing(
     """Why the time of a living controller, which its bridge does not hold, stands still."""
     if inside := handler_at_work(connection, session, now_s):
         return inside
-    unseen = moved_s is None and session.last_poll_wall_time_s is None
+    stacks = find_stacks(connection, session, now_s)
+    for other in companions(connection, session, now_s) if stacks and stacks.is_in_step else ():
+        if hang := _hang(connection, other, now_s):
+            return _HELD_UP_BY.format(robot_name(connection, other.robot_id), hang)
+    unseen = _is_unseen(session, moved_s)
     seen = _seen_by_observer(connection, session, now_s)
     if seen and not (unseen and seen.startswith(SEEN_RUNNING)):
         return seen
     if unseen:
-        return UNMOVED
+        at = f"; {stacks.limit_s:g} s after it began it was in {stacks.place}" if stacks else ""
+        return f"{UNMOVED}{at}"
     if moved_s is None:
         return _NOT_STARTED
     # A loop that hangs in a step beat last when it last moved: only a later beat shows it alive.
@@ -511,7 +534,33 @@ def _why_standing(
     if session.heartbeat_is_fresh(now_s) and beaten_since_s > HEARTBEAT_INTERVAL_S:
         return _STANDING
     left = left_holding(connection, session, now_s)
-    return SILENT if left is None else LEFT_PAUSED.format(robot_name(connection, left.robot_id))
+    if left is None:
+        return WAITING_IN_STEP if stacks and stacks.is_in_step else SILENT
+    return LEFT_PAUSED.format(robot_name(connection, left.robot_id))
+
+
+def _is_unseen(session: Session, moved_s: float | None) -> bool:
+    """Whether its bridge has seen nothing of the loop yet."""
+    return moved_s is None and session.last_poll_wall_time_s is None
+
+
+def find_stacks(connection: sqlite3.Connection, session: Session, now_s: float) -> Stacks | None:
+    """Where the loop of a session is silent now; None where it is not, or that is not known."""
+    path = _path_of(connection, session, stacks_path)
+    is_silent = session.host == host_name() and not session.heartbeat_is_fresh(now_s)
+    may_signal = is_silent and not is_stopped(session.pid)
+    stacks = stacks_at(path, session.pid, may_signal=may_signal) if path else None
+    return stacks if stacks and stacks.began_after(session.last_seen_wall_time_s) else None
+
+
+def _hang(connection: sqlite3.Connection, session: Session, now_s: float) -> str | None:
+    """That the loop is silent in the controller's code, and in which; None where it is not."""
+    stacks = find_stacks(connection, session, now_s)
+    if stacks is None or not stacks.is_hang:
+        return None
+    silent_s = session.silent_s(now_s)
+    hangs = f"silent for {silent_s:.{1 if silent_s < 10 else 0}f} s in {stacks.place}"
+    return "; ".join(filter(None, (hangs, handler_at_work(connection, session, now_s))))
 
 
 def _seen_by_observer(connection: sqlite3.Connection, session: Session, now_s: float) -> str | None:
@@ -544,7 +593,7 @@ def stopped_for(seconds: float) -> str:
 
 def _stopped(session: Session, moved_s: float | None, now_s: float, why: str | None) -> Status:
     seconds = session.age_s(moved_s or session.started_wall_time_s, now_s)
-    if why == UNMOVED:
+    if why and why.startswith(UNMOVED):
         return Status(f"not seen moving for {max(seconds, 0.0):.0f} s", why)
     return Status(stopped_for(seconds), why)
 
@@ -609,11 +658,15 @@ def find_backlog(connection: sqlite3.Connection, session: Session) -> FileBacklo
     return None
 
 
-def _path_of(connection: sqlite3.Connection, session: Session) -> Path | None:
+def _path_of(
+    connection: sqlite3.Connection,
+    session: Session,
+    path_in: Callable[[Path, str], Path] = waiting_path,
+) -> Path | None:
     """None for a database in memory."""
     (file,) = connection.execute("SELECT file FROM pragma_database_list").fetchone()
     (uuid,) = connection.execute("SELECT uuid FROM session WHERE id = ?", (session.id,)).fetchone()
-    return waiting_path(Path(file), uuid) if file else None
+    return path_in(Path(file), uuid) if file else None
 
 
 def _oldest_s(entries: list[tuple[int, Entry]]) -> float:

@@ -148,6 +148,12 @@ _LATER_THAN_ANY: Final = b"\xff"
 PACE_ROWS: Final = 6
 PACE_WINDOW_S: Final = 5.0
 _PACE_WINDOW_ROWS: Final = 500
+# Mean wall time of a round of the loop, in its own code and in `step`; null where few were seen.
+_ENOUGH: Final = "steps >= 20 OR (steps > 0 AND own_wall_s + step_wait_wall_s >= 10)"
+OWN_MS: Final = f"CASE WHEN {_ENOUGH} THEN 1e3 * own_wall_s / steps END"
+STEP_WAIT_MS: Final = f"CASE WHEN {_ENOUGH} THEN 1e3 * step_wait_wall_s / steps END"
+_ROUND: Final = f"SELECT {OWN_MS}, {STEP_WAIT_MS}, steps FROM run WHERE id = ?"
+_SETS_PACE: Final = 0.8  # of a round's time
 _SHOWN_KEYS: Final = 20
 _SEARCHED_KEYS: Final = 1000  # for those like the one that is not there
 _SHOWN_KEY_CHARACTERS: Final = 40
@@ -231,6 +237,22 @@ def real_time_factor(connection: sqlite3.Connection, run_id: int) -> float | Non
     if len(recent) < 2 or recent[0][1] <= recent[-1][1]:
         return None
     return (recent[0][0] - recent[-1][0]) / (recent[0][1] - recent[-1][1])
+
+
+def pace_of(connection: sqlite3.Connection, robot: str, run_id: int) -> str | None:
+    """Who sets the pace of a run, in a sentence; None where too few of its steps were seen."""
+    own_ms, wait_ms, steps = connection.execute(_ROUND, (run_id,)).fetchone()
+    if own_ms is None:
+        return None
+    share = own_ms / max(own_ms + wait_ms, 1e-9)
+    if share >= _SETS_PACE:
+        why = "the controller, not the physics, sets the pace"
+    elif share > 1 - _SETS_PACE:
+        why = "controller and Webots (or another controller) take turns"
+    else:
+        why = "Webots, real time or another controller sets the pace, not this one"
+    needs = f"{robot} needs {own_ms:.4g} of each {own_ms + wait_ms:.4g} ms"
+    return f"{needs}: {why} (mean of {steps} steps)"
 
 
 def select(value: Any, path: str) -> Any:

@@ -49,8 +49,9 @@ def test_after_a_quit_all_is_written_and_nothing_is_asked_any_more(
 def test_detach_leaves_nothing_on_the_robot(
     robot: InProcessSupervisor, database: MemoryDatabase, recording: Recording
 ) -> None:
+    MCPBridge(robot, database=database, throttle_interval=1)
     before = set(vars(robot))
-    bridge = MCPBridge.attach(robot, database=database, throttle_interval=1)
+    bridge = MCPBridge.attach(robot)
     robot.step(STEP_MS)
     bridge.detach()
     bridge.detach()

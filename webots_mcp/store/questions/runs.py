@@ -46,7 +46,7 @@ from webots_mcp.store.reading.frame_summary import change_points
 from webots_mcp.store.reading.ranges import TimeRange, unrecorded, whole_run
 from webots_mcp.store.reading.segment import Deadline, Segment, Subject, in_one_snapshot, kept_parts
 from webots_mcp.store.robots import resolve_robot
-from webots_mcp.store.run_rows import fetch_run
+from webots_mcp.store.run_rows import OWN_MS, STEP_WAIT_MS, fetch_run
 from webots_mcp.store.signals import Signal
 
 MOST_RUNS: Final = 200
@@ -56,6 +56,7 @@ MAX_NOTE: Final = 4000
 _RUNS: Final = (
     "SELECT r.id, b.name, r.session_id, s.controller, s.controller_sha256, s.git_commit, r.world, "
     "r.start_reason, r.end_reason, r.label, r.note, r.purged_rows, "
+    f"{OWN_MS}, {STEP_WAIT_MS}, "
     # Rows, times and what was said last are those of a heartbeat, which newer rows may follow.
     "r.row_count + CASE WHEN r.ended_wall_time_s IS NULL THEN (SELECT count(*) FROM state "
     "WHERE run_id = r.id AND sim_time_s > CASE WHEN r.row_count > 0 THEN r.last_sim_time_s "
@@ -68,7 +69,8 @@ _RUNS: Final = (
 )
 _WHAT: Final = (
     "run_id", "robot", "session_id", "controller", "controller_sha256", "git_commit", "world",
-    "start_reason", "end_reason", "label", "note", "purged_rows", "row_count",
+    "start_reason", "end_reason", "label", "note", "purged_rows",
+    "own_ms", "step_wait_ms", "row_count",
 )  # fmt: skip
 _PAGE: Final = (
     f"{_RUNS} WHERE (:robot IS NULL OR r.robot_id = :robot) AND (:before IS NULL OR r.id < :before)"
@@ -101,6 +103,8 @@ class RunInfo:
     Attributes:
         end_reason: None while it goes on; where its process is gone, how that will be judged.
         duration_s: Simulated seconds.
+        own_ms: Mean wall time of a step in the controller's own code; None where few were seen.
+        step_wait_ms: Likewise in `step` itself.
         held_s: Of the wall time, that for which the simulation was paused by a command.
         row_count: State rows; retention has deleted `purged_rows` of them.
         notable: How often what needs attention was stored: warnings, errors, dropped rows,
@@ -121,6 +125,8 @@ class RunInfo:
     label: str | None
     note: str | None
     purged_rows: int
+    own_ms: float | None
+    step_wait_ms: float | None
     row_count: int
     started_wall_time_s: float
     wall_duration_s: float
@@ -332,7 +338,8 @@ class Measure:
     """What each run came to as a whole, over the compared stretch, by group.
 
     Attributes:
-        name: distance_m, mean_speed_m_s, `share of MODE` (of the time), `KIND per min` (events).
+        name: distance_m, mean_speed_m_s, `share of MODE` (of the time), `KIND per min` (events),
+            own_ms_per_step (wall time in the controller's own code, of the whole run).
         spread: Over the runs of the group; None where it is not known of all of them.
         different: Whether the group differs from the first by more than like runs do; None where
             that cannot be decided, because both groups are one run each, a figure is missing, or
@@ -498,6 +505,9 @@ def _outcome(
 ) -> _Outcome:
     run_id, duration_s = part.segment.run_id, part.segment.end_s - part.segment.start_s
     figures: dict[str, float | None] = {}
+    own_ms = run_info(connection, run_id).own_ms
+    if own_ms is not None:
+        figures["own_ms_per_step"] = own_ms
     unknown: dict[str, tuple[str, ...]] = {}
     position = part.motion.position
     if position is None:

@@ -1,0 +1,157 @@
+"""Writes down where the loop is when it gives no sign of life.
+
+Once a second the maintainer's thread looks, and where the loop is silent for longer than the limit
+it writes the stacks of all threads: with the interpreter's lock, so that no thread changes them
+meanwhile. The timer of `faulthandler` does without that lock, and ended one process in 15 to 100
+whose code was running then (Python 3.10 to 3.13, measured); it is not used. Where C code keeps the
+lock, no thread of Python runs. The file's time stops then, and who asks for the status sends a
+signal on which `faulthandler` writes the stacks (`store.robots`); those stand still as well.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import functools
+import json
+import os
+import signal
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from webots_mcp.contract import PRIVATE_FILE, Database
+from webots_mcp.stacks import FORMAT, VERSION, read_stacks, stacks_path
+from webots_mcp.waiting_file import lock
+
+if TYPE_CHECKING:
+    from webots_mcp.bridge.session import Session
+
+_MOST_LOGGED: Final = 20  # in a session: a loop that is slow by design would fill the log
+_OURS: Final = f"{Path(__file__).parents[1]}{os.sep}"
+_STDLIB: Final = f"{Path(os.__file__).parent}{os.sep}"
+_WEBOTS: Final = ("controller", "vehicle")  # its packages
+_SIGNAL: Final = getattr(signal, "SIGRTMAX", 5) - 5  # 0, none, but on Linux
+
+
+class Watchdog:
+    """Of the loop of one session; it is off for a database in memory, and with a limit of 0.
+
+    Args:
+        session: The session.
+        database: Next to which the file is.
+        limit_s: So long may the loop be silent, in seconds of wall time.
+    """
+
+    def __init__(self, session: Session, database: Database, limit_s: float) -> None:
+        self._session = session
+        self._meter = session.simulation.meter
+        self._limit_s = limit_s
+        self._is_on = limit_s > 0 and isinstance(database, Path)
+        self._path = stacks_path(Path(str(database)), session.recorder.uuid)
+        self._lock = threading.Lock()
+        self._about = {VERSION: FORMAT, "thread": threading.get_ident(), "limit_s": limit_s}
+        files = session.simulation.step_files
+        folders = [folder for file in files if (folder := Path(file).parent).name in _WEBOTS]
+        libraries = [_OURS, _STDLIB, *(f"{folder}{os.sep}" for folder in folders)]
+        self._about |= {"step_files": files, "libraries": libraries}
+        self._file = -1
+        self._head = b""
+        self._began_s = self._silent_since_s = 0.0  # signs of life
+        self._judged_s = 0.0  # when the stacks were written that were judged last
+        self._logged = 0
+
+    def begin(self) -> None:
+        """What the loop's thread does from now on counts."""
+        self._began_s = self._meter.at_s = time.perf_counter()
+        self.look()
+
+    def look(self) -> None:
+        """In the maintainer's thread: write where a silent loop is, and log it once."""
+        with self._lock:
+            if not self._is_on:
+                return
+            try:
+                self._look()
+            except (OSError, RuntimeError) as error:
+                self._end()
+                text = f"hangs of the loop are not looked for: {error}"
+                self._session.journal.log("warning", "bridge", text)
+
+    def close(self) -> None:
+        """Log what was written last, and remove the file."""
+        is_locked = self._lock.acquire(timeout=1.0)  # an interrupt may have left it locked
+        self._end()
+        if is_locked:
+            self._lock.release()
+
+    def abandon(self) -> None:
+        """In a forked child: the file is the parent's."""
+        self._is_on = False
+
+    def _end(self) -> None:
+        if self._is_on and self._file >= 0:
+            with suppress(OSError):
+                self._judge()
+                os.ftruncate(self._file, 0)  # of a file without a first line no signal is sent
+                self._path.unlink()
+            self._leave_file()
+        self._is_on = False
+
+    def _look(self) -> None:
+        if self._file < 0 or not os.fstat(self._file).st_nlink:
+            self._open()
+        self._judge()  # what came of a signal
+        alive_s = self._meter.at_s
+        if time.perf_counter() - alive_s < self._limit_s:
+            self._begin_anew()
+        elif alive_s != self._silent_since_s:
+            self._silent_since_s = alive_s
+            self._begin_anew()
+            faulthandler.dump_traceback(self._file, all_threads=True)
+            self._judge()
+
+    def _open(self) -> None:
+        """Make the file; a former one was deleted."""
+        if self._file >= 0:
+            self._leave_file()
+        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_BINARY", 0)
+        self._file = os.open(self._path, flags, PRIVATE_FILE)
+        lock(self._file)
+        if _SIGNAL and signal.getsignal(_SIGNAL) is signal.SIG_DFL:
+            faulthandler.register(_SIGNAL, self._file, all_threads=True)
+            self._about["signal"] = _SIGNAL
+
+    def _leave_file(self) -> None:
+        """Close it; a signal that was sent meanwhile must neither end the process nor find it."""
+        if "signal" in self._about:
+            faulthandler.register(_SIGNAL, _nowhere(), all_threads=False)
+        os.close(self._file)
+
+    def _begin_anew(self) -> None:
+        """Whose stacks will follow; the time of the file shows that Python runs."""
+        head = json.dumps(self._about | {"run": self._session.clock.run.uuid}).encode() + b"\n"
+        if head == self._head and os.fstat(self._file).st_size == len(head):
+            os.utime(self._file)
+            return
+        os.ftruncate(self._file, 0)
+        os.write(self._file, head)
+        self._head = head
+
+    def _judge(self) -> None:
+        """Log where the loop was, unless it waited for Webots or had not begun."""
+        with open(self._file, "rb", closefd=False) as file:
+            stacks = read_stacks(file)
+        if stacks is None or stacks.wall_time_s == self._judged_s or not stacks.is_hang:
+            return
+        self._judged_s = stacks.wall_time_s
+        if self._meter.at_s > self._began_s and self._logged < _MOST_LOGGED:
+            self._logged += 1
+            clock = self._session.clock
+            self._session.recorder.record("stacks", clock.run, stacks.log_values(clock.sim_time_s))
+
+
+@functools.cache
+def _nowhere() -> int:
+    return os.open(os.devnull, os.O_WRONLY)

@@ -1,0 +1,158 @@
+"""Where a silent loop is: the stacks of a controller's threads, in a file next to the database.
+
+The bridge lets `faulthandler` write them where the loop gives no sign of life for longer than a
+limit. The first line of the file is a JSON object: whose stacks they are, and which files are not
+the controller's own. What follows is empty, or what `faulthandler` wrote; its time is that of the
+file. The file stays locked while its process lives.
+
+Standard library only, because the bridge imports it inside a robot's controller.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import BinaryIO, Final, NamedTuple
+
+VERSION: Final = "webots_mcp_stacks"
+FORMAT: Final = 1
+LOGGER: Final = "stacks"  # of the log rows
+STEPPING: Final = ("step", "stepBegin", "stepEnd")  # methods in which a controller waits for Webots
+_THREAD: Final = re.compile(
+    r"^(?:Current thread|Thread) 0x([0-9a-f]+)[^\n]*\(most recent call first\):\n((?:  .*\n?)*)",
+    re.MULTILINE,
+)
+_CALL: Final = re.compile(r'^  File "(.*)", line (\S+) in (.*)$', re.MULTILINE)
+_FOLDERS: Final = re.compile(r".*[/\\]")
+INSTALLED: Final = re.compile(r"[/\\](?:site|dist)-packages[/\\]|^<frozen ")
+_DEBUGGER: Final = re.compile(r"(?:[/\\]|^)(?:bdb|pdb)\.py$|[/\\](?:pydevd|debugpy|_pydev)")
+_EARLY: Final = 0.9  # of the limit: the clock of files is coarse
+_UNTOUCHED_S: Final = 3.0  # the maintainer's thread touches the file each second
+_WRITING_S: Final = 0.1
+_MOST_BYTES: Final = 200_000
+_MOST_TEXT: Final = 4000
+_MOST_CALLERS: Final = 3
+_LONGEST_NAME: Final = 60
+
+
+class Call(NamedTuple):
+    """A function that was being executed: its file, line and name."""
+
+    file: str
+    line: str
+    function: str
+
+    def __str__(self) -> str:
+        place = f"{_cut(_FOLDERS.sub('', self.file))}:{self.line}"
+        return place if self.function == "<module>" else f"{place}, {_cut(self.function)}()"
+
+    @property
+    def as_caller(self) -> str:
+        """In a list of callers, where its name is enough."""
+        return str(self) if self.function == "<module>" else f"{_cut(self.function)}()"
+
+
+class Stacks(NamedTuple):
+    """What was written of a silent controller.
+
+    Attributes:
+        wall_time_s: When, Unix time.
+        run: UUID of the run.
+        limit_s: How long the loop may be silent.
+        calls: Of the loop's thread, the innermost first; never empty.
+        own: Of them, those of the controller's own code: neither the bridge's nor a library's.
+        is_hang: That code, or what it called, keeps the loop from its step; else it waits for
+            Webots in a step, or a person has stopped it with a debugger of Python.
+        is_in_step: It waits for Webots.
+        text: All threads, as `faulthandler` wrote them.
+    """
+
+    wall_time_s: float
+    run: str
+    limit_s: float
+    calls: list[Call]
+    own: list[Call]
+    is_hang: bool
+    is_in_step: bool
+    text: str
+
+    def began_after(self, last_seen_wall_time_s: float) -> bool:
+        """Whether the loop had been silent for the limit since that sign of life."""
+        return self.wall_time_s - last_seen_wall_time_s >= _EARLY * self.limit_s
+
+    @property
+    def place(self) -> str:
+        """Where the loop was, the controller's own code first."""
+        place, *callers = self.own or self.calls
+        names = " and ".join(call.as_caller for call in callers[:_MOST_CALLERS])
+        text = f"{place}, called from {names}" if names else f"{place}"
+        return text if place is self.calls[0] else f"{text}; there in {self.calls[0]}"
+
+    def log_values(self, sim_time_s: float | None) -> dict[str, float | str | None]:
+        """Of the log row, which is known by its time."""
+        text = f"silent for more than {self.limit_s:g} s in {self.place}\n{self.text[:_MOST_TEXT]}"
+        return {"sim_time": sim_time_s, "wall_time": self.wall_time_s, "message": text}
+
+
+def stacks_path(database: Path, session_uuid: str) -> Path:
+    """Where the stacks of a session's process are written."""
+    return Path(f"{database}-stacks-{session_uuid}.txt")
+
+
+def read_stacks(file: BinaryIO) -> Stacks | None:
+    """What a file holds; None where nothing was written, or it cannot be read."""
+    file.seek(0)
+    head, _, rest = file.read(_MOST_BYTES).partition(b"\n")
+    text = rest.decode("utf-8", "replace")
+    try:
+        about = json.loads(head)
+        run, limit_s = str(about["run"]), float(about["limit_s"])
+        threads = {int(thread, 16): calls for thread, calls in _THREAD.findall(text)}
+        calls = [Call(*call) for call in _CALL.findall(threads[about["thread"]])]
+        steps, libraries = (tuple(map(str, about[name])) for name in ("step_files", "libraries"))
+    except (ValueError, TypeError, LookupError, RecursionError):
+        return None
+    if not calls or about.get(VERSION) != FORMAT:
+        return None
+    waits = [call for call in calls if call.function in STEPPING and call.file in steps]
+    own = [call for call in calls if call not in waits and not _is_library(call.file, libraries)]
+    inner = calls[: calls.index(own[0])] if own else calls
+    is_in_step = any(call in waits for call in inner)
+    is_debugged = any(_DEBUGGER.search(call.file) for call in calls)
+    hangs = not (is_in_step or is_debugged)
+    written_s = os.fstat(file.fileno()).st_mtime
+    return Stacks(written_s, run, limit_s, calls, own, hangs, is_in_step, text)
+
+
+def _is_library(file: str, libraries: tuple[str, ...]) -> bool:
+    return file.startswith(libraries) or INSTALLED.search(file) is not None
+
+
+def stacks_at(path: Path, pid: int, *, may_signal: bool) -> Stacks | None:
+    """What the file of a process holds; None where nothing was written.
+
+    Where no thread of that process could touch the file any more, C code keeps the interpreter's
+    lock. The process is sent the signal then on which it writes its stacks.
+
+    Args:
+        path: The file.
+        pid: The process.
+        may_signal: It runs on this machine, and is not stopped.
+    """
+    with suppress(OSError, ValueError, LookupError, TypeError), path.open("rb") as file:
+        found, about = read_stacks(file), json.loads((file.seek(0), file.readline())[1])
+        untouched_s = time.time() - os.fstat(file.fileno()).st_mtime
+        if found is None and may_signal and untouched_s > about["limit_s"] + _UNTOUCHED_S:
+            os.kill(pid, about["signal"])
+            time.sleep(_WRITING_S)
+            found = read_stacks(file)
+        return found
+    return None
+
+
+def _cut(name: str) -> str:
+    return name if len(name) <= _LONGEST_NAME else f"{name[: _LONGEST_NAME - 1]}…"

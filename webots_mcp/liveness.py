@@ -11,7 +11,7 @@ import os
 import sqlite3
 import sys
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -62,7 +62,7 @@ _FOUND: Final = (
     f"max(last_wall_time_s, {_LAST_ROW.format('wall_time_s', 'last_wall_time_s')}), "
     f"max(last_sim_time_s, {_LAST_ROW.format('sim_time_s', 'last_sim_time_s')}), "
     "purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) "
-    "FROM run WHERE session_id = ? AND ended_wall_time_s IS NULL"
+    "FROM run WHERE session_id = ? AND ended_wall_time_s IS NULL AND uuid IS NOT ?"
 )
 END_RUN: Final = (
     "UPDATE run SET ended_wall_time_s = :last_s, last_wall_time_s = :last_s, "
@@ -74,6 +74,10 @@ _OPEN_SESSIONS: Final = (
     "SELECT id, pid, CAST(process AS BLOB), last_seen_wall_time_s, EXISTS (SELECT 1 FROM command "
     "WHERE session_id = session.id AND action = 'reload' AND issued_wall_time_s IS NOT NULL) "
     "FROM session WHERE ended_wall_time_s IS NULL AND host = ?"
+)
+_SESSIONS_OF: Final = (
+    "SELECT s.id, s.host, s.pid, s.process, s.last_seen_wall_time_s FROM session s "
+    "JOIN robot r ON r.id = s.robot_id WHERE r.name = ? AND s.ended_wall_time_s IS NULL"
 )
 _FILE: Final = "SELECT file FROM pragma_database_list WHERE name = 'main'"
 
@@ -238,6 +242,28 @@ def write_heartbeat(
     connection.execute(_BEAT_RUN, (now, loop.sim_time_s, rows, run_id))
 
 
+# Of a session that has not ended: its id, host, pid, process, and its last sign of life.
+OpenSession = tuple[int, str, int, str | None, float]
+
+
+def free_name(
+    connection: sqlite3.Connection, name: str, living: Callable[[OpenSession], bool]
+) -> str:
+    """The name for a robot's new session: where a living one has it, `#2` and so on is appended.
+
+    Sessions of that name which are over are ended as superseded; the caller opens the transaction.
+    """
+    wanted, number = name, 1
+    while True:
+        sessions = connection.execute(_SESSIONS_OF, (wanted,)).fetchall()
+        if not any(map(living, sessions)):
+            for row in sessions:
+                end_session(connection, row[0], "superseded")
+            return wanted
+        number += 1
+        wanted = f"{name}#{number}"
+
+
 def reap(connection: sqlite3.Connection, now_s: float) -> None:
     """Settle everything that no live process will finish.
 
@@ -291,11 +317,19 @@ def dead_sessions(connection: sqlite3.Connection) -> list[tuple[int, str]]:
 
 def end_session(connection: sqlite3.Connection, session_id: int, reason: str) -> None:
     """End a session that another process left open, and its runs, as of their last sign of life."""
-    for run_id, last_s, last_sim_s, rows in connection.execute(_FOUND, (session_id,)).fetchall():
-        times = {"last_s": last_s, "last_sim_s": last_sim_s}
-        connection.execute(END_RUN, {"id": run_id, "reason": reason, "rows": rows, **times})
+    end_runs(connection, session_id, reason)
     # Last: a process that is killed before this leaves a session that will be settled again.
     connection.execute(END_SESSION, {"id": session_id, "reason": reason})
+
+
+def end_runs(
+    connection: sqlite3.Connection, session_id: int, reason: str, going_on: str | None = None
+) -> None:
+    """End the open runs of a session, as of their last sign of life, but for that UUID."""
+    values = (session_id, going_on)
+    for run_id, last_s, last_sim_s, rows in connection.execute(_FOUND, values).fetchall():
+        times = {"last_s": last_s, "last_sim_s": last_sim_s}
+        connection.execute(END_RUN, {"id": run_id, "reason": reason, "rows": rows, **times})
 
 
 # Leases: one process at a time does a job, on whatever host; who is gone or stopped loses it.

@@ -62,7 +62,7 @@ _FOUND: Final = (
     f"max(last_wall_time_s, {_LAST_ROW.format('wall_time_s', 'last_wall_time_s')}), "
     f"max(last_sim_time_s, {_LAST_ROW.format('sim_time_s', 'last_sim_time_s')}), "
     "purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) "
-    "FROM run WHERE session_id = ? AND ended_wall_time_s IS NULL AND uuid IS NOT ?"
+    "FROM run WHERE session_id = ? AND ended_wall_time_s IS NULL AND coalesce(uuid, '') <> ?"
 )
 END_RUN: Final = (
     "UPDATE run SET ended_wall_time_s = :last_s, last_wall_time_s = :last_s, "
@@ -323,7 +323,7 @@ def end_session(connection: sqlite3.Connection, session_id: int, reason: str) ->
 
 
 def end_runs(
-    connection: sqlite3.Connection, session_id: int, reason: str, going_on: str | None = None
+    connection: sqlite3.Connection, session_id: int, reason: str, going_on: str = "none"
 ) -> None:
     """End the open runs of a session, as of their last sign of life, but for that UUID."""
     values = (session_id, going_on)

@@ -21,44 +21,25 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple, NoReturn, cast
 
+from webots_mcp import liveness, signal_register, waiting_file
 from webots_mcp.connection import identify_files, in_transaction
 from webots_mcp.contract import find_log_level, host_name, instance_of, is_extern
 from webots_mcp.errors import warn
-from webots_mcp.liveness import OpenSession, end_runs, free_name, is_living, process_identity, reap
 from webots_mcp.naming import flatten
-from webots_mcp.signal_register import (
-    Seen,
-    SignalNames,
-    StateChanges,
-    find_changes,
-    write_changes,
-)
-from webots_mcp.waiting_file import (
-    ENTRIES_AT_ONCE,
-    STATEMENTS,
-    Entry,
-    Kind,
-    Taken,
-    enter_robot,
-    enter_session,
-    journal_parts,
-    lock,
-    read_header,
-    report_strange,
-    take_in,
-)
+from webots_mcp.waiting_file import STATEMENTS, Entry, Kind, Taken, journal_parts
 
 BUDGET_S: Final = 5.0  # of a question; what is left waits for the next one, and is said
 LONGEST_LINE_BYTES: Final = 4_000_000
 _HEADERLESS_S: Final = 60.0  # its writer has not come to the header yet, or never will
-_TAIL_BYTES: Final = 65_536
+_LAG_S: Final = 2.0  # a row that came since the question began is no delay
 
-# Numbers, texts and objects that the values of an entry are; a capital letter: or null.
+# The values of each kind: (n)umbers, (s)trings, (o)bjects; a capital letter: or null.
 _FIELDS: Final[dict[Kind, tuple[str, ...]]] = {
     "run": ("s uuid", "S world", "N step_ms", "s reason", "n wall_time", "n sim_time"),
     "state": ("n sim_time", "n wall_time", "o data", "O replaced"),
@@ -68,7 +49,7 @@ _FIELDS: Final[dict[Kind, tuple[str, ...]]] = {
     "session end": ("s reason", "n now", "N dropped", "S error"),
 }
 _NAMED: Final = ("run", "run end", "session end")  # whose values are an object, not an array
-_OF_RUN: Final = ("state", "event", "log", "run end")
+_OF_SESSION: Final = ("run", "session end")  # which name no run before their values
 _TYPES: Final[dict[str, tuple[type, ...]]] = {"n": (int, float), "s": (str,), "o": (dict,)}
 _UNGIVEN: Final = {"rows": None, "monotonic": None}  # of statements, which bridges alone know
 
@@ -90,6 +71,7 @@ _SEEN_RUN: Final = (
     "purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) END WHERE uuid = :run"
 )
 _RUN_ID: Final = "SELECT id FROM run WHERE uuid = ?"
+_SEEN_S: Final = "SELECT last_seen_wall_time_s FROM session WHERE uuid = ?"
 
 
 class _Place(NamedTuple):
@@ -107,7 +89,7 @@ class _Place(NamedTuple):
 
 
 class _Line(NamedTuple):
-    """A complete line: the byte after it, its entry, the state in it; and what was wrong."""
+    """A complete line: the byte after it, its entry, the state in it; or what is wrong with it."""
 
     end: int
     entry: Entry | None
@@ -115,22 +97,39 @@ class _Line(NamedTuple):
     fault: str = ""
 
 
+class _Looks:
+    """What is looked for in the states of a session."""
+
+    def __init__(self, newest: str | None) -> None:
+        self.names = signal_register.SignalNames()
+        self.changes = signal_register.StateChanges()
+        self.changes.look(json.loads(newest or "{}"))
+
+
 _lock = threading.Lock()
 _places: dict[Path, _Place] = {}
-_looks: dict[str, tuple[StateChanges, SignalNames]] = {}  # at the states of each session
+_looks: dict[str, _Looks] = {}
 
 
 def has_news(database: Path) -> bool:
     """Whether a journal next to a database has bytes that this process has not taken in."""
-    for parts in journal_parts(database).values():
-        for path in parts:
-            place = _places.get(path)
-            with suppress(OSError):
-                status = path.stat()
-                known = place is not None and place.file == _identity(status, database)
-                if not known or status.st_size != cast("_Place", place).offset:
-                    return True
+    for path in (path for parts in journal_parts(database).values() for path in parts):
+        with suppress(OSError):
+            status, place = path.stat(), _places.get(path)
+            if place is None or place[:2] != (_identity(status, database), status.st_size):
+                return True
     return False
+
+
+def journals_behind(connection: sqlite3.Connection, database: Path) -> list[str]:
+    """The journals of which rows are not in the database, although there was time."""
+    behind: list[str] = []
+    for uuid, parts in journal_parts(database).items():
+        (seen_s,) = connection.execute(_SEEN_S, (uuid,)).fetchone() or (0.0,)
+        with suppress(OSError):
+            if parts[-1].stat().st_mtime > seen_s + _LAG_S:
+                behind.append(parts[-1].name)
+    return behind
 
 
 def _identity(status: os.stat_result, database: Path) -> tuple[int, ...]:
@@ -157,8 +156,8 @@ def take_in_journals(
             if path.parent == database.parent:
                 del _places[path]
         for uuid, parts in journals.items():
-            # A part is read after all of those before it: entries that are older than one which is
-            # in are taken for taken in.
+            # In order, and no part before those ahead of it are in: of its entries only those that
+            # are newer than the last one that is in are taken.
             all(_take_in_part(connection, database, uuid, path, until_s) for path in parts)
 
 
@@ -168,19 +167,16 @@ def _take_in_part(
     """Take in a part, and delete it if it is complete; False where some of it is left."""
     try:
         with path.open("r+b") as file:
-            if os.fstat(file.fileno()).st_nlink == 0:
-                return True
-            header = read_header(file)
-            if header is None:
-                is_late = time.time() - os.fstat(file.fileno()).st_mtime > _HEADERLESS_S
-                if not (is_late and lock(file.fileno())):
-                    return False
-                is_complete = True
-            else:
-                # The lock first: what is written after the question would be deleted unread.
-                is_complete = lock(file.fileno())
-                reading = _Reading(connection, database, uuid, path, file, until_s)
-                if not reading.take_in(header, is_living=not is_complete):
+            status = os.fstat(file.fileno())
+            header = waiting_file.read_header(file)
+            if header is None and time.time() - status.st_mtime < _HEADERLESS_S:
+                return False
+            # First of all: what is written after the last look would be deleted unread.
+            is_complete = waiting_file.lock(file.fileno())
+            if header is not None and status.st_nlink:
+                identity = _identity(status, database)
+                reading = _Reading(connection, uuid, path, file, identity, not is_complete)
+                if not reading.take_in(header, until_s):
                     return False
             if is_complete and os.name != "nt":
                 path.unlink()
@@ -190,85 +186,72 @@ def _take_in_part(
         return True
     except Exception as error:  # noqa: BLE001  (raised again where it is not the file's)
         _looks.pop(uuid, None)
-        report_strange(path, error)
+        waiting_file.report_strange(path, error)
         return False
     return True
 
 
+@dataclass
 class _Reading:
     """Reads one part of a journal into the database."""
 
-    def __init__(
-        self,
-        connection: sqlite3.Connection,
-        database: Path,
-        uuid: str,
-        path: Path,
-        file: BinaryIO,
-        until_s: float,
-    ) -> None:
-        self._connection = connection
-        self._identity = _identity(os.fstat(file.fileno()), database)
-        self._uuid = uuid
-        self._path = path
-        self._file = file
-        self._until_s = until_s
+    connection: sqlite3.Connection
+    uuid: str
+    path: Path
+    file: BinaryIO
+    identity: tuple[int, ...]
+    is_living: bool
 
-    def take_in(self, header: dict[str, Any], *, is_living: bool) -> bool:
+    def take_in(self, header: dict[str, Any], until_s: float) -> bool:
         """Take in all complete lines from where it was left; False where time is up."""
-        start = self._file.tell()
-        session_id, robot_id, number, newest = self._enter(header, is_living=is_living)
-        place = _places.get(self._path)
-        if place is None or place.file != self._identity or place.number > number:
-            place = _Place(self._identity, _skip(self._file, start, number), number)
-        if self._uuid not in _looks:
-            changes, _ = _looks[self._uuid] = StateChanges(), SignalNames()
-            changes.look(json.loads(newest or "{}"))
-        faults: list[str] = []
-        while lines := _read_lines(self._file, place.offset):
-            entries = [each.entry for each in lines if each.entry]
-            if not entries:  # counted with the next entry
+        start = self.file.tell()
+        session_id, robot_id, number, newest = self._enter(header)
+        place = _places.get(self.path)
+        if place is None or place.file != self.identity or place.number > number:
+            place = _Place(self.identity, _skip(self.file, start, number), number)
+        looks = _looks.get(self.uuid) or _looks.setdefault(self.uuid, _Looks(newest))
+        faults: list[str] = []  # which are counted with the next entry
+        while lines := _read_lines(self.file, place.offset):
+            if entries := [each.entry for each in lines if each.entry]:
+                finish = partial(self._finish, session_id, robot_id, looks, lines, faults)
+                taken = waiting_file.take_in(self.connection, session_id, entries, finish)
+                done = _until(lines, taken.number)[-1].end
+                _places[self.path] = place = _Place(self.identity, done, taken.number)
+                faults.clear()
+            else:
                 faults += [each.fault for each in lines if each.fault]
                 place = place._replace(offset=lines[-1].end)
-                continue
-            finish = partial(self._finish, session_id, robot_id, lines, faults)
-            taken = take_in(self._connection, session_id, entries, finish)
-            place = _Place(self._identity, _until(lines, taken.number)[-1].end, taken.number)
-            _places[self._path] = place
-            faults.clear()
-            if time.monotonic() > self._until_s:
+            if time.monotonic() > until_s:
                 return False
-        _places[self._path] = place
+        _places[self.path] = place
         if faults:
-            warn(f"{len(faults)} lines at the end of {self._path} are no entries: {faults[0]}")
+            warn(f"{len(faults)} lines at the end of {self.path} are no entries: {faults[0]}")
         return True
 
-    def _enter(
-        self, header: dict[str, Any], *, is_living: bool
-    ) -> tuple[int, int, int, str | None]:
+    def _enter(self, header: dict[str, Any]) -> tuple[int, int, int, str | None]:
         """The ids of session and robot, the number of the last entry, the newest state."""
-        connection, uuid = self._connection, self._uuid
-        if (known := connection.execute(_KNOWN, (uuid,)).fetchone()) is not None:
+        connection = self.connection
+        if (known := connection.execute(_KNOWN, (self.uuid,)).fetchone()) is not None:
             return known
-        robot, session = _described(header, uuid, is_living=is_living)
+        name, session = _described(header, self.uuid, is_living=self.is_living)
 
-        def act() -> int:
-            if (found := connection.execute(_KNOWN, (uuid,)).fetchone()) is not None:
-                return found[0]  # another process was faster
-            reap(connection, time.time())
-            name = free_name(connection, robot["name"], _lives)
-            now_s = session["started_wall_time_s"]
-            return enter_session(
-                connection, enter_robot(connection, robot | {"name": name}, now_s), session
-            )
+        def act() -> None:
+            if connection.execute(_KNOWN, (self.uuid,)).fetchone() is None:
+                liveness.reap(connection, time.time())
+                robot = {"name": liveness.free_name(connection, name, _lives)}
+                robot |= {"kind": "Robot", "devices": "{}"}
+                now_s = session["started_wall_time_s"]
+                robot_id = waiting_file.enter_robot(connection, robot, now_s)
+                waiting_file.enter_session(connection, robot_id, session)
 
         in_transaction(connection, act)
-        return connection.execute(_KNOWN, (uuid,)).fetchone()
+        return connection.execute(_KNOWN, (self.uuid,)).fetchone()
 
     def _finish(
         self,
         session_id: int,
         robot_id: int,
+        looks: _Looks,
         lines: Sequence[_Line],
         faults: Sequence[str],
         taken: Taken,
@@ -276,96 +259,92 @@ class _Reading:
         """Write what follows: names, changes, times, ends of runs, what was dropped."""
         written = {entry.number for entry in taken.written}
         faults = [*faults, *taken.unfit]
-        changes, names = _looks[self._uuid]
-        runs = dict[str, tuple[float, float, int]]()
+        runs, ends = dict[str, tuple[float, float, int]](), dict[Kind, dict[str, Any]]()
         last: Entry | None = None
         for _, entry, state, fault in _until(lines, taken.number):
             if entry is None:
                 faults += [fault] * bool(fault)
                 continue
             if entry.kind == "run":
-                changes.forget()
-            is_new = entry.number in written
-            changed = changes.look(state) if state is not None else ()
-            if is_new and entry.kind == "run" and isinstance(entry.values, dict):
-                end_runs(self._connection, session_id, "reset", entry.values["uuid"])
-            if is_new and entry.kind == "session end" and isinstance(entry.values, dict):
-                end_runs(self._connection, session_id, entry.values["reason"])
-            if not is_new or isinstance(entry.values, dict):
+                looks.changes.forget()
+            changed = looks.changes.look(state) if state is not None else ()
+            if entry.number not in written:  # taken in by another process, or refused
                 continue
-            last = entry
+            if isinstance(entry.values, dict):  # a run or an end, after which others are over
+                ends[entry.kind] = entry.values
+                continue
+            last, run = entry, entry.run or ""
             sim_time_s, wall_time_s, *_ = entry.values
-            _, _, rows = runs.get(entry.run or "", (0.0, 0.0, 0))
-            run = entry.run or ""
+            _, _, rows = runs.get(run, (0.0, 0.0, 0))
             runs[run] = sim_time_s, wall_time_s, rows + (entry.kind == "state")
             if state is not None:
-                names.look(state, str(entry.values[2]), partial(self._enter_names, robot_id))
+                looks.names.look(state, entry.values[2], partial(self._enter_names, robot_id))
             for name, before, after in changed:
                 data = json.dumps({"from": before, "to": after}, ensure_ascii=False)
                 self._event(entry, "change", name[:200], data)
         for run, (sim, wall, rows) in runs.items():
             values = {"run": run, "sim": sim, "wall": wall, "rows": rows, "session": session_id}
-            self._connection.execute(_SEEN_RUN, values)
-            self._connection.execute(_SEEN_SESSION, values)
+            self.connection.execute(_SEEN_RUN, values)
+            self.connection.execute(_SEEN_SESSION, values)
+        if begun := ends.get("run"):
+            liveness.end_runs(self.connection, session_id, "reset", begun["uuid"])
+        if end := ends.get("session end"):
+            liveness.end_runs(self.connection, session_id, end["reason"])
         if faults and last is not None:
-            text = {"row_count": len(faults), "why": f"{self._path.name}: {faults[0]}"}
-            self._event(last, "dropped", None, json.dumps(text))
+            data = {"row_count": len(faults), "why": f"{self.path.name}: {faults[0]}"}
+            self._event(last, "dropped", None, json.dumps(data))
 
-    def _enter_names(self, robot_id: int, seen: Mapping[str, Seen]) -> bool:
-        changes = find_changes(self._connection, robot_id, seen)
-        write_changes(self._connection, robot_id, changes)
+    def _enter_names(self, robot_id: int, seen: Mapping[str, signal_register.Seen]) -> bool:
+        changes = signal_register.find_changes(self.connection, robot_id, seen)
+        signal_register.write_changes(self.connection, robot_id, changes)
         return True
 
     def _event(self, entry: Entry, kind: str, name: str | None, data: str) -> None:
-        (run_id,) = self._connection.execute(_RUN_ID, (entry.run,)).fetchone()
+        (run_id,) = self.connection.execute(_RUN_ID, (entry.run,)).fetchone()
         values = (run_id, *cast("tuple[Any, ...]", entry.values)[:2], kind, name, data)
-        self._connection.execute(STATEMENTS["event"], values)
+        self.connection.execute(STATEMENTS["event"], values)
 
 
-def _lives(session: OpenSession) -> bool:
-    return is_living(*session[1:], time.time())
+def _lives(session: liveness.OpenSession) -> bool:
+    return liveness.is_living(*session[1:], time.time())
 
 
 def _described(
     header: Mapping[str, Any], uuid: str, *, is_living: bool
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The values of robot and session, from the first line of a journal.
+) -> tuple[str, dict[str, Any]]:
+    """The robot's name and the values of the session, from the first line of a journal.
 
     Raises:
         ValueError: It lacks what a session needs.
     """
-    robot, session = _object(header.get("robot")), _object(header.get("session"))
-    name: Any = robot.get("name")
-    pid: Any = session.get("pid")
-    started_s: Any = session.get("started_wall_time_s")
-    parent: Any = session.get("parent_pid")
+    name, session = _object(header.get("robot")).get("name"), _object(header.get("session"))
+    pid, started_s = session.get("pid"), session.get("started_wall_time_s")
     if not (name and _is("s", name) and session.get("uuid") == uuid):
         raise ValueError("its first line has no robot.name, or another session.uuid than its name")
     if not (_is("n", pid) and _is("n", started_s)):
         raise ValueError("its first line has no session.pid or no session.started_wall_time_s")
     texts = {key: value for key, value in session.items() if _is("s", value)}
-    environment = {k: v for k, v in _object(session.get("environment")).items() if _is("s", v)}
-    host = texts.get("host", host_name())
-    is_here = host == host_name()
-    file = texts.get("controller")
-    values = {
+    given = _object(session.get("environment"))
+    environment = {key: value for key, value in given.items() if _is("s", value)}
+    host, parent = texts.get("host", host_name()), cast("int", session.get("parent_pid"))
+    is_here, file = host == host_name(), texts.get("controller")
+    return cast("str", name), {
         "uuid": uuid,
-        "pid": int(pid),
+        "pid": pid,
         # Of a process that is gone it is not known any more.
-        "process": process_identity(int(pid)) if is_here and is_living else None,
+        "process": liveness.process_identity(cast("int", pid)) if is_here and is_living else None,
         "host": host,
         "instance": instance_of(environment, parent) if is_here else f"{host} process {parent}",
         "extern": int(is_extern(environment)),
         "controller": file,
-        "controller_sha256": _sha256(file, started_s) if is_here and file else None,
+        "controller_sha256": _sha256(file, cast("float", started_s)) if is_here and file else None,
         "versions": json.dumps(_object(session.get("versions"))),
         "supervisor": 0,
         "actions": "{}",
-        "started_wall_time_s": float(started_s),
-        "last_seen_wall_time_s": float(started_s),
+        "started_wall_time_s": started_s,
+        "last_seen_wall_time_s": started_s,
         "throttle_interval": session.get("throttle_interval"),
     }
-    return {"name": name, "kind": "Robot", "devices": "{}"}, values
 
 
 def _object(value: object) -> dict[str, Any]:
@@ -404,20 +383,15 @@ def _skip(file: BinaryIO, offset: int, number: int) -> int:
 
 
 def _read_lines(file: BinaryIO, offset: int) -> list[_Line]:
-    """The next complete lines from that byte on; the last one may not be, while it is written."""
+    """The next complete lines from that byte on; one that is too long comes in pieces."""
     lines: list[_Line] = []
     file.seek(offset)
-    while len(lines) < ENTRIES_AT_ONCE and (line := file.readline(LONGEST_LINE_BYTES)):
+    while len(lines) < waiting_file.ENTRIES_AT_ONCE:
+        line = file.readline(LONGEST_LINE_BYTES)
+        if not line.endswith(b"\n") and len(line) < LONGEST_LINE_BYTES:
+            break  # the rest of it may come
         offset += len(line)
-        if line.endswith(b"\n"):
-            lines.append(_line(line, offset))
-            continue
-        while (more := file.readline(LONGEST_LINE_BYTES)) and not more.endswith(b"\n"):
-            offset += len(more)
-        if not more:
-            break
-        offset += len(more)
-        lines.append(_Line(offset, None, fault=f"longer than {LONGEST_LINE_BYTES} bytes"))
+        lines.append(_line(line, offset))
     return lines
 
 
@@ -432,16 +406,16 @@ def _line(line: bytes, end: int) -> _Line:
             raise ValueError("its number is none")
         if kind not in _FIELDS:
             raise ValueError(f"there is no kind {kind!r}")
-        if not (_is("s", run) if kind in _OF_RUN else run is None):
+        if not (run is None if kind in _OF_SESSION else _is("s", run)):
             raise ValueError(f"its run is {run!r}")
         if "\\ud" in text.lower():  # half a character is none
             json.dumps(values, ensure_ascii=False).encode()
         given = _checked(kind, values)
         state = _state(given, text, line) if kind == "state" else None
-        values = _bound(kind, given)
+        entry = Entry(number, kind, run, _bound(kind, given))
     except (ValueError, TypeError, ArithmeticError, RecursionError) as error:
-        return _Line(end, None, fault=f"{text[:60]!r}: {error}")
-    return _Line(end, Entry(number, kind, run, values), state)
+        return _Line(end, None, fault=f"{text[:60]!r}: {error}"[:300])
+    return _Line(end, entry, state)
 
 
 def _refuse(constant: str) -> NoReturn:
@@ -466,27 +440,25 @@ def _checked(kind: Kind, values: Any) -> dict[str, Any]:
         if not isinstance(values, list) or len(cast("list[Any]", values)) > len(fields):
             raise ValueError(f"its values are no array of at most {len(fields)}")
         values = dict(zip((name for _, name in fields), cast("list[Any]", values), strict=False))
-    given = _object(values)
+    given = {name: _object(values).get(name) for _, name in fields}
     for letter, name in fields:
-        value = given.get(name)
-        may_miss = value is None and letter.isupper()
-        if not (may_miss or _is(letter.lower(), value)):
-            raise ValueError(f"{name} is {value!r}")
+        may_miss = letter.isupper() and given[name] is None
+        if not (may_miss or _is(letter.lower(), given[name])):
+            raise ValueError(f"{name} is {given[name]!r}")
     if kind == "log" and find_log_level(given["level"]) is None:
         raise ValueError(f"there is no level {given['level']!r}")
-    return {name: given.get(name) for _, name in fields}
+    return given
 
 
 def _state(given: dict[str, Any], text: str, line: bytes) -> dict[str, Any]:
     """The state, with objects for dotted names; texts that were no UTF-8 are named as replaced."""
     state = given["data"] = _nested(given["data"])
     if "\ufffd" in text and line.decode("utf-8", "ignore") != text:
-        named = {
+        given["replaced"] = (given["replaced"] or {}) | {
             name: "not UTF-8"
             for name, value in flatten(state).items()
             if isinstance(value, str) and "\ufffd" in value
         }
-        given["replaced"] = (given["replaced"] or {}) | named
     return state
 
 
@@ -510,52 +482,13 @@ def _nested(state: dict[str, Any]) -> dict[str, Any]:
 def _bound(kind: Kind, given: dict[str, Any]) -> tuple[Any, ...] | dict[str, Any]:
     """The values as the statement of that kind takes them."""
     if kind in _NAMED:
-        return _UNGIVEN | given | ({"dropped": given["dropped"] or 0} if "dropped" in given else {})
+        return _UNGIVEN | given | {"dropped": given.get("dropped") or 0}
     if kind == "log":
         given |= {"level": find_log_level(given["level"]), "source": "controller"}
-    return tuple(
-        _text(cast("Any", value)) if type(value) is dict else value for value in given.values()
-    )
+    values: list[Any] = list(given.values())
+    return tuple(_text(each) if isinstance(each, dict) else each for each in values)
 
 
 _text: Final[Callable[[object], str]] = json.JSONEncoder(
     ensure_ascii=False, allow_nan=False, separators=(",", ":")
 ).encode
-
-
-# -- what waits ------------------------------------------------------------------------------------
-
-_LAG_S: Final = 2.0  # a row that came since the question began is no delay
-_ADOPTED: Final = "SELECT last_adopted_entry, last_seen_wall_time_s FROM session WHERE uuid = ?"
-
-
-def journals_behind(connection: sqlite3.Connection, database: Path) -> list[str]:
-    """The journals of which rows are not in the database, although there was time."""
-    behind: list[str] = []
-    for uuid, parts in journal_parts(database).items():
-        adopted, seen_s = connection.execute(_ADOPTED, (uuid,)).fetchone() or (0, 0.0)
-        newest = _newest(parts[-1])
-        if (
-            newest is not None
-            and newest.number > adopted
-            and _wall_time_s(newest) > seen_s + _LAG_S
-        ):
-            behind.append(parts[-1].name)
-    return behind
-
-
-def _newest(path: Path) -> Entry | None:
-    """The last entry of a part."""
-    with suppress(OSError), path.open("rb") as file:
-        size = file.seek(0, os.SEEK_END)
-        for tail in (_TAIL_BYTES, LONGEST_LINE_BYTES):
-            file.seek(max(size - tail, 0))
-            found = [_line(line + b"\n", 0).entry for line in file.read().split(b"\n")[-3:-1]]
-            if entries := [entry for entry in found if entry]:
-                return entries[-1]
-    return None
-
-
-def _wall_time_s(entry: Entry) -> float:
-    values = entry.values
-    return float(values[1] if isinstance(values, tuple) else values.get("now", math.inf))

@@ -1,7 +1,5 @@
 /* webots_mcp.h: records what a Webots controller in C or C++ publishes, for webots-mcp to read.
 
-       #include "webots_mcp.h"
-
        wmcp *w = wmcp_open(NULL, wb_robot_get_name(), wb_robot_get_world_path(),
                            wb_robot_get_basic_time_step(), 0);
        while (wb_robot_step(step) != -1) {
@@ -13,13 +11,11 @@
        wmcp_close(w);
 
    C99 or C++11, one file, nothing to link. It appends lines, each with one write(), to a journal in
-   the data folder (docs/journal.md), which the servers and commands of webots-mcp take into the
+   the data folder (docs/journal.md), which servers and commands of webots-mcp take into the
    database. What was published survives a killed controller. No function waits, fails or stops the
    robot: what cannot be written is counted, tried again each second, and reported as an event
-   "dropped". NULL does no harm as a wmcp, a name or a text.
-
-   Threads: a wmcp is used by one thread at a time; where several do, put a lock of yours around it.
-   A forked child must leave the wmcp of its parent alone.
+   "dropped". NULL does no harm as a wmcp, a name or a text. A wmcp is used by one thread at a time:
+   where several do, put a lock of yours around it. A forked child must leave its parent's alone.
 
    Tested on Linux; on macOS and Windows it is not tested yet. MIT license. */
 #ifndef WEBOTS_MCP_H
@@ -69,8 +65,8 @@ typedef struct {
 } wmcp__text;
 
 typedef struct wmcp {
-  char folder[WMCP_PATH], path[WMCP_PATH + 100], uuid[37], run[37], why[200];
-  wmcp__text row, replaced, log, extra, header, world;
+  char folder[WMCP_PATH], path[WMCP_PATH + 100], world[WMCP_PATH], uuid[37], run[37], why[200];
+  wmcp__text row, replaced, log, extra, header;
   double step_ms, sim_time_s, run_sim_time_s, run_wall_time_s, retry_at_s;
   long long number, bytes, dropped, unreported;
   unsigned long long calls;
@@ -81,18 +77,14 @@ typedef struct wmcp {
 /* -- text -------------------------------------------------------------------------------------- */
 
 static inline void wmcp__put(wmcp__text *text, const char *bytes, size_t count) {
-  if (count == 0) return;
   if (text->size - text->length < count) {
     size_t size = 2 * (text->size + count) + 1024;
     char *data = (char *)realloc(text->data, size);
-    if (!data) {
-      text->is_cut = 1;
-      return;
-    }
+    if (!data) { text->is_cut = 1; return; }
     text->data = data;
     text->size = size;
   }
-  memcpy(text->data + text->length, bytes, count);
+  if (count) memcpy(text->data + text->length, bytes, count);
   text->length += count;
 }
 
@@ -109,7 +101,7 @@ static inline void wmcp__whole(wmcp__text *text, long long value) {
   wmcp__put(text, at, (size_t)(end - at));
 }
 
-/* A JSON string; its length where it was longer than `limit` bytes and is cut. */
+/* A JSON string; returns its length where it was longer than `limit` bytes and is cut. */
 static inline size_t wmcp__string(wmcp__text *text, const char *value, size_t limit) {
   size_t length = strlen(value), end = length < limit ? length : limit;
   while (end < length && (value[end] & 0xC0) == 0x80 && end + 4 > limit) end--; /* UTF-8 */
@@ -119,9 +111,8 @@ static inline size_t wmcp__string(wmcp__text *text, const char *value, size_t li
     if (at < end && c >= 0x20 && c != '"' && c != '\\') continue;
     wmcp__put(text, value + plain, at - plain);
     plain = at + 1;
-    if (at == end) break;
     char escaped[8];
-    wmcp__put(text, escaped, (size_t)snprintf(escaped, 8, "\\u%04x", c));
+    if (at < end) wmcp__put(text, escaped, (size_t)snprintf(escaped, 8, "\\u%04x", c));
   }
   wmcp__put(text, "\"", 1);
   return length > end ? length : 0;
@@ -129,16 +120,28 @@ static inline size_t wmcp__string(wmcp__text *text, const char *value, size_t li
 
 /* -- numbers: what Python's float() reads is the same to the last bit --------------------------- */
 
-/* mantissa * 5^power / 2^shift to the nearest whole number; exact in 128 bits until it is rounded */
+static inline uint64_t wmcp__multiply(uint64_t a, uint64_t b, uint64_t *high) {
+  uint64_t half = 0xFFFFFFFF, low = (a & half) * (b & half);
+  uint64_t left = (a >> 32) * (b & half), right = (a & half) * (b >> 32);
+  uint64_t middle = (low >> 32) + (left & half) + (right & half);
+  *high = (a >> 32) * (b >> 32) + (left >> 32) + (right >> 32) + (middle >> 32);
+  return (low & half) | middle << 32;
+}
+
+/* mantissa * 5^power / 2^shift, to the nearest whole number. Exact up to 5^27, which 64 bits hold;
+   beyond it off by 1e-19 of it, where another double would be 1e-16 away. */
 static inline uint64_t wmcp__scaled(uint64_t mantissa, int power, int shift) {
-  uint64_t five = 1, half = 0xFFFFFFFF;
+  uint64_t five = 1, high, low;
+  if (power > 27) {
+    low = wmcp__multiply(mantissa, 7450580596923828125, &high);
+    mantissa = high << 12 | low >> 52;
+    power -= 27;
+    shift -= 52;
+  }
   for (uint64_t base = 5; power; base *= base, power >>= 1)
     if (power & 1) five *= base;
-  uint64_t low = (mantissa & half) * (five & half), high = (mantissa >> 32) * (five >> 32);
-  uint64_t left = (mantissa >> 32) * (five & half), right = (mantissa & half) * (five >> 32);
-  uint64_t middle = (low >> 32) + (left & half) + (right & half);
-  high += (left >> 32) + (right >> 32) + (middle >> 32);
-  low = (low & half) | middle << 32;
+  low = wmcp__multiply(mantissa, five, &high);
+  for (; shift > 63; shift--, high >>= 1) low = low >> 1 | high << 63;
   uint64_t bit = (uint64_t)1 << (shift - 1), sum = low + bit;
   uint64_t whole = (sum >> shift) | ((high + (sum < low)) << (64 - shift));
   return (low & (2 * bit - 1)) == bit ? whole & ~(uint64_t)1 : whole; /* a tie: to the even one */
@@ -148,62 +151,73 @@ static inline uint64_t wmcp__scaled(uint64_t mantissa, int power, int shift) {
 static inline void wmcp__double(wmcp__text *text, double value) {
   char out[64], *end = out + 64, *at;
   double size = value < 0 ? -value : value;
-  uint64_t bits, digits;
+  uint64_t bits;
   memcpy(&bits, &value, sizeof bits);
   if (bits >> 63) wmcp__put(text, "-", 1);
   if (size < 9007199254740992.0 && size == (double)(int64_t)size) {
     wmcp__whole(text, (long long)size);
     wmcp__put(text, ".0", 2);
-    return;
-  }
-  if (!(size >= 1e-9 && size < 1e15)) { /* by the library, whose decimal point is the locale's */
+  } else if (!(size >= 1e-36 && size < 1e15)) { /* the library's; the locale has its own point */
     snprintf(out, sizeof out, "%.16e", size);
     at = strchr(out, 'e');
     wmcp__put(text, out, 1);
     wmcp__put(text, ".", 1);
     wmcp__put(text, at - 16, 16 + strlen(at));
-    return;
+  } else {
+    uint64_t mantissa = (bits & 0xFFFFFFFFFFFFF) | 0x10000000000000;
+    int exponent = (int)(bits >> 52 & 0x7FF) - 1075;
+    int point = 17 - (((exponent + 53) * 1233) >> 12); /* digits after the point, or one more */
+    uint64_t digits = wmcp__scaled(mantissa, point, -exponent - point);
+    if (digits >= 100000000000000000)
+      point--, digits = wmcp__scaled(mantissa, point, -exponent - point);
+    for (; point > 1 && digits % 10 == 0; point--) digits /= 10;
+    at = wmcp__digits(end, digits);
+    if (point > 20) {
+      wmcp__put(text, at, (size_t)(end - at));
+      wmcp__put(text, "e-", 2);
+      wmcp__whole(text, point);
+      return;
+    }
+    while (end - at <= point) *--at = '0';
+    wmcp__put(text, at, (size_t)(end - at - point));
+    wmcp__put(text, ".", 1);
+    wmcp__put(text, end - point, (size_t)point);
   }
-  uint64_t mantissa = (bits & 0xFFFFFFFFFFFFF) | 0x10000000000000;
-  int exponent = (int)(bits >> 52 & 0x7FF) - 1075;
-  int point = 17 - (((exponent + 53) * 1233) >> 12); /* so many digits after the point, or one less */
-  if ((digits = wmcp__scaled(mantissa, point, -exponent - point)) >= 100000000000000000)
-    point--, digits = wmcp__scaled(mantissa, point, -exponent - point);
-  for (; point > 1 && digits % 10 == 0; point--) digits /= 10;
-  for (at = wmcp__digits(end, digits); end - at <= point;) *--at = '0';
-  wmcp__put(text, at, (size_t)(end - at - point));
-  wmcp__put(text, ".", 1);
-  wmcp__put(text, end - point, (size_t)point);
 }
 
-/* Text as it is but for @ a text, $ a JSON string, # a whole number, % a number. */
+/* Text as it is but for @ a text, $ a JSON string or null, # a whole number, % a number. */
 static inline void wmcp__format(wmcp__text *text, const char *format, ...) {
   va_list values;
   va_start(values, format);
-  for (const char *at = format; *at; at++)
-    if (*at == '@' || *at == '$') {
-      const char *value = va_arg(values, const char *);
-      if (*at == '$' && value)
-        wmcp__string(text, value, WMCP_PATH);
-      else
-        wmcp__put(text, value ? value : "null", value ? strlen(value) : 4);
-    } else if (*at == '#')
+  for (const char *at = format; *at; at++) {
+    const char *value = *at == '@' || *at == '$' ? va_arg(values, const char *) : NULL;
+    if (*at == '$' && value)
+      wmcp__string(text, value, WMCP_PATH);
+    else if (*at == '$' || *at == '@')
+      wmcp__put(text, value ? value : "null", value ? strlen(value) : 4);
+    else if (*at == '#')
       wmcp__whole(text, va_arg(values, long long));
     else if (*at == '%')
       wmcp__double(text, va_arg(values, double));
     else
       wmcp__put(text, at, 1);
+  }
   va_end(values);
 }
 
 /* -- the system -------------------------------------------------------------------------------- */
 
 #ifdef _WIN32
+#define WMCP_HOME "USERPROFILE"
+#define WMCP_FLAGS (_O_WRONLY | _O_CREAT | _O_EXCL | _O_APPEND | _O_BINARY | _O_NOINHERIT)
+#define wmcp__cut(file, bytes) _chsize_s(file, bytes)
+#define wmcp__make(path) _mkdir(path)
 static inline double wmcp__now_s(void) {
   FILETIME time;
   GetSystemTimeAsFileTime(&time);
   return (double)((uint64_t)time.dwHighDateTime << 32 | time.dwLowDateTime) / 1e7 - 11644473600.0;
 }
+
 static inline int wmcp__lock(int file) { /* the byte that webots-mcp itself asks for */
   OVERLAPPED at;
   memset(&at, 0, sizeof at);
@@ -211,33 +225,21 @@ static inline int wmcp__lock(int file) { /* the byte that webots-mcp itself asks
   return LockFileEx((HANDLE)_get_osfhandle(file),
                     LOCKFILE_EXCLUSIVE_LOCK | LOCKFILE_FAIL_IMMEDIATELY, 0, 1, 0, &at);
 }
-#define WMCP_FLAGS (_O_WRONLY | _O_CREAT | _O_EXCL | _O_APPEND | _O_BINARY | _O_NOINHERIT)
-#define WMCP_HOME "USERPROFILE"
-#define wmcp__open(path) _open(path, WMCP_FLAGS, _S_IREAD | _S_IWRITE)
-#define wmcp__write(file, data, count) _write(file, data, (unsigned)(count))
-#define wmcp__cut(file, bytes) _chsize_s(file, bytes)
-#define wmcp__close _close
-#define wmcp__unlink _unlink
-#define wmcp__make(path) _mkdir(path)
-#define wmcp__working_folder _getcwd
 #else
+#define WMCP_HOME "HOME"
+#define WMCP_FLAGS (O_WRONLY | O_CREAT | O_EXCL | O_APPEND)
+#define wmcp__cut(file, bytes) ftruncate(file, (off_t)(bytes))
+#define wmcp__make(path) mkdir(path, 0700)
 static inline double wmcp__now_s(void) {
   struct timeval now;
   gettimeofday(&now, NULL);
   return (double)now.tv_sec + (double)now.tv_usec / 1e6;
 }
+
 static inline int wmcp__lock(int file) { /* some network drives have none */
   fcntl(file, F_SETFD, FD_CLOEXEC);
   return flock(file, LOCK_EX | LOCK_NB) == 0 || errno != EWOULDBLOCK;
 }
-#define WMCP_HOME "HOME"
-#define wmcp__open(path) open(path, O_WRONLY | O_CREAT | O_EXCL | O_APPEND, 0600)
-#define wmcp__write write
-#define wmcp__cut(file, bytes) ftruncate(file, (off_t)(bytes))
-#define wmcp__close close
-#define wmcp__unlink unlink
-#define wmcp__make(path) mkdir(path, 0700)
-#define wmcp__working_folder getcwd
 #endif
 
 static inline void wmcp__new_uuid(char *text) { /* RFC 9562, version 4 */
@@ -263,41 +265,20 @@ static inline int wmcp__has(const char *path, const char *folder) {
    the working folder, ~/.webots-mcp/data. */
 static inline void wmcp__find_folder(char *path, const char *named) {
   const char *home = getenv(WMCP_HOME) ? getenv(WMCP_HOME) : ".";
+  char *end = getcwd(path, WMCP_PATH - 20);
   if (!named || !*named) named = getenv("WEBOTS_MCP_DATA_DIR");
   if (named && *named) {
     int in_home = named[0] == '~' && (named[1] == '/' || !named[1]);
     snprintf(path, WMCP_PATH, "%s%s", in_home ? home : "", named + in_home);
     return;
   }
-  char *end = wmcp__working_folder(path, WMCP_PATH - 20);
   while (end && !(wmcp__has(path, "worlds") && wmcp__has(path, "controllers"))) {
     for (end = path + strlen(path); end > path && *end != '/' && *end != '\\';) end--;
     *end = 0;
     if (end == path) end = NULL;
   }
-  if (end)
-    strcat(path, "/mcp_data");
-  else
-    snprintf(path, WMCP_PATH, "%s/.webots-mcp/data", home);
-}
-
-/* -- the journal ------------------------------------------------------------------------------- */
-
-static inline void wmcp__put_run(wmcp *w, wmcp__text *text) { /* before the line that needs it */
-  wmcp__format(text, "[#,\"run\",null,{\"uuid\":$,\"world\":", w->number - 2, w->run);
-  wmcp__put(text, w->world.data, w->world.length);
-  wmcp__format(text, ",\"step_ms\":%,\"reason\":$,\"wall_time\":%,\"sim_time\":%}]\n", w->step_ms,
-               w->start_reason, w->run_wall_time_s, w->run_sim_time_s);
-}
-
-static inline int wmcp__append(wmcp *w, const wmcp__text *line) { /* all of it or nothing */
-  if (w->is_torn && wmcp__write(w->file, "\n", 1) == 1) w->is_torn = 0, w->bytes++;
-  if (w->is_torn || line->is_cut) return 0;
-  errno = ENOSPC; /* where only a part is written */
-  long long done = (long long)wmcp__write(w->file, line->data, line->length);
-  if (done == (long long)line->length) return (w->bytes += done) > 0;
-  if (done > 0) w->is_torn = wmcp__cut(w->file, w->bytes) != 0;
-  return 0;
+  if (end) strcat(path, "/mcp_data");
+  if (!end) snprintf(path, WMCP_PATH, "%s/.webots-mcp/data", home);
 }
 
 static inline void wmcp__make_folder(char *path) { /* and those around it */
@@ -309,27 +290,46 @@ static inline void wmcp__make_folder(char *path) { /* and those around it */
   }
 }
 
+/* -- the journal ------------------------------------------------------------------------------- */
+
+static inline int wmcp__append(wmcp *w, const wmcp__text *line) { /* all of it or nothing */
+  if (w->is_torn && write(w->file, "\n", 1) == 1) w->is_torn = 0, w->bytes++;
+  if (w->is_torn || line->is_cut) return 0;
+  errno = ENOSPC; /* where only a part is written */
+  long long done = (long long)write(w->file, line->data, (unsigned)line->length);
+  if (done == (long long)line->length) return (w->bytes += done) > 0;
+  if (done > 0) w->is_torn = wmcp__cut(w->file, w->bytes) != 0;
+  return 0;
+}
+
+static inline void wmcp__put_run(wmcp *w) { /* before the line that needs it */
+  wmcp__format(&w->extra, "[#,\"run\",null,{\"uuid\":$,\"world\":$,\"step_ms\":%,\"reason\":$,",
+               w->number - 2, w->run, w->world[0] ? w->world : NULL, w->step_ms, w->start_reason);
+  wmcp__format(&w->extra, "\"wall_time\":%,\"sim_time\":%}]\n", w->run_wall_time_s,
+               w->run_sim_time_s);
+}
+
 /* Goes on in a new file, which begins with who records and the run; 0 where it cannot be made. */
 static inline int wmcp__begin_part(wmcp *w) {
   int before = w->file, why;
   long long bytes = w->bytes;
   snprintf(w->path, sizeof w->path, "%s/webots.db-waiting-%s-%04d.jsonl", w->folder, w->uuid,
            w->part + 1);
-  if ((w->file = wmcp__open(w->path)) < 0 && errno == ENOENT) {
+  if ((w->file = open(w->path, WMCP_FLAGS, 0600)) < 0 && errno == ENOENT) {
     wmcp__make_folder(w->folder);
-    w->file = wmcp__open(w->path);
+    w->file = open(w->path, WMCP_FLAGS, 0600);
   }
-  w->extra.length = 0;
   w->bytes = w->is_torn = 0;
+  w->extra.length = 0;
   wmcp__put(&w->extra, w->header.data, w->header.length);
-  if (w->run[0]) wmcp__put_run(w, &w->extra);
+  if (w->run[0]) wmcp__put_run(w);
   if (w->file >= 0 && wmcp__lock(w->file) && wmcp__append(w, &w->extra)) {
-    if (before >= 0) wmcp__close(before);
+    if (before >= 0) close(before);
     w->part++;
     return w->is_described = 1;
   }
   why = errno;
-  if (w->file >= 0) wmcp__close(w->file), wmcp__unlink(w->path);
+  if (w->file >= 0) close(w->file), remove(w->path);
   errno = why;
   w->file = before;
   w->bytes = bytes;
@@ -340,19 +340,19 @@ static inline int wmcp__begin_part(wmcp *w) {
 static inline int wmcp__is_ready(wmcp *w, size_t count) {
   struct stat status;
   if (w->file >= 0 && (fstat(w->file, &status) || !status.st_nlink)) { /* it was deleted */
-    wmcp__close(w->file);
+    close(w->file);
     w->file = -1;
   }
   if (w->file < 0 || w->bytes + (long long)count > WMCP_PART_BYTES)
     if (!wmcp__begin_part(w) && w->file < 0) return 0;
   w->extra.length = 0;
-  if (!w->is_described) wmcp__put_run(w, &w->extra);
-  if (w->extra.length && !(w->is_described = wmcp__append(w, &w->extra))) return 0;
+  if (!w->is_described) wmcp__put_run(w);
+  if (!w->is_described && !(w->is_described = wmcp__append(w, &w->extra))) return 0;
   w->extra.length = 0;
-  if (w->unreported)
-    wmcp__format(&w->extra, "[#,\"event\",$,[%,%,\"dropped\",null,{\"row_count\":#,\"why\":$}]]\n",
-                 w->number - 1, w->run, w->sim_time_s, wmcp__now_s(), w->unreported, w->why);
-  if (w->extra.length && !wmcp__append(w, &w->extra)) return 0;
+  if (!w->unreported) return 1;
+  wmcp__format(&w->extra, "[#,\"event\",$,[%,%,\"dropped\",null,{\"row_count\":#,\"why\":$}]]\n",
+               w->number - 1, w->run, w->sim_time_s, wmcp__now_s(), w->unreported, w->why);
+  if (!wmcp__append(w, &w->extra)) return 0;
   w->unreported = 0;
   return 1;
 }
@@ -415,16 +415,13 @@ static inline const char *wmcp__not_finite(double value) { /* by its bits: -ffas
 
 /* -- what a controller calls ------------------------------------------------------------------- */
 
-/* Begins to record.
-   data_dir: the data folder; NULL to find it as webots-mcp does.
-   robot: the robot's name. world: path of the world file, or NULL.
-   basic_time_step_ms: of the world. throttle_interval: one publish of so many is recorded; 0 for 5;
-   the environment variable WEBOTS_MCP_THROTTLE_INTERVAL has the last word.
-   Returns NULL only where there is no memory. */
+/* Begins to record, in the data folder `data_dir`; NULL: found as webots-mcp finds it. Of so many
+   states as `throttle_interval` says one is recorded, 0: of 5; the environment variable
+   WEBOTS_MCP_THROTTLE_INTERVAL has the last word. NULL is returned where there is no memory. */
 static inline wmcp *wmcp_open(const char *data_dir, const char *robot, const char *world,
                               double basic_time_step_ms, int throttle_interval) {
   wmcp *w = (wmcp *)calloc(1, sizeof(wmcp));
-  const char *interval = getenv("WEBOTS_MCP_THROTTLE_INTERVAL");
+  const char *interval = getenv("WEBOTS_MCP_THROTTLE_INTERVAL"), *host = NULL;
   char program[WMCP_PATH] = "";
   if (!w) return NULL;
   if (interval && atoi(interval) > 0) throttle_interval = atoi(interval);
@@ -432,16 +429,17 @@ static inline wmcp *wmcp_open(const char *data_dir, const char *robot, const cha
   w->step_ms = basic_time_step_ms;
   w->start_reason = "start";
   w->file = -1;
+  w->is_described = 1;
   wmcp__new_uuid(w->uuid);
   wmcp__find_folder(w->folder, data_dir);
-  wmcp__format(&w->world, "$", world);
+  snprintf(w->world, sizeof w->world, "%s", world ? world : "");
 #ifdef _WIN32
-  const char *host = getenv("COMPUTERNAME");
+  host = getenv("COMPUTERNAME");
   GetModuleFileNameA(NULL, program, WMCP_PATH - 1);
   long long pid = (long long)GetCurrentProcessId(), parent = 0;
 #else
   struct utsname names;
-  const char *host = uname(&names) < 0 ? NULL : names.nodename;
+  if (uname(&names) >= 0) host = names.nodename;
   if (readlink("/proc/self/exe", program, WMCP_PATH - 1) < 0) program[0] = 0;
   long long pid = getpid(), parent = getppid();
 #endif
@@ -451,10 +449,10 @@ static inline wmcp *wmcp_open(const char *data_dir, const char *robot, const cha
                w->uuid, pid, parent, host ? host : "", program[0] ? program : NULL);
   wmcp__format(&w->header, "\"versions\":{\"webots_mcp.h\":\"1\"},\"throttle_interval\":#,",
                (long long)w->interval);
-  wmcp__format(&w->header, "\"environment\":{\"WEBOTS_INSTANCE_PATH\":$,\"WEBOTS_ROBOT_NAME\":$,",
+  wmcp__format(&w->header, "\"started_wall_time_s\":%,\"environment\":{", wmcp__now_s());
+  wmcp__format(&w->header, "\"WEBOTS_INSTANCE_PATH\":$,\"WEBOTS_ROBOT_NAME\":$,",
                getenv("WEBOTS_INSTANCE_PATH"), getenv("WEBOTS_ROBOT_NAME"));
-  wmcp__format(&w->header, "\"WEBOTS_CONTROLLER_URL\":$},\"started_wall_time_s\":%}}\n",
-               getenv("WEBOTS_CONTROLLER_URL"), wmcp__now_s());
+  wmcp__format(&w->header, "\"WEBOTS_CONTROLLER_URL\":$}}}\n", getenv("WEBOTS_CONTROLLER_URL"));
   wmcp__begin_part(w);
   return w;
 }
@@ -466,10 +464,10 @@ static inline void wmcp_begin(wmcp *w, double sim_time_s) {
   w->sim_time_s = sim_time_s;
   if (is_reset) {
     w->start_reason = "reset";
-    w->run[0] = 0;
     w->calls = 0;
+    w->run[0] = 0;
     wmcp__start_line(w, &w->row, "event");
-    wmcp__format(&w->row, "\"reset\"]]\n");
+    wmcp__put(&w->row, "\"reset\"]]\n", 10);
     wmcp__write_line(w, &w->row);
   }
   if (!(w->is_due = ++w->calls % (unsigned)w->interval == 0)) return;
@@ -487,12 +485,10 @@ static inline void wmcp_number(wmcp *w, const char *name, double value) {
   wmcp__format(&w->row, what ? "null" : "%", value);
 }
 
-/* A whole number. */
 static inline void wmcp_integer(wmcp *w, const char *name, long long value) {
   if (wmcp__start_value(w, name)) wmcp__whole(&w->row, value);
 }
 
-/* A truth value. */
 static inline void wmcp_flag(wmcp *w, const char *name, int value) {
   if (wmcp__start_value(w, name)) wmcp__format(&w->row, value ? "true" : "false");
 }
@@ -508,22 +504,18 @@ static inline void wmcp_text(wmcp *w, const char *name, const char *value) {
 /* An array of at most 20,000 numbers. */
 static inline void wmcp_array(wmcp *w, const char *name, const double *values, size_t count) {
   const char *what, *first = NULL;
-  int is_mixed = 0;
+  int is_mixed = 0, is_whole = values && count <= WMCP_MAX_ITEMS;
   if (!wmcp__start_value(w, name)) return;
-  if (!values || count > WMCP_MAX_ITEMS) {
-    wmcp__put(&w->row, "null", 4);
-    if (values) wmcp__replace(w, name, "array", (long long)count);
-    return;
-  }
-  wmcp__put(&w->row, "[", 1);
-  for (size_t i = 0; i < count; i++) {
+  wmcp__format(&w->row, is_whole ? "[" : "null");
+  if (values && !is_whole) wmcp__replace(w, name, "array", (long long)count);
+  for (size_t i = 0; is_whole && i < count; i++) {
     if (i) wmcp__put(&w->row, ",", 1);
     what = wmcp__not_finite(values[i]);
     wmcp__format(&w->row, what ? "null" : "%", values[i]);
-    if (what && first && what != first) is_mixed = 1;
-    if (what) first = what;
+    is_mixed |= what && first && what != first;
+    first = what ? what : first;
   }
-  wmcp__put(&w->row, "]", 1);
+  if (is_whole) wmcp__put(&w->row, "]", 1);
   if (first) wmcp__replace(w, name, is_mixed ? "not finite" : first, -1);
 }
 
@@ -531,10 +523,11 @@ static inline void wmcp_array(wmcp *w, const char *name, const double *values, s
 static inline void wmcp_floats(wmcp *w, const char *name, const float *values, size_t count) {
   if (!w || !w->is_due) return;
   w->extra.length = 0;
-  for (size_t i = 0; values && i < count && i <= WMCP_MAX_ITEMS; i++) {
+  for (size_t i = 0; values && i < count && count <= WMCP_MAX_ITEMS; i++) {
     double value = values[i];
     wmcp__put(&w->extra, (const char *)&value, sizeof value);
   }
+  wmcp__put(&w->extra, "", 1); /* so that there is one */
   if (!w->extra.is_cut) wmcp_array(w, name, values ? (double *)(void *)w->extra.data : NULL, count);
 }
 
@@ -554,7 +547,7 @@ static inline void wmcp_log(wmcp *w, const char *level, const char *message) {
   wmcp__start_line(w, &w->log, "log");
   wmcp__format(&w->log, "$,\"controller\",", level ? level : "info");
   wmcp__string(&w->log, message ? message : "", WMCP_MAX_LOG);
-  wmcp__format(&w->log, "]]\n");
+  wmcp__put(&w->log, "]]\n", 3);
   wmcp__write_line(w, &w->log);
 }
 
@@ -563,12 +556,13 @@ static inline void wmcp_close(wmcp *w) {
   if (!w) return;
   w->log.length = 0;
   w->number += 4;
-  wmcp__format(&w->log, "[#,\"session end\",null,{\"reason\":\"finished\",\"now\":%,\"dropped\":#}]\n",
-               w->number, wmcp__now_s(), w->dropped);
+  wmcp__format(&w->log, "[#,\"session end\",null,{\"reason\":\"finished\",\"now\":%,", w->number,
+               wmcp__now_s());
+  wmcp__format(&w->log, "\"dropped\":#}]\n", w->dropped);
   wmcp__write_line(w, &w->log);
-  if (w->file >= 0) wmcp__close(w->file);
-  wmcp__text *texts[] = {&w->row, &w->replaced, &w->log, &w->extra, &w->header, &w->world};
-  for (int i = 0; i < 6; i++) free(texts[i]->data);
+  if (w->file >= 0) close(w->file);
+  wmcp__text *texts[] = {&w->row, &w->replaced, &w->log, &w->extra, &w->header};
+  for (int i = 0; i < 5; i++) free(texts[i]->data);
   free(w);
 }
 

@@ -51,6 +51,7 @@ _LEVEL_ALIASES: Final[dict[str, LogLevel]] = {
 }
 
 _PACKAGE: Final = Path(__file__).parent
+C_HEADER: Final = _PACKAGE / "webots_mcp.h"  # by which controllers in C and C++ record
 
 
 class BuiltInAction(NamedTuple):

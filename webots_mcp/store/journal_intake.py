@@ -79,13 +79,15 @@ class _Place(NamedTuple):
 
     Attributes:
         file: Its device and inode, and those of the database.
-        offset: The byte after the last entry that is in.
-        number: Of that entry.
+        offset: The byte after the last line.
+        number: Of the last entry that is in.
+        faults: Of lines that are to be counted with the next entry.
     """
 
     file: tuple[int, ...]
     offset: int
     number: int
+    faults: tuple[str, ...] = ()
 
 
 class _Line(NamedTuple):
@@ -201,6 +203,7 @@ class _Reading:
     file: BinaryIO
     identity: tuple[int, ...]
     is_living: bool
+    faults: tuple[str, ...] = ()
 
     def take_in(self, header: dict[str, Any], until_s: float) -> bool:
         """Take in all complete lines from where it was left; False where time is up."""
@@ -210,22 +213,22 @@ class _Reading:
         if place is None or place.file != self.identity or place.number > number:
             place = _Place(self.identity, _skip(self.file, start, number), number)
         looks = _looks.get(self.uuid) or _looks.setdefault(self.uuid, _Looks(newest))
-        faults: list[str] = []  # which are counted with the next entry
         while lines := _read_lines(self.file, place.offset):
+            self.faults = place.faults
             if entries := [each.entry for each in lines if each.entry]:
-                finish = partial(self._finish, session_id, robot_id, looks, lines, faults)
+                finish = partial(self._finish, session_id, robot_id, looks, lines)
                 taken = waiting_file.take_in(self.connection, session_id, entries, finish)
                 done = _until(lines, taken.number)[-1].end
-                _places[self.path] = place = _Place(self.identity, done, taken.number)
-                faults.clear()
+                place = _Place(self.identity, done, taken.number, self.faults)
             else:
-                faults += [each.fault for each in lines if each.fault]
-                place = place._replace(offset=lines[-1].end)
+                faults = (*self.faults, *(each.fault for each in lines if each.fault))
+                place = place._replace(offset=lines[-1].end, faults=faults)
+            _places[self.path] = place
             if time.monotonic() > until_s:
                 return False
         _places[self.path] = place
-        if faults:
-            warn(f"{len(faults)} lines at the end of {self.path} are no entries: {faults[0]}")
+        if place.faults and not self.is_living:
+            warn(f"{len(place.faults)} lines of {self.path} are no entries: {place.faults[0]}")
         return True
 
     def _enter(self, header: dict[str, Any]) -> tuple[int, int, int, str | None]:
@@ -253,12 +256,11 @@ class _Reading:
         robot_id: int,
         looks: _Looks,
         lines: Sequence[_Line],
-        faults: Sequence[str],
         taken: Taken,
     ) -> None:
         """Write what follows: names, changes, times, ends of runs, what was dropped."""
         written = {entry.number for entry in taken.written}
-        faults = [*faults, *taken.unfit]
+        faults = [*self.faults, *taken.unfit]
         runs, ends = dict[str, tuple[float, float, int]](), dict[Kind, dict[str, Any]]()
         last: Entry | None = None
         for _, entry, state, fault in _until(lines, taken.number):
@@ -290,7 +292,8 @@ class _Reading:
             liveness.end_runs(self.connection, session_id, "reset", begun["uuid"])
         if end := ends.get("session end"):
             liveness.end_runs(self.connection, session_id, end["reason"])
-        if faults and last is not None:
+        self.faults = () if last else tuple(faults)
+        if faults and last:
             data = {"row_count": len(faults), "why": f"{self.path.name}: {faults[0]}"}
             self._event(last, "dropped", None, json.dumps(data))
 
@@ -485,8 +488,9 @@ def _bound(kind: Kind, given: dict[str, Any]) -> tuple[Any, ...] | dict[str, Any
         return _UNGIVEN | given | {"dropped": given.get("dropped") or 0}
     if kind == "log":
         given |= {"level": find_log_level(given["level"]), "source": "controller"}
-    values: list[Any] = list(given.values())
-    return tuple(_text(each) if isinstance(each, dict) else each for each in values)
+    return tuple(
+        _text(_object(each)) if isinstance(each, dict) else each for each in given.values()
+    )
 
 
 _text: Final[Callable[[object], str]] = json.JSONEncoder(

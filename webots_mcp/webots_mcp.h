@@ -118,7 +118,7 @@ static inline size_t wmcp__string(wmcp__text *text, const char *value, size_t li
   return length > end ? length : 0;
 }
 
-/* -- numbers: what Python's float() reads is the same to the last bit --------------------------- */
+/* -- numbers: what Python's float() reads is the same to the last bit -------------------------- */
 
 static inline uint64_t wmcp__multiply(uint64_t a, uint64_t b, uint64_t *high) {
   uint64_t half = 0xFFFFFFFF, low = (a & half) * (b & half);
@@ -357,9 +357,13 @@ static inline int wmcp__is_ready(wmcp *w, size_t count) {
   return 1;
 }
 
+#define WMCP_NUMBER "[                " /* it is known when the line is written, to end here */
+
 /* Appends the line, or counts it as dropped. */
 static inline void wmcp__write_line(wmcp *w, const wmcp__text *line) {
   double now_s = wmcp__now_s();
+  w->number += 4; /* those between are of the run and of what was dropped */
+  if (!line->is_cut) wmcp__digits(line->data + sizeof WMCP_NUMBER - 1, (uint64_t)w->number);
   if (!(now_s >= w->retry_at_s - 1.0 && now_s < w->retry_at_s)) { /* a clock may be set back */
     errno = ENOMEM;
     w->retry_at_s = 0.0;
@@ -373,17 +377,26 @@ static inline void wmcp__write_line(wmcp *w, const wmcp__text *line) {
   w->unreported++;
 }
 
+static inline void wmcp__begin_run(wmcp *w, double sim_time_s) {
+  wmcp__new_uuid(w->run);
+  w->run_sim_time_s = sim_time_s;
+  w->run_wall_time_s = wmcp__now_s();
+  w->is_described = 0;
+}
+
 static inline void wmcp__start_line(wmcp *w, wmcp__text *line, const char *kind) {
-  if (!w->run[0]) {
-    wmcp__new_uuid(w->run);
-    w->run_sim_time_s = w->sim_time_s;
-    w->run_wall_time_s = wmcp__now_s();
-    w->is_described = 0;
-  }
+  if (!w->run[0]) wmcp__begin_run(w, w->sim_time_s);
   line->length = 0;
   line->is_cut = 0;
-  w->number += 4; /* those between are of the run and of what was dropped */
-  wmcp__format(line, "[#,\"@\",\"@\",[%,%,", w->number, kind, w->run, w->sim_time_s, wmcp__now_s());
+  wmcp__format(line, WMCP_NUMBER ",\"@\",\"@\",[%,%,", kind, w->run, w->sim_time_s, wmcp__now_s());
+}
+
+static inline void wmcp__end_run(wmcp *w, const char *reason) {
+  w->log.length = 0;
+  w->log.is_cut = 0;
+  wmcp__format(&w->log, WMCP_NUMBER ",\"run end\",$,{\"reason\":$,\"now\":%,\"sim_time\":%}]\n", w->run,
+               reason, wmcp__now_s(), w->sim_time_s);
+  wmcp__write_line(w, &w->log);
 }
 
 /* Names a value that is stored otherwise; `size` of what was cut, or -1 for those in an array. */
@@ -461,11 +474,16 @@ static inline wmcp *wmcp_open(const char *data_dir, const char *robot, const cha
 static inline void wmcp_begin(wmcp *w, double sim_time_s) {
   if (!w || wmcp__not_finite(sim_time_s)) return;
   int is_reset = w->run[0] && sim_time_s < w->sim_time_s - 1e-9;
+  if (is_reset) wmcp__end_run(w, "reset");
   w->sim_time_s = sim_time_s;
+  if (!w->run[0]) { /* a step ago, as the controller began before it */
+    double start_s = sim_time_s - w->step_ms / 1000.0;
+    wmcp__begin_run(w, start_s > 1e-9 ? start_s : 0.0);
+  }
   if (is_reset) {
     w->start_reason = "reset";
     w->calls = 0;
-    w->run[0] = 0;
+    wmcp__begin_run(w, sim_time_s);
     wmcp__start_line(w, &w->row, "event");
     wmcp__put(&w->row, "\"reset\"]]\n", 10);
     wmcp__write_line(w, &w->row);
@@ -554,9 +572,10 @@ static inline void wmcp_log(wmcp *w, const char *level, const char *message) {
 /* Ends the session: call it when wb_robot_step() has returned -1. */
 static inline void wmcp_close(wmcp *w) {
   if (!w) return;
+  if (w->run[0]) wmcp__end_run(w, "finished");
   w->log.length = 0;
-  w->number += 4;
-  wmcp__format(&w->log, "[#,\"session end\",null,{\"reason\":\"finished\",\"now\":%,", w->number,
+  w->log.is_cut = 0;
+  wmcp__format(&w->log, WMCP_NUMBER ",\"session end\",null,{\"reason\":\"finished\",\"now\":%,",
                wmcp__now_s());
   wmcp__format(&w->log, "\"dropped\":#}]\n", w->dropped);
   wmcp__write_line(w, &w->log);

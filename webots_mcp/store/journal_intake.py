@@ -56,7 +56,8 @@ _UNGIVEN: Final = {"rows": None, "monotonic": None}  # of statements, which brid
 _KNOWN: Final = (
     "SELECT id, robot_id, last_adopted_entry, (SELECT data FROM state WHERE run_id = "
     "(SELECT max(id) FROM run WHERE session_id = session.id) ORDER BY sim_time_s DESC, id DESC "
-    "LIMIT 1) FROM session WHERE uuid = ?"
+    "LIMIT 1), (SELECT uuid FROM run WHERE session_id = session.id ORDER BY id DESC LIMIT 1) "
+    "FROM session WHERE uuid = ?"
 )
 _SEEN_SESSION: Final = (
     "UPDATE session SET last_seen_wall_time_s = max(last_seen_wall_time_s, :wall), "
@@ -102,7 +103,8 @@ class _Line(NamedTuple):
 class _Looks:
     """What is looked for in the states of a session."""
 
-    def __init__(self, newest: str | None) -> None:
+    def __init__(self, newest: str | None, run: str | None) -> None:
+        self.run = run
         self.names = signal_register.SignalNames()
         self.changes = signal_register.StateChanges()
         self.changes.look(json.loads(newest or "{}"))
@@ -208,11 +210,12 @@ class _Reading:
     def take_in(self, header: dict[str, Any], until_s: float) -> bool:
         """Take in all complete lines from where it was left; False where time is up."""
         start = self.file.tell()
-        session_id, robot_id, number, newest = self._enter(header)
+        session_id, robot_id, number, *newest = self._enter(header)
         place = _places.get(self.path)
         if place is None or place.file != self.identity or place.number > number:
             place = _Place(self.identity, _skip(self.file, start, number), number)
-        looks = _looks.get(self.uuid) or _looks.setdefault(self.uuid, _Looks(newest))
+            _looks[self.uuid] = _Looks(*newest)  # another process may have read on meanwhile
+        looks = _looks.get(self.uuid) or _looks.setdefault(self.uuid, _Looks(*newest))
         while lines := _read_lines(self.file, place.offset):
             self.faults = place.faults
             if entries := [each.entry for each in lines if each.entry]:
@@ -231,12 +234,12 @@ class _Reading:
             warn(f"{len(place.faults)} lines of {self.path} are no entries: {place.faults[0]}")
         return True
 
-    def _enter(self, header: dict[str, Any]) -> tuple[int, int, int, str | None]:
-        """The ids of session and robot, the number of the last entry, the newest state."""
+    def _enter(self, header: dict[str, Any]) -> tuple[Any, ...]:
+        """The ids of session and robot, the number of the last entry, newest state and run."""
         connection = self.connection
         if (known := connection.execute(_KNOWN, (self.uuid,)).fetchone()) is not None:
             return known
-        name, session = _described(header, self.uuid, is_living=self.is_living)
+        name, session = _described(header, self.uuid)
 
         def act() -> None:
             if connection.execute(_KNOWN, (self.uuid,)).fetchone() is None:
@@ -267,7 +270,8 @@ class _Reading:
             if entry is None:
                 faults += [fault] * bool(fault)
                 continue
-            if entry.kind == "run":
+            if isinstance(entry.values, dict) and entry.values.get("uuid", looks.run) != looks.run:
+                looks.run = entry.values["uuid"]
                 looks.changes.forget()
             changed = looks.changes.look(state) if state is not None else ()
             if entry.number not in written:  # taken in by another process, or refused
@@ -312,9 +316,7 @@ def _lives(session: liveness.OpenSession) -> bool:
     return liveness.is_living(*session[1:], time.time())
 
 
-def _described(
-    header: Mapping[str, Any], uuid: str, *, is_living: bool
-) -> tuple[str, dict[str, Any]]:
+def _described(header: Mapping[str, Any], uuid: str) -> tuple[str, dict[str, Any]]:
     """The robot's name and the values of the session, from the first line of a journal.
 
     Raises:
@@ -331,16 +333,17 @@ def _described(
     environment = {key: value for key, value in given.items() if _is("s", value)}
     host, parent = texts.get("host", host_name()), cast("int", session.get("parent_pid"))
     is_here, file = host == host_name(), texts.get("controller")
+    pid, started_s = cast("int", pid), cast("float", started_s)
+    lives = liveness.process_alive(pid, None, started_s)  # of one that is gone none can tell it
     return cast("str", name), {
         "uuid": uuid,
         "pid": pid,
-        # Of a process that is gone it is not known any more.
-        "process": liveness.process_identity(cast("int", pid)) if is_here and is_living else None,
+        "process": liveness.process_identity(pid) if is_here and lives else None,
         "host": host,
         "instance": instance_of(environment, parent) if is_here else f"{host} process {parent}",
         "extern": int(is_extern(environment)),
         "controller": file,
-        "controller_sha256": _sha256(file, cast("float", started_s)) if is_here and file else None,
+        "controller_sha256": _sha256(file, started_s) if is_here and file else None,
         "versions": json.dumps(_object(session.get("versions"))),
         "supervisor": 0,
         "actions": "{}",
@@ -377,7 +380,7 @@ def _skip(file: BinaryIO, offset: int, number: int) -> int:
     at = offset
     while number and (line := file.readline(LONGEST_LINE_BYTES)).endswith(b"\n"):
         at += len(line)
-        head = line[1 : line.find(b",")]
+        head = line[1 : line.find(b",")].strip()
         if head.isdigit():
             if int(head) > number:
                 break
@@ -488,9 +491,8 @@ def _bound(kind: Kind, given: dict[str, Any]) -> tuple[Any, ...] | dict[str, Any
         return _UNGIVEN | given | {"dropped": given.get("dropped") or 0}
     if kind == "log":
         given |= {"level": find_log_level(given["level"]), "source": "controller"}
-    return tuple(
-        _text(_object(each)) if isinstance(each, dict) else each for each in given.values()
-    )
+    objects = [name for name in ("data", "replaced") if given.get(name) is not None]
+    return tuple((given | {name: _text(given[name]) for name in objects}).values())
 
 
 _text: Final[Callable[[object], str]] = json.JSONEncoder(

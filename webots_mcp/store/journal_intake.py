@@ -22,7 +22,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple, NoReturn, cast
@@ -474,15 +474,23 @@ def _nested(state: dict[str, Any]) -> dict[str, Any]:
         return state
     nested: dict[str, Any] = {}
     for name, value in state.items():
-        *branches, leaf = name.split(".")
-        at: Any = nested if leaf and all(branches) else None
+        branches, leaf = _path(name)
+        at = nested
         for branch in branches:
-            at = cast("Any", at).setdefault(branch, {}) if type(at) is dict else None
-        if type(at) is dict:
-            at[leaf] = value
+            inner: Any = at.setdefault(branch, {})
+            if not isinstance(inner, dict):
+                nested[name] = value
+                break
+            at = cast("dict[str, Any]", inner)
         else:
-            nested[name] = value
+            at[leaf] = value
     return nested
+
+
+@lru_cache(maxsize=4096)
+def _path(name: str) -> tuple[list[str], str]:
+    *branches, leaf = name.split(".")
+    return (branches, leaf) if leaf and all(branches) else ([], name)
 
 
 def _bound(kind: Kind, given: dict[str, Any]) -> tuple[Any, ...] | dict[str, Any]:

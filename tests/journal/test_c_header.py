@@ -17,10 +17,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import anyio
 import pytest
+from mcp import Client
 
 from webots_mcp.cli import main
 from webots_mcp.contract import C_HEADER
+from webots_mcp.server import create_server
 from webots_mcp.store.recording import Recording
 from webots_mcp.waiting_file import journal_parts
 
@@ -208,6 +211,7 @@ def test_a_locale_with_another_decimal_point_changes_no_number(
 READER = """
 import sys, time
 from pathlib import Path
+from webots_mcp.server import create_server
 from webots_mcp.store.recording import Recording
 folder = Path(sys.argv[1])
 print("ready", flush=True)
@@ -338,3 +342,24 @@ def test_the_command_writes_the_header_and_no_other_file(
     assert main(["header", str(tmp_path / "mine.h")]) == 2
     assert "it is left as it is" in capsys.readouterr().err
     assert len(C_HEADER.read_text().splitlines()) <= 600
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("anyio_backend", ["asyncio"])
+async def test_a_server_that_began_before_the_database_answers_what_was_just_published(
+    start: Start, tmp_path: Path
+) -> None:
+    async with Client(create_server(tmp_path / "webots.db", tmp_path)) as client:
+        process = start()
+        for i in range(1, 4):
+            do(process, f"begin {i}", f"integer {hexed('front.i')} {i}", "publish")
+            answer = (await client.call_tool("webots_get_robot_state", {})).structured_content
+            assert answer and answer["sim_time_s"] == i and answer["robot"] == "rover"
+        process.kill()
+        process.communicate()
+        while journal_parts(
+            tmp_path / "webots.db"
+        ):  # it is taken in and deleted without a question
+            await anyio.sleep(0.05)
+        answer = (await client.call_tool("webots_get_robot_state", {})).structured_content
+        assert answer and "killed or crashed" in answer["why"]

@@ -394,8 +394,8 @@ static inline void wmcp__start_line(wmcp *w, wmcp__text *line, const char *kind)
 static inline void wmcp__end_run(wmcp *w, const char *reason) {
   w->log.length = 0;
   w->log.is_cut = 0;
-  wmcp__format(&w->log, WMCP_NUMBER ",\"run end\",$,{\"reason\":$,\"now\":%,\"sim_time\":%}]\n", w->run,
-               reason, wmcp__now_s(), w->sim_time_s);
+  wmcp__format(&w->log, WMCP_NUMBER ",\"run end\",$,{\"reason\":$,\"now\":%,\"sim_time\":%}]\n",
+               w->run, reason, wmcp__now_s(), w->sim_time_s);
   wmcp__write_line(w, &w->log);
 }
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import sqlite3
 import sys
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, get_args
@@ -52,6 +52,7 @@ _LEVEL_ALIASES: Final[dict[str, LogLevel]] = {
 }
 
 _PACKAGE: Final = Path(__file__).parent
+C_HEADER: Final = _PACKAGE / "webots_mcp.h"  # by which controllers in C and C++ record
 
 
 class BuiltInAction(NamedTuple):
@@ -160,6 +161,43 @@ def host_name() -> str:
     import socket  # only where needed: it is a tenth of the bridge's import time
 
     return socket.gethostname()
+
+
+BY_PROCESS: Final = " process "  # in an instance that names no simulator
+
+
+def instance_of(environment: Mapping[str, str], parent: int) -> str:
+    """Which Webots a controller belongs to: its host and port, else the process that started it.
+
+    Args:
+        environment: Of the controller, which runs on this host.
+        parent: The process that started it.
+    """
+    folder = environment.get("WEBOTS_INSTANCE_PATH", "").rstrip("/\\")
+    url = environment.get("WEBOTS_CONTROLLER_URL", "")
+    if folder and not is_extern(environment):
+        port = folder[len(folder.rstrip("0123456789")) :]  # /tmp/webots/ada/1234, ...\webots-1234
+        return f"{host_name()}:{port}" if port else f"{host_name()}:{folder}"
+    if "://" in url:
+        return _simulator_of(url)
+    return f"{host_name()}{BY_PROCESS}{parent}"
+
+
+def _simulator_of(url: str) -> str:
+    """Of `ipc://1234/robot` or `tcp://192.168.1.5:1234/robot`; the robot may be left out."""
+    place = url.partition("://")[2].partition("/")[0]
+    host, _, port = place.rpartition(":")
+    here = ("", "localhost", "127.0.0.1", "::1", host_name().lower())
+    return f"{host_name() if host.strip('[]').lower() in here else host}:{port}"
+
+
+def is_extern(environment: Mapping[str, str]) -> bool:
+    """Whether Webots did not start the controller, and so will not start its successor.
+
+    The variables are tested in the order in which Webots' library reads them.
+    """
+    intern = "WEBOTS_ROBOT_NAME" in environment and "WEBOTS_INSTANCE_PATH" in environment
+    return not intern and "WEBOTS_CONTROLLER_URL" in environment
 
 
 def new_uuid() -> str:

@@ -11,7 +11,7 @@ import os
 import sqlite3
 import sys
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -64,7 +64,7 @@ _FOUND: Final = (
     f"max(last_wall_time_s, {_LAST_ROW.format('wall_time_s', 'last_wall_time_s')}), "
     f"max(last_sim_time_s, {_LAST_ROW.format('sim_time_s', 'last_sim_time_s')}), "
     "purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) "
-    "FROM run WHERE session_id = ? AND ended_wall_time_s IS NULL"
+    "FROM run WHERE session_id = ? AND ended_wall_time_s IS NULL AND coalesce(uuid, '') <> ?"
 )
 END_RUN: Final = (
     "UPDATE run SET ended_wall_time_s = :last_s, last_wall_time_s = :last_s, "
@@ -76,6 +76,10 @@ _OPEN_SESSIONS: Final = (
     "SELECT id, pid, CAST(process AS BLOB), last_seen_wall_time_s, EXISTS (SELECT 1 FROM command "
     "WHERE session_id = session.id AND action = 'reload' AND issued_wall_time_s IS NOT NULL) "
     "FROM session WHERE ended_wall_time_s IS NULL AND host = ?"
+)
+_SESSIONS_OF: Final = (
+    "SELECT s.id, s.host, s.pid, s.process, s.last_seen_wall_time_s, s.instance, r.kind "
+    "FROM session s JOIN robot r ON r.id = s.robot_id WHERE r.name = ? AND s.ended_wall_time_s IS NULL"
 )
 _FILE: Final = "SELECT file FROM pragma_database_list WHERE name = 'main'"
 
@@ -257,6 +261,36 @@ def write_heartbeat(
     connection.execute(_BEAT_RUN, (now, loop.sim_time_s, rows, *(loop.times or NO_TIMES), run_id))
 
 
+class OpenSession(NamedTuple):
+    """A session that has not ended."""
+
+    session_id: int
+    host: str
+    pid: int
+    process: str | None
+    last_seen_wall_time_s: float
+    instance: str
+    kind: str
+
+
+def free_name(
+    connection: sqlite3.Connection, name: str, living: Callable[[OpenSession], bool]
+) -> str:
+    """The name for a robot's new session: where a living one has it, `#2` and so on is appended.
+
+    Sessions of that name which are over are ended as superseded; the caller opens the transaction.
+    """
+    wanted, number = name, 1
+    while True:
+        sessions = [OpenSession(*row) for row in connection.execute(_SESSIONS_OF, (wanted,))]
+        if not any(map(living, sessions)):
+            for session in sessions:
+                end_session(connection, session.session_id, "superseded")
+            return wanted
+        number += 1
+        wanted = f"{name}#{number}"
+
+
 def reap(connection: sqlite3.Connection, now_s: float) -> None:
     """Settle everything that no live process will finish.
 
@@ -310,11 +344,19 @@ def dead_sessions(connection: sqlite3.Connection) -> list[tuple[int, str]]:
 
 def end_session(connection: sqlite3.Connection, session_id: int, reason: str) -> None:
     """End a session that another process left open, and its runs, as of their last sign of life."""
-    for run_id, last_s, last_sim_s, rows in connection.execute(_FOUND, (session_id,)).fetchall():
-        times = {"last_s": last_s, "last_sim_s": last_sim_s}
-        connection.execute(END_RUN, {"id": run_id, "reason": reason, "rows": rows, **times})
+    end_runs(connection, session_id, reason)
     # Last: a process that is killed before this leaves a session that will be settled again.
     connection.execute(END_SESSION, {"id": session_id, "reason": reason})
+
+
+def end_runs(
+    connection: sqlite3.Connection, session_id: int, reason: str, going_on: str = "none"
+) -> None:
+    """End the open runs of a session, as of their last sign of life, but for that UUID."""
+    values = (session_id, going_on)
+    for run_id, last_s, last_sim_s, rows in connection.execute(_FOUND, values).fetchall():
+        times = {"last_s": last_s, "last_sim_s": last_sim_s}
+        connection.execute(END_RUN, {"id": run_id, "reason": reason, "rows": rows, **times})
 
 
 # Leases: one process at a time does a job, on whatever host; who is gone or stopped loses it.

@@ -59,6 +59,7 @@ from webots_mcp.questions.declaring import (
 from webots_mcp.steering.routes import Companions, Launcher
 from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.chunk_making import make_chunks, make_missing_chunks
+from webots_mcp.store.journal_intake import take_in_journals
 from webots_mcp.store.purge import Upkeep
 from webots_mcp.store.questions.sql import describe_schema
 from webots_mcp.store.recording import OpenReaders, Recording
@@ -153,9 +154,16 @@ def _lifespan(
         if unasked:
             ask(connection, unasked)
             unasked.clear()
+        if isinstance(recording.database, Path):
+            take_in_journals(connection, recording.database)
         reap_if_dead(connection)
         make_chunks(connection, pause_s=_PAUSE_S)
         retain(connection)
+
+    def make_database() -> None:
+        """Where controllers have begun to record that never open it."""
+        if isinstance(recording.database, Path) and not recording.database.exists():
+            recording.take_in()
 
     @asynccontextmanager
     async def lifespan(_: MCPServer) -> AsyncGenerator[Companions]:
@@ -165,7 +173,7 @@ def _lifespan(
         if isinstance(recording.database, Path) and recording.read_only:
             chunk_maker.start()
         elif isinstance(recording.database, Path):
-            maintainer = Maintainer(recording.database, "server", work=work)
+            maintainer = Maintainer(recording.database, "server", make_database, work)
             watches = [maintainer, ConsoleWatch(recording)]
         for watch in watches:
             watch.start()

@@ -13,8 +13,10 @@ import json
 import math
 import re
 import sqlite3
-from collections.abc import Container, Iterable, Mapping, Sequence
+import time
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from functools import lru_cache
+from itertools import islice
 from typing import Any, Final, Literal, NamedTuple, cast
 
 from webots_mcp.naming import (
@@ -23,6 +25,7 @@ from webots_mcp.naming import (
     REDUCTIONS,
     Value,
     angle_unit,
+    flatten,
     in_snake_case,
     is_seen_speed,
     modes_in,
@@ -432,3 +435,116 @@ def write_changes(connection: sqlite3.Connection, robot_id: int, changes: Change
         connection.execute(_ADD + marks, [value for row in some for value in row])
     changed = [(*each, robot_id, name) for name, each in changes.changed.items()]
     connection.executemany(_CHANGE, changed)
+
+
+# What a recorder looks at in each state: names that are new, and changes of what the robot does.
+
+
+MOST_KEYS: Final = 1000  # of a state that are compared
+_MOST_SHAPES: Final = 64  # keys made of ids or times would make every state a new one
+
+
+class SignalNames:
+    """What the register has of this session's names.
+
+    A state is looked at where its keys at the top or the number of its values are new, and in the
+    2nd, 4th, 8th, ... row of the session: what was null at first may have a value by then.
+    """
+
+    def __init__(self) -> None:
+        self._shapes: set[tuple[Any, ...]] = set()
+        self._rows = 0
+        self._known: dict[str, tuple[Kind, bool]] = {}  # kind, and whether numbers are whole
+        self._waiting: dict[str, Seen] = {}
+
+    def look(
+        self, state: Mapping[Any, Any], text: str, enter: Callable[[dict[str, Seen]], bool]
+    ) -> None:
+        """Enter the names that are new, some of many.
+
+        Args:
+            state: Which was recorded.
+            text: Its JSON.
+            enter: Enters names into the register; False where that has to wait.
+        """
+        self._rows = rows = self._rows + 1
+        # Cheaper than a walk through the state: a name more is mostly a comma more.
+        keys = state if state.__class__ is dict else ()
+        shape = (text.count(","), *islice(keys, MOST_KEYS))
+        if shape not in self._shapes and len(self._shapes) < _MOST_SHAPES:
+            self._shapes.add(shape)
+        elif rows & (rows - 1):
+            if self._waiting:
+                self._enter(enter)
+            return
+        self._take(text)
+        if self._waiting:
+            self._enter(enter)
+
+    def _take(self, text: str) -> None:
+        state = cast("dict[str, Any]", json.loads(text))
+        found, now_s = places(state), time.time()
+        for name, value in flatten(state).items():
+            if name not in self._known and len(self._known) >= MAX_SIGNALS:
+                continue
+            kind, is_whole = before = self._known.get(name, ("null", True))
+            kind = widen(kind, kind_of(name, value, ends_pose=ends_pose(name, found)))
+            is_whole = is_whole and (value is None or type(value) is int)
+            if name not in self._known or (kind, is_whole) != before:
+                self._known[name] = kind, is_whole
+                self._waiting[name] = Seen(*found[name], kind, is_whole, now_s)
+
+    def _enter(self, enter: Callable[[dict[str, Seen]], bool]) -> None:
+        some = dict(islice(self._waiting.items(), ADDED_AT_ONCE))
+        if enter(some):
+            for name in some:
+                del self._waiting[name]
+
+    def begin_anew(self) -> tuple[()]:
+        """Another database does not have the names; returns what else it needs: nothing."""
+        self._shapes.clear()
+        self._known.clear()
+        self._waiting.clear()
+        return ()
+
+
+MOST_CHANGES: Final = 1000  # in one run; a text that changes in every row is not a mode
+_LONGEST_TEXT: Final = 1000  # characters; a longer text is not a mode either
+_UNSEEN: Final = object()
+
+
+class StateChanges:
+    """Compares the texts and booleans at the top of each recorded state with the last one.
+
+    Only the top level: a comparison of every leaf would cost more than writing the row. Changes
+    deeper down are found in the rows.
+    """
+
+    def __init__(self) -> None:
+        self._last: dict[Any, object] = {}
+        self._count = 0
+
+    def forget(self) -> None:
+        """A new run has begun: its first values are not changes."""
+        self._last.clear()
+        self._count = 0
+
+    def look(self, state: Mapping[Any, Any]) -> list[tuple[Any, object, object]]:
+        """The (key, before, after) of each change since the last call; usually none."""
+        changed: list[tuple[Any, object, object]] = []
+        last = self._last
+        if len(state) > MOST_KEYS:
+            return changed
+        for key, value in islice(state.items(), MOST_KEYS):  # a user's mapping may be endless
+            if type(value) is not bool and not (type(value) is str and len(value) <= _LONGEST_TEXT):
+                continue
+            before = last.get(key, _UNSEEN)
+            if before is value or before == value:
+                continue
+            if before is _UNSEEN and len(last) >= MOST_KEYS:
+                continue  # keys that change all the time would fill the memory
+            last[key] = value
+            if before is not _UNSEEN and self._count < MOST_CHANGES:
+                self._count += 1
+                changed.append((key, before, value))
+        return changed

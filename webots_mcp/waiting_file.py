@@ -20,6 +20,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import sqlite3
 import sys
 import time
@@ -238,6 +239,11 @@ _OF_THE_FILE: Final = (
     OSError, ValueError, TypeError, LookupError, RecursionError, SessionGoneError,
 )  # fmt: skip
 
+# At the end of the name of a journal's part: the session's UUID and the number of the part.
+_PART: Final = re.compile(
+    r"-waiting-([0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12})-(\d{4,})\.jsonl$"
+)
+
 _strange: set[Path] = set()
 
 
@@ -247,14 +253,41 @@ def waiting_path(database: Path, session_uuid: str) -> Path:
 
 
 def waiting_paths(database: Path, kind: Callable[[Path, str], Path] = waiting_path) -> list[Path]:
-    """The files in which entries for a database wait, of living sessions too; or of a kind."""
+    """The files in which entries of bridges wait, of living sessions too; or those of a kind."""
+    names = _names(database, kind)
+    return [database.with_name(name) for name in sorted(names) if not _PART.search(name)]
+
+
+def journal_parts(database: Path) -> dict[str, list[Path]]:
+    """The journals of controllers that open no database (docs/journal.md), by session.
+
+    Returns:
+        Of each UUID the parts in order; those that were written last come last. Where a part is
+        here, those before it are complete.
+    """
+    found: dict[str, list[tuple[int, Path]]] = {}
+    for name in _names(database, waiting_path):
+        if part := _PART.search(name):
+            found.setdefault(part[1], []).append((int(part[2]), database.with_name(name)))
+    return {
+        uuid: [path for _, path in sorted(parts)]
+        for uuid, parts in sorted(found.items(), key=lambda each: _written_s(max(each[1])[1]))
+    }
+
+
+def _written_s(path: Path) -> float:
+    with contextlib.suppress(OSError):
+        return path.stat().st_mtime
+    return 0.0  # it was taken in meanwhile
+
+
+def _names(database: Path, kind: Callable[[Path, str], Path]) -> list[str]:
     before, after = kind(database, "*").name.split("*")
     try:
         with os.scandir(database.parent) as files:
-            names = [f.name for f in files if f.name.startswith(before) and f.name.endswith(after)]
+            return [f.name for f in files if f.name.startswith(before) and f.name.endswith(after)]
     except OSError:
         return []
-    return [database.with_name(name) for name in sorted(names)]
 
 
 class WaitingFile:
@@ -443,18 +476,31 @@ class Taken(NamedTuple):
     """What one transaction took in.
 
     Attributes:
+        since: Number of the last entry that was in before.
         number: Of the last entry that is in.
         written: The entries of this call; those passed over are not among them.
         unfit: Why the database will never take an entry, for each such.
     """
 
+    since: int
     number: int
     written: list[Entry]
     unfit: list[str]
 
 
-def take_in(connection: sqlite3.Connection, session_id: int, piece: Sequence[Entry]) -> Taken:
+def take_in(
+    connection: sqlite3.Connection,
+    session_id: int,
+    piece: Sequence[Entry],
+    finish: Callable[[Taken], object] | None = None,
+) -> Taken:
     """Write the entries of a session in one transaction, as many as there is time for.
+
+    Args:
+        connection: A writer in autocommit mode and in no transaction.
+        session_id: Of the session.
+        piece: Its next entries, in order.
+        finish: Called last of all in that transaction.
 
     Raises:
         sqlite3.Error: Nothing was written.
@@ -466,7 +512,7 @@ def take_in(connection: sqlite3.Connection, session_id: int, piece: Sequence[Ent
         session = connection.execute(_ADOPTED, (session_id,)).fetchone()
         if session is None:
             raise SessionGoneError(f"the session {session_id} was deleted from the database")
-        taken = Taken(session[0], [], [])
+        taken = Taken(session[0], session[0], [], [])
         for entry in piece:
             if entry.number > taken.number:
                 taken = taken._replace(number=entry.number)
@@ -475,6 +521,8 @@ def take_in(connection: sqlite3.Connection, session_id: int, piece: Sequence[Ent
                 if time.monotonic() > until_s:
                     break
         connection.execute(_SET_ADOPTED, (taken.number, session_id))
+        if finish is not None:
+            finish(taken)
         return taken
 
     return in_transaction(connection, act)
@@ -544,16 +592,20 @@ def _adopt_file(connection: sqlite3.Connection, path: Path) -> int:
             path.unlink()
     except FileNotFoundError:  # another took it in meanwhile
         return 0
-    except Exception as error:
-        if not (isinstance(error, _OF_THE_FILE) or is_unfit(error)):
-            raise
-        _warn_once(path, error)
+    except Exception as error:  # noqa: BLE001  (raised again where it is not the file's)
+        report_strange(path, error)
         return 0
     return count
 
 
-def _warn_once(path: Path, error: Exception) -> None:
-    """A file that stays is met again each second."""
+def report_strange(path: Path, error: Exception) -> None:
+    """Warn once of a file that cannot be taken in: it stays, and is met again each second.
+
+    Raises:
+        Exception: The error, where it is not the file's fault.
+    """
+    if not (isinstance(error, _OF_THE_FILE) or is_unfit(error)):
+        raise error
     if path not in _strange:
         _strange.add(path)
         speaks = isinstance(error, (OSError, ValueError))

@@ -14,11 +14,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from tests.benchmarks import answers, commands, history, in_loop, kills, pool, starting
+from tests.benchmarks import answers, c_header, commands, history, in_loop, kills, pool, starting
 from tests.benchmarks.core import Bench, Benchmark, Section, render
 
 BENCHMARKS: Final[tuple[Benchmark, ...]] = (
     *in_loop.BENCHMARKS,
+    *c_header.BENCHMARKS,
     *starting.BENCHMARKS,
     *commands.BENCHMARKS,
     *kills.BENCHMARKS,

@@ -34,7 +34,7 @@ from webots_mcp import MCPBridge
 from webots_mcp.bridge import cleaning, encoding
 from webots_mcp.bridge.cleaning import MAX_NAMED
 from webots_mcp.bridge.encoding import MAX_ROW_BYTES, Encoded
-from webots_mcp.bridge.journal import Changes
+from webots_mcp.signal_register import StateChanges
 
 POSE = [1.5, 2.5, 0.25]
 MOST_LOOKED_AT = 20_000
@@ -317,7 +317,7 @@ def test_what_is_added_to_the_devices_may_never_come_to_its_end_either(
 
 
 def test_keys_that_are_new_in_every_state_do_not_fill_the_memory() -> None:
-    changes = Changes()
+    changes = StateChanges()
     tracemalloc.start()
     try:
         for n in range(20_000):

@@ -23,7 +23,7 @@ from typing import Any, Final, Protocol, cast
 
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.error_report import ErrorReport, cut
-from webots_mcp.bridge.journal import Changes, Heartbeat, Journal, SignalNames
+from webots_mcp.bridge.journal import Heartbeat, Journal
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import same_simulation
 from webots_mcp.bridge.scene import SceneNode, find_field
@@ -31,6 +31,7 @@ from webots_mcp.bridge.session import Session
 from webots_mcp.bridge.simulation import Clock
 from webots_mcp.contract import CUSTOM_DATA, HEARTBEAT_INTERVAL_S
 from webots_mcp.liveness import is_living
+from webots_mcp.signal_register import SignalNames, StateChanges
 
 TEXT: Final = "custom_data"  # the signal of what is no JSON object
 MISSED: Final = "seq_missed"  # how many messages of this run were overwritten before a reading
@@ -261,7 +262,7 @@ class _Recording:
         self.recorder = Recorder(observer.recorder.database, identity, self._clock, self._errors)
         self._journal = Journal(self.recorder, self._clock)
         self._heartbeat = Heartbeat(self.recorder, self._clock)
-        self._names, self._changes = SignalNames(self.recorder), Changes()
+        self._names, self._changes = SignalNames(), StateChanges()
         self._values: Mapping[str, Any] = {}
         self._stale_until_s = -1.0
         self._sequence = _Sequence()
@@ -310,7 +311,7 @@ class _Recording:
         self._journal.state(encoded)
         for name, before, after in self._changes.look(state):
             self._journal.event("change", {"from": before, "to": after}, name)
-        self._names.look(state, encoded.text)
+        self._names.look(state, encoded.text, self.recorder.enter_signals)
 
     def _report_missed(self) -> None:
         counted = self._sequence

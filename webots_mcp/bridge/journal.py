@@ -2,33 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from itertools import islice
-from typing import Any, Final, cast
+from collections.abc import Sequence
+from typing import Final
 
-from webots_mcp.bridge.cleaning import MAX_KEY_CHARACTERS, key_text
 from webots_mcp.bridge.encoding import Encoded, encode
 from webots_mcp.bridge.error_report import cut, storable
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.simulation import Clock
 from webots_mcp.contract import HEARTBEAT_INTERVAL_S
 from webots_mcp.liveness import LoopStatus
-from webots_mcp.naming import flatten
 from webots_mcp.pauses import PAUSED
-from webots_mcp.signal_register import (
-    ADDED_AT_ONCE,
-    MAX_SIGNALS,
-    Kind,
-    Seen,
-    ends_pose,
-    kind_of,
-    places,
-    widen,
-)
-from webots_mcp.waiting_file import Kind as EntryKind
-from webots_mcp.waiting_file import Values
 
 MOST_LOG_CHARACTERS: Final = 10_000
 _MOST_LOGGER_CHARACTERS: Final = 200
@@ -145,112 +129,3 @@ class Heartbeat:
 def _wall_time_s(monotonic_s: float | None) -> float | None:
     """The wall time of a moment of the monotonic clock, as the wall clock is set now."""
     return None if monotonic_s is None else time.time() - (time.monotonic() - monotonic_s)
-
-
-_MOST_SHAPES: Final = 64  # keys made of ids or times would make every state a new one
-_MOST_KEYS: Final = 1000  # of a state that are compared
-
-
-class SignalNames:
-    """What the register has of this session's names.
-
-    A state is looked at where its keys at the top or the number of its values are new, and in the
-    2nd, 4th, 8th, ... row of the session: what was null at first may have a value by then.
-    """
-
-    def __init__(self, recorder: Recorder) -> None:
-        self._recorder = recorder
-        self._shapes: set[tuple[Any, ...]] = set()
-        self._rows = 0
-        self._known: dict[str, tuple[Kind, bool]] = {}  # kind, and whether numbers are whole
-        self._waiting: dict[str, Seen] = {}
-        recorder.new_database_entries.append(self._begin_anew)
-
-    def look(self, state: Mapping[Any, Any], text: str) -> None:
-        """Enter the names that are new, some of many.
-
-        Args:
-            state: Which was recorded.
-            text: Its JSON.
-        """
-        self._rows = rows = self._rows + 1
-        # Cheaper than a walk through the state: a name more is mostly a comma more.
-        keys = state if state.__class__ is dict else ()
-        shape = (text.count(","), *islice(keys, _MOST_KEYS))
-        if shape not in self._shapes and len(self._shapes) < _MOST_SHAPES:
-            self._shapes.add(shape)
-        elif rows & (rows - 1):
-            if self._waiting:
-                self._enter()
-            return
-        self._take(text)
-        if self._waiting:
-            self._enter()
-
-    def _take(self, text: str) -> None:
-        state = cast("dict[str, Any]", json.loads(text))
-        found, now_s = places(state), time.time()
-        for name, value in flatten(state).items():
-            if name not in self._known and len(self._known) >= MAX_SIGNALS:
-                continue
-            kind, is_whole = before = self._known.get(name, ("null", True))
-            kind = widen(kind, kind_of(name, value, ends_pose=ends_pose(name, found)))
-            is_whole = is_whole and (value is None or type(value) is int)
-            if name not in self._known or (kind, is_whole) != before:
-                self._known[name] = kind, is_whole
-                self._waiting[name] = Seen(*found[name], kind, is_whole, now_s)
-
-    def _enter(self) -> None:
-        some = dict(islice(self._waiting.items(), ADDED_AT_ONCE))
-        if self._recorder.enter_signals(some):
-            for name in some:
-                del self._waiting[name]
-
-    def _begin_anew(self) -> Iterable[tuple[EntryKind, bool, Values]]:
-        """Another database does not have the names."""
-        self._shapes.clear()
-        self._known.clear()
-        self._waiting.clear()
-        return ()
-
-
-MOST_CHANGES: Final = 1000  # in one run; a text that changes in every row is not a mode
-_LONGEST: Final = 1000  # characters; a longer text is not a mode either
-_UNSEEN: Final = object()
-
-
-class Changes:
-    """Compares the texts and booleans at the top of each recorded state with the last one.
-
-    Only the top level: a comparison of every leaf would cost more than writing the row. Changes
-    deeper down are found in the rows.
-    """
-
-    def __init__(self) -> None:
-        self._last: dict[Any, object] = {}
-        self._count = 0
-
-    def forget(self) -> None:
-        """A new run has begun: its first values are not changes."""
-        self._last.clear()
-        self._count = 0
-
-    def look(self, state: Mapping[Any, Any]) -> Iterable[tuple[str, object, object]]:
-        """The (name, before, after) of each change since the last call; usually none."""
-        changed: list[tuple[str, object, object]] = []
-        last = self._last
-        if len(state) > _MOST_KEYS:
-            return changed
-        for key, value in islice(state.items(), _MOST_KEYS):  # a user's mapping may be endless
-            if type(value) is not bool and not (type(value) is str and len(value) <= _LONGEST):
-                continue
-            before = last.get(key, _UNSEEN)
-            if before is value or before == value:
-                continue
-            if before is _UNSEEN and len(last) >= _MOST_KEYS:
-                continue  # keys that change all the time would fill the memory
-            last[key] = value
-            if before is not _UNSEEN and self._count < MOST_CHANGES:
-                self._count += 1
-                changed.append((cut(key_text(key), MAX_KEY_CHARACTERS), before, value))
-        return changed

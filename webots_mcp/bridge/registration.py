@@ -7,21 +7,18 @@ import os
 import sqlite3
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from webots_mcp import liveness
 from webots_mcp.connection import transaction
-from webots_mcp.contract import CUSTOM_DATA, host_name
+from webots_mcp.contract import BY_PROCESS, CUSTOM_DATA, host_name, instance_of, is_extern
 from webots_mcp.liveness import process_identity
 from webots_mcp.pauses import PAUSED
 from webots_mcp.waiting_file import enter_robot, enter_session
 
 # -- the identity of a process ---------------------------------------------------------------------
-
-
-_BY_PROCESS: Final = " process "
-_THIS_HOST: Final = ("", "localhost", "127.0.0.1", "::1", host_name().lower())
 
 
 class Identity(NamedTuple):
@@ -60,8 +57,8 @@ def identify(
         pid=os.getpid(),
         process=process_identity(os.getpid()),
         host=host_name(),
-        instance=_instance(),
-        extern=_is_extern(),
+        instance=instance_of(os.environ, os.getppid()),
+        extern=is_extern(os.environ),
         controller=_plain_text(controller) if controller else None,
         controller_sha256=_sha256(controller) if controller else None,
         git_commit=_git_commit(controller.parent) if controller else None,
@@ -90,37 +87,9 @@ def _devices(robot: Any) -> dict[str, Any]:
     return getattr(robot, "devices", None) or {}
 
 
-def _instance() -> str:
-    """Identifies the Webots: its host and port, or else the process that started this one."""
-    folder = os.environ.get("WEBOTS_INSTANCE_PATH", "").rstrip("/\\")
-    url = os.environ.get("WEBOTS_CONTROLLER_URL", "")
-    if folder and not _is_extern():
-        port = folder[len(folder.rstrip("0123456789")) :]  # /tmp/webots/ada/1234, ...\webots-1234
-        return f"{host_name()}:{port}" if port else f"{host_name()}:{folder}"
-    if "://" in url:
-        return _simulator_of(url)
-    return f"{host_name()}{_BY_PROCESS}{os.getppid()}"
-
-
-def _simulator_of(url: str) -> str:
-    """Of `ipc://1234/robot` or `tcp://192.168.1.5:1234/robot`; the robot may be left out."""
-    place = url.partition("://")[2].partition("/")[0]
-    host, _, port = place.rpartition(":")
-    return f"{host_name() if host.strip('[]').lower() in _THIS_HOST else host}:{port}"
-
-
 def same_simulation(instance: str, other: str) -> bool:
     """Whether two instances are, or may be, one Webots: that of some extern ones is not known."""
-    return instance == other or any(_BY_PROCESS in each for each in (instance, other))
-
-
-def _is_extern() -> bool:
-    """Whether Webots did not start this process, and so will not start its successor.
-
-    The variables are tested in the order in which Webots' library reads them.
-    """
-    intern = "WEBOTS_ROBOT_NAME" in os.environ and "WEBOTS_INSTANCE_PATH" in os.environ
-    return not intern and "WEBOTS_CONTROLLER_URL" in os.environ
+    return instance == other or any(BY_PROCESS in each for each in (instance, other))
 
 
 def _sha256(file: Path) -> str | None:
@@ -174,11 +143,6 @@ def _head(git: Path) -> str | None:
     return next((line.split()[0] for line in lines if line.endswith(f" {ref}")), None)
 
 
-_OPEN_SESSIONS: Final = (
-    "SELECT s.id, s.host, s.pid, s.process, s.last_seen_wall_time_s, s.instance, r.kind "
-    "FROM session s "
-    "JOIN robot r ON r.id = s.robot_id WHERE r.name = ? AND s.ended_wall_time_s IS NULL"
-)
 _KIND: Final = "SELECT kind FROM robot WHERE name = ?"
 # A successor in the same Webots within seconds means a reload; so does one after an issued reload
 # command. A predecessor that was killed counts only where Webots starts the controllers: Webots
@@ -236,7 +200,8 @@ def register(
     liveness.reap(connection, now_s)
     with transaction(connection):
         liveness.reap(connection, now_s)
-        name = _free_name(connection, identity, now_s)
+        living = partial(_is_living, identity=identity, now_s=now_s)
+        name = liveness.free_name(connection, identity.robot_name, living)
         before = connection.execute(_KIND, (name,)).fetchone()
         robot_id = enter_robot(connection, describe_robot(identity, name), now_s)
         # A bridge is not the reloaded successor of an observer's reading of customData.
@@ -255,19 +220,6 @@ def register(
 def deregister(session_id: int) -> None:
     """This process no longer records under that session."""
     _own_sessions.discard(session_id)
-
-
-def _free_name(connection: sqlite3.Connection, identity: Identity, now_s: float) -> str:
-    number = 1
-    while True:
-        name = identity.robot_name if number == 1 else f"{identity.robot_name}#{number}"
-        sessions = connection.execute(_OPEN_SESSIONS, (name,)).fetchall()
-        living = [row for row in sessions if _is_living(row, identity, now_s)]
-        if not living:
-            for row in sessions:
-                liveness.end_session(connection, row[0], "superseded")
-            return name
-        number += 1
 
 
 def _is_reload(
@@ -293,16 +245,14 @@ def _paused_mode(connection: sqlite3.Connection, identity: Identity, robot_id: i
     return row[0] if row else None
 
 
-def _is_living(
-    session: tuple[int, str, int, str | None, float, str, str], identity: Identity, now_s: float
-) -> bool:
+def _is_living(session: liveness.OpenSession, identity: Identity, now_s: float) -> bool:
     """Whether a session keeps its name; an observer's, of `customData`, makes way for a bridge."""
-    session_id, host, pid, process, last_seen_s, instance, kind = session
-    if kind == CUSTOM_DATA != identity.kind and same_simulation(instance, identity.instance):
+    is_of_observer = session.kind == CUSTOM_DATA != identity.kind
+    if is_of_observer and same_simulation(session.instance, identity.instance):
         return False
-    if (host, pid) == (identity.host, identity.pid):
-        return session_id in _own_sessions
-    return liveness.is_living(host, pid, process, last_seen_s, now_s)
+    if (session.host, session.pid) == (identity.host, identity.pid):
+        return session.session_id in _own_sessions
+    return liveness.is_living(*session[1:5], now_s)
 
 
 def describe_robot(identity: Identity, name: str) -> dict[str, Any]:

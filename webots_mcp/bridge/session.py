@@ -10,11 +10,12 @@ from typing import Any, Final, cast
 
 from webots_mcp.bridge.actions import Control
 from webots_mcp.bridge.breakpoints import Breakpoints, Watch
+from webots_mcp.bridge.cleaning import MAX_KEY_CHARACTERS, key_text
 from webots_mcp.bridge.commands import ClaimedCommand, ClaimedCommands, Reloads
 from webots_mcp.bridge.devices import DeviceReader, restart_motors
 from webots_mcp.bridge.encoding import encode
-from webots_mcp.bridge.error_report import ErrorReport
-from webots_mcp.bridge.journal import Changes, Heartbeat, Journal, SignalNames
+from webots_mcp.bridge.error_report import ErrorReport, cut
+from webots_mcp.bridge.journal import Heartbeat, Journal
 from webots_mcp.bridge.keeping import Keeper
 from webots_mcp.bridge.parameters import Parameters
 from webots_mcp.bridge.pause import Pause
@@ -26,6 +27,7 @@ from webots_mcp.bridge.simulation import QUIT, Clock, Simulation, Step
 from webots_mcp.bridge.watchdog import Watchdog
 from webots_mcp.contract import UNMOVED, UNSEEN, Database, MemoryDatabase
 from webots_mcp.maintenance import Maintainer
+from webots_mcp.signal_register import SignalNames, StateChanges
 
 _IDLE_S: Final = 0.5  # a loop that recorded nothing for so long is blocked or waiting
 _UNSEEN_S: Final = 1.0  # of simulation time; less may be one step whose end an interrupt hid
@@ -279,8 +281,9 @@ class Publisher:
         self._breakpoints = session.breakpoints
         self._watch = session.watch
         self._keeper = session.keeper
-        self._changes = Changes()
-        self._names = SignalNames(session.recorder)
+        self._changes = StateChanges()
+        self._names = SignalNames()
+        session.recorder.new_database_entries.append(self._names.begin_anew)
         self.devices = DeviceReader(session)
         self._run = session.clock.run
         self._own_bytes = 0  # that a state of the devices takes in memory, about
@@ -363,7 +366,7 @@ class Publisher:
         if isinstance(state, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
             self._record_changes(state)
         self._own_bytes = _BYTES_OF_A_CHARACTER * len(encoded.text)
-        self._names.look(state, encoded.text)
+        self._names.look(state, encoded.text, self._session.recorder.enter_signals)
         self._heartbeat.beat_if_due()
         self._count(time.perf_counter() - started_s)
 
@@ -378,7 +381,8 @@ class Publisher:
             self._run = self._clock.run
             self._changes.forget()
         for name, before, after in self._changes.look(state):
-            self._session.journal.event("change", {"from": before, "to": after}, name)
+            shown = cut(key_text(name), MAX_KEY_CHARACTERS)
+            self._session.journal.event("change", {"from": before, "to": after}, shown)
 
 
 def _finite(extra: Mapping[Any, Any]) -> dict[Any, Any]:

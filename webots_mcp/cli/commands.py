@@ -47,6 +47,7 @@ _OF_THE_CORE: Final = {
     "retain": Command(DATA, "webots_mcp.cli.data", "retain"),
     "completion": Command(SETUP, "webots_mcp.cli.setting_up", "completion"),
     "doctor": Command(SETUP, "webots_mcp.cli.setting_up", "doctor"),
+    "header": Command(SETUP, "webots_mcp.cli.setting_up", "header"),
     "init": Command(SETUP, "webots_mcp.cli.setting_up", "init"),
     "observe": Command(SETUP, "webots_mcp.cli.serving", "observe"),
     "serve": Command(SETUP, "webots_mcp.cli.serving", "serve"),

@@ -453,6 +453,35 @@ def _print_folded(head: str, text: str) -> None:
     print(head + f"\n{'':{len(head)}}".join(lines))
 
 
+def header(
+    target: Annotated[
+        Path, Parameter("TARGET", help="The controller's folder, or the file (webots_mcp.h here).")
+    ] = Path(),
+    /,
+    *,
+    as_json: Json = False,
+) -> None:
+    """Write webots_mcp.h into the folder of a controller in C or C++, which records with it.
+
+        webots-mcp header controllers/my_robot
+
+    An older one is replaced. docs/c.md has what a controller calls.
+    """
+    from webots_mcp.contract import C_HEADER
+
+    file = target / C_HEADER.name if target.is_dir() else target
+    text = C_HEADER.read_text("utf-8")
+    try:
+        if file.exists() and not file.read_bytes().startswith(text[:15].encode()):
+            raise InvalidInputError(f"{file} is another file: it is left as it is; name a new one")
+        file.write_text(text, "utf-8", newline="\n")
+    except OSError as error:
+        raise InvalidInputError(f"{file} cannot be written: {error}") from error
+    if as_json:
+        return print_json({"file": str(file)})
+    print(f'{file} is written: #include "{file.name}" in the controller')
+
+
 def completion(
     shell: Annotated[
         Literal["bash", "zsh", "fish", "powershell"] | None,

@@ -50,6 +50,7 @@ from webots_mcp.store.chunks import (
     statistics_of,
 )
 from webots_mcp.store.export import Progress
+from webots_mcp.store.journal_intake import take_in_journals
 from webots_mcp.store.parameters import fetch_trial_set, is_at_work
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.run_rows import MAX_FILE_BYTES, PICTURES, inside
@@ -175,6 +176,7 @@ def settled(database: Path) -> Recording:
     recording = Recording(database, database.parent)
     with recording.writer() as connection:
         adopt(connection, database)
+        take_in_journals(connection, database)
         now_s = time.time()
         silent = (host_name(), now_s - REMOTE_SILENCE_S)  # their processes cannot be asked
         for (session_id,) in connection.execute(_SILENT_ELSEWHERE, silent).fetchall():

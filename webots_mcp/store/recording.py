@@ -44,6 +44,12 @@ from webots_mcp.errors import (
 from webots_mcp.liveness import Lease, still_held
 from webots_mcp.queue import any_unfinished
 from webots_mcp.store.chunks import is_chunked_aside, show_chunks_aside
+from webots_mcp.store.journal_intake import (
+    BUDGET_S,
+    has_news,
+    journals_behind,
+    take_in_journals,
+)
 from webots_mcp.store.reading.segment import Subject, choose, require_run
 from webots_mcp.store.retention import Asked
 from webots_mcp.store.robots import Robot, Session, Status, judge, stopped_for
@@ -60,6 +66,10 @@ GETTING_STARTED: Final = (
 _MOST_IDLE: Final = 8  # connections: each may hold 2 MB of pages
 _NO_DATABASE: Final = "file is not a database"  # SQLite's words
 _FROZEN: Final = "the file cannot be written from here: read as it is on the disk"
+_BEHIND: Final = (
+    "newer rows of {} are not in the database yet: ask again, or start 'webots-mcp serve' (not "
+    "--read-only), which takes them in"
+)
 _NOT_IN: Final = (
     "; without the rows in {} waiting files next to it (...-waiting-...): copy all of them to a "
     "writable folder and open the copy with webots-mcp serve to include them"
@@ -200,7 +210,11 @@ class Recording:
 
     @contextmanager
     def reader(self) -> Generator[sqlite3.Connection]:
-        """A connection that cannot write, and that no other uses meanwhile."""
+        """A connection that cannot write, and that no other uses meanwhile.
+
+        What controllers wrote into journals is taken in first.
+        """
+        self.take_in()
         if self.readers is None or not isinstance(self.database, Path):
             with self._opened("reader") as connection:
                 yield connection
@@ -237,6 +251,17 @@ class Recording:
                 if isinstance(self.database, Path):
                     adopt(connection, self.database)  # a command's result may wait there
                 liveness.reap(connection, time.time())
+
+    def take_in(self) -> None:
+        """Take in what controllers wrote into journals; nothing where the asker may not write."""
+        database = self.database
+        if not isinstance(database, Path) or (self.read_only and self.asker == "mcp"):
+            return
+        if has_news(database):
+            with suppress(DatabaseError):  # a locked or unwritable one: `storage` says what waits
+                self.create()
+                with self.writer() as connection:
+                    take_in_journals(connection, database, BUDGET_S)
 
     def create(self) -> None:
         """Make the database where there is none, with its folder; one that is there is kept.
@@ -317,11 +342,12 @@ def _of_earlier_run(run: Run, now_s: float) -> Status:
 
 
 def storage(connection: sqlite3.Connection) -> dict[str, Any]:
-    """What an answer says of the file that it was read from; nothing where robots may record."""
-    if not isinstance(connection, FrozenConnection):
-        return {}
+    """What an answer says of the file that it was read from, and of rows that are not in it."""
     (file,) = connection.execute("SELECT file FROM pragma_database_list").fetchone()
-    waiting = [path.name for path in waiting_paths(Path(file))]
+    behind = journals_behind(connection, Path(file)) if file else []
+    if not isinstance(connection, FrozenConnection):
+        return {"storage": _BEHIND.format(", ".join(behind))} if behind else {}
+    waiting = [*(path.name for path in waiting_paths(Path(file))), *behind]
     return {"storage": f"{_FROZEN}{_NOT_IN.format(len(waiting)) if waiting else ''}"}
 
 

@@ -1,0 +1,115 @@
+"""Each journal of conformance/ comes to the rows beside it, complete or while it is written.
+
+docs/journal.md describes the format. A reader in another language runs over the same files.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from webots_mcp.store.journal_intake import take_in_journals
+from webots_mcp.store.recording import Recording
+from webots_mcp.waiting_file import journal_parts
+
+FILES = sorted((Path(__file__).parent / "conformance").glob("*.jsonl"))
+SESSION = "5f0d1f6e-3a52-4d8e-9c2b-0a1b2c3d4e5f"
+ROWS = {
+    "run": "SELECT uuid, start_reason, last_sim_time_s, row_count, end_reason FROM run ORDER BY id",
+    "state": "SELECT sim_time_s, data, replaced FROM state ORDER BY id",
+    "event": "SELECT sim_time_s, kind, name, data FROM event WHERE kind <> 'dropped' ORDER BY id",
+    "log": "SELECT sim_time_s, level, source, message FROM log ORDER BY id",
+    "session": "SELECT end_reason, rows_dropped FROM session",
+    "dropped": "SELECT coalesce(sum(json_extract(data, '$.row_count')), 0) FROM event "
+    "WHERE kind = 'dropped'",
+}
+
+
+def part(folder: Path, number: int = 1) -> Path:
+    return folder / f"webots.db-waiting-{SESSION}-{number:04}.jsonl"
+
+
+def rows(folder: Path, what: str) -> list[list[Any]]:
+    with closing(sqlite3.connect(folder / "webots.db")) as connection:
+        return [list(row) for row in connection.execute(ROWS[what])]
+
+
+def require_rows(folder: Path, expected: dict[str, Any]) -> None:
+    for what in expected.keys() & ROWS.keys():
+        (found,) = rows(folder, what)[0] if what == "dropped" else (rows(folder, what),)
+        assert found == expected[what]
+    assert "dropped" in expected or rows(folder, "dropped") == [[0]]
+
+
+@pytest.mark.parametrize("pieces", [1, 2, 997])
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_a_journal_comes_to_its_rows(
+    file: Path, pieces: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Written at once and left; or byte by byte, with a reader after each piece."""
+    expected, data = json.loads(file.with_suffix(".json").read_text("utf-8")), file.read_bytes()
+    recording = Recording(tmp_path / "webots.db", tmp_path)
+    with part(tmp_path).open("ab", buffering=0) as journal:
+        fcntl.flock(journal, fcntl.LOCK_EX)
+        size = len(data) // pieces if pieces > 1 else len(data)
+        for start in range(0, len(data), max(size, 1)):
+            journal.write(data[start : start + max(size, 1)])
+            if pieces > 1:
+                recording.take_in()
+                assert part(tmp_path).exists()
+    recording.take_in()  # its writer is gone
+    for _ in range(2):
+        with recording.writer() as connection:
+            take_in_journals(connection, tmp_path / "webots.db")  # as a server does each second
+    require_rows(tmp_path, expected)
+    assert part(tmp_path).exists() == expected.get("left", False)
+    assert ("cannot be taken in" in capsys.readouterr().err) == expected.get("left", False)
+
+
+def test_parts_are_taken_in_one_after_the_other_and_deleted_when_they_are_complete(
+    tmp_path: Path,
+) -> None:
+    header, run, *states, _ = (FILES[0].parent / "old_numbers.jsonl").read_text().splitlines()
+    lines = [states[0].replace("[5,", f"[{n},").replace("1}", f"{n}}}") for n in range(2, 12)]
+    for number in range(1, 11):  # the tenth part is after the ninth
+        text = "\n".join([header, run.replace("[1,", f"[{number},"), lines[number - 1], ""])
+        part(tmp_path, number).write_text(text)
+    recording = Recording(tmp_path / "webots.db", tmp_path)
+    with part(tmp_path, 10).open("ab") as living:
+        fcntl.flock(living, fcntl.LOCK_EX)
+        recording.take_in()
+        assert [json.loads(data)["x"] for _, data, _ in rows(tmp_path, "state")] == [*range(2, 12)]
+        assert journal_parts(tmp_path / "webots.db") == {SESSION: [part(tmp_path, 10)]}
+
+
+def test_no_part_is_read_before_one_that_cannot_be(tmp_path: Path) -> None:
+    text = (FILES[0].parent / "cut_line.jsonl").read_text()
+    part(tmp_path, 1).write_text(text.replace('waiting":1', 'waiting":9'))
+    part(tmp_path, 2).write_text(text)
+    Recording(tmp_path / "webots.db", tmp_path).take_in()
+    assert rows(tmp_path, "state") == []
+    part(tmp_path, 1).unlink()
+    Recording(tmp_path / "webots.db", tmp_path).take_in()
+    assert len(rows(tmp_path, "state")) == 1
+
+
+def test_a_reader_that_may_not_write_says_what_waits(tmp_path: Path) -> None:
+    text = (FILES[0].parent / "cut_line.jsonl").read_text()
+    with part(tmp_path).open("w") as living:
+        fcntl.flock(living, fcntl.LOCK_EX)
+        living.write(text)
+        living.flush()
+        Recording(tmp_path / "webots.db", tmp_path).take_in()
+        living.write(text.splitlines()[-2].replace("[2,", "\n[3,") + "\n")
+        living.flush()
+        with Recording(tmp_path / "webots.db", tmp_path, read_only=True).view() as view:
+            assert part(tmp_path).name in view.header()["storage"]
+            assert len(rows(tmp_path, "state")) == 1
+        with Recording(tmp_path / "webots.db", tmp_path, read_only=True, asker="cli").reader():
+            assert len(rows(tmp_path, "state")) == 2

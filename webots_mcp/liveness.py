@@ -79,7 +79,8 @@ _OPEN_SESSIONS: Final = (
 )
 _SESSIONS_OF: Final = (
     "SELECT s.id, s.host, s.pid, s.process, s.last_seen_wall_time_s, s.instance, r.kind "
-    "FROM session s JOIN robot r ON r.id = s.robot_id WHERE r.name = ? AND s.ended_wall_time_s IS NULL"
+    "FROM session s JOIN robot r ON r.id = s.robot_id "
+    "WHERE r.name = ? AND s.ended_wall_time_s IS NULL"
 )
 _FILE: Final = "SELECT file FROM pragma_database_list WHERE name = 'main'"
 

@@ -1,0 +1,321 @@
+"""Checks of how a robot moved: as it was commanded, as its wheels turned, as others measured it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+from webots_mcp.naming import METRES, find_targets, in_snake_case, listed, unit_in
+from webots_mcp.signal_register import PLACES
+from webots_mcp.store.analysis.arrays import Array, Run, median, np, runs_of
+from webots_mcp.store.analysis.summary import unwrap
+from webots_mcp.store.checks.finding import (
+    Finding,
+    NotApplicableError,
+    RunUnderCheck,
+    times,
+    total_s,
+)
+from webots_mcp.store.detection.condition import lasting
+from webots_mcp.store.detection.motion import in_metres, places_in
+from webots_mcp.store.detection.standstill import ON_THE_SPOT
+from webots_mcp.store.signals import Signal, stored_roles
+
+APART_S: Final = 3.0  # command and measurement for so long
+NO_COMMAND: Final = (
+    "nothing says when it should move: publish commanded_m_s, the speeds of its wheels, or mode"
+)
+
+
+def moves_when_commanded(run: RunUnderCheck) -> Finding:
+    """Fails where it stood although a command, its wheels or its mode say that it should move."""
+    motion, stuck, stood = run.motion, run.events("stuck"), run.events("standstill")
+    if stuck:
+        evidence = f"stuck {times(len(stuck))}, {total_s(stuck):.3g} s in total"
+        first = f"{evidence}; the first time {stuck[0].details['evidence_for']}"
+        return Finding("fail", first, stuck[0].start_s, len(stuck), run.more("stuck"))
+    if not (motion.commanded or motion.speed or motion.wheels or motion.wheel_commands):
+        if motion.mode is None:
+            raise NotApplicableError(NO_COMMAND)
+        if total_s(stood) > 0.95 * run.search.length_s:
+            raise NotApplicableError(f"it always stood, in a mode unseen in motion: {NO_COMMAND}")
+    return Finding("pass", f"{len(stood)} standstills, none against a command")
+
+
+# -- command and measurement -----------------------------------------------------------------------
+
+_OF_RANGE: Final = 0.1  # of a target's whole range: what is apart by more is not there
+_NOISE: Final = 6.0  # standard deviations
+_HOLDING: Final = frozenset(("gripper", "finger", "hand", "claw", "jaw"))  # they close on things
+
+
+def follows_targets(run: RunUnderCheck) -> Finding:
+    """Fails where something was a tenth of its target's range away for 3 s and came no nearer.
+
+    Places where a robot shall go are no targets, and grippers hold things.
+    """
+    pairs = list(_pairs(run))
+    if not pairs:
+        raise NotApplicableError("no target is published beside what it is the target of")
+    found: list[tuple[Signal, Run, float]] = []
+    for measured, target in pairs:
+        found += _apart(run, measured, target)
+    if not found:
+        return Finding("pass", f"{len(pairs)} follow their targets, as {pairs[0][0].name}")
+    found.sort(key=lambda each: each[1].start_s)
+    names = listed(list(dict.fromkeys(signal.name for signal, *_ in found)), 3)
+    longest, by = max((rest.duration_s, by) for _, rest, by in found)
+    evidence = f"{names}: up to {longest:.3g} s without coming nearer, {by:.3g} away"
+    more = f"webots_query_history(signals={[found[0][0].name]}, run_id={run.info.run_id})"
+    return Finding("fail", evidence, found[0][1].start_s, len(found), more)
+
+
+def _pairs(run: RunUnderCheck) -> Iterator[tuple[Signal, Signal]]:
+    """Measured values with their targets, but for where the robot shall go, and what holds."""
+    motion, known = run.motion, run.search.known
+    there = [
+        name for name, each in known.items()
+        if each.kind in ("num", "angle") and run.frame.zones(name).value_count.any()
+    ]  # fmt: skip
+    away = {each.name for each in (*(motion.position or ()), motion.heading, motion.height) if each}
+    for name in there:
+        words = in_snake_case(name).replace(".", "_").split("_")
+        if name in away or (known[name].role or "")[:3].startswith(("x", "y", "z")):
+            continue
+        target, _ = find_targets(name, there)
+        if target is not None and _HOLDING.isdisjoint(words):
+            yield known[name], known[target]
+
+
+def _apart(
+    run: RunUnderCheck, measured: Signal, target: Signal
+) -> Iterator[tuple[Signal, Run, float]]:
+    frame = run.frame
+    values, aims = frame.numbers(measured.name), frame.numbers(target.name)
+    there = np.flatnonzero(np.isfinite(values) & np.isfinite(aims))
+    if len(there) < 2:
+        return
+    rows, off = frame.times[there], values[there] - aims[there]
+    if turn := measured.turn:
+        off = np.remainder(off + turn / 2, turn) - turn / 2
+    off = np.abs(off)
+    noise = max(run.noise.of(measured.name), run.noise.of(target.name))
+    limit = max(_OF_RANGE * float(np.ptp(aims[there])), _NOISE * noise)
+    limit = limit or _OF_RANGE * float(np.abs(aims[there]).max())
+    before = np.maximum(np.searchsorted(rows, rows - APART_S, "right") - 1, 0)
+    still = lasting(rows, off > limit, APART_S) & (off > off[before] - limit / 2)
+    runs = runs_of(still, rows)
+    for each in runs.each():
+        lasted = each._replace(start_s=max(float(rows[0]), each.start_s - APART_S))
+        yield measured, lasted, float(off[each.start : each.stop].max())
+
+
+# -- wheels and motion -----------------------------------------------------------------------------
+
+_SLIPS: Final = 0.5  # of the usual way per turn of the wheels
+_CELLS_S: Final = (0.25, 0.5, 1.0, 2.0)  # over which speeds are compared; the noise chooses
+_NOISE_SHARE: Final = 0.1  # of the speed that it may take
+_TURNS_RAD: Final = 1.0  # within a cell: then the straight line is shorter than the way
+_LEAST_CELLS: Final = 10
+_SPREAD: Final = 0.3  # of the ratios of a robot that rolls: of more they say nothing
+_BY_WHEELS: Final = ("odom", "odometry")
+
+
+def wheels_grip(run: RunUnderCheck) -> Finding:
+    """Fails where the wheels drove ahead for 3 s and it went less than half as far as usual."""
+    motion, position = run.motion, run.motion.position
+    wheels = [each for each in motion.wheels or motion.wheel_commands if each.name in run.frame]
+    if position is None or not wheels:
+        raise NotApplicableError("publish the position and the speeds of its wheels")
+    if position[0].name.partition(".")[0] in _BY_WHEELS:
+        raise NotApplicableError(f"{position[0].name} is counted by the wheels themselves")
+    cells = _cells(run, position, wheels)
+    ahead = cells.turned > 0
+    if np.count_nonzero(ahead) < _LEAST_CELLS:
+        raise NotApplicableError("its wheels drove it ahead too seldom")
+    ratios = cells.went_m_s[ahead] / cells.turned[ahead]
+    usual = median(ratios[ratios >= np.quantile(ratios, 0.5)])
+    rolled = ratios[ratios >= _SLIPS * usual]
+    spread = median(np.abs(rolled - median(rolled))) / 0.6745
+    if usual <= 0 or spread > _SPREAD * usual:
+        raise NotApplicableError("its speed and that of its wheels have no fixed ratio")
+    slips = np.zeros(len(ahead), np.bool_)
+    slips[ahead] = ratios < _SLIPS * median(rolled)
+    found = [
+        each for each in runs_of(slips, cells.starts_s).each()
+        if each.duration_s + cells.lasts_s >= APART_S
+    ]  # fmt: skip
+    unit = "" if unit_in(wheels[0].name) in METRES else " per unit of wheel speed"
+    rolls = f"rolls {median(rolled):.3g} m/s{unit}"
+    if not found:
+        return Finding("pass", f"{rolls}, over {len(ratios)} stretches of {cells.lasts_s:g} s")
+    longest = max(each.duration_s for each in found) + cells.lasts_s
+    least = min(float(ratios_in.min()) for ratios_in in _ratios_of(found, cells))
+    evidence = f"slipped {times(len(found))}, up to {longest:.3g} s; {rolls}, then {least:.3g}"
+    more = f"webots_query_history(signals={[wheels[0].name]}, run_id={run.info.run_id})"
+    return Finding("fail", evidence, found[0].start_s, len(found), more)
+
+
+class _Cells(NamedTuple):
+    """Stretches of one length: how fast the robot went in each, and how fast its wheels turned.
+
+    Attributes:
+        turned: Their mean; 0 where they do not drive it ahead, or nothing is known.
+    """
+
+    starts_s: Array
+    lasts_s: float
+    went_m_s: Array
+    turned: Array
+
+
+def _ratios_of(found: list[Run], cells: _Cells) -> Iterator[Array]:
+    for each in found:
+        rows = slice(each.start, each.stop)
+        yield cells.went_m_s[rows] / cells.turned[rows]
+
+
+def _cells(run: RunUnderCheck, position: tuple[Signal, Signal], wheels: list[Signal]) -> _Cells:
+    frame = run.frame
+    rows, x, y = places_in(frame, position)
+    clock = frame.times[rows]
+    speeds = np.nan_to_num([frame.numbers(each.name)[rows] for each in wheels])
+    mean, fastest = speeds.mean(axis=0), np.abs(speeds).max(axis=0)
+    ahead = (np.abs(mean) >= ON_THE_SPOT * fastest) & (fastest > 4 * run.noise.of(wheels[0].name))
+    per_row_s = max(run.noise.interval_s, 1e-6)
+    way_m = float(np.hypot(np.diff(x), np.diff(y)).sum()) if len(x) > 1 else 0.0
+    drove_s = max(per_row_s, np.count_nonzero(ahead) * per_row_s)
+    for lasts_s in _CELLS_S:
+        noise_m = 2 * run.noise.position_m / math.sqrt(max(1.0, lasts_s / per_row_s / 4))
+        if lasts_s >= 4 * per_row_s and noise_m / lasts_s <= _NOISE_SHARE * way_m / drove_s:
+            break
+    edges = np.arange(clock[0], clock[-1], lasts_s) if len(clock) > 1 else np.zeros(0)
+    first = np.searchsorted(clock, edges)
+    stop = np.searchsorted(clock, edges + lasts_s)
+    full = stop - first >= 3
+    edges, first, stop = edges[full], first[full], stop[full]
+    went, turned = np.zeros(len(edges)), np.zeros(len(edges))
+    heading = None if run.motion.heading is None else frame.numbers(run.motion.heading.name)[rows]
+    for cell, (a, b) in enumerate(zip(first.tolist(), stop.tolist(), strict=True)):
+        few = max(1, (b - a) // 4)
+        gone = [each[b - few : b].mean() - each[a : a + few].mean() for each in (x, y)]
+        took_s = clock[b - few : b].mean() - clock[a : a + few].mean()
+        went[cell] = math.hypot(*gone) / took_s
+        whole = bool(ahead[a:b].all()) and (np.sign(mean[a:b]) == np.sign(mean[a])).all()
+        if heading is not None and whole:
+            turn = run.motion.heading.turn if run.motion.heading else None
+            course = unwrap(heading[a:b], turn or math.tau) * math.tau / (turn or math.tau)
+            whole = bool(np.ptp(course) <= _TURNS_RAD)
+        turned[cell] = abs(float(mean[a:b].mean())) if whole else 0.0
+    return _Cells(edges, lasts_s, went, turned)
+
+
+# -- two estimates of one thing --------------------------------------------------------------------
+
+_FITTED: Final = 0.2  # of the way: so much of it lays one estimate over the other
+_LEAST_WAY_M: Final = 1.0
+_SAME: Final = 0.1  # of the fitted way: two that are farther apart there are no two of one thing
+_WARNS: Final = (0.05, 0.1)  # of the way, and m: farther apart is a drift worth a look
+_FAILS: Final = (0.15, 0.3)
+_TURN_WARNS_RAD, _TURN_FAILS_RAD = 0.2, 0.5
+
+
+def estimates_agree(run: RunUnderCheck) -> Finding:
+    """Warns where two estimates came apart by 5 % of the way or 0.2 rad, fails from 15 % or 0.5 on.
+
+    Each may have a frame of its own: they are laid over each other where the run begins.
+    """
+    positions, headings = list(_positions(run)), _headings(run)
+    findings = [
+        each for other in positions[1:] if (each := _drift(run, positions[0], other)) is not None
+    ]
+    findings += [each for other in headings[1:] if (each := _turned_apart(run, headings[0], other))]
+    if not findings:
+        raise NotApplicableError(
+            "no second position or heading of the robot that goes along with the first"
+            f" for {_LEAST_WAY_M:g} m: publish gps and odometry, say"
+        )
+    return min(findings, key=lambda each: ("fail", "warn", "pass").index(each.outcome))
+
+
+def _positions(run: RunUnderCheck) -> list[tuple[Signal, Signal]]:
+    known = run.search.known
+    by_role = {role: known[name] for name, role in stored_roles(known).items() if name in run.frame}
+    pairs = [(by_role.get(f"x{place}"), by_role.get(f"y{place}")) for place in PLACES]
+    return [(x, y) for x, y in pairs if x and y]
+
+
+def _headings(run: RunUnderCheck) -> list[Signal]:
+    known = run.search.known
+    roles = {role: name for name, role in stored_roles(known).items() if name in run.frame}
+    names = [roles[f"yaw{place}"] for place in PLACES if f"yaw{place}" in roles]
+    aims = {find_targets(name, names)[0] for name in names}
+    return [known[name] for name in names if name not in aims]
+
+
+def _drift(
+    run: RunUnderCheck, one: tuple[Signal, Signal], other: tuple[Signal, Signal]
+) -> Finding | None:
+    """None where they are no two of one thing, or it went too little to tell."""
+    both = [in_metres(each, run.frame.numbers(each.name)) for each in (*one, *other)]
+    there = np.flatnonzero(np.isfinite(both).all(axis=0))
+    if len(there) < 10:
+        return None
+    a, b = both[0][there] + 1j * both[1][there], both[2][there] + 1j * both[3][there]
+    thin = max(1, len(there) // 500)
+    way_m = np.abs(np.diff(a[::thin])).cumsum()
+    if way_m[-1] < _LEAST_WAY_M or np.abs(np.diff(b[::thin])).sum() < 0.2 * way_m[-1]:
+        return None
+    first = max(5, int(np.searchsorted(way_m, _FITTED * way_m[-1])) * thin)
+    a, b = a - a[:first].mean(), b - b[:first].mean()
+    turn = np.vdot(b[:first], a[:first])
+    off = np.abs(a - b * (turn / abs(turn) if abs(turn) else 1))
+    if off[:first].max() > max(_SAME * _FITTED * way_m[-1], 0.1):
+        return None
+    last = max(1, len(off) // 20)
+    end_m, worst_m = median(off[-last:]), float(off.max())
+    names = " and ".join(each[0].name.rpartition(".")[0] or each[0].name for each in (one, other))
+    apart = f"{worst_m:.3g} m apart at most, {end_m:.3g} m at the end"
+    evidence = f"{names}: {apart} of {way_m[-1]:.3g} m"
+    limits = [max(share * way_m[-1], least) for share, least in (_WARNS, _FAILS)]
+    if worst_m <= limits[0]:
+        return Finding("pass", evidence)
+    since_s = float(run.frame.times[there][int(np.argmax(off > limits[0]))])
+    more = f"webots_plot(signals={[one[0].name, other[0].name]}, run_id={run.info.run_id})"
+    return Finding("fail" if worst_m > limits[1] else "warn", evidence, since_s, 1, more)
+
+
+def _turned_apart(run: RunUnderCheck, one: Signal, other: Signal) -> Finding | None:
+    angles = [
+        run.frame.numbers(each.name) * math.tau / (each.turn or math.tau) for each in (one, other)
+    ]
+    there = np.flatnonzero(np.isfinite(angles).all(axis=0))
+    if len(there) < 10:
+        return None
+    # A compass that counts the other way round turns as much, against it.
+    a, b = (unwrap(each[there]) for each in angles)
+    first = max(5, len(there) // 5)
+    sign = 1.0 if np.vdot(a[:first] - a[:first].mean(), b[:first] - b[:first].mean()) >= 0 else -1.0
+    off = np.abs((a - a[0]) - sign * (b - b[0]))
+    if np.ptp(a[:first]) < _TURN_WARNS_RAD or off[:first].max() > _TURN_WARNS_RAD:
+        return None
+    worst = float(off.max())
+    evidence = f"{one.name} and {other.name}: {worst:.3g} rad apart at most"
+    if worst <= _TURN_WARNS_RAD:
+        return Finding("pass", evidence)
+    since_s = float(run.frame.times[there][int(np.argmax(off > _TURN_WARNS_RAD))])
+    more = f"webots_plot(signals={[one.name, other.name]}, run_id={run.info.run_id})"
+    return Finding("fail" if worst > _TURN_FAILS_RAD else "warn", evidence, since_s, 1, more)
+
+
+def stays_in_place(run: RunUnderCheck) -> Finding:
+    """Warns where the position jumped: something put it elsewhere, or the estimate is wrong."""
+    if run.motion.position is None:
+        raise NotApplicableError("no position is published")
+    leaps = [each for each in run.events("jump") if each.name == "position"]
+    if not leaps:
+        return Finding("pass", "its position never jumped")
+    far_m = max(float(each.details.get("distance_m", 0.0)) for each in leaps)
+    evidence = f"its position jumped {times(len(leaps))}, up to {far_m:.3g} m"
+    return Finding("warn", evidence, leaps[0].start_s, len(leaps), run.more("jump"))

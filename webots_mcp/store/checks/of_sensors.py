@@ -1,0 +1,166 @@
+"""Checks of what sensors gave: nothing, the same, an extreme, or something else for a moment."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+from webots_mcp.naming import find_targets, listed, words_of
+from webots_mcp.store.analysis.arrays import np, runs_of
+from webots_mcp.store.checks.finding import (
+    Finding,
+    RunUnderCheck,
+    times,
+    total_s,
+)
+from webots_mcp.store.detection.kinds import Event
+from webots_mcp.store.detection.sensors import OTHER_ROWS, is_lively, is_noisy
+from webots_mcp.store.signals import Signal
+
+MOST_NAMED: Final = 3
+_FAULTY: Final = "nan"  # what a device gives that has no value; inf is a range without an end
+
+
+def sensors_speak(run: RunUnderCheck) -> Finding:
+    """Fails where a signal was NaN for a second or more, warns where it was null.
+
+    Null may be meant, of what is not seen now; an infinite range is.
+    """
+    silent = [e for e in run.events("missing") if e.details.get("value") in (None, _FAULTY)]
+    never = [
+        name for name, each in run.search.known.items()
+        if each.is_number and run.frame.replaced(name)[_FAULTY] == len(run.frame) > 0
+    ]  # fmt: skip
+    if not (silent or never):
+        return Finding("pass", "none was without a value for a second")
+    nan = [each for each in silent if each.details.get("value") == _FAULTY]
+    names = listed(list(dict.fromkeys([*never, *(each.name or "" for each in silent)])), MOST_NAMED)
+    evidence = f"{names}: {times(len(silent))}, {total_s(silent):.3g} s in total without a value"
+    evidence = f"{listed(never, MOST_NAMED)}: NaN in every row" if never else evidence
+    since_s = silent[0].start_s if silent and not never else run.search.began_s
+    outcome = "fail" if nan or never else "warn"
+    return Finding(outcome, evidence, since_s, len(silent) + len(never), run.more("missing"))
+
+
+def sensors_live(run: RunUnderCheck) -> Finding:
+    """Fails where a signal that changes otherwise froze at one value while the robot moved.
+
+    Commands and speeds of wheels may be constant.
+    """
+    frozen = [each for each in run.events("flat") if _is_frozen(run, each)]
+    if not frozen:
+        return Finding("pass", "none froze")
+    first = frozen[0]
+    names = listed(list(dict.fromkeys(each.name or "" for each in frozen)), MOST_NAMED)
+    says = f"; {first.details['says']}" if "says" in first.details else ""
+    evidence = f"{names}: {times(len(frozen))}, up to {_longest(frozen):.3g} s the same{says}"
+    return Finding("fail", evidence, first.start_s, len(frozen), run.more("flat"))
+
+
+def _is_frozen(run: RunUnderCheck, flat: Event) -> bool:
+    name, says = flat.name or "", str(flat.details.get("says", ""))
+    if name not in _sensors(run) or says.startswith(("at ", "at its limit")):
+        return False
+    if says:  # its target went on
+        return True
+    frame = run.frame
+    first, stop = frame.places([flat.start_s, flat.end_s]).tolist()
+    before = frame.rows(max(0, first - OTHER_ROWS), first).usable(name)[1]
+    after = frame.rows(stop + 1, stop + OTHER_ROWS).usable(name)[1]
+    if is_noisy(np.concatenate([before, after])):
+        return True
+    others = run.events("standstill") + run.events("stuck")
+    if run.motion.position is None:
+        branch = name.partition(".")[0]
+        others = [e for e in run.events("flat") if (e.name or "").partition(".")[0] != branch]
+    rests_s = (min(flat.end_s, e.end_s) - max(flat.start_s, e.start_s) for e in others)
+    return sum(max(0.0, each) for each in rests_s) < 0.5 * flat.duration_s
+
+
+def _sensors(run: RunUnderCheck) -> dict[str, Signal]:
+    """The numbers that somebody measured, as far as their names tell."""
+    motion = run.motion
+    told = {motion.commanded, motion.speed, motion.mode, *motion.wheels, *motion.wheel_commands}
+    numbers = {each.name: each for each in run.search.numbers if not each.is_index}
+    aims = {aim for name in numbers for aim in find_targets(name, numbers)}
+    return {
+        name: each for name, each in numbers.items()
+        if each not in told and name not in aims and not _SET.intersection(_words(name))
+    }  # fmt: skip
+
+
+_SET: Final = frozenset(
+    ("target", "setpoint", "goal", "desired", "commanded", "command", "cmd", "reference", "ref")
+)
+_RANGES: Final = frozenset(
+    ("distance", "range", "lidar", "sonar", "ir", "ds", "ps", "front", "left", "right", "rear")
+)
+
+
+def _words(name: str) -> set[str]:
+    return {word for part in name.split(".") for word in words_of(part)}
+
+
+_AT_LIMIT: Final = 0.05  # of the rows
+_MANY_VALUES: Final = 200  # different ones: of fewer one comes back by nature
+_IN_A_ROW, _OFTEN = 3, 3  # so many rows are at the limit, so many times
+
+
+def sensors_within_limits(run: RunUnderCheck) -> Finding:
+    """Warns where a signal was cut off at its least or greatest value in 5 % of the rows.
+
+    Not a range, which ends where nothing is in sight.
+    """
+    found = list(_saturated(run))
+    if not found:
+        return Finding("pass", "none was cut off at a limit")
+    name, limit, share, since_s, count = max(found, key=lambda each: each[2])
+    others = listed([each[0] for each in found if each[0] != name], MOST_NAMED)
+    evidence = f"{name} was at {limit:.6g} in {100 * share:.3g} % of the rows"
+    evidence += f"; also {others}" if others else ""
+    more = f"webots_query_history(signals={[name]}, run_id={run.info.run_id})"
+    return Finding("warn", evidence, since_s, count, more)
+
+
+def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, int]]:
+    position = {each.name for each in run.motion.position or ()}
+    for name, signal in _sensors(run).items():
+        if run.search.deadline.passed:
+            return
+        if name in position or signal.turn or not _RANGES.isdisjoint(_words(name)):
+            continue
+        zones = run.frame.zones(name)
+        if zones.change_count.sum() < _MANY_VALUES or not is_lively(run.frame, name):
+            continue
+        clock, values = run.frame.usable(name)
+        if len(np.unique(values)) < _MANY_VALUES:
+            continue
+        for limit in (float(values.min()), float(values.max())):
+            at = values == limit
+            rests = runs_of(at, clock)
+            long = rests.only(rests.stops - rests.starts >= _IN_A_ROW)
+            if len(long) >= _OFTEN and at.mean() >= _AT_LIMIT:
+                yield name, limit, float(at.mean()), float(long.starts_s[0]), len(long)
+
+
+_OFTEN_THE_SAME: Final = 3
+
+
+def sensors_drop_nothing(run: RunUnderCheck) -> Finding:
+    """Warns where a signal went away and back at once, fails where it went to one value 3 times."""
+    sensors = _sensors(run)
+    gone = [e for e in run.events("jump") if "back" in e.details and e.name in sensors]
+    if not gone:
+        return Finding("pass", "none dropped out")
+    to = Counter((each.name, float(each.details["after"])) for each in gone)
+    ((name, value), most) = to.most_common(1)[0]
+    names = listed(list(dict.fromkeys(each.name or "" for each in gone)), MOST_NAMED)
+    evidence = f"{names}: away and back {times(len(gone))}"
+    evidence += f"; {name} {times(most)} to {value:.6g}" if most > 1 else ""
+    outcome = "fail" if most >= _OFTEN_THE_SAME else "warn"
+    return Finding(outcome, evidence, gone[0].start_s, len(gone), run.more("jump"))
+
+
+def _longest(events: Sequence[Event]) -> float:
+    return max(each.duration_s for each in events)

@@ -1,0 +1,157 @@
+"""`check_run`: all checks of a run, by the registry."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Final
+
+from webots_mcp.store.checks import of_motion, of_run, of_sensors
+from webots_mcp.store.checks.finding import (
+    WORST_FIRST,
+    Check,
+    Finding,
+    NotApplicableError,
+    Outcome,
+    RunUnderCheck,
+)
+from webots_mcp.store.detection.events import asked_kinds, search_events
+from webots_mcp.store.detection.kinds import EventOptions
+from webots_mcp.store.detection.search import Search
+from webots_mcp.store.questions.runs import run_info
+from webots_mcp.store.reading.catalogue import catalogue
+from webots_mcp.store.reading.ranges import TimeRange, whole_run
+from webots_mcp.store.reading.segment import Deadline, Segment, Subject, in_one_snapshot
+from webots_mcp.store.run_rows import fetch_run
+
+CHECK_DEADLINE_S: Final = 8.0
+_OF_EVENTS: Final = 0.7  # of the time
+
+# A new check is a function and a line here: question, command, report, page and docs read it.
+CHECKS: Final[list[Check]] = [
+    Check(
+        "moves when commanded",
+        of_motion.moves_when_commanded,
+        "the position; a commanded speed, speeds of wheels, or a mode",
+        kinds=("stuck", "standstill"),
+    ),
+    Check(
+        "follows its targets",
+        of_motion.follows_targets,
+        "a target beside its measurement: `arm.target`, `arm.position`",
+        of_values=True,
+    ),
+    Check(
+        "wheels grip",
+        of_motion.wheels_grip,
+        "a position that the wheels do not count; speeds of wheels",
+        of_values=True,
+    ),
+    Check(
+        "estimates agree",
+        of_motion.estimates_agree,
+        "two positions or headings of the robot, such as gps and odometry",
+        of_values=True,
+    ),
+    Check("stays in place", of_motion.stays_in_place, "the position", kinds=("jump",)),
+    Check("sensors speak", of_sensors.sensors_speak, "numbers", kinds=("missing",), of_values=True),
+    Check("sensors live", of_sensors.sensors_live, "numbers", kinds=("flat",), of_values=True),
+    Check("sensors within limits", of_sensors.sensors_within_limits, "numbers", of_values=True),
+    Check("sensors drop nothing", of_sensors.sensors_drop_nothing, "numbers", kinds=("jump",)),
+    Check("keeps pace", of_run.keeps_pace, "rows", of_values=True),
+    Check("misses no steps", of_run.misses_no_steps, "rows", kinds=("gap",)),
+    Check("logs no errors", of_run.logs_no_errors, "", kinds=("log",)),
+    Check("ends well", of_run.ends_well, ""),
+    Check("loses no rows", of_run.loses_no_rows, "", kinds=("bridge_event",)),
+    Check("reaches its goal", of_run.reaches_goal, "a run command with a condition in `until`"),
+]
+
+
+@dataclass(frozen=True)
+class CheckedRun:
+    """What became of each check of a run.
+
+    Attributes:
+        findings: With their names, in the order of the registry.
+    """
+
+    run_id: int
+    robot: str
+    findings: tuple[Finding, ...]
+
+    @property
+    def outcome(self) -> Outcome:
+        """The worst of all; a check that could not be made shows nothing."""
+        there = {each.outcome for each in self.findings}
+        return next(each for each in WORST_FIRST if each in there)
+
+    def of(self, *outcomes: Outcome) -> list[Finding]:
+        """Those that came out so."""
+        return [each for each in self.findings if each.outcome in outcomes]
+
+
+@in_one_snapshot
+def check_run(
+    connection: sqlite3.Connection,
+    run_id: int,
+    *,
+    options: EventOptions | None = None,
+    deadline_s: float = CHECK_DEADLINE_S,
+) -> CheckedRun:
+    """Make all checks of a run.
+
+    Args:
+        connection: Any.
+        run_id: The run.
+        options: What counts as an event, and what the position and the mode are.
+        deadline_s: What was not looked at by then is said so, and does not pass.
+
+    Raises:
+        UnknownRunError, UnknownSignalError: As they say.
+    """
+    run = _under_check(connection, run_id, options or EventOptions(), deadline_s)
+    findings = [found for check in CHECKS for found in findings_of(check, run)]
+    return CheckedRun(run_id, run.info.robot, tuple(findings))
+
+
+def _under_check(
+    connection: sqlite3.Connection, run_id: int, options: EventOptions, deadline_s: float
+) -> RunUnderCheck:
+    import_module("numpy")  # once per process, before the time counts
+    robot_id, info = fetch_run(connection, run_id).robot_id, run_info(connection, run_id)
+    whole = Segment(run_id, -math.inf, math.inf, open_start=True, open_end=True)
+    segment = whole_run(connection, run_id) or whole
+    kinds = tuple(dict.fromkeys(kind for check in CHECKS for kind in check.kinds))
+    wanted = EventOptions(kinds, position=options.position, mode=options.mode)
+    deadline = Deadline(deadline_s)
+    found = search_events(
+        connection,
+        TimeRange(robot_id, info.robot, (segment,), "simulation"),
+        wanted,
+        around=(),
+        group=False,
+        deadline_s=_OF_EVENTS * deadline_s,
+    )
+    known = catalogue(connection, Subject(robot_id, info.robot, run_id))
+    search = Search(connection, segment, known, asked_kinds(wanted), wanted, deadline)
+    return RunUnderCheck(info, robot_id, found, search)
+
+
+def findings_of(check: Check, run: RunUnderCheck) -> list[Finding]:
+    """What a check finds; it does not pass on what could not be looked at."""
+    if (lacking := run.lacking(check)) is not None:
+        return [lacking._replace(name=check.name)]
+    try:
+        made = check.find(run)
+        found = [made] if isinstance(made, Finding) else list(made)
+    except NotApplicableError as error:
+        found = [Finding("not applicable", str(error))]
+    if unread := run.unread(check):
+        found = [
+            each._replace(outcome="not looked at", evidence=f"{unread}; {each.evidence}")
+            if each.outcome in ("pass", "not applicable") else each
+            for each in found
+        ]  # fmt: skip
+    return [each if each.name else each._replace(name=check.name) for each in found]

@@ -34,7 +34,7 @@ class Finding(NamedTuple):
     Attributes:
         evidence: The numbers that it rests on.
         since_s: Simulation time at which what is wrong began first.
-        count: How often it was so.
+        often: How many times it was so.
         more: The call that shows it in full.
         name: Of what was checked, where a check is about several things.
     """
@@ -42,7 +42,7 @@ class Finding(NamedTuple):
     outcome: Outcome
     evidence: str
     since_s: float | None = None
-    count: int | None = None
+    often: int | None = None
     more: str = ""
     name: str = ""
 

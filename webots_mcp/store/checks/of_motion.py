@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.naming import METRES, find_targets, in_snake_case, listed, unit_in
 from webots_mcp.signal_register import PLACES
-from webots_mcp.store.analysis.arrays import Array, Run, median, np, runs_of
+from webots_mcp.store.analysis.arrays import Array, Run, inner, median, np, runs_of
 from webots_mcp.store.analysis.summary import unwrap
 from webots_mcp.store.checks.finding import (
     Finding,
@@ -18,6 +18,7 @@ from webots_mcp.store.checks.finding import (
     total_s,
 )
 from webots_mcp.store.detection.condition import lasting
+from webots_mcp.store.detection.kinds import Event
 from webots_mcp.store.detection.motion import in_metres, places_in
 from webots_mcp.store.detection.standstill import ON_THE_SPOT
 from webots_mcp.store.signals import Signal, stored_roles
@@ -29,12 +30,16 @@ NO_COMMAND: Final = (
 
 
 def moves_when_commanded(run: RunUnderCheck) -> Finding:
-    """Fails where it stood although a command, its wheels or its mode say that it should move."""
+    """Fails where it stood although a command, its wheels or its mode say that it should move.
+
+    Warns where nothing but a mode says so that is the same in the whole run.
+    """
     motion, stuck, stood = run.motion, run.events("stuck"), run.events("standstill")
     if stuck:
         evidence = f"stuck {times(len(stuck))}, {total_s(stuck):.3g} s in total"
         first = f"{evidence}; the first time {stuck[0].details['evidence_for']}"
-        return Finding("fail", first, stuck[0].start_s, len(stuck), run.more("stuck"))
+        outcome = "fail" if any(_is_shown(run, each) for each in stuck) else "warn"
+        return Finding(outcome, first, stuck[0].start_s, len(stuck), run.more("stuck"))
     if not (motion.commanded or motion.speed or motion.wheels or motion.wheel_commands):
         if motion.mode is None:
             raise NotApplicableError(NO_COMMAND)
@@ -43,10 +48,20 @@ def moves_when_commanded(run: RunUnderCheck) -> Finding:
     return Finding("pass", f"{len(stood)} standstills, none against a command")
 
 
+def _is_shown(run: RunUnderCheck, stuck: Event) -> bool:
+    """Whether more than a mode that never changes says that it should have moved."""
+    mode = run.motion.mode
+    by_mode_alone = all(
+        each.startswith(("in mode ", "mode ")) for each in stuck.details["evidence_for"].split("; ")
+    )
+    return not by_mode_alone or mode is None or len(set(run.frame.coded(mode.name).labels)) > 2
+
+
 # -- command and measurement -----------------------------------------------------------------------
 
 _OF_RANGE: Final = 0.1  # of a target's whole range: what is apart by more is not there
-_NOISE: Final = 6.0  # standard deviations
+_NEARER: Final = 0.02  # of that range, within `APART_S`: what comes so much nearer is on its way
+_NOISE: Final = 6.0  # standard deviations; for half as many it may come nearer by chance
 _HOLDING: Final = frozenset(("gripper", "finger", "hand", "claw", "jaw"))  # they close on things
 
 
@@ -96,19 +111,23 @@ def _apart(
     there = np.flatnonzero(np.isfinite(values) & np.isfinite(aims))
     if len(there) < 2:
         return
-    rows, off = frame.times[there], values[there] - aims[there]
-    if turn := measured.turn:
-        off = np.remainder(off + turn / 2, turn) - turn / 2
-    off = np.abs(off)
-    noise = max(run.noise.of(measured.name), run.noise.of(target.name))
-    limit = max(_OF_RANGE * float(np.ptp(aims[there])), _NOISE * noise)
-    limit = limit or _OF_RANGE * float(np.abs(aims[there]).max())
+    rows, values, aims = frame.times[there], values[there], aims[there]
     before = np.maximum(np.searchsorted(rows, rows - APART_S, "right") - 1, 0)
-    still = lasting(rows, off > limit, APART_S) & (off > off[before] - limit / 2)
-    runs = runs_of(still, rows)
-    for each in runs.each():
+    off, was_off = (_between(each, aims, measured.turn) for each in (values, values[before]))
+    noise = max(run.noise.of(measured.name), run.noise.of(target.name))
+    span = float(np.ptp(aims)) or float(np.abs(aims).max())
+    is_apart = off > max(_OF_RANGE * span, _NOISE * noise)
+    nearer_by = max(_NEARER * span, _NOISE / 2 * noise)
+    # For as long again: a target that was set anew may lie the other way.
+    still = lasting(rows, is_apart & (was_off - off < nearer_by), APART_S)
+    for each in runs_of(still, rows).each():
         lasted = each._replace(start_s=max(float(rows[0]), each.start_s - APART_S))
         yield measured, lasted, float(off[each.start : each.stop].max())
+
+
+def _between(values: Array, aims: Array, turn: float | None) -> Array:
+    off = values - aims
+    return np.abs(np.remainder(off + turn / 2, turn) - turn / 2) if turn else np.abs(off)
 
 
 # -- wheels and motion -----------------------------------------------------------------------------
@@ -185,7 +204,8 @@ def _cells(run: RunUnderCheck, position: tuple[Signal, Signal], wheels: list[Sig
     ahead = (np.abs(mean) >= ON_THE_SPOT * fastest) & (fastest > 4 * run.noise.of(wheels[0].name))
     per_row_s = max(run.noise.interval_s, 1e-6)
     way_m = float(np.hypot(np.diff(x), np.diff(y)).sum()) if len(x) > 1 else 0.0
-    drove_s = max(per_row_s, np.count_nonzero(ahead) * per_row_s)
+    drove_s = max(1, int(np.count_nonzero(ahead))) * per_row_s
+    lasts_s = _CELLS_S[0]
     for lasts_s in _CELLS_S:
         noise_m = 2 * run.noise.position_m / math.sqrt(max(1.0, lasts_s / per_row_s / 4))
         if lasts_s >= 4 * per_row_s and noise_m / lasts_s <= _NOISE_SHARE * way_m / drove_s:
@@ -218,6 +238,7 @@ _LEAST_WAY_M: Final = 1.0
 _SAME: Final = 0.1  # of the fitted way: two that are farther apart there are no two of one thing
 _WARNS: Final = (0.05, 0.1)  # of the way, and m: farther apart is a drift worth a look
 _FAILS: Final = (0.15, 0.3)
+_ALIKE: Final = 0.8  # correlation of the turns of two headings of one robot
 _TURN_WARNS_RAD, _TURN_FAILS_RAD = 0.2, 0.5
 
 
@@ -262,15 +283,16 @@ def _drift(
     there = np.flatnonzero(np.isfinite(both).all(axis=0))
     if len(there) < 10:
         return None
-    a, b = both[0][there] + 1j * both[1][there], both[2][there] + 1j * both[3][there]
+    a: Any = both[0][there] + 1j * both[1][there]
+    b: Any = both[2][there] + 1j * both[3][there]
     thin = max(1, len(there) // 500)
-    way_m = np.abs(np.diff(a[::thin])).cumsum()
+    way_m: Array = np.abs(np.diff(a[::thin])).cumsum()
     if way_m[-1] < _LEAST_WAY_M or np.abs(np.diff(b[::thin])).sum() < 0.2 * way_m[-1]:
         return None
-    first = max(5, int(np.searchsorted(way_m, _FITTED * way_m[-1])) * thin)
+    first = max(5, int(np.count_nonzero(way_m < _FITTED * way_m[-1])) * thin)
     a, b = a - a[:first].mean(), b - b[:first].mean()
-    turn = np.vdot(b[:first], a[:first])
-    off = np.abs(a - b * (turn / abs(turn) if abs(turn) else 1))
+    turn = cast("complex", np.vdot(b[:first], a[:first]))
+    off: Array = np.abs(a - b * (turn / abs(turn) if turn else 1.0))
     if off[:first].max() > max(_SAME * _FITTED * way_m[-1], 0.1):
         return None
     last = max(1, len(off) // 20)
@@ -293,13 +315,15 @@ def _turned_apart(run: RunUnderCheck, one: Signal, other: Signal) -> Finding | N
     there = np.flatnonzero(np.isfinite(angles).all(axis=0))
     if len(there) < 10:
         return None
-    # A compass that counts the other way round turns as much, against it.
     a, b = (unwrap(each[there]) for each in angles)
-    first = max(5, len(there) // 5)
-    sign = 1.0 if np.vdot(a[:first] - a[:first].mean(), b[:first] - b[:first].mean()) >= 0 else -1.0
-    off = np.abs((a - a[0]) - sign * (b - b[0]))
-    if np.ptp(a[:first]) < _TURN_WARNS_RAD or off[:first].max() > _TURN_WARNS_RAD:
+    thin = max(1, len(there) // 200)
+    turns = [np.diff(each[::thin]) for each in (a, b)]
+    size = math.sqrt(inner(turns[0], turns[0]) * inner(turns[1], turns[1]))
+    alike = inner(*turns) / size if size else 0.0
+    if np.ptp(a) < _TURN_FAILS_RAD or abs(alike) < _ALIKE:
         return None
+    # A compass that counts the other way round turns as much, against it.
+    off = np.abs((a - a[0]) - math.copysign(1.0, alike) * (b - b[0]))
     worst = float(off.max())
     evidence = f"{one.name} and {other.name}: {worst:.3g} rad apart at most"
     if worst <= _TURN_WARNS_RAD:

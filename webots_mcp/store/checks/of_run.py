@@ -118,15 +118,13 @@ def loses_no_rows(run: RunUnderCheck) -> Finding:
     """Fails where rows were dropped, warns where the database was in trouble or rows wait."""
     noticed = [e for e in run.events("bridge_event") if e.details["what"] in ("dropped", "storage")]
     rows = sum(_rows_of(each) for each in noticed)
-    if rows:
-        first = next(each for each in noticed if _rows_of(each))
-        why = first.details["data"].get("why")
-        evidence = f"{rows} rows were dropped: {why}"
-        return Finding("fail", evidence, first.start_s, len(noticed), run.more("bridge_event"))
     if noticed:
-        why = (noticed[0].details.get("data") or {}).get("why", "trouble with the database")
+        first = next((each for each in noticed if _rows_of(each)), noticed[0])
+        data: dict[str, Any] = first.details.get("data") or {}
+        evidence = f"{rows} rows were dropped" if rows else "trouble with the database"
+        evidence += f": {data.get('why', 'no reason was noted')}"
         more = run.more("bridge_event")
-        return Finding("warn", str(why), noticed[0].start_s, len(noticed), more)
+        return Finding("fail" if rows else "warn", evidence, first.start_s, len(noticed), more)
     waiting, error = run.connection.execute(_LOST, (run.info.session_id,)).fetchone()
     if run.is_over and waiting:
         return Finding("warn", f"{waiting} rows of its session still wait: {error or 'no reason'}")

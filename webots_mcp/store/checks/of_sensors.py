@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from typing import Final
+from collections.abc import Iterable, Iterator
+from typing import Final, Literal
 
-from webots_mcp.naming import find_targets, listed, words_of
+from webots_mcp.naming import REDUCTIONS, find_targets, listed, words_of
 from webots_mcp.store.analysis.arrays import np, runs_of
 from webots_mcp.store.checks.finding import (
     Finding,
@@ -15,8 +15,8 @@ from webots_mcp.store.checks.finding import (
     total_s,
 )
 from webots_mcp.store.detection.kinds import Event
-from webots_mcp.store.detection.sensors import OTHER_ROWS, is_lively, is_noisy
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.detection.sensors import OTHER_ROWS, is_noisy
+from webots_mcp.store.signals import Signal, stored_roles
 
 MOST_NAMED: Final = 3
 _FAULTY: Final = "nan"  # what a device gives that has no value; inf is a range without an end
@@ -35,8 +35,8 @@ def sensors_speak(run: RunUnderCheck) -> Finding:
     if not (silent or never):
         return Finding("pass", "none was without a value for a second")
     nan = [each for each in silent if each.details.get("value") == _FAULTY]
-    names = listed(list(dict.fromkeys([*never, *(each.name or "" for each in silent)])), MOST_NAMED)
-    evidence = f"{names}: {times(len(silent))}, {total_s(silent):.3g} s in total without a value"
+    silent = by_array(silent)
+    evidence = f"{_names(silent)}: {times(len(silent))}, {total_s(silent):.3g} s without a value"
     evidence = f"{listed(never, MOST_NAMED)}: NaN in every row" if never else evidence
     since_s = silent[0].start_s if silent and not never else run.search.began_s
     outcome = "fail" if nan or never else "warn"
@@ -44,38 +44,48 @@ def sensors_speak(run: RunUnderCheck) -> Finding:
 
 
 def sensors_live(run: RunUnderCheck) -> Finding:
-    """Fails where a signal that changes otherwise froze at one value while the robot moved.
+    """Fails where a signal froze that is noisy otherwise, or whose target went on.
 
-    Commands and speeds of wheels may be constant.
+    Warns of others that changed otherwise, and rested for 20 s while the robot moved.
     """
-    frozen = [each for each in run.events("flat") if _is_frozen(run, each)]
+    judged = [(each, _frozen(run, each)) for each in run.events("flat")]
+    frozen = by_array([each for each, outcome in judged if outcome])
     if not frozen:
         return Finding("pass", "none froze")
-    first = frozen[0]
-    names = listed(list(dict.fromkeys(each.name or "" for each in frozen)), MOST_NAMED)
+    first, outcomes = frozen[0], [outcome for _, outcome in judged]
     says = f"; {first.details['says']}" if "says" in first.details else ""
-    evidence = f"{names}: {times(len(frozen))}, up to {_longest(frozen):.3g} s the same{says}"
-    return Finding("fail", evidence, first.start_s, len(frozen), run.more("flat"))
+    longest_s = max(each.duration_s for each in frozen)
+    evidence = f"{_names(frozen)}: {times(len(frozen))}, up to {longest_s:.3g} s the same{says}"
+    outcome = "fail" if "fail" in outcomes else "warn"
+    return Finding(outcome, evidence, first.start_s, len(frozen), run.more("flat"))
 
 
-def _is_frozen(run: RunUnderCheck, flat: Event) -> bool:
+def _frozen(run: RunUnderCheck, flat: Event) -> Literal["fail", "warn"] | None:
     name, says = flat.name or "", str(flat.details.get("says", ""))
-    if name not in _sensors(run) or says.startswith(("at ", "at its limit")):
-        return False
+    if name not in _sensors(run) or says.startswith("at "):
+        return None
     if says:  # its target went on
-        return True
+        return "fail"
     frame = run.frame
     first, stop = frame.places([flat.start_s, flat.end_s]).tolist()
     before = frame.rows(max(0, first - OTHER_ROWS), first).usable(name)[1]
     after = frame.rows(stop + 1, stop + OTHER_ROWS).usable(name)[1]
     if is_noisy(np.concatenate([before, after])):
-        return True
+        return "fail"
+    if run.search.known[name].turn or name in _place(run):  # of who drives straight on
+        return None
     others = run.events("standstill") + run.events("stuck")
     if run.motion.position is None:
         branch = name.partition(".")[0]
         others = [e for e in run.events("flat") if (e.name or "").partition(".")[0] != branch]
     rests_s = (min(flat.end_s, e.end_s) - max(flat.start_s, e.start_s) for e in others)
-    return sum(max(0.0, each) for each in rests_s) < 0.5 * flat.duration_s
+    return None if sum(max(0.0, each) for each in rests_s) > flat.duration_s / 2 else "warn"
+
+
+def _place(run: RunUnderCheck) -> set[str]:
+    """The signals of where it is, in each of its positions."""
+    places = (name for name, role in stored_roles(run.search.known).items() if role[0] in "xyz")
+    return {*places, *(each.name for each in run.motion.position or ())}
 
 
 def _sensors(run: RunUnderCheck) -> dict[str, Signal]:
@@ -103,7 +113,7 @@ def _words(name: str) -> set[str]:
 
 
 _AT_LIMIT: Final = 0.05  # of the rows
-_MANY_VALUES: Final = 200  # different ones: of fewer one comes back by nature
+_MANY_VALUES: Final = 100  # different ones: of fewer one comes back by nature
 _IN_A_ROW, _OFTEN = 3, 3  # so many rows are at the limit, so many times
 
 
@@ -124,14 +134,14 @@ def sensors_within_limits(run: RunUnderCheck) -> Finding:
 
 
 def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, int]]:
-    position = {each.name for each in run.motion.position or ()}
+    position = _place(run)
     for name, signal in _sensors(run).items():
         if run.search.deadline.passed:
             return
         if name in position or signal.turn or not _RANGES.isdisjoint(_words(name)):
             continue
         zones = run.frame.zones(name)
-        if zones.change_count.sum() < _MANY_VALUES or not is_lively(run.frame, name):
+        if zones.change_count.sum() < _MANY_VALUES:
             continue
         clock, values = run.frame.usable(name)
         if len(np.unique(values)) < _MANY_VALUES:
@@ -155,12 +165,24 @@ def sensors_drop_nothing(run: RunUnderCheck) -> Finding:
         return Finding("pass", "none dropped out")
     to = Counter((each.name, float(each.details["after"])) for each in gone)
     ((name, value), most) = to.most_common(1)[0]
-    names = listed(list(dict.fromkeys(each.name or "" for each in gone)), MOST_NAMED)
-    evidence = f"{names}: away and back {times(len(gone))}"
+    gone = by_array(gone)
+    evidence = f"{_names(gone)}: away and back {times(len(gone))}"
     evidence += f"; {name} {times(most)} to {value:.6g}" if most > 1 else ""
     outcome = "fail" if most >= _OFTEN_THE_SAME else "warn"
     return Finding(outcome, evidence, gone[0].start_s, len(gone), run.more("jump"))
 
 
-def _longest(events: Sequence[Event]) -> float:
-    return max(each.duration_s for each in events)
+def by_array(events: Iterable[Event]) -> list[Event]:
+    """What the items of an array did at once as one."""
+    found = {(_branch(each), each.start_s, each.end_s): each for each in reversed(list(events))}
+    return list(reversed(found.values()))
+
+
+def _names(events: Iterable[Event]) -> str:
+    return listed(list(dict.fromkeys(map(_branch, events))), MOST_NAMED)
+
+
+def _branch(event: Event) -> str:
+    """The array, or the signal that is in none."""
+    branch, _, item = (event.name or "").rpartition(".")
+    return branch if item.isdigit() or item in REDUCTIONS else event.name or ""

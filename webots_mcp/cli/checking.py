@@ -24,6 +24,14 @@ def check(
     run_id: Annotated[Id | None, Parameter("RUN", help="Else the newest run.")] = None,
     /,
     *,
+    expect: Annotated[
+        list[str] | None,
+        Parameter(
+            "--expect",
+            metavar="CONDITION",
+            help="What shall hold, as \"front_m > 0.1 during mode == 'drive'\"; may be repeated.",
+        ),
+    ] = None,
     junit: Annotated[
         Path | None,
         Parameter("--junit", metavar="FILE", help="Write the checks there as JUnit XML too."),
@@ -42,7 +50,7 @@ def check(
     from webots_mcp.cli.asking import ask, show
     from webots_mcp.questions.check_run import webots_check_run
 
-    given = {"run_id": run_id, "robot": robot}
+    given = {"run_id": run_id, "robot": robot, "expect": expect}
     reply = ask(webots_check_run, given, recorded)
     data = reply.data or {}
     shown = reply if as_json else reply._replace(data=_as_typed(data))
@@ -62,7 +70,7 @@ def _as_typed(answer: dict[str, Any]) -> dict[str, Any]:
         if call is None:
             return cell
         words = ["webots-mcp", commands_by_tool().get(call[1], call[1])]
-        for name, value in re.findall(r"(\w+)=(\[[^]]*\]|\w+)", call[2]):
+        for name, value in re.findall(r"(\w+)=(\[[^]]*\]|'[^']*'|\w+)", call[2]):
             for each in re.findall(r"'([^']*)'", value) or [value]:
                 words += [OPTIONS.get(name, f"--{name}"), each]
         return shlex.join(words)

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from collections.abc import Sequence
+from typing import Annotated, Any, Final
 
+from pydantic import Field
+
+from webots_mcp.conditions.expectation import Expectation, read_expectation
 from webots_mcp.questions.answers import CheckAnswer
 from webots_mcp.questions.budget import (
     answer_about,
@@ -34,19 +38,27 @@ _BUDGET_TOKENS: Final = 1_400
     example="4 --junit check.xml",
 )
 def webots_check_run(
-    recording: Recording, robot: RobotName = None, run_id: RunId = None
+    recording: Recording,
+    expect: Annotated[
+        list[Annotated[str, Field(max_length=1100)]] | None,
+        Field(max_length=20, description="What shall hold: front_m > 0.1 during mode == 'drive'."),
+    ] = None,
+    robot: RobotName = None,
+    run_id: RunId = None,
 ) -> CheckAnswer:
     """Is this run well? Motion against commands, sensors, estimates, pace, log, end, rows, goal.
 
     Each check passes, warns, fails, is not applicable (what is missing) or was not looked at.
     """
+    expected = [read_expectation(each) for each in expect or ()]
     with recording.view(robot, run_id) as view:
-        return answer_about(view, CheckAnswer, lambda: _checked(view))
+        return answer_about(view, CheckAnswer, lambda: _checked(view, expected))
 
 
-def _checked(view: View) -> dict[str, Any]:
+def _checked(view: View, expected: Sequence[Expectation]) -> dict[str, Any]:
     deadline_s = _FOR_A_PERSON_S if is_for_a_person() else CHECK_DEADLINE_S
-    return told(check_run(view.connection, view.require_run().id, deadline_s=deadline_s))
+    run_id = view.require_run().id
+    return told(check_run(view.connection, run_id, expect=expected, deadline_s=deadline_s))
 
 
 def told(checked: CheckedRun) -> dict[str, Any]:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import inspect
 import sqlite3
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, Literal, NamedTuple
 
+from webots_mcp.conditions.expectation import Expectation
 from webots_mcp.store.detection.events import Found
 from webots_mcp.store.detection.kinds import Event
 from webots_mcp.store.detection.motion import Motion, RunNoise
@@ -79,12 +80,14 @@ class RunUnderCheck:
         info: What `webots_list_runs` says of it.
         found: Events of the kinds that checks judge, each by itself.
         search: In the whole run: its signals, values and motion.
+        expected: What was expected of it, be it for this question alone.
     """
 
     info: RunInfo
     robot_id: int
     found: Found
     search: Search
+    expected: Sequence[Expectation] = ()
 
     @property
     def is_over(self) -> bool:

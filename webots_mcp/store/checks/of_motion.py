@@ -34,7 +34,8 @@ def moves_when_commanded(run: RunUnderCheck) -> Finding:
 
     Warns where nothing but a mode says so that is the same in the whole run.
     """
-    motion, stuck, stood = run.motion, run.events("stuck"), run.events("standstill")
+    motion, stood = run.motion, run.events("standstill")
+    stuck = [each for each in run.events("stuck") if each.duration_s >= APART_S]
     if stuck:
         evidence = f"stuck {times(len(stuck))}, {total_s(stuck):.3g} s in total"
         first = f"{evidence}; the first time {stuck[0].details['evidence_for']}"

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from typing import Any, Final
 
+from webots_mcp.conditions.expectation import Expectation
+from webots_mcp.errors import ConditionFailedError
 from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.checks.finding import (
     Finding,
@@ -13,6 +16,7 @@ from webots_mcp.store.checks.finding import (
     times,
     total_s,
 )
+from webots_mcp.store.detection.expectation import NONE_EXPECTED, Held, judge_expectation
 from webots_mcp.store.detection.kinds import Event
 
 SLOW: Final = 0.9  # of real time
@@ -135,6 +139,41 @@ def _rows_of(event: Event) -> int:
     data: Any = event.details.get("data")
     rows = data.get("row_count") if event.details["what"] == "dropped" and data else 0
     return rows if isinstance(rows, int) else 0
+
+
+def keeps_expectations(run: RunUnderCheck) -> Iterator[Finding]:
+    """Fails where something that was expected did not hold. Each expectation is a line."""
+    if not run.expected:
+        raise NotApplicableError(NONE_EXPECTED)
+    for each in run.expected:
+        name = f"expects: {each.name}"
+        missing = [*each.violation.describe_unknown(run.search.known)]
+        if missing and not each.asks_missing:
+            yield Finding("not applicable", "; ".join(missing), name=name)
+            continue
+        try:
+            held = judge_expectation(each, run.frame, run.search.known)
+        except ConditionFailedError as error:
+            yield Finding("not looked at", str(error), name=name)
+            continue
+        yield _held(run, each, held)._replace(name=name)
+
+
+def _held(run: RunUnderCheck, each: Expectation, held: Held) -> Finding:
+    lacking = f"; without a value in {held.lacking} rows" if held.lacking else ""
+    if not held.meant_s:
+        why = f"{each.during.text!r} never held" if each.during else "it was too short"
+        return Finding("not applicable", f"it was never asked{lacking or f': {why}'}")
+    evidence = f"held {100 * held.held_s / held.meant_s:.4g} % of {held.meant_s:.4g} s{lacking}"
+    if not len(held.violations):
+        return Finding("pass", evidence)
+    evidence = f"{evidence}; {times(len(held.violations))} violated"
+    if held.worst is not None:
+        evidence += f"; worst {held.worst[0]} = {held.worst[1]:.4g}"
+    where = each.violation.text.replace("'", '"')
+    more = f"webots_find_events(where='{where}', run_id={run.info.run_id})"
+    since_s = float(held.violations.starts_s[0])
+    return Finding("fail", evidence, since_s, len(held.violations), more)
 
 
 _GOAL: Final = (

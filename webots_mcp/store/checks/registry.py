@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 import sqlite3
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Final
 
+from webots_mcp.conditions.expectation import Expectation
+from webots_mcp.errors import UnknownSignalError
 from webots_mcp.store.checks import of_motion, of_run, of_sensors
 from webots_mcp.store.checks.finding import (
     WORST_FIRST,
@@ -18,6 +21,7 @@ from webots_mcp.store.checks.finding import (
     RunUnderCheck,
 )
 from webots_mcp.store.detection.events import asked_kinds, search_events
+from webots_mcp.store.detection.expectation import expectations_of
 from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.questions.runs import run_info
@@ -66,6 +70,12 @@ CHECKS: Final[list[Check]] = [
     Check("ends well", of_run.ends_well, ""),
     Check("loses no rows", of_run.loses_no_rows, "", kinds=("bridge_event",)),
     Check("reaches its goal", of_run.reaches_goal, "a run command with a condition in `until`"),
+    Check(
+        "keeps expectations",
+        of_run.keeps_expectations,
+        "expectations, and the signals that they name",
+        of_values=True,
+    ),
 ]
 
 
@@ -97,6 +107,7 @@ def check_run(
     connection: sqlite3.Connection,
     run_id: int,
     *,
+    expect: Sequence[Expectation] = (),
     options: EventOptions | None = None,
     deadline_s: float = CHECK_DEADLINE_S,
 ) -> CheckedRun:
@@ -105,6 +116,7 @@ def check_run(
     Args:
         connection: Any.
         run_id: The run.
+        expect: What is expected besides what the run's controller and its project expect.
         options: What counts as an event, and what the position and the mode are.
         deadline_s: What was not looked at by then is said so, and does not pass.
 
@@ -112,6 +124,11 @@ def check_run(
         UnknownRunError, UnknownSignalError: As they say.
     """
     run = _under_check(connection, run_id, options or EventOptions(), deadline_s)
+    for each in expect:
+        if not each.asks_missing and (unknown := each.violation.describe_unknown(run.search.known)):
+            raise UnknownSignalError("; ".join(unknown))
+    expected = [*expectations_of(connection, run_id), *expect]
+    run.expected = list({each.asks: each for each in expected}.values())
     findings = [found for check in CHECKS for found in findings_of(check, run)]
     return CheckedRun(run_id, run.info.robot, tuple(findings))
 

@@ -142,6 +142,7 @@ def paused_s(connection: sqlite3.Connection, run_id: int, end_wall_s: float) -> 
 
 OF_CONTROLLER: Final = "controller"  # `created_by` of those that the controller's own code has set
 # Those end with their session.
+OF_PROJECT: Final = "project"  # of those of its file
 _MEANT: Final = "(b.robot_id = r.id OR b.robot_name IN ('*', r.name))"
 _OF_ROBOT: Final = (
     f"FROM robot r JOIN breakpoint b ON {_MEANT} LEFT JOIN session s ON s.id = b.session_id "
@@ -159,7 +160,7 @@ ARMED: Final = (
 )
 # What was expected of a run: by its controller's code, and by the project.
 EXPECTED: Final = (
-    "SELECT b.expects, b.during, b.name FROM run u JOIN robot r ON r.id = u.robot_id "
+    "SELECT b.expects, b.during, b.name, b.created_by FROM run u JOIN robot r ON r.id = u.robot_id "
     f"JOIN breakpoint b ON {_MEANT} WHERE u.id = ? AND b.expects IS NOT NULL "
     f"AND (b.created_by IS NOT '{OF_CONTROLLER}' OR b.session_id = u.session_id) ORDER BY b.id"
 )

@@ -59,6 +59,7 @@ from webots_mcp.questions.declaring import (
 from webots_mcp.steering.routes import Companions, Launcher
 from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.chunk_making import make_chunks, make_missing_chunks
+from webots_mcp.store.project_file import ProjectWatch
 from webots_mcp.store.purge import Upkeep
 from webots_mcp.store.questions.sql import describe_schema
 from webots_mcp.store.recording import OpenReaders, Recording
@@ -147,12 +148,13 @@ def _lifespan(
 
     What it follows is the console of each Webots that belongs to the recording.
     """
-    unasked = dict(asked)
+    unasked, project = dict(asked), ProjectWatch(recording.data_dir)
 
     def work(connection: Connection) -> None:
         if unasked:
             ask(connection, unasked)
             unasked.clear()
+        project.look(connection)
         reap_if_dead(connection)
         make_chunks(connection, pause_s=_PAUSE_S)
         retain(connection)

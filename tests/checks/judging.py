@@ -55,7 +55,7 @@ def _judge(kind: str, by: str, runs: int) -> Judged:
     return found
 
 
-def checked(kind: str, number: int) -> list[Finding]:
+def checked(kind: str, number: int, *, deadline_s: float = _UNHURRIED_S) -> list[Finding]:
     """What is said of the run of that kind and number."""
     rng = np.random.default_rng([1, number, zlib.crc32(kind.encode())])
     run = healthy(rng)
@@ -63,7 +63,7 @@ def checked(kind: str, number: int) -> list[Finding]:
         run = FAULTS[kind][0](rng, run)
     with memory_connection() as connection:
         run_id = record(connection, run, WRITTEN[kind][0] if kind in WRITTEN else "")
-        return list(check_run(connection, run_id, deadline_s=_UNHURRIED_S).findings)
+        return list(check_run(connection, run_id, deadline_s=deadline_s).findings)
 
 
 def render(judged: dict[str, Judged]) -> str:

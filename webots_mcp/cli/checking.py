@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shlex
+import sqlite3
 from collections import Counter
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 from webots_mcp.cli.options import HERE, Id, Json, Parameter, Robot, Where
 from webots_mcp.contract import whole_file
-from webots_mcp.errors import InvalidInputError
+from webots_mcp.errors import DatabaseError, InvalidInputError
 
 EXIT_CODES: Final = {"fail": 1, "not looked at": 2}
 _ELEMENTS: Final = {  # of JUnit, and by which attribute they are counted
@@ -50,6 +52,7 @@ def check(
     from webots_mcp.cli.asking import ask, show
     from webots_mcp.questions.check_run import webots_check_run
 
+    _compile(recorded)
     given = {"run_id": run_id, "robot": robot, "expect": expect}
     reply = ask(webots_check_run, given, recorded)
     data = reply.data or {}
@@ -58,6 +61,19 @@ def check(
     if junit is not None:
         _write(junit, data)
     return EXIT_CODES.get(data.get("outcome", ""), 0)
+
+
+def _compile(recorded: Where) -> None:
+    """Let controllers that start without a server read what their project expects now."""
+    from webots_mcp.store.project_file import compile_project, file_of, read_project
+
+    recording = recorded.recording(read_only=False)
+    if (file := file_of(recording.data_dir)) is None:
+        return
+    expected = read_project(file)
+    # Where nothing can be written it is asked all the same, of what is recorded.
+    with contextlib.suppress(DatabaseError, sqlite3.Error), recording.writer() as connection:
+        compile_project(connection, expected)
 
 
 def _as_typed(answer: dict[str, Any]) -> dict[str, Any]:

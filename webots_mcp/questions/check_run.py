@@ -20,6 +20,7 @@ from webots_mcp.questions.budget import (
 from webots_mcp.questions.declaring import READS, RobotName, RunId, question
 from webots_mcp.store.checks.finding import WORST_FIRST, Finding
 from webots_mcp.store.checks.registry import CHECK_DEADLINE_S, CheckedRun, check_run
+from webots_mcp.store.project_file import Expected, file_of, read_project
 from webots_mcp.store.recording import Recording, View
 
 CHECK_COLUMNS: Final = ("check", "outcome", "evidence", "since_s", "times", "more")
@@ -51,14 +52,21 @@ def webots_check_run(
     Each check passes, warns, fails, is not applicable (what is missing) or was not looked at.
     """
     expected = [read_expectation(each) for each in expect or ()]
+    file = file_of(recording.data_dir)
+    project = None if file is None else read_project(file)
     with recording.view(robot, run_id) as view:
-        return answer_about(view, CheckAnswer, lambda: _checked(view, expected))
+        return answer_about(view, CheckAnswer, lambda: _checked(view, expected, project))
 
 
-def _checked(view: View, expected: Sequence[Expectation]) -> dict[str, Any]:
+def _checked(
+    view: View, expected: Sequence[Expectation], project: Sequence[Expected] | None
+) -> dict[str, Any]:
     deadline_s = _FOR_A_PERSON_S if is_for_a_person() else CHECK_DEADLINE_S
     run_id = view.require_run().id
-    return told(check_run(view.connection, run_id, expect=expected, deadline_s=deadline_s))
+    checked = check_run(
+        view.connection, run_id, expect=expected, project=project, deadline_s=deadline_s
+    )
+    return told(checked)
 
 
 def told(checked: CheckedRun) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Iterator
 from typing import Any, Final
@@ -18,6 +19,7 @@ from webots_mcp.store.checks.finding import (
 )
 from webots_mcp.store.detection.expectation import NONE_EXPECTED, Held, judge_expectation
 from webots_mcp.store.detection.kinds import Event
+from webots_mcp.store.robots import fetch_session
 
 SLOW: Final = 0.9  # of real time
 _CELL_S: Final = 5.0  # of simulation time, over which the pace is measured
@@ -94,9 +96,13 @@ _HABIT: Final = 3  # other runs of the session that ended so: its code does it
 def ends_well(run: RunUnderCheck) -> Finding:
     """Fails where its controller crashed; warns of a reset or reload that no command asked for."""
     reason, session = run.info.end_reason, run.info.session_id
-    if reason is None:
-        return Finding("pass", "it goes on")
     more = f"webots_get_logs(run_id={run.info.run_id})"
+    if reason is None:
+        process = fetch_session(run.connection, session)
+        if process is None or process.is_alive(time.time()):
+            return Finding("pass", "it goes on")
+        silent = f"its controller, on {process.host}, has been silent and did not say that it ended"
+        return Finding("warn", silent, run.search.ended_s, 1, more)
     if reason == "crashed":
         return Finding("fail", "its controller crashed or was killed", run.search.ended_s, 1, more)
     if reason == "superseded":

@@ -24,6 +24,7 @@ from webots_mcp.store.detection.events import asked_kinds, search_events
 from webots_mcp.store.detection.expectation import expectations_of
 from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.detection.search import Search
+from webots_mcp.store.project_file import ALL, Expected
 from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.ranges import TimeRange, whole_run
@@ -108,6 +109,7 @@ def check_run(
     run_id: int,
     *,
     expect: Sequence[Expectation] = (),
+    project: Sequence[Expected] | None = None,
     options: EventOptions | None = None,
     deadline_s: float = CHECK_DEADLINE_S,
 ) -> CheckedRun:
@@ -117,6 +119,7 @@ def check_run(
         connection: Any.
         run_id: The run.
         expect: What is expected besides what the run's controller and its project expect.
+        project: What its project's file says; None for what of it was compiled last.
         options: What counts as an event, and what the position and the mode are.
         deadline_s: What was not looked at by then is said so, and does not pass.
 
@@ -127,7 +130,10 @@ def check_run(
     for each in expect:
         if not each.asks_missing and (unknown := each.violation.describe_unknown(run.search.known)):
             raise UnknownSignalError("; ".join(unknown))
-    expected = [*expectations_of(connection, run_id), *expect]
+    expected = expectations_of(connection, run_id, of_project=project is None)
+    here = (ALL, run.info.robot)
+    expected += [each.expectation for each in project or () if each.robot in here]
+    expected += expect
     run.expected = list({each.asks: each for each in expected}.values())
     findings = [found for check in CHECKS for found in findings_of(check, run)]
     return CheckedRun(run_id, run.info.robot, tuple(findings))

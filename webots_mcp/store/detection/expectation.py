@@ -12,7 +12,7 @@ from webots_mcp.conditions.compiler import Condition
 from webots_mcp.conditions.expectation import Expectation, parse_expectation
 from webots_mcp.conditions.signal_values import SAME_TIME_S
 from webots_mcp.errors import ConditionFailedError, InvalidConditionError
-from webots_mcp.pauses import EXPECTED, VIOLATION
+from webots_mcp.pauses import EXPECTED, OF_PROJECT, VIOLATION
 from webots_mcp.store.analysis.arrays import Flags, Runs, np, runs_of
 from webots_mcp.store.detection.condition import (
     holds_in,
@@ -55,13 +55,23 @@ class Held:
     worst: tuple[str, float] | None
 
 
-def expectations_of(connection: sqlite3.Connection, run_id: int) -> list[Expectation]:
-    """What was expected of a run: by its controller's code, and by its project now."""
+def expectations_of(
+    connection: sqlite3.Connection, run_id: int, *, of_project: bool = True
+) -> list[Expectation]:
+    """What was expected of a run: by its controller's code, and by its project as compiled last.
+
+    Args:
+        connection: Any.
+        run_id: The run.
+        of_project: False leaves out what its project expects.
+    """
     found = list[Expectation]()
-    for expects, during, name in connection.execute(EXPECTED, (run_id,)).fetchall():
+    for expects, during, name, by in connection.execute(EXPECTED, (run_id,)).fetchall():
         try:
+            if by == OF_PROJECT and not of_project:
+                continue
             found.append(parse_expectation(expects, during, name))
-        except InvalidConditionError:  # noqa: PERF203  (another program's: no bridge asks it)
+        except InvalidConditionError:
             continue
     return list({each.asks: each for each in found}.values())
 

@@ -129,7 +129,7 @@ class RunUnderCheck:
         verdicts = self.found.verdicts
         for kind in check.kinds:
             if why := verdicts.unlooked(kind):
-                return Finding("not looked at" if _is_unread(why) else "not applicable", why)
+                return Finding(outcome_of(why), why)
         if check.of_values and not len(self.frame):
             why = "; ".join(map(str, self.frame.unread))
             none = f"run {self.info.run_id} has no state row: call bridge.publish"
@@ -153,6 +153,11 @@ class RunUnderCheck:
 
 def _is_unread(why: str) -> bool:
     return why.startswith(NOT_READ) or _TIMED_OUT in why
+
+
+def outcome_of(why: str) -> Outcome:
+    """Of a check that could not be made, by why: there was no time, or something is missing."""
+    return "not looked at" if _is_unread(why) else "not applicable"
 
 
 def total_s(events: Iterable[Event]) -> float:

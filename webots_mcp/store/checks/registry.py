@@ -19,10 +19,11 @@ from webots_mcp.store.checks.finding import (
     NotApplicableError,
     Outcome,
     RunUnderCheck,
+    outcome_of,
 )
 from webots_mcp.store.detection.events import asked_kinds, search_events
 from webots_mcp.store.detection.expectation import expectations_of
-from webots_mcp.store.detection.kinds import EventOptions
+from webots_mcp.store.detection.kinds import EventOptions, NotSearchableError
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.project_file import ALL, Expected
 from webots_mcp.store.questions.runs import run_info
@@ -164,17 +165,25 @@ def _under_check(
 
 def findings_of(check: Check, run: RunUnderCheck) -> list[Finding]:
     """What a check finds; it does not pass on what could not be looked at."""
-    if (lacking := run.lacking(check)) is not None:
-        return [lacking._replace(name=check.name)]
     try:
-        made = check.find(run)
-        found = [made] if isinstance(made, Finding) else list(made)
+        found = _made(check, run)
     except NotApplicableError as error:
         found = [Finding("not applicable", str(error))]
-    if unread := run.unread(check):
-        found = [
-            each._replace(outcome="not looked at", evidence=f"{unread}; {each.evidence}")
-            if each.outcome in ("pass", "not applicable") else each
-            for each in found
-        ]  # fmt: skip
+    except NotSearchableError as error:  # no row could be read in time
+        found = [Finding(outcome_of(str(error)), str(error))]
     return [each if each.name else each._replace(name=check.name) for each in found]
+
+
+def _made(check: Check, run: RunUnderCheck) -> list[Finding]:
+    if (lacking := run.lacking(check)) is not None:
+        return [lacking]
+    made = check.find(run)
+    found = [made] if isinstance(made, Finding) else list(made)
+    if not (unread := run.unread(check)):
+        return found
+    return [
+        each
+        if each.outcome in ("fail", "warn")
+        else each._replace(outcome="not looked at", evidence=f"{unread}; {each.evidence}")
+        for each in found
+    ]

@@ -18,7 +18,7 @@ from webots_mcp.questions.budget import (
     without_empty,
 )
 from webots_mcp.questions.declaring import READS, RobotName, RunId, question
-from webots_mcp.store.checks.finding import WORST_FIRST, Finding
+from webots_mcp.store.checks.finding import Finding
 from webots_mcp.store.checks.registry import CHECK_DEADLINE_S, CheckedRun, check_run
 from webots_mcp.store.project_file import Expected, file_of, read_project
 from webots_mcp.store.recording import Recording, View
@@ -71,10 +71,7 @@ def _checked(
 
 def told(checked: CheckedRun) -> dict[str, Any]:
     """What became of the checks, the worst first; of those that passed the names."""
-    others = sorted(
-        (each for each in checked.findings if each.outcome != "pass"),
-        key=lambda each: WORST_FIRST.index(each.outcome),
-    )
+    others = [each for each in checked.worst_first if each.outcome != "pass"]
     rows = fitting([_row(each) for each in others], None if is_for_a_person() else _BUDGET_TOKENS)
     left = len(others) - len(rows)
     return {

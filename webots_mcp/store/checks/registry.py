@@ -21,7 +21,7 @@ from webots_mcp.store.checks.finding import (
     RunUnderCheck,
     outcome_of,
 )
-from webots_mcp.store.detection.events import asked_kinds, search_events
+from webots_mcp.store.detection.events import Found, asked_kinds, search_events
 from webots_mcp.store.detection.expectation import expectations_of
 from webots_mcp.store.detection.kinds import EventOptions, NotSearchableError
 from webots_mcp.store.detection.search import Search
@@ -99,6 +99,11 @@ class CheckedRun:
         there = {each.outcome for each in self.findings}
         return next(each for each in WORST_FIRST if each in there)
 
+    @property
+    def worst_first(self) -> list[Finding]:
+        """All of them."""
+        return sorted(self.findings, key=lambda each: WORST_FIRST.index(each.outcome))
+
     def of(self, *outcomes: Outcome) -> list[Finding]:
         """Those that came out so."""
         return [each for each in self.findings if each.outcome in outcomes]
@@ -111,7 +116,7 @@ def check_run(
     *,
     expect: Sequence[Expectation] = (),
     project: Sequence[Expected] | None = None,
-    options: EventOptions | None = None,
+    found: Found | None = None,
     deadline_s: float = CHECK_DEADLINE_S,
 ) -> CheckedRun:
     """Make all checks of a run.
@@ -121,13 +126,13 @@ def check_run(
         run_id: The run.
         expect: What is expected besides what the run's controller and its project expect.
         project: What its project's file says; None for what of it was compiled last.
-        options: What counts as an event, and what the position and the mode are.
+        found: All events of the whole run, each by itself, where they are known already.
         deadline_s: What was not looked at by then is said so, and does not pass.
 
     Raises:
         UnknownRunError, UnknownSignalError: As they say.
     """
-    run = _under_check(connection, run_id, options or EventOptions(), deadline_s)
+    run = _under_check(connection, run_id, found, deadline_s)
     for each in expect:
         if not each.asks_missing and (unknown := each.violation.describe_unknown(run.search.known)):
             raise UnknownSignalError("; ".join(unknown))
@@ -141,16 +146,15 @@ def check_run(
 
 
 def _under_check(
-    connection: sqlite3.Connection, run_id: int, options: EventOptions, deadline_s: float
+    connection: sqlite3.Connection, run_id: int, found: Found | None, deadline_s: float
 ) -> RunUnderCheck:
     import_module("numpy")  # once per process, before the time counts
     robot_id, info = fetch_run(connection, run_id).robot_id, run_info(connection, run_id)
     whole = Segment(run_id, -math.inf, math.inf, open_start=True, open_end=True)
     segment = whole_run(connection, run_id) or whole
     kinds = tuple(dict.fromkeys(kind for check in CHECKS for kind in check.kinds))
-    wanted = EventOptions(kinds, position=options.position, mode=options.mode)
-    deadline = Deadline(deadline_s)
-    found = search_events(
+    wanted, deadline = EventOptions(kinds), Deadline(deadline_s)
+    found = found or search_events(
         connection,
         TimeRange(robot_id, info.robot, (segment,), "simulation"),
         wanted,

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import json
 import time
 
 import pytest
 
 from tests.recordings.rows import Recorded
-from tests.server.conftest import DATA_TOOLS, Connect, ask, fail, text_of, text_of
+from tests.server.conftest import DATA_TOOLS, Connect, ask, fail, text_of
 
 pytestmark = pytest.mark.anyio
 

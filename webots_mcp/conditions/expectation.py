@@ -55,7 +55,7 @@ class Expectation:
 
     @property
     def needs_two(self) -> bool:
-        """Whether the first state alone tells nothing of it."""
+        """Whether the first state alone shows nothing of it."""
         return "rate(" in self.expected.text
 
     def evaluator(self, plain: Plain) -> Violated:

@@ -181,7 +181,6 @@ def make_report(
     for chapter in chapters:
         pictures = pictures_of(chapter.images, data_dir, share_bytes)
         page.pictures[chapter.info.run_id] = pictures
-        rest_bytes -= sum(picture.size_bytes for picture in pictures.shown)
         done.step()
     page = replace(page, left_out=_left_out(page))
     html = render(replace(page, size_bytes=len(render(page))))

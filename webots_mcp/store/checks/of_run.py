@@ -18,7 +18,6 @@ from webots_mcp.store.checks.finding import (
     total_s,
 )
 from webots_mcp.store.detection.expectation import NONE_EXPECTED, Held, judge_expectation
-from webots_mcp.store.detection.kinds import Event
 from webots_mcp.store.robots import fetch_session
 
 SLOW: Final = 0.9  # of real time
@@ -126,25 +125,19 @@ _LOST: Final = "SELECT rows_waiting, last_error FROM session WHERE id = ?"
 
 def loses_no_rows(run: RunUnderCheck) -> Finding:
     """Fails where rows were dropped, warns where the database was in trouble or rows wait."""
-    noticed = [e for e in run.events("bridge_event") if e.details["what"] in ("dropped", "storage")]
-    rows = sum(_rows_of(each) for each in noticed)
-    if noticed:
-        first = next((each for each in noticed if _rows_of(each)), noticed[0])
-        data: dict[str, Any] = first.details.get("data") or {}
-        evidence = f"{rows} rows were dropped" if rows else "trouble with the database"
-        evidence += f": {data.get('why', 'no reason was noted')}"
+    noticed = run.events("bridge_event")
+    dropped = [each for each in noticed if each.details["what"] == "dropped"]
+    if found := dropped or [each for each in noticed if each.details["what"] == "storage"]:
+        data: list[dict[str, Any]] = [each.details.get("data") or {} for each in found]
+        rows = sum(each.get("row_count", 0) for each in data) or "some"
+        evidence = f"{rows} rows were dropped" if dropped else "trouble with the database"
+        evidence += f": {data[0].get('why', 'no reason was noted')}"
         more = run.more("bridge_event")
-        return Finding("fail" if rows else "warn", evidence, first.start_s, len(noticed), more)
+        return Finding("fail" if dropped else "warn", evidence, found[0].start_s, len(found), more)
     waiting, error = run.connection.execute(_LOST, (run.info.session_id,)).fetchone()
     if run.is_over and waiting:
         return Finding("warn", f"{waiting} rows of its session still wait: {error or 'no reason'}")
     return Finding("pass", f"all {run.info.row_count} rows are recorded")
-
-
-def _rows_of(event: Event) -> int:
-    data: Any = event.details.get("data")
-    rows = data.get("row_count") if event.details["what"] == "dropped" and data else 0
-    return rows if isinstance(rows, int) else 0
 
 
 def keeps_expectations(run: RunUnderCheck) -> Iterator[Finding]:

@@ -76,39 +76,3 @@ async def test_one_that_would_go_off_at_once_says_so(connect: Connect, driver: D
         (note,) = answer["notes"]
         assert note.startswith("it will be turned off by the next state like the last ones")
         assert "> the number 1?" in note
-
-
-async def test_where_no_controller_runs_it_is_said_that_none_is_asked_and_which_come_back(
-    connect: Connect, driver: Driver
-) -> None:
-    driver.bridge.breakpoint("steps == 1000000")
-    async with connect() as client:
-        await newest_state(client)
-        before = await ask(client, "webots_list_breakpoints")
-        assert before["breakpoints"]["rows"] and "hint" not in before
-        driver.stop()
-        listed = await ask(client, "webots_list_breakpoints")
-        assert "breakpoints" not in listed
-        assert listed["hint"].startswith("no controller of this robot runs, so none is asked")
-        await ask(client, "webots_breakpoint", condition="steps == 2000000", action="log")
-        listed = await ask(client, "webots_list_breakpoints")
-        assert [row[1] for row in listed["breakpoints"]["rows"]] == ["steps == 2000000"]
-        assert "those of webots_breakpoint stay" in listed["hint"]
-
-
-async def test_where_no_controller_runs_it_is_said_that_none_is_asked_and_which_come_back(
-    connect: Connect, driver: Driver
-) -> None:
-    driver.bridge.breakpoint("steps == 1000000")
-    async with connect() as client:
-        await newest_state(client)
-        before = await ask(client, "webots_list_breakpoints")
-        assert before["breakpoints"]["rows"] and "hint" not in before
-        driver.stop()
-        listed = await ask(client, "webots_list_breakpoints")
-        assert "breakpoints" not in listed
-        assert listed["hint"].startswith("no controller of this robot runs, so none is asked")
-        await ask(client, "webots_breakpoint", condition="steps == 2000000", action="log")
-        listed = await ask(client, "webots_list_breakpoints")
-        assert [row[1] for row in listed["breakpoints"]["rows"]] == ["steps == 2000000"]
-        assert "those of webots_breakpoint stay" in listed["hint"]

@@ -16,7 +16,6 @@ import sqlite3
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
@@ -123,26 +122,21 @@ def compile_project(connection: sqlite3.Connection, expected: Sequence[Expected]
         connection.executemany(_ADD, rows)
 
 
-@dataclass
 class ProjectWatch:
     """Compiles the file of a recording's project again where it has changed."""
 
-    data_dir: Path
-    _seen: tuple[Path, int, int] | None = field(default=None, init=False)
-    _is_new: bool = field(default=True, init=False)
+    def __init__(self, data_dir: Path) -> None:
+        self._data_dir = data_dir
+        self._seen: tuple[Path | None, int] | None = None
 
     def look(self, connection: sqlite3.Connection) -> None:
         """Compile it if it is another than at the last look; warn once of one that is invalid."""
-        file = file_of(self.data_dir)
-        try:
-            status = file and file.stat()
-        except OSError:
-            status = None
-        seen = (file, status.st_mtime_ns, status.st_size) if file and status else None
-        if seen == self._seen and not self._is_new:
+        file = file_of(self._data_dir)
+        seen = (file, file.stat().st_mtime_ns if file else 0)
+        if seen == self._seen:
             return
-        self._seen, self._is_new = seen, False
+        self._seen = seen
         try:
-            compile_project(connection, read_project(file) if file and seen else [])
+            compile_project(connection, read_project(file) if file else [])
         except InvalidInputError as error:
             warn(f"{error}. What was expected before stays")

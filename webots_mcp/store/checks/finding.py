@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import sqlite3
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -90,16 +89,6 @@ class RunUnderCheck:
     expected: Sequence[Expectation] = ()
 
     @property
-    def is_over(self) -> bool:
-        """Whether nothing of it goes on."""
-        return self.info.end_reason is not None
-
-    @property
-    def connection(self) -> sqlite3.Connection:
-        """To the recording."""
-        return self.search.connection
-
-    @property
     def frame(self) -> Frame:
         """All rows of the run."""
         return self.search.whole
@@ -116,13 +105,16 @@ class RunUnderCheck:
 
     def events(self, kind: str) -> list[Event]:
         """What was found of a kind, in order."""
-        return sorted(
-            (each for each in self.found.events if each.kind == kind), key=lambda e: e.start_s
-        )
+        found = (each for each in self.found.events if each.kind == kind)
+        return sorted(found, key=lambda each: each.start_s)
 
     def more(self, *kinds: str) -> str:
         """The call that shows events of these kinds."""
         return f"webots_find_events(kinds={list(kinds)}, run_id={self.info.run_id})"
+
+    def shows(self, *names: str) -> str:
+        """The call that shows signals."""
+        return f"webots_query_history(signals={list(names)}, run_id={self.info.run_id})"
 
     def lacking(self, check: Check) -> Finding | None:
         """Why a check cannot be made at all; None if it can."""
@@ -138,12 +130,8 @@ class RunUnderCheck:
 
     def unread(self, check: Check) -> str:
         """What of the run a check did not see; empty if nothing."""
-        reasons = [
-            why
-            for kind in check.kinds
-            for why in self.found.verdicts.reasons.get(kind, ())
-            if _is_unread(why)
-        ]
+        said = self.found.verdicts.reasons
+        reasons = [why for kind in check.kinds for why in said.get(kind, ()) if _is_unread(why)]
         if check.of_values:
             reasons += map(str, self.frame.unread)
             if self.search.deadline.passed:

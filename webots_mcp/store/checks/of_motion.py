@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from typing import Any, Final, NamedTuple, cast
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, Final, cast
 
 from webots_mcp.naming import METRES, find_targets, in_snake_case, listed, unit_in
 from webots_mcp.signal_register import PLACES
-from webots_mcp.store.analysis.arrays import Array, Run, inner, median, np, runs_of
+from webots_mcp.store.analysis.arrays import Array, Indexes, Run, inner, median, np, runs_of
 from webots_mcp.store.analysis.summary import unwrap
 from webots_mcp.store.checks.finding import (
     Finding,
@@ -18,6 +18,7 @@ from webots_mcp.store.checks.finding import (
     total_s,
 )
 from webots_mcp.store.detection.condition import lasting
+from webots_mcp.store.detection.jump import JUMP
 from webots_mcp.store.detection.kinds import Event
 from webots_mcp.store.detection.motion import in_metres, places_in
 from webots_mcp.store.detection.standstill import ON_THE_SPOT
@@ -83,8 +84,8 @@ def follows_targets(run: RunUnderCheck) -> Finding:
     names = listed(list(dict.fromkeys(signal.name for signal, *_ in found)), 3)
     longest, by = max((rest.duration_s, by) for _, rest, by in found)
     evidence = f"{names}: up to {longest:.3g} s without coming nearer, {by:.3g} away"
-    more = f"webots_query_history(signals={[found[0][0].name]}, run_id={run.info.run_id})"
-    return Finding("fail", evidence, found[0][1].start_s, len(found), more)
+    since_s, shown = found[0][1].start_s, run.shows(found[0][0].name)
+    return Finding("fail", evidence, since_s, len(found), shown)
 
 
 def _pairs(run: RunUnderCheck) -> Iterator[tuple[Signal, Signal]]:
@@ -150,86 +151,70 @@ def wheels_grip(run: RunUnderCheck) -> Finding:
         raise NotApplicableError("publish the position and the speeds of its wheels")
     if position[0].name.partition(".")[0] in _BY_WHEELS:
         raise NotApplicableError(f"{position[0].name} is counted by the wheels themselves")
-    cells = _cells(run, position, wheels)
-    ahead = cells.turned > 0
-    if np.count_nonzero(ahead) < _LEAST_CELLS:
+    starts_s, lasts_s, ratios = _ratios(run, position, wheels)
+    known = np.isfinite(ratios)
+    if np.count_nonzero(known) < _LEAST_CELLS:
         raise NotApplicableError("its wheels drove it ahead too seldom")
-    ratios = cells.went_m_s[ahead] / cells.turned[ahead]
-    usual = median(ratios[ratios >= np.quantile(ratios, 0.5)])
+    usual = median(ratios[ratios >= np.nanquantile(ratios, 0.5)])
     rolled = ratios[ratios >= _SLIPS * usual]
-    spread = median(np.abs(rolled - median(rolled))) / 0.6745
-    if usual <= 0 or spread > _SPREAD * usual:
+    usual = median(rolled)
+    if usual <= 0 or median(np.abs(rolled - usual)) > _SPREAD * usual:
         raise NotApplicableError("its speed and that of its wheels have no fixed ratio")
-    slips = np.zeros(len(ahead), np.bool_)
-    slips[ahead] = ratios < _SLIPS * median(rolled)
-    found = [
-        each for each in runs_of(slips, cells.starts_s).each()
-        if each.duration_s + cells.lasts_s >= APART_S
-    ]  # fmt: skip
+    slips = runs_of(ratios < _SLIPS * usual, starts_s)
+    found = list(slips.only(slips.durations_s + 2 * lasts_s >= APART_S).each())
     unit = "" if unit_in(wheels[0].name) in METRES else " per unit of wheel speed"
-    rolls = f"rolls {median(rolled):.3g} m/s{unit}"
+    rolls = f"rolls {usual:.3g} m/s{unit}"
     if not found:
-        return Finding("pass", f"{rolls}, over {len(ratios)} stretches of {cells.lasts_s:g} s")
-    longest = max(each.duration_s for each in found) + cells.lasts_s
-    least = min(float(ratios_in.min()) for ratios_in in _ratios_of(found, cells))
-    evidence = f"slipped {times(len(found))}, up to {longest:.3g} s; {rolls}, then {least:.3g}"
-    more = f"webots_query_history(signals={[wheels[0].name]}, run_id={run.info.run_id})"
-    return Finding("fail", evidence, found[0].start_s, len(found), more)
+        return Finding("pass", f"{rolls}, over {np.count_nonzero(known) * lasts_s:.3g} s")
+    longest_s = max(each.duration_s for each in found) + 2 * lasts_s
+    least = min(float(np.nanmin(ratios[each.start : each.stop])) for each in found)
+    evidence = f"slipped {times(len(found))}, up to {longest_s:.3g} s; {rolls}, then {least:.3g}"
+    return Finding("fail", evidence, found[0].start_s, len(found), run.shows(wheels[0].name))
 
 
-class _Cells(NamedTuple):
-    """Stretches of one length: how fast the robot went in each, and how fast its wheels turned.
+def _ratios(
+    run: RunUnderCheck, position: tuple[Signal, Signal], wheels: list[Signal]
+) -> tuple[Array, float, Array]:
+    """From cell to cell how far it went per turn of its wheels; NaN where these do not drive it.
 
-    Attributes:
-        turned: Their mean; 0 where they do not drive it ahead, or nothing is known.
+    Returns:
+        When each cell begins, how long cells are, and the ratios.
     """
-
-    starts_s: Array
-    lasts_s: float
-    went_m_s: Array
-    turned: Array
-
-
-def _ratios_of(found: list[Run], cells: _Cells) -> Iterator[Array]:
-    for each in found:
-        rows = slice(each.start, each.stop)
-        yield cells.went_m_s[rows] / cells.turned[rows]
-
-
-def _cells(run: RunUnderCheck, position: tuple[Signal, Signal], wheels: list[Signal]) -> _Cells:
-    frame = run.frame
-    rows, x, y = places_in(frame, position)
-    clock = frame.times[rows]
-    speeds = np.nan_to_num([frame.numbers(each.name)[rows] for each in wheels])
+    rows, x, y = places_in(run.frame, position)
+    clock = run.frame.times[rows]
+    speeds = np.nan_to_num([run.frame.numbers(each.name)[rows] for each in wheels])
     mean, fastest = speeds.mean(axis=0), np.abs(speeds).max(axis=0)
     ahead = (np.abs(mean) >= ON_THE_SPOT * fastest) & (fastest > 4 * run.noise.of(wheels[0].name))
+    drives = np.sign(mean) * ahead
     per_row_s = max(run.noise.interval_s, 1e-6)
-    way_m = float(np.hypot(np.diff(x), np.diff(y)).sum()) if len(x) > 1 else 0.0
-    drove_s = max(1, int(np.count_nonzero(ahead))) * per_row_s
-    lasts_s = _CELLS_S[0]
-    for lasts_s in _CELLS_S:
-        noise_m = 2 * run.noise.position_m / math.sqrt(max(1.0, lasts_s / per_row_s / 4))
-        if lasts_s >= 4 * per_row_s and noise_m / lasts_s <= _NOISE_SHARE * way_m / drove_s:
-            break
-    edges = np.arange(clock[0], clock[-1], lasts_s) if len(clock) > 1 else np.zeros(0)
-    first = np.searchsorted(clock, edges)
-    stop = np.searchsorted(clock, edges + lasts_s)
-    full = stop - first >= 3
-    edges, first, stop = edges[full], first[full], stop[full]
-    went, turned = np.zeros(len(edges)), np.zeros(len(edges))
-    heading = None if run.motion.heading is None else frame.numbers(run.motion.heading.name)[rows]
-    for cell, (a, b) in enumerate(zip(first.tolist(), stop.tolist(), strict=True)):
-        few = max(1, (b - a) // 4)
-        gone = [each[b - few : b].mean() - each[a : a + few].mean() for each in (x, y)]
-        took_s = clock[b - few : b].mean() - clock[a : a + few].mean()
-        went[cell] = math.hypot(*gone) / took_s
-        whole = bool(ahead[a:b].all()) and (np.sign(mean[a:b]) == np.sign(mean[a])).all()
-        if heading is not None and whole:
-            turn = run.motion.heading.turn if run.motion.heading else None
-            course = unwrap(heading[a:b], turn or math.tau) * math.tau / (turn or math.tau)
-            whole = bool(np.ptp(course) <= _TURNS_RAD)
-        turned[cell] = abs(float(mean[a:b].mean())) if whole else 0.0
-    return _Cells(edges, lasts_s, went, turned)
+    way_m = float(np.hypot(np.diff(x), np.diff(y)).sum())
+    speed_m_s = way_m / (max(1, int(np.count_nonzero(ahead))) * per_row_s)
+    noises = {each: 1.5 * run.noise.position_m * (per_row_s / each) ** 0.5 for each in _CELLS_S}
+    fit = (
+        each for each, noise_m in noises.items()
+        if each >= 3 * per_row_s and noise_m / each <= _NOISE_SHARE * speed_m_s
+    )  # fmt: skip
+    lasts_s = next(fit, _CELLS_S[-1])
+    cells = (clock // lasts_s).astype(np.intp)
+    starts = np.flatnonzero(np.diff(cells, prepend=-1))
+    if len(starts) < 2:
+        return np.zeros(0), lasts_s, np.zeros(0)
+    course = np.zeros(len(rows))
+    if (heading := run.motion.heading) is not None:
+        turn = heading.turn or math.tau
+        course = unwrap(run.frame.numbers(heading.name)[rows], turn) * math.tau / turn
+    counts = np.diff(starts, append=len(rows))
+    t, x, y, turned, course, driven = (
+        np.add.reduceat(each, starts) / counts for each in (clock, x, y, mean, course, drives)
+    )
+    whole = (np.abs(driven) == 1) & (counts >= 2)
+    both = whole[1:] & whole[:-1] & (driven[1:] == driven[:-1]) & (np.diff(cells[starts]) == 1)
+    both &= np.abs(np.diff(course)) <= _TURNS_RAD
+    rates = np.abs(turned[1:] + turned[:-1]) / 2 * np.diff(t)
+    went_m = np.hypot(np.diff(x), np.diff(y))
+    ratios = np.full(len(both), math.nan)
+    ratios[both] = went_m[both] / rates[both]
+    return clock[starts[:-1]], lasts_s, ratios
 
 
 # -- two estimates of one thing --------------------------------------------------------------------
@@ -248,12 +233,10 @@ def estimates_agree(run: RunUnderCheck) -> Finding:
 
     Each may have a frame of its own: they are laid over each other where the run begins.
     """
-    positions, headings = list(_positions(run)), _headings(run)
-    findings = [
-        each for other in positions[1:] if (each := _drift(run, positions[0], other)) is not None
-    ]
-    findings += [each for other in headings[1:] if (each := _turned_apart(run, headings[0], other))]
-    if not findings:
+    positions, headings = _positions(run), _headings(run)
+    made = [_drift(run, positions[0], other) for other in positions[1:]]
+    made += [_turned_apart(run, headings[0], other) for other in headings[1:]]
+    if not (findings := [each for each in made if each is not None]):
         raise NotApplicableError(
             "no second position or heading of the robot that goes along with the first"
             f" for {_LEAST_WAY_M:g} m: publish gps and odometry, say"
@@ -296,17 +279,27 @@ def _drift(
     off: Array = np.abs(a - b * (turn / abs(turn) if turn else 1.0))
     if off[:first].max() > max(_SAME * _FITTED * way_m[-1], 0.1):
         return None
-    last = max(1, len(off) // 20)
-    end_m, worst_m = median(off[-last:]), float(off.max())
     names = " and ".join(each[0].name.rpartition(".")[0] or each[0].name for each in (one, other))
-    apart = f"{worst_m:.3g} m apart at most, {end_m:.3g} m at the end"
-    evidence = f"{names}: {apart} of {way_m[-1]:.3g} m"
     limits = [max(share * way_m[-1], least) for share, least in (_WARNS, _FAILS)]
-    if worst_m <= limits[0]:
-        return Finding("pass", evidence)
+    what = f"{names}: {{:.3g}} m apart at most, of a way of {way_m[-1]:.3g} m"
+    return _came_apart(run, there, off, limits, what, (one[0], other[0]))
+
+
+def _came_apart(
+    run: RunUnderCheck,
+    there: Indexes,
+    off: Array,
+    limits: Sequence[float],
+    what: str,
+    signals: Iterable[Signal],
+) -> Finding:
+    worst = float(off.max())
+    if worst <= limits[0]:
+        return Finding("pass", what.format(worst))
     since_s = float(run.frame.times[there][int(np.argmax(off > limits[0]))])
-    more = f"webots_plot(signals={[one[0].name, other[0].name]}, run_id={run.info.run_id})"
-    return Finding("fail" if worst_m > limits[1] else "warn", evidence, since_s, 1, more)
+    outcome = "fail" if worst > limits[1] else "warn"
+    shown = run.shows(*(each.name for each in signals))
+    return Finding(outcome, what.format(worst), since_s, 1, shown)
 
 
 def _turned_apart(run: RunUnderCheck, one: Signal, other: Signal) -> Finding | None:
@@ -325,22 +318,17 @@ def _turned_apart(run: RunUnderCheck, one: Signal, other: Signal) -> Finding | N
         return None
     # A compass that counts the other way round turns as much, against it.
     off = np.abs((a - a[0]) - math.copysign(1.0, alike) * (b - b[0]))
-    worst = float(off.max())
-    evidence = f"{one.name} and {other.name}: {worst:.3g} rad apart at most"
-    if worst <= _TURN_WARNS_RAD:
-        return Finding("pass", evidence)
-    since_s = float(run.frame.times[there][int(np.argmax(off > _TURN_WARNS_RAD))])
-    more = f"webots_plot(signals={[one.name, other.name]}, run_id={run.info.run_id})"
-    return Finding("fail" if worst > _TURN_FAILS_RAD else "warn", evidence, since_s, 1, more)
+    what = f"{one.name} and {other.name}: {{:.3g}} rad apart at most"
+    return _came_apart(run, there, off, (_TURN_WARNS_RAD, _TURN_FAILS_RAD), what, (one, other))
 
 
 def stays_in_place(run: RunUnderCheck) -> Finding:
     """Warns where the position jumped: something put it elsewhere, or the estimate is wrong."""
     if run.motion.position is None:
         raise NotApplicableError("no position is published")
-    leaps = [each for each in run.events("jump") if each.name == "position"]
+    leaps = [each for each in run.events(JUMP.name) if each.name == "position"]
     if not leaps:
         return Finding("pass", "its position never jumped")
     far_m = max(float(each.details.get("distance_m", 0.0)) for each in leaps)
     evidence = f"its position jumped {times(len(leaps))}, up to {far_m:.3g} m"
-    return Finding("warn", evidence, leaps[0].start_s, len(leaps), run.more("jump"))
+    return Finding("warn", evidence, leaps[0].start_s, len(leaps), run.more(JUMP.name))

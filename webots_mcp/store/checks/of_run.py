@@ -97,7 +97,7 @@ def ends_well(run: RunUnderCheck) -> Finding:
     reason, session = run.info.end_reason, run.info.session_id
     more = f"webots_get_logs(run_id={run.info.run_id})"
     if reason is None:
-        process = fetch_session(run.connection, session)
+        process = fetch_session(run.search.connection, session)
         if process is None or process.is_alive(time.time()):
             return Finding("pass", "it goes on")
         silent = f"its controller, on {process.host}, has been silent and did not say that it ended"
@@ -110,10 +110,10 @@ def ends_well(run: RunUnderCheck) -> Finding:
         return Finding("pass", f"it ended: {reason}")
     last_s = run.info.started_wall_time_s + run.info.wall_duration_s
     asked = {"session": session, "last": last_s}
-    if run.connection.execute(_RESET_BY, asked).fetchone()[0]:
+    if run.search.connection.execute(_RESET_BY, asked).fetchone()[0]:
         return Finding("pass", f"it ended by a {reason} that a command asked for")
     others = (session, run.info.run_id)
-    habit = int(run.connection.execute(_ENDS_OF_SESSION, others).fetchone()[0])
+    habit = int(run.search.connection.execute(_ENDS_OF_SESSION, others).fetchone()[0])
     if reason == "reset" and habit >= _HABIT:
         return Finding("pass", f"it ended by a reset, as {habit} others of its session")
     evidence = f"it ended by a {reason} that no command asked for: by hand, or by code"
@@ -134,8 +134,8 @@ def loses_no_rows(run: RunUnderCheck) -> Finding:
         evidence += f": {data[0].get('why', 'no reason was noted')}"
         more = run.more("bridge_event")
         return Finding("fail" if dropped else "warn", evidence, found[0].start_s, len(found), more)
-    waiting, error = run.connection.execute(_LOST, (run.info.session_id,)).fetchone()
-    if run.is_over and waiting:
+    waiting, error = run.search.connection.execute(_LOST, (run.info.session_id,)).fetchone()
+    if run.info.end_reason and waiting:
         return Finding("warn", f"{waiting} rows of its session still wait: {error or 'no reason'}")
     return Finding("pass", f"all {run.info.row_count} rows are recorded")
 
@@ -187,7 +187,7 @@ _GOAL: Final = (
 def reaches_goal(run: RunUnderCheck) -> Finding:
     """Fails where the condition of its last run command, or trial, did not come to hold."""
     asked = (run.robot_id, run.info.run_id)
-    row = run.connection.execute(_GOAL, asked).fetchone()
+    row = run.search.connection.execute(_GOAL, asked).fetchone()
     if row is None:
         raise NotApplicableError("no finished run command had a goal: webots_run(until=...)")
     goal, ended, took_s, at_s = row

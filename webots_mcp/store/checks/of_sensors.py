@@ -14,8 +14,9 @@ from webots_mcp.store.checks.finding import (
     times,
     total_s,
 )
+from webots_mcp.store.detection.jump import JUMP
 from webots_mcp.store.detection.kinds import Event
-from webots_mcp.store.detection.sensors import OTHER_ROWS, is_noisy
+from webots_mcp.store.detection.sensors import FLAT, OTHER_ROWS, is_noisy
 from webots_mcp.store.signals import Signal, stored_roles
 
 MOST_NAMED: Final = 3
@@ -48,7 +49,7 @@ def sensors_live(run: RunUnderCheck) -> Finding:
 
     Warns of others that changed otherwise, and rested for 20 s while the robot moved.
     """
-    judged = [(each, _frozen(run, each)) for each in run.events("flat")]
+    judged = [(each, _frozen(run, each)) for each in run.events(FLAT.name)]
     frozen = by_array([each for each, outcome in judged if outcome])
     if not frozen:
         return Finding("pass", "none froze")
@@ -57,7 +58,7 @@ def sensors_live(run: RunUnderCheck) -> Finding:
     longest_s = max(each.duration_s for each in frozen)
     evidence = f"{_names(frozen)}: {times(len(frozen))}, up to {longest_s:.3g} s the same{says}"
     outcome = "fail" if "fail" in outcomes else "warn"
-    return Finding(outcome, evidence, first.start_s, len(frozen), run.more("flat"))
+    return Finding(outcome, evidence, first.start_s, len(frozen), run.more(FLAT.name))
 
 
 def _frozen(run: RunUnderCheck, flat: Event) -> Literal["fail", "warn"] | None:
@@ -77,7 +78,7 @@ def _frozen(run: RunUnderCheck, flat: Event) -> Literal["fail", "warn"] | None:
     others = run.events("standstill") + run.events("stuck")
     if run.motion.position is None:
         branch = name.partition(".")[0]
-        others = [e for e in run.events("flat") if (e.name or "").partition(".")[0] != branch]
+        others = [e for e in run.events(FLAT.name) if (e.name or "").partition(".")[0] != branch]
     rests_s = (min(flat.end_s, e.end_s) - max(flat.start_s, e.start_s) for e in others)
     return None if sum(max(0.0, each) for each in rests_s) > flat.duration_s / 2 else "warn"
 
@@ -129,8 +130,7 @@ def sensors_within_limits(run: RunUnderCheck) -> Finding:
     others = listed([each[0] for each in found if each[0] != name], MOST_NAMED)
     evidence = f"{name} was at {limit:.6g} in {100 * share:.3g} % of the rows"
     evidence += f"; also {others}" if others else ""
-    more = f"webots_query_history(signals={[name]}, run_id={run.info.run_id})"
-    return Finding("warn", evidence, since_s, count, more)
+    return Finding("warn", evidence, since_s, count, run.shows(name))
 
 
 def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, int]]:
@@ -160,7 +160,7 @@ _OFTEN_THE_SAME: Final = 3
 def sensors_drop_nothing(run: RunUnderCheck) -> Finding:
     """Warns where a signal went away and back at once, fails where it went to one value 3 times."""
     sensors = _sensors(run)
-    gone = [e for e in run.events("jump") if "back" in e.details and e.name in sensors]
+    gone = [e for e in run.events(JUMP.name) if "back" in e.details and e.name in sensors]
     if not gone:
         return Finding("pass", "none dropped out")
     to = Counter((each.name, float(each.details["after"])) for each in gone)
@@ -169,7 +169,7 @@ def sensors_drop_nothing(run: RunUnderCheck) -> Finding:
     evidence = f"{_names(gone)}: away and back {times(len(gone))}"
     evidence += f"; {name} {times(most)} to {value:.6g}" if most > 1 else ""
     outcome = "fail" if most >= _OFTEN_THE_SAME else "warn"
-    return Finding(outcome, evidence, gone[0].start_s, len(gone), run.more("jump"))
+    return Finding(outcome, evidence, gone[0].start_s, len(gone), run.more(JUMP.name))
 
 
 def by_array(events: Iterable[Event]) -> list[Event]:

@@ -21,6 +21,7 @@ from webots_mcp.store.checks.finding import (
     RunUnderCheck,
     outcome_of,
 )
+from webots_mcp.store.detection import jump, sensors
 from webots_mcp.store.detection.events import Found, asked_kinds, search_events
 from webots_mcp.store.detection.expectation import expectations_of
 from webots_mcp.store.detection.kinds import EventOptions, NotSearchableError
@@ -36,48 +37,27 @@ CHECK_DEADLINE_S: Final = 8.0
 _OF_EVENTS: Final = 0.7  # of the time
 
 # A new check is a function and a line here: question, command, report, page and docs read it.
+_MOVES: Final = "the position; a commanded speed, speeds of wheels, or a mode"
+_AIMS: Final = "a target beside its measurement: `arm.target`, `arm.position`"
+_TWO: Final = "two positions or headings of the robot, such as gps and odometry"
+_JUMP, _FLAT = (jump.JUMP.name,), (sensors.FLAT.name,)
 CHECKS: Final[list[Check]] = [
-    Check(
-        "moves when commanded",
-        of_motion.moves_when_commanded,
-        "the position; a commanded speed, speeds of wheels, or a mode",
-        kinds=("stuck", "standstill"),
-    ),
-    Check(
-        "follows its targets",
-        of_motion.follows_targets,
-        "a target beside its measurement: `arm.target`, `arm.position`",
-        of_values=True,
-    ),
-    Check(
-        "wheels grip",
-        of_motion.wheels_grip,
-        "a position that the wheels do not count; speeds of wheels",
-        of_values=True,
-    ),
-    Check(
-        "estimates agree",
-        of_motion.estimates_agree,
-        "two positions or headings of the robot, such as gps and odometry",
-        of_values=True,
-    ),
-    Check("stays in place", of_motion.stays_in_place, "the position", kinds=("jump",)),
-    Check("sensors speak", of_sensors.sensors_speak, "numbers", kinds=("missing",), of_values=True),
-    Check("sensors live", of_sensors.sensors_live, "numbers", kinds=("flat",), of_values=True),
+    Check("moves when commanded", of_motion.moves_when_commanded, _MOVES, ("stuck", "standstill")),
+    Check("follows its targets", of_motion.follows_targets, _AIMS, of_values=True),
+    Check("wheels grip", of_motion.wheels_grip, "a position; speeds of wheels", of_values=True),
+    Check("estimates agree", of_motion.estimates_agree, _TWO, of_values=True),
+    Check("stays in place", of_motion.stays_in_place, "the position", _JUMP),
+    Check("sensors speak", of_sensors.sensors_speak, "numbers", ("missing",), of_values=True),
+    Check("sensors live", of_sensors.sensors_live, "numbers", _FLAT, of_values=True),
     Check("sensors within limits", of_sensors.sensors_within_limits, "numbers", of_values=True),
-    Check("sensors drop nothing", of_sensors.sensors_drop_nothing, "numbers", kinds=("jump",)),
+    Check("sensors drop nothing", of_sensors.sensors_drop_nothing, "numbers", _JUMP),
     Check("keeps pace", of_run.keeps_pace, "rows", of_values=True),
-    Check("misses no steps", of_run.misses_no_steps, "rows", kinds=("gap",)),
-    Check("logs no errors", of_run.logs_no_errors, "", kinds=("log",)),
+    Check("misses no steps", of_run.misses_no_steps, "rows", ("gap",)),
+    Check("logs no errors", of_run.logs_no_errors, "", ("log",)),
     Check("ends well", of_run.ends_well, ""),
-    Check("loses no rows", of_run.loses_no_rows, "", kinds=("bridge_event",)),
+    Check("loses no rows", of_run.loses_no_rows, "", ("bridge_event",)),
     Check("reaches its goal", of_run.reaches_goal, "a run command with a condition in `until`"),
-    Check(
-        "keeps expectations",
-        of_run.keeps_expectations,
-        "expectations, and the signals that they name",
-        of_values=True,
-    ),
+    Check("keeps expectations", of_run.keeps_expectations, "expectations", of_values=True),
 ]
 
 

@@ -177,7 +177,9 @@ class Breakpoints:
         )
         try:
             if expects is not None:
-                return _expected(number, parse_expectation(expects, during, name))
+                found = _expected(number, parse_expectation(expects, during, name))
+                found.unseen = frozenset()  # it may be of all robots of a project
+                return found
             condition = parse_condition(text.decode("utf-8", "replace"))
         except InvalidConditionError as error:
             self._disable(number, str(error))

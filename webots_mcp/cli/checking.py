@@ -10,7 +10,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from webots_mcp.cli.options import HERE, Id, Json, Parameter, Robot, Where
+from webots_mcp.cli.options import HERE, Id, Json, Parameter, Robot, Where, make_chunks_first
 from webots_mcp.contract import whole_file
 from webots_mcp.errors import DatabaseError, InvalidInputError
 
@@ -53,6 +53,7 @@ def check(
     from webots_mcp.questions.check_run import webots_check_run
 
     _compile(recorded)
+    make_chunks_first(recorded.recording())
     given = {"run_id": run_id, "robot": robot, "expect": expect}
     reply = ask(webots_check_run, given, recorded)
     data = reply.data or {}

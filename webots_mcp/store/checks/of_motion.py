@@ -24,6 +24,7 @@ from webots_mcp.store.detection.motion import in_metres, places_in
 from webots_mcp.store.detection.standstill import ON_THE_SPOT
 from webots_mcp.store.signals import Signal, stored_roles
 
+_OFF_THE_FLOOR_M: Final = 0.3
 APART_S: Final = 3.0  # command and measurement for so long
 NO_COMMAND: Final = (
     "nothing says when it should move: publish commanded_m_s, the speeds of its wheels, or mode"
@@ -33,7 +34,7 @@ NO_COMMAND: Final = (
 def moves_when_commanded(run: RunUnderCheck) -> Finding:
     """Fails where it stood although a command, its wheels or its mode say that it should move.
 
-    Warns where nothing but a mode says so that is the same in the whole run.
+    Warns where only a mode that is the same in the whole run says so, or motors that lift it.
     """
     motion, stood = run.motion, run.events("standstill")
     stuck = [each for each in run.events("stuck") if each.duration_s >= APART_S]
@@ -51,18 +52,32 @@ def moves_when_commanded(run: RunUnderCheck) -> Finding:
 
 
 def _is_shown(run: RunUnderCheck, stuck: Event) -> bool:
-    """Whether more than a mode that never changes says that it should have moved."""
+    """Whether more says that it should have moved than a constant mode, or motors that lift it."""
+    said = stuck.details["evidence_for"].split("; ")
+    if _flies(run):
+        said = [each for each in said if not each.startswith("wheels at ")]
+    by_mode = [each for each in said if each.startswith(("in mode ", "mode "))]
     mode = run.motion.mode
-    by_mode_alone = all(
-        each.startswith(("in mode ", "mode ")) for each in stuck.details["evidence_for"].split("; ")
-    )
-    return not by_mode_alone or mode is None or len(set(run.frame.coded(mode.name).labels)) > 2
+    may_change = mode is not None and len(set(run.frame.coded(mode.name).labels)) > 2
+    return len(said) > len(by_mode) or (bool(said) and may_change)
+
+
+def _flies(run: RunUnderCheck) -> bool:
+    """Whether its motors are those of propellers: none is called a wheel, and it is off the floor.
+
+    The motors of what flies turn all the time.
+    """
+    motors, height = run.motion.wheels or run.motion.wheel_commands, run.motion.height
+    if height is None or any("wheel" in each.name.lower() for each in motors):
+        return False
+    heights = in_metres(height, run.frame.usable(height.name)[1])
+    return len(heights) > 0 and median(heights) > _OFF_THE_FLOOR_M
 
 
 # -- command and measurement -----------------------------------------------------------------------
 
 _OF_RANGE: Final = 0.1  # of a target's whole range: what is apart by more is not there
-_NEARER: Final = 0.02  # of that range, within `APART_S`: what comes so much nearer is on its way
+_NEARER: Final = 0.002  # of that range, within `APART_S`: what comes so much nearer is on its way
 _NOISE: Final = 6.0  # standard deviations; for half as many it may come nearer by chance
 _HOLDING: Final = frozenset(("gripper", "finger", "hand", "claw", "jaw"))  # they close on things
 
@@ -137,6 +152,7 @@ def _between(values: Array, aims: Array, turn: float | None) -> Array:
 _SLIPS: Final = 0.5  # of the usual way per turn of the wheels
 _CELLS_S: Final = (0.25, 0.5, 1.0, 2.0)  # over which speeds are compared; the noise chooses
 _NOISE_SHARE: Final = 0.1  # of the speed that it may take
+_CREEPS: Final = 0.2  # of how fast its wheels turn at their best: at less little can be said
 _TURNS_RAD: Final = 1.0  # within a cell: then the straight line is shorter than the way
 _LEAST_CELLS: Final = 10
 _SPREAD: Final = 0.3  # of the ratios of a robot that rolls: of more they say nothing
@@ -149,6 +165,8 @@ def wheels_grip(run: RunUnderCheck) -> Finding:
     wheels = [each for each in motion.wheels or motion.wheel_commands if each.name in run.frame]
     if position is None or not wheels:
         raise NotApplicableError("publish the position and the speeds of its wheels")
+    if _flies(run):
+        raise NotApplicableError("its motors lift it")
     if position[0].name.partition(".")[0] in _BY_WHEELS:
         raise NotApplicableError(f"{position[0].name} is counted by the wheels themselves")
     starts_s, lasts_s, ratios = _ratios(run, position, wheels)
@@ -184,7 +202,8 @@ def _ratios(
     clock = run.frame.times[rows]
     speeds = np.nan_to_num([run.frame.numbers(each.name)[rows] for each in wheels])
     mean, fastest = speeds.mean(axis=0), np.abs(speeds).max(axis=0)
-    ahead = (np.abs(mean) >= ON_THE_SPOT * fastest) & (fastest > 4 * run.noise.of(wheels[0].name))
+    least = max(4 * run.noise.of(wheels[0].name), _CREEPS * float(np.quantile(fastest, 0.9)))
+    ahead = (np.abs(mean) >= ON_THE_SPOT * fastest) & (fastest > least)
     drives = np.sign(mean) * ahead
     per_row_s = max(run.noise.interval_s, 1e-6)
     way_m = float(np.hypot(np.diff(x), np.diff(y)).sum())

@@ -17,7 +17,12 @@ from webots_mcp.store.checks.finding import (
     times,
     total_s,
 )
-from webots_mcp.store.detection.expectation import NONE_EXPECTED, Held, judge_expectation
+from webots_mcp.store.detection.expectation import (
+    NONE_EXPECTED,
+    Held,
+    every_call_of,
+    judge_expectation,
+)
 from webots_mcp.store.robots import fetch_session
 
 SLOW: Final = 0.9  # of real time
@@ -144,6 +149,7 @@ def keeps_expectations(run: RunUnderCheck) -> Iterator[Finding]:
     """Fails where something that was expected did not hold. Each expectation is a line."""
     if not run.expected:
         raise NotApplicableError(NONE_EXPECTED)
+    frame = every_call_of(run.search)
     for each in run.expected:
         name = f"expects: {each.name}"
         missing = [*each.violation.describe_unknown(run.search.known)]
@@ -151,7 +157,7 @@ def keeps_expectations(run: RunUnderCheck) -> Iterator[Finding]:
             yield Finding("not applicable", "; ".join(missing), name=name)
             continue
         try:
-            held = judge_expectation(each, run.frame, run.search.known)
+            held = judge_expectation(each, frame, run.search.known)
         except ConditionFailedError as error:
             yield Finding("not looked at", str(error), name=name)
             continue

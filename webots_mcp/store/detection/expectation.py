@@ -28,7 +28,8 @@ from webots_mcp.store.detection.kinds import (
     NotSearchableError,
 )
 from webots_mcp.store.detection.search import Search
-from webots_mcp.store.reading.frame import Frame
+from webots_mcp.store.reading.frame import Frame, read_frame
+from webots_mcp.store.reading.segment import Segment, just_after
 from webots_mcp.store.signals import Signal
 
 NONE_EXPECTED: Final = (
@@ -74,6 +75,12 @@ def expectations_of(
         except InvalidConditionError:
             continue
     return list({each.asks: each for each in found}.values())
+
+
+def every_call_of(search: Search) -> Frame:
+    """All rows of the run, in kept stretches each call: violations keep the seconds around them."""
+    whole = Segment(search.segment.run_id, search.began_s, just_after(search.ended_s))
+    return read_frame(search.connection, whole, search.deadline, every_call=True)
 
 
 def judge_expectation(expectation: Expectation, frame: Frame, known: dict[str, Signal]) -> Held:
@@ -150,7 +157,7 @@ def violation_events(search: Search) -> Iterator[Event]:
         if len(search.kinds) > 1:
             raise NotAskedError
         raise NotSearchableError(NONE_EXPECTED)
-    frame = search.whole
+    frame = every_call_of(search)
     search.not_searched(VIOLATION, *map(str, frame.unread))
     for each in expected:
         try:

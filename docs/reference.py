@@ -15,6 +15,7 @@ from webots_mcp import MemoryDatabase, pytest_plugin, testing
 from webots_mcp.cli import described
 from webots_mcp.connection import connect, create_schema
 from webots_mcp.server import create_server
+from webots_mcp.store.checks.registry import CHECKS
 
 _COMMENT: Final = re.compile(r"/\*(.*?)\*/", re.DOTALL)
 _TOC: Final = "```{{toctree}}\n:hidden:\n:caption: {caption}\n\n{pages}\n```\n"
@@ -69,6 +70,12 @@ def _default(schema: dict[str, Any], required: bool) -> str:
     if required:
         return "required"
     return f"`{schema['default']}`" if schema.get("default") is not None else ""
+
+
+def checks(_page: str = "") -> str:
+    """Each check with what it needs."""
+    rows = [[each.name, each.means, each.needs or "nothing"] for each in CHECKS]
+    return "## The checks\n\n" + _table(["check", "when it warns and fails", "needs"], rows)
 
 
 def commands(_page: str = "") -> str:
@@ -172,6 +179,7 @@ def _table(columns: list[str], rows: list[list[str]]) -> str:
 
 ADDED: Final[dict[str, Callable[[str], str]]] = {
     "docs/index": navigation,
+    "docs/check": checks,
     "docs/tools": tools,
     "docs/command-line": commands,
     "docs/database": tables,

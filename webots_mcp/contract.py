@@ -24,6 +24,7 @@ SCHEMA_VERSION: Final = 10  # PRAGMA user_version of a database that this versio
 DATABASE_NAME: Final = "webots.db"
 WORLD_ENDING: Final = ".wbt"
 PROJECT_DATA_FOLDER: Final = "mcp_data"  # in a Webots project
+PROJECT_FILE: Final = "webots-mcp.toml"  # beside that folder: what is expected of its robots
 CAMERA_FOLDER: Final = "camera"
 SCREENSHOT_FOLDER: Final = "screenshots"
 KEPT_FRAME: Final = "kept"  # the kind of a picture that belongs to the kept stretch it lies in

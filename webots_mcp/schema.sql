@@ -211,7 +211,7 @@ CREATE INDEX ix_command_pending ON command (robot_id, id) WHERE status = 'pendin
 CREATE INDEX ix_command_session_id ON command (session_id);
 CREATE TABLE breakpoint (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
-	robot_id INTEGER NOT NULL, 
+	robot_id INTEGER /* null: of robot_name */, 
 	session_id INTEGER, 
 	condition TEXT NOT NULL /* see docs/conditions.md */, 
 	action TEXT NOT NULL /* pause, log or keep */, 
@@ -219,8 +219,12 @@ CREATE TABLE breakpoint (
 	enabled INTEGER DEFAULT 1 NOT NULL /* 0 once the condition failed */, 
 	hit_count INTEGER DEFAULT 0 NOT NULL /* how often it began to hold, in all runs */, 
 	created_wall_time_s FLOAT NOT NULL, 
-	created_by TEXT /* mcp, cli or controller: its code, for session_id only */, 
+	created_by TEXT /* mcp, cli, project (its file), or controller: its code, for session_id only */, 
 	error TEXT /* why the condition failed */, 
+	name TEXT /* of an expectation */, 
+	expects TEXT /* the condition that is expected to hold; null of a breakpoint */, 
+	during TEXT /* while this holds; null: always */, 
+	robot_name TEXT /* of the project's expectations: a robot's, or * for all */, 
 	CONSTRAINT fk_breakpoint_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
 	CONSTRAINT fk_breakpoint_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE SET NULL
 );

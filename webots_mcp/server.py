@@ -60,6 +60,7 @@ from webots_mcp.steering.routes import Companions, Launcher
 from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.chunk_making import make_chunks, make_missing_chunks
 from webots_mcp.store.journal_intake import take_in_journals
+from webots_mcp.store.project_file import ProjectWatch
 from webots_mcp.store.purge import Upkeep
 from webots_mcp.store.questions.sql import describe_schema
 from webots_mcp.store.recording import OpenReaders, Recording
@@ -148,7 +149,7 @@ def _lifespan(
 
     What it follows is the console of each Webots that belongs to the recording.
     """
-    unasked = dict(asked)
+    unasked, project = dict(asked), ProjectWatch(recording.data_dir)
 
     def work(connection: Connection) -> None:
         if unasked:
@@ -156,6 +157,7 @@ def _lifespan(
             unasked.clear()
         if isinstance(recording.database, Path):
             take_in_journals(connection, recording.database)
+        project.look(connection)
         reap_if_dead(connection)
         make_chunks(connection, pause_s=_PAUSE_S)
         retain(connection)

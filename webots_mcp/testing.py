@@ -17,6 +17,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar, overload
 
+from webots_mcp.conditions.expectation import read_expectation
 from webots_mcp.connection import Role, connect, require_current, schema_version
 from webots_mcp.contract import (
     DATA_DIR_VARIABLE,
@@ -43,6 +44,7 @@ from webots_mcp.standin import (
 from webots_mcp.standin.controllers import Controller
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 from webots_mcp.store.analysis.summary import LARGEST
+from webots_mcp.store.checks.registry import CHECKS, check_run
 from webots_mcp.store.detection.events import find_events
 from webots_mcp.store.detection.kinds import Event as FoundEvent
 from webots_mcp.store.detection.kinds import EventOptions
@@ -413,6 +415,32 @@ class RobotRecording:
             UnknownSignalError: It names a signal that was never published.
         """
         return self.find_events("condition", where=condition)
+
+    def assert_well(self, *expect: str, allow: Sequence[str] = ()) -> None:
+        """Fail if a check of the run fails, or could not look at all of the run.
+
+        Args:
+            expect: What shall hold besides what the controller expects, as
+                `front_m > 0.1 during mode == 'drive'`.
+            allow: Names of checks that may fail.
+
+        Raises:
+            AssertionError: With the evidence of each check that failed.
+            InvalidInputError: An expectation is not of the language, or there is no such check.
+            UnknownSignalError: An expectation names a signal that was never published.
+        """
+        names = [check.name for check in CHECKS]
+        for name in allow:
+            if name not in names:
+                raise InvalidInputError(f"no check {name!r}; there is {', '.join(names)}")
+        expected = [read_expectation(each) for each in expect]
+        with self._subject() as (connection, subject):
+            checked = check_run(connection, subject.run_id, expect=expected, deadline_s=math.inf)
+        bad = [each for each in checked.of("fail", "not looked at") if each.name not in allow]
+        if bad:
+            lines = [f"{each.name}: {each.evidence}" for each in bad]
+            run = f"run {subject.run_id} of robot {subject.robot!r} is not well"
+            raise AssertionError("\n  ".join([run, *lines]))
 
     def logs(self, level: str = "debug", text: str = "") -> list[LogLine]:
         """The lines that were logged in the run, in order.

@@ -144,7 +144,8 @@ STATEMENTS: Final[dict[Kind, str]] = {
     # What a controller's code has set ends with its session.
     "breakpoints forgotten": (
         "DELETE FROM breakpoint WHERE robot_id = (SELECT robot_id FROM session "
-        "WHERE id = :session) AND created_by = :by AND coalesce(session_id, 0) < :session"
+        "WHERE id = :session) AND created_by = :by AND coalesce(session_id, 0) < :session "
+        "AND (expects IS NULL OR session_id IS NULL)"  # what was expected of earlier runs stays
     ),
     "kept stretch": (
         "INSERT INTO kept_stretch (run_id, uuid, start_sim_time_s, end_sim_time_s, wall_time_s, "

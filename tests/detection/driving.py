@@ -92,7 +92,7 @@ def driven(
     evidence = evidence or str(rng.choice(_EVIDENCE))
     times = times_of(rng, sum(each.duration_s for each in phases), interval_s)
     at = _phases_at(phases, times)
-    x, y, heading, way_m = _way(phases, times)
+    x, y, heading, way_m = way_of(phases, times)
     noise = rng.normal(0, noise_m, (2, len(times)))
     columns = {
         **_position(form or str(rng.choice(_FORMS)), x + noise[0], y + noise[1], heading),
@@ -118,7 +118,7 @@ def _phases_at(phases: Sequence[Phase], times: Array) -> list[int]:
     return np.minimum(np.searchsorted(ends, times, side="right"), len(phases) - 1).tolist()
 
 
-def _way(phases: Sequence[Phase], times: Array) -> tuple[Array, Array, Array, float]:
+def way_of(phases: Sequence[Phase], times: Array) -> tuple[Array, Array, Array, float]:
     """x, y and heading at those times without noise, and the metres travelled until the last."""
     fine = np.arange(0.0, float(times[-1]) + _FINE_S, _FINE_S)
     at = _phases_at(phases, fine)

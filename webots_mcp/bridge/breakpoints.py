@@ -18,16 +18,21 @@ from webots_mcp.errors import (
     InvalidConditionError,
     InvalidInputError,
 )
-from webots_mcp.pauses import ARMED, OF_CONTROLLER, SET, Cause
+from webots_mcp.pauses import ARMED, OF_CONTROLLER, SET, VIOLATION, Cause
 
 if TYPE_CHECKING:
     from webots_mcp.bridge.session import Session
     from webots_mcp.conditions import Condition, Evaluator
+    from webots_mcp.conditions.expectation import Expectation, Violated
     from webots_mcp.naming import Value
 
 MOST_EVENTS: Final = 1000  # of one breakpoint in one run: a flickering condition fills no database
 _UNPUBLISHED_S: Final = 1.0  # a signal that was not published for so long is reported
 _MOST_ERROR_CHARACTERS: Final = 1000
+
+
+# Condition, action, hits; of an expectation its name, what is expected, and during what.
+Asks = tuple[str, str, int, "str | None", "str | None", "str | None"]
 
 
 class Breakpoint:
@@ -39,15 +44,17 @@ class Breakpoint:
         holding: Its condition held in the previous state.
         asked_since_s: The simulation time of the first state that it was evaluated on in this run.
         unseen: Its signals that no state has contained yet.
+        expectation: What is expected, where the condition is that it does not hold.
     """
 
     def __init__(
         self,
         id: int | None,  # noqa: A002
         condition: Condition,
-        evaluator: Evaluator,
+        evaluator: Evaluator | Violated,
         action: str,
         after_hits: int,
+        expectation: Expectation | None = None,
     ) -> None:
         self.id = id
         self.condition = condition
@@ -58,11 +65,25 @@ class Breakpoint:
         self.holding = False
         self.asked_since_s: float | None = None
         self.unseen = frozenset(condition.signals)
+        self.expectation = expectation
 
     @property
-    def asks(self) -> tuple[str, str, int]:
-        """Its condition, action and hits: what identifies it in another database."""
-        return self.condition.text, self.action, self.after_hits
+    def asks(self) -> Asks:
+        """Its condition, action, hits and expectation: what identifies it in another database."""
+        own = self.condition.text, self.action, self.after_hits
+        if self.expectation is None:
+            return *own, None, None, None
+        name, expects, during = self.expectation.asks
+        return *own, name, expects, during
+
+    @property
+    def called(self) -> str:
+        """How messages name it."""
+        return (
+            f"expectation {self.expectation.name!r}"
+            if self.expectation
+            else (f"breakpoint {self.id or ''}")
+        )
 
     def begin_run(self) -> None:
         """Arm it again for a new run."""
@@ -145,10 +166,20 @@ class Breakpoints:
             each.id = same.id if same is not None else self._store(*each.asks)
         self.armed += there.values()
 
-    def _read(self, number: int, text: bytes, action: bytes, after_hits: int) -> Breakpoint | None:
+    def _read(
+        self, number: int, text: bytes, action: bytes, after_hits: int, *expected: bytes | None
+    ) -> Breakpoint | None:
         from webots_mcp.conditions import parse_condition
+        from webots_mcp.conditions.expectation import parse_expectation
 
+        name, expects, during = (
+            None if each is None else each.decode("utf-8", "replace") for each in expected
+        )
         try:
+            if expects is not None:
+                found = _expected(number, parse_expectation(expects, during, name))
+                found.unseen = frozenset()  # it may be of all robots of a project
+                return found
             condition = parse_condition(text.decode("utf-8", "replace"))
         except InvalidConditionError as error:
             self._disable(number, str(error))
@@ -170,21 +201,35 @@ class Breakpoints:
 
         condition = parse_condition(text)
         _require_action(action, after_hits)
+        return self._arm(_armed(None, condition, action, after_hits))
+
+    def expect(self, text: str, during: str | None, name: str | None) -> int | None:
+        """Arm an expectation of the controller's code; as `set`.
+
+        Raises:
+            InvalidInputError: As of `set`.
+        """
+        from webots_mcp.conditions.expectation import parse_expectation
+
+        return self._arm(_expected(None, parse_expectation(text, during, name)))
+
+    def _arm(self, new: Breakpoint) -> int | None:
         for each in self.armed:
-            if each.asks == (condition.text, action, after_hits):
+            if each.asks == new.asks:
                 return each.id
         if len(self.armed) >= MAX_BREAKPOINTS:
             raise InvalidInputError(f"{MAX_BREAKPOINTS} breakpoints are armed already: remove one")
-        number = self._store(condition.text, action, after_hits)
-        self.armed.append(_armed(number, condition, action, after_hits))
-        return number
+        new.id = self._store(*new.asks)
+        self.armed.append(new)
+        return new.id
 
-    def _store(self, text: str, action: str, after_hits: int) -> int | None:
+    def _store(self, text: str, action: str, after_hits: int, *expected: str | None) -> int | None:
         registration = self._recorder.registration
         if registration is None:
             return None
         ids = (registration.robot_id, registration.session_id)
-        values = (*ids, storable(text), action, after_hits, time.time(), OF_CONTROLLER)
+        asked = (storable(text), action, after_hits, time.time(), OF_CONTROLLER)
+        values = (*ids, *asked, *(each and storable(each) for each in expected))
         rows = self._recorder.fetch(SET, values)
         return int(rows[0][0]) if rows else None
 
@@ -234,7 +279,7 @@ class Breakpoints:
         """Record the hits, keep the seconds around them, and pause where one demands it."""
         for each in hit:
             if each.action in _KEEPING:
-                self._keeper.keep(f"breakpoint {each.id or ''}: {each.condition.text}")
+                self._keeper.keep(f"{each.called}: {each.condition.text}")
             if each.hit_count - each.after_hits < MOST_EVENTS:
                 self._record_hit(each, state)
         pausing = [each for each in hit if each.action == "pause"]
@@ -253,7 +298,11 @@ class Breakpoints:
             data["not_paused"] = _CANNOT_PAUSE
         if each.action == "keep" and not self._keeper.enabled:
             data["not_kept"] = self._keeper.why_not
-        self._journal.event("breakpoint", data, each.condition.text)
+        if each.expectation is None:
+            self._journal.event("breakpoint", data, each.condition.text)
+        else:
+            data["condition"] = each.condition.text
+            self._journal.event(VIOLATION, data, each.expectation.name)
 
     # -- failures ------------------------------------------------------------------------------
 
@@ -262,7 +311,7 @@ class Breakpoints:
         self.armed.remove(each)
         if each.id is not None:
             self._disable(each.id, why)
-        self._journal.log("warning", "bridge", f"breakpoint {each.id or ''} is off: {why}")
+        self._journal.log("warning", "bridge", f"{each.called} is off: {why}")
 
     def _disable(self, number: int, why: str) -> None:
         text = storable(cut(why, _MOST_ERROR_CHARACTERS))
@@ -280,7 +329,7 @@ class Breakpoints:
             each.unseen = frozenset()
             known = each.evaluator.names_in(state)
             for text in each.condition.describe_unknown(known):
-                self._journal.log("warning", "bridge", f"breakpoint {each.id or ''}: {text}")
+                self._journal.log("warning", "bridge", f"{each.called}: {text}")
 
 
 _KEEPING: Final = ("pause", "keep")  # a pause is for looking at what led to it
@@ -291,6 +340,11 @@ _CANNOT_PAUSE: Final = (
 
 def _armed(number: int | None, condition: Condition, action: str, after_hits: int) -> Breakpoint:
     return Breakpoint(number, condition, condition.evaluator(plain), action, after_hits)
+
+
+def _expected(number: int | None, expectation: Expectation) -> Breakpoint:
+    condition, evaluator = expectation.violation, expectation.evaluator(plain)
+    return Breakpoint(number, condition, evaluator, "keep", 1, expectation)
 
 
 def _require_action(action: str, after_hits: object) -> None:

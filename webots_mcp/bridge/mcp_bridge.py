@@ -450,6 +450,32 @@ class MCPBridge:
         """
         return self._session.breakpoints.set(condition, action, after_hits)
 
+    def expect(
+        self, condition: str, *, during: str | None = None, name: str | None = None
+    ) -> int | None:
+        """Say what shall hold, always or while `during` holds, as long as this session lasts.
+
+            bridge.expect("front_m > 0.1", during="mode == 'drive'", name="keeps its distance")
+
+        It is evaluated as a breakpoint is. Where it begins not to hold, that is an event of the
+        kind `violation`, and the seconds around it are kept at full rate (see `keep`). States that
+        lack a value of the condition are not judged. `webots-mcp check` says in which share of
+        the time it held.
+
+        Args:
+            condition: In the language of docs/conditions.md.
+            during: Only while this condition holds.
+            name: As it is reported; without one the condition is its name.
+
+        Returns:
+            Its id among the breakpoints; None while the database cannot be written.
+
+        Raises:
+            InvalidInputError: A condition or the name is invalid, or there are 32 breakpoints and
+                expectations already.
+        """
+        return self._session.breakpoints.expect(condition, during, name)
+
     def on_reload(self, callback: Callable[[], object]) -> None:
         """Call `callback` once for each reload or reset of the world, and on `reset_state`.
 

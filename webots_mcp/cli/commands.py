@@ -31,6 +31,7 @@ _Q: Final = "webots_mcp.questions"
 _STEERING: Final = "webots_mcp.cli.steering"
 _OF_THE_CORE: Final = {
     "events": Command(PAST, f"{_Q}.events", "webots_find_events"),
+    "check": Command(PAST, "webots_mcp.cli.checking", "check"),
     "compare": Command(PAST, f"{_Q}.compare_runs", "webots_compare_runs"),
     "diff": Command(PAST, "webots_mcp.cli.repeating", "diff"),
     "logs": Command(PAST, f"{_Q}.get_logs", "webots_get_logs"),

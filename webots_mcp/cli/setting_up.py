@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import textwrap
 from collections import Counter
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
@@ -272,21 +273,44 @@ def _make_ready(folder: str | None, name: str, writing: Writing, *, claude_deskt
 
     project = project_of(folder)
     data_dir = project / PROJECT_DATA_FOLDER
+    expected = _expected(data_dir, writing)
     clients = client_entries.clients_of(project)
     clients += [client_entries.claude_desktop()] if claude_desktop else []
     line = client_entries.server_command(data_dir)
     files = [_ignored(data_dir, writing)]
     files += [_told(client, name, line, writing) for client in clients]
     controllers = [_described(found, project) for found in controllers_of(project)]
-    note = client_entries.server_hindrance()
+    notes = [note for note in (client_entries.server_hindrance(), expected) if note]
     found = {"project": str(project), "server": line, "files": files, "controllers": controllers}
     if writing.as_json:
-        print_json(found | ({"note": note} if note else {}))
+        print_json(found | ({"note": "; ".join(notes)} if notes else {}))
     else:
-        _print_project(found, [note] if note else [])
+        _print_project(found, notes)
     refused = [each["file"] for each in files if each["outcome"] == "refused"]
     if refused:
         raise CommandRefusedError(f"not written: {', '.join(refused)}; the reasons are above")
+
+
+def _expected(data_dir: Path, writing: Writing) -> str | None:
+    """Let bridges know what the project's file expects; what it is, or None without a file.
+
+    Raises:
+        InvalidInputError: The file is invalid.
+    """
+    from webots_mcp.connection import connect, create_schema, schema_version
+    from webots_mcp.contract import DATABASE_NAME, make_folder
+    from webots_mcp.store.project_file import compile_project, file_of, read_project
+
+    if (file := file_of(data_dir)) is None:
+        return None
+    expected = read_project(file)
+    if not writing.dry_run:
+        make_folder(data_dir)
+        with closing(connect(data_dir / DATABASE_NAME, "writer", create=True)) as connection:
+            if schema_version(connection) == 0:
+                create_schema(connection)
+            compile_project(connection, expected)
+    return f"{file}: {len(expected)} expectations; webots-mcp check judges runs by them"
 
 
 def _ignored(data_dir: Path, writing: Writing) -> dict[str, str]:

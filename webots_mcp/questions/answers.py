@@ -304,6 +304,14 @@ class EventsAnswer(NotedAnswer):
     cursor: str | None = said("Ask again with this cursor for those that are not shown.")
 
 
+class CheckAnswer(NotedAnswer):
+    """Whether a run is well."""
+
+    outcome: str | None = said("The worst: fail, not looked at, warn or pass.")
+    checks: Table | None = said("Those that did not pass; more: the call that shows it in full.")
+    passed: list[str] | None = None
+
+
 class TimelineAnswer(NotedAnswer):
     """A page of what happened, in order of time."""
 

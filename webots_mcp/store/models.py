@@ -39,9 +39,11 @@ def _id() -> Any:
     return Field(default=None, sa_column=Column("id", Integer, primary_key=True))
 
 
-def _to(table: str, comment: str | None = None, *, nullable: bool = False) -> Any:
+def _to(
+    table: str, comment: str | None = None, *, nullable: bool = False, on_delete: str | None = None
+) -> Any:
     """A reference to another table's id; what cannot be without it goes with it."""
-    on_delete = "SET NULL" if nullable else "CASCADE"
+    on_delete = on_delete or ("SET NULL" if nullable else "CASCADE")
     key = ForeignKey(f"{table}.id", ondelete=on_delete)
     return Field(default=None, sa_column=Column(Integer, key, nullable=nullable, comment=comment))
 
@@ -345,11 +347,14 @@ class Command(SQLModel, table=True):
 
 
 class Breakpoint(SQLModel, table=True):
-    """A condition that a robot's bridge asks of each published state, and what it does then."""
+    """A condition that a robot's bridge asks of each published state, and what it does then.
+
+    An expectation is one as well: its condition is that it does not hold.
+    """
 
     __table_args__ = (Index(None, "robot_id"), Index(None, "session_id"), _KEEP_IDS)
     id: int | None = _id()
-    robot_id: int = _to("robot")
+    robot_id: int | None = _to("robot", "null: of robot_name", nullable=True, on_delete="CASCADE")
     session_id: int | None = _to("session", nullable=True)
     condition: str = _text("see docs/conditions.md", nullable=False)
     action: str = _text("pause, log or keep", nullable=False)
@@ -364,8 +369,14 @@ class Breakpoint(SQLModel, table=True):
     )
     hit_count: int = _count("how often it began to hold, in all runs")
     created_wall_time_s: float = _number(nullable=False)
-    created_by: str | None = _text("mcp, cli or controller: its code, for session_id only")
+    created_by: str | None = _text(
+        "mcp, cli, project (its file), or controller: its code, for session_id only"
+    )
     error: str | None = _text("why the condition failed")
+    name: str | None = _text("of an expectation")
+    expects: str | None = _text("the condition that is expected to hold; null of a breakpoint")
+    during: str | None = _text("while this holds; null: always")
+    robot_name: str | None = _text("of the project's expectations: a robot's, or * for all")
 
 
 class KeptStretch(SQLModel, table=True):

@@ -29,6 +29,7 @@ from webots_mcp.plotting.question import changed_most
 from webots_mcp.plotting.signals import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import Obstacle, Track, TrajectoryAxes, compose_trajectory
 from webots_mcp.plugins.report.figures import obstacles_of
+from webots_mcp.store.checks.registry import check_run
 from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines
 from webots_mcp.store.parameters import described
 from webots_mcp.store.questions.runs import RunInfo, list_runs
@@ -44,6 +45,8 @@ MOST_RUNS: Final = 100  # to choose from
 MOST_LINES: Final = 200  # of the log
 MOST_NAMES: Final = 2000  # of signals to choose from
 MOST_ROBOTS: Final = 10  # on one map
+MOST_LIGHTS: Final = 20  # of the newest runs that are over
+_LIGHT_S: Final = 1.0  # for the checks of one
 _LONGEST_LINE: Final = 1000  # characters of a log line
 _SETTLED_S: Final = 5.0  # of simulation time tell which signals change
 _SIDE_PX: Final = 640
@@ -137,7 +140,7 @@ def look(recording: Recording, choice: Choice, *, steers: bool) -> dict[str, Any
             "started": run.started_wall_time_s if run else None,
             "until": header["sim_time_s"],
             "robots": [robot.name for robot in robots],
-            "runs": [{"id": each.run_id, "title": run_title(each)} for each in runs],
+            "runs": _with_lights(recording, connection, runs),
             "names": list(catalogue(connection, view.subject))[:MOST_NAMES] if run else [],
             "lines": [_line(each) for each in newest_lines(connection, asked, MOST_LINES)],
             "parameters": [_parameter(each) for each in described(connection, run)] if run else [],
@@ -192,6 +195,25 @@ def run_title(run: RunInfo) -> str:
     label = f" “{spelled_out(run.label)}”" if run.label else ""
     began = datetime.fromtimestamp(run.started_wall_time_s).strftime("%d %b %H:%M:%S")
     return f"run {run.run_id}{label} · {began} · {run.duration_s:.1f} s"
+
+
+# Of runs that are over, by database and run: nothing that a check looks at changes any more.
+_LIGHTS: Final[dict[tuple[str, int, float], str]] = {}
+_OF_OUTCOME: Final = {"fail": "🔴", "warn": "🟡", "pass": "🟢"}
+
+
+def _with_lights(
+    recording: Recording, connection: sqlite3.Connection, runs: Sequence[RunInfo]
+) -> list[dict[str, Any]]:
+    """The runs to choose from, each with a light where it is checked; one more with each look."""
+    keys = [(str(recording.database), each.run_id, each.started_wall_time_s) for each in runs]
+    over = [k for k, run in zip(keys, runs, strict=True) if run.end_reason][:MOST_LIGHTS]
+    if (dark := next((key for key in over if key not in _LIGHTS), None)) is not None:
+        outcome = check_run(connection, dark[1], deadline_s=_LIGHT_S).outcome
+        _LIGHTS[dark] = _OF_OUTCOME.get(outcome, "⚪")
+    lights = (_LIGHTS.get(key, "") for key in keys)
+    titled = zip(runs, lights, strict=True)
+    return [{"id": e.run_id, "title": f"{light} {run_title(e)}".strip()} for e, light in titled]
 
 
 def _line(line: LogLine) -> dict[str, str]:

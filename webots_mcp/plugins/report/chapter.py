@@ -27,6 +27,7 @@ from webots_mcp.plugins.report.words import (
     told,
     valued,
 )
+from webots_mcp.store.checks.registry import check_run
 from webots_mcp.store.detection.events import KINDS, Found, choose, search_events, stored_kinds
 from webots_mcp.store.detection.kinds import Event, EventOptions, Verdicts
 from webots_mcp.store.logs import COUNT_LIMIT, LogFilter, LogLine, Window, count_lines, newest_lines
@@ -51,8 +52,8 @@ _ORDINARY: Final = ("pause", "resume", WORLD_EVENT, MODE_EVENT)  # that the brid
 _MARKS: Final = {"warning": "warning", "error": "error", "critical": "error"}
 # Where the room for texts goes; what one table leaves, the next ones have.
 _SHARES: Final = {
-    "parameters": 0.05, "moments": 0.1, "events": 0.15, "trends": 0.15, "commands": 0.1,
-    "timeline": 0.2, "log": 0.25,
+    "checks": 0.05, "parameters": 0.05, "moments": 0.1, "events": 0.15, "trends": 0.15,
+    "commands": 0.1, "timeline": 0.2, "log": 0.2,
 }  # fmt: skip
 
 
@@ -114,6 +115,7 @@ class Chapter:
     mode: str = ""
     held: Sequence[Held] = ()
     moments: Sequence[Moment] = ()
+    checks: Grid | None = None
     parameters: Grid | None = None
     events: Grid | None = None
     trends: Grid | None = None
@@ -130,7 +132,8 @@ class Chapter:
     def grids(self) -> dict[str, Grid]:
         """The tables that can lack rows, by what their rows are called."""
         named = {
-            "parameters": self.parameters, "events": self.events, "trends": self.trends,
+            "checks": self.checks, "parameters": self.parameters, "events": self.events,
+            "trends": self.trends,
             "commands": self.commands, "entries of the timeline": self.timeline,
             "log lines": self.log,
         }  # fmt: skip
@@ -170,15 +173,18 @@ def chapter_of(
     session = fetch_session(connection, run.session_id)
     room = _Room(room_bytes)
     facts = _facts(info, session, run.basic_time_step_ms)
-    parameters = room.fit("parameters", _parameters(connection, run_id))
     title = f"Run {run_id} of {info.robot}" + (f": {info.label}" if info.label else "")
     try:
         whole = find_range(connection, Scope(run_id=run_id))
     except NothingRecordedError as error:
+        checks = room.fit("checks", _checks(connection, run_id, deadline_s))
+        parameters = room.fit("parameters", _parameters(connection, run_id))
         log = room.fit("log", _log(connection, run_id), newest=True)
         return Chapter(info, None, title, f"{_first_words(info)} {error}.", facts,
-                       parameters=parameters, log=log)  # fmt: skip
+                       checks=checks, parameters=parameters, log=log)  # fmt: skip
     each_alone = _found(connection, whole, deadline_s)
+    checks = room.fit("checks", _checks(connection, run_id, deadline_s, each_alone))
+    parameters = room.fit("parameters", _parameters(connection, run_id))
     found = each_alone.in_groups(known_signals(connection, whole))
     stored = _stored(connection, whole, deadline_s / 3)
     moments = [_moment(each, stored) for each in _outstanding(connection, found)]
@@ -197,6 +203,7 @@ def chapter_of(
         moments=[
             each for each in moments if room.fit("moments", each.lines) or not each.lines.rows
         ],
+        checks=checks,
         parameters=parameters,
         events=room.fit("events", _events(connection, found)),
         trends=room.fit("trends", _trends(told_trends)),
@@ -263,6 +270,25 @@ def _facts(info: RunInfo, session: Session | None, step_ms: float | None) -> dic
             "rows dropped": session.rows_dropped or None,
         }
     return {name: cut(str(fact), 4_000) for name, fact in facts.items() if fact is not None}
+
+
+def _checks(
+    connection: sqlite3.Connection, run_id: int, deadline_s: float, found: Found | None = None
+) -> Grid:
+    """Each check, the worst first."""
+    checked = check_run(connection, run_id, found=found, deadline_s=deadline_s / 2)
+    rows = [
+        Row(
+            [each.name, each.outcome, each.evidence, _since(each.since_s), str(each.often or "")],
+            {"fail": "error", "warn": "warning"}.get(each.outcome, ""),
+        )
+        for each in checked.worst_first
+    ]
+    return Grid(("check", "outcome", "evidence", "since [s]", "times"), rows)
+
+
+def _since(time_s: float | None) -> str:
+    return "" if time_s is None else time_at(time_s)
 
 
 def _parameters(connection: sqlite3.Connection, run_id: int) -> Grid:

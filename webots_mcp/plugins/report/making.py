@@ -181,11 +181,9 @@ def make_report(
     for chapter in chapters:
         pictures = pictures_of(chapter.images, data_dir, share_bytes)
         page.pictures[chapter.info.run_id] = pictures
-        rest_bytes -= sum(picture.size_bytes for picture in pictures.shown)
         done.step()
-    size_bytes = round(max_mb * 1e6 - rest_bytes)
-    page = replace(page, left_out=_left_out(page), size_bytes=size_bytes)
-    html = render(page)
+    page = replace(page, left_out=_left_out(page))
+    html = render(replace(page, size_bytes=len(render(page))))
     done.step()
     return Report(html, page.title, _holds(page), tuple(page.left_out))
 

@@ -140,6 +140,10 @@ class NotSearchableError(NothingRecordedError):
     """Nothing was recorded in which a kind could be looked for; the text says what is missing."""
 
 
+class NotAskedError(Exception):
+    """A kind that was not named has nothing to look for, and nothing is said of it."""
+
+
 def but_for_numbers(text: object) -> str:
     """What texts that differ in their numbers only have in common."""
     return _NUMBER.sub("#", str(text))

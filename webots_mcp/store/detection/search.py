@@ -17,6 +17,7 @@ from webots_mcp.store.detection.kinds import (
     EventKind,
     EventOptions,
     Ledger,
+    NotAskedError,
     NotSearchableError,
 )
 from webots_mcp.store.detection.motion import Motion, motion_in
@@ -266,6 +267,8 @@ def _found(search: Search) -> list[Event]:
 def _found_of(kind: EventKind, search: Search) -> list[Event]:
     try:
         found = list(kind.find(search))
+    except NotAskedError:
+        return []
     except NotSearchableError as error:
         search.not_searched(kind.name, str(error))
         return []

@@ -9,6 +9,7 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any, Final
 
+from webots_mcp.pauses import VIOLATION
 from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.detection.kinds import (
     LEVELS,
@@ -182,7 +183,11 @@ def log_events(search: Search) -> Iterator[Event]:
 
 def noticed_events(search: Search) -> Iterator[Event]:
     """What the bridge noticed and stored: pause, resume, dropped rows, trouble with storage."""
+    wanted = search.options.kinds
+    is_found = not wanted or VIOLATION in wanted  # in values, as an event of its own kind
     for time_s, wall_s, kind, name, data in _newest(search, "bridge_event", _NOTICED):
+        if kind == VIOLATION and is_found:
+            continue
         details: dict[str, Any] = {"what": kind} | ({"data": json.loads(data)} if data else {})
         yield Event("bridge_event", search.segment.run_id, time_s, time_s, wall_s, name, details)
 

@@ -51,7 +51,8 @@ _FIRST_FROM: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ? AND sim
 # and how many rows there are, counted no further than matters.
 _HITS: Final = (
     "SELECT count(*) FROM (SELECT 1 FROM event WHERE run_id = :run AND sim_time_s >= :start "
-    "AND sim_time_s < :end AND kind = 'breakpoint' GROUP BY sim_time_s LIMIT :most)"
+    "AND sim_time_s < :end AND kind IN ('breakpoint', 'violation') "
+    "GROUP BY sim_time_s LIMIT :most)"
 )
 _IS_THROTTLED: Final = (
     "SELECT 1 FROM run r JOIN session s ON s.id = r.session_id "

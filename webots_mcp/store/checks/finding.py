@@ -1,0 +1,158 @@
+"""What a check is, what it may look at, and what it says."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Final, Literal, NamedTuple
+
+from webots_mcp.conditions.expectation import Expectation
+from webots_mcp.store.detection.events import Found
+from webots_mcp.store.detection.kinds import Event
+from webots_mcp.store.detection.motion import Motion, RunNoise
+from webots_mcp.store.detection.search import Search
+from webots_mcp.store.questions.runs import RunInfo
+from webots_mcp.store.reading.frame import Frame
+from webots_mcp.store.reading.frame_source import NOT_READ
+
+Outcome = Literal["pass", "warn", "fail", "not applicable", "not looked at"]
+WORST_FIRST: Final[tuple[Outcome, ...]] = (
+    "fail", "not looked at", "warn", "pass", "not applicable",
+)  # fmt: skip
+_TIMED_OUT: Final = "time limit reached"
+
+
+class NotApplicableError(Exception):
+    """A check cannot be made of this run; the text says what is missing."""
+
+
+class Finding(NamedTuple):
+    """What a check came to.
+
+    Attributes:
+        evidence: The numbers that it rests on.
+        since_s: Simulation time at which what is wrong began first.
+        often: How many times it was so.
+        more: The call that shows it in full.
+        name: Of what was checked, where a check is about several things.
+    """
+
+    outcome: Outcome
+    evidence: str
+    since_s: float | None = None
+    often: int | None = None
+    more: str = ""
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class Check:
+    """A check. One of these, a line in `registry.CHECKS`, is all that a new check takes.
+
+    Attributes:
+        find: Says what was found; its docstring says when it warns and when it fails. It may raise
+            `NotApplicableError`.
+        needs: What has to be recorded, for a person.
+        kinds: Of events that it judges: where one could not be looked for, the check is not made.
+        of_values: It reads values itself: where some were not read, it does not pass.
+    """
+
+    name: str
+    find: Callable[[RunUnderCheck], Finding | Iterable[Finding]]
+    needs: str
+    kinds: tuple[str, ...] = ()
+    of_values: bool = False
+
+    @property
+    def means(self) -> str:
+        """When it warns and when it fails, for a person."""
+        return " ".join((inspect.getdoc(self.find) or "").split())
+
+
+@dataclass
+class RunUnderCheck:
+    """A run, and what was found in it.
+
+    Attributes:
+        info: What `webots_list_runs` says of it.
+        found: Events of the kinds that checks judge, each by itself.
+        search: In the whole run: its signals, values and motion.
+        expected: What was expected of it, be it for this question alone.
+    """
+
+    info: RunInfo
+    robot_id: int
+    found: Found
+    search: Search
+    expected: Sequence[Expectation] = ()
+
+    @property
+    def frame(self) -> Frame:
+        """All rows of the run."""
+        return self.search.whole
+
+    @property
+    def motion(self) -> Motion:
+        """The signals of its motion."""
+        return self.search.motion
+
+    @cached_property
+    def noise(self) -> RunNoise:
+        """How noisy its signals are."""
+        return RunNoise(self.frame, self.motion)
+
+    def events(self, kind: str) -> list[Event]:
+        """What was found of a kind, in order."""
+        found = (each for each in self.found.events if each.kind == kind)
+        return sorted(found, key=lambda each: each.start_s)
+
+    def more(self, *kinds: str) -> str:
+        """The call that shows events of these kinds."""
+        return f"webots_find_events(kinds={list(kinds)}, run_id={self.info.run_id})"
+
+    def shows(self, *names: str) -> str:
+        """The call that shows signals."""
+        return f"webots_query_history(signals={list(names)}, run_id={self.info.run_id})"
+
+    def lacking(self, check: Check) -> Finding | None:
+        """Why a check cannot be made at all; None if it can."""
+        verdicts = self.found.verdicts
+        for kind in check.kinds:
+            if why := verdicts.unlooked(kind):
+                return Finding(outcome_of(why), why)
+        if check.of_values and not len(self.frame):
+            why = "; ".join(map(str, self.frame.unread))
+            none = f"run {self.info.run_id} has no state row: call bridge.publish"
+            return Finding("not looked at", why) if why else Finding("not applicable", none)
+        return None
+
+    def unread(self, check: Check) -> str:
+        """What of the run a check did not see; empty if nothing."""
+        said = self.found.verdicts.reasons
+        reasons = [why for kind in check.kinds for why in said.get(kind, ()) if _is_unread(why)]
+        if check.of_values:
+            reasons += map(str, self.frame.unread)
+            if self.search.deadline.passed:
+                reasons.append(_TIMED_OUT)
+        return "; ".join(dict.fromkeys(reasons))
+
+
+def _is_unread(why: str) -> bool:
+    return why.startswith(NOT_READ) or _TIMED_OUT in why
+
+
+def outcome_of(why: str) -> Outcome:
+    """Of a check that could not be made, by why: there was no time, or something is missing."""
+    return "not looked at" if _is_unread(why) else "not applicable"
+
+
+def total_s(events: Iterable[Event]) -> float:
+    """How long they lasted together."""
+    return sum(each.duration_s for each in events)
+
+
+def times(count: int) -> str:
+    """How often, in words."""
+    return "once" if count == 1 else f"{count} times"

@@ -1,0 +1,353 @@
+"""Checks of how a robot moved: as it was commanded, as its wheels turned, as others measured it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, Final, cast
+
+from webots_mcp.naming import METRES, find_targets, in_snake_case, listed, unit_in
+from webots_mcp.signal_register import PLACES
+from webots_mcp.store.analysis.arrays import Array, Indexes, Run, inner, median, np, runs_of
+from webots_mcp.store.analysis.summary import unwrap
+from webots_mcp.store.checks.finding import (
+    Finding,
+    NotApplicableError,
+    RunUnderCheck,
+    times,
+    total_s,
+)
+from webots_mcp.store.detection.condition import lasting
+from webots_mcp.store.detection.jump import JUMP
+from webots_mcp.store.detection.kinds import Event
+from webots_mcp.store.detection.motion import in_metres, places_in
+from webots_mcp.store.detection.standstill import ON_THE_SPOT
+from webots_mcp.store.signals import Signal, stored_roles
+
+_OFF_THE_FLOOR_M: Final = 0.3
+APART_S: Final = 3.0  # command and measurement for so long
+NO_COMMAND: Final = (
+    "nothing says when it should move: publish commanded_m_s, the speeds of its wheels, or mode"
+)
+
+
+def moves_when_commanded(run: RunUnderCheck) -> Finding:
+    """Fails where it stood although a command, its wheels or its mode say that it should move.
+
+    Warns where only a mode that is the same in the whole run says so, or motors that lift it.
+    """
+    motion, stood = run.motion, run.events("standstill")
+    stuck = [each for each in run.events("stuck") if each.duration_s >= APART_S]
+    if stuck:
+        evidence = f"stuck {times(len(stuck))}, {total_s(stuck):.3g} s in total"
+        first = f"{evidence}; the first time {stuck[0].details['evidence_for']}"
+        outcome = "fail" if any(_is_shown(run, each) for each in stuck) else "warn"
+        return Finding(outcome, first, stuck[0].start_s, len(stuck), run.more("stuck"))
+    if not (motion.commanded or motion.speed or motion.wheels or motion.wheel_commands):
+        if motion.mode is None:
+            raise NotApplicableError(NO_COMMAND)
+        if total_s(stood) > 0.95 * run.search.length_s:
+            raise NotApplicableError(f"it always stood, in a mode unseen in motion: {NO_COMMAND}")
+    return Finding("pass", f"{len(stood)} standstills, none against a command")
+
+
+def _is_shown(run: RunUnderCheck, stuck: Event) -> bool:
+    """Whether more says that it should have moved than a constant mode, or motors that lift it."""
+    said = stuck.details["evidence_for"].split("; ")
+    if _flies(run):
+        said = [each for each in said if not each.startswith("wheels at ")]
+    by_mode = [each for each in said if each.startswith(("in mode ", "mode "))]
+    mode = run.motion.mode
+    may_change = mode is not None and len(set(run.frame.coded(mode.name).labels)) > 2
+    return len(said) > len(by_mode) or (bool(said) and may_change)
+
+
+def _flies(run: RunUnderCheck) -> bool:
+    """Whether its motors are those of propellers: none is called a wheel, and it is off the floor.
+
+    The motors of what flies turn all the time.
+    """
+    motors, height = run.motion.wheels or run.motion.wheel_commands, run.motion.height
+    if height is None or any("wheel" in each.name.lower() for each in motors):
+        return False
+    heights = in_metres(height, run.frame.usable(height.name)[1])
+    return len(heights) > 0 and median(heights) > _OFF_THE_FLOOR_M
+
+
+# -- command and measurement -----------------------------------------------------------------------
+
+_OF_RANGE: Final = 0.1  # of a target's whole range: what is apart by more is not there
+_NEARER: Final = 0.002  # of that range, within `APART_S`: what comes so much nearer is on its way
+_NOISE: Final = 6.0  # standard deviations; for half as many it may come nearer by chance
+_HOLDING: Final = frozenset(("gripper", "finger", "hand", "claw", "jaw"))  # they close on things
+
+
+def follows_targets(run: RunUnderCheck) -> Finding:
+    """Fails where something was a tenth of its target's range away for 3 s and came no nearer.
+
+    Places where a robot shall go are no targets, and grippers hold things.
+    """
+    pairs = list(_pairs(run))
+    if not pairs:
+        raise NotApplicableError("no target is published beside what it is the target of")
+    found: list[tuple[Signal, Run, float]] = []
+    for measured, target in pairs:
+        found += _apart(run, measured, target)
+    if not found:
+        return Finding("pass", f"{len(pairs)} follow their targets, as {pairs[0][0].name}")
+    found.sort(key=lambda each: each[1].start_s)
+    names = listed(list(dict.fromkeys(signal.name for signal, *_ in found)), 3)
+    longest, by = max((rest.duration_s, by) for _, rest, by in found)
+    evidence = f"{names}: up to {longest:.3g} s without coming nearer, {by:.3g} away"
+    since_s, shown = found[0][1].start_s, run.shows(found[0][0].name)
+    return Finding("fail", evidence, since_s, len(found), shown)
+
+
+def _pairs(run: RunUnderCheck) -> Iterator[tuple[Signal, Signal]]:
+    """Measured values with their targets, but for where the robot shall go, and what holds."""
+    motion, known = run.motion, run.search.known
+    there = [
+        name for name, each in known.items()
+        if each.kind in ("num", "angle") and run.frame.zones(name).value_count.any()
+    ]  # fmt: skip
+    away = {each.name for each in (*(motion.position or ()), motion.heading, motion.height) if each}
+    for name in there:
+        words = in_snake_case(name).replace(".", "_").split("_")
+        if name in away or (known[name].role or "")[:3].startswith(("x", "y", "z")):
+            continue
+        target, _ = find_targets(name, there)
+        if target is not None and _HOLDING.isdisjoint(words):
+            yield known[name], known[target]
+
+
+def _apart(
+    run: RunUnderCheck, measured: Signal, target: Signal
+) -> Iterator[tuple[Signal, Run, float]]:
+    frame = run.frame
+    values, aims = frame.numbers(measured.name), frame.numbers(target.name)
+    there = np.flatnonzero(np.isfinite(values) & np.isfinite(aims))
+    if len(there) < 2:
+        return
+    rows, values, aims = frame.times[there], values[there], aims[there]
+    before = np.maximum(np.searchsorted(rows, rows - APART_S, "right") - 1, 0)
+    off, was_off = (_between(each, aims, measured.turn) for each in (values, values[before]))
+    noise = max(run.noise.of(measured.name), run.noise.of(target.name))
+    span = float(np.ptp(aims)) or float(np.abs(aims).max())
+    is_apart = off > max(_OF_RANGE * span, _NOISE * noise)
+    nearer_by = max(_NEARER * span, _NOISE / 2 * noise)
+    # For as long again: a target that was set anew may lie the other way.
+    still = lasting(rows, is_apart & (was_off - off < nearer_by), APART_S)
+    for each in runs_of(still, rows).each():
+        lasted = each._replace(start_s=max(float(rows[0]), each.start_s - APART_S))
+        yield measured, lasted, float(off[each.start : each.stop].max())
+
+
+def _between(values: Array, aims: Array, turn: float | None) -> Array:
+    off = values - aims
+    return np.abs(np.remainder(off + turn / 2, turn) - turn / 2) if turn else np.abs(off)
+
+
+# -- wheels and motion -----------------------------------------------------------------------------
+
+_SLIPS: Final = 0.5  # of the usual way per turn of the wheels
+_CELLS_S: Final = (0.25, 0.5, 1.0, 2.0)  # over which speeds are compared; the noise chooses
+_NOISE_SHARE: Final = 0.1  # of the speed that it may take
+_CREEPS: Final = 0.2  # of how fast its wheels turn at their best: at less little can be said
+_TURNS_RAD: Final = 1.0  # within a cell: then the straight line is shorter than the way
+_LEAST_CELLS: Final = 10
+_SPREAD: Final = 0.3  # of the ratios of a robot that rolls: of more they say nothing
+_BY_WHEELS: Final = ("odom", "odometry")
+
+
+def wheels_grip(run: RunUnderCheck) -> Finding:
+    """Fails where the wheels drove ahead for 3 s and it went less than half as far as usual."""
+    motion, position = run.motion, run.motion.position
+    wheels = [each for each in motion.wheels or motion.wheel_commands if each.name in run.frame]
+    if position is None or not wheels:
+        raise NotApplicableError("publish the position and the speeds of its wheels")
+    if _flies(run):
+        raise NotApplicableError("its motors lift it")
+    if position[0].name.partition(".")[0] in _BY_WHEELS:
+        raise NotApplicableError(f"{position[0].name} is counted by the wheels themselves")
+    starts_s, lasts_s, ratios = _ratios(run, position, wheels)
+    known = np.isfinite(ratios)
+    if np.count_nonzero(known) < _LEAST_CELLS:
+        raise NotApplicableError("its wheels drove it ahead too seldom")
+    usual = median(ratios[ratios >= np.nanquantile(ratios, 0.5)])
+    rolled = ratios[ratios >= _SLIPS * usual]
+    usual = median(rolled)
+    if usual <= 0 or median(np.abs(rolled - usual)) > _SPREAD * usual:
+        raise NotApplicableError("its speed and that of its wheels have no fixed ratio")
+    slips = runs_of(ratios < _SLIPS * usual, starts_s)
+    found = list(slips.only(slips.durations_s + 2 * lasts_s >= APART_S).each())
+    unit = "" if unit_in(wheels[0].name) in METRES else " per unit of wheel speed"
+    rolls = f"rolls {usual:.3g} m/s{unit}"
+    if not found:
+        return Finding("pass", f"{rolls}, over {np.count_nonzero(known) * lasts_s:.3g} s")
+    longest_s = max(each.duration_s for each in found) + 2 * lasts_s
+    least = min(float(np.nanmin(ratios[each.start : each.stop])) for each in found)
+    evidence = f"slipped {times(len(found))}, up to {longest_s:.3g} s; {rolls}, then {least:.3g}"
+    return Finding("fail", evidence, found[0].start_s, len(found), run.shows(wheels[0].name))
+
+
+def _ratios(
+    run: RunUnderCheck, position: tuple[Signal, Signal], wheels: list[Signal]
+) -> tuple[Array, float, Array]:
+    """From cell to cell how far it went per turn of its wheels; NaN where these do not drive it.
+
+    Returns:
+        When each cell begins, how long cells are, and the ratios.
+    """
+    rows, x, y = places_in(run.frame, position)
+    clock = run.frame.times[rows]
+    speeds = np.nan_to_num([run.frame.numbers(each.name)[rows] for each in wheels])
+    mean, fastest = speeds.mean(axis=0), np.abs(speeds).max(axis=0)
+    least = max(4 * run.noise.of(wheels[0].name), _CREEPS * float(np.quantile(fastest, 0.9)))
+    ahead = (np.abs(mean) >= ON_THE_SPOT * fastest) & (fastest > least)
+    drives = np.sign(mean) * ahead
+    per_row_s = max(run.noise.interval_s, 1e-6)
+    way_m = float(np.hypot(np.diff(x), np.diff(y)).sum())
+    speed_m_s = way_m / (max(1, int(np.count_nonzero(ahead))) * per_row_s)
+    noises = {each: 1.5 * run.noise.position_m * (per_row_s / each) ** 0.5 for each in _CELLS_S}
+    fit = (
+        each for each, noise_m in noises.items()
+        if each >= 3 * per_row_s and noise_m / each <= _NOISE_SHARE * speed_m_s
+    )  # fmt: skip
+    lasts_s = next(fit, _CELLS_S[-1])
+    cells = (clock // lasts_s).astype(np.intp)
+    starts = np.flatnonzero(np.diff(cells, prepend=-1))
+    if len(starts) < 2:
+        return np.zeros(0), lasts_s, np.zeros(0)
+    course = np.zeros(len(rows))
+    if (heading := run.motion.heading) is not None:
+        turn = heading.turn or math.tau
+        course = unwrap(run.frame.numbers(heading.name)[rows], turn) * math.tau / turn
+    counts = np.diff(starts, append=len(rows))
+    t, x, y, turned, course, driven = (
+        np.add.reduceat(each, starts) / counts for each in (clock, x, y, mean, course, drives)
+    )
+    whole = (np.abs(driven) == 1) & (counts >= 2)
+    both = whole[1:] & whole[:-1] & (driven[1:] == driven[:-1]) & (np.diff(cells[starts]) == 1)
+    both &= np.abs(np.diff(course)) <= _TURNS_RAD
+    rates = np.abs(turned[1:] + turned[:-1]) / 2 * np.diff(t)
+    went_m = np.hypot(np.diff(x), np.diff(y))
+    ratios = np.full(len(both), math.nan)
+    ratios[both] = went_m[both] / rates[both]
+    return clock[starts[:-1]], lasts_s, ratios
+
+
+# -- two estimates of one thing --------------------------------------------------------------------
+
+_FITTED: Final = 0.2  # of the way: so much of it lays one estimate over the other
+_LEAST_WAY_M: Final = 1.0
+_SAME: Final = 0.1  # of the fitted way: two that are farther apart there are no two of one thing
+_WARNS: Final = (0.05, 0.1)  # of the way, and m: farther apart is a drift worth a look
+_FAILS: Final = (0.15, 0.3)
+_ALIKE: Final = 0.8  # correlation of the turns of two headings of one robot
+_TURN_WARNS_RAD, _TURN_FAILS_RAD = 0.2, 0.5
+
+
+def estimates_agree(run: RunUnderCheck) -> Finding:
+    """Warns where two estimates came apart by 5 % of the way or 0.2 rad, fails from 15 % or 0.5 on.
+
+    Each may have a frame of its own: they are laid over each other where the run begins.
+    """
+    positions, headings = _positions(run), _headings(run)
+    made = [_drift(run, positions[0], other) for other in positions[1:]]
+    made += [_turned_apart(run, headings[0], other) for other in headings[1:]]
+    if not (findings := [each for each in made if each is not None]):
+        raise NotApplicableError(
+            "no second position or heading of the robot that goes along with the first"
+            f" for {_LEAST_WAY_M:g} m: publish gps and odometry, say"
+        )
+    return min(findings, key=lambda each: ("fail", "warn", "pass").index(each.outcome))
+
+
+def _positions(run: RunUnderCheck) -> list[tuple[Signal, Signal]]:
+    known = run.search.known
+    by_role = {role: known[name] for name, role in stored_roles(known).items() if name in run.frame}
+    pairs = [(by_role.get(f"x{place}"), by_role.get(f"y{place}")) for place in PLACES]
+    return [(x, y) for x, y in pairs if x and y]
+
+
+def _headings(run: RunUnderCheck) -> list[Signal]:
+    known = run.search.known
+    roles = {role: name for name, role in stored_roles(known).items() if name in run.frame}
+    names = [roles[f"yaw{place}"] for place in PLACES if f"yaw{place}" in roles]
+    aims = {find_targets(name, names)[0] for name in names}
+    return [known[name] for name in names if name not in aims]
+
+
+def _drift(
+    run: RunUnderCheck, one: tuple[Signal, Signal], other: tuple[Signal, Signal]
+) -> Finding | None:
+    """None where they are no two of one thing, or it went too little to tell."""
+    both = [in_metres(each, run.frame.numbers(each.name)) for each in (*one, *other)]
+    there = np.flatnonzero(np.isfinite(both).all(axis=0))
+    if len(there) < 10:
+        return None
+    a: Any = both[0][there] + 1j * both[1][there]
+    b: Any = both[2][there] + 1j * both[3][there]
+    thin = max(1, len(there) // 500)
+    way_m: Array = np.abs(np.diff(a[::thin])).cumsum()
+    if way_m[-1] < _LEAST_WAY_M or np.abs(np.diff(b[::thin])).sum() < 0.2 * way_m[-1]:
+        return None
+    first = max(5, int(np.count_nonzero(way_m < _FITTED * way_m[-1])) * thin)
+    a, b = a - a[:first].mean(), b - b[:first].mean()
+    turn = cast("complex", np.vdot(b[:first], a[:first]))
+    off: Array = np.abs(a - b * (turn / abs(turn) if turn else 1.0))
+    if off[:first].max() > max(_SAME * _FITTED * way_m[-1], 0.1):
+        return None
+    names = " and ".join(each[0].name.rpartition(".")[0] or each[0].name for each in (one, other))
+    limits = [max(share * way_m[-1], least) for share, least in (_WARNS, _FAILS)]
+    what = f"{names}: {{:.3g}} m apart at most, of a way of {way_m[-1]:.3g} m"
+    return _came_apart(run, there, off, limits, what, (one[0], other[0]))
+
+
+def _came_apart(
+    run: RunUnderCheck,
+    there: Indexes,
+    off: Array,
+    limits: Sequence[float],
+    what: str,
+    signals: Iterable[Signal],
+) -> Finding:
+    worst = float(off.max())
+    if worst <= limits[0]:
+        return Finding("pass", what.format(worst))
+    since_s = float(run.frame.times[there][int(np.argmax(off > limits[0]))])
+    outcome = "fail" if worst > limits[1] else "warn"
+    shown = run.shows(*(each.name for each in signals))
+    return Finding(outcome, what.format(worst), since_s, 1, shown)
+
+
+def _turned_apart(run: RunUnderCheck, one: Signal, other: Signal) -> Finding | None:
+    angles = [
+        run.frame.numbers(each.name) * math.tau / (each.turn or math.tau) for each in (one, other)
+    ]
+    there = np.flatnonzero(np.isfinite(angles).all(axis=0))
+    if len(there) < 10:
+        return None
+    a, b = (unwrap(each[there]) for each in angles)
+    thin = max(1, len(there) // 200)
+    turns = [np.diff(each[::thin]) for each in (a, b)]
+    size = math.sqrt(inner(turns[0], turns[0]) * inner(turns[1], turns[1]))
+    alike = inner(*turns) / size if size else 0.0
+    if np.ptp(a) < _TURN_FAILS_RAD or abs(alike) < _ALIKE:
+        return None
+    # A compass that counts the other way round turns as much, against it.
+    off = np.abs((a - a[0]) - math.copysign(1.0, alike) * (b - b[0]))
+    what = f"{one.name} and {other.name}: {{:.3g}} rad apart at most"
+    return _came_apart(run, there, off, (_TURN_WARNS_RAD, _TURN_FAILS_RAD), what, (one, other))
+
+
+def stays_in_place(run: RunUnderCheck) -> Finding:
+    """Warns where the position jumped: something put it elsewhere, or the estimate is wrong."""
+    if run.motion.position is None:
+        raise NotApplicableError("no position is published")
+    leaps = [each for each in run.events(JUMP.name) if each.name == "position"]
+    if not leaps:
+        return Finding("pass", "its position never jumped")
+    far_m = max(float(each.details.get("distance_m", 0.0)) for each in leaps)
+    evidence = f"its position jumped {times(len(leaps))}, up to {far_m:.3g} m"
+    return Finding("warn", evidence, leaps[0].start_s, len(leaps), run.more(JUMP.name))

@@ -1,0 +1,185 @@
+"""`violation`: what was expected of a robot did not hold; and how well it held in a whole run."""
+
+from __future__ import annotations
+
+import ast
+import sqlite3
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+from webots_mcp.conditions.compiler import Condition
+from webots_mcp.conditions.expectation import Expectation, parse_expectation
+from webots_mcp.conditions.signal_values import SAME_TIME_S
+from webots_mcp.errors import ConditionFailedError, InvalidConditionError
+from webots_mcp.pauses import EXPECTED, OF_PROJECT, VIOLATION
+from webots_mcp.store.analysis.arrays import Flags, Runs, np, runs_of
+from webots_mcp.store.detection.condition import (
+    holds_in,
+    numbers_in,
+    position_in,
+    values_at,
+)
+from webots_mcp.store.detection.kinds import (
+    Alike,
+    Event,
+    EventKind,
+    NotAskedError,
+    NotSearchableError,
+)
+from webots_mcp.store.detection.search import Search
+from webots_mcp.store.reading.frame import Frame, read_frame
+from webots_mcp.store.reading.segment import Segment, just_after
+from webots_mcp.store.signals import Signal
+
+NONE_EXPECTED: Final = (
+    "nothing is expected of this run: bridge.expect(...), webots-mcp.toml, or "
+    "webots_check_run(expect=[...])"
+)
+
+
+@dataclass(frozen=True)
+class Held:
+    """How an expectation held in the rows of a run.
+
+    Attributes:
+        violations: Where it did not.
+        meant_s: For how long it was asked, and `held_s` for how long of that it held.
+        lacking: Rows in which it was meant and had no value to be asked of.
+        worst: The value that was farthest on the wrong side, where it compares with a number.
+    """
+
+    violations: Runs
+    meant_s: float
+    held_s: float
+    lacking: int
+    worst: tuple[str, float] | None
+
+
+def expectations_of(
+    connection: sqlite3.Connection, run_id: int, *, of_project: bool = True
+) -> list[Expectation]:
+    """What was expected of a run: by its controller's code, and by its project as compiled last.
+
+    Args:
+        connection: Any.
+        run_id: The run.
+        of_project: False leaves out what its project expects.
+    """
+    found = list[Expectation]()
+    for expects, during, name, by in connection.execute(EXPECTED, (run_id,)).fetchall():
+        try:
+            if by == OF_PROJECT and not of_project:
+                continue
+            found.append(parse_expectation(expects, during, name))
+        except InvalidConditionError:
+            continue
+    return list({each.asks: each for each in found}.values())
+
+
+def every_call_of(search: Search) -> Frame:
+    """All rows of the run, in kept stretches each call: violations keep the seconds around them."""
+    whole = Segment(search.segment.run_id, search.began_s, just_after(search.ended_s))
+    return read_frame(search.connection, whole, search.deadline, every_call=True)
+
+
+def judge_expectation(expectation: Expectation, frame: Frame, known: dict[str, Signal]) -> Held:
+    """Ask an expectation of the rows of a run.
+
+    Raises:
+        ConditionFailedError: The values are not of the kinds that it can be asked of.
+    """
+    position = position_in(frame, known) if _asks_position(expectation) else None
+
+    def holds(condition: Condition) -> Flags:
+        return holds_in(condition.scanned, condition.tree, frame, position)
+
+    meant: Flags = np.array(frame.was_read())
+    if expectation.during is not None:
+        meant &= holds(expectation.during)
+    if len(frame):
+        meant &= frame.times - frame.times[0] >= expectation.takes_s - SAME_TIME_S
+        meant[0] &= not expectation.needs_two
+    lacks: Flags = np.zeros(len(frame), np.bool_)
+    if not expectation.asks_missing:
+        names = [*expectation.expected.signals, *(position or ())]
+        lost = expectation.expected.asks_position and position is None
+        for name in names:
+            lacks |= np.isnan(frame.numbers(name)) & (frame.texts(name).codes == 0)
+        lacks |= lost
+    asked: Flags = meant & ~lacks
+    violated: Flags = asked & ~holds(expectation.expected)
+    lasts_s = np.diff(frame.times)
+    meant_s, bad_s = (float(lasts_s[each[:-1]].sum()) for each in (asked, violated))
+    worst = _worst(expectation.expected, frame, position, violated)
+    lacking = int(np.count_nonzero(meant & lacks))
+    runs = runs_of(violated, frame.times)
+    if not meant_s:  # a single row
+        meant_s, bad_s = float(asked.any()), float(violated.any())
+    return Held(runs, meant_s, meant_s - bad_s, lacking, worst)
+
+
+def _asks_position(expectation: Expectation) -> bool:
+    both = (expectation.expected, expectation.during)
+    return any(each is not None and each.asks_position for each in both)
+
+
+def _worst(
+    expected: Condition, frame: Frame, position: tuple[str, str] | None, violated: Flags
+) -> tuple[str, float] | None:
+    """Of a comparison of one value with a number: the value that is farthest from holding."""
+    tree = expected.tree
+    if not isinstance(tree, ast.Compare) or len(tree.ops) != 1 or not violated.any():
+        return None
+    left, right, op = tree.left, tree.comparators[0], tree.ops[0]
+    flipped = isinstance(left, ast.Constant)
+    side = right if flipped else left
+    other = left if flipped else right
+    if not isinstance(other, ast.Constant | ast.UnaryOp) or isinstance(side, ast.Constant):
+        return None
+    if not isinstance(op, ast.Lt | ast.LtE | ast.Gt | ast.GtE):
+        return None
+    try:
+        values = numbers_in(expected.scanned, side, frame, position)[violated]
+    except ConditionFailedError:
+        return None
+    wants_more = isinstance(op, ast.Gt | ast.GtE) is not flipped
+    start, end = side.col_offset, side.end_col_offset or 0
+    columns = expected.scanned.columns
+    text = expected.scanned.original[columns[start] : columns[end]]
+    return text.strip(), float(np.nanmin(values) if wants_more else np.nanmax(values))
+
+
+def violation_events(search: Search) -> Iterator[Event]:
+    """Each stretch in which something that was expected did not hold."""
+    expected = expectations_of(search.connection, search.segment.run_id)
+    if not expected:
+        if len(search.kinds) > 1:
+            raise NotAskedError
+        raise NotSearchableError(NONE_EXPECTED)
+    frame = every_call_of(search)
+    search.not_searched(VIOLATION, *map(str, frame.unread))
+    for each in expected:
+        try:
+            held = judge_expectation(each, frame, search.known)
+        except ConditionFailedError as error:
+            search.not_searched(VIOLATION, str(error))
+            continue
+        position = position_in(frame, search.known) if _asks_position(each) else None
+        runs, condition = held.violations, each.violation
+        values = values_at(condition, frame, position, runs)
+        for run, details in zip(runs.each(), values, strict=True):
+            here = search.segment
+            if run.start_s < here.end_s and run.end_s >= here.start_s:
+                details = {"expected": each.expected.text, **dict(list(details.items())[:8])}
+                yield search.event(VIOLATION, run.start_s, run.end_s, each.name, **details)
+
+
+VIOLATIONS: Final = EventKind(
+    VIOLATION,
+    "of what is expected",
+    violation_events,
+    lasts=True,
+    drawn=1,
+    alike=Alike(lambda events, unit: "violations"),
+)

@@ -138,12 +138,11 @@ def test_a_breakpoint_that_cannot_be_stored_is_stored_when_it_is_set_again_or_a_
         assert [bridge.breakpoint(f"n == {n}", "log") for n in (1, 2)] == [None, None]
     assert bridge.breakpoint("n == 1", "log") is not None
     assert filed.rows("SELECT condition FROM breakpoint") == ["n == 1"]
+    robot.step(2 * STEP_MS)
     bridge.publish({"n": 0})
-    robot.step(STEP_MS)
     robot.simulationReset()
     robot.step(STEP_MS)
     bridge.publish({"n": 0})
-    catch_up(bridge)
     assert filed.rows("SELECT condition FROM breakpoint ORDER BY id") == ["n == 1", "n == 2"]
 
 

@@ -148,6 +148,8 @@ class Breakpoints:
         else:
             known = {each.id: each for each in self.armed}
             unstored = [each for each in self.armed if each.id is None]
+            for each in unstored:
+                each.id = self._store(*each.asks)
             stored = [known.get(row[0]) or self._read(*row) for row in rows]
             self.armed = [*unstored, *filter(None, stored)]
         self.run = run
@@ -191,7 +193,8 @@ class Breakpoints:
         """Arm one of the controller's code, for as long as its session lasts.
 
         Returns:
-            Its id; None while the database cannot take it: it is armed all the same.
+            Its id; None while the database cannot take it: it is armed all the same, and stored
+            when it is set again, or the next run begins.
 
         Raises:
             InvalidInputError: The condition is not of the language, there is no such action, or
@@ -216,6 +219,8 @@ class Breakpoints:
     def _arm(self, new: Breakpoint) -> int | None:
         for each in self.armed:
             if each.asks == new.asks:
+                if each.id is None:
+                    each.id = self._store(*each.asks)
                 return each.id
         if len(self.armed) >= MAX_BREAKPOINTS:
             raise InvalidInputError(f"{MAX_BREAKPOINTS} breakpoints are armed already: remove one")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from tests.bridge.attaching.conftest import times
 from tests.bridge.conftest import STEP_MS, Recording
 from webots_mcp import MCPBridge, MemoryDatabase
+from webots_mcp.bridge import devices
 from webots_mcp.standin import InProcessSupervisor
 
 pytestmark = pytest.mark.usefixtures("look_in_every_step")
@@ -24,8 +27,12 @@ calls: list[str] = []
 
 
 def test_after_a_quit_all_is_written_and_nothing_is_asked_any_more(
-    database: MemoryDatabase, recording: Recording, capsys: pytest.CaptureFixture[str]
+    database: MemoryDatabase,
+    recording: Recording,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(devices, "MOST_READING_US", math.inf)  # read for the ring in each call
     robot = Watched("rover")
     bridge = MCPBridge.attach(robot, database=database)
     for _ in range(7):

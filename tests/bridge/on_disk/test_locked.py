@@ -131,6 +131,21 @@ def test_breakpoints_stay_armed_through_a_reset_at_which_they_cannot_be_read(
     assert told == ["n == 1", "n == 2"]
 
 
+def test_a_breakpoint_that_cannot_be_stored_is_stored_when_it_is_set_again_or_a_run_begins(
+    robot: InProcessSupervisor, bridge: MCPBridge, file: Path, filed: Recording
+) -> None:
+    with write_lock(file):
+        assert [bridge.breakpoint(f"n == {n}", "log") for n in (1, 2)] == [None, None]
+    assert bridge.breakpoint("n == 1", "log") is not None
+    assert filed.rows("SELECT condition FROM breakpoint") == ["n == 1"]
+    robot.step(2 * STEP_MS)
+    bridge.publish({"n": 0})
+    robot.simulationReset()
+    robot.step(STEP_MS)
+    bridge.publish({"n": 0})
+    assert filed.rows("SELECT condition FROM breakpoint ORDER BY id") == ["n == 1", "n == 2"]
+
+
 def test_arming_is_answered_once_the_breakpoints_could_be_read(
     bridge: MCPBridge, file: Path
 ) -> None:

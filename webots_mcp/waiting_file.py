@@ -193,7 +193,7 @@ _PIECE_S: Final = 0.001  # how long a transaction may keep other writers out
 _SESSION_OF: Final = "SELECT id, last_adopted_entry FROM session WHERE uuid = ?"
 _ADOPTED: Final = "SELECT last_adopted_entry FROM session WHERE id = ?"
 _SET_ADOPTED: Final = "UPDATE session SET last_adopted_entry = ? WHERE id = ?"
-_RUN_OF: Final = "SELECT id FROM run WHERE uuid = ?"
+_RUN_OF: Final = "SELECT id FROM run WHERE uuid = ? AND session_id = ?"
 _RECOUNT: Final = (
     "SELECT purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id), id FROM run "
     "WHERE session_id = ? AND ended_wall_time_s IS NOT NULL"
@@ -534,9 +534,9 @@ def _write(connection: sqlite3.Connection, session_id: int, entry: Entry) -> str
     run_id = None
     try:
         if entry.run is not None:
-            row = connection.execute(_RUN_OF, (entry.run,)).fetchone()
+            row = connection.execute(_RUN_OF, (entry.run, session_id)).fetchone()
             if row is None:
-                return f"its run {entry.run} is not known"
+                return f"its session has no run {entry.run}"
             run_id = row[0]
         connection.execute(STATEMENTS[entry.kind], bind(run_id, session_id, entry.values))
     except Exception as error:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import fcntl
 import json
+import os
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -113,3 +114,24 @@ def test_a_reader_that_may_not_write_says_what_waits(tmp_path: Path) -> None:
             assert len(rows(tmp_path, "state")) == 1
         with Recording(tmp_path / "webots.db", tmp_path, read_only=True, asker="cli").reader():
             assert len(rows(tmp_path, "state")) == 2
+
+
+def test_a_journal_writes_to_no_run_of_another_session_and_waits_for_no_program(
+    tmp_path: Path,
+) -> None:
+    other = part(tmp_path).with_name(part(tmp_path).name.replace(SESSION[:8], "6" * 8))
+    os.mkfifo(tmp_path / "program")
+    first = {"uuid": SESSION, "pid": 1, "started_wall_time_s": 2e9}
+    second = first | {"uuid": SESSION.replace(SESSION[:8], "6" * 8)}
+    second["controller"] = str(tmp_path / "program")
+    run = {"uuid": "1", "reason": "start", "wall_time": 1.0, "sim_time": 0.0}
+    for path, session, value in ((part(tmp_path), first, 1), (other, second, 2)):
+        header = {"webots_mcp_waiting": 1, "robot": {"name": f"r{value}"}, "session": session}
+        state = [2, "state", "1", [0.1, 1.1, {"x": value}]]
+        end = [3, "run end", "1", {"reason": "finished", "now": 1.0 + value, "sim_time": 1.0}]
+        lines = (header, [1, "run", None, run], state, end)
+        path.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+        os.utime(path, (value, value))  # in this order
+    Recording(tmp_path / "webots.db", tmp_path).take_in()
+    assert [data for _, data, _ in rows(tmp_path, "state")] == ['{"x":1}']
+    assert rows(tmp_path, "run") == [["1", "start", 1.0, 1, "finished"]]

@@ -184,6 +184,7 @@ def bind(run_id: int | None, session_id: int | None, values: Values) -> Values:
 
 ENTRIES_AT_ONCE: Final = 100  # read, or written in one transaction
 FORMAT: Final = 1  # of the file; versions that know another one leave the file alone
+_LONGEST_HEADER_BYTES: Final = 16_000_000
 MAX_FILE_BYTES: Final = 1_000_000_000
 _VERSION: Final = "webots_mcp_waiting"
 _NO_NUMBER: Final = 1 << 63  # SQLite's integers end there
@@ -416,17 +417,17 @@ def read_header(file: BinaryIO) -> dict[str, Any] | None:
     """Who recorded; None where the first line was cut off.
 
     Raises:
-        ValueError: Another version wrote the file.
+        ValueError: Another version wrote the file, or it is no JSON object.
     """
     file.seek(0)
+    line = file.readline(_LONGEST_HEADER_BYTES)
+    if not line.endswith(b"\n") and len(line) < _LONGEST_HEADER_BYTES:
+        return None
     try:
-        header = json.loads(file.readline())
-    except (ValueError, RecursionError):
-        return None
-    if not isinstance(header, dict):
-        return None
-    header = cast("dict[str, Any]", header)
-    if header.get(_VERSION) != FORMAT:
+        header = cast("dict[str, Any]", json.loads(line))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"the first line of {file.name} is no JSON: {error}") from None
+    if not isinstance(header, dict) or header.get(_VERSION) != FORMAT:  # pyright: ignore[reportUnnecessaryIsInstance]
         raise ValueError(f"{file.name} was written by another version of webots-mcp")
     return header
 

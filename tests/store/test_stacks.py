@@ -8,7 +8,9 @@ import os
 import shutil
 import signal
 import sqlite3
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -134,6 +136,17 @@ def test_a_controllers_own_handler_of_the_signal_stays_and_no_file_of_others_is_
         assert handled == [SIGNAL]
     finally:
         signal.signal(SIGNAL, former)
+
+
+def test_the_loops_thread_is_the_one_that_steps(tmp_path: Path) -> None:
+    robot = InProcessSupervisor()
+    bridge = MCPBridge(robot, tmp_path)
+    with ThreadPoolExecutor(1) as other:
+        stepped_in = other.submit(lambda: (robot.step(16), threading.get_ident())[1]).result()
+        bridge._session._watchdog.look()  # pyright: ignore[reportPrivateUsage]
+    (path,) = tmp_path.glob("*-stacks-*")
+    assert json.loads(path.read_bytes())["thread"] == stepped_in != threading.get_ident()
+    bridge.close()
 
 
 @pytest.mark.parametrize(("silent_s", "rows"), [(3.1, 1), (1.0, 0)])

@@ -50,7 +50,7 @@ class Watchdog:
         self._is_on = limit_s > 0 and isinstance(database, Path)
         self._path = stacks_path(Path(str(database)), session.recorder.uuid)
         self._lock = threading.Lock()
-        self._about = {VERSION: FORMAT, "thread": threading.get_ident(), "limit_s": limit_s}
+        self._about = {VERSION: FORMAT, "limit_s": limit_s}
         files = session.simulation.step_files
         folders = [folder for file in files if (folder := Path(file).parent).name in _WEBOTS]
         libraries = [_OURS, _STDLIB, *(f"{folder}{os.sep}" for folder in folders)]
@@ -138,7 +138,8 @@ class Watchdog:
     def _begin_anew(self) -> None:
         """Whose stacks will follow; the time of the file shows that Python runs."""
         self._look_at_signal()
-        head = json.dumps(self._about | {"run": self._session.clock.run.uuid}).encode() + b"\n"
+        now = {"run": self._session.clock.run.uuid, "thread": self._meter.thread}
+        head = json.dumps(self._about | now).encode() + b"\n"
         if head == self._head and os.fstat(self._file).st_size == len(head):
             os.utime(self._file)
             return

@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from webots_mcp.connection import connect, create_schema
 from webots_mcp.store.journal_intake import take_in_journals
 from webots_mcp.store.recording import Recording
 from webots_mcp.waiting_file import journal_parts
@@ -114,6 +115,21 @@ def test_a_reader_that_may_not_write_says_what_waits(tmp_path: Path) -> None:
             assert len(rows(tmp_path, "state")) == 1
         with Recording(tmp_path / "webots.db", tmp_path, read_only=True, asker="cli").reader():
             assert len(rows(tmp_path, "state")) == 2
+
+
+def test_what_there_is_no_time_for_waits_also_where_there_are_many_journals(
+    tmp_path: Path,
+) -> None:
+    text = (FILES[0].parent / "cut_line.jsonl").read_text()
+    for start in "5678":
+        name = part(tmp_path).name.replace("-5f", f"-{start}f")
+        (tmp_path / name).write_text(text.replace('"5f', f'"{start}f'))
+    with closing(connect(tmp_path / "webots.db", "writer", create=True)) as connection:
+        create_schema(connection)
+        for begun in (1, 1, 2, 2, 3, 3, 4, 4):  # read, and then found to be at its end
+            take_in_journals(connection, tmp_path / "webots.db", budget_s=0.0)
+            assert len(rows(tmp_path, "session")) == begun
+    assert journal_parts(tmp_path / "webots.db") == {}
 
 
 def test_a_journal_writes_to_no_run_of_another_session_and_waits_for_no_program(

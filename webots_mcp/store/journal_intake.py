@@ -166,6 +166,8 @@ def take_in_journals(
             # In order, and no part before those ahead of it are in: of its entries only those that
             # are newer than the last one that is in are taken.
             all(_take_in_part(connection, database, uuid, path, until_s) for path in parts)
+            if time.monotonic() > until_s:
+                return
 
 
 def _take_in_part(

@@ -8,6 +8,7 @@ Standard library only, because the bridge imports it inside a robot's controller
 from __future__ import annotations
 
 import os
+import signal
 import sqlite3
 import sys
 import time
@@ -181,6 +182,27 @@ def is_stopped(pid: int) -> bool:
         return _linux_stat(pid)[0] in (b"T", b"t")
     except (OSError, IndexError):
         return False
+
+
+def signal_process(pid: int, process: str | None, number: int) -> None:
+    """Send a signal that would end whoever does not expect it.
+
+    It is sent to that very process (`process_identity`) only, not to another of its pid, and where
+    a handler is installed: another program, begun by `exec`, has none. Linux only.
+
+    Raises:
+        OSError: No such process runs, or the system does not tell.
+    """
+    if sys.platform != "linux":
+        return
+    handle = os.pidfd_open(pid)
+    try:
+        with open(f"/proc/{pid}/status", "rb") as file:  # noqa: PTH123
+            caught = int(file.read().partition(b"\nSigCgt:")[2].split()[0], 16)
+        if caught >> number - 1 & 1 and process is not None and process_identity(pid) == process:
+            signal.pidfd_send_signal(handle, number)
+    finally:
+        os.close(handle)
 
 
 def _windows_start(pid: int) -> float | None:

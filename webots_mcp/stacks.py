@@ -13,7 +13,9 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
@@ -21,6 +23,7 @@ from typing import BinaryIO, Final, NamedTuple
 VERSION: Final = "webots_mcp_stacks"
 FORMAT: Final = 1
 LOGGER: Final = "stacks"  # of the log rows
+SIGNAL: Final = getattr(signal, "SIGRTMAX", 5) - 5  # 0, none, but on Linux
 STEPPING: Final = ("step", "stepBegin", "stepEnd")  # methods in which a controller waits for Webots
 _THREAD: Final = re.compile(
     r"^(?:Current thread|Thread) 0x([0-9a-f]+)[^\n]*\(most recent call first\):\n((?:  .*\n?)*)",
@@ -37,6 +40,8 @@ _MOST_BYTES: Final = 200_000
 _MOST_TEXT: Final = 4000
 _MOST_CALLERS: Final = 3
 _LONGEST_NAME: Final = 60
+# What a file that was made by others raises.
+_STRANGE: Final = (OSError, ValueError, TypeError, LookupError, ArithmeticError, RecursionError)
 
 
 class Call(NamedTuple):
@@ -114,7 +119,8 @@ def read_stacks(file: BinaryIO) -> Stacks | None:
         threads = {int(thread, 16): calls for thread, calls in _THREAD.findall(text)}
         calls = [Call(*call) for call in _CALL.findall(threads[about["thread"]])]
         steps, libraries = (tuple(map(str, about[name])) for name in ("step_files", "libraries"))
-    except (ValueError, TypeError, LookupError, RecursionError):
+        run.encode()
+    except _STRANGE:
         return None
     if not calls or about.get(VERSION) != FORMAT:
         return None
@@ -132,7 +138,7 @@ def _is_library(file: str, libraries: tuple[str, ...]) -> bool:
     return file.startswith(libraries) or INSTALLED.search(file) is not None
 
 
-def stacks_at(path: Path, pid: int, *, may_signal: bool) -> Stacks | None:
+def stacks_at(path: Path, send: Callable[[], object] | None) -> Stacks | None:
     """What the file of a process holds; None where nothing was written.
 
     Where no thread of that process could touch the file any more, C code keeps the interpreter's
@@ -140,14 +146,14 @@ def stacks_at(path: Path, pid: int, *, may_signal: bool) -> Stacks | None:
 
     Args:
         path: The file.
-        pid: The process.
-        may_signal: It runs on this machine, and is not stopped.
+        send: Sends `SIGNAL` to the process; None where that cannot be.
     """
-    with suppress(OSError, ValueError, LookupError, TypeError), path.open("rb") as file:
+    with suppress(*_STRANGE), path.open("rb") as file:
         found, about = read_stacks(file), json.loads((file.seek(0), file.readline())[1])
         untouched_s = time.time() - os.fstat(file.fileno()).st_mtime
-        if found is None and may_signal and untouched_s > about["limit_s"] + _UNTOUCHED_S:
-            os.kill(pid, about["signal"])
+        is_stuck = found is None and untouched_s > about["limit_s"] + _UNTOUCHED_S
+        if send is not None and is_stuck and about["signal"] == SIGNAL:
+            send()
             time.sleep(_WRITING_S)
             found = read_stacks(file)
         return found

@@ -184,6 +184,7 @@ def bind(run_id: int | None, session_id: int | None, values: Values) -> Values:
 
 ENTRIES_AT_ONCE: Final = 100  # read, or written in one transaction
 FORMAT: Final = 1  # of the file; versions that know another one leave the file alone
+_LONGEST_HEADER_BYTES: Final = 16_000_000
 MAX_FILE_BYTES: Final = 1_000_000_000
 _VERSION: Final = "webots_mcp_waiting"
 _NO_NUMBER: Final = 1 << 63  # SQLite's integers end there
@@ -193,7 +194,7 @@ _PIECE_S: Final = 0.001  # how long a transaction may keep other writers out
 _SESSION_OF: Final = "SELECT id, last_adopted_entry FROM session WHERE uuid = ?"
 _ADOPTED: Final = "SELECT last_adopted_entry FROM session WHERE id = ?"
 _SET_ADOPTED: Final = "UPDATE session SET last_adopted_entry = ? WHERE id = ?"
-_RUN_OF: Final = "SELECT id FROM run WHERE uuid = ?"
+_RUN_OF: Final = "SELECT id FROM run WHERE uuid = ? AND session_id = ?"
 _RECOUNT: Final = (
     "SELECT purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id), id FROM run "
     "WHERE session_id = ? AND ended_wall_time_s IS NOT NULL"
@@ -416,17 +417,17 @@ def read_header(file: BinaryIO) -> dict[str, Any] | None:
     """Who recorded; None where the first line was cut off.
 
     Raises:
-        ValueError: Another version wrote the file.
+        ValueError: Another version wrote the file, or it is no JSON object.
     """
     file.seek(0)
+    line = file.readline(_LONGEST_HEADER_BYTES)
+    if not line.endswith(b"\n") and len(line) < _LONGEST_HEADER_BYTES:
+        return None
     try:
-        header = json.loads(file.readline())
-    except (ValueError, RecursionError):
-        return None
-    if not isinstance(header, dict):
-        return None
-    header = cast("dict[str, Any]", header)
-    if header.get(_VERSION) != FORMAT:
+        header = cast("dict[str, Any]", json.loads(line))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"the first line of {file.name} is no JSON: {error}") from None
+    if not isinstance(header, dict) or header.get(_VERSION) != FORMAT:  # pyright: ignore[reportUnnecessaryIsInstance]
         raise ValueError(f"{file.name} was written by another version of webots-mcp")
     return header
 
@@ -534,9 +535,9 @@ def _write(connection: sqlite3.Connection, session_id: int, entry: Entry) -> str
     run_id = None
     try:
         if entry.run is not None:
-            row = connection.execute(_RUN_OF, (entry.run,)).fetchone()
+            row = connection.execute(_RUN_OF, (entry.run, session_id)).fetchone()
             if row is None:
-                return f"its run {entry.run} is not known"
+                return f"its session has no run {entry.run}"
             run_id = row[0]
         connection.execute(STATEMENTS[entry.kind], bind(run_id, session_id, entry.values))
     except Exception as error:

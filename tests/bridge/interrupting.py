@@ -26,7 +26,7 @@ WRITING = {
     f"{name}.py"
     for name in (
         *("recorder", "backlog", "journal", "session", "simulation", "mcp_bridge"),
-        *("waiting_file", "transactions", "connection"),
+        *("waiting_file", "transactions", "connection", "watchdog"),
     )
 }
 Place = tuple[str, int, int]  # file, line, and the instruction in it or -1

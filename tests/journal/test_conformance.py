@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import fcntl
 import json
+import os
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from webots_mcp.connection import connect, create_schema
 from webots_mcp.store.journal_intake import take_in_journals
 from webots_mcp.store.recording import Recording
 from webots_mcp.waiting_file import journal_parts
@@ -113,3 +115,39 @@ def test_a_reader_that_may_not_write_says_what_waits(tmp_path: Path) -> None:
             assert len(rows(tmp_path, "state")) == 1
         with Recording(tmp_path / "webots.db", tmp_path, read_only=True, asker="cli").reader():
             assert len(rows(tmp_path, "state")) == 2
+
+
+def test_what_there_is_no_time_for_waits_also_where_there_are_many_journals(
+    tmp_path: Path,
+) -> None:
+    text = (FILES[0].parent / "cut_line.jsonl").read_text()
+    for start in "5678":
+        name = part(tmp_path).name.replace("-5f", f"-{start}f")
+        (tmp_path / name).write_text(text.replace('"5f', f'"{start}f'))
+    with closing(connect(tmp_path / "webots.db", "writer", create=True)) as connection:
+        create_schema(connection)
+        for begun in (1, 1, 2, 2, 3, 3, 4, 4):  # read, and then found to be at its end
+            take_in_journals(connection, tmp_path / "webots.db", budget_s=0.0)
+            assert len(rows(tmp_path, "session")) == begun
+    assert journal_parts(tmp_path / "webots.db") == {}
+
+
+def test_a_journal_writes_to_no_run_of_another_session_and_waits_for_no_program(
+    tmp_path: Path,
+) -> None:
+    other = part(tmp_path).with_name(part(tmp_path).name.replace(SESSION[:8], "6" * 8))
+    os.mkfifo(tmp_path / "program")
+    first = {"uuid": SESSION, "pid": 1, "started_wall_time_s": 2e9}
+    second = first | {"uuid": SESSION.replace(SESSION[:8], "6" * 8)}
+    second["controller"] = str(tmp_path / "program")
+    run = {"uuid": "1", "reason": "start", "wall_time": 1.0, "sim_time": 0.0}
+    for path, session, value in ((part(tmp_path), first, 1), (other, second, 2)):
+        header = {"webots_mcp_waiting": 1, "robot": {"name": f"r{value}"}, "session": session}
+        state = [2, "state", "1", [0.1, 1.1, {"x": value}]]
+        end = [3, "run end", "1", {"reason": "finished", "now": 1.0 + value, "sim_time": 1.0}]
+        lines = (header, [1, "run", None, run], state, end)
+        path.write_text("".join(f"{json.dumps(line)}\n" for line in lines))
+        os.utime(path, (value, value))  # in this order
+    Recording(tmp_path / "webots.db", tmp_path).take_in()
+    assert [data for _, data, _ in rows(tmp_path, "state")] == ['{"x":1}']
+    assert rows(tmp_path, "run") == [["1", "start", 1.0, 1, "finished"]]

@@ -120,6 +120,7 @@ def test_a_robot_that_publishes_a_pose_itself_keeps_it_and_the_seen_one_stands_b
         ('{"a": NaN}', '{"a":null}'),
         ("0.5", '{"custom_data":0.5}'),
         ('{"a": 1,}', '{"custom_data":"{\\"a\\": 1,}"}'),
+        ('{"a": "' + 'x\\"' * 20_000, None),  # was cut off
         ("[" * 50_000, None),
         ("1" * 50_000, None),
         ('{"a":' * 20_000, None),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sqlite3
 import subprocess
 import sys
@@ -16,7 +17,8 @@ import pytest
 from tests.bridge.conftest import heartbeat_now
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect, create_schema
-from webots_mcp.liveness import process_identity
+from webots_mcp.liveness import process_identity, signal_process
+from webots_mcp.stacks import SIGNAL
 from webots_mcp.standin import InProcessSupervisor
 
 
@@ -121,3 +123,28 @@ def test_two_processes_are_told_apart_and_one_that_ended_is_none() -> None:
         assert None is not told != process_identity(os.getpid())
         other.communicate(b"\n")
     assert process_identity(other.pid) is None
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="is sent on Linux only")
+def test_a_signal_reaches_the_process_that_expects_it_and_no_other_of_its_pid() -> None:
+    waits = "import signal; signal.signal({}, lambda *_: print('caught')); print(signal.pause())"
+    for number, is_that_process, is_sent in (
+        (SIGNAL, True, True),
+        (SIGNAL, False, False),
+        (signal.SIGUSR1, True, False),  # what another program expects, begun by exec in its place
+    ):
+        command = [sys.executable, "-uc", f"print(0); {waits.format(int(number))}"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as other:
+            assert other.stdout is not None and other.stdout.readline() == "0\n"
+            while (state := _caught(other.pid)) >> number - 1 & 1 == 0:
+                assert other.poll() is None, state
+            identity = process_identity(other.pid if is_that_process else os.getpid())
+            signal_process(other.pid, identity, SIGNAL)
+            if not is_sent:
+                other.kill()
+            said = other.stdout.read()
+        assert (other.returncode, said) == ((0, "caught\nNone\n") if is_sent else (-9, ""))
+
+
+def _caught(pid: int) -> int:
+    return int(Path(f"/proc/{pid}/status").read_text().partition("SigCgt:")[2].split()[0], 16)

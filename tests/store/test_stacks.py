@@ -5,15 +5,21 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
+import signal
 import sqlite3
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from tests.recordings.rows import Recorded
 from tests.store.questions.test_outcomes import driving, measure, medians, record
-from webots_mcp.stacks import FORMAT, VERSION, read_stacks, stacks_path
+from webots_mcp import MCPBridge
+from webots_mcp.stacks import FORMAT, SIGNAL, VERSION, read_stacks, stacks_at, stacks_path
+from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.questions.compare import compare_runs
 from webots_mcp.store.run_rows import pace_of
 from webots_mcp.waiting_file import adopt
@@ -77,11 +83,15 @@ def test_the_place_is_the_controllers_own_code_and_a_step_or_a_debugger_is_no_ha
         b"",
         b"\xff\xfe\n" * 1000,
         b"[1]\n",
+        b"[" * 100_000,
         json.dumps(HEAD).encode(),  # nothing was written
         f"{json.dumps(HEAD)}\n{LOOP}\n".encode(),
         *(
             f'{json.dumps(HEAD | wrong)}\n{LOOP}\n  File "a", line 1 in b\n'.encode()
-            for wrong in ({VERSION: 99}, {"thread": 3}, {"limit_s": "x"}, {"libraries": None})
+            for wrong in (
+                *({VERSION: 99}, {"thread": 3}, {"limit_s": "x"}, {"libraries": None}),
+                *({"limit_s": 10**400}, {"run": "\ud800"}),
+            )
         ),
     ],
 )
@@ -92,9 +102,51 @@ def test_a_file_without_the_stacks_of_the_loop_says_nothing_and_is_removed(
     path.write_bytes(content)
     with path.open("rb") as file:
         assert read_stacks(file) is None
+    assert stacks_at(path, lambda: pytest.fail("no process is asked")) is None
     recorded.robot()
     assert adopt(recorded.connection, tmp_path / "webots.db") == 0
     assert not path.exists()
+
+
+@pytest.mark.skipif(not SIGNAL, reason="there is no such signal")
+def test_a_controllers_own_handler_of_the_signal_stays_and_no_file_of_others_is_touched(
+    tmp_path: Path,
+) -> None:
+    robot = InProcessSupervisor()
+    former = signal.getsignal(SIGNAL)
+    try:
+        bridge = MCPBridge(robot, tmp_path / "data")
+        (path,) = (tmp_path / "data").glob("*-stacks-*")
+        assert json.loads(path.read_bytes())["signal"] == SIGNAL
+        handled: list[int] = []
+        signal.signal(SIGNAL, lambda number, _: handled.append(number))
+        watchdog = bridge._session._watchdog  # pyright: ignore[reportPrivateUsage]
+        watchdog.look()
+        assert "signal" not in json.loads(path.read_bytes())
+
+        shutil.rmtree(tmp_path / "data")
+        (tmp_path / "data").write_text("in its place")
+        watchdog.look()
+        with (tmp_path / "other").open("w") as other:  # which gets the number of the closed file
+            other.write("kept")
+            other.flush()
+            bridge.close()
+        assert (tmp_path / "other").read_text() == "kept"
+        signal.raise_signal(SIGNAL)
+        assert handled == [SIGNAL]
+    finally:
+        signal.signal(SIGNAL, former)
+
+
+def test_the_loops_thread_is_the_one_that_steps(tmp_path: Path) -> None:
+    robot = InProcessSupervisor()
+    bridge = MCPBridge(robot, tmp_path)
+    with ThreadPoolExecutor(1) as other:
+        stepped_in = other.submit(lambda: (robot.step(16), threading.get_ident())[1]).result()
+        bridge._session._watchdog.look()  # pyright: ignore[reportPrivateUsage]
+    (path,) = tmp_path.glob("*-stacks-*")
+    assert json.loads(path.read_bytes())["thread"] == stepped_in != threading.get_ident()
+    bridge.close()
 
 
 @pytest.mark.parametrize(("silent_s", "rows"), [(3.1, 1), (1.0, 0)])

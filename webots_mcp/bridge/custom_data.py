@@ -43,7 +43,7 @@ _MOST_FOUND: Final = 10  # robots whose fields are looked for in one round
 _STALE_S: Final = 1.0  # of simulation time in which a text from before a reset is not believed
 # Strings, which stay as they are, and what C prints of numbers that JSON lacks.
 _C_NUMBERS: Final = re.compile(
-    r'"(?:\\.|[^"\\])*"|([-+]?)\b(?:(nan)\b(?:\(\w*\))?|inf(?:inity)?\b)', re.IGNORECASE
+    r'"(?:\\.|[^"\\])*"?|([-+]?)\b(?:(nan)\b(?:\(\w*\))?|inf(?:inity)?\b)', re.IGNORECASE
 )
 _END_REASON: Final = "SELECT end_reason FROM session WHERE id = ?"
 _OPEN_SESSIONS: Final = (

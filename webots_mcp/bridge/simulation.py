@@ -6,6 +6,7 @@ Webots is called only in the controller's own thread, and never after a quit.
 from __future__ import annotations
 
 import functools
+import threading
 import time
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
@@ -272,11 +273,13 @@ class LoopMeter:
 
     Attributes:
         at_s: The newest sign of life, by `time.perf_counter`.
+        thread: The one that steps.
     """
 
-    __slots__ = ("_own_s", "_step_s", "_steps", "at_s")
+    __slots__ = ("_own_s", "_step_s", "_steps", "at_s", "thread")
 
     def __init__(self) -> None:
+        self.thread = threading.get_ident()
         self.at_s = time.perf_counter()
         self._own_s = self._step_s = 0.0
         self._steps = -1  # until the first step has ended: what a controller does before is no loop
@@ -290,6 +293,7 @@ class LoopMeter:
     def leave_step(self, answer: int, has_advanced: bool) -> int:
         """Webots has answered; returns its answer."""
         now_s = time.perf_counter()
+        self.thread = threading.get_ident()
         self._step_s += now_s - self.at_s
         self.at_s = now_s
         if has_advanced:

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from webots_mcp.contract import PRIVATE_FILE, Database
-from webots_mcp.stacks import FORMAT, VERSION, read_stacks, stacks_path
+from webots_mcp.stacks import FORMAT, SIGNAL, VERSION, read_stacks, stacks_path
 from webots_mcp.waiting_file import lock
 
 if TYPE_CHECKING:
@@ -32,7 +32,6 @@ _MOST_LOGGED: Final = 20  # in a session: a loop that is slow by design would fi
 _OURS: Final = f"{Path(__file__).parents[1]}{os.sep}"
 _STDLIB: Final = f"{Path(os.__file__).parent}{os.sep}"
 _WEBOTS: Final = ("controller", "vehicle")  # its packages
-_SIGNAL: Final = getattr(signal, "SIGRTMAX", 5) - 5  # 0, none, but on Linux
 
 
 class Watchdog:
@@ -51,7 +50,7 @@ class Watchdog:
         self._is_on = limit_s > 0 and isinstance(database, Path)
         self._path = stacks_path(Path(str(database)), session.recorder.uuid)
         self._lock = threading.Lock()
-        self._about = {VERSION: FORMAT, "thread": threading.get_ident(), "limit_s": limit_s}
+        self._about = {VERSION: FORMAT, "limit_s": limit_s}
         files = session.simulation.step_files
         folders = [folder for file in files if (folder := Path(file).parent).name in _WEBOTS]
         libraries = [_OURS, _STDLIB, *(f"{folder}{os.sep}" for folder in folders)]
@@ -119,19 +118,28 @@ class Watchdog:
         flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | getattr(os, "O_BINARY", 0)
         self._file = os.open(self._path, flags, PRIVATE_FILE)
         lock(self._file)
-        if _SIGNAL and signal.getsignal(_SIGNAL) is signal.SIG_DFL:
-            faulthandler.register(_SIGNAL, self._file, all_threads=True)
-            self._about["signal"] = _SIGNAL
+        if SIGNAL and signal.getsignal(SIGNAL) is signal.SIG_DFL:
+            faulthandler.register(SIGNAL, self._file, all_threads=True)
+            self._about["signal"] = SIGNAL
 
     def _leave_file(self) -> None:
         """Close it; a signal that was sent meanwhile must neither end the process nor find it."""
+        self._look_at_signal()
         if "signal" in self._about:
-            faulthandler.register(_SIGNAL, _nowhere(), all_threads=False)
-        os.close(self._file)
+            faulthandler.register(SIGNAL, _nowhere(), all_threads=False)
+        file, self._file = self._file, -1  # first: the number may be another file's at once
+        os.close(file)
+
+    def _look_at_signal(self) -> None:
+        """Leave it to a controller that has taken it for itself."""
+        if "signal" in self._about and signal.getsignal(SIGNAL) is not signal.SIG_DFL:
+            del self._about["signal"]
 
     def _begin_anew(self) -> None:
         """Whose stacks will follow; the time of the file shows that Python runs."""
-        head = json.dumps(self._about | {"run": self._session.clock.run.uuid}).encode() + b"\n"
+        self._look_at_signal()
+        now = {"run": self._session.clock.run.uuid, "thread": self._meter.thread}
+        head = json.dumps(self._about | now).encode() + b"\n"
         if head == self._head and os.fstat(self._file).st_size == len(head):
             os.utime(self._file)
             return

@@ -17,6 +17,7 @@ import json
 import math
 import os
 import sqlite3
+import stat
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -36,6 +37,7 @@ from webots_mcp.waiting_file import STATEMENTS, Entry, Kind, Taken, journal_part
 
 BUDGET_S: Final = 5.0  # of a question; what is left waits for the next one, and is said
 LONGEST_LINE_BYTES: Final = 4_000_000
+_LARGEST_PROGRAM_BYTES: Final = 100_000_000
 _HEADERLESS_S: Final = 60.0  # its writer has not come to the header yet, or never will
 _LAG_S: Final = 2.0  # a row that came since the question began is no delay
 
@@ -51,7 +53,8 @@ _FIELDS: Final[dict[Kind, tuple[str, ...]]] = {
 _NAMED: Final = ("run", "run end", "session end")  # whose values are an object, not an array
 _OF_SESSION: Final = ("run", "session end")  # which name no run before their values
 _TYPES: Final[dict[str, tuple[type, ...]]] = {"n": (int, float), "s": (str,), "o": (dict,)}
-_UNGIVEN: Final = {"rows": None, "monotonic": None}  # of statements, which bridges alone know
+# Of statements, which bridges alone know.
+_UNGIVEN: Final = dict.fromkeys(("rows", "monotonic", "own", "step_wait", "steps"))
 
 _KNOWN: Final = (
     "SELECT id, robot_id, last_adopted_entry, (SELECT data FROM state WHERE run_id = "
@@ -163,6 +166,8 @@ def take_in_journals(
             # In order, and no part before those ahead of it are in: of its entries only those that
             # are newer than the last one that is in are taken.
             all(_take_in_part(connection, database, uuid, path, until_s) for path in parts)
+            if time.monotonic() > until_s:
+                return
 
 
 def _take_in_part(
@@ -361,7 +366,9 @@ def _object(value: object) -> dict[str, Any]:
 def _sha256(file: str, started_s: float) -> str | None:
     """Of the program, if it is still the one that was started."""
     with suppress(OSError, ValueError):
-        if Path(file).stat().st_mtime <= started_s:
+        status = Path(file).stat()
+        is_program = stat.S_ISREG(status.st_mode) and status.st_size <= _LARGEST_PROGRAM_BYTES
+        if is_program and status.st_mtime <= started_s:
             return sha256(Path(file).read_bytes()).hexdigest()
     return None
 

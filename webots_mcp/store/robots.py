@@ -9,6 +9,7 @@ import sqlite3
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -26,7 +27,7 @@ from webots_mcp.contract import (
     host_name,
 )
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError, UnknownRobotError
-from webots_mcp.liveness import EXTERN, is_living, is_stopped, process_alive
+from webots_mcp.liveness import EXTERN, is_living, is_stopped, process_alive, signal_process
 from webots_mcp.naming import SOLIDS, WORLD
 from webots_mcp.pauses import (
     HELD_ELSEWHERE,
@@ -40,7 +41,7 @@ from webots_mcp.pauses import (
     breakpoint_at,
     change_since,
 )
-from webots_mcp.stacks import LOGGER, Stacks, stacks_at, stacks_path
+from webots_mcp.stacks import LOGGER, SIGNAL, Stacks, stacks_at, stacks_path
 from webots_mcp.store.run_rows import Run, columns_of, newest_state, recent_interval_s, state_at
 from webots_mcp.waiting_file import Entry, count_rows, next_entries, read_header, waiting_path
 
@@ -549,7 +550,8 @@ def find_stacks(connection: sqlite3.Connection, session: Session, now_s: float) 
     path = _path_of(connection, session, stacks_path)
     is_silent = session.host == host_name() and not session.heartbeat_is_fresh(now_s)
     may_signal = is_silent and not is_stopped(session.pid)
-    stacks = stacks_at(path, session.pid, may_signal=may_signal) if path else None
+    send = partial(signal_process, session.pid, session.process, SIGNAL) if may_signal else None
+    stacks = stacks_at(path, send) if path else None
     return stacks if stacks and stacks.began_after(session.last_seen_wall_time_s) else None
 
 
@@ -663,10 +665,11 @@ def _path_of(
     session: Session,
     path_in: Callable[[Path, str], Path] = waiting_path,
 ) -> Path | None:
-    """None for a database in memory."""
+    """None for a database in memory, and where there is no such file."""
     (file,) = connection.execute("SELECT file FROM pragma_database_list").fetchone()
     (uuid,) = connection.execute("SELECT uuid FROM session WHERE id = ?", (session.id,)).fetchone()
-    return path_in(Path(file), uuid) if file else None
+    path = path_in(Path(file), uuid) if file else None
+    return path if path and path.is_file() else None  # a FIFO would wait for a writer
 
 
 def _oldest_s(entries: list[tuple[int, Entry]]) -> float:

@@ -51,7 +51,8 @@ _FIELDS: Final[dict[Kind, tuple[str, ...]]] = {
 _NAMED: Final = ("run", "run end", "session end")  # whose values are an object, not an array
 _OF_SESSION: Final = ("run", "session end")  # which name no run before their values
 _TYPES: Final[dict[str, tuple[type, ...]]] = {"n": (int, float), "s": (str,), "o": (dict,)}
-_UNGIVEN: Final = {"rows": None, "monotonic": None}  # of statements, which bridges alone know
+# Values of statements that bridges alone know.
+_UNGIVEN: Final = dict.fromkeys(("rows", "monotonic", "own", "step_wait", "steps"))
 
 _KNOWN: Final = (
     "SELECT id, robot_id, last_adopted_entry, (SELECT data FROM state WHERE run_id = "

@@ -262,6 +262,16 @@ def test_commands_are_refused_and_nothing_is_said_of_get_command(robots: Robots)
         assert "recorded by the observer" in (view.status.why or "")
 
 
+def test_whose_time_a_step_takes_is_said_of_the_observer_alone(robots: Robots) -> None:
+    robots.go_on(5, rover='{"n": 1}')
+    robots.watching.observer.bridge.close()
+    robots.watching.observer.custom_data.close()
+    joined = "FROM run JOIN robot r ON r.id = run.robot_id"
+    rows = robots.watching.rows(f"SELECT r.name, own_wall_s, steps {joined}")
+    assert {name for name, _, steps in rows if steps} == {"mcp_observer"}
+    assert ("rover", None, None) in rows
+
+
 def test_robots_that_wrote_nothing_have_no_session_and_a_hidden_field_is_said_once(
     robots: Robots, monkeypatch: pytest.MonkeyPatch
 ) -> None:

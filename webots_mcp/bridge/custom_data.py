@@ -28,7 +28,7 @@ from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import same_simulation
 from webots_mcp.bridge.scene import SceneNode, find_field
 from webots_mcp.bridge.session import Session
-from webots_mcp.bridge.simulation import Clock
+from webots_mcp.bridge.simulation import Clock, LoopMeter
 from webots_mcp.contract import CUSTOM_DATA, HEARTBEAT_INTERVAL_S
 from webots_mcp.liveness import is_living
 from webots_mcp.signal_register import SignalNames, StateChanges
@@ -258,6 +258,7 @@ class _Recording:
         self._body = body
         self._followed, self._observed_run = observer.clock, observer.clock.run
         self._clock = Clock(observer.simulation)
+        self._clock.meter = LoopMeter()  # that of its own loop, which nobody sees
         self._errors = ErrorReport(strict=False)
         self.recorder = Recorder(observer.recorder.database, identity, self._clock, self._errors)
         self._journal = Journal(self.recorder, self._clock)

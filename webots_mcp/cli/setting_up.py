@@ -310,7 +310,8 @@ def _expected(data_dir: Path, writing: Writing) -> str | None:
             if schema_version(connection) == 0:
                 create_schema(connection)
             compile_project(connection, expected)
-    return f"{file}: {len(expected)} expectations; webots-mcp check judges runs by them"
+    counted = f"{len(expected)} expectation{'s' * (len(expected) != 1)}"
+    return f"{file}: {counted}; webots-mcp check judges runs by what is there"
 
 
 def _ignored(data_dir: Path, writing: Writing) -> dict[str, str]:

@@ -50,6 +50,7 @@ _EXTERN: Final = re.compile(r'^\s*controller\s+"<extern>"', re.MULTILINE)
 _LARGEST_WORLD_BYTES: Final = 50_000_000
 _ENDED_BADLY: Final = ("crashed", "reload")
 _SEE_PAGE: Final = "see docs/troubleshooting.md#simulation"
+_MEND_LINE: Final = f"mend that line; else {_SEE_PAGE}"
 _PRESS_PLAY: Final = "press play in Webots"
 _RELOAD: Final = "end or mend that controller, then reload the world (Ctrl+Shift+R in Webots)"
 _PLACES: Final = ("--data-dir", "--database")
@@ -95,7 +96,7 @@ def _judged(view: View) -> Finding:
         return warning(seen, f"webots-mcp resume --robot {name}")
     if (status.why or "").startswith(SEEN_PAUSED):
         return warning(seen, "webots_simulation_control('resume'), or press play")
-    return wrong(seen, _SEE_PAGE)
+    return wrong(seen, _MEND_LINE if "silent for " in (status.why or "") else _SEE_PAGE)
 
 
 def _narrowed(subject: Examined, view: View) -> Finding:

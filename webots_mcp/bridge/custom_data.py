@@ -253,7 +253,7 @@ class _Recording:
             controller=body.controller or None,
             controller_sha256=None,
             git_commit=None,
-            versions={},
+            versions={"observer": observer.identity.versions["webots_mcp"]},
         )
         self._body = body
         self._followed, self._observed_run = observer.clock, observer.clock.run

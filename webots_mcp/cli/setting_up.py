@@ -495,6 +495,8 @@ def header(
     from webots_mcp.contract import C_HEADER
 
     file = target / C_HEADER.name if target.is_dir() else target
+    if not file.suffix.startswith(".h"):
+        raise InvalidInputError(f"there is no folder {target}; a file has to be named *.h")
     text = C_HEADER.read_text("utf-8")
     try:
         if file.exists() and not file.read_bytes().startswith(text[:15].encode()):

@@ -431,7 +431,8 @@ class _Progress:
         else:  # the same again, which no score ranks
             said += "over" if result.status == "done" else came
         print(said, file=sys.stderr, flush=True)
-        if trial.values and time.monotonic() >= self._ranked_s + _RANK_EVERY_S and self._over < self._of:
+        is_due = time.monotonic() >= self._ranked_s + _RANK_EVERY_S
+        if trial.values and is_due and self._over < self._of:
             self._tell_leader()
             self._ranked_s = time.monotonic()
 

@@ -90,13 +90,14 @@ def _judged(view: View) -> Finding:
             return wrong(seen, "see 'webots-mcp logs --level error', mend the controller and start "
                          "it again")  # fmt: skip
         return ok(seen)
+    hangs = _MEND_LINE if "silent for " in (status.why or "") else None
     if status.is_moving:
-        return Finding("warning" if status.why else "ok", seen)
+        return Finding("warning" if status.why else "ok", seen, hangs)
     if status.text == PAUSED:
         return warning(seen, f"webots-mcp resume --robot {name}")
     if (status.why or "").startswith(SEEN_PAUSED):
         return warning(seen, "webots_simulation_control('resume'), or press play")
-    return wrong(seen, _MEND_LINE if "silent for " in (status.why or "") else _SEE_PAGE)
+    return wrong(seen, hangs or _SEE_PAGE)
 
 
 def _narrowed(subject: Examined, view: View) -> Finding:

@@ -80,7 +80,7 @@ class Session:
     @property
     def has_bridge(self) -> bool:
         """Whether it takes commands; what was read from a journal or from customData does not."""
-        return "webots_mcp" in self.versions
+        return not self.versions or "webots_mcp" in self.versions
 
     def is_alive(self, now_s: float) -> bool:
         """Whether it has not ended, and its process still runs."""

@@ -258,7 +258,7 @@ class _Recording:
         self._body = body
         self._followed, self._observed_run = observer.clock, observer.clock.run
         self._clock = Clock(observer.simulation)
-        self._clock.meter = LoopMeter()  # that of its own loop, which nobody sees
+        self._clock.meter = LoopMeter()  # of its own loop, which is not seen
         self._errors = ErrorReport(strict=False)
         self.recorder = Recorder(observer.recorder.database, identity, self._clock, self._errors)
         self._journal = Journal(self.recorder, self._clock)

@@ -260,7 +260,7 @@ def _run(view: View, run: Run) -> dict[str, Any]:
 def _controller(view: View, session: Session | None) -> dict[str, Any] | None:
     if session is None:
         return None
-    if view.robot.kind == CUSTOM_DATA:  # whose process, and its code, nobody knows
+    if view.robot.kind == CUSTOM_DATA:  # its own process and code are not known
         return {"file": session.controller, "recorded_by": _READ}
     return {
         "file": session.controller,

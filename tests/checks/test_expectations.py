@@ -221,9 +221,10 @@ def test_the_command_ends_with_0_1_or_2_and_writes_what_continuous_integration_r
 ) -> None:
     file, recorder = recorded
     where = ["--database", str(file), "--junit", str(tmp_path / "check.xml")]
-    recorder.insert("log", **recorder.at(9.0), level="warning", source="controller", message="hm")
+    recorder.insert("log", **recorder.at(9.0), level="warning", source="controller",
+                    message="silent in a.py:1\n  File a.py, line 1")  # fmt: skip
     assert main(["check", "1", *where]) == 0
-    assert "logs no errors" in capsys.readouterr().out
+    assert "1 warning; first: silent in a.py:1 " in capsys.readouterr().out
     assert main(["check", *where, "--expect", "pose.0 < 2"]) == 1
     out = capsys.readouterr().out
     assert "webots-mcp events --where 'not (pose.0 < 2)' --run 1" in out

@@ -341,6 +341,8 @@ def test_the_command_writes_the_header_and_no_other_file(
     (tmp_path / "mine.h").write_text("#define MINE")
     assert main(["header", str(tmp_path / "mine.h")]) == 2
     assert "it is left as it is" in capsys.readouterr().err
+    assert main(["header", str(tmp_path / "mistyped")]) == 2
+    assert "there is no folder" in capsys.readouterr().err
     assert len(C_HEADER.read_text().splitlines()) <= 600
 
 
@@ -355,6 +357,16 @@ async def test_a_server_that_began_before_the_database_answers_what_was_just_pub
             do(process, f"begin {i}", f"integer {hexed('front.i')} {i}", "publish")
             answer = (await client.call_tool("webots_get_robot_state", {})).structured_content
             assert answer and answer["sim_time_s"] == i and answer["robot"] == "rover"
+        for name, arguments in (
+            ("webots_simulation_control", {"command": "pause"}),
+            ("webots_send_command", {"action": "dance"}),
+            ("webots_list_commands", {}),
+            ("webots_list_commands", {"what": "parameters"}),
+            ("webots_diagnose", {}),
+        ):  # nothing waits for it, and nothing advises what C cannot do
+            said = str((await client.call_tool(name, arguments)).content)
+            assert "get_command()" not in said and "bridge.parameter" not in said
+            assert "no bridge" in said or name == "webots_diagnose"
         process.kill()
         process.communicate()
         while journal_parts(

@@ -13,6 +13,7 @@ from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.bridge.custom_data import LONGEST_TEXT, signals_of
 from webots_mcp.diagnosis import all_checks, diagnose, subject_of
 from webots_mcp.errors import CommandRefusedError
+from webots_mcp.questions.robot_state import webots_get_world_info
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.steering.dispatch import find_target
 from webots_mcp.store.recording import Recording
@@ -258,9 +259,21 @@ def test_commands_are_refused_and_nothing_is_said_of_get_command(robots: Robots)
     said = " ".join(f"{each.finding.seen} {each.finding.fix}" for each in diagnosed(robots))
     assert "rover has no bridge, and takes no commands" in said
     assert "never called get_command" not in said
+    told = webots_get_world_info.function(robots.recording, "rover").controller or {}
+    assert "pid" not in told and "the observer" in told["recorded_by"]
     robots.watching.observer.custom_data.close()
     with robots.recording.view("rover") as view:
         assert "recorded by the observer" in (view.status.why or "")
+
+
+def test_whose_time_a_step_takes_is_said_of_the_observer_alone(robots: Robots) -> None:
+    robots.go_on(5, rover='{"n": 1}')
+    robots.watching.observer.bridge.close()
+    robots.watching.observer.custom_data.close()
+    joined = "FROM run JOIN robot r ON r.id = run.robot_id"
+    rows = robots.watching.rows(f"SELECT r.name, own_wall_s, steps {joined}")
+    assert {name for name, _, steps in rows if steps} == {"mcp_observer"}
+    assert ("rover", None, None) in rows
 
 
 def test_robots_that_wrote_nothing_have_no_session_and_a_hidden_field_is_said_once(

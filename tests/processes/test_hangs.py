@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.bridge.conftest import Recording
+from tests.diagnosis.conftest import found
 from tests.processes.conftest import PatientSimulation, Start, has_states
 from webots_mcp.connection import connect
 from webots_mcp.contract import HANG_VARIABLE
@@ -109,6 +110,8 @@ def test_one_that_comes_back_is_logged_once_and_not_said_any_more(
         HANGS.format(hang=f"while not Path({str(tmp_path / 'go')!r}).exists(): pass")
     )
     why(simulation, filed, "plan()")
+    assert isinstance(filed.database, Path)
+    assert "mend that line" in str(found(filed.database, "Simulation").fix)
     (tmp_path / "go").touch()
     simulation.wait_for(lambda: status(filed).is_moving and messages(filed))
     running = status(filed)
@@ -117,7 +120,7 @@ def test_one_that_comes_back_is_logged_once_and_not_said_any_more(
 
     assert running.why is None
     assert [text.count("plan()") for text in messages(filed)] == [1]
-    assert isinstance(filed.database, Path) and waiting_paths(filed.database, stacks_path) == []
+    assert waiting_paths(filed.database, stacks_path) == []
 
 
 def test_neither_a_simulation_that_is_paused_nor_a_loop_that_is_held_hangs(

@@ -29,6 +29,7 @@ def repeat(project: Path, capsys: pytest.CaptureFixture[str]) -> Repeat:
         assert code == status, said.err
         if status:
             return said.err
+        assert "score" not in said.err and "best" not in said.err  # which rank trials
         return json.loads(said.out) if "--json" in options else said.out
 
     return run

@@ -28,7 +28,7 @@ from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import same_simulation
 from webots_mcp.bridge.scene import SceneNode, find_field
 from webots_mcp.bridge.session import Session
-from webots_mcp.bridge.simulation import Clock
+from webots_mcp.bridge.simulation import Clock, LoopMeter
 from webots_mcp.contract import CUSTOM_DATA, HEARTBEAT_INTERVAL_S
 from webots_mcp.liveness import is_living
 from webots_mcp.signal_register import SignalNames, StateChanges
@@ -253,11 +253,12 @@ class _Recording:
             controller=body.controller or None,
             controller_sha256=None,
             git_commit=None,
-            versions={"webots_mcp": observer.identity.versions["webots_mcp"]},
+            versions={"observer": observer.identity.versions["webots_mcp"]},
         )
         self._body = body
         self._followed, self._observed_run = observer.clock, observer.clock.run
         self._clock = Clock(observer.simulation)
+        self._clock.meter = LoopMeter()  # of its own loop, which is not seen
         self._errors = ErrorReport(strict=False)
         self.recorder = Recorder(observer.recorder.database, identity, self._clock, self._errors)
         self._journal = Journal(self.recorder, self._clock)

@@ -328,6 +328,7 @@ class Clock:
 
     def __init__(self, simulation: Simulation) -> None:
         self._simulation = simulation
+        self.meter = simulation.meter  # whose time the rounds of the loop take
         self.sim_time_s = simulation.time_s
         self.moved_s: float | None = None  # by the monotonic clock
         self.stepped_s = self.sim_time_s  # at the end of the newest step that the bridge saw
@@ -367,11 +368,6 @@ class Clock:
             self.run = Run("reset", other.sim_time_s)
         self.sim_time_s, self.moved_s = other.sim_time_s, other.moved_s
         return is_new
-
-    @property
-    def meter(self) -> LoopMeter:
-        """Whose time the rounds of the loop take."""
-        return self._simulation.meter
 
     def start_moving(self) -> None:
         """Count time as moving from now on; it counts as standing still only after a while."""

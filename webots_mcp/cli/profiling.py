@@ -47,6 +47,8 @@ def profile(
         name, session = view.robot.name, view.session
     if session is None or not view.robot.live or session.host != host_name():
         raise CommandRefusedError(f"no controller of {name} runs on this machine")
+    if not session.has_bridge:
+        raise CommandRefusedError(f"{name} has no bridge in Python: its lines cannot be sampled")
     controller = Path(session.controller or "/nowhere")
     own = str(find_project(controller.parent) or controller.parent)
     samples = Counter[tuple[str, str | None]]()

@@ -310,7 +310,8 @@ def _expected(data_dir: Path, writing: Writing) -> str | None:
             if schema_version(connection) == 0:
                 create_schema(connection)
             compile_project(connection, expected)
-    return f"{file}: {len(expected)} expectations; webots-mcp check judges runs by them"
+    counted = f"{len(expected)} expectation{'s' * (len(expected) != 1)}"
+    return f"{file}: {counted}; webots-mcp check judges runs by what is there"
 
 
 def _ignored(data_dir: Path, writing: Writing) -> dict[str, str]:
@@ -494,6 +495,8 @@ def header(
     from webots_mcp.contract import C_HEADER
 
     file = target / C_HEADER.name if target.is_dir() else target
+    if not file.suffix.startswith(".h"):
+        raise InvalidInputError(f"there is no folder {target}; a file has to be named *.h")
     text = C_HEADER.read_text("utf-8")
     try:
         if file.exists() and not file.read_bytes().startswith(text[:15].encode()):

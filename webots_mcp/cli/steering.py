@@ -425,9 +425,14 @@ class _Progress:
         self._over += 1
         came = text_of(result.score) if result.status == "done" else result.error
         came = f"{_WORDS[result.status]} {came}"
-        said = f"{self._over}/{self._of}  {text_of(trial.values)}: {came}"
+        said = f"{self._over}/{self._of}  "
+        if trial.values:
+            said += f"{text_of(trial.values)}: {came}"
+        else:  # the same again, which no score ranks
+            said += "over" if result.status == "done" else came
         print(said, file=sys.stderr, flush=True)
-        if time.monotonic() >= self._ranked_s + _RANK_EVERY_S and self._over < self._of:
+        is_due = time.monotonic() >= self._ranked_s + _RANK_EVERY_S
+        if trial.values and is_due and self._over < self._of:
             self._tell_leader()
             self._ranked_s = time.monotonic()
 

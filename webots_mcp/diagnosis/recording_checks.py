@@ -405,7 +405,7 @@ def get_command(subject: Examined) -> Iterator[Finding]:
     for view in subject.live:
         if (session := view.session) is None:
             continue
-        if view.robot.kind == CUSTOM_DATA:
+        if not session.has_bridge:
             yield ok(f"{view.robot.name} has no bridge, and takes no commands")
             continue
         loop, polled_s = f"{view.robot.name}'s loop", session.last_poll_wall_time_s

@@ -50,6 +50,7 @@ _EXTERN: Final = re.compile(r'^\s*controller\s+"<extern>"', re.MULTILINE)
 _LARGEST_WORLD_BYTES: Final = 50_000_000
 _ENDED_BADLY: Final = ("crashed", "reload")
 _SEE_PAGE: Final = "see docs/troubleshooting.md#simulation"
+_MEND_LINE: Final = f"mend that line; else {_SEE_PAGE}"
 _PRESS_PLAY: Final = "press play in Webots"
 _RELOAD: Final = "end or mend that controller, then reload the world (Ctrl+Shift+R in Webots)"
 _PLACES: Final = ("--data-dir", "--database")
@@ -89,13 +90,14 @@ def _judged(view: View) -> Finding:
             return wrong(seen, "see 'webots-mcp logs --level error', mend the controller and start "
                          "it again")  # fmt: skip
         return ok(seen)
+    hangs = _MEND_LINE if "silent for " in (status.why or "") else None
     if status.is_moving:
-        return Finding("warning" if status.why else "ok", seen)
+        return Finding("warning" if status.why else "ok", seen, hangs)
     if status.text == PAUSED:
         return warning(seen, f"webots-mcp resume --robot {name}")
     if (status.why or "").startswith(SEEN_PAUSED):
         return warning(seen, "webots_simulation_control('resume'), or press play")
-    return wrong(seen, _SEE_PAGE)
+    return wrong(seen, hangs or _SEE_PAGE)
 
 
 def _narrowed(subject: Examined, view: View) -> Finding:

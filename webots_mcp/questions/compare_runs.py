@@ -174,7 +174,10 @@ def webots_compare_runs(
     if run_ids and trial_set:
         raise InvalidInputError("give run_ids or trial_set, not both")
     if first_difference and (not run_ids or len(run_ids) != 2 or position or mode):
-        raise InvalidInputError("first_difference is of two runs, by signals alone; name both runs")
+        raise InvalidInputError(
+            f"first_difference compares two runs, not {run_ids or 'none'}: run_ids=[3, 4]; "
+            "besides it takes signals only"
+        )
     options = EventOptions(position=both_of(position), mode=mode)
     first = run_ids[0] if run_ids else _first_run(recording, trial_set) if trial_set else None
     with recording.view(robot, first) as view:

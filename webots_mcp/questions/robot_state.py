@@ -131,7 +131,7 @@ def webots_get_world_info(
             supervisor=session.supervisor if session else None,
             run=_run(view, run),
             runs_recorded=count_runs(view.connection, view.robot.id),
-            controller=_controller(session),
+            controller=_controller(view, session),
             devices=_devices(view.robot.devices),
             other_robots=Table(columns=["robot", "kind", "pause_state"], rows=shown)
             if shown
@@ -257,9 +257,11 @@ def _run(view: View, run: Run) -> dict[str, Any]:
     }
 
 
-def _controller(session: Session | None) -> dict[str, Any] | None:
+def _controller(view: View, session: Session | None) -> dict[str, Any] | None:
     if session is None:
         return None
+    if view.robot.kind == CUSTOM_DATA:  # its own process and code are not known
+        return {"file": session.controller, "recorded_by": _READ}
     return {
         "file": session.controller,
         "sha256": session.controller_sha256,

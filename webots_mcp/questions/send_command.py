@@ -317,7 +317,9 @@ def _answer(view: View, commands: list[Command], limit: int) -> CommandsAnswer:
     more = len(rows) < len(commands) or len(commands) == limit
     actions = view.session.actions if view.session else {}
     shown = _shown_actions(actions)
-    hints = ["no such command was sent to this robot yet"] * (not commands)
+    has_bridge = view.session is None or view.session.has_bridge
+    nothing = "no such command was sent to this robot yet" if has_bridge else _TAKES_NONE
+    hints = [nothing] * (not commands)
     hints += [_MORE_OF_ONE.format(view.session.id)] if view.session and shown != actions else []
     hints += [f"{len(shown)} of {len(actions)} actions are shown"] * (len(shown) < len(actions))
     return CommandsAnswer(
@@ -325,7 +327,7 @@ def _answer(view: View, commands: list[Command], limit: int) -> CommandsAnswer:
         commands=condensed(COMMAND_COLUMNS, rows),
         cursor=commands[len(rows) - 1].id if more else None,
         actions=shown,
-        built_in=list(BUILT_IN_ACTIONS),
+        built_in=list(BUILT_IN_ACTIONS) if has_bridge else [],
         hint="; ".join(hints) or None,
     )
 
@@ -395,6 +397,13 @@ _NONE: Final = (
 )
 
 
+_TAKES_NONE: Final = "this robot has no bridge: it takes no commands, and has no parameters"
+
+
+def _none(view: View) -> str:
+    return _NONE if view.session is None or view.session.has_bridge else _TAKES_NONE
+
+
 @question("Get the parameters", READS)
 def webots_get_parameters(
     recording: Recording,
@@ -418,7 +427,7 @@ def webots_get_parameters(
             **view.header(),
             parameters=without_empty(COLUMNS, told),
             total=len(rows),
-            hint="; ".join(hints) or (None if rows else _NONE),
+            hint="; ".join(hints) or (None if rows else _none(view)),
         )
 
 

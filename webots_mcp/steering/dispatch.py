@@ -618,6 +618,7 @@ def _last_rows(view: View, command: Command, progress: Progress, end_s: float) -
 # -- the robot whose controller is to run a command --
 
 _SHOWN_ACTIONS: Final = 30
+_MAKE_OBSERVER: Final = "'webots-mcp init --observer WORLD' adds one to a world"
 _MAKE_ONE: Final = (
     "set the field 'supervisor' of its Robot node to TRUE and create it with Supervisor() instead "
     "of Robot()"
@@ -680,12 +681,14 @@ def _require_action(view: View, action: str) -> None:
 def _require_live(view: View) -> Session:
     """The robot's session; during a reload the old one, since its successor runs the command."""
     session = view.session
-    if view.robot.kind == CUSTOM_DATA:
+    if session is not None and not session.has_bridge:
         name, observer = view.robot.name, live_observer(view.connection, session, view.now_s)
+        is_seen = view.robot.kind == CUSTOM_DATA
+        how = "the observer records it from its customData" if is_seen else "it writes a journal"
         raise CommandRefusedError(
-            f"robot {name!r} takes no commands: it has no bridge, the observer records it from its "
-            "customData. In Python give its controller MCPBridge.attach(robot); the simulation is "
-            f"steered by an observer{f' (robot={observer.name!r})' if observer else ''}"
+            f"robot {name!r} takes no commands: it has no bridge, {how}. In Python give its "
+            "controller MCPBridge.attach(robot); the simulation is steered by an observer "
+            f"({f'robot={observer.name!r}' if observer else _MAKE_OBSERVER})"
         )
     if session is not None and (view.robot.live or _is_reloading(session, view.now_s)):
         return session

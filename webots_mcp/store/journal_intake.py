@@ -33,7 +33,7 @@ from webots_mcp.connection import identify_files, in_transaction
 from webots_mcp.contract import CUSTOM_DATA, find_log_level, host_name, instance_of, is_extern
 from webots_mcp.errors import warn
 from webots_mcp.naming import flatten
-from webots_mcp.waiting_file import STATEMENTS, Entry, Kind, Taken, journal_parts
+from webots_mcp.waiting_file import FORMAT, STATEMENTS, Entry, Kind, Taken, journal_parts
 
 BUDGET_S: Final = 5.0  # of a question; what is left waits for the next one, and is said
 LONGEST_LINE_BYTES: Final = 4_000_000
@@ -350,7 +350,7 @@ def _described(header: Mapping[str, Any], uuid: str) -> tuple[str, dict[str, Any
         "extern": int(is_extern(environment)),
         "controller": file,
         "controller_sha256": _sha256(file, started_s) if is_here and file else None,
-        "versions": json.dumps(_object(session.get("versions"))),
+        "versions": json.dumps({"journal": str(FORMAT)} | _object(session.get("versions"))),
         "supervisor": 0,
         "actions": "{}",
         "started_wall_time_s": started_s,

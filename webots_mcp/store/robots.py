@@ -78,6 +78,11 @@ class Session:
     ended_wall_time_s: float | None
     end_reason: str | None
 
+    @property
+    def has_bridge(self) -> bool:
+        """Whether it takes commands; what was read from a journal or from customData does not."""
+        return not self.versions or "webots_mcp" in self.versions
+
     def is_alive(self, now_s: float) -> bool:
         """Whether it has not ended, and its process still runs."""
         process = (self.host, self.pid, self.process, self.last_seen_wall_time_s)

@@ -79,8 +79,9 @@ def logs_no_errors(run: RunUnderCheck) -> Finding:
     first = (errors or lines)[0]
     counts = Counter(each.name or "" for each in lines)
     said = str(first.details["message"]).strip().splitlines() or [""]
+    line = said[-1 if said[0].startswith("Traceback") else 0]  # which exception it was
     evidence = ", ".join(f"{count} {level}" for level, count in counts.items())
-    evidence += f"; first: {said[-1][:_LONGEST_MESSAGE]}"
+    evidence += f"; first: {line[:_LONGEST_MESSAGE]}"
     more = f"webots_get_logs(run_id={run.info.run_id})"
     return Finding("fail" if errors else "warn", evidence, first.start_s, len(lines), more)
 

@@ -12,7 +12,6 @@ from webots_mcp.store.checks.finding import (
     Finding,
     RunUnderCheck,
     times,
-    total_s,
 )
 from webots_mcp.store.detection.jump import JUMP
 from webots_mcp.store.detection.kinds import Event
@@ -37,7 +36,8 @@ def sensors_speak(run: RunUnderCheck) -> Finding:
         return Finding("pass", "none was without a value for a second")
     nan = [each for each in silent if each.details.get("value") == _FAULTY]
     silent = by_array(silent)
-    evidence = f"{_names(silent)}: {times(len(silent))}, {total_s(silent):.3g} s without a value"
+    longest_s = max((each.duration_s for each in silent), default=0.0)
+    evidence = f"{_names(silent)}: {times(len(silent))}, up to {longest_s:.4g} s without a value"
     evidence = f"{listed(never, MOST_NAMED)}: NaN in every row" if never else evidence
     since_s = silent[0].start_s if silent and not never else run.search.began_s
     outcome = "fail" if nan or never else "warn"

@@ -20,7 +20,7 @@ from webots_mcp.connection import connect, create_schema
 from webots_mcp.errors import InvalidConditionError, InvalidInputError, UnknownSignalError
 from webots_mcp.server import create_server
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.checks.registry import check_run
+from webots_mcp.store.checks import check_run
 from webots_mcp.store.detection.events import find_events
 from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.project_file import ProjectWatch, read_project

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.checks.judging import HEALTHY, checked, judge, render
-from webots_mcp.store.checks.registry import CHECKS
+from webots_mcp.store.checks import CHECKS
 
 pytestmark = pytest.mark.slow
 

@@ -18,8 +18,8 @@ from webots_mcp.questions.budget import (
     without_empty,
 )
 from webots_mcp.questions.declaring import READS, RobotName, RunId, question
+from webots_mcp.store.checks import CHECK_DEADLINE_S, CheckedRun, check_run
 from webots_mcp.store.checks.finding import Finding
-from webots_mcp.store.checks.registry import CHECK_DEADLINE_S, CheckedRun, check_run
 from webots_mcp.store.project_file import Expected, file_of, read_project
 from webots_mcp.store.recording import Recording, View
 

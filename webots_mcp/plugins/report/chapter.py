@@ -27,7 +27,7 @@ from webots_mcp.plugins.report.words import (
     told,
     valued,
 )
-from webots_mcp.store.checks.registry import check_run
+from webots_mcp.store.checks import check_run
 from webots_mcp.store.detection.events import KINDS, Found, choose, search_events, stored_kinds
 from webots_mcp.store.detection.kinds import Event, EventOptions, Verdicts
 from webots_mcp.store.logs import COUNT_LIMIT, LogFilter, LogLine, Window, count_lines, newest_lines

@@ -49,7 +49,7 @@ class Finding(NamedTuple):
 
 @dataclass(frozen=True)
 class Check:
-    """A check. One of these, a line in `registry.CHECKS`, is all that a new check takes.
+    """A check. One of these, a line in `checks.CHECKS`, is all that a new check takes.
 
     Attributes:
         find: Says what was found; its docstring says when it warns and when it fails. It may raise

@@ -73,7 +73,7 @@ def check(
     asked, or not all of the run was looked at.
     """
     from webots_mcp.cli.asking import ask, show
-    from webots_mcp.questions.check_run import webots_check_run
+    from webots_mcp.questions.compare_runs import webots_check_run
 
     _compile(recorded)
     make_chunks_first(recorded.recording())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, cast
@@ -14,25 +15,40 @@ from pydantic import Field
 
 from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
+from webots_mcp.plotting import (
+    HEIGHT_PX,
+    LEAST_HEIGHT_PX,
+    LEAST_WIDTH_PX,
+    MOST_PX,
+    WIDTH_PX,
+    PlotKind,
+    Sheet,
+    plot,
+    plot_trials,
+)
 from webots_mcp.questions.answers import CommandAnswer, ShownPicture
-from webots_mcp.questions.budget import compact_json, seconds, some
+from webots_mcp.questions.budget import compact_json, notes_of, seconds, some
 from webots_mcp.questions.declaring import (
     CHANGES,
     READS,
+    AnyNames,
     Caller,
     RobotName,
     RunId,
+    RunIds,
     Seconds,
     TimeoutS,
+    TrialSetId,
     question,
 )
 from webots_mcp.steering.dispatch import Dispatcher
+from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.reading.segment import just_after, kept_stretches
 from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.run_rows import StoredImage, camera_frames, cameras, inside, opened
 
 if TYPE_CHECKING:
-    from PIL.Image import Image as Picture
+    from PIL.Image import Image
 
 _WAIT_S: Final = 15.0
 _MOST_RUNS: Final = 5
@@ -177,6 +193,63 @@ def _no_frame(view: View, camera: str) -> str:
     return _caption(view.header() | {"camera": camera, "hint": hint})
 
 
+# -- plots -----------------------------------------------------------------------------------------
+
+
+@question("Plot", READS)
+def webots_plot(
+    recording: Recording,
+    scope: Scope,
+    kind: Annotated[
+        PlotKind,
+        Field(description="trajectory: the way from above."),
+    ] = "signals",
+    signals: AnyNames = None,
+    run_ids: RunIds = None,
+    trial_set: TrialSetId = None,
+    width_px: Annotated[
+        int, Field(ge=LEAST_WIDTH_PX, le=MOST_PX, description="Pixels.")
+    ] = WIDTH_PX,
+    height_px: Annotated[
+        int, Field(ge=LEAST_HEIGHT_PX, le=MOST_PX, description="Pixels.")
+    ] = HEIGHT_PX,
+) -> list[str | ShownPicture]:
+    """A picture of signals over time (mean, min-max band, modes, events), way, or trials.
+
+    Without signals those that changed most; a trajectory finds the position, or takes two signals.
+    Several run_ids are laid over each other. trial_set: scores over one or two parameters, as
+    signals.
+    """
+    if trial_set is not None:
+        return _plotted_trials(recording, trial_set, signals or (), (width_px, height_px))
+    first = scope.run_id or next(iter(run_ids or ()), None)
+    with recording.view(scope.robot, first) as view:
+        view.require_run()
+        picture = plot(
+            view.connection,
+            kind,
+            signals or (),
+            scope=scope if first else replace(scope, robot=view.robot.name),
+            run_ids=run_ids or (),
+            width_px=width_px,
+            height_px=height_px,
+        )
+        facts = view.header() | {"shows": picture.caption, "notes": notes_of(picture.notes)}
+        return [_caption(facts), ShownPicture(data=picture.data, format="png")]
+
+
+def _plotted_trials(
+    recording: Recording, set_id: int, names: Sequence[str], size_px: tuple[int, int]
+) -> list[str | ShownPicture]:
+    """The scores of a trial set, which may be of a robot that is gone."""
+    with recording.reader() as connection:
+        picture = plot_trials(connection, set_id, names, sheet=Sheet(*size_px))
+    return [
+        compact_json({"shows": picture.caption, "notes": notes_of(picture.notes) or []}),
+        ShownPicture(data=picture.data, format="png"),
+    ]
+
+
 # -- pictures as a model can look at them: small enough, in a format that clients show -------------
 
 
@@ -200,7 +273,7 @@ def _load_sheet(files: Sequence[Path]) -> ShownPicture:
     return ShownPicture(data=png.getvalue(), format="png")
 
 
-def _thumbnail(file: Path, side_px: int) -> Picture:
+def _thumbnail(file: Path, side_px: int) -> Image:
     with opened(file) as picture:
         scaled = picture.convert("RGB")
     scaled.thumbnail((side_px, side_px))

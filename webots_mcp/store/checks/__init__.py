@@ -39,7 +39,7 @@ _OF_EVENTS: Final = 0.7  # of the time
 # A new check is a function and a line here: question, command, report, page and docs read it.
 _MOVES: Final = "the position; a commanded speed, speeds of wheels, or a mode"
 _AIMS: Final = "a target beside its measurement: `arm.target`, `arm.position`"
-_TWO: Final = "two positions or headings of the robot, such as gps and odometry"
+_TWO: Final = "two positions of the robot, such as gps and odometry"
 _JUMP, _FLAT = (jump.JUMP.name,), (sensors.FLAT.name,)
 CHECKS: Final[list[Check]] = [
     Check("moves when commanded", of_motion.moves_when_commanded, _MOVES, ("stuck", "standstill")),

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, Final, cast
 
 from webots_mcp.naming import METRES, find_targets, in_snake_case, listed, unit_in
 from webots_mcp.signal_register import PLACES
-from webots_mcp.store.analysis.arrays import Array, Indexes, Run, inner, median, np, runs_of
+from webots_mcp.store.analysis.arrays import Array, Run, median, np, runs_of
 from webots_mcp.store.analysis.summary import unwrap
 from webots_mcp.store.checks.finding import (
     Finding,
@@ -243,39 +243,24 @@ _LEAST_WAY_M: Final = 1.0
 _SAME: Final = 0.1  # of the fitted way: two that are farther apart there are no two of one thing
 _WARNS: Final = (0.05, 0.1)  # of the way, and m: farther apart is a drift worth a look
 _FAILS: Final = (0.15, 0.3)
-_ALIKE: Final = 0.8  # correlation of the turns of two headings of one robot
-_TURN_WARNS_RAD, _TURN_FAILS_RAD = 0.2, 0.5
 
 
 def estimates_agree(run: RunUnderCheck) -> Finding:
-    """Warns where two estimates came apart by 5 % of the way or 0.2 rad, fails from 15 % or 0.5 on.
+    """Warns where two positions came apart by 5 % of the way, and fails from 15 % on.
 
     Each may have a frame of its own: they are laid over each other where the run begins.
     """
-    positions, headings = _positions(run), _headings(run)
-    made = [_drift(run, positions[0], other) for other in positions[1:]]
-    made += [_turned_apart(run, headings[0], other) for other in headings[1:]]
-    if not (findings := [each for each in made if each is not None]):
-        raise NotApplicableError(
-            "no second position or heading of the robot that goes along with the first"
-            f" for {_LEAST_WAY_M:g} m: publish gps and odometry, say"
-        )
-    return min(findings, key=lambda each: ("fail", "warn", "pass").index(each.outcome))
-
-
-def _positions(run: RunUnderCheck) -> list[tuple[Signal, Signal]]:
     known = run.search.known
     by_role = {role: known[name] for name, role in stored_roles(known).items() if name in run.frame}
     pairs = [(by_role.get(f"x{place}"), by_role.get(f"y{place}")) for place in PLACES]
-    return [(x, y) for x, y in pairs if x and y]
-
-
-def _headings(run: RunUnderCheck) -> list[Signal]:
-    known = run.search.known
-    roles = {role: name for name, role in stored_roles(known).items() if name in run.frame}
-    names = [roles[f"yaw{place}"] for place in PLACES if f"yaw{place}" in roles]
-    aims = {find_targets(name, names)[0] for name in names}
-    return [known[name] for name in names if name not in aims]
+    positions = [(x, y) for x, y in pairs if x and y]
+    made = [_drift(run, positions[0], other) for other in positions[1:]]
+    if not (findings := [each for each in made if each is not None]):
+        raise NotApplicableError(
+            "no second position of the robot that goes along with the first"
+            f" for {_LEAST_WAY_M:g} m: publish gps and odometry, say"
+        )
+    return min(findings, key=lambda each: ("fail", "warn", "pass").index(each.outcome))
 
 
 def _drift(
@@ -299,46 +284,14 @@ def _drift(
     if off[:first].max() > max(_SAME * _FITTED * way_m[-1], 0.1):
         return None
     names = " and ".join(each[0].name.rpartition(".")[0] or each[0].name for each in (one, other))
-    limits = [max(share * way_m[-1], least) for share, least in (_WARNS, _FAILS)]
-    what = f"{names}: {{:.3g}} m apart at most, of a way of {way_m[-1]:.3g} m"
-    return _came_apart(run, there, off, limits, what, (one[0], other[0]))
-
-
-def _came_apart(
-    run: RunUnderCheck,
-    there: Indexes,
-    off: Array,
-    limits: Sequence[float],
-    what: str,
-    signals: Iterable[Signal],
-) -> Finding:
-    worst = float(off.max())
-    if worst <= limits[0]:
-        return Finding("pass", what.format(worst))
-    since_s = float(run.frame.times[there][int(np.argmax(off > limits[0]))])
-    outcome = "fail" if worst > limits[1] else "warn"
-    shown = run.shows(*(each.name for each in signals))
-    return Finding(outcome, what.format(worst), since_s, 1, shown)
-
-
-def _turned_apart(run: RunUnderCheck, one: Signal, other: Signal) -> Finding | None:
-    angles = [
-        run.frame.numbers(each.name) * math.tau / (each.turn or math.tau) for each in (one, other)
-    ]
-    there = np.flatnonzero(np.isfinite(angles).all(axis=0))
-    if len(there) < 10:
-        return None
-    a, b = (unwrap(each[there]) for each in angles)
-    thin = max(1, len(there) // 200)
-    turns = [np.diff(each[::thin]) for each in (a, b)]
-    size = math.sqrt(inner(turns[0], turns[0]) * inner(turns[1], turns[1]))
-    alike = inner(*turns) / size if size else 0.0
-    if np.ptp(a) < _TURN_FAILS_RAD or abs(alike) < _ALIKE:
-        return None
-    # A compass that counts the other way round turns as much, against it.
-    off = np.abs((a - a[0]) - math.copysign(1.0, alike) * (b - b[0]))
-    what = f"{one.name} and {other.name}: {{:.3g}} rad apart at most"
-    return _came_apart(run, there, off, (_TURN_WARNS_RAD, _TURN_FAILS_RAD), what, (one, other))
+    warns_m, fails_m = (max(share * way_m[-1], least) for share, least in (_WARNS, _FAILS))
+    worst_m = float(off.max())
+    evidence = f"{names}: {worst_m:.3g} m apart at most, of a way of {way_m[-1]:.3g} m"
+    if worst_m <= warns_m:
+        return Finding("pass", evidence)
+    since_s = float(run.frame.times[there][int(np.argmax(off > warns_m))])
+    outcome = "fail" if worst_m > fails_m else "warn"
+    return Finding(outcome, evidence, since_s, 1, run.shows(one[0].name, other[0].name))
 
 
 def stays_in_place(run: RunUnderCheck) -> Finding:

@@ -24,8 +24,8 @@ from webots_mcp.errors import (
     WebotsMCPError,
 )
 from webots_mcp.naming import spelled_out
+from webots_mcp.plotting import changed_most
 from webots_mcp.plotting.on_a_page import ROOM, signals_figure, way_figure
-from webots_mcp.plotting.question import changed_most
 from webots_mcp.plotting.signals import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import Obstacle, Track, TrajectoryAxes, compose_trajectory
 from webots_mcp.plugins.report.figures import obstacles_of

@@ -18,9 +18,8 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.naming import spelled_out
 from webots_mcp.plotting.on_a_page import figure_part
 from webots_mcp.plugins.report.chapter import Chapter, chapter_of
-from webots_mcp.plugins.report.comparison import Beside, beside
 from webots_mcp.plugins.report.figures import Figures, figures_of, moment_key
-from webots_mcp.plugins.report.words import clock, counted, size, time_at
+from webots_mcp.plugins.report.words import Beside, beside, clock, counted, size, time_at
 from webots_mcp.store.detection.kinds import Event
 from webots_mcp.store.reading.segment import in_one_snapshot
 from webots_mcp.store.run_rows import fetch_run, inside, opened

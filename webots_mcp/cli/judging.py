@@ -310,7 +310,7 @@ def _answer(found: Sequence[Parting]) -> dict[str, Any]:
 _FRAME: Final = re.compile(r"(.*) \((.*):(\d+)\)$")
 _OURS: Final = str(Path(__file__).parents[1])
 _SHOWN: Final = 12
-_WAITING: Final = ("waiting in step()", None)
+_IN_STEP: Final = ("waiting in step()", None)
 _BRIDGE: Final = ("in the bridge", None)
 _OTHER: Final = ("in no file of the controller", None)
 _NOT_PERMITTED: Final = (
@@ -382,7 +382,7 @@ def _place_of(stack: str, own: str) -> tuple[str, str | None]:
         function, file, line = found.groups() if (found := _FRAME.match(each)) else ("", "", "")
         is_own = file.startswith(own) and not INSTALLED.search(file)
         if function.rpartition(".")[2] in STEPPING and not is_own:
-            return _WAITING
+            return _IN_STEP
         if is_own:
             return _BRIDGE if in_bridge else (f"{Path(file).name}:{line}", f"{function}()")
         in_bridge = in_bridge or file.startswith(_OURS)

@@ -5,15 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from webots_mcp.cli.options import (
-    HERE,
-    Id,
-    Json,
-    Parameter,
-    Robot,
-    Where,
-    make_chunks_first,
-)
+from webots_mcp.cli.options import HERE, Id, Json, Parameter, Robot, Where, make_chunks_first
 from webots_mcp.cli.terminal import print_json, print_notes, printable, shown_progress
 
 

@@ -8,12 +8,7 @@ from typing import Final, Literal
 
 from webots_mcp.naming import REDUCTIONS, find_targets, listed, words_of
 from webots_mcp.store.analysis.arrays import np, runs_of
-from webots_mcp.store.checks.finding import (
-    Finding,
-    RunUnderCheck,
-    times,
-    total_s,
-)
+from webots_mcp.store.checks.finding import Finding, RunUnderCheck, times, total_s
 from webots_mcp.store.detection.jump import JUMP
 from webots_mcp.store.detection.kinds import Event
 from webots_mcp.store.detection.sensors import FLAT, OTHER_ROWS, is_noisy

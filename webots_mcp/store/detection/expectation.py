@@ -14,12 +14,7 @@ from webots_mcp.conditions.signal_values import SAME_TIME_S
 from webots_mcp.errors import ConditionFailedError, InvalidConditionError
 from webots_mcp.pauses import EXPECTED, OF_PROJECT, VIOLATION
 from webots_mcp.store.analysis.arrays import Flags, Runs, np, runs_of
-from webots_mcp.store.detection.condition import (
-    holds_in,
-    numbers_in,
-    position_in,
-    values_at,
-)
+from webots_mcp.store.detection.condition import holds_in, numbers_in, position_in, values_at
 from webots_mcp.store.detection.kinds import (
     Alike,
     Event,

@@ -16,7 +16,6 @@ from webots_mcp.store.checks.finding import (
     WORST_FIRST,
     Check,
     Finding,
-    NotApplicableError,
     Outcome,
     RunUnderCheck,
     outcome_of,
@@ -150,24 +149,14 @@ def _under_check(
 def findings_of(check: Check, run: RunUnderCheck) -> list[Finding]:
     """What a check finds; it does not pass on what could not be looked at."""
     try:
-        found = _made(check, run)
-    except NotApplicableError as error:
-        found = [Finding("not applicable", str(error))]
-    except NotSearchableError as error:  # no row could be read in time
+        run.require(check)
+        made = check.find(run)
+        found = [made] if isinstance(made, Finding) else list(made)
+        if unread := run.unread(check):
+            for at, (outcome, evidence, *_) in enumerate(found):
+                if outcome not in ("fail", "warn"):
+                    said = f"{unread}; {evidence}"
+                    found[at] = found[at]._replace(outcome="not looked at", evidence=said)
+    except NotSearchableError as error:
         found = [Finding(outcome_of(str(error)), str(error))]
     return [each if each.name else each._replace(name=check.name) for each in found]
-
-
-def _made(check: Check, run: RunUnderCheck) -> list[Finding]:
-    if (lacking := run.lacking(check)) is not None:
-        return [lacking]
-    made = check.find(run)
-    found = [made] if isinstance(made, Finding) else list(made)
-    if not (unread := run.unread(check)):
-        return found
-    return [
-        each
-        if each.outcome in ("fail", "warn")
-        else each._replace(outcome="not looked at", evidence=f"{unread}; {each.evidence}")
-        for each in found
-    ]

@@ -10,16 +10,10 @@ from webots_mcp.naming import METRES, find_targets, in_snake_case, listed, unit_
 from webots_mcp.signal_register import PLACES
 from webots_mcp.store.analysis.arrays import Array, Run, median, np, runs_of
 from webots_mcp.store.analysis.summary import unwrap
-from webots_mcp.store.checks.finding import (
-    Finding,
-    NotApplicableError,
-    RunUnderCheck,
-    times,
-    total_s,
-)
+from webots_mcp.store.checks.finding import Finding, RunUnderCheck, times, total_s
 from webots_mcp.store.detection.condition import lasting
 from webots_mcp.store.detection.jump import JUMP
-from webots_mcp.store.detection.kinds import Event
+from webots_mcp.store.detection.kinds import Event, NotSearchableError
 from webots_mcp.store.detection.motion import in_metres, places_in
 from webots_mcp.store.detection.standstill import ON_THE_SPOT
 from webots_mcp.store.signals import Signal, stored_roles
@@ -45,9 +39,9 @@ def moves_when_commanded(run: RunUnderCheck) -> Finding:
         return Finding(outcome, first, stuck[0].start_s, len(stuck), run.more("stuck"))
     if not (motion.commanded or motion.speed or motion.wheels or motion.wheel_commands):
         if motion.mode is None:
-            raise NotApplicableError(NO_COMMAND)
+            raise NotSearchableError(NO_COMMAND)
         if total_s(stood) > 0.95 * run.search.length_s:
-            raise NotApplicableError(f"it always stood, in a mode unseen in motion: {NO_COMMAND}")
+            raise NotSearchableError(f"it always stood, in a mode unseen in motion: {NO_COMMAND}")
     return Finding("pass", f"{len(stood)} standstills, none against a command")
 
 
@@ -89,7 +83,7 @@ def follows_targets(run: RunUnderCheck) -> Finding:
     """
     pairs = list(_pairs(run))
     if not pairs:
-        raise NotApplicableError("no target is published beside what it is the target of")
+        raise NotSearchableError("no target is published beside what it is the target of")
     found: list[tuple[Signal, Run, float]] = []
     for measured, target in pairs:
         found += _apart(run, measured, target)
@@ -164,20 +158,20 @@ def wheels_grip(run: RunUnderCheck) -> Finding:
     motion, position = run.motion, run.motion.position
     wheels = [each for each in motion.wheels or motion.wheel_commands if each.name in run.frame]
     if position is None or not wheels:
-        raise NotApplicableError("publish the position and the speeds of its wheels")
+        raise NotSearchableError("publish the position and the speeds of its wheels")
     if _flies(run):
-        raise NotApplicableError("its motors lift it")
+        raise NotSearchableError("its motors lift it")
     if position[0].name.partition(".")[0] in _BY_WHEELS:
-        raise NotApplicableError(f"{position[0].name} is counted by the wheels themselves")
+        raise NotSearchableError(f"{position[0].name} is counted by the wheels themselves")
     starts_s, lasts_s, ratios = _ratios(run, position, wheels)
     known = np.isfinite(ratios)
     if np.count_nonzero(known) < _LEAST_CELLS:
-        raise NotApplicableError("its wheels drove it ahead too seldom")
+        raise NotSearchableError("its wheels drove it ahead too seldom")
     usual = median(ratios[ratios >= np.nanquantile(ratios, 0.5)])
     rolled = ratios[ratios >= _SLIPS * usual]
     usual = median(rolled)
     if usual <= 0 or median(np.abs(rolled - usual)) > _SPREAD * usual:
-        raise NotApplicableError("its speed and that of its wheels have no fixed ratio")
+        raise NotSearchableError("its speed and that of its wheels have no fixed ratio")
     slips = runs_of(ratios < _SLIPS * usual, starts_s)
     found = list(slips.only(slips.durations_s + 2 * lasts_s >= APART_S).each())
     unit = "" if unit_in(wheels[0].name) in METRES else " per unit of wheel speed"
@@ -256,7 +250,7 @@ def estimates_agree(run: RunUnderCheck) -> Finding:
     positions = [(x, y) for x, y in pairs if x and y]
     made = [_drift(run, positions[0], other) for other in positions[1:]]
     if not (findings := [each for each in made if each is not None]):
-        raise NotApplicableError(
+        raise NotSearchableError(
             "no second position of the robot that goes along with the first"
             f" for {_LEAST_WAY_M:g} m: publish gps and odometry, say"
         )
@@ -297,7 +291,7 @@ def _drift(
 def stays_in_place(run: RunUnderCheck) -> Finding:
     """Warns where the position jumped: something put it elsewhere, or the estimate is wrong."""
     if run.motion.position is None:
-        raise NotApplicableError("no position is published")
+        raise NotSearchableError("no position is published")
     leaps = [each for each in run.events(JUMP.name) if each.name == "position"]
     if not leaps:
         return Finding("pass", "its position never jumped")

@@ -10,19 +10,14 @@ from typing import Any, Final
 from webots_mcp.conditions.expectation import Expectation
 from webots_mcp.errors import ConditionFailedError
 from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.checks.finding import (
-    Finding,
-    NotApplicableError,
-    RunUnderCheck,
-    times,
-    total_s,
-)
+from webots_mcp.store.checks.finding import Finding, RunUnderCheck, times, total_s
 from webots_mcp.store.detection.expectation import (
     NONE_EXPECTED,
     Held,
     every_call_of,
     judge_expectation,
 )
+from webots_mcp.store.detection.kinds import NotSearchableError
 from webots_mcp.store.robots import fetch_session
 
 SLOW: Final = 0.9  # of real time
@@ -38,7 +33,7 @@ def keeps_pace(run: RunUnderCheck) -> Finding:
     goes_on = moved & (waits <= np.maximum(1.0, 20 * steps))
     sim_s, wall_s = float(steps[goes_on].sum()), float(waits[goes_on].sum())
     if wall_s < 1.0:
-        raise NotApplicableError("it lasted less than a second of wall time")
+        raise NotSearchableError("it lasted less than a second of wall time")
     factor = sim_s / wall_s
     longest = float(waits[moved].max())
     waited = f"; longest wait between two rows {longest:.3g} s" if longest > 1.0 else ""
@@ -148,7 +143,7 @@ def loses_no_rows(run: RunUnderCheck) -> Finding:
 def keeps_expectations(run: RunUnderCheck) -> Iterator[Finding]:
     """Fails where something that was expected did not hold. Each expectation is a line."""
     if not run.expected:
-        raise NotApplicableError(NONE_EXPECTED)
+        raise NotSearchableError(NONE_EXPECTED)
     frame = every_call_of(run.search)
     for each in run.expected:
         name = f"expects: {each.name}"
@@ -195,7 +190,7 @@ def reaches_goal(run: RunUnderCheck) -> Finding:
     asked = (run.robot_id, run.info.run_id)
     row = run.search.connection.execute(_GOAL, asked).fetchone()
     if row is None:
-        raise NotApplicableError("no finished run command had a goal: webots_run(until=...)")
+        raise NotSearchableError("no finished run command had a goal: webots_run(until=...)")
     goal, ended, took_s, at_s = row
     if ended == "condition held":
         return Finding("pass", f"{goal}: after {took_s:.4g} s")

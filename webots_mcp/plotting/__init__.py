@@ -8,39 +8,12 @@ from dataclasses import replace
 from typing import Final, Literal, get_args
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plotting.canvas import (
-    HEIGHT_PX,
-    LEAST_HEIGHT_PX,
-    LEAST_WIDTH_PX,
-    MOST_PX,
-    WIDTH_PX,
-    ImageFormat,
-    Picture,
-    Sheet,
-    image_format_of,
-)
+from webots_mcp.plotting.canvas import HEIGHT_PX, WIDTH_PX, ImageFormat, Picture, Sheet
 from webots_mcp.plotting.signals import plot_signals
 from webots_mcp.plotting.trajectory import plot_trajectory
 from webots_mcp.plotting.trials import plot_trials
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
-
-__all__ = [
-    "HEIGHT_PX",
-    "LEAST_HEIGHT_PX",
-    "LEAST_WIDTH_PX",
-    "MOST_PX",
-    "WIDTH_PX",
-    "ImageFormat",
-    "Picture",
-    "PlotKind",
-    "Sheet",
-    "image_format_of",
-    "plot",
-    "plot_signals",
-    "plot_trajectory",
-    "plot_trials",
-]
 
 PlotKind = Literal["signals", "trajectory"]
 

@@ -15,16 +15,13 @@ from pydantic import Field
 
 from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.plotting import (
+from webots_mcp.plotting import PlotKind, plot
+from webots_mcp.plotting.canvas import (
     HEIGHT_PX,
     LEAST_HEIGHT_PX,
     LEAST_WIDTH_PX,
     MOST_PX,
     WIDTH_PX,
-    PlotKind,
-    Sheet,
-    plot,
-    plot_trials,
 )
 from webots_mcp.questions.answers import CommandAnswer, ShownPicture
 from webots_mcp.questions.budget import compact_json, notes_of, seconds, some
@@ -220,34 +217,19 @@ def webots_plot(
     Several run_ids are laid over each other. trial_set: scores over one or two parameters, as
     signals.
     """
-    if trial_set is not None:
-        return _plotted_trials(recording, trial_set, signals or (), (width_px, height_px))
+    draw = partial(plot, kind=kind, signals=signals or (), width_px=width_px, height_px=height_px)
+    if trial_set is not None:  # which may be of a robot that is gone
+        with recording.reader() as connection:
+            picture = draw(connection, trial_set=trial_set)
+        facts = {"shows": picture.caption, "notes": notes_of(picture.notes) or []}
+        return [_caption(facts), ShownPicture(data=picture.data, format="png")]
     first = scope.run_id or next(iter(run_ids or ()), None)
     with recording.view(scope.robot, first) as view:
         view.require_run()
-        picture = plot(
-            view.connection,
-            kind,
-            signals or (),
-            scope=scope if first else replace(scope, robot=view.robot.name),
-            run_ids=run_ids or (),
-            width_px=width_px,
-            height_px=height_px,
-        )
+        meant = scope if first else replace(scope, robot=view.robot.name)
+        picture = draw(view.connection, scope=meant, run_ids=run_ids or ())
         facts = view.header() | {"shows": picture.caption, "notes": notes_of(picture.notes)}
         return [_caption(facts), ShownPicture(data=picture.data, format="png")]
-
-
-def _plotted_trials(
-    recording: Recording, set_id: int, names: Sequence[str], size_px: tuple[int, int]
-) -> list[str | ShownPicture]:
-    """The scores of a trial set, which may be of a robot that is gone."""
-    with recording.reader() as connection:
-        picture = plot_trials(connection, set_id, names, sheet=Sheet(*size_px))
-    return [
-        compact_json({"shows": picture.caption, "notes": notes_of(picture.notes) or []}),
-        ShownPicture(data=picture.data, format="png"),
-    ]
 
 
 # -- pictures as a model can look at them: small enough, in a format that clients show -------------

@@ -116,11 +116,7 @@ def webots_list_runs(
     limit: Limit = 20,
     cursor: Cursor = None,
     parameters: Annotated[
-        dict[str, Value] | None,
-        Field(
-            max_length=20,
-            description="Only runs with these values.",
-        ),
+        dict[str, Value] | None, Field(max_length=20, description="Only runs with these values.")
     ] = None,
     robot: RobotName = None,
 ) -> RunsAnswer:
@@ -214,13 +210,7 @@ def _first_run(recording: Recording, set_id: int) -> int:
 )
 def webots_annotate_run(
     recording: Recording,
-    label: Annotated[
-        str,
-        Field(
-            max_length=100,
-            description="Short name; '-' takes it away.",
-        ),
-    ] = "",
+    label: Annotated[str, Field(max_length=100, description="Short name; '-' takes it away.")] = "",
     note: Annotated[str, Field(max_length=4000, description="Any text, or '-'.")] = "",
     robot: RobotName = None,
     run_id: RunId = None,

@@ -16,13 +16,7 @@ from pydantic import Field
 from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.plotting import PlotKind, plot
-from webots_mcp.plotting.canvas import (
-    HEIGHT_PX,
-    LEAST_HEIGHT_PX,
-    LEAST_WIDTH_PX,
-    MOST_PX,
-    WIDTH_PX,
-)
+from webots_mcp.plotting.canvas import HEIGHT_PX, LEAST_HEIGHT_PX, LEAST_WIDTH_PX, MOST_PX, WIDTH_PX
 from webots_mcp.questions.answers import CommandAnswer, ShownPicture
 from webots_mcp.questions.budget import compact_json, notes_of, seconds, some
 from webots_mcp.questions.declaring import (
@@ -197,10 +191,7 @@ def _no_frame(view: View, camera: str) -> str:
 def webots_plot(
     recording: Recording,
     scope: Scope,
-    kind: Annotated[
-        PlotKind,
-        Field(description="trajectory: the way from above."),
-    ] = "signals",
+    kind: Annotated[PlotKind, Field(description="trajectory: the way from above.")] = "signals",
     signals: AnyNames = None,
     run_ids: RunIds = None,
     trial_set: TrialSetId = None,

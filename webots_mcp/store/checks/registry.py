@@ -52,7 +52,7 @@ CHECKS: Final[list[Check]] = [
     Check("sensors within limits", of_sensors.sensors_within_limits, "numbers", of_values=True),
     Check("sensors drop nothing", of_sensors.sensors_drop_nothing, "numbers", _JUMP),
     Check("keeps pace", of_run.keeps_pace, "rows", of_values=True),
-    Check("misses no steps", of_run.misses_no_steps, "rows", ("gap",)),
+    Check("misses no steps", of_run.misses_no_steps, "rows", ("gap",), of_values=True),
     Check("logs no errors", of_run.logs_no_errors, "", ("log",)),
     Check("ends well", of_run.ends_well, ""),
     Check("loses no rows", of_run.loses_no_rows, "", ("bridge_event",)),

@@ -13,7 +13,7 @@ from webots_mcp.conditions.expectation import Expectation, parse_expectation
 from webots_mcp.conditions.signal_values import SAME_TIME_S
 from webots_mcp.errors import ConditionFailedError, InvalidConditionError
 from webots_mcp.pauses import EXPECTED, OF_PROJECT, VIOLATION
-from webots_mcp.store.analysis.arrays import Flags, Runs, np, runs_of
+from webots_mcp.store.analysis.arrays import Flags, Runs, median, np, runs_of
 from webots_mcp.store.detection.condition import (
     holds_in,
     numbers_in,
@@ -44,12 +44,15 @@ class Held:
 
     Attributes:
         violations: Where it did not.
-        meant_s: For how long it was asked, and `held_s` for how long of that it held.
+        rows: Of how many it was asked.
+        meant_s: For how long it was asked, and `held_s` for how long of that it held: each row
+            lasts to the next one, the last as long as usual, an only one not at all.
         lacking: Rows in which it was meant and had no value to be asked of.
         worst: The value that was farthest on the wrong side, where it compares with a number.
     """
 
     violations: Runs
+    rows: int
     meant_s: float
     held_s: float
     lacking: int
@@ -109,14 +112,14 @@ def judge_expectation(expectation: Expectation, frame: Frame, known: dict[str, S
         lacks |= lost
     asked: Flags = meant & ~lacks
     violated: Flags = asked & ~holds(expectation.expected)
-    lasts_s = np.diff(frame.times)
-    meant_s, bad_s = (float(lasts_s[each[:-1]].sum()) for each in (asked, violated))
+    steps_s = np.diff(frame.times)
+    lasts_s = np.append(steps_s, median(steps_s) if len(steps_s) else 0.0)[: len(frame)]
+    meant_s, bad_s = (float(lasts_s[each].sum()) for each in (asked, violated))
     worst = _worst(expectation.expected, frame, position, violated)
     lacking = int(np.count_nonzero(meant & lacks))
     runs = runs_of(violated, frame.times)
-    if not meant_s:  # a single row
-        meant_s, bad_s = float(asked.any()), float(violated.any())
-    return Held(runs, meant_s, meant_s - bad_s, lacking, worst)
+    rows = int(np.count_nonzero(asked))
+    return Held(runs, rows, meant_s, meant_s - bad_s, lacking, worst)
 
 
 def _asks_position(expectation: Expectation) -> bool:

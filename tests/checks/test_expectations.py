@@ -127,8 +127,8 @@ def test_each_row_lasts_to_the_next_one_and_the_last_as_long_as_usual(project: P
     expected = [read_expectation(each) for each in asked]
     told = lines(file, expect=expected)
     outcome, evidence = told["front_m > 0.1"]
-    assert (outcome, evidence.partition(";")[0]) == ("fail", "held 90 % of 0.16 s")
-    assert told[expected[1].name] == ("pass", "held 100 % of 0.016 s")
+    assert (outcome, evidence.partition(";")[0]) == ("fail", "held 90 % of 0.16 s (10 rows)")
+    assert told[expected[1].name] == ("pass", "held 100 % of 0.016 s (1 row)")
     assert lines(file, 2, expect=expected[:1])["front_m > 0.1"] == ("pass", "asked of its only row")
 
 

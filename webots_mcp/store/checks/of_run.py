@@ -174,8 +174,9 @@ def _held(run: RunUnderCheck, each: Expectation, held: Held) -> Finding:
     share = f"{100 * held.held_s / held.meant_s:.4g}" if held.meant_s else ""
     if share == "100" and len(held.violations):
         share = "over 99.99"
-    of_all = f"held {share} % of {held.meant_s:.4g} s" if share else "asked of its only row"
-    evidence = f"{of_all}{lacking}"
+    count = f"{held.rows} row" + "s" * (held.rows > 1)
+    of_all = f"held {share} % of {held.meant_s:.4g} s ({count})"
+    evidence = (of_all if share else "asked of its only row") + lacking
     if not len(held.violations):
         return Finding("pass", evidence)
     evidence = f"{evidence}; {times(len(held.violations))} violated"

@@ -141,7 +141,7 @@ class RunUnderCheck:
         if check.of_values:
             frames = (self.frame, self.__dict__.get("every_call", self.frame))
             reasons += [str(part) for frame in frames for part in frame.unread]
-            if self.search.deadline.passed:
+            if self.search.deadline.passed and not any(_TIMED_OUT in why for why in reasons):
                 reasons.append(_TIMED_OUT)
         return "; ".join(dict.fromkeys(reasons))
 

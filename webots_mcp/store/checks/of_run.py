@@ -141,10 +141,11 @@ def loses_no_rows(run: RunUnderCheck) -> Finding:
         return Finding("fail" if dropped else "warn", evidence, found[0].start_s, len(found), more)
     if not run.info.row_count:
         return Finding("warn", f"run {run.info.run_id} has no state row: call bridge.publish")
+    verb = "were" if run.info.purged_rows else "are"  # they were deleted since
     waiting, error = run.search.connection.execute(_LOST, (run.info.session_id,)).fetchone()
     if run.info.end_reason and waiting:
         return Finding("warn", f"{waiting} rows of its session still wait: {error or 'no reason'}")
-    return Finding("pass", f"all {run.info.row_count} rows are recorded")
+    return Finding("pass", f"all {run.info.row_count} rows {verb} recorded")
 
 
 def keeps_expectations(run: RunUnderCheck) -> Iterator[Finding]:

@@ -168,6 +168,9 @@ def _made(check: Check, run: RunUnderCheck) -> list[Finding]:
     return [
         each
         if each.outcome in ("fail", "warn")
-        else each._replace(outcome="not looked at", evidence=f"{unread}; {each.evidence}")
+        else each._replace(
+            outcome="not looked at",
+            evidence=unread + f"; {each.evidence}" * (each.outcome == "pass"),
+        )
         for each in found
     ]

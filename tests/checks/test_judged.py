@@ -70,11 +70,11 @@ State = Callable[[int], dict[str, Any]]
 FOOLING: list[tuple[State, float, str, str]] = [
     (
         lambda row: {"front": math.nan if row % 2 else row}, 1.0,
-        "sensors speak", "warn: front: NaN in up to 50 % of the rows",
+        "sensors speak", "warn: front: NaN in 50 % of the rows",
     ),
     (
         lambda row: {"front": math.nan if row < 200 else row}, 1.0,
-        "sensors speak", "warn: front: NaN in up to 66.7 % of the rows",
+        "sensors speak", "warn: front: NaN in 66.7 % of the rows",
     ),
     (
         lambda row: {"front": math.nan if row < 3 else row}, 1.0,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import Annotated, Any, Final
 
@@ -73,12 +74,13 @@ def told(checked: CheckedRun) -> dict[str, Any]:
     """What became of the checks, the worst first; of those that passed the names."""
     others = [each for each in checked.worst_first if each.outcome != "pass"]
     rows = fitting([_row(each) for each in others], None if is_for_a_person() else _BUDGET_TOKENS)
-    left = len(others) - len(rows)
+    left = Counter(each.outcome for each in others[len(rows) :])
+    counts = ", ".join(f"{count} {outcome}" for outcome, count in left.items())
     return {
         "outcome": checked.outcome,
         "checks": without_empty(CHECK_COLUMNS, rows),
         "passed": [each.name for each in checked.of("pass")] or None,
-        "notes": [f"{left} more are not shown: webots-mcp check shows all"] if left else None,
+        "notes": [f"not shown: {counts}; webots-mcp check shows all"] if left else None,
     }
 
 

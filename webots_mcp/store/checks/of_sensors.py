@@ -40,8 +40,8 @@ def sensors_speak(run: RunUnderCheck) -> Finding:
     if not (silent or never):
         least = max(_MANY, _LEAST_S / run.search.length_s)
         if many := [name for name, share in shares.items() if share >= least]:
-            evidence = f"{listed(many, MOST_NAMED)}: NaN in up to {{:.3g}} % of the rows"
-            evidence = evidence.format(100 * max(shares.values()))
+            most, up_to = 100 * max(shares.values()), "up to " * (len(many) > 1)
+            evidence = f"{listed(many, MOST_NAMED)}: NaN in {up_to}{most:.3g} % of the rows"
             return Finding("warn", evidence, None, len(many), run.shows(many[0]))
         return Finding("pass", "none that had a value was without one for a second")
     nan = [each for each in silent if each.details.get("value") == _FAULTY]

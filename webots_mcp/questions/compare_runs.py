@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import PurePath
@@ -492,12 +493,13 @@ def _checked(
     rows = fitting(
         [_check_row(each) for each in others], None if is_for_a_person() else _CHECK_BUDGET_TOKENS
     )
-    left = len(others) - len(rows)
+    left = Counter(each.outcome for each in others[len(rows) :])
+    counts = ", ".join(f"{count} {outcome}" for outcome, count in left.items())
     return {
         "outcome": checked.outcome,
         "checks": without_empty(CHECK_COLUMNS, rows),
         "passed": [each.name for each in checked.of("pass")] or None,
-        "notes": [f"{left} more are not shown: webots-mcp check shows all"] if left else None,
+        "notes": [f"not shown: {counts}; webots-mcp check shows all"] if left else None,
     }
 
 

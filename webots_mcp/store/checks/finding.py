@@ -10,6 +10,7 @@ from typing import Final, Literal, NamedTuple
 
 from webots_mcp.conditions.expectation import Expectation
 from webots_mcp.store.detection.events import Found
+from webots_mcp.store.detection.expectation import every_call_of
 from webots_mcp.store.detection.kinds import Event, NotSearchableError
 from webots_mcp.store.detection.motion import Motion, RunNoise
 from webots_mcp.store.detection.search import Search
@@ -89,6 +90,11 @@ class RunUnderCheck:
         """All rows of the run."""
         return self.search.whole
 
+    @cached_property
+    def every_call(self) -> Frame:
+        """All rows of the run, in kept stretches each call."""
+        return every_call_of(self.search)
+
     @property
     def motion(self) -> Motion:
         """The signals of its motion."""
@@ -130,8 +136,9 @@ class RunUnderCheck:
         said = self.found.verdicts.reasons
         reasons = [why for kind in check.kinds for why in said.get(kind, ()) if _is_unread(why)]
         if check.of_values:
-            reasons += map(str, self.frame.unread)
-            if self.search.deadline.passed:
+            frames = (self.frame, self.__dict__.get("every_call", self.frame))
+            reasons += [str(part) for frame in frames for part in frame.unread]
+            if self.search.deadline.passed and not any(_TIMED_OUT in why for why in reasons):
                 reasons.append(_TIMED_OUT)
         return "; ".join(dict.fromkeys(reasons))
 

@@ -79,11 +79,13 @@ _HOLDING: Final = frozenset(("gripper", "finger", "hand", "claw", "jaw"))  # the
 def follows_targets(run: RunUnderCheck) -> Finding:
     """Fails where something was a tenth of its target's range away for 3 s and came no nearer.
 
-    Places where a robot shall go are no targets, and grippers hold things.
+    Places where a robot shall go are no targets, and grippers hold things. A target that is always
+    0 has no range to judge by.
     """
     pairs = list(_pairs(run))
     if not pairs:
-        raise NotSearchableError("no target is published beside what it is the target of")
+        none = "no target, other than always 0, is published beside what it is the target of"
+        raise NotSearchableError(none)
     found: list[tuple[Signal, Run, float]] = []
     for measured, target in pairs:
         found += _apart(run, measured, target)
@@ -110,7 +112,10 @@ def _pairs(run: RunUnderCheck) -> Iterator[tuple[Signal, Signal]]:
         if name in away or (known[name].role or "")[:3].startswith(("x", "y", "z")):
             continue
         target, _ = find_targets(name, there)
-        if target is not None and _HOLDING.isdisjoint(words):
+        if target is None or not _HOLDING.isdisjoint(words):
+            continue
+        zones = run.frame.zones(target)
+        if (zones.min < 0).any() or (zones.max > 0).any():
             yield known[name], known[target]
 
 
@@ -132,7 +137,8 @@ def _apart(
     # For as long again: a target that was set anew may lie the other way.
     still = lasting(rows, is_apart & (was_off - off < nearer_by), APART_S)
     for each in runs_of(still, rows).each():
-        lasted = each._replace(start_s=max(float(rows[0]), each.start_s - APART_S))
+        began = max(0, int(np.searchsorted(rows, each.start_s - APART_S, "right")) - 1)
+        lasted = each._replace(start_s=float(rows[began]))
         yield measured, lasted, float(off[each.start : each.stop].max())
 
 
@@ -242,7 +248,8 @@ _FAILS: Final = (0.15, 0.3)
 def estimates_agree(run: RunUnderCheck) -> Finding:
     """Warns where two positions came apart by 5 % of the way, and fails from 15 % on.
 
-    Each may have a frame of its own: they are laid over each other where the run begins.
+    Each may have a frame of its own: they are laid over each other where the run begins; two that
+    are far apart there already are not taken for estimates of one thing.
     """
     known = run.search.known
     by_role = {role: known[name] for name, role in stored_roles(known).items() if name in run.frame}

@@ -16,20 +16,29 @@ from webots_mcp.store.signals import Signal, stored_roles
 
 MOST_NAMED: Final = 3
 _FAULTY: Final = "nan"  # what a device gives that has no value; inf is a range without an end
+_MANY: Final = 0.05  # of the rows that are NaN: a sensor has none in its first steps alone
+_LEAST_S: Final = 1.0  # as of what is missing
 
 
 def sensors_speak(run: RunUnderCheck) -> Finding:
     """Fails where a signal was NaN for a second or more, warns where it was null.
 
-    Null may be meant, of what is not seen now; an infinite range is.
+    Null may be meant, of what is not seen now; an infinite range is. Warns of one that was NaN in
+    5 % of the rows, never for so long or before its first value.
     """
     silent = [e for e in run.events("missing") if e.details.get("value") in (None, _FAULTY)]
-    never = [
-        name for name, each in run.search.known.items()
-        if each.is_number and run.frame.replaced(name)[_FAULTY] == len(run.frame) > 0
-    ]  # fmt: skip
+    shares = {
+        name: run.frame.replaced(name)[_FAULTY] / max(len(run.frame), 1)
+        for name, each in run.search.known.items() if each.is_number
+    }  # fmt: skip
+    never = [name for name, share in shares.items() if share == 1]
     if not (silent or never):
-        return Finding("pass", "none was without a value for a second")
+        least = max(_MANY, _LEAST_S / run.search.length_s)
+        if many := [name for name, share in shares.items() if share >= least]:
+            most, up_to = 100 * max(shares.values()), "up to " * (len(many) > 1)
+            evidence = f"{listed(many, MOST_NAMED)}: NaN in {up_to}{most:.3g} % of the rows"
+            return Finding("warn", evidence, None, len(many), run.shows(many[0]))
+        return Finding("pass", "none that had a value was without one for a second")
     nan = [each for each in silent if each.details.get("value") == _FAULTY]
     silent = by_array(silent)
     evidence = f"{_names(silent)}: {times(len(silent))}, {total_s(silent):.3g} s without a value"

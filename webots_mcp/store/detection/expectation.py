@@ -14,7 +14,7 @@ from webots_mcp.conditions.expectation import Expectation, parse_expectation
 from webots_mcp.conditions.signal_values import SAME_TIME_S
 from webots_mcp.errors import ConditionFailedError, InvalidConditionError
 from webots_mcp.pauses import EXPECTED, OF_PROJECT, VIOLATION
-from webots_mcp.store.analysis.arrays import Flags, Runs, np, runs_of
+from webots_mcp.store.analysis.arrays import Flags, Runs, median, np, runs_of
 from webots_mcp.store.detection.condition import holds_in, numbers_in, position_in, values_at
 from webots_mcp.store.detection.kinds import (
     Alike,
@@ -40,12 +40,15 @@ class Held:
 
     Attributes:
         violations: Where it did not.
-        meant_s: For how long it was asked, and `held_s` for how long of that it held.
+        rows: Of how many it was asked.
+        meant_s: For how long it was asked, and `held_s` for how long of that it held: each row
+            lasts to the next one, the last as long as usual, an only one not at all.
         lacking: Rows in which it was meant and had no value to be asked of.
         worst: The value that was farthest on the wrong side, where it compares with a number.
     """
 
     violations: Runs
+    rows: int
     meant_s: float
     held_s: float
     lacking: int
@@ -98,13 +101,12 @@ def judge_expectation(expectation: Expectation, frame: Frame, known: dict[str, S
         lacks |= expected.asks_position and position is None
     asked: Flags = meant & ~lacks
     violated: Flags = asked & ~holds_in(expected.scanned, expected.tree, frame, position)
-    lasts_s = np.diff(frame.times)
-    meant_s, bad_s = (float(lasts_s[each[:-1]].sum()) for each in (asked, violated))
-    if not meant_s:  # a single row
-        meant_s, bad_s = float(asked.any()), float(violated.any())
-    worst, lacking = _worst(expected, frame, position, violated), np.count_nonzero(meant & lacks)
-    runs = runs_of(violated, frame.times)
-    return Held(runs, meant_s, meant_s - bad_s, int(lacking), worst)
+    steps_s = np.diff(frame.times)
+    lasts_s = np.append(steps_s, median(steps_s) if len(steps_s) else 0.0)[: len(frame)]
+    meant_s, bad_s = (float(lasts_s[each].sum()) for each in (asked, violated))
+    worst, runs = _worst(expected, frame, position, violated), runs_of(violated, frame.times)
+    rows, lacking = (int(np.count_nonzero(each)) for each in (asked, meant & lacks))
+    return Held(runs, rows, meant_s, meant_s - bad_s, lacking, worst)
 
 
 def _worst(

@@ -10,13 +10,7 @@ from typing import Any, Final, NamedTuple
 
 from webots_mcp.connection import transaction
 from webots_mcp.console import as_row
-from webots_mcp.contract import (
-    WORLD_ENDING,
-    find_project,
-    full_path,
-    host_name,
-    require_world_of,
-)
+from webots_mcp.contract import WORLD_ENDING, find_project, full_path, host_name, require_world_of
 from webots_mcp.errors import InvalidInputError, NoDatabaseError
 from webots_mcp.setup import controllers_in, has_bridge
 from webots_mcp.store.logs import ConsoleRows

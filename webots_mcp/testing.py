@@ -44,7 +44,7 @@ from webots_mcp.standin import (
 from webots_mcp.standin.controllers import Controller
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 from webots_mcp.store.analysis.summary import LARGEST
-from webots_mcp.store.checks.registry import CHECKS, check_run
+from webots_mcp.store.checks import CHECKS, check_run
 from webots_mcp.store.detection.events import find_events
 from webots_mcp.store.detection.kinds import Event as FoundEvent
 from webots_mcp.store.detection.kinds import EventOptions

@@ -127,14 +127,6 @@ def drifts(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
     return replace(run, columns={**run.columns, "odom": [[e.real, e.imag] for e in odometry]})
 
 
-def yaw_drifts(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
-    """Its gyro's heading turns away from that of its compass."""
-    rate = float(rng.choice([-1, 1]) * rng.uniform(0.01, 0.03))
-    yaw = np.array([each["yaw"] for each in run.columns["imu"]]) + rate * run.times
-    turned = [{"yaw": each} for each in np.angle(np.exp(1j * yaw)).tolist()]
-    return replace(run, columns={**run.columns, "imu": turned})
-
-
 def silent(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
     return _changed(run, "front", _span(rng, run), lambda value: float("nan"))
 
@@ -147,13 +139,6 @@ def frozen(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
     rows = _span(rng, run, (25.0, 40.0))
     at = run.columns["front"][int(np.argmax(rows))]
     return _changed(run, "front", rows, lambda value: at)
-
-
-def saturated(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
-    """Its gyro ends at a fifth of what it would have to show."""
-    slow = 2 * np.sin(run.times / 1.5)
-    rates = np.clip(np.array(run.columns["rate_rad_s"]) + slow, -1.0, 1.0)
-    return replace(run, columns={**run.columns, "rate_rad_s": rates.tolist()})
 
 
 def dropouts(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
@@ -177,12 +162,10 @@ FAULTS: Final[dict[str, tuple[Fault, str]]] = {
     "slips": (slips, "wheels grip"),
     "jammed": (jammed, "follows its targets"),
     "odometry drifts": (drifts, "estimates agree"),
-    "heading drifts": (yaw_drifts, "estimates agree"),
     "leaps": (leaps, "stays in place"),
     "NaN": (silent, "sensors speak"),
     "null": (null, "sensors speak"),
     "frozen": (frozen, "sensors live"),
-    "saturated": (saturated, "sensors within limits"),
     "dropouts": (dropouts, "sensors drop nothing"),
     "gaps": (gaps, "misses no steps"),
 }

@@ -20,7 +20,7 @@ from webots_mcp.connection import connect, create_schema
 from webots_mcp.errors import InvalidConditionError, InvalidInputError, UnknownSignalError
 from webots_mcp.server import create_server
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.checks.registry import check_run
+from webots_mcp.store.checks import check_run
 from webots_mcp.store.detection.events import find_events
 from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.project_file import ProjectWatch, read_project
@@ -111,12 +111,25 @@ def test_states_without_a_value_and_those_before_it_can_be_asked_are_not_judged(
     assert told["blind"] == ("not applicable", "it was never asked; without a value in 20 rows")
     assert told["slow"][0] == "pass"
     assert told["far"][0] == "fail"
-    assert told["far"][1].startswith("held 0 % of 0.096 s")  # not of the first 0.2 s
+    assert told["far"][1].startswith("held 0 % of 0.112 s")  # not of the first 0.2 s
     assert told["seen"][0] == "fail"
     assert told["docked"][0] == "not applicable"
     with closing(connect(file, "reader")) as connection:
         names = connection.execute("SELECT name FROM event WHERE kind = 'violation'").fetchall()
     assert sorted(name for (name,) in names) == ["far", "seen"]  # live, the same
+
+
+def test_each_row_lasts_to_the_next_one_and_the_last_as_long_as_usual(project: Path) -> None:
+    file = project / "mcp_data" / "webots.db"
+    drive(file, [{"front_m": 0.5, "mode": "drive"}] * 9 + [{"front_m": 0.05, "mode": "dock"}])
+    drive(file, [{"front_m": 0.5, "mode": "drive"}])
+    asked = ("front_m > 0.1", "front_m > 0 during mode == 'dock'")
+    expected = [read_expectation(each) for each in asked]
+    told = lines(file, expect=expected)
+    outcome, evidence = told["front_m > 0.1"]
+    assert (outcome, evidence.partition(";")[0]) == ("fail", "held 90 % of 0.16 s (10 rows)")
+    assert told[expected[1].name] == ("pass", "held 100 % of 0.016 s (1 row)")
+    assert lines(file, 2, expect=expected[:1])["front_m > 0.1"] == ("pass", "asked of its only row")
 
 
 def test_what_was_expected_of_an_earlier_run_is_asked_of_it_and_of_no_other(project: Path) -> None:
@@ -253,6 +266,12 @@ async def test_the_tool_answers_shortly_and_refuses_what_is_no_condition(
         assert told["checks"]["rows"][0][:2] == ["expects: pose.0 < 2", "fail"]
         assert "expects: pose.1 < 1" in told["passed"]
         assert len(json.dumps(told)) < 4000
+        many = {"expect": [f"pose.0 < 2 during pose.0 > -{each}{'0' * 80}" for each in range(20)]}
+        answer = await client.call_tool("webots_check_run", many)
+        told = answer.structured_content or {}
+        shown = sum(row[1] == "fail" for row in told["checks"]["rows"])
+        assert told["notes"][-1].startswith(f"not shown: {20 - shown} fail, ")
+        assert len(json.dumps(told)) < 6000
         wrong = await client.call_tool("webots_check_run", {"expect": ["pose.0 <"]})
         assert wrong.is_error
 

@@ -27,10 +27,10 @@ from webots_mcp.errors import (
     UnknownRunError,
     UnknownSignalError,
 )
-from webots_mcp.plotting import Picture, PlotKind, Sheet, image_format_of, plot, plot_signals
-from webots_mcp.plotting.canvas import DASHES, LINES, Canvas
+from webots_mcp.plotting import PlotKind, plot
+from webots_mcp.plotting.canvas import DASHES, LINES, Canvas, Picture, Sheet, image_format_of
 from webots_mcp.plotting.intervals import Interval
-from webots_mcp.plotting.signals import compose_signals, paint_signals
+from webots_mcp.plotting.signals import compose_signals, paint_signals, plot_signals
 from webots_mcp.plotting.trajectory import compose_trajectory, paint_trajectory
 from webots_mcp.questions.declaring import RunIds
 from webots_mcp.store.chunk_making import make_chunks

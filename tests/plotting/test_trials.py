@@ -13,8 +13,9 @@ from PIL import Image
 from tests.memory import memory_connection
 from tests.plotting.test_pictures import words
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.plotting import Sheet, plot, plot_trials
-from webots_mcp.plotting.trials import compose_trials
+from webots_mcp.plotting import plot
+from webots_mcp.plotting.canvas import Sheet
+from webots_mcp.plotting.trials import compose_trials, plot_trials
 from webots_mcp.store.parameters import Result, create_trial_set, finish_trial, trials_of
 
 SVG = Sheet(image_format="svg")

@@ -79,11 +79,8 @@ class Breakpoint:
     @property
     def called(self) -> str:
         """How messages name it."""
-        return (
-            f"expectation {self.expectation.name!r}"
-            if self.expectation
-            else (f"breakpoint {self.id or ''}")
-        )
+        expected = self.expectation
+        return f"expectation {expected.name!r}" if expected else f"breakpoint {self.id or ''}"
 
     def begin_run(self) -> None:
         """Arm it again for a new run."""

@@ -31,9 +31,9 @@ _Q: Final = "webots_mcp.questions"
 _STEERING: Final = "webots_mcp.cli.steering"
 _OF_THE_CORE: Final = {
     "events": Command(PAST, f"{_Q}.events", "webots_find_events"),
-    "check": Command(PAST, "webots_mcp.cli.checking", "check"),
+    "check": Command(PAST, "webots_mcp.cli.judging", "check"),
     "compare": Command(PAST, f"{_Q}.compare_runs", "webots_compare_runs"),
-    "diff": Command(PAST, "webots_mcp.cli.repeating", "diff"),
+    "diff": Command(PAST, "webots_mcp.cli.judging", "diff"),
     "logs": Command(PAST, f"{_Q}.get_logs", "webots_get_logs"),
     "history": Command(PAST, f"{_Q}.history", "webots_query_history"),
     "label": Command(DATA, f"{_Q}.compare_runs", "webots_annotate_run"),
@@ -65,9 +65,9 @@ _OF_THE_CORE: Final = {
     "keep": Command(STEER, _STEERING, "keep"),
     "breakpoint": Command(STEER, _STEERING, "breakpoint_"),
     "trials": Command(STEER, "webots_mcp.cli.steering", "trials"),
-    "repeat": Command(STEER, "webots_mcp.cli.repeating", "repeat"),
+    "repeat": Command(STEER, "webots_mcp.cli.judging", "repeat"),
     "launch": Command(SETUP, "webots_mcp.cli.serving", "launch"),
-    "profile": Command(NOW, "webots_mcp.cli.profiling", "profile"),
+    "profile": Command(NOW, "webots_mcp.cli.judging", "profile"),
     "plot": Command(PAST, "webots_mcp.cli.data", "plot"),
     "tail": Command(NOW, "webots_mcp.cli.data", "tail"),
 }

@@ -44,7 +44,7 @@ from webots_mcp.store.purge import Purged
 if TYPE_CHECKING:
     import sqlite3
 
-    from webots_mcp.plotting import Picture
+    from webots_mcp.plotting.canvas import Picture
     from webots_mcp.store.logs import Line
     from webots_mcp.store.reading.ranges import TimeRange
     from webots_mcp.store.recording import Recording
@@ -539,6 +539,7 @@ def plot(
     behind_runs = [each for each in run_ids or () if not _is_id(each)]
 
     from webots_mcp import plotting
+    from webots_mcp.plotting.canvas import image_format_of
 
     make_chunks_first(recorded.recording())
     with recorded.reader() as connection:
@@ -551,7 +552,7 @@ def plot(
             trial_set=trial_set,
             width_px=width_px,
             height_px=height_px,
-            image_format=plotting.image_format_of(output),
+            image_format=image_format_of(output),
         )
     write_picture(output, picture, as_json=json)
 

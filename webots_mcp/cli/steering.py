@@ -361,7 +361,8 @@ def _picture_of(file: Path | None) -> Callable[[Recording, int], None] | None:
     """What draws the picture that is asked for; None where none is."""
     if file is None:
         return None
-    from webots_mcp.plotting import Sheet, image_format_of, plot_trials
+    from webots_mcp.plotting.canvas import Sheet, image_format_of
+    from webots_mcp.plotting.trials import plot_trials
 
     sheet = Sheet(image_format=image_format_of(file))
 

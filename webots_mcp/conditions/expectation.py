@@ -44,6 +44,11 @@ class Expectation:
         return replace(self.expected, text=text, signals=signals)
 
     @property
+    def asks_position(self) -> bool:
+        """Whether one of its conditions asks where the robot is."""
+        return self.expected.asks_position or bool(self.during and self.during.asks_position)
+
+    @property
     def takes_s(self) -> float:
         """How long a run takes until it can be asked: what it remembers has to be there."""
         return self.expected.remembers_s / 2  # a displacement takes places of twice the age

@@ -22,12 +22,7 @@ from webots_mcp.connection import (
     require_current,
     schema_version,
 )
-from webots_mcp.contract import (
-    CUSTOM_DATA,
-    DATA_DIR_VARIABLE,
-    HEARTBEAT_LATE_S,
-    SCHEMA_VERSION,
-)
+from webots_mcp.contract import CUSTOM_DATA, DATA_DIR_VARIABLE, HEARTBEAT_LATE_S, SCHEMA_VERSION
 from webots_mcp.diagnosis import (
     Examined,
     Finding,

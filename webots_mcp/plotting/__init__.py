@@ -1,34 +1,89 @@
-"""Pictures of a recording: signals over time, and the way of a robot; PNG or SVG."""
+"""Pictures of a recording: signals over time, the way of a robot, and trials; PNG or SVG."""
 
-from webots_mcp.plotting.canvas import (
-    HEIGHT_PX,
-    LEAST_HEIGHT_PX,
-    LEAST_WIDTH_PX,
-    MOST_PX,
-    WIDTH_PX,
-    ImageFormat,
-    Picture,
-    Sheet,
-    image_format_of,
-)
-from webots_mcp.plotting.question import PlotKind, plot
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final, Literal, get_args
+
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.plotting.canvas import HEIGHT_PX, WIDTH_PX, ImageFormat, Picture, Sheet
 from webots_mcp.plotting.signals import plot_signals
 from webots_mcp.plotting.trajectory import plot_trajectory
 from webots_mcp.plotting.trials import plot_trials
+from webots_mcp.store.questions.trends import trends
+from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 
-__all__ = [
-    "HEIGHT_PX",
-    "LEAST_HEIGHT_PX",
-    "LEAST_WIDTH_PX",
-    "MOST_PX",
-    "WIDTH_PX",
-    "ImageFormat",
-    "Picture",
-    "PlotKind",
-    "Sheet",
-    "image_format_of",
-    "plot",
-    "plot_signals",
-    "plot_trajectory",
-    "plot_trials",
-]
+PlotKind = Literal["signals", "trajectory"]
+
+_DEFAULT_SIGNALS: Final = 3
+
+
+def plot(
+    connection: sqlite3.Connection,
+    kind: PlotKind = "signals",
+    signals: Sequence[str] = (),
+    *,
+    scope: Scope | None = None,
+    run_ids: Sequence[int] = (),
+    trial_set: int | None = None,
+    bands: str | None = None,
+    events: bool = True,
+    width_px: int = WIDTH_PX,
+    height_px: int = HEIGHT_PX,
+    image_format: ImageFormat = "png",
+) -> Picture:
+    """A picture of signals over a range of time, of the robot's way, or of trials.
+
+    Args:
+        connection: Any.
+        kind: "signals" over time, or "trajectory" in the plane.
+        signals: Names, with `*`; none for the three that changed most. Of a trajectory the two of
+            the position, or none to find them by name.
+        scope: Robot and stretch of time; None for the whole newest run.
+        run_ids: More runs than that of the scope; of several, each from its start, in one picture.
+        trial_set: The scores of that set instead, over one or two parameters, which `signals` may
+            name; of what else is asked only the form of the picture counts.
+        bands: The text signal that stands behind the curves or colours the way; None for the mode,
+            where there is one; "" for none (a trajectory is coloured by time then).
+        events: Whether to mark events.
+        width_px: 400 to 2000.
+        height_px: 300 to 2000.
+        image_format: "png" or "svg".
+
+    Raises:
+        InvalidInputError: And its kin: an unknown signal, run, robot, kind or format; a range that
+            contradicts another; a size out of bounds. The text lists what there is.
+        NothingRecordedError: There is nothing to draw in the range.
+    """
+    sheet = Sheet(width_px, height_px, image_format)
+    if trial_set is not None:
+        return plot_trials(connection, trial_set, signals, sheet=sheet)
+    asked = scope or Scope()
+    several = dict.fromkeys((asked.run_id, *run_ids) if asked.run_id is not None else run_ids)
+    scopes = [replace(asked, run_id=run_id) for run_id in several] or [asked]
+    ranges = [find_range(connection, each) for each in scopes]
+    if kind == "signals":
+        names = signals or changed_most(connection, ranges[-1])
+        return plot_signals(connection, ranges, names, bands=bands, events=events, sheet=sheet)
+    if kind != "trajectory":
+        raise InvalidInputError(f"kind={kind!r}: there is {', '.join(get_args(PlotKind))}")
+    position = _position(signals)
+    return plot_trajectory(connection, ranges, position, bands=bands, events=events, sheet=sheet)
+
+
+def changed_most(connection: sqlite3.Connection, time_range: TimeRange) -> list[str]:
+    """The three numbers that changed most, which are drawn where none is named."""
+    found = trends(connection, time_range, limit=_DEFAULT_SIGNALS).runs
+    return [trend.name for run in found for trend in run.numbers] or ["*"]
+
+
+def _position(signals: Sequence[str]) -> tuple[str, str] | None:
+    if not signals:
+        return None
+    if len(signals) != 2:
+        raise InvalidInputError(
+            f"a trajectory takes two signals, x and y, or none: {len(signals)} are named"
+        )
+    return signals[0], signals[1]

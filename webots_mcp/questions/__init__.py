@@ -10,8 +10,8 @@ from webots_mcp.questions.declaring import Question
 
 # In the order in which clients list them; those of plugins follow.
 MODULES: Final = (
-    "robot_state", "get_camera", "get_logs", "monitor", "history", "events", "check_run",
-    "compare_runs", "draw_plot", "query_sql", "control_simulation", "run_trials", "send_command",
+    "robot_state", "show_pictures", "get_logs", "monitor", "history", "events",
+    "compare_runs", "query_sql", "control_simulation", "run_trials", "send_command",
     "edit_scene",
 )  # fmt: skip
 

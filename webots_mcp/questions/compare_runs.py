@@ -1,8 +1,9 @@
-"""Tools about runs as a whole: which there were, how they differ, what to call them."""
+"""Tools about runs as a whole: which there were, are they well, how they differ, their names."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import PurePath
@@ -10,8 +11,9 @@ from typing import Annotated, Any, Final
 
 from pydantic import Field
 
+from webots_mcp.conditions.expectation import Expectation, read_expectation
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.questions.answers import ComparisonAnswer, RunsAnswer, Table
+from webots_mcp.questions.answers import CheckAnswer, ComparisonAnswer, RunsAnswer, Table
 from webots_mcp.questions.budget import (
     DETAIL_BUDGET_TOKENS,
     WHOLE,
@@ -48,8 +50,11 @@ from webots_mcp.questions.declaring import (
     question,
 )
 from webots_mcp.store.analysis.summary import MIN_EFFECT_SD, Spread
+from webots_mcp.store.checks import CHECK_DEADLINE_S, check_run
+from webots_mcp.store.checks.finding import Finding
 from webots_mcp.store.detection.kinds import EventOptions, both_of
 from webots_mcp.store.parameters import scored_runs
+from webots_mcp.store.project_file import Expected, file_of, read_project
 from webots_mcp.store.questions.compare import (
     COMPARE_DEADLINE_S,
     Comparison,
@@ -83,6 +88,10 @@ DIFFERENCE_COLUMNS: Final = (
     "signal", "unit", "mean", "mean_range", "deviation", "effect", "deviation_ratio", "different",
     "interval", "min", "max",
 )  # fmt: skip
+CHECK_COLUMNS: Final = ("check", "outcome", "evidence", "since_s", "times", "more")
+_CHECKED_FOR_A_PERSON_S: Final = 120.0
+_LONGEST_EVIDENCE: Final = 250
+_CHECK_BUDGET_TOKENS: Final = 1_400
 DEFAULT_DIFFERENCES: Final = 15
 _MOST_PARTED: Final = 10
 _LONGEST_VERDICT: Final = 600
@@ -108,11 +117,7 @@ def webots_list_runs(
     limit: Limit = 20,
     cursor: Cursor = None,
     parameters: Annotated[
-        dict[str, Value] | None,
-        Field(
-            max_length=20,
-            description="Only runs with these values.",
-        ),
+        dict[str, Value] | None, Field(max_length=20, description="Only runs with these values.")
     ] = None,
     robot: RobotName = None,
 ) -> RunsAnswer:
@@ -209,13 +214,7 @@ def _first_run(recording: Recording, set_id: int) -> int:
 )
 def webots_annotate_run(
     recording: Recording,
-    label: Annotated[
-        str,
-        Field(
-            max_length=100,
-            description="Short name; '-' takes it away.",
-        ),
-    ] = "",
+    label: Annotated[str, Field(max_length=100, description="Short name; '-' takes it away.")] = "",
     note: Annotated[str, Field(max_length=4000, description="Any text, or '-'.")] = "",
     robot: RobotName = None,
     run_id: RunId = None,
@@ -450,3 +449,69 @@ def _hint(found: Comparison, measures: int, told: int, differing: int, only_in: 
     hints += [f"mean and deviation of the other {equal} are equal"] * (equal > 0 and differing > 0)
     hints += [f"{only_in + _MOST_ONLY_IN} signals are in some groups only"] * (only_in > 0)
     return "; ".join(hints) or None
+
+
+# -- is a run well? --------------------------------------------------------------------------------
+
+
+@question(
+    "Check a run",
+    READS,
+    command="check",
+    positional=("run_id",),
+    options={"run_id": "RUN"},
+    core=True,
+    example="4 --junit check.xml",
+)
+def webots_check_run(
+    recording: Recording,
+    expect: Annotated[
+        list[Annotated[str, Field(max_length=1100)]] | None,
+        Field(max_length=20, description="What shall hold: front_m > 0.1 during mode == 'drive'."),
+    ] = None,
+    robot: RobotName = None,
+    run_id: RunId = None,
+) -> CheckAnswer:
+    """Is this run well? Motion against commands, sensors, estimates, pace, log, end, rows, goal.
+
+    Each check passes, warns, fails, is not applicable (what is missing) or was not looked at.
+    """
+    expected = [read_expectation(each) for each in expect or ()]
+    file = file_of(recording.data_dir)
+    project = None if file is None else read_project(file)
+    with recording.view(robot, run_id) as view:
+        return answer_about(view, CheckAnswer, lambda: _checked(view, expected, project))
+
+
+def _checked(
+    view: View, expected: Sequence[Expectation], project: Sequence[Expected] | None
+) -> dict[str, Any]:
+    """What became of the checks, the worst first; of those that passed the names."""
+    deadline_s = _CHECKED_FOR_A_PERSON_S if is_for_a_person() else CHECK_DEADLINE_S
+    run_id = view.require_run().id
+    checked = check_run(
+        view.connection, run_id, expect=expected, project=project, deadline_s=deadline_s
+    )
+    others = [each for each in checked.worst_first if each.outcome != "pass"]
+    rows = fitting(
+        [_check_row(each) for each in others], None if is_for_a_person() else _CHECK_BUDGET_TOKENS
+    )
+    left = Counter(each.outcome for each in others[len(rows) :])
+    counts = ", ".join(f"{count} {outcome}" for outcome, count in left.items())
+    return {
+        "outcome": checked.outcome,
+        "checks": without_empty(CHECK_COLUMNS, rows),
+        "passed": [each.name for each in checked.of("pass")] or None,
+        "notes": [f"not shown: {counts}; webots-mcp check shows all"] if left else None,
+    }
+
+
+def _check_row(finding: Finding) -> list[Any]:
+    return [
+        finding.name,
+        finding.outcome,
+        cut_for_a_model(finding.evidence, _LONGEST_EVIDENCE),
+        seconds(finding.since_s),
+        finding.often,
+        finding.more or None,
+    ]

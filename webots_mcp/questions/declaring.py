@@ -43,11 +43,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from webots_mcp import contract
-from webots_mcp.errors import (
-    InvalidInputError,
-    NoDatabaseError,
-    NothingRecordedError,
-)
+from webots_mcp.errors import InvalidInputError, NoDatabaseError, NothingRecordedError
 from webots_mcp.naming import same_in_meaning
 from webots_mcp.questions.answers import Answer, ShownPicture
 from webots_mcp.questions.budget import Client, compact_json, reader

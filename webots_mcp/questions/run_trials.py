@@ -41,10 +41,7 @@ from webots_mcp.questions.declaring import (
 )
 from webots_mcp.questions.send_command import settable
 from webots_mcp.steering.dispatch import ACTION, find_target, known_names, require_possible
-from webots_mcp.steering.trial_plan import (
-    TrialPlan,
-    combinations,
-)
+from webots_mcp.steering.trial_plan import TrialPlan, combinations
 from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.analysis.summary import Best, Ranked, Ranking
 from webots_mcp.store.parameters import (

@@ -91,10 +91,10 @@ def attaching_place(controller: Path) -> AttachingPlace:
             place = _place(module)
         except _NoRobotError as error:
             why = why or error
-        except AlreadyPatchedError as error:
-            raise AlreadyPatchedError(_of_module(file, controller, error)) from error
         except InvalidInputError as error:
-            raise InvalidInputError(_of_module(file, controller, error)) from error
+            if file == controller:
+                raise
+            raise type(error)(f"{file.name}, which it imports: {error}") from error
         else:
             line = place.after.end_lineno or place.after.lineno
             found.append(AttachingPlace(file, line, place.attach))
@@ -107,10 +107,6 @@ def attaching_place(controller: Path) -> AttachingPlace:
         raise InvalidInputError(f"several of its modules make a robot: {places}")
     assert why is not None
     raise why
-
-
-def _of_module(file: Path, controller: Path, error: InvalidInputError) -> str:
-    return str(error) if file == controller else f"{file.name}, which it imports: {error}"
 
 
 def _imported(module: ast.Module, file: Path, controller: Path) -> list[Path]:

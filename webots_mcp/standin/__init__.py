@@ -19,11 +19,7 @@ in their processes. Importing this package makes it importable here as well.
 from __future__ import annotations
 
 from webots_mcp.standin.controller_path import LIBRARY  # first: the others import `controller`
-from webots_mcp.standin.in_process import (
-    InProcessRobot,
-    InProcessSimulation,
-    InProcessSupervisor,
-)
+from webots_mcp.standin.in_process import InProcessRobot, InProcessSimulation, InProcessSupervisor
 from webots_mcp.standin.simulation import Simulation
 from webots_mcp.standin.simulator import Mode
 from webots_mcp.standin.vrml import ControllerEndedError, StandInError, WorldError, WouldBlockError

@@ -23,14 +23,7 @@ from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.errors import DatabaseError, InvalidInputError, NothingRecordedError
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.retention import DEFAULT, KEPT, Retention, in_force
-from webots_mcp.store.retention_plan import (
-    OLD_COMMANDS,
-    Going,
-    Plan,
-    Portion,
-    plan,
-    rows_of,
-)
+from webots_mcp.store.retention_plan import OLD_COMMANDS, Going, Plan, Portion, plan, rows_of
 from webots_mcp.store.run_rows import inside
 
 BATCH_ROWS: Final = 500

@@ -288,6 +288,7 @@ def test_runs_are_aligned_by_simulation_time(empty: sqlite3.Connection) -> None:
     record(empty, driving, first=10_000)
     found = compare_rows(empty, [1, 2])
     assert (found.from_s, found.rows, found.is_whole) == (at(150), 300, True)
+    assert found.notes[0] == f"one run begins at {at_s(1):.3f} s, the other at {at_s(150):.3f} s"
     assert found.parted[0].from_s == at(NOISE_ROW)
     apart = compare_rows(empty, [1, 3])
     assert (apart.rows, apart.is_equal) == (0, None)

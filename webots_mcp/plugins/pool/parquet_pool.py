@@ -43,15 +43,7 @@ from webots_mcp.plugins.pool.parquet_files import (
     run_of,
     uuid_in,
 )
-from webots_mcp.plugins.pool.pool_interface import (
-    LISTED,
-    Batch,
-    Row,
-    Table,
-    batches,
-    table,
-    tables,
-)
+from webots_mcp.plugins.pool.pool_interface import LISTED, Batch, Row, Table, batches, table, tables
 from webots_mcp.plugins.pool.value_columns import NameAndKind, chunks_of, columns_of
 from webots_mcp.store.questions.sql import Result
 

@@ -7,5 +7,5 @@ from webots_mcp.plugins import Plugin, PluginCommand
 
 PLUGIN = Plugin(
     commands=(PluginCommand("report", "The past", f"{__name__}.report_command:report"),),
-    questions=(f"{__name__}.write_report",),
+    questions=(f"{__name__}.making",),
 )

@@ -27,7 +27,7 @@ from webots_mcp.plugins.report.words import (
     told,
     valued,
 )
-from webots_mcp.store.checks.registry import check_run
+from webots_mcp.store.checks import check_run
 from webots_mcp.store.detection.events import KINDS, Found, choose, search_events, stored_kinds
 from webots_mcp.store.detection.kinds import Event, EventOptions, Verdicts
 from webots_mcp.store.logs import COUNT_LIMIT, LogFilter, LogLine, Window, count_lines, newest_lines
@@ -277,18 +277,12 @@ def _checks(
 ) -> Grid:
     """Each check, the worst first."""
     checked = check_run(connection, run_id, found=found, deadline_s=deadline_s / 2)
-    rows = [
-        Row(
-            [each.name, each.outcome, each.evidence, _since(each.since_s), str(each.often or "")],
-            {"fail": "error", "warn": "warning"}.get(each.outcome, ""),
-        )
-        for each in checked.worst_first
-    ]
+    rows: list[Row] = []
+    for each in checked.worst_first:
+        since = "" if each.since_s is None else time_at(each.since_s)
+        cells = [each.name, each.outcome, each.evidence, since, str(each.often or "")]
+        rows.append(Row(cells, {"fail": "error", "warn": "warning"}.get(each.outcome, "")))
     return Grid(("check", "outcome", "evidence", "since [s]", "times"), rows)
-
-
-def _since(time_s: float | None) -> str:
-    return "" if time_s is None else time_at(time_s)
 
 
 def _parameters(connection: sqlite3.Connection, run_id: int) -> Grid:

@@ -1,4 +1,4 @@
-"""How a report is put together in the room that it may take, and becomes HTML and a file."""
+"""How a report is put together in the room that it may take, as a file that a question writes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
+
+from pydantic import Field
 
 from webots_mcp import __version__
 from webots_mcp.contract import make_folder, whole_file
@@ -18,11 +20,14 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.naming import spelled_out
 from webots_mcp.plotting.on_a_page import figure_part
 from webots_mcp.plugins.report.chapter import Chapter, chapter_of
-from webots_mcp.plugins.report.comparison import Beside, beside
 from webots_mcp.plugins.report.figures import Figures, figures_of, moment_key
-from webots_mcp.plugins.report.words import clock, counted, size, time_at
+from webots_mcp.plugins.report.words import Beside, beside, clock, counted, size, time_at
+from webots_mcp.questions.answers import NotedAnswer
+from webots_mcp.questions.budget import notes_of
+from webots_mcp.questions.declaring import DESTROYS, AnyNames, RobotName, RunIds, question
 from webots_mcp.store.detection.kinds import Event
 from webots_mcp.store.reading.segment import in_one_snapshot
+from webots_mcp.store.recording import Recording
 from webots_mcp.store.run_rows import fetch_run, inside, opened
 
 if TYPE_CHECKING:
@@ -363,3 +368,60 @@ def write_report(file: Path, html: bytes, *, overwrite: bool = False) -> None:
             aside.write_bytes(html)
     except OSError as error:
         raise InvalidInputError(f"{file} cannot be written: {error}") from error
+
+
+# -- the question ----------------------------------------------------------------------------------
+
+FOLDER: Final = "reports"  # in the data folder
+
+
+class ReportAnswer(NotedAnswer):
+    """A report that was written."""
+
+    file: str | None = None
+    size_bytes: int | None = None
+    holds: dict[str, int] | None = Field(default=None, description="How many of each.")
+    left_out: list[str] | None = Field(default=None, description="What had no room, and why.")
+
+
+@question("Write a report", DESTROYS)
+def webots_report(
+    recording: Recording,
+    run_ids: RunIds = None,
+    file: Annotated[str, Field(max_length=500, description="In the data folder.")] = "",
+    overwrite: Annotated[bool, Field(description="A file that is there.")] = False,
+    signals: AnyNames = None,
+    robot: RobotName = None,
+) -> ReportAnswer:
+    """Write a run, or two compared, as one HTML file for people, which opens offline.
+
+    Events, trends, plots, pictures, log.
+    """
+    with recording.view(robot, run_ids[0] if run_ids else None) as view:
+        chosen = run_ids or [view.require_run().id]
+        path = _inside(recording.data_dir, file or f"{FOLDER}/{file_name(chosen)}")
+        require_free(path, overwrite=overwrite)
+        made = make_report(view.connection, chosen, recording.data_dir, names=signals or ())
+        write_report(path, made.html, overwrite=overwrite)
+        return ReportAnswer(
+            **view.header(),
+            file=str(path),
+            size_bytes=len(made.html),
+            holds=made.holds,
+            left_out=notes_of(made.left_out),
+            hint=None if made.holds.get("figures") else "nothing in it could be drawn",
+        )
+
+
+def _inside(data_dir: Path, file: str) -> Path:
+    """The file, which has to lie in the data folder."""
+    try:
+        path = (data_dir / file).resolve()
+    except (OSError, ValueError, RuntimeError) as error:
+        raise InvalidInputError(f"file={file[:100]!r} is not a usable path: {error}") from error
+    if not path.is_relative_to(data_dir.resolve()):
+        raise InvalidInputError(
+            f"file={file[:100]!r} lies outside the data folder {data_dir}: name one in it, or "
+            "write it by 'webots-mcp report -o FILE'"
+        )
+    return path

@@ -1,19 +1,11 @@
-"""The command that writes a report, to any file; an assistant's question is in `write_report`."""
+"""The command that writes a report, to any file; an assistant's question is in `making`."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated
 
-from webots_mcp.cli.options import (
-    HERE,
-    Id,
-    Json,
-    Parameter,
-    Robot,
-    Where,
-    make_chunks_first,
-)
+from webots_mcp.cli.options import HERE, Id, Json, Parameter, Robot, Where, make_chunks_first
 from webots_mcp.cli.terminal import print_json, print_notes, printable, shown_progress
 
 

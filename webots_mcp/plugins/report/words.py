@@ -1,17 +1,22 @@
-"""How a report says things: numbers, times, events and tables as texts for a person."""
+"""How a report says things: numbers, times, events, tables and comparisons as texts."""
 
 from __future__ import annotations
 
 import json
 import math
 import re
+import sqlite3
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 from html import escape
 from typing import Any, Final, NamedTuple, cast
 
+from webots_mcp import naming
+from webots_mcp.errors import NothingRecordedError
+from webots_mcp.store.analysis.summary import Spread
 from webots_mcp.store.detection.kinds import Event
+from webots_mcp.store.questions.compare import Comparison, Difference, compare_runs
 
 LONGEST_TEXT: Final = 1_000  # characters of a cell
 _LONGEST_VALUE: Final = 400  # of a value within one
@@ -271,3 +276,140 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+# -- two runs beside each other: the answer of `compare_runs`, in words too ------------------------
+
+MOST_DIFFERENCES: Final = 30
+_MOST_SAID: Final = 5
+_SHARE_OF_TEXTS: Final = 0.1
+_LARGE: Final = ((0.8, "large"), (0.5, "medium"), (0.2, "small"))  # Cohen's words for his d
+
+
+@dataclass(frozen=True)
+class Beside:
+    """Two runs beside each other.
+
+    Attributes:
+        says: The comparison in words.
+        differing: The signals that differ, what differs most first.
+        why_not: Why they could not be compared; empty where they were.
+    """
+
+    says: Sequence[str] = ()
+    differing: Sequence[str] = ()
+    parameters: Grid | None = None
+    measures: Grid | None = None
+    differences: Grid | None = None
+    notes: Sequence[str] = ()
+    why_not: str = ""
+
+
+def beside(connection: sqlite3.Connection, run_ids: Sequence[int], room_bytes: float) -> Beside:
+    """Compare two runs, in texts of about a tenth of so many bytes at most.
+
+    Raises:
+        UnknownRunError: No run has such an id.
+    """
+    try:
+        found = compare_runs(connection, run_ids, limit=MOST_DIFFERENCES)
+    except NothingRecordedError as error:
+        return Beside(why_not=str(error))
+    names = [group.name for group in found.groups]
+    differences = _differences(found, names).within(_SHARE_OF_TEXTS * room_bytes)
+    notes = [f"not known: {figures}: {why}" for figures, why in found.unknown.items()]
+    notes += [
+        f"only in {' and '.join(groups)}: {naming.listed(only)}" for groups, only in _only_in(found)
+    ]
+    return Beside(
+        _says(found),
+        [each.name for each in found.differences if each.effect[1]],
+        _parameters(found, names),
+        _measures(found, names),
+        differences if differences.rows else None,
+        (*found.notes, *notes),
+    )
+
+
+def _says(found: Comparison) -> list[str]:
+    """In words: how long, what the runs came to, and the signals that differ most."""
+    first, second = (group.name for group in found.groups)
+    said = [
+        f"Compared are the first {length(found.compared_s)} of each run: {second} with {first}."
+    ]
+    said += [
+        f"{name}: {first} {_values(first_had)}, {second} {_values(second_had)}."
+        for name, first_had, second_had in _unlike_parameters(found)
+    ]
+    for each in found.measures:
+        one, other = each.spread
+        if one is not None and other is not None and one.median != other.median:
+            said.append(f"{each.name}: {_change(one, other)}.")
+    large = [each for each in found.differences if abs(each.effect[1] or 0.0) >= _LARGE[-1][0]]
+    for each in large[:_MOST_SAID]:
+        one, other = each.mean
+        if one is not None and other is not None:
+            said.append(f"mean of {each.name}: {_change(one, other)}{_effect(each)}.")
+    return said if len(said) > 1 else [*said, "No figure differs."]
+
+
+def _change(one: Spread, other: Spread) -> str:
+    by = other.median - one.median
+    change = f"{100 * by / abs(one.median):+.3g} %" if one.median else f"{by:+.3g}"
+    return f"{number(other.median)} instead of {number(one.median)} ({change})"
+
+
+def _effect(difference: Difference) -> str:
+    size = difference.effect[1]
+    if size is None:
+        return ""
+    word = next((word for least, word in _LARGE if abs(size) >= least), "hardly any")
+    return f"; beside how much it varies within a run that is {word} (effect {number(size)})"
+
+
+def _unlike_parameters(found: Comparison) -> list[tuple[str, Sequence[object], Sequence[object]]]:
+    first, second = (group.parameters for group in found.groups)
+    names = dict.fromkeys((*first, *second))
+    return [(name, first.get(name, ()), second.get(name, ())) for name in names]
+
+
+def _values(values: Sequence[object]) -> str:
+    return "; ".join(map(spelled, values)) or "without it"
+
+
+def _parameters(found: Comparison, names: Sequence[str]) -> Grid | None:
+    rows = [
+        Row([name, _values(one), _values(other)]) for name, one, other in _unlike_parameters(found)
+    ]
+    return Grid(("parameter", *names), rows) if rows else None
+
+
+def _measures(found: Comparison, names: Sequence[str]) -> Grid | None:
+    rows = [Row([each.name, *map(_median, each.spread)]) for each in found.measures]
+    return Grid(("figure", *names), rows) if rows else None
+
+
+def _differences(found: Comparison, names: Sequence[str]) -> Grid:
+    first, second = names
+    columns = ("signal", "unit", f"mean, {first}", f"mean, {second}", "effect",
+               f"deviation, {first}", f"deviation, {second}")  # fmt: skip
+    rows = [
+        Row([
+            each.name, each.unit or "", *map(_median, each.mean), number(each.effect[1]),
+            *map(_median, each.deviation),
+        ])
+        for each in found.differences
+    ]  # fmt: skip
+    return Grid(columns, rows, left_out=found.total - len(rows))
+
+
+def _median(spread: Spread | None) -> str:
+    return number(None if spread is None else spread.median)
+
+
+def _only_in(found: Comparison) -> list[tuple[tuple[str, ...], list[str]]]:
+    """Signals that one of the runs lacks, by the runs that have them."""
+    names: dict[tuple[str, ...], list[str]] = {}
+    for name, groups in found.only_in.items():
+        names.setdefault(groups, []).append(name)
+    return list(names.items())

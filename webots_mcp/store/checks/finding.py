@@ -10,7 +10,8 @@ from typing import Final, Literal, NamedTuple
 
 from webots_mcp.conditions.expectation import Expectation
 from webots_mcp.store.detection.events import Found
-from webots_mcp.store.detection.kinds import Event
+from webots_mcp.store.detection.expectation import every_call_of
+from webots_mcp.store.detection.kinds import Event, NotSearchableError
 from webots_mcp.store.detection.motion import Motion, RunNoise
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.questions.runs import RunInfo
@@ -22,10 +23,6 @@ WORST_FIRST: Final[tuple[Outcome, ...]] = (
     "fail", "not looked at", "warn", "pass", "not applicable",
 )  # fmt: skip
 _TIMED_OUT: Final = "time limit reached"
-
-
-class NotApplicableError(Exception):
-    """A check cannot be made of this run; the text says what is missing."""
 
 
 class Finding(NamedTuple):
@@ -49,11 +46,11 @@ class Finding(NamedTuple):
 
 @dataclass(frozen=True)
 class Check:
-    """A check. One of these, a line in `registry.CHECKS`, is all that a new check takes.
+    """A check. One of these, a line in `checks.CHECKS`, is all that a new check takes.
 
     Attributes:
         find: Says what was found; its docstring says when it warns and when it fails. It may raise
-            `NotApplicableError`.
+            `NotSearchableError` where the run lacks what it is about.
         needs: What has to be recorded, for a person.
         kinds: Of events that it judges: where one could not be looked for, the check is not made.
         of_values: It reads values itself: where some were not read, it does not pass.
@@ -93,6 +90,11 @@ class RunUnderCheck:
         """All rows of the run."""
         return self.search.whole
 
+    @cached_property
+    def every_call(self) -> Frame:
+        """All rows of the run, in kept stretches each call."""
+        return every_call_of(self.search)
+
     @property
     def motion(self) -> Motion:
         """The signals of its motion."""
@@ -116,25 +118,27 @@ class RunUnderCheck:
         """The call that shows signals."""
         return f"webots_query_history(signals={list(names)}, run_id={self.info.run_id})"
 
-    def lacking(self, check: Check) -> Finding | None:
-        """Why a check cannot be made at all; None if it can."""
-        verdicts = self.found.verdicts
+    def require(self, check: Check) -> None:
+        """Make sure that a check can be made.
+
+        Raises:
+            NotSearchableError: Why it cannot.
+        """
         for kind in check.kinds:
-            if why := verdicts.unlooked(kind):
-                return Finding(outcome_of(why), why)
+            if why := self.found.verdicts.unlooked(kind):
+                raise NotSearchableError(why)
         if check.of_values and not len(self.frame):
-            why = "; ".join(map(str, self.frame.unread))
             none = f"run {self.info.run_id} has no state row: call bridge.publish"
-            return Finding("not looked at", why) if why else Finding("not applicable", none)
-        return None
+            raise NotSearchableError("; ".join(map(str, self.frame.unread)) or none)
 
     def unread(self, check: Check) -> str:
         """What of the run a check did not see; empty if nothing."""
         said = self.found.verdicts.reasons
         reasons = [why for kind in check.kinds for why in said.get(kind, ()) if _is_unread(why)]
         if check.of_values:
-            reasons += map(str, self.frame.unread)
-            if self.search.deadline.passed:
+            frames = (self.frame, self.__dict__.get("every_call", self.frame))
+            reasons += [str(part) for frame in frames for part in frame.unread]
+            if self.search.deadline.passed and not any(_TIMED_OUT in why for why in reasons):
                 reasons.append(_TIMED_OUT)
         return "; ".join(dict.fromkeys(reasons))
 

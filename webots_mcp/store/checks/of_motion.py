@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, Final, cast
 
 from webots_mcp.naming import METRES, find_targets, in_snake_case, listed, unit_in
 from webots_mcp.signal_register import PLACES
-from webots_mcp.store.analysis.arrays import Array, Indexes, Run, inner, median, np, runs_of
+from webots_mcp.store.analysis.arrays import Array, Run, median, np, runs_of
 from webots_mcp.store.analysis.summary import unwrap
-from webots_mcp.store.checks.finding import (
-    Finding,
-    NotApplicableError,
-    RunUnderCheck,
-    times,
-    total_s,
-)
+from webots_mcp.store.checks.finding import Finding, RunUnderCheck, times, total_s
 from webots_mcp.store.detection.condition import lasting
 from webots_mcp.store.detection.jump import JUMP
-from webots_mcp.store.detection.kinds import Event
+from webots_mcp.store.detection.kinds import Event, NotSearchableError
 from webots_mcp.store.detection.motion import in_metres, places_in
 from webots_mcp.store.detection.standstill import ON_THE_SPOT
 from webots_mcp.store.signals import Signal, stored_roles
@@ -45,9 +39,9 @@ def moves_when_commanded(run: RunUnderCheck) -> Finding:
         return Finding(outcome, first, stuck[0].start_s, len(stuck), run.more("stuck"))
     if not (motion.commanded or motion.speed or motion.wheels or motion.wheel_commands):
         if motion.mode is None:
-            raise NotApplicableError(NO_COMMAND)
+            raise NotSearchableError(NO_COMMAND)
         if total_s(stood) > 0.95 * run.search.length_s:
-            raise NotApplicableError(f"it always stood, in a mode unseen in motion: {NO_COMMAND}")
+            raise NotSearchableError(f"it always stood, in a mode unseen in motion: {NO_COMMAND}")
     return Finding("pass", f"{len(stood)} standstills, none against a command")
 
 
@@ -85,11 +79,13 @@ _HOLDING: Final = frozenset(("gripper", "finger", "hand", "claw", "jaw"))  # the
 def follows_targets(run: RunUnderCheck) -> Finding:
     """Fails where something was a tenth of its target's range away for 3 s and came no nearer.
 
-    Places where a robot shall go are no targets, and grippers hold things.
+    Places where a robot shall go are no targets, and grippers hold things. A target that is always
+    0 has no range to judge by.
     """
     pairs = list(_pairs(run))
     if not pairs:
-        raise NotApplicableError("no target is published beside what it is the target of")
+        none = "no target, other than always 0, is published beside what it is the target of"
+        raise NotSearchableError(none)
     found: list[tuple[Signal, Run, float]] = []
     for measured, target in pairs:
         found += _apart(run, measured, target)
@@ -116,7 +112,10 @@ def _pairs(run: RunUnderCheck) -> Iterator[tuple[Signal, Signal]]:
         if name in away or (known[name].role or "")[:3].startswith(("x", "y", "z")):
             continue
         target, _ = find_targets(name, there)
-        if target is not None and _HOLDING.isdisjoint(words):
+        if target is None or not _HOLDING.isdisjoint(words):
+            continue
+        zones = run.frame.zones(target)
+        if (zones.min < 0).any() or (zones.max > 0).any():
             yield known[name], known[target]
 
 
@@ -138,7 +137,8 @@ def _apart(
     # For as long again: a target that was set anew may lie the other way.
     still = lasting(rows, is_apart & (was_off - off < nearer_by), APART_S)
     for each in runs_of(still, rows).each():
-        lasted = each._replace(start_s=max(float(rows[0]), each.start_s - APART_S))
+        began = max(0, int(np.searchsorted(rows, each.start_s - APART_S, "right")) - 1)
+        lasted = each._replace(start_s=float(rows[began]))
         yield measured, lasted, float(off[each.start : each.stop].max())
 
 
@@ -164,20 +164,20 @@ def wheels_grip(run: RunUnderCheck) -> Finding:
     motion, position = run.motion, run.motion.position
     wheels = [each for each in motion.wheels or motion.wheel_commands if each.name in run.frame]
     if position is None or not wheels:
-        raise NotApplicableError("publish the position and the speeds of its wheels")
+        raise NotSearchableError("publish the position and the speeds of its wheels")
     if _flies(run):
-        raise NotApplicableError("its motors lift it")
+        raise NotSearchableError("its motors lift it")
     if position[0].name.partition(".")[0] in _BY_WHEELS:
-        raise NotApplicableError(f"{position[0].name} is counted by the wheels themselves")
+        raise NotSearchableError(f"{position[0].name} is counted by the wheels themselves")
     starts_s, lasts_s, ratios = _ratios(run, position, wheels)
     known = np.isfinite(ratios)
     if np.count_nonzero(known) < _LEAST_CELLS:
-        raise NotApplicableError("its wheels drove it ahead too seldom")
+        raise NotSearchableError("its wheels drove it ahead too seldom")
     usual = median(ratios[ratios >= np.nanquantile(ratios, 0.5)])
     rolled = ratios[ratios >= _SLIPS * usual]
     usual = median(rolled)
     if usual <= 0 or median(np.abs(rolled - usual)) > _SPREAD * usual:
-        raise NotApplicableError("its speed and that of its wheels have no fixed ratio")
+        raise NotSearchableError("its speed and that of its wheels have no fixed ratio")
     slips = runs_of(ratios < _SLIPS * usual, starts_s)
     found = list(slips.only(slips.durations_s + 2 * lasts_s >= APART_S).each())
     unit = "" if unit_in(wheels[0].name) in METRES else " per unit of wheel speed"
@@ -243,39 +243,25 @@ _LEAST_WAY_M: Final = 1.0
 _SAME: Final = 0.1  # of the fitted way: two that are farther apart there are no two of one thing
 _WARNS: Final = (0.05, 0.1)  # of the way, and m: farther apart is a drift worth a look
 _FAILS: Final = (0.15, 0.3)
-_ALIKE: Final = 0.8  # correlation of the turns of two headings of one robot
-_TURN_WARNS_RAD, _TURN_FAILS_RAD = 0.2, 0.5
 
 
 def estimates_agree(run: RunUnderCheck) -> Finding:
-    """Warns where two estimates came apart by 5 % of the way or 0.2 rad, fails from 15 % or 0.5 on.
+    """Warns where two positions came apart by 5 % of the way, and fails from 15 % on.
 
-    Each may have a frame of its own: they are laid over each other where the run begins.
+    Each may have a frame of its own: they are laid over each other where the run begins; two that
+    are far apart there already are not taken for estimates of one thing.
     """
-    positions, headings = _positions(run), _headings(run)
-    made = [_drift(run, positions[0], other) for other in positions[1:]]
-    made += [_turned_apart(run, headings[0], other) for other in headings[1:]]
-    if not (findings := [each for each in made if each is not None]):
-        raise NotApplicableError(
-            "no second position or heading of the robot that goes along with the first"
-            f" for {_LEAST_WAY_M:g} m: publish gps and odometry, say"
-        )
-    return min(findings, key=lambda each: ("fail", "warn", "pass").index(each.outcome))
-
-
-def _positions(run: RunUnderCheck) -> list[tuple[Signal, Signal]]:
     known = run.search.known
     by_role = {role: known[name] for name, role in stored_roles(known).items() if name in run.frame}
     pairs = [(by_role.get(f"x{place}"), by_role.get(f"y{place}")) for place in PLACES]
-    return [(x, y) for x, y in pairs if x and y]
-
-
-def _headings(run: RunUnderCheck) -> list[Signal]:
-    known = run.search.known
-    roles = {role: name for name, role in stored_roles(known).items() if name in run.frame}
-    names = [roles[f"yaw{place}"] for place in PLACES if f"yaw{place}" in roles]
-    aims = {find_targets(name, names)[0] for name in names}
-    return [known[name] for name in names if name not in aims]
+    positions = [(x, y) for x, y in pairs if x and y]
+    made = [_drift(run, positions[0], other) for other in positions[1:]]
+    if not (findings := [each for each in made if each is not None]):
+        raise NotSearchableError(
+            "no second position of the robot that goes along with the first"
+            f" for {_LEAST_WAY_M:g} m: publish gps and odometry, say"
+        )
+    return min(findings, key=lambda each: ("fail", "warn", "pass").index(each.outcome))
 
 
 def _drift(
@@ -299,52 +285,20 @@ def _drift(
     if off[:first].max() > max(_SAME * _FITTED * way_m[-1], 0.1):
         return None
     names = " and ".join(each[0].name.rpartition(".")[0] or each[0].name for each in (one, other))
-    limits = [max(share * way_m[-1], least) for share, least in (_WARNS, _FAILS)]
-    what = f"{names}: {{:.3g}} m apart at most, of a way of {way_m[-1]:.3g} m"
-    return _came_apart(run, there, off, limits, what, (one[0], other[0]))
-
-
-def _came_apart(
-    run: RunUnderCheck,
-    there: Indexes,
-    off: Array,
-    limits: Sequence[float],
-    what: str,
-    signals: Iterable[Signal],
-) -> Finding:
-    worst = float(off.max())
-    if worst <= limits[0]:
-        return Finding("pass", what.format(worst))
-    since_s = float(run.frame.times[there][int(np.argmax(off > limits[0]))])
-    outcome = "fail" if worst > limits[1] else "warn"
-    shown = run.shows(*(each.name for each in signals))
-    return Finding(outcome, what.format(worst), since_s, 1, shown)
-
-
-def _turned_apart(run: RunUnderCheck, one: Signal, other: Signal) -> Finding | None:
-    angles = [
-        run.frame.numbers(each.name) * math.tau / (each.turn or math.tau) for each in (one, other)
-    ]
-    there = np.flatnonzero(np.isfinite(angles).all(axis=0))
-    if len(there) < 10:
-        return None
-    a, b = (unwrap(each[there]) for each in angles)
-    thin = max(1, len(there) // 200)
-    turns = [np.diff(each[::thin]) for each in (a, b)]
-    size = math.sqrt(inner(turns[0], turns[0]) * inner(turns[1], turns[1]))
-    alike = inner(*turns) / size if size else 0.0
-    if np.ptp(a) < _TURN_FAILS_RAD or abs(alike) < _ALIKE:
-        return None
-    # A compass that counts the other way round turns as much, against it.
-    off = np.abs((a - a[0]) - math.copysign(1.0, alike) * (b - b[0]))
-    what = f"{one.name} and {other.name}: {{:.3g}} rad apart at most"
-    return _came_apart(run, there, off, (_TURN_WARNS_RAD, _TURN_FAILS_RAD), what, (one, other))
+    warns_m, fails_m = (max(share * way_m[-1], least) for share, least in (_WARNS, _FAILS))
+    worst_m = float(off.max())
+    evidence = f"{names}: {worst_m:.3g} m apart at most, of a way of {way_m[-1]:.3g} m"
+    if worst_m <= warns_m:
+        return Finding("pass", evidence)
+    since_s = float(run.frame.times[there][int(np.argmax(off > warns_m))])
+    outcome = "fail" if worst_m > fails_m else "warn"
+    return Finding(outcome, evidence, since_s, 1, run.shows(one[0].name, other[0].name))
 
 
 def stays_in_place(run: RunUnderCheck) -> Finding:
     """Warns where the position jumped: something put it elsewhere, or the estimate is wrong."""
     if run.motion.position is None:
-        raise NotApplicableError("no position is published")
+        raise NotSearchableError("no position is published")
     leaps = [each for each in run.events(JUMP.name) if each.name == "position"]
     if not leaps:
         return Finding("pass", "its position never jumped")

@@ -1,18 +1,14 @@
-"""Checks of what sensors gave: nothing, the same, an extreme, or something else for a moment."""
+"""Checks of what sensors gave: nothing, the same, or something else for a moment."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Final, Literal
 
 from webots_mcp.naming import REDUCTIONS, find_targets, listed, words_of
-from webots_mcp.store.analysis.arrays import np, runs_of
-from webots_mcp.store.checks.finding import (
-    Finding,
-    RunUnderCheck,
-    times,
-)
+from webots_mcp.store.analysis.arrays import np
+from webots_mcp.store.checks.finding import Finding, RunUnderCheck, times
 from webots_mcp.store.detection.jump import JUMP
 from webots_mcp.store.detection.kinds import Event
 from webots_mcp.store.detection.sensors import FLAT, OTHER_ROWS, is_noisy
@@ -20,20 +16,29 @@ from webots_mcp.store.signals import Signal, stored_roles
 
 MOST_NAMED: Final = 3
 _FAULTY: Final = "nan"  # what a device gives that has no value; inf is a range without an end
+_MANY: Final = 0.05  # of the rows that are NaN: a sensor has none in its first steps alone
+_LEAST_S: Final = 1.0  # as of what is missing
 
 
 def sensors_speak(run: RunUnderCheck) -> Finding:
     """Fails where a signal was NaN for a second or more, warns where it was null.
 
-    Null may be meant, of what is not seen now; an infinite range is.
+    Null may be meant, of what is not seen now; an infinite range is. Warns of one that was NaN in
+    5 % of the rows, never for so long or before its first value.
     """
     silent = [e for e in run.events("missing") if e.details.get("value") in (None, _FAULTY)]
-    never = [
-        name for name, each in run.search.known.items()
-        if each.is_number and run.frame.replaced(name)[_FAULTY] == len(run.frame) > 0
-    ]  # fmt: skip
+    shares = {
+        name: run.frame.replaced(name)[_FAULTY] / max(len(run.frame), 1)
+        for name, each in run.search.known.items() if each.is_number
+    }  # fmt: skip
+    never = [name for name, share in shares.items() if share == 1]
     if not (silent or never):
-        return Finding("pass", "none was without a value for a second")
+        least = max(_MANY, _LEAST_S / run.search.length_s)
+        if many := [name for name, share in shares.items() if share >= least]:
+            most, up_to = 100 * max(shares.values()), "up to " * (len(many) > 1)
+            evidence = f"{listed(many, MOST_NAMED)}: NaN in {up_to}{most:.3g} % of the rows"
+            return Finding("warn", evidence, None, len(many), run.shows(many[0]))
+        return Finding("pass", "none that had a value was without one for a second")
     nan = [each for each in silent if each.details.get("value") == _FAULTY]
     silent = by_array(silent)
     longest_s = max((each.duration_s for each in silent), default=0.0)
@@ -104,54 +109,10 @@ def _sensors(run: RunUnderCheck) -> dict[str, Signal]:
 _SET: Final = frozenset(
     ("target", "setpoint", "goal", "desired", "commanded", "command", "cmd", "reference", "ref")
 )
-_RANGES: Final = frozenset(
-    ("distance", "range", "lidar", "sonar", "ir", "ds", "ps", "front", "left", "right", "rear")
-)
 
 
 def _words(name: str) -> set[str]:
     return {word for part in name.split(".") for word in words_of(part)}
-
-
-_AT_LIMIT: Final = 0.05  # of the rows
-_MANY_VALUES: Final = 100  # different ones: of fewer one comes back by nature
-_IN_A_ROW, _OFTEN = 3, 3  # so many rows are at the limit, so many times
-
-
-def sensors_within_limits(run: RunUnderCheck) -> Finding:
-    """Warns where a signal was cut off at its least or greatest value in 5 % of the rows.
-
-    Not a range, which ends where nothing is in sight.
-    """
-    found = list(_saturated(run))
-    if not found:
-        return Finding("pass", "none was cut off at a limit")
-    name, limit, share, since_s, count = max(found, key=lambda each: each[2])
-    others = listed([each[0] for each in found if each[0] != name], MOST_NAMED)
-    evidence = f"{name} was at {limit:.6g} in {100 * share:.3g} % of the rows"
-    evidence += f"; also {others}" if others else ""
-    return Finding("warn", evidence, since_s, count, run.shows(name))
-
-
-def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, int]]:
-    position = _place(run)
-    for name, signal in _sensors(run).items():
-        if run.search.deadline.passed:
-            return
-        if name in position or signal.turn or not _RANGES.isdisjoint(_words(name)):
-            continue
-        zones = run.frame.zones(name)
-        if zones.change_count.sum() < _MANY_VALUES:
-            continue
-        clock, values = run.frame.usable(name)
-        if len(np.unique(values)) < _MANY_VALUES:
-            continue
-        for limit in (float(values.min()), float(values.max())):
-            at = values == limit
-            rests = runs_of(at, clock)
-            long = rests.only(rests.stops - rests.starts >= _IN_A_ROW)
-            if len(long) >= _OFTEN and at.mean() >= _AT_LIMIT:
-                yield name, limit, float(at.mean()), float(long.starts_s[0]), len(long)
 
 
 _OFTEN_THE_SAME: Final = 3

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import sqlite3
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
@@ -13,13 +14,8 @@ from webots_mcp.conditions.expectation import Expectation, parse_expectation
 from webots_mcp.conditions.signal_values import SAME_TIME_S
 from webots_mcp.errors import ConditionFailedError, InvalidConditionError
 from webots_mcp.pauses import EXPECTED, OF_PROJECT, VIOLATION
-from webots_mcp.store.analysis.arrays import Flags, Runs, np, runs_of
-from webots_mcp.store.detection.condition import (
-    holds_in,
-    numbers_in,
-    position_in,
-    values_at,
-)
+from webots_mcp.store.analysis.arrays import Flags, Runs, median, np, runs_of
+from webots_mcp.store.detection.condition import holds_in, numbers_in, position_in, values_at
 from webots_mcp.store.detection.kinds import (
     Alike,
     Event,
@@ -44,12 +40,15 @@ class Held:
 
     Attributes:
         violations: Where it did not.
-        meant_s: For how long it was asked, and `held_s` for how long of that it held.
+        rows: Of how many it was asked.
+        meant_s: For how long it was asked, and `held_s` for how long of that it held: each row
+            lasts to the next one, the last as long as usual, an only one not at all.
         lacking: Rows in which it was meant and had no value to be asked of.
         worst: The value that was farthest on the wrong side, where it compares with a number.
     """
 
     violations: Runs
+    rows: int
     meant_s: float
     held_s: float
     lacking: int
@@ -66,15 +65,13 @@ def expectations_of(
         run_id: The run.
         of_project: False leaves out what its project expects.
     """
-    found = list[Expectation]()
+    found = dict[tuple[str, str, str | None], Expectation]()
     for expects, during, name, by in connection.execute(EXPECTED, (run_id,)).fetchall():
-        try:
-            if by == OF_PROJECT and not of_project:
-                continue
-            found.append(parse_expectation(expects, during, name))
-        except InvalidConditionError:
-            continue
-    return list({each.asks: each for each in found}.values())
+        with suppress(InvalidConditionError):
+            if of_project or by != OF_PROJECT:
+                each = parse_expectation(expects, during, name)
+                found[each.asks] = each
+    return list(found.values())
 
 
 def every_call_of(search: Search) -> Frame:
@@ -89,39 +86,27 @@ def judge_expectation(expectation: Expectation, frame: Frame, known: dict[str, S
     Raises:
         ConditionFailedError: The values are not of the kinds that it can be asked of.
     """
-    position = position_in(frame, known) if _asks_position(expectation) else None
-
-    def holds(condition: Condition) -> Flags:
-        return holds_in(condition.scanned, condition.tree, frame, position)
-
+    position = position_in(frame, known) if expectation.asks_position else None
+    during, expected = expectation.during, expectation.expected
     meant: Flags = np.array(frame.was_read())
-    if expectation.during is not None:
-        meant &= holds(expectation.during)
+    if during is not None:
+        meant &= holds_in(during.scanned, during.tree, frame, position)
     if len(frame):
         meant &= frame.times - frame.times[0] >= expectation.takes_s - SAME_TIME_S
         meant[0] &= not expectation.needs_two
     lacks: Flags = np.zeros(len(frame), np.bool_)
     if not expectation.asks_missing:
-        names = [*expectation.expected.signals, *(position or ())]
-        lost = expectation.expected.asks_position and position is None
-        for name in names:
+        for name in (*expected.signals, *(position or ())):
             lacks |= np.isnan(frame.numbers(name)) & (frame.texts(name).codes == 0)
-        lacks |= lost
+        lacks |= expected.asks_position and position is None
     asked: Flags = meant & ~lacks
-    violated: Flags = asked & ~holds(expectation.expected)
-    lasts_s = np.diff(frame.times)
-    meant_s, bad_s = (float(lasts_s[each[:-1]].sum()) for each in (asked, violated))
-    worst = _worst(expectation.expected, frame, position, violated)
-    lacking = int(np.count_nonzero(meant & lacks))
-    runs = runs_of(violated, frame.times)
-    if not meant_s:  # a single row
-        meant_s, bad_s = float(asked.any()), float(violated.any())
-    return Held(runs, meant_s, meant_s - bad_s, lacking, worst)
-
-
-def _asks_position(expectation: Expectation) -> bool:
-    both = (expectation.expected, expectation.during)
-    return any(each is not None and each.asks_position for each in both)
+    violated: Flags = asked & ~holds_in(expected.scanned, expected.tree, frame, position)
+    steps_s = np.diff(frame.times)
+    lasts_s = np.append(steps_s, median(steps_s) if len(steps_s) else 0.0)[: len(frame)]
+    meant_s, bad_s = (float(lasts_s[each].sum()) for each in (asked, violated))
+    worst, runs = _worst(expected, frame, position, violated), runs_of(violated, frame.times)
+    rows, lacking = (int(np.count_nonzero(each)) for each in (asked, meant & lacks))
+    return Held(runs, rows, meant_s, meant_s - bad_s, lacking, worst)
 
 
 def _worst(
@@ -133,11 +118,9 @@ def _worst(
         return None
     left, right, op = tree.left, tree.comparators[0], tree.ops[0]
     flipped = isinstance(left, ast.Constant)
-    side = right if flipped else left
-    other = left if flipped else right
-    if not isinstance(other, ast.Constant | ast.UnaryOp) or isinstance(side, ast.Constant):
-        return None
-    if not isinstance(op, ast.Lt | ast.LtE | ast.Gt | ast.GtE):
+    side, other = (right, left) if flipped else (left, right)
+    is_fit = isinstance(other, ast.Constant | ast.UnaryOp) and not isinstance(side, ast.Constant)
+    if not is_fit or isinstance(op, ast.Eq | ast.NotEq):
         return None
     try:
         values = numbers_in(expected.scanned, side, frame, position)[violated]
@@ -165,10 +148,9 @@ def violation_events(search: Search) -> Iterator[Event]:
         except ConditionFailedError as error:
             search.not_searched(VIOLATION, str(error))
             continue
-        position = position_in(frame, search.known) if _asks_position(each) else None
-        runs, condition = held.violations, each.violation
-        values = values_at(condition, frame, position, runs)
-        for run, details in zip(runs.each(), values, strict=True):
+        position = position_in(frame, search.known) if each.asks_position else None
+        values = values_at(each.violation, frame, position, held.violations)
+        for run, details in zip(held.violations.each(), values, strict=True):
             here = search.segment
             if run.start_s < here.end_s and run.end_s >= here.start_s:
                 details = {"expected": each.expected.text, **dict(list(details.items())[:8])}

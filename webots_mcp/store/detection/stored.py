@@ -20,6 +20,7 @@ from webots_mcp.store.detection.kinds import (
     but_for_numbers,
 )
 from webots_mcp.store.detection.search import Search
+from webots_mcp.store.reading.frame_source import Unread
 from webots_mcp.store.reading.frame_summary import (
     MOST_VALUES,
     Point,
@@ -91,8 +92,10 @@ def gap_events(search: Search) -> Iterator[Event]:
     around = frame_around(search.connection, segment, search.deadline)
     _note_unread(search, "gap", around.cut_at_s)
     asked = search.segment
-    left = (e for e in around.unread if e.end_s > asked.start_s and e.start_s < asked.end_s)
-    search.not_searched("gap", *map(str, left))
+    for e in around.unread:
+        if e.end_s > asked.start_s and e.start_s < asked.end_s:
+            here = (max(e.start_s, asked.start_s), min(e.end_s, asked.end_s))
+            search.not_searched("gap", str(Unread(*here, e.why)))
     rhythm = rhythm_in(around)
     for gap in rhythm.gaps:
         if gap.end_s > segment.start_s and gap.start_s < segment.end_s:

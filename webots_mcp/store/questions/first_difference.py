@@ -191,6 +191,9 @@ def compare_rows(
     if until < until_s - _SHORT_ROWS * row_s - SAME_TIME_S and until_s < math.inf:
         left_out += [f"a run ends before {until_s:g} s"]
     remarks = [_REDUCED] * any(each.reduction for each in shared)
+    begins_s = sorted(each.bounds_s[0] for each in (one, other))
+    if len(pair.times) and begins_s[1] > begins_s[0] + row_s / 2:
+        remarks += ["one run begins at {:.3f} s, the other at {:.3f} s".format(*begins_s)]
     if len(pair.times) and (last_s := max(one.bounds_s[1], other.bounds_s[1])) > until + row_s / 2:
         remarks += [f"one run goes on to {last_s:.3f} s, which the other does not"]
     return Parting(

@@ -2,36 +2,53 @@
 
 from __future__ import annotations
 
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
-from typing import Annotated, Any, Final, cast
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, cast
 
 from anyio import to_thread
 from pydantic import Field
 
 from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
+from webots_mcp.plotting import PlotKind, plot
+from webots_mcp.plotting.canvas import HEIGHT_PX, LEAST_HEIGHT_PX, LEAST_WIDTH_PX, MOST_PX, WIDTH_PX
 from webots_mcp.questions.answers import CommandAnswer, ShownPicture
-from webots_mcp.questions.budget import compact_json, seconds, some
+from webots_mcp.questions.budget import compact_json, notes_of, seconds, some
 from webots_mcp.questions.declaring import (
     CHANGES,
     READS,
+    AnyNames,
     Caller,
     RobotName,
     RunId,
+    RunIds,
     Seconds,
     TimeoutS,
+    TrialSetId,
     question,
 )
-from webots_mcp.questions.pictures import load_picture, load_sheet
 from webots_mcp.steering.dispatch import Dispatcher
+from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.reading.segment import just_after, kept_stretches
 from webots_mcp.store.recording import Recording, View
-from webots_mcp.store.run_rows import StoredImage, camera_frames, cameras, inside
+from webots_mcp.store.run_rows import StoredImage, camera_frames, cameras, inside, opened
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 _WAIT_S: Final = 15.0
 _MOST_RUNS: Final = 5
 _MOST_FRAMES: Final = 16
 _FAR_S: Final = 1.0  # from the time that was asked for
+_LONGEST_SIDE_PX: Final = 1000
+_MAX_SENT_BYTES: Final = 4_000_000  # more than such a picture has pixels: it holds something else
+_JPEG_QUALITY: Final = 85
+_GAP_PX: Final = 4
 
 
 @question("Get the camera picture", READS, core=True)
@@ -105,7 +122,7 @@ def _told_of(view: View, found: list[StoredImage]) -> dict[str, Any]:
 def _single(
     recording: Recording, view: View, image: StoredImage
 ) -> tuple[ShownPicture, dict[str, Any]]:
-    picture, note = load_picture(image.file(recording.data_dir))
+    picture, note = _load_picture(image.file(recording.data_dir))
     return picture, {
         "picture_sim_time_s": seconds(image.sim_time_s),
         "picture_age_s": view.age_s(image.wall_time_s),
@@ -117,7 +134,7 @@ def _single(
 
 
 def _sheet(recording: Recording, found: list[StoredImage]) -> tuple[ShownPicture, dict[str, Any]]:
-    picture = load_sheet([image.file(recording.data_dir) for image in found])
+    picture = _load_sheet([image.file(recording.data_dir) for image in found])
     return picture, {
         "pictures_sim_time_s": [seconds(image.sim_time_s) for image in found],
         "note": "row by row, from left to right",
@@ -144,7 +161,7 @@ def _show(recording: Recording, answer: CommandAnswer) -> list[str | ShownPictur
     if answer.outcome != "done" or path is None:
         raise CommandRefusedError(f"no picture: {compact_json(said)}")
     file = inside(recording.data_dir, str(path))
-    picture, note = load_picture(file)
+    picture, note = _load_picture(file)
     return [_caption(said | {"note": note, "file": str(file)}), picture]
 
 
@@ -165,3 +182,92 @@ def _no_frame(view: View, camera: str) -> str:
         "bridge.keep_camera(camera) those of kept stretches"
     )
     return _caption(view.header() | {"camera": camera, "hint": hint})
+
+
+# -- plots -----------------------------------------------------------------------------------------
+
+
+@question("Plot", READS)
+def webots_plot(
+    recording: Recording,
+    scope: Scope,
+    kind: Annotated[PlotKind, Field(description="trajectory: the way from above.")] = "signals",
+    signals: AnyNames = None,
+    run_ids: RunIds = None,
+    trial_set: TrialSetId = None,
+    width_px: Annotated[
+        int, Field(ge=LEAST_WIDTH_PX, le=MOST_PX, description="Pixels.")
+    ] = WIDTH_PX,
+    height_px: Annotated[
+        int, Field(ge=LEAST_HEIGHT_PX, le=MOST_PX, description="Pixels.")
+    ] = HEIGHT_PX,
+) -> list[str | ShownPicture]:
+    """A picture of signals over time (mean, min-max band, modes, events), way, or trials.
+
+    Without signals those that changed most; a trajectory finds the position, or takes two signals.
+    Several run_ids are laid over each other. trial_set: scores over one or two parameters, as
+    signals.
+    """
+    draw = partial(plot, kind=kind, signals=signals or (), width_px=width_px, height_px=height_px)
+    if trial_set is not None:  # which may be of a robot that is gone
+        with recording.reader() as connection:
+            picture = draw(connection, trial_set=trial_set)
+        facts = {"shows": picture.caption, "notes": notes_of(picture.notes) or []}
+        return [_caption(facts), ShownPicture(data=picture.data, format="png")]
+    first = scope.run_id or next(iter(run_ids or ()), None)
+    with recording.view(scope.robot, first) as view:
+        view.require_run()
+        meant = scope if first else replace(scope, robot=view.robot.name)
+        picture = draw(view.connection, scope=meant, run_ids=run_ids or ())
+        facts = view.header() | {"shows": picture.caption, "notes": notes_of(picture.notes)}
+        return [_caption(facts), ShownPicture(data=picture.data, format="png")]
+
+
+# -- pictures as a model can look at them: small enough, in a format that clients show -------------
+
+
+def _load_sheet(files: Sequence[Path]) -> ShownPicture:
+    """Pictures beside each other, from left to right and from top to bottom, as one.
+
+    Raises:
+        InvalidInputError: A file holds no complete picture, or is too large.
+    """
+    from PIL import Image as Pictures
+
+    columns = math.ceil(math.sqrt(len(files)))
+    side_px = _LONGEST_SIDE_PX // columns - _GAP_PX
+    parts = [_thumbnail(file, side_px) for file in files]
+    width, height = (max(part.size[i] for part in parts) + _GAP_PX for i in (0, 1))
+    sheet = Pictures.new("RGB", (columns * width, math.ceil(len(parts) / columns) * height))
+    for number, part in enumerate(parts):
+        sheet.paste(part, (number % columns * width, number // columns * height))
+    png = io.BytesIO()
+    sheet.save(png, "PNG")
+    return ShownPicture(data=png.getvalue(), format="png")
+
+
+def _thumbnail(file: Path, side_px: int) -> Image:
+    with opened(file) as picture:
+        scaled = picture.convert("RGB")
+    scaled.thumbnail((side_px, side_px))
+    return scaled
+
+
+def _load_picture(file: Path) -> tuple[ShownPicture, str]:
+    """A picture within 1,000 pixels, and a note where it had to be scaled (else empty).
+
+    Raises:
+        InvalidInputError: The file holds no complete picture, or is too large.
+    """
+    with opened(file) as picture:
+        picture.load()
+        short = max(picture.size) <= _LONGEST_SIDE_PX
+        if short and picture.format and file.stat().st_size <= _MAX_SENT_BYTES:
+            return ShownPicture(data=file.read_bytes(), format=picture.format.lower()), ""
+        scaled = picture.convert("RGB")
+        scaled.thumbnail((_LONGEST_SIDE_PX, _LONGEST_SIDE_PX))
+        jpeg = io.BytesIO()
+        scaled.save(jpeg, "JPEG", quality=_JPEG_QUALITY)
+    (width, height), (true_width, true_height) = scaled.size, picture.size
+    note = f"shown at {width} x {height} of {true_width} x {true_height} pixels"
+    return ShownPicture(data=jpeg.getvalue(), format="jpeg"), note

@@ -1,0 +1,391 @@
+"""Commands that judge runs: is it well, where do two part, does it repeat, what takes its time."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import re
+import shlex
+import shutil
+import sqlite3
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+from webots_mcp.cli.options import (
+    HERE,
+    Count,
+    Id,
+    Json,
+    Parameter,
+    Robot,
+    Waiting,
+    Where,
+    make_chunks_first,
+)
+from webots_mcp.cli.terminal import print_answer, print_json, print_table
+from webots_mcp.contract import find_project, host_name, whole_file
+from webots_mcp.errors import CommandRefusedError, DatabaseError, InvalidInputError
+from webots_mcp.naming import listed, spelled_out
+from webots_mcp.requirements import explain_extra
+from webots_mcp.stacks import INSTALLED, STEPPING
+
+if TYPE_CHECKING:
+    from webots_mcp.store.questions.first_difference import Parting
+
+EXIT_CODES: Final = {"fail": 1, "not looked at": 2}
+_ELEMENTS: Final = {  # of JUnit, and by which attribute they are counted
+    "fail": ("failure", "failures"),
+    "not looked at": ("error", "errors"),
+    "not applicable": ("skipped", "skipped"),
+}
+
+
+def check(
+    run_id: Annotated[Id | None, Parameter("RUN", help="Else the newest run.")] = None,
+    /,
+    *,
+    expect: Annotated[
+        list[str] | None,
+        Parameter(
+            "--expect",
+            metavar="CONDITION",
+            help="What shall hold, as \"front_m > 0.1 during mode == 'drive'\"; may be repeated.",
+        ),
+    ] = None,
+    junit: Annotated[
+        Path | None,
+        Parameter("--junit", metavar="FILE", help="Write the checks there as JUnit XML too."),
+    ] = None,
+    robot: Robot = None,
+    as_json: Json = False,
+    recorded: Where = HERE,
+) -> int:
+    """Is this run well? Motion against commands, sensors, pace, log, end, lost rows, goal.
+
+        webots-mcp check 4 --junit check.xml
+
+    Exit code 0: each check passed, warned or did not apply. 1: one failed. 2: it could not be
+    asked, or not all of the run was looked at.
+    """
+    from webots_mcp.cli.asking import ask, show
+    from webots_mcp.questions.compare_runs import webots_check_run
+
+    _compile(recorded)
+    make_chunks_first(recorded.recording())
+    given = {"run_id": run_id, "robot": robot, "expect": expect}
+    reply = ask(webots_check_run, given, recorded)
+    data = reply.data or {}
+    shown = reply if as_json else reply._replace(data=_as_typed(data))
+    show(webots_check_run, shown, recorded, as_json=as_json)
+    if junit is not None:
+        _write(junit, data)
+    return EXIT_CODES.get(data.get("outcome", ""), 0)
+
+
+def _compile(recorded: Where) -> None:
+    """Let controllers that start without a server read what their project expects now."""
+    from webots_mcp.store.project_file import compile_project, file_of, read_project
+
+    recording = recorded.recording(read_only=False)
+    if (file := file_of(recording.data_dir)) is None:
+        return
+    expected = read_project(file)
+    # Where nothing can be written it is asked all the same, of what is recorded.
+    with contextlib.suppress(DatabaseError, sqlite3.Error), recording.writer() as connection:
+        compile_project(connection, expected)
+
+
+def _as_typed(answer: dict[str, Any]) -> dict[str, Any]:
+    """The answer with commands in the place of calls, and what passed in one line."""
+    from webots_mcp.cli.asking import OPTIONS
+    from webots_mcp.cli.terminal import commands_by_tool
+
+    def typed(cell: Any) -> Any:
+        call = re.fullmatch(r"webots_(\w+)\((.*)\)", str(cell))
+        if call is None:
+            return cell
+        words = ["webots-mcp", commands_by_tool().get(call[1], call[1])]
+        for name, value in re.findall(r"(\w+)=(\[[^]]*\]|'[^']*'|\w+)", call[2]):
+            for each in re.findall(r"'([^']*)'", value) or [value]:
+                words += [OPTIONS.get(name, f"--{name}"), each]
+        return shlex.join(words)
+
+    passed, table = answer.get("passed"), answer.get("checks")
+    changed = {"passed": f"{len(passed)}: {', '.join(passed)}"} if passed else {}
+    if table:
+        changed["checks"] = table | {"rows": [[*map(typed, row)] for row in table["rows"]]}
+    return answer | changed
+
+
+def _write(file: Path, answer: dict[str, Any]) -> None:
+    """Write an answer as JUnit XML: a warning passes, and stands in `system-out`.
+
+    Raises:
+        InvalidInputError: The file cannot be written.
+    """
+    from xml.etree.ElementTree import Element, SubElement, tostring
+
+    suite = Element("testsuite", name=f"run {answer.get('run_id')} of {answer.get('robot')}")
+    counts = Counter[str](tests=0, failures=0, errors=0, skipped=0)
+    for each in _checks_in(answer):
+        name, says = spelled_out(each["check"]), spelled_out(each.get("evidence") or "")
+        case = SubElement(suite, "testcase", classname="webots-mcp", name=name)
+        says += f" (since {each['since_s']:g} s)" if each.get("since_s") is not None else ""
+        element, counted = _ELEMENTS.get(each["outcome"], ("", ""))
+        counts.update(filter(None, ("tests", counted)))
+        if element:
+            SubElement(case, element, message=says)
+        elif each["outcome"] == "warn":
+            SubElement(case, "system-out").text = f"warning: {says}"
+    suite.attrib |= {name: str(count) for name, count in counts.items()}
+    try:
+        with whole_file(file) as aside:
+            aside.write_bytes(tostring(suite, "utf-8", xml_declaration=True))
+    except OSError as error:
+        raise InvalidInputError(f"{file} cannot be written: {error}") from error
+
+
+def _checks_in(answer: dict[str, Any]) -> list[dict[str, Any]]:
+    table: Any = answer.get("checks") or {"columns": [], "rows": []}
+    found = [dict(zip(table["columns"], row, strict=True)) for row in table["rows"]]
+    return [*found, *({"check": name, "outcome": "pass"} for name in answer.get("passed") or ())]
+
+
+# -- whether runs repeat ---------------------------------------------------------------------------
+
+By = list[Literal["reset", "reload", "process"]] | None
+_Names = list[str] | None
+_World = Path | None
+_WAITING: Final = Waiting()
+
+
+def diff(
+    first: Annotated[Id, Parameter("RUN", help="The id of a run.")],
+    other: Annotated[Id, Parameter("RUN", help="The id of another.")],
+    /,
+    *,
+    signals: Annotated[
+        _Names, Parameter("--signal", negative=(), help="Only these, with '*'.")
+    ] = None,
+    json: Json = False,
+    recorded: Where = HERE,
+) -> None:
+    """Where two runs part: which signal is first not the same to the last digit, and how it grows.
+
+        webots-mcp diff 3 4 --signal 'pose*'
+
+    Parameters, code, world and versions that differ are named first. Rows are compared with those
+    of the other run at the same simulation time; the others are counted.
+    """
+    from webots_mcp.cli.asking import ask_and_show
+    from webots_mcp.questions.compare_runs import webots_compare_runs
+
+    asked = {"run_ids": [first, other], "signals": signals, "first_difference": True}
+    ask_and_show(webots_compare_runs, asked, recorded, as_json=json)
+
+
+def repeat(
+    world: Annotated[_World, Parameter("WORLD", help="Of processes (the newest run's).")] = None,
+    /,
+    *,
+    for_s: Annotated[float, Parameter("--for", metavar="S", help="Simulated seconds of each.")],
+    by: Annotated[By, Parameter("--by", negative=(), help="How each begins (reset).")] = None,
+    number: Annotated[Count, Parameter("-n", help="How many of each (5).")] = 5,
+    stand_in: Annotated[bool, Parameter("--stand-in", negative=(), help="Not Webots.")] = False,
+    asked: Waiting = _WAITING,
+    json: Json = False,
+) -> None:
+    """Run the same again, and say where the runs part from the first, and how it grows.
+
+        webots-mcp repeat --by reset --by process -n 3 --for 20
+
+    Each begins with a reset or reload of the live simulation, whose controller has to be a
+    Supervisor, or in a simulator process of its own, as a trial does. Where runs part after a
+    reset, and processes of their own do not, the reset is to blame.
+    """
+    from webots_mcp.store.questions.first_difference import compare_repeats
+    from webots_mcp.store.run_rows import fetch_run
+
+    ways = sorted(dict.fromkeys(by or ["reset"]))  # processes first: others are judged by them
+    if number < 2:
+        raise InvalidInputError(f"-n {number}: it takes two runs to see whether they are the same")
+    if (world or stand_in) and "process" not in ways:
+        raise InvalidInputError("WORLD and --stand-in are for --by process")
+    runs = dict[str, list[int]]()
+    for way in ways:
+        if way == "process":
+            runs[way] = _in_processes(world, asked, for_s, number, stand_in=stand_in)
+        else:
+            runs[way] = [_live(way, asked, for_s) for _ in range(number)]
+    if len(ways) > 1:
+        runs["the first of each"] = [run_ids[0] for run_ids in runs.values()]
+    found: dict[str, list[Parting]] = {}
+    with asked.recording().reader() as connection:
+        for way, run_ids in runs.items():
+            until_s = fetch_run(connection, run_ids[0]).started_sim_time_s + for_s
+            found[way] = compare_repeats(connection, run_ids, until_s=until_s, deadline_s=math.inf)
+    answer: dict[str, Any] = {way: _answer(each) for way, each in found.items()}
+    (print_json if json else print_answer)(answer | _blame(found))
+
+
+def _in_processes(
+    world: Path | None, asked: Waiting, for_s: float, number: int, *, stand_in: bool
+) -> list[int]:
+    """Run a world in simulators of their own, as trials without parameters."""
+    from webots_mcp.cli.steering import TrialOptions, run_plan
+    from webots_mcp.steering.trial_plan import WorldPlan
+    from webots_mcp.store.parameters import trials_of
+
+    recording = asked.recording(read_only=False)
+    if world is None:
+        with recording.view(asked.robot) as view:
+            world = Path(view.require_run().world or "")
+    plan = WorldPlan(
+        world=str(world.resolve()), robot=asked.robot, score="duration", parameters=[{}],
+        for_s=for_s, repeats=number, timeout_s=asked.timeout_wall_s or 600.0,
+    )  # fmt: skip
+    set_id = run_plan(recording, plan, TrialOptions(stand_in=stand_in, again=True))
+    with recording.reader() as connection:
+        found = [each.run_id for each in trials_of(connection, set_id) if each.run_id is not None]
+    if len(found) < 2:
+        raise CommandRefusedError("fewer than two runs were recorded")
+    return found
+
+
+def _live(way: str, asked: Waiting, for_s: float) -> int:
+    """Let the live simulation begin anew and run; the run that was recorded."""
+    from webots_mcp.cli.asking import ask
+    from webots_mcp.questions.control_simulation import webots_run, webots_world_reload
+
+    to: dict[str, Any] = {"robot": asked.robot, "timeout_wall_s": asked.timeout_wall_s}
+    answer: dict[str, Any] = {}
+    if way == "reload":
+        answer = ask(webots_world_reload, to, asked).data or {}
+    if way == "reset" or answer["outcome"] == "done":
+        to |= {"for_s": for_s, "reset": way == "reset"}
+        answer = ask(webots_run, to, asked).data or {}
+    if answer.get("stopped") != "simulation time reached":
+        why = (answer.get(each) for each in ("error", "stopped", "stop_reason", "hint"))
+        raise CommandRefusedError("; ".join(["a run did not reach its end", *filter(None, why)]))
+    return answer["run_id"]
+
+
+def _blame(found: Mapping[str, Sequence[Parting]]) -> dict[str, str]:
+    """Whose fault it is that runs part, where processes of their own tell."""
+    first, *ways = found
+    if first != "process" or not ways:
+        return {}
+    if not all(each.is_equal for each in found[first]):
+        return {"verdict": "processes of their own part as well, or tell nothing"}
+    across = dict(zip(ways, found[ways.pop()], strict=False))
+    unlike = {name: None for each in across.values() for name in each.unlike}
+    blamed = [way for way in ways if any(each.parted for each in (across[way], *found[way]))]
+    if named := [name for name in unlike if name not in ("robot", "began_by")]:
+        return {"verdict": f"nothing is blamed: not alike to begin with ({listed(named)})"}
+    said = f"the {' and the '.join(blamed)} is to blame: processes of their own repeat"
+    return {"verdict": said if blamed else "what was compared is the same, however a run begins"}
+
+
+def _answer(found: Sequence[Parting]) -> dict[str, Any]:
+    from webots_mcp.questions.compare_runs import parting_facts
+    from webots_mcp.store.questions.first_difference import verdict_on
+
+    facts = [{"run_id": each.run_ids[1], **parting_facts(each)} for each in found]
+    shown = ("run_id", "verdict", "growth", "notes")
+    return {
+        "run_ids": [found[0].run_ids[0], *(each["run_id"] for each in facts)],
+        "parted": [each.run_ids[1] for each in found if each.parted],
+        "verdict": verdict_on(found),
+        "repeats": [{name: each[name] for name in shown if each[name]} for each in facts],
+    }
+
+
+# -- what takes the time ---------------------------------------------------------------------------
+
+_FRAME: Final = re.compile(r"(.*) \((.*):(\d+)\)$")
+_OURS: Final = str(Path(__file__).parents[1])
+_SHOWN: Final = 12
+_IN_STEP: Final = ("waiting in step()", None)
+_BRIDGE: Final = ("in the bridge", None)
+_OTHER: Final = ("in no file of the controller", None)
+_NOT_PERMITTED: Final = (
+    "py-spy may not look into process {}: allow it with 'sudo sysctl kernel.yama.ptrace_scope=0' "
+    "on Linux, with --cap-add SYS_PTRACE for a container, or ask as root (macOS)"
+)
+
+
+def profile(
+    robot: Annotated[str | None, Parameter("ROBOT", help="Which (the only live one).")] = None,
+    /,
+    *,
+    seconds: Annotated[Count, Parameter("--for", help="Seconds of wall time (10).")] = 10,
+    json: Json = False,
+    recorded: Where = HERE,
+) -> None:
+    """Sample which lines of a controller take its time, 100 times a second, by py-spy.
+
+    Of the lines of its own files those that the main thread was in, or in what they called; time in
+    which it sleeps or waits counts. Each sample stops the controller for about a millisecond.
+    """
+    with recorded.recording().view(robot) as view:
+        name, session = view.robot.name, view.session
+    if session is None or not view.robot.live or session.host != host_name():
+        raise CommandRefusedError(f"no controller of {name} runs on this machine")
+    if not session.has_bridge:
+        raise CommandRefusedError(f"{name} has no bridge in Python: its lines cannot be sampled")
+    controller = Path(session.controller or "/nowhere")
+    own = str(find_project(controller.parent) or controller.parent)
+    samples = Counter[tuple[str, str | None]]()
+    for stack, count in _sampled(session.pid, seconds):
+        samples[_place_of(stack, own)] += count
+    total = samples.total()
+    columns = ("share", "line", "function", "samples")
+    rows = [[f"{n / total:.1%}", *place, n] for place, n in samples.most_common(_SHOWN)]
+    if json:
+        found = {"robot": name, "seconds": seconds, "samples": total}
+        return print_json(found | {"columns": columns, "rows": rows})
+    print_table(columns, rows)
+    print(f"{name}: {total} samples of its main thread in {seconds} s")
+
+
+def _sampled(pid: int, seconds: int) -> list[tuple[str, int]]:
+    """The stacks of the main thread, and how often each was met.
+
+    Raises:
+        CommandRefusedError: py-spy is not installed, or not permitted; the text says what to do.
+    """
+    spy = shutil.which("py-spy") or shutil.which(Path(sys.executable).with_name("py-spy"))
+    if spy is None:
+        raise CommandRefusedError(explain_extra("webots-mcp profile", "profile"))
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "stacks"
+        how = ("--format=raw", "--idle", "--threads", "--full-filenames", f"--output={file}")
+        line = [spy, "record", f"--pid={pid}", f"--duration={seconds}", *how]
+        ended = subprocess.run(line, capture_output=True, text=True, check=False)
+        text = file.read_text("utf-8", "replace") if file.exists() else ""
+    found = [line.rpartition(" ") for line in text.splitlines() if "MainThread;" in line]
+    if found:
+        return [(stack, int(count)) for stack, _, count in found]
+    if re.search("permi", ended.stderr, re.IGNORECASE):
+        raise CommandRefusedError(_NOT_PERMITTED.format(pid))
+    *_, said = ended.stderr.strip().splitlines() or ["it has written nothing"]
+    raise CommandRefusedError(f"py-spy could not sample process {pid}: {said}")
+
+
+def _place_of(stack: str, own: str) -> tuple[str, str | None]:
+    """The innermost line of the controller's own files, and its function."""
+    in_bridge = False
+    for each in reversed(stack.split(";")):
+        function, file, line = found.groups() if (found := _FRAME.match(each)) else ("", "", "")
+        is_own = file.startswith(own) and not INSTALLED.search(file)
+        if function.rpartition(".")[2] in STEPPING and not is_own:
+            return _IN_STEP
+        if is_own:
+            return _BRIDGE if in_bridge else (f"{Path(file).name}:{line}", f"{function}()")
+        in_bridge = in_bridge or file.startswith(_OURS)
+    return _OTHER

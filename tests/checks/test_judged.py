@@ -96,6 +96,10 @@ FOOLING: list[tuple[State, float, str, str]] = [
         lambda row: {"imu": course(row, 0.5), "compass": course(row, -0.5)}, 1.0,
         "estimates agree", "pass: ",
     ),
+    (
+        lambda row: {"arm": {"target": -(row < 99), "position": max(-1, min(0, row / 200 - 1))}},
+        1.0, "sensors live", "pass",
+    ),
     (lambda row: {"x": row}, 0.02, "keeps pace", "warn: 0.02 times real time"),
 ]  # fmt: skip
 

@@ -84,6 +84,8 @@ def _frozen(run: RunUnderCheck, flat: Event) -> Literal["fail", "warn"] | None:
         return "fail"
     if run.search.known[name].turn or name in _place(run):  # of who drives straight on
         return None
+    if _target(run, name) is not None:  # which rests as well
+        return None
     others = run.events("standstill") + run.events("stuck")
     if run.motion.position is None:
         branch = name.partition(".")[0]
@@ -96,6 +98,11 @@ def _place(run: RunUnderCheck) -> set[str]:
     """The signals of where it is, in each of its positions."""
     places = (name for name, role in stored_roles(run.search.known).items() if role[0] in "xyz")
     return {*places, *(each.name for each in run.motion.position or ())}
+
+
+def _target(run: RunUnderCheck, name: str) -> str | None:
+    """What a joint shall come to, or how fast it shall be: it stays there."""
+    return find_targets(name, [each.name for each in run.search.numbers])[0]
 
 
 def _sensors(run: RunUnderCheck) -> dict[str, Signal]:
@@ -147,7 +154,12 @@ def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, i
     for name, signal in _sensors(run).items():
         if run.search.deadline.passed:
             return
-        if name in position or signal.turn or not _RANGES.isdisjoint(_words(name)):
+        if (
+            name in position
+            or signal.turn
+            or _target(run, name)
+            or not _RANGES.isdisjoint(_words(name))
+        ):
             continue
         zones = run.frame.zones(name)
         if zones.change_count.sum() < _MANY_VALUES:

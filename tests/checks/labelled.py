@@ -141,6 +141,13 @@ def frozen(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
     return _changed(run, "front", rows, lambda value: at)
 
 
+def saturated(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
+    """Its gyro ends at a fifth of what it would have to show."""
+    slow = 2 * np.sin(run.times / 1.5)
+    rates = np.clip(np.array(run.columns["rate_rad_s"]) + slow, -1.0, 1.0)
+    return replace(run, columns={**run.columns, "rate_rad_s": rates.tolist()})
+
+
 def dropouts(rng: np.random.Generator, run: LabelledRun) -> LabelledRun:
     rows = np.zeros(len(run.times), np.bool_)
     rows[rng.choice(np.arange(20, len(rows) - 20, 10), int(rng.integers(4, 12)), False)] = True
@@ -166,6 +173,7 @@ FAULTS: Final[dict[str, tuple[Fault, str]]] = {
     "NaN": (silent, "sensors speak"),
     "null": (null, "sensors speak"),
     "frozen": (frozen, "sensors live"),
+    "saturated": (saturated, "sensors within limits"),
     "dropouts": (dropouts, "sensors drop nothing"),
     "gaps": (gaps, "misses no steps"),
 }

@@ -83,6 +83,10 @@ FOOLING: list[tuple[State, float, str, str]] = [
         lambda row: {"arm": {"target": 1.0, "position": 0.2}}, 1.0,
         "follows its targets", "fail: arm.position: up to 29.9 s",
     ),
+    (
+        lambda row: {"arm": {"target": -(row < 99), "position": max(-1, min(0, row / 200 - 1))}},
+        1.0, "sensors live", "pass",
+    ),
     (lambda row: {"x": row}, 0.02, "keeps pace", "warn: 0.02 times real time"),
 ]  # fmt: skip
 

@@ -48,6 +48,7 @@ CHECKS: Final[list[Check]] = [
     Check("stays in place", of_motion.stays_in_place, "the position", _JUMP),
     Check("sensors speak", of_sensors.sensors_speak, "numbers", ("missing",), of_values=True),
     Check("sensors live", of_sensors.sensors_live, "numbers", _FLAT, of_values=True),
+    Check("sensors within limits", of_sensors.sensors_within_limits, "numbers", of_values=True),
     Check("sensors drop nothing", of_sensors.sensors_drop_nothing, "numbers", _JUMP),
     Check("keeps pace", of_run.keeps_pace, "rows", of_values=True),
     Check("misses no steps", of_run.misses_no_steps, "rows", ("gap",), of_values=True),

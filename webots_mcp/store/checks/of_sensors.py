@@ -1,13 +1,13 @@
-"""Checks of what sensors gave: nothing, the same, or something else for a moment."""
+"""Checks of what sensors gave: nothing, the same, an extreme, or something else for a moment."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Final, Literal
 
 from webots_mcp.naming import REDUCTIONS, find_targets, listed, words_of
-from webots_mcp.store.analysis.arrays import np
+from webots_mcp.store.analysis.arrays import np, runs_of
 from webots_mcp.store.checks.finding import Finding, RunUnderCheck, times
 from webots_mcp.store.detection.jump import JUMP
 from webots_mcp.store.detection.kinds import Event
@@ -80,6 +80,8 @@ def _frozen(run: RunUnderCheck, flat: Event) -> Literal["fail", "warn"] | None:
         return "fail"
     if run.search.known[name].turn or name in _place(run):  # of who drives straight on
         return None
+    if _target(run, name) is not None:  # which rests as well
+        return None
     others = run.events("standstill") + run.events("stuck")
     if run.motion.position is None:
         branch = name.partition(".")[0]
@@ -92,6 +94,11 @@ def _place(run: RunUnderCheck) -> set[str]:
     """The signals of where it is, in each of its positions."""
     places = (name for name, role in stored_roles(run.search.known).items() if role[0] in "xyz")
     return {*places, *(each.name for each in run.motion.position or ())}
+
+
+def _target(run: RunUnderCheck, name: str) -> str | None:
+    """What a joint shall come to, or how fast it shall be: it stays there."""
+    return find_targets(name, [each.name for each in run.search.numbers])[0]
 
 
 def _sensors(run: RunUnderCheck) -> dict[str, Signal]:
@@ -113,6 +120,55 @@ _SET: Final = frozenset(
 
 def _words(name: str) -> set[str]:
     return {word for part in name.split(".") for word in words_of(part)}
+
+
+_RANGES: Final = frozenset(
+    ("distance", "range", "lidar", "sonar", "ir", "ds", "ps", "front", "left", "right", "rear")
+)
+_AT_LIMIT: Final = 0.05  # of the rows
+_MANY_VALUES: Final = 100  # different ones: of fewer one comes back by nature
+_IN_A_ROW, _OFTEN = 3, 3  # so many rows are at the limit, so many times
+
+
+def sensors_within_limits(run: RunUnderCheck) -> Finding:
+    """Warns where a signal was cut off at its least or greatest value in 5 % of the rows.
+
+    Not a range, which ends where nothing is in sight.
+    """
+    found = list(_saturated(run))
+    if not found:
+        return Finding("pass", "none was cut off at a limit")
+    name, limit, share, since_s, count = max(found, key=lambda each: each[2])
+    others = listed([each[0] for each in found if each[0] != name], MOST_NAMED)
+    evidence = f"{name} was at {limit:.6g} in {100 * share:.3g} % of the rows"
+    evidence += f"; also {others}" if others else ""
+    return Finding("warn", evidence, since_s, count, run.shows(name))
+
+
+def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, int]]:
+    position = _place(run)
+    for name, signal in _sensors(run).items():
+        if run.search.deadline.passed:
+            return
+        if (
+            name in position
+            or signal.turn
+            or _target(run, name)
+            or not _RANGES.isdisjoint(_words(name))
+        ):
+            continue
+        zones = run.frame.zones(name)
+        if zones.change_count.sum() < _MANY_VALUES:
+            continue
+        clock, values = run.frame.usable(name)
+        if len(np.unique(values)) < _MANY_VALUES:
+            continue
+        for limit in (float(values.min()), float(values.max())):
+            at = values == limit
+            rests = runs_of(at, clock)
+            long = rests.only(rests.stops - rests.starts >= _IN_A_ROW)
+            if len(long) >= _OFTEN and at.mean() >= _AT_LIMIT:
+                yield name, limit, float(at.mean()), float(long.starts_s[0]), len(long)
 
 
 _OFTEN_THE_SAME: Final = 3

@@ -126,11 +126,14 @@ def _worst(
         values = numbers_in(expected.scanned, side, frame, position)[violated]
     except ConditionFailedError:
         return None
+    values = values[~np.isnan(values)]
+    if not len(values):
+        return None
     wants_more = isinstance(op, ast.Gt | ast.GtE) is not flipped
     start, end = side.col_offset, side.end_col_offset or 0
     columns = expected.scanned.columns
     text = expected.scanned.original[columns[start] : columns[end]]
-    return text.strip(), float(np.nanmin(values) if wants_more else np.nanmax(values))
+    return text.strip(), float(values.min() if wants_more else values.max())
 
 
 def violation_events(search: Search) -> Iterator[Event]:

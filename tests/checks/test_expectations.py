@@ -150,6 +150,7 @@ def test_what_was_expected_of_an_earlier_run_is_asked_of_it_and_of_no_other(proj
         ({"condition": "front_m >"}, "something is missing at the end"),
         ({"condition": "x > 1", "during": "1 > 0"}, "no signal is named"),
         ({"condition": "x > 1", "name": " "}, "the name of an expectation"),
+        ({"condition": "x > 1", "name": "\ud800"}, "1 to 100 printable"),
     ],
 )
 def test_what_is_no_expectation_is_refused(wrong: dict[str, Any], why: str, tmp_path: Path) -> None:
@@ -210,8 +211,7 @@ def test_the_file_of_a_project_is_compiled_and_asked_by_the_bridges_of_its_robot
     assert main(["check", *where]) == 2
     assert "at line 1" in capsys.readouterr().err
     (project / "webots-mcp.toml").unlink()
-    with closing(connect(file, "writer")) as connection:
-        watch.look(connection)
+    main(["check", *where])
     assert lines(file) == {}
 
 

@@ -15,7 +15,9 @@ from typing import Any
 
 import pytest
 
+from webots_mcp import MCPBridge
 from webots_mcp.connection import connect, create_schema
+from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.journal_intake import take_in_journals
 from webots_mcp.store.recording import Recording
 from webots_mcp.waiting_file import journal_parts
@@ -151,3 +153,19 @@ def test_a_journal_writes_to_no_run_of_another_session_and_waits_for_no_program(
     Recording(tmp_path / "webots.db", tmp_path).take_in()
     assert [data for _, data, _ in rows(tmp_path, "state")] == ['{"x":1}']
     assert rows(tmp_path, "run") == [["1", "start", 1.0, 1, "finished"]]
+
+
+def test_a_journal_with_the_uuid_of_a_bridges_session_is_left_and_reported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bridge = MCPBridge(InProcessSupervisor("rover"), tmp_path)
+    ((uuid,),) = sqlite3.connect(tmp_path / "webots.db").execute("SELECT uuid FROM session")
+    journal = tmp_path / f"webots.db-waiting-{uuid}-0001.jsonl"
+    session = {"uuid": uuid, "pid": 1, "started_wall_time_s": 1.0}
+    header = {"webots_mcp_waiting": 1, "robot": {"name": "rover"}, "session": session}
+    end = [9, "session end", None, {"reason": "finished", "now": 1.0}]
+    journal.write_text(f"{json.dumps(header)}\n{json.dumps(end)}\n")
+    Recording(tmp_path / "webots.db", tmp_path).take_in()
+    assert journal.exists() and rows(tmp_path, "session") == [[None, 0]]
+    assert "its session is that of a bridge" in capsys.readouterr().err
+    bridge.close()

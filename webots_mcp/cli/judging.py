@@ -29,7 +29,7 @@ from webots_mcp.cli.options import (
 )
 from webots_mcp.cli.terminal import print_answer, print_json, print_table
 from webots_mcp.contract import find_project, host_name, whole_file
-from webots_mcp.errors import CommandRefusedError, DatabaseError, InvalidInputError
+from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 from webots_mcp.naming import listed, spelled_out
 from webots_mcp.requirements import explain_extra
 from webots_mcp.stacks import INSTALLED, STEPPING
@@ -92,11 +92,10 @@ def _compile(recorded: Where) -> None:
     from webots_mcp.store.project_file import compile_project, file_of, read_project
 
     recording = recorded.recording(read_only=False)
-    if (file := file_of(recording.data_dir)) is None:
-        return
-    expected = read_project(file)
+    file = file_of(recording.data_dir)
+    expected = read_project(file) if file else []
     # Where nothing can be written it is asked all the same, of what is recorded.
-    with contextlib.suppress(DatabaseError, sqlite3.Error), recording.writer() as connection:
+    with contextlib.suppress(WebotsMCPError, sqlite3.Error), recording.writer() as connection:
         compile_project(connection, expected)
 
 

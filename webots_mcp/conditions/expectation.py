@@ -120,10 +120,12 @@ def parse_expectation(
     """
     expected = parse_condition(condition)
     meant = None if during is None else parse_condition(during)
-    name = expected.text[:MOST_CHARACTERS] if name is None else name
-    if not isinstance(name, str) or not 0 < len(name.strip()) <= MOST_CHARACTERS:  # pyright: ignore[reportUnnecessaryIsInstance]
+    if name is None:
+        return Expectation(expected.text[:MOST_CHARACTERS].strip(), expected, meant)
+    is_text = isinstance(name, str) and name.strip().isprintable()  # pyright: ignore[reportUnnecessaryIsInstance]
+    if not is_text or not 0 < len(name.strip()) <= MOST_CHARACTERS:
         raise InvalidConditionError(
-            f"the name of an expectation is a text of 1 to {MOST_CHARACTERS} characters, "
+            f"the name of an expectation is a text of 1 to {MOST_CHARACTERS} printable characters, "
             f"not {name!r:.150}"
         )
     return Expectation(name.strip(), expected, meant)

@@ -62,6 +62,9 @@ _KNOWN: Final = (
     "LIMIT 1), (SELECT uuid FROM run WHERE session_id = session.id ORDER BY id DESC LIMIT 1) "
     "FROM session WHERE uuid = ?"
 )
+_OF_BRIDGE: Final = (  # which takes in its own rows; journals know no monotonic clock
+    "SELECT 1 FROM session WHERE uuid = ? AND last_seen_monotonic_s IS NOT NULL"
+)
 _SEEN_SESSION: Final = (
     "UPDATE session SET last_seen_wall_time_s = max(last_seen_wall_time_s, :wall), "
     "ended_wall_time_s = max(ended_wall_time_s, :wall) WHERE id = :session"
@@ -242,6 +245,8 @@ class _Reading:
     def _enter(self, header: dict[str, Any]) -> tuple[Any, ...]:
         """The ids of session and robot, the number of the last entry, newest state and run."""
         connection = self.connection
+        if connection.execute(_OF_BRIDGE, (self.uuid,)).fetchone():
+            raise ValueError("its session is that of a bridge")
         if (known := connection.execute(_KNOWN, (self.uuid,)).fetchone()) is not None:
             return known
         name, session = _described(header, self.uuid)

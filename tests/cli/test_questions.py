@@ -65,7 +65,7 @@ REFUSED = [
     ("diff 1 1", "two different runs"),
     ("diff 1 77", "no run 77"),
     ("diff 1 2 --signal moed", "mode"),
-    ("compare 1 --first-difference", "is of two runs"),
+    ("compare 1 --first-difference", "compares two runs, not [1]"),
     ("runs -n 501", "-n must be less than or equal to 500, not 501"),
     ("plot -o a.gif", ".png or .svg"),
     ("plot -o /no/such/folder/a.png", "cannot be written"),

@@ -382,7 +382,7 @@ _LEFT_WAITING: Final = (
     "--read-only) takes them in: what is shown here is older"
 )
 WAITING_IN_STEP: Final = (
-    "its loop waits in step(): Webots is paused by hand or at a breakpoint, another controller "
+    "its loop waits in step(): paused by hand in Webots or at a breakpoint, another controller "
     "holds the world up, or an extern one is missing; from inside the simulation these look alike"
 )
 _HELD_UP_BY: Final = "its loop waits in step(), as the whole world does, for {}: {}"

@@ -213,7 +213,7 @@ def _with_lights(
         _LIGHTS[dark] = _OF_OUTCOME.get(outcome, "⚪")
     lights = (_LIGHTS.get(key, "") for key in keys)
     titled = zip(runs, lights, strict=True)
-    return [{"id": e.run_id, "title": f"{light} {run_title(e)}".strip()} for e, light in titled]
+    return [{"id": e.run_id, "title": f"{run_title(e)} {light}".strip()} for e, light in titled]
 
 
 def _line(line: LogLine) -> dict[str, str]:

@@ -276,6 +276,14 @@ def test_whose_time_a_step_takes_is_said_of_the_observer_alone(robots: Robots) -
     assert ("rover", None, None) in rows
 
 
+def test_what_a_car_keeps_there_for_the_vehicle_library_is_no_message(robots: Robots) -> None:
+    of_car = "2.94 1.72 1.72 0.36 -1 500 2e-05 C 250 50000 1000 4500 150 0.1 0 0.25 1 6 2 4 -12 10 "
+    robots.go_on(5, rover=of_car, e_puck="1 2 3 C")
+    assert [name for name, *_ in robots.sessions()] == ["e-puck"]
+    robots.go_on(5, rover='{"seq": 1}')
+    assert robots.newest()["seq"] == 1
+
+
 def test_robots_that_wrote_nothing_have_no_session_and_a_hidden_field_is_said_once(
     robots: Robots, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -123,6 +123,17 @@ def test_one_that_comes_back_is_logged_once_and_not_said_any_more(
     assert waiting_paths(filed.database, stacks_path) == []
 
 
+def test_c_code_that_the_question_wakes_from_its_sleep_is_named_nevertheless(
+    start: Start, filed: Recording
+) -> None:
+    hang = "__import__('ctypes').PyDLL(None).sleep(600)"
+    simulation = start(HANGS.format(hang=hang))
+    said = why(simulation, filed, "plan()")
+    simulation.wait_for(lambda: status(filed).is_moving)
+    assert said.startswith("silent for ")
+    assert [text.count("plan()") for text in messages(filed)] == [1]
+
+
 def test_neither_a_simulation_that_is_paused_nor_a_loop_that_is_held_hangs(
     start: Start, filed: Recording
 ) -> None:

@@ -21,6 +21,7 @@ from webots_mcp import MCPBridge
 from webots_mcp.stacks import FORMAT, SIGNAL, VERSION, read_stacks, stacks_at, stacks_path
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.questions.compare import compare_runs
+from webots_mcp.store.recording import look
 from webots_mcp.store.run_rows import pace_of
 from webots_mcp.waiting_file import adopt
 
@@ -153,10 +154,13 @@ def test_the_loops_thread_is_the_one_that_steps(tmp_path: Path) -> None:
 def test_what_a_dead_process_left_is_logged_where_its_loop_had_been_silent(
     recorded: Recorded, tmp_path: Path, silent_s: float, rows: int
 ) -> None:
-    robot = recorded.robot(now=time.time() - 60)
+    robot = recorded.robot(now=time.time() - 60, uuid="gone", pid=2**31)
     recorded.connection.execute("UPDATE run SET uuid = 'a run'")
     path = written(stacks_path(tmp_path / "webots.db", "gone"), "/p/nav.py:8:plan")
     os.utime(path, (robot.now + silent_s, robot.now + silent_s))
+    said = "it was silent for more than 3 s in nav.py:8, plan()"
+    before = look(recorded.connection, None).status.why or ""
+    assert (said in before) == bool(rows)  # as nobody has taken it in yet
     assert adopt(recorded.connection, tmp_path / "webots.db") == rows
     found = recorded.connection.execute("SELECT level, message FROM log").fetchall()
     assert [(level, message.split("\n")[0]) for level, message in found] == [

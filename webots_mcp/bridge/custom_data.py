@@ -45,6 +45,8 @@ _STALE_S: Final = 1.0  # of simulation time in which a text from before a reset 
 _C_NUMBERS: Final = re.compile(
     r'"(?:\\.|[^"\\])*"?|([-+]?)\b(?:(nan)\b(?:\(\w*\))?|inf(?:inity)?\b)', re.IGNORECASE
 )
+# What Webots' PROTO Car keeps there for its vehicle library: seven numbers, the engine's letter.
+_OF_CAR: Final = re.compile(r"(?:[-+.\de]+ ){7}[CEPS] ")
 _END_REASON: Final = "SELECT end_reason FROM session WHERE id = ?"
 _OPEN_SESSIONS: Final = (
     "SELECT r.name, s.id, s.instance, s.host, s.pid, s.process, s.last_seen_wall_time_s "
@@ -238,7 +240,7 @@ class _Robot:
         elif not is_long and self._read_again_s is not None:
             self._field.enableSFTracking(self._step_ms)
         self._read_again_s = now_s + _READ_LONG_AGAIN_S if is_long else None
-        return text
+        return "" if _OF_CAR.match(text) else text
 
 
 class _Recording:

@@ -101,7 +101,8 @@ class Watchdog:
     def _look(self) -> None:
         if self._file < 0 or not os.fstat(self._file).st_nlink:
             self._open()
-        self._judge()  # what came of a signal
+        if self._judge():  # what came of a signal, which may have woken the loop: who sent it looks
+            return
         alive_s = self._meter.at_s
         if time.perf_counter() - alive_s < self._limit_s:
             self._begin_anew()
@@ -147,17 +148,18 @@ class Watchdog:
         os.write(self._file, head)
         self._head = head
 
-    def _judge(self) -> None:
-        """Log where the loop was, unless it waited for Webots or had not begun."""
+    def _judge(self) -> bool:
+        """Log where the loop was, unless it waited for Webots or had not begun; True if new."""
         with open(self._file, "rb", closefd=False) as file:
             stacks = read_stacks(file)
         if stacks is None or stacks.wall_time_s == self._judged_s or not stacks.is_hang:
-            return
+            return False
         self._judged_s = stacks.wall_time_s
         if self._meter.at_s > self._began_s and self._logged < _MOST_LOGGED:
             self._logged += 1
             clock = self._session.clock
             self._session.recorder.record("stacks", clock.run, stacks.log_values(clock.sim_time_s))
+        return True
 
 
 @functools.cache

@@ -506,8 +506,17 @@ def _why_ended(connection: sqlite3.Connection, session: Session) -> str | None:
     why = _ENDED.get(session.end_reason or "crashed")
     if session.end_reason in (None, "crashed"):
         hung = connection.execute(_HUNG, (session.id, session.last_seen_wall_time_s)).fetchone()
-        why = f"{why}; it was {hung[0].partition(chr(10))[0]}" if hung else why
+        said = hung[0] if hung else _left_stacks(connection, session)
+        why = f"{why}; it was {said.partition(chr(10))[0]}" if said else why
     return why
+
+
+def _left_stacks(connection: sqlite3.Connection, session: Session) -> str | None:
+    """Where a dead process had hung, as the file has it that nobody has taken in yet."""
+    path = _path_of(connection, session, stacks_path)
+    stacks = stacks_at(path, None) if path else None
+    is_told = stacks and stacks.is_hang and stacks.began_after(session.last_seen_wall_time_s)
+    return f"{stacks.log_values(None)['message']}" if stacks and is_told else None
 
 
 def ended_by(connection: sqlite3.Connection, session_id: int) -> str | None:

@@ -33,6 +33,7 @@ _CALL: Final = re.compile(r'^  File "(.*)", line (\S+) in (.*)$', re.MULTILINE)
 _FOLDERS: Final = re.compile(r".*[/\\]")
 INSTALLED: Final = re.compile(r"[/\\](?:site|dist)-packages[/\\]|^<frozen ")
 _DEBUGGER: Final = re.compile(r"(?:[/\\]|^)(?:bdb|pdb)\.py$|[/\\](?:pydevd|debugpy|_pydev)")
+_BY_PERSON: Final = "waitForUserInputEvent"  # of Webots' Robot: a key or a click is waited for
 _EARLY: Final = 0.9  # of the limit: the clock of files is coarse
 _UNTOUCHED_S: Final = 3.0  # the maintainer's thread touches the file each second
 _WRITING_S: Final = 0.1
@@ -71,7 +72,7 @@ class Stacks(NamedTuple):
         calls: Of the loop's thread, the innermost first; never empty.
         own: Of them, those of the controller's own code: neither the bridge's nor a library's.
         is_hang: That code, or what it called, keeps the loop from its step; else it waits for
-            Webots in a step, or a person has stopped it with a debugger of Python.
+            Webots in a step, or for a person: in a debugger of Python, for a key or a click.
         is_in_step: It waits for Webots.
         text: All threads, as `faulthandler` wrote them.
     """
@@ -128,8 +129,8 @@ def read_stacks(file: BinaryIO) -> Stacks | None:
     own = [call for call in calls if call not in waits and not _is_library(call.file, libraries)]
     inner = calls[: calls.index(own[0])] if own else calls
     is_in_step = any(call in waits for call in inner)
-    is_debugged = any(_DEBUGGER.search(call.file) for call in calls)
-    hangs = not (is_in_step or is_debugged)
+    is_held = any(_DEBUGGER.search(call.file) or call.function == _BY_PERSON for call in calls)
+    hangs = not (is_in_step or is_held)
     written_s = os.fstat(file.fileno()).st_mtime
     return Stacks(written_s, run, limit_s, calls, own, hangs, is_in_step, text)
 

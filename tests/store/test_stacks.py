@@ -59,6 +59,11 @@ def _parts(call: str) -> list[str]:
         ("/webots/controller/robot.py:5:step /p/r.py:9:<module>", "r.py:9", False),
         ("/webots/controller/robot.py:5:getDevice /p/r.py:9:run", "r.py:9, run()", True),
         ("/usr/lib/python3/bdb.py:5:trace_dispatch /p/r.py:9:run", "r.py:9, run()", False),
+        (
+            "/webots/controller/robot.py:5:waitForUserInputEvent /p/r.py:9:run",
+            "r.py:9, run(); there in robot.py:5, waitForUserInputEvent()",
+            False,
+        ),
         ("/usr/lib/python3/runpy.py:5:run", "runpy.py:5, run()", True),
         (f"C:\\p\\{'n' * 300}.py:8:{'f' * 300}", f"{'n' * 59}…:8, {'f' * 59}…()", True),
         (

@@ -599,7 +599,10 @@ def is_chunked_aside(connection: sqlite3.Connection, database: Path) -> bool:
 
     A server that has begun to maintain it meanwhile deletes rows after it put them into chunks.
     """
-    made = _made.get(_key(database))
+    try:
+        made = _made.get(_key(database))
+    except FileNotFoundError:  # moved away since the connection was opened
+        return False
     if made is None or connection.execute(_UUID.format("main")).fetchone() != (made.uuid,):
         return False
     (mark,) = connection.execute(_MARK).fetchone() or (0,)

@@ -211,7 +211,7 @@ def _with_lights(
     if (dark := next((key for key in over if key not in _LIGHTS), None)) is not None:
         outcome = check_run(connection, dark[1], deadline_s=_LIGHT_S).outcome
         _LIGHTS[dark] = _OF_OUTCOME.get(outcome, "⚪")
-    lights = (_LIGHTS.get(key, "") for key in keys)
+    lights = (_LIGHTS.get(key, "⚪" if key in over else "") for key in keys)  # of equal width
     titled = zip(runs, lights, strict=True)
     return [{"id": e.run_id, "title": f"{run_title(e)} {light}".strip()} for e, light in titled]
 

@@ -97,7 +97,10 @@ function offer(id, options, value) {
   const select = by(id);
   if (select.dataset.options !== JSON.stringify(options)) {
     select.dataset.options = JSON.stringify(options);
-    select.replaceChildren(...options.map(([key, text]) => element("option", { value: key, textContent: text })));
+    const shown = [...select.options];
+    if (shown.length === options.length && shown.every((each, at) => each.value === `${options[at][0]}`)) {
+      shown.forEach((each, at) => { each.textContent = options[at][1]; }); // it may be open
+    } else select.replaceChildren(...options.map(([key, text]) => element("option", { value: key, textContent: text })));
   }
   if (document.activeElement !== select || select.value === "") select.value = value;
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.client
+import json
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.page.conftest import Server
+from tests.waiting import wait_for
 from webots_mcp.cli import main
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.plugins.page.server import MOST_TABS
@@ -40,6 +42,19 @@ def test_the_page_is_for_this_computer(told: Server, host: str) -> None:
     status, text = answer(told, "", Host=host.format(told.port))
     assert status == 200
     assert "webots-mcp" in text
+
+
+def test_behind_each_run_that_is_over_there_comes_the_light_of_its_check(told: Server) -> None:
+    def lights() -> dict[int, str]:
+        status, text = answer(told, "look?robot=rover")
+        assert status == 200
+        return {run["id"]: run["title"][-1] for run in json.loads(text)["runs"]}
+
+    shown = wait_for(lights, lambda found: "⚪" not in found.values())
+    where = ["--data-dir", str(told.data_dir)]
+    checked = {number: main(["check", str(number), *where]) for number in shown}
+    assert set(checked.values()) == {0, 1}
+    assert {number: "🟢🔴"[code] for number, code in checked.items()} == shown
 
 
 @pytest.mark.parametrize("path", ["", "page.js", "look", "draw"])

@@ -5,10 +5,12 @@ from __future__ import annotations
 import base64
 import io
 import json
+import logging
 import math
 import sqlite3
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -45,6 +47,7 @@ MOST_RUNS: Final = 100  # to choose from
 MOST_LINES: Final = 200  # of the log
 MOST_NAMES: Final = 2000  # of signals to choose from
 MOST_ROBOTS: Final = 10  # on one map
+_log: Final = logging.getLogger(__name__)
 MOST_LIGHTS: Final = 20  # of the newest runs that are over
 _LIGHT_S: Final = 1.0  # for the checks of one
 _LONGEST_LINE: Final = 1000  # characters of a log line
@@ -140,7 +143,7 @@ def look(recording: Recording, choice: Choice, *, steers: bool) -> dict[str, Any
             "started": run.started_wall_time_s if run else None,
             "until": header["sim_time_s"],
             "robots": [robot.name for robot in robots],
-            "runs": _with_lights(recording, connection, runs),
+            "runs": _with_lights(recording, runs),
             "names": list(catalogue(connection, view.subject))[:MOST_NAMES] if run else [],
             "lines": [_line(each) for each in newest_lines(connection, asked, MOST_LINES)],
             "parameters": [_parameter(each) for each in described(connection, run)] if run else [],
@@ -200,20 +203,37 @@ def run_title(run: RunInfo) -> str:
 # Of runs that are over, by database and run: nothing that a check looks at changes any more.
 _LIGHTS: Final[dict[tuple[str, int, float], str]] = {}
 _OF_OUTCOME: Final = {"fail": "🔴", "warn": "🟡", "pass": "🟢"}
+_NO_OUTCOME: Final = "⚪"  # not judged yet, or not to be judged
+_judges: Final = ThreadPoolExecutor(1, "webots-mcp lights")  # no look waits for a check
 
 
-def _with_lights(
-    recording: Recording, connection: sqlite3.Connection, runs: Sequence[RunInfo]
-) -> list[dict[str, Any]]:
-    """The runs to choose from, each with a light where it is checked; one more with each look."""
-    keys = [(str(recording.database), each.run_id, each.started_wall_time_s) for each in runs]
-    over = [k for k, run in zip(keys, runs, strict=True) if run.end_reason][:MOST_LIGHTS]
-    if (dark := next((key for key in over if key not in _LIGHTS), None)) is not None:
-        outcome = check_run(connection, dark[1], deadline_s=_LIGHT_S).outcome
-        _LIGHTS[dark] = _OF_OUTCOME.get(outcome, "⚪")
-    lights = (_LIGHTS.get(key, "⚪" if key in over else "") for key in keys)  # of equal width
-    titled = zip(runs, lights, strict=True)
-    return [{"id": e.run_id, "title": f"{run_title(e)} {light}".strip()} for e, light in titled]
+def _with_lights(recording: Recording, runs: Sequence[RunInfo]) -> list[dict[str, Any]]:
+    """The runs to choose from; behind those that are over a light, which a check gives them."""
+    choices: list[dict[str, Any]] = []
+    lights = 0
+    for run in runs:
+        title = run_title(run)
+        if run.end_reason and lights < MOST_LIGHTS:
+            lights += 1
+            key = (str(recording.database), run.run_id, run.started_wall_time_s)
+            if key not in _LIGHTS:
+                _LIGHTS[key] = _NO_OUTCOME
+                _judges.submit(_judge, recording, key)
+            title += f" {_LIGHTS[key]}"
+        choices.append({"id": run.run_id, "title": title})
+    return choices
+
+
+def _judge(recording: Recording, key: tuple[str, int, float]) -> None:
+    """Check a run; one that cannot be read now is judged at another look."""
+    try:
+        with recording.reader() as connection:
+            outcome = check_run(connection, key[1], deadline_s=_LIGHT_S).outcome
+        _LIGHTS[key] = _OF_OUTCOME.get(outcome, _NO_OUTCOME)
+    except (WebotsMCPError, sqlite3.Error):
+        del _LIGHTS[key]
+    except Exception:  # noqa: BLE001  (no look of the page waits for it, to say so)
+        _log.exception("run %d cannot be judged", key[1])
 
 
 def _line(line: LogLine) -> dict[str, str]:

@@ -152,7 +152,7 @@ async function draw() {
       put("way", drawing.way);
       by("empty").hidden = Boolean(drawing.signals);
       by("notes").replaceChildren(...drawing.notes.map((note) => element("p", { textContent: note })));
-      tick(drawing.names);
+      if (JSON.stringify(wanted.signals) === parameters.signals) tick(drawing.names); // else chosen meanwhile
       if (drawing.settled && !wanted.signals) { // others change most later: these stay
         change({ signals: drawing.names });
         if (!wanted.view) drawnOf = JSON.stringify([{ ...parameters, signals: JSON.stringify(wanted.signals) }, shown.started]);

@@ -12,7 +12,6 @@ import shutil
 import struct
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ import anyio
 import pytest
 from mcp import Client
 
+from tests.waiting import wait_for
 from webots_mcp.cli import main
 from webots_mcp.contract import C_HEADER
 from webots_mcp.server import create_server
@@ -86,12 +86,6 @@ def read(folder: Path, sql: str) -> list[Any]:
     """Through a recording, as a question reads."""
     with Recording(folder / "webots.db", folder).reader() as connection:
         return connection.execute(sql).fetchall()
-
-
-def until(condition: Callable[[], Any]) -> Any:
-    while not (found := condition()):
-        time.sleep(0.02)
-    return found
 
 
 def hexed(data: bytes | str) -> str:
@@ -288,7 +282,7 @@ def test_what_a_full_disk_cost_is_counted_and_reported(start: Start, tmp_path: P
         do(process, f"begin {next(count)}", *row)
         return read(tmp_path, "SELECT data FROM event WHERE kind = 'dropped'")
 
-    ((data,),) = until(reported)
+    ((data,),) = wait_for(reported)
     lost = json.loads(data)["row_count"]
     assert json.loads(data)["why"] == os.strerror(errno.ENOSPC)
     end(process)
@@ -322,7 +316,7 @@ def test_a_folder_that_is_missing_stops_nothing(start: Start, tmp_path: Path, lo
             return []
         return read(folder, "SELECT json_extract(data, '$.i') FROM state ORDER BY id")
 
-    assert until(recorded)[:2] == ([(1,), (2,)] if loss == "database deleted" else [(2,)])[:2]
+    assert wait_for(recorded)[:2] == ([(1,), (2,)] if loss == "database deleted" else [(2,)])[:2]
     dropped = read(folder, "SELECT count(*) FROM event WHERE kind = 'dropped'")
     assert dropped == [(int(loss == "a file in its place"),)]
     end(process)

@@ -249,7 +249,9 @@ def test_the_command_ends_with_0_1_or_2_and_writes_what_continuous_integration_r
     assert cases["moves when commanded"] == []
     assert main(["check", "7", *where]) == 2
     assert main(["check", "1", "--expect", "pose.0 <", *where]) == 2
+    capsys.readouterr()
     assert main(["check", "--junit", str(tmp_path / "no" / "x.xml"), *where[:2]]) == 2
+    assert capsys.readouterr().out == ""  # the file comes first
 
 
 @pytest.mark.anyio

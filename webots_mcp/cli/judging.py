@@ -81,9 +81,9 @@ def check(
     reply = ask(webots_check_run, given, recorded)
     data = reply.data or {}
     shown = reply if as_json else reply._replace(data=_as_typed(data))
-    show(webots_check_run, shown, recorded, as_json=as_json)
-    if junit is not None:
+    if junit is not None:  # first: who reads what is shown may not read it to its end
         _write(junit, data)
+    show(webots_check_run, shown, recorded, as_json=as_json)
     return EXIT_CODES.get(data.get("outcome", ""), 0)
 
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import Field
 
-from webots_mcp.conditions.expectation import Expectation, read_expectation
+from webots_mcp.conditions.compiler import Expectation, read_expectation
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.answers import CheckAnswer, ComparisonAnswer, RunsAnswer, Table
 from webots_mcp.questions.budget import (

@@ -17,7 +17,6 @@ from webots_mcp.store.detection.motion import ModeUses, RunNoise
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.detection.standstill import judge_standstills
 from webots_mcp.store.reading.catalogue import known_signals
-from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.reading.segment import Deadline
 

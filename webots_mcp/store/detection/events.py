@@ -15,7 +15,7 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.liveness import dead_sessions
 from webots_mcp.naming import flatten
 from webots_mcp.store.chunks import parse
-from webots_mcp.store.detection import condition, expectation, jump, sensors, standstill, stored
+from webots_mcp.store.detection import condition, jump, sensors, standstill, stored
 from webots_mcp.store.detection import jump as oscillation
 from webots_mcp.store.detection.kinds import (
     Event,
@@ -419,7 +419,7 @@ KINDS: Final[list[EventKind]] = [
     standstill.STANDSTILL,
     standstill.STUCK,
     condition.CONDITION,
-    expectation.VIOLATIONS,
+    condition.VIOLATIONS,
     sensors.MISSING,
     sensors.FLAT,
     jump.JUMP,

@@ -13,8 +13,7 @@ from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from tests.store.questions.asking import ask, spans
 from webots_mcp.store.detection.events import find_events
 from webots_mcp.store.detection.kinds import Event, EventOptions
-from webots_mcp.store.detection.motion import ModeUses, RunNoise
-from webots_mcp.store.detection.search import Search
+from webots_mcp.store.detection.search import ModeUses, RunNoise, Search
 from webots_mcp.store.detection.standstill import judge_standstills
 from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import Scope, find_range

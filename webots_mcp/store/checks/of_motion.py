@@ -14,7 +14,7 @@ from webots_mcp.store.checks.finding import Finding, RunUnderCheck, times, total
 from webots_mcp.store.detection.condition import lasting
 from webots_mcp.store.detection.jump import JUMP
 from webots_mcp.store.detection.kinds import Event, NotSearchableError
-from webots_mcp.store.detection.motion import in_metres, places_in
+from webots_mcp.store.detection.search import in_metres, places_in
 from webots_mcp.store.detection.standstill import ON_THE_SPOT
 from webots_mcp.store.signals import Signal, stored_roles
 

@@ -1,6 +1,6 @@
 """Conditions over the past: where one that the asker gives held, and what scores are made of.
 
-The kind `condition`, and the tree of a condition asked of arrays.
+The kinds `condition` and `violation`, and the tree of a condition asked of arrays.
 """
 
 from __future__ import annotations

@@ -25,8 +25,7 @@ from webots_mcp.store.detection.kinds import (
     Verdicts,
     count_by_kind,
 )
-from webots_mcp.store.detection.motion import find_motion
-from webots_mcp.store.detection.search import Search, events_touching
+from webots_mcp.store.detection.search import Search, events_touching, find_motion
 from webots_mcp.store.reading.catalogue import known_signals, resolve_signals
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import TimeRange

@@ -25,15 +25,16 @@ from webots_mcp.store.detection.kinds import (
     EventOptions,
     NotSearchableError,
 )
-from webots_mcp.store.detection.motion import (
+from webots_mcp.store.detection.search import (
+    NO_TIME,
     ModeUse,
     ModeUses,
     Motion,
     RunNoise,
+    Search,
     in_metres,
     tracks_in,
 )
-from webots_mcp.store.detection.search import NO_TIME, Search
 from webots_mcp.store.reading.frame import Frame
 
 # -- whether it should have moved: what shows it, and what speaks against it -----------------------

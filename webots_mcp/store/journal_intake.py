@@ -254,8 +254,8 @@ class _Reading:
         def act() -> None:
             if connection.execute(_KNOWN, (self.uuid,)).fetchone() is None:
                 liveness.reap(connection, time.time())
-                robot = {"name": liveness.free_name(connection, name, _lives)}
-                robot |= {"kind": "Robot", "devices": "{}"}
+                free = liveness.free_name(connection, name, lambda it: it.kind == CUSTOM_DATA)
+                robot = {"name": free, "kind": "Robot", "devices": "{}"}
                 now_s = session["started_wall_time_s"]
                 robot_id = waiting_file.enter_robot(connection, robot, now_s)
                 waiting_file.enter_session(connection, robot_id, session)
@@ -320,11 +320,6 @@ class _Reading:
         (run_id,) = self.connection.execute(_RUN_ID, (entry.run,)).fetchone()
         values = (run_id, *cast("tuple[Any, ...]", entry.values)[:2], kind, name, data)
         self.connection.execute(STATEMENTS["event"], values)
-
-
-def _lives(session: liveness.OpenSession) -> bool:
-    """Whether a session keeps its name; an observer's, of `customData`, makes way."""
-    return session.kind != CUSTOM_DATA and liveness.is_living(*session[1:5], time.time())
 
 
 def _described(header: Mapping[str, Any], uuid: str) -> tuple[str, dict[str, Any]]:

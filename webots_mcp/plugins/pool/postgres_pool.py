@@ -401,7 +401,7 @@ class PostgresPool:
             with contextlib.suppress(psycopg.Error):  # it is lost, and the lock with it
                 connection.execute(unlock, values)
 
-    def listed(self, name: str) -> Iterator[tuple[str, Sequence[Any]]]:
+    def rows_of(self, name: str) -> Iterator[tuple[str, Sequence[Any]]]:
         """The columns `LISTED` of all rows of such a table, behind their recording's UUID."""
         columns = ", ".join(map(_quoted, LISTED[name]))
         for owner, *row in self._asked(f"SELECT {OWNER}::text, {columns} FROM {name}"):

@@ -301,7 +301,8 @@ def free_name(
 ) -> str:
     """The name for a robot's new session: where a living one has it, `#2` and so on is appended.
 
-    A living one may make way, as an observer's does, of `customData`, for a bridge. Sessions of that name which are over are ended as superseded; the caller opens the transaction.
+    A living one may make way, as an observer's does, of `customData`, for a bridge. Sessions of
+    that name which are over are ended as superseded; the caller opens the transaction.
     """
     wanted, number = name, 1
     while True:

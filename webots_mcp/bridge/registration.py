@@ -246,7 +246,7 @@ def _paused_mode(connection: sqlite3.Connection, identity: Identity, robot_id: i
 
 
 def _makes_way(session: liveness.OpenSession, identity: Identity) -> bool:
-    """Whether a session leaves its name to another: one that is over in this process, for example."""
+    """Whether a session leaves its name: one of this process that is over, an observer's."""
     if session.kind == CUSTOM_DATA != identity.kind:
         return same_simulation(session.instance, identity.instance)
     is_here = (session.host, session.pid) == (identity.host, identity.pid)

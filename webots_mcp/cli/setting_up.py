@@ -186,6 +186,9 @@ def _change_controller(file: Path, changed: Callable[[bytes], bytes], writing: W
     before = read(file)
     if before is None:
         raise InvalidInputError(f"there is no file {file}")
+    if file.suffix != ".py":
+        own = "'webots-mcp init' says what controllers in other languages need"
+        raise InvalidInputError(f"{file} is no file of Python, and left as it is; {own}")
     try:
         change = FileChange(file, before, changed(before))
     except AlreadyPatchedError as error:

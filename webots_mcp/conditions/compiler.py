@@ -466,6 +466,7 @@ def _either(left: Holds, right: Holds) -> Holds:
 
 MOST_CHARACTERS: Final = 100  # of a name
 _DURING: Final = re.compile(r"""(?:[^'"]|'[^']*'|"[^"]*")*?(?<=[\s)])(during)(?=[\s(])""")
+_WITHIN: Final = re.compile(r"(.*[^\s])\s+within\s+(\d+\.?\d*|\.\d+)\s*", re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -476,21 +477,30 @@ class Expectation:
         name: As it is reported.
         expected: What shall hold.
         during: Only while this holds; None: always.
+        within_s: It shall hold once, so many seconds after the run began at the latest; None: in
+            each state.
     """
 
     name: str
     expected: Condition
     during: Condition | None = None
+    within_s: float | None = None
+
+    @property
+    def text(self) -> str:
+        """What is expected, as it was given."""
+        within = "" if self.within_s is None else f" within {self.within_s:g}"
+        return self.expected.text + within
 
     @property
     def asks(self) -> tuple[str, str, str | None]:
         """Name and texts: two with the same are one."""
-        return self.name, self.expected.text, self.during and self.during.text
+        return self.name, self.text, self.during and self.during.text
 
     @property
     def violation(self) -> Condition:
         """That it does not hold: its text and signals, for people; it is not asked itself."""
-        text, signals = f"not ({self.expected.text})", self.expected.signals
+        text, signals = f"not ({self.text})", self.expected.signals
         if self.during is not None:
             text = f"({self.during.text}) and {text}"
             signals = tuple(dict.fromkeys([*self.during.signals, *signals]))
@@ -529,6 +539,7 @@ class Violated:
         self._expected: Evaluator = expectation.expected.evaluator(plain)
         self._during = expectation.during and expectation.during.evaluator(plain)
         self._since_s: float | None = None
+        self._reached = False
 
     def holds(self, state: State, sim_time_s: float) -> bool:
         """Take in the next state; True where what is expected does not hold.
@@ -540,7 +551,11 @@ class Violated:
         is_met, asked = self._expected.holds(state, sim_time_s), self._expectation
         is_first = self._since_s is None or sim_time_s < self._since_s - SAME_TIME_S
         if is_first or self._since_s is None:
-            self._since_s = sim_time_s
+            self._since_s, self._reached = sim_time_s, False
+        if asked.within_s is not None:
+            self._reached |= is_met and (asked.asks_missing or not self._expected.lacks(state))
+            late = sim_time_s - self._since_s > asked.within_s + SAME_TIME_S
+            return late and not self._reached
         if is_met or not is_meant or (is_first and asked.needs_two):
             return False
         if sim_time_s - self._since_s < asked.takes_s - SAME_TIME_S:
@@ -568,20 +583,29 @@ def parse_expectation(
 ) -> Expectation:
     """Read an expectation; without a name it is called as its condition.
 
+    Args:
+        condition: A condition, or one with how soon it shall hold: `x > 2 within 20`.
+        during: Another one.
+        name: As it is reported.
+
     Raises:
         InvalidConditionError: A condition is not of the language, or the name is no short text.
     """
-    expected = parse_condition(condition)
+    within = _WITHIN.fullmatch(condition) if isinstance(condition, str) else None  # pyright: ignore[reportUnnecessaryIsInstance]
+    if within and during is not None:
+        raise InvalidConditionError("'within' counts from the begin of the run: leave out 'during'")
+    expected = parse_condition(within[1] if within else condition)
     meant = None if during is None else parse_condition(during)
+    found = Expectation("", expected, meant, float(within[2]) if within else None)
     if name is None:
-        return Expectation(expected.text[:MOST_CHARACTERS].strip(), expected, meant)
+        return replace(found, name=found.text[:MOST_CHARACTERS].strip())
     is_text = isinstance(name, str) and name.strip().isprintable()  # pyright: ignore[reportUnnecessaryIsInstance]
     if not is_text or not 0 < len(name.strip()) <= MOST_CHARACTERS:
         raise InvalidConditionError(
             f"the name of an expectation is a text of 1 to {MOST_CHARACTERS} printable characters, "
             f"not {name!r:.150}"
         )
-    return Expectation(name.strip(), expected, meant)
+    return replace(found, name=name.strip())
 
 
 def read_expectation(text: str) -> Expectation:

@@ -292,7 +292,8 @@ class _Reading:
             last, run = entry, entry.run or ""
             sim_time_s, wall_time_s, *_ = entry.values
             _, _, rows = runs.get(run, (0.0, 0.0, 0))
-            runs[run] = sim_time_s, wall_time_s, rows + (entry.kind == "state")
+            seen_s = min(wall_time_s, time.time())  # what is dated later than now was seen now
+            runs[run] = sim_time_s, seen_s, rows + (entry.kind == "state")
             if state is not None:
                 looks.names.look(state, entry.values[2], partial(self._enter_names, robot_id))
             for name, before, after in changed:
@@ -353,8 +354,8 @@ def _described(header: Mapping[str, Any], uuid: str) -> tuple[str, dict[str, Any
         "versions": json.dumps({"journal": str(FORMAT)} | _object(session.get("versions"))),
         "supervisor": 0,
         "actions": "{}",
-        "started_wall_time_s": started_s,
-        "last_seen_wall_time_s": started_s,
+        "started_wall_time_s": min(started_s, time.time()),
+        "last_seen_wall_time_s": min(started_s, time.time()),
         "throttle_interval": session.get("throttle_interval"),
     }
 

@@ -13,6 +13,7 @@ from typing import Any, Final
 
 from webots_mcp.conditions.compiler import Expectation
 from webots_mcp.errors import ConditionFailedError, UnknownSignalError
+from webots_mcp.naming import counted
 from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.checks import of_motion, of_sensors
 from webots_mcp.store.checks.finding import (
@@ -164,8 +165,9 @@ def loses_no_rows(run: RunUnderCheck) -> Finding:
     dropped = [each for each in noticed if each.details["what"] == "dropped"]
     if found := dropped or [each for each in noticed if each.details["what"] == "storage"]:
         data: list[dict[str, Any]] = [each.details.get("data") or {} for each in found]
-        rows = sum(each.get("row_count", 0) for each in data) or "some"
-        evidence = f"{rows} rows were dropped" if dropped else "trouble with the database"
+        rows = sum(each.get("row_count", 0) for each in data)
+        lost = f"{counted(rows, 'row') if rows else 'some rows'} dropped"
+        evidence = lost if dropped else "trouble with the database"
         evidence += f": {data[0].get('why', 'no reason was noted')}"
         more = run.more("bridge_event")
         return Finding("fail" if dropped else "warn", evidence, found[0].start_s, len(found), more)
@@ -174,8 +176,10 @@ def loses_no_rows(run: RunUnderCheck) -> Finding:
     verb = "were" if run.info.purged_rows else "are"  # they were deleted since
     waiting, error = run.search.connection.execute(_LOST, (run.info.session_id,)).fetchone()
     if run.info.end_reason and waiting:
-        return Finding("warn", f"{waiting} rows of its session still wait: {error or 'no reason'}")
-    return Finding("pass", f"all {run.info.row_count} rows {verb} recorded")
+        left = f"{counted(waiting, 'row')} of its session waiting still: {error or 'no reason'}"
+        return Finding("warn", left)
+    rows = f"all {run.info.row_count} rows {verb}" if run.info.row_count > 1 else "its only row is"
+    return Finding("pass", f"{rows} recorded")
 
 
 def keeps_expectations(run: RunUnderCheck) -> Iterator[Finding]:
@@ -198,23 +202,37 @@ def keeps_expectations(run: RunUnderCheck) -> Iterator[Finding]:
 
 
 def _held(run: RunUnderCheck, each: Expectation, held: Adherence) -> Finding:
-    lacking = f"; without a value in {held.lacking} rows" if held.lacking else ""
+    lacking = f"; without a value in {counted(held.lacking, 'row')}" if held.lacking else ""
+    if each.within_s is not None:
+        return _reached(run, each, held)
     if not held.rows:
         why = f"{each.during.text!r} never held" if each.during else "it was too short"
         return Finding("not applicable", f"it was never asked{lacking or f': {why}'}")
     share = f"{100 * held.held_s / held.meant_s:.4g}" if held.meant_s else ""
     if share == "100" and len(held.violations):
         share = "over 99.99"
-    count = f"{held.rows} row" + "s" * (held.rows > 1)
-    of_all = f"held {share} % of {held.meant_s:.4g} s ({count})"
+    of_all = f"held {share} % of {held.meant_s:.4g} s ({counted(held.rows, 'row')})"
     evidence = (of_all if share else "asked of its only row") + lacking
     if not len(held.violations):
         return Finding("pass", evidence)
     evidence = f"{evidence}; {times(len(held.violations))} violated"
+    return _violated(run, each, held, evidence)
+
+
+def _reached(run: RunUnderCheck, each: Expectation, held: Adherence) -> Finding:
+    after = "" if held.after_s is None else f"after {held.after_s:.4g} s"
+    if not len(held.violations):
+        short = f"it lasted {run.search.length_s:.4g} s, shorter than {each.within_s:g} s"
+        return Finding("pass", after) if after else Finding("not applicable", short)
+    evidence = f"not within {each.within_s:g} s: {after or f'never in {run.search.length_s:.4g} s'}"
+    return _violated(run, each, held, evidence)
+
+
+def _violated(run: RunUnderCheck, each: Expectation, held: Adherence, evidence: str) -> Finding:
     if held.worst is not None:
         evidence += f"; worst {held.worst[0]} = {held.worst[1]:.4g}"
-    where = each.violation.text.replace("'", '"')
-    more = f"webots_find_events(where='{where}', run_id={run.info.run_id})"
+    where = (each.violation if each.within_s is None else each.expected).text
+    more = f"webots_find_events(where={where!r}, run_id={run.info.run_id})"
     since_s = float(held.violations.starts_s[0])
     return Finding("fail", evidence, since_s, len(held.violations), more)
 

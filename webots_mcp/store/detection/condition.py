@@ -585,6 +585,7 @@ class Adherence:
         meant_s: For how long it was asked, and `held_s` for how long of that it held: each row
             lasts to the next one, the last as long as usual, an only one not at all.
         lacking: Rows in which it was meant and had no value to be asked of.
+        after_s: How long the run took until it held for the first time; None if it never did.
         worst: The value that was farthest on the wrong side, where it compares with a number.
     """
 
@@ -593,6 +594,7 @@ class Adherence:
     meant_s: float
     held_s: float
     lacking: int
+    after_s: float | None
     worst: tuple[str, float] | None
 
 
@@ -643,13 +645,20 @@ def judge_expectation(
             lacks |= np.isnan(frame.numbers(name)) & (frame.texts(name).codes == 0)
         lacks |= expected.asks_position and position is None
     asked: Flags = meant & ~lacks
-    violated: Flags = asked & ~holds_in(expected.scanned, expected.tree, frame, position)
+    holds: Flags = asked & holds_in(expected.scanned, expected.tree, frame, position)
+    violated: Flags = asked & ~holds
+    run_s = frame.times - frame.times[:1]
+    after_s = float(run_s[np.argmax(holds)]) if holds.any() else None
+    if expectation.within_s is not None:  # it is decided once it held, or is late
+        reached = np.logical_or.accumulate(holds)
+        late = meant & (run_s > expectation.within_s + SAME_TIME_S)
+        asked, violated = late | reached, late & ~reached
     steps_s = np.diff(frame.times)
     lasts_s = np.append(steps_s, median(steps_s) if len(steps_s) else 0.0)[: len(frame)]
     meant_s, bad_s = (float(lasts_s[each].sum()) for each in (asked, violated))
     worst, runs = _worst(expected, frame, position, violated), runs_of(violated, frame.times)
     rows, lacking = (int(np.count_nonzero(each)) for each in (asked, meant & lacks))
-    return Adherence(runs, rows, meant_s, meant_s - bad_s, lacking, worst)
+    return Adherence(runs, rows, meant_s, meant_s - bad_s, lacking, after_s, worst)
 
 
 def _worst(
@@ -699,7 +708,7 @@ def violation_events(search: Search) -> Iterator[Event]:
         for run, details in zip(held.violations.each(), values, strict=True):
             here = search.segment
             if run.start_s < here.end_s and run.end_s >= here.start_s:
-                details = {"expected": each.expected.text, **dict(list(details.items())[:8])}
+                details = {"expected": each.text, **dict(list(details.items())[:8])}
                 yield search.event(VIOLATION, run.start_s, run.end_s, each.name, **details)
 
 

@@ -164,9 +164,7 @@ def test_what_shall_be_reached_in_time_is_told_live_and_by_the_past_alike(projec
         "not applicable", "it lasted 0.176 s, shorter than 5 s"
     )  # fmt: skip
     never = read_expectation("left_m < -9 within .1")
-    assert lines(file, 2, expect=[never])[never.name][1].startswith(
-        "not within 0.1 s: never in 0.1"
-    )
+    assert lines(file, 2, expect=[never])[never.name][1].startswith("not within 0.1 s: never")
     with closing(connect(file, "reader")) as connection:
         live = "SELECT name, round(sim_time_s, 3) FROM event WHERE kind = 'violation'"
         assert connection.execute(live).fetchall() == [("late", 0.128)] * 2

@@ -469,7 +469,7 @@ def webots_check_run(
         list[Annotated[str, Field(max_length=1100)]] | None,
         Field(
             max_length=20,
-            description="What shall hold: front_m > 0.1 during mode == 'drive'; goal_m < 0.1 within 20.",
+            description="front_m > 0.1 during mode == 'drive'; goal_m < 0.1 within 20.",
         ),
     ] = None,
     robot: RobotName = None,

@@ -15,7 +15,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, cast
 
 from webots_mcp.cli.options import (
     HERE,
@@ -113,7 +113,8 @@ def _as_typed(answer: dict[str, Any]) -> dict[str, Any]:
         call: Any = ast.parse(cell, mode="eval").body
         for keyword in call.keywords:
             value: Any = ast.literal_eval(keyword.value)
-            for each in value if isinstance(value, list) else [value]:
+            values = cast("list[Any]", value) if isinstance(value, list) else [value]
+            for each in values:
                 words += [OPTIONS.get(keyword.arg, f"--{keyword.arg}"), str(each)]
         return shlex.join(words)
 

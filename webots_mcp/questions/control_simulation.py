@@ -421,7 +421,7 @@ async def webots_remove_node(
 
 # -- asking any live Supervisor of the simulation --
 
-_WAIT_S: Final = 15.0  # of wall time
+_SCENE_WAIT_S: Final = 15.0  # of wall time
 _NO_SUPERVISOR: Final = (
     "no live controller can read the scene of {}: set the field 'supervisor' of a Robot node to "
     "TRUE and create that robot with Supervisor(), or open the world with an observer in it, made "
@@ -447,7 +447,7 @@ async def _ask(
         )
     name = await to_thread.run_sync(_find_supervisor, recording, robot)
     given = {key: value for key, value in params.items() if value is not None}
-    return await Dispatcher(recording, caller.report).ask(name, action, _WAIT_S, given)
+    return await Dispatcher(recording, caller.report).ask(name, action, _SCENE_WAIT_S, given)
 
 
 def _find_supervisor(recording: Recording, robot: str | None) -> str:

@@ -460,8 +460,8 @@ def _fine_places(rows: Rows, start: int, end: int, parts: int) -> tuple[Array, f
 def _best_rest(places: Array, least_m2: float) -> tuple[int, int, float]:
     """From and to which of the places it rests, and how many squares that explains."""
     firsts, lasts, bases = _rests_among(len(places))
-    squares_m2 = (bases @ places) ** 2
-    explained = squares_m2.reshape(len(firsts), -1).sum(axis=1)
+    explained: Array = np.sum((bases @ places) ** 2, axis=1)
+    explained = np.add.reduceat(explained, np.arange(0, len(explained), 3))
     explained -= least_m2 * ((firsts > 0) + 1.0 * (lasts < len(places)))
     best = int(np.argmax(explained))
     return int(firsts[best]), int(lasts[best]), float(explained[best])
@@ -484,8 +484,8 @@ def _rests_among(count: int) -> tuple[Indexes, Indexes, Array]:
     left, sizes, _ = np.linalg.svd(
         np.stack((np.ones_like(ramps[0]), *ramps), axis=-1), full_matrices=False
     )
-    bases = left * (sizes > 1e-9 * sizes[:, :1])[:, None, :]
-    return firsts, lasts, np.ascontiguousarray(bases.transpose(0, 2, 1)).reshape(-1, count)
+    bases: Array = left * (sizes > 1e-9 * sizes[:, :1])[:, None, :]
+    return firsts, lasts, np.ascontiguousarray(np.concatenate(np.swapaxes(bases, 1, 2)))
 
 
 def _only_twitches(rows: Rows, start: int, end: int) -> bool:

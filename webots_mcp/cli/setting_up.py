@@ -83,10 +83,7 @@ class Writing:
         return self._done(file, "deleted")
 
     def _done(self, file: Path, outcome: str) -> dict[str, str]:
-        return {
-            "file": str(file),
-            "outcome": f"would be {outcome}" if self.dry_run else outcome,
-        }
+        return {"file": str(file), "outcome": f"would be {outcome}" if self.dry_run else outcome}
 
 
 _ASKING: Final = Writing()

@@ -165,6 +165,11 @@ def test_what_shall_be_reached_in_time_is_told_live_and_by_the_past_alike(projec
     )  # fmt: skip
     never = read_expectation("left_m < -9 within .1")
     assert lines(file, 2, expect=[never])[never.name][1].startswith("not within 0.1 s: never")
+    violated = read_expectation("x > 1 within 1").evaluator(lambda value: value)
+    for _ in range(2):  # resets
+        violated.forget()
+        asked = [violated.holds({"x": x}, time_s) for time_s, x in enumerate((0, 0, 0, 2, 0))]
+        assert asked == [False, False, True, False, False]
     with closing(connect(file, "reader")) as connection:
         live = "SELECT name, round(sim_time_s, 3) FROM event WHERE kind = 'violation'"
         assert connection.execute(live).fetchall() == [("late", 0.128)] * 2

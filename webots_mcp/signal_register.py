@@ -174,7 +174,7 @@ _WHEEL: Final = re.compile(
 _NO_SPEED: Final = re.compile(  # of a wheel or a motor; and motors that move no robot
     r"(^|[._])(position|pos|angle|encoders?|ticks?|odo\w*|distance|torque|force|current|power"
     r"|temp\w*|radius|base|track|width|slip|contact|max|min|limit|gain|count|volt\w*"
-    r"|arm|gripper|hand|head|neck|joint|finger|lidar|camera|mast|lift)([._]|$)"
+    r"|arm|gripper|hand|head|neck|joint|finger|lidar|camera|mast|lift)([._]|$)",
 )
 _SIDE: Final = r"(\d|[lr]|(front|rear|back)?_?(left|right))"
 _COMMANDED_WHEEL: Final = re.compile(
@@ -189,7 +189,9 @@ _KEPT: Final = 4096  # names whose motion is remembered
 
 
 def decide_roles(
-    kinds: Mapping[str, Kind], choices: Container[str] = (), position: tuple[str, str] | None = None
+    kinds: Mapping[str, Kind],
+    choices: Container[str] = (),
+    position: tuple[str, str] | None = None,
 ) -> dict[str, str]:
     """The role of each signal of a robot that has one.
 

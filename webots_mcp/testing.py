@@ -218,7 +218,10 @@ class RecordedSignal:
         self._assert_each(lambda number: number > limit, f"rose above {limit:g}", max)
 
     def _assert_each(
-        self, is_bad: Callable[[float], bool], what: str, worst_of: Callable[[list[float]], float]
+        self,
+        is_bad: Callable[[float], bool],
+        what: str,
+        worst_of: Callable[[list[float]], float],
     ) -> None:
         numbers = self._usable
         if not numbers:

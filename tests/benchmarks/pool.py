@@ -34,15 +34,13 @@ from webots_mcp.connection import connect as connect_recording
 from webots_mcp.connection import create_schema
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.plugins.pool.fetching import fetch
-from webots_mcp.plugins.pool.pool_interface import (
-    Batch,
+from webots_mcp.plugins.pool.pool_contents import (
     Choice,
-    batches,
     meant,
     open_pool,
     pooled_runs,
-    table,
 )
+from webots_mcp.plugins.pool.pool_interface import Batch, batches, table
 from webots_mcp.plugins.pool.postgres_pool import Connection, PostgresShipment, connect, prepare
 from webots_mcp.plugins.pool.shipping import Order, Report, ship
 from webots_mcp.store.recording import Recording

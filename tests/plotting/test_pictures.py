@@ -29,7 +29,7 @@ from webots_mcp.errors import (
 )
 from webots_mcp.plotting import PlotKind, plot
 from webots_mcp.plotting.canvas import DASHES, LINES, Canvas, Picture, Sheet, image_format_of
-from webots_mcp.plotting.parts import Interval
+from webots_mcp.plotting.intervals import Interval
 from webots_mcp.plotting.signals import compose_signals, paint_signals, plot_signals
 from webots_mcp.plotting.trajectory import compose_trajectory, paint_trajectory
 from webots_mcp.questions.declaring import RunIds

@@ -18,7 +18,7 @@ from tests.postgres import NoServerError, Server, running_server
 from tests.recordings.runs import Recorded
 from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME, new_uuid
-from webots_mcp.plugins.pool.pool_interface import open_pool
+from webots_mcp.plugins.pool.pool_contents import open_pool
 from webots_mcp.plugins.pool.shipping import Order, Report, ship
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.recording import Recording

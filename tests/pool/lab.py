@@ -15,7 +15,7 @@ from tests.recordings.runs import Recorded
 from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.plugins.pool.fetching import Fetched, fetch
-from webots_mcp.plugins.pool.pool_interface import Choice, meant, open_pool
+from webots_mcp.plugins.pool.pool_contents import Choice, meant, open_pool
 from webots_mcp.plugins.pool.shipping import Order, Report, ship
 from webots_mcp.store.parameters import Result, create_trial_set, finish_trial, trials_of
 from webots_mcp.store.recording import Recording

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from webots_mcp.plugins.pool.pool_contents import open_pool
 from webots_mcp.plugins.pool.pool_interface import (
     Batch,
     Row,
@@ -17,7 +18,6 @@ from webots_mcp.plugins.pool.pool_interface import (
     SQLValue,
     Table,
     batches,
-    open_pool,
     table,
     tables,
 )

@@ -31,13 +31,8 @@ from tests.recordings.rover import Recorder, record_rover
 from webots_mcp.connection import connect
 from webots_mcp.errors import InvalidInputError, PoolBusyError, PoolError
 from webots_mcp.plugins.pool import duckdb_statement, postgres_pool
-from webots_mcp.plugins.pool.pool_interface import (
-    Pool,
-    open_pool,
-    pooled_runs,
-    pooled_trial_sets,
-    table,
-)
+from webots_mcp.plugins.pool.pool_contents import open_pool, pooled_runs, pooled_trial_sets
+from webots_mcp.plugins.pool.pool_interface import Pool, table
 from webots_mcp.store.chunk_making import make_chunks
 
 

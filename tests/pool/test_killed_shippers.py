@@ -19,7 +19,7 @@ from tests.pool.rows import BeforeWrite, pooled, recorded
 from tests.postgres import Server
 from tests.recordings.bridge import STEP_MS, Rover
 from webots_mcp.connection import connect
-from webots_mcp.plugins.pool.pool_interface import open_pool
+from webots_mcp.plugins.pool.pool_contents import open_pool
 from webots_mcp.plugins.pool.shipping import Order, Report, follow, ship
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.recording import Recording

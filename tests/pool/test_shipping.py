@@ -27,13 +27,8 @@ from webots_mcp.errors import (
     PoolUnavailableError,
     SchemaTooOldError,
 )
-from webots_mcp.plugins.pool.pool_interface import (
-    BATCH_BYTES,
-    is_whole,
-    open_pool,
-    pooled_runs,
-    table,
-)
+from webots_mcp.plugins.pool.pool_contents import open_pool, pooled_runs
+from webots_mcp.plugins.pool.pool_interface import BATCH_BYTES, is_whole, table
 from webots_mcp.plugins.pool.shipping import LAST_GROUP, Order, Report, Source, follow
 from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.merging import merge
@@ -287,7 +282,7 @@ def ship_unwritable(shipped: Shipped, *, full: bool) -> str:
     shipped.connection.close()
     code = (
         "import functools, sys; from pathlib import Path; "
-        "from webots_mcp.plugins.pool.pool_interface import open_pool; "
+        "from webots_mcp.plugins.pool.pool_contents import open_pool; "
         "from webots_mcp.plugins.pool.shipping import Report; "
         "from webots_mcp.plugins.pool.shipping import Order, ship; "
         "from webots_mcp.store.recording import Recording; folder, pool = map(Path, sys.argv[1:]); "

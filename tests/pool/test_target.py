@@ -7,7 +7,8 @@ from collections import Counter
 import pytest
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.plugins.pool.pool_interface import Batch, fitted, open_pool, redacted, table, tables
+from webots_mcp.plugins.pool.pool_contents import open_pool
+from webots_mcp.plugins.pool.pool_interface import Batch, fitted, redacted, table, tables
 
 SECRET = "hunter2"
 

@@ -124,7 +124,10 @@ class ClaimedCommands:
             )
 
     def _read(
-        self, row: tuple[int, bytes, bytes | None, bytes | None], session_id: int, sim_time_s: float
+        self,
+        row: tuple[int, bytes, bytes | None, bytes | None],
+        session_id: int,
+        sim_time_s: float,
     ) -> ClaimedCommand | None:
         command_id, action, text, asker = row
         by = None if asker is None else asker.decode("utf-8", "replace")

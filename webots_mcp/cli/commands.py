@@ -55,7 +55,7 @@ _OF_THE_CORE: Final = {
     "run": Command(STEER, f"{_Q}.control_simulation", "webots_run"),
     "send": Command(STEER, f"{_Q}.send_command", "webots_send_command"),
     "wait": Command(STEER, f"{_Q}.send_command", "webots_wait_for_command"),
-    "scene": Command(NOW, f"{_Q}.control_simulation", "webots_get_scene"),
+    "scene": Command(NOW, f"{_Q}.edit_scene", "webots_get_scene"),
     "commands": Command(NOW, f"{_Q}.send_command", "webots_list_commands"),
     "field": Command(NOW, _STEERING, "field"),
     "parameters": Command(NOW, _STEERING, "parameters"),

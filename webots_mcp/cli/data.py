@@ -232,7 +232,8 @@ def import_(
     source: Annotated[
         Path,
         Parameter(
-            "SOURCE", help="A recording, a webots.db; or a bundle, a .zip of 'webots-mcp export'."
+            "SOURCE",
+            help="A recording, a webots.db; or a bundle, a .zip of 'webots-mcp export'.",
         ),
     ],
     /,
@@ -461,7 +462,8 @@ def tail(
     ] = 10,
     robot: Robot = None,
     interval_s: Annotated[
-        float, Parameter("--interval", help="Seconds between looks (0.5).", validator=Number(gt=0))
+        float,
+        Parameter("--interval", help="Seconds between looks (0.5).", validator=Number(gt=0)),
     ] = 0.5,
     no_follow: Annotated[
         bool, Parameter("--no-follow", negative=(), help="Print the last lines and end.")
@@ -510,7 +512,8 @@ def plot(
     *signals: Annotated[str, Parameter("SIGNAL", help="Names, with '*' (all).")],
     output: Annotated[Path, Parameter(("-o", "--output"), help="A .png or .svg file.")],
     trajectory: Annotated[
-        bool, Parameter("--trajectory", negative=(), help="The path of the robot, seen from above.")
+        bool,
+        Parameter("--trajectory", negative=(), help="The path of the robot, seen from above."),
     ] = False,
     run_ids: Annotated[
         list[str] | None,

@@ -159,7 +159,9 @@ def field(
     value: Annotated[
         str | None,
         Parameter(
-            "VALUE", help="Set it: '[0, 1, 0.04]', 0.5, true, a text.", allow_leading_hyphen=True
+            "VALUE",
+            help="Set it: '[0, 1, 0.04]', 0.5, true, a text.",
+            allow_leading_hyphen=True,
         ),
     ] = None,
     /,
@@ -183,7 +185,7 @@ def field(
 
         webots-mcp field ROVER.translation '[0, 1, 0.04]'
     """
-    from webots_mcp.questions.control_simulation import webots_get_field, webots_set_field
+    from webots_mcp.questions.edit_scene import webots_get_field, webots_set_field
 
     if stop and value is None:
         raise InvalidInputError("--stop goes with a VALUE that is set")
@@ -269,13 +271,16 @@ def trials(
     plot: Annotated[
         Path | None,
         Parameter(
-            "--plot", metavar="FILE", help="A .png or .svg file: the scores over the parameters."
+            "--plot",
+            metavar="FILE",
+            help="A .png or .svg file: the scores over the parameters.",
         ),
     ] = None,
     so_far: Annotated[
         bool,
         Parameter(
-            "--so-far", help="Only print what is over, also while another process works on it."
+            "--so-far",
+            help="Only print what is over, also while another process works on it.",
         ),
     ] = False,
     recorded: Where = _WHERE,

@@ -34,19 +34,16 @@ from webots_mcp.plotting.canvas import (
     wrapped,
 )
 from webots_mcp.plotting.curves import Curve, Panel, by_choice, by_scale, by_signal, curve_of
+from webots_mcp.plotting.intervals import Interval, Lane, lane_of, merged_notes
 from webots_mcp.plotting.parts import (
     LINE_PX,
     Entry,
-    Interval,
-    Lane,
     Part,
     area_sample,
     event_lanes,
     hatch_sample,
     known_signals,
-    lane_of,
     line_sample,
-    merged_notes,
     mode_signal,
     paint_area,
     paint_grid,

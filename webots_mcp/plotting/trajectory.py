@@ -28,18 +28,16 @@ from webots_mcp.plotting.canvas import (
     width_of,
 )
 from webots_mcp.plotting.curves import Path, Place, extent, headings, read_path, thinned
+from webots_mcp.plotting.intervals import Lane, lane_of, merged_notes
 from webots_mcp.plotting.parts import (
     LINE_PX,
     SCALE_PX,
     Entry,
     Known,
-    Lane,
     Part,
     known_signals,
-    lane_of,
     line_sample,
     mark_sample,
-    merged_notes,
     mode_signal,
     paint_grid,
     paint_mark,

@@ -12,7 +12,7 @@ from webots_mcp.questions.declaring import Question
 MODULES: Final = (
     "robot_state", "show_pictures", "get_logs", "monitor", "history", "events",
     "compare_runs", "query_sql", "control_simulation", "run_trials", "send_command",
-
+    "edit_scene",
 )  # fmt: skip
 
 

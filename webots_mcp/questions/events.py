@@ -53,7 +53,11 @@ def _as_kind(name: str) -> str:
     return name
 
 
-Kind = Annotated[str, AfterValidator(_as_kind), Field(json_schema_extra={"enum": [*kind_names()]})]
+Kind = Annotated[
+    str,
+    AfterValidator(_as_kind),
+    Field(json_schema_extra={"enum": [*kind_names()]}),
+]
 Kinds = Annotated[
     list[Kind] | None,
     Field(
@@ -138,7 +142,12 @@ def webots_find_events(
 
 
 def _found(
-    view: View, asked: TimeRange, options: EventOptions, group: bool, limit: int | None, cursor: str
+    view: View,
+    asked: TimeRange,
+    options: EventOptions,
+    group: bool,
+    limit: int | None,
+    cursor: str,
 ) -> dict[str, Any]:
     found = search_events(view.connection, asked, options, group=group, after=cursor or None)
     verdicts, notes = verdicts_of(found.verdicts), notes_of(found.notes)

@@ -398,7 +398,10 @@ _SHOWN_CONSTANTS: Final = 20
     core=True,
 )
 def webots_get_trends(
-    recording: Recording, scope: Scope, signals: AnyNames = None, limit: ShownLimit = None
+    recording: Recording,
+    scope: Scope,
+    signals: AnyNames = None,
+    limit: ShownLimit = None,
 ) -> TrendsAnswer:
     """What each signal did, in words, by default over the whole run; values: webots_query_history.
 
@@ -420,7 +423,11 @@ def _trends(
     budget_tokens = room_tokens(limit) // max(len(found.runs), 1)
     recorded = [run for run in found.runs if run.rows or run.cut_at_s is not None]
     runs = [trend_tables(run, limit or DEFAULT_LIMIT, budget_tokens) for run in recorded]
-    return {"runs": runs or None, "notes": notes_of(found.notes), "hint": _hint_of_trends(runs)}
+    return {
+        "runs": runs or None,
+        "notes": notes_of(found.notes),
+        "hint": _hint_of_trends(runs),
+    }
 
 
 def trend_tables(run: RunTrends, limit: int, budget_tokens: int) -> RunTrendTables:
@@ -482,7 +489,13 @@ def _state_row(state: StateTrend) -> list[Any]:
     times = {shown(value): round(duration_s, 3) for value, duration_s in longest_first[:most]}
     if rest := longest_first[most:]:
         times[f"… {len(rest)} more values"] = round(sum(duration_s for _, duration_s in rest), 3)
-    return [short_name(state.name), state.changes, shown(state.last), seconds(state.since_s), times]
+    return [
+        short_name(state.name),
+        state.changes,
+        shown(state.last),
+        seconds(state.since_s),
+        times,
+    ]
 
 
 def _hint_of_trends(runs: Sequence[RunTrendTables]) -> str | None:

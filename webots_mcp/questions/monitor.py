@@ -55,7 +55,12 @@ async def webots_monitor(
         Annotated[float, Field(ge=1, le=MAX_WAIT_S)] | None, Field(description="To watch; 10.")
     ] = None,
     lookback_wall_s: Annotated[
-        float | None, Field(gt=0, le=86_400, description="Instead: the last wall seconds, at once.")
+        float | None,
+        Field(
+            gt=0,
+            le=86_400,
+            description="Instead: the last wall seconds, at once.",
+        ),
     ] = None,
     robot: RobotName = None,
 ) -> MonitorAnswer:

@@ -347,7 +347,10 @@ _SHOWN_REPLACED: Final = 20
 _NULL: Final = "the value at this path is null"  # which an answer leaves out
 _ERROR_CHARACTERS: Final = 300
 
-PagePath = Annotated[str, Field(max_length=1000, description="Dotted path, as sensors.lidar.")]
+PagePath = Annotated[
+    str,
+    Field(max_length=1000, description="Dotted path, as sensors.lidar."),
+]
 Offset = Annotated[int, Field(ge=0, description="First member, item or character at the path.")]
 PageSize = Annotated[int | None, Field(ge=1, le=2000, description="So many, up to 10,000 tokens.")]
 

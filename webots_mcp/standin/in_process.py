@@ -168,7 +168,10 @@ class InProcessRobot(Robot):
     """
 
     def __init__(
-        self, name: str | None = None, *, world: str | Path | InProcessSimulation = DEFAULT_WORLD
+        self,
+        name: str | None = None,
+        *,
+        world: str | Path | InProcessSimulation = DEFAULT_WORLD,
     ) -> None:
         """Connect to a robot of a world.
 

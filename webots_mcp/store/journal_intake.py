@@ -264,7 +264,12 @@ class _Reading:
         return connection.execute(_KNOWN, (self.uuid,)).fetchone()
 
     def _finish(
-        self, session_id: int, robot_id: int, looks: _Looks, lines: Sequence[_Line], taken: Taken
+        self,
+        session_id: int,
+        robot_id: int,
+        looks: _Looks,
+        lines: Sequence[_Line],
+        taken: Taken,
     ) -> None:
         """Write what follows: names, changes, times, ends of runs, what was dropped."""
         written = {entry.number for entry in taken.written}

@@ -14,7 +14,7 @@ import pytest
 from tests.pool.parquet import bucket
 from tests.recordings.rows import Recorded
 from webots_mcp.contract import DATABASE_NAME, new_uuid
-from webots_mcp.plugins.pool.pool_interface import open_pool
+from webots_mcp.plugins.pool.pool_contents import open_pool
 from webots_mcp.plugins.pool.shipping import Order, Report, ship
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.recording import Recording

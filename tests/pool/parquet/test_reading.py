@@ -21,7 +21,7 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.pool import duckdb_statement as asking
 from webots_mcp.plugins.pool.parquet_files import Storage
 from webots_mcp.plugins.pool.parquet_pool import ParquetPool
-from webots_mcp.plugins.pool.pool_interface import pooled_runs
+from webots_mcp.plugins.pool.pool_contents import pooled_runs
 from webots_mcp.store.detection.events import find_events
 from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.questions.runs import list_runs

@@ -47,7 +47,7 @@ MIDNIGHT_S = 19_700 * DAY_S
 
 HOLDER = """
 import os, sys
-from webots_mcp.plugins.pool.pool_interface import open_pool
+from webots_mcp.plugins.pool.pool_contents import open_pool
 with open_pool(sys.argv[1], ships=True) as pool:
     with pool.shipment(sys.argv[2]):
         print("ships", flush=True)

@@ -29,7 +29,7 @@ from typing import Any, Final, NamedTuple
 from webots_mcp import __version__
 from webots_mcp.contract import DATABASE_NAME, host_name
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
-from webots_mcp.plugins.pool.pool_interface import open_pool
+from webots_mcp.plugins.pool.pool_contents import open_pool
 from webots_mcp.requirements import explain_extra
 from webots_mcp.steering.trial_plan import WorldPlan
 from webots_mcp.steering.trial_run import (
@@ -298,7 +298,7 @@ class ClusterSimulators:
     def _fetched(self, result: Result, recording_uuid: str, folder: Path) -> Result:
         """The result, with its runs in a recording in the folder, as if it had been returned."""
         from webots_mcp.plugins.pool.fetching import fetch
-        from webots_mcp.plugins.pool.pool_interface import Meant, pooled_runs
+        from webots_mcp.plugins.pool.pool_contents import Meant, pooled_runs
 
         assert self._needs.ship_to is not None
         recording = Recording(folder / DATABASE_NAME, folder)

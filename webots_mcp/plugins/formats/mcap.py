@@ -313,7 +313,9 @@ FIXED: Final[dict[str, Schema]] = {
         rotation=_QUATERNION,
     ),
     "foxglove.PosesInFrame": _object(
-        timestamp=_TIME, frame_id=_TEXT, poses={"type": "array", "items": _POSE}
+        timestamp=_TIME,
+        frame_id=_TEXT,
+        poses={"type": "array", "items": _POSE},
     ),
     "foxglove.CompressedImage": _object(
         timestamp=_TIME,
@@ -322,7 +324,12 @@ FIXED: Final[dict[str, Schema]] = {
         format=_TEXT,
     ),
     "foxglove.Log": _object(
-        timestamp=_TIME, level=_INTEGER, message=_TEXT, name=_TEXT, file=_TEXT, line=_INTEGER
+        timestamp=_TIME,
+        level=_INTEGER,
+        message=_TEXT,
+        name=_TEXT,
+        file=_TEXT,
+        line=_INTEGER,
     ),
     "webots_mcp.Event": _object(timestamp=_TIME, kind=_TEXT, name=_TEXT, data=_object()),
     "webots_mcp.Command": _object(

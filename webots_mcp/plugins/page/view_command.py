@@ -29,7 +29,8 @@ def view(
         bool, Parameter("--no-browser", help="Only say the address of the page.")
     ] = False,
     read_only: Annotated[
-        bool, Parameter("--read-only", help="Without buttons and inputs that steer the robot.")
+        bool,
+        Parameter("--read-only", help="Without buttons and inputs that steer the robot."),
     ] = False,
     as_json: Json = False,
     recorded: Where = HERE,

@@ -2,7 +2,7 @@
 
 A pool is a PostgreSQL database or a dataset of Parquet files that other people's engines read.
 Each row is keyed by its recording's UUID and the key that it has there. `pool_interface` says what
-a pool can do; `pool_interface` opens one of the two kinds, which are `postgres_pool` and
+a pool can do; `pool_contents` opens one of the two kinds, which are `postgres_pool` and
 `parquet_pool`.
 """
 

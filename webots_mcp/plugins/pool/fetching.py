@@ -23,7 +23,8 @@ from typing import Final
 from webots_mcp.connection import transaction
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.liveness import process_alive
-from webots_mcp.plugins.pool.pool_interface import Meant, Pool, PooledRun, is_whole, table
+from webots_mcp.plugins.pool.pool_contents import Meant, PooledRun
+from webots_mcp.plugins.pool.pool_interface import Pool, is_whole, table
 from webots_mcp.store.chunk_making import chunk_whole_run
 from webots_mcp.store.chunks import STATE_IDS
 from webots_mcp.store.merging import END_SESSIONS, merge, small_recording

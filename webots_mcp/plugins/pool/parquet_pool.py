@@ -347,7 +347,11 @@ def _whole(content: bytes, path: str) -> Any:
 
 
 def _rows(
-    table: Table, content: bytes, path: str, count: int | None, where: Mapping[str, Collection[int]]
+    table: Table,
+    content: bytes,
+    path: str,
+    count: int | None,
+    where: Mapping[str, Collection[int]],
 ) -> Iterator[Row]:
     """Of the first rows of a file, or of all, those whose columns have one of these values.
 

@@ -20,7 +20,7 @@ from webots_mcp.cli.terminal import (
     shown_progress,
 )
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
-from webots_mcp.plugins.pool.pool_interface import (
+from webots_mcp.plugins.pool.pool_contents import (
     Choice,
     chosen_runs,
     chosen_trial_sets,
@@ -61,7 +61,7 @@ def fetch(
     is still being shipped is not taken: fetch it again when it is whole.
     """
     from webots_mcp.plugins.pool.fetching import fetch as fetch_runs
-    from webots_mcp.plugins.pool.pool_interface import open_pool
+    from webots_mcp.plugins.pool.pool_contents import open_pool
 
     with open_pool(url) as pool:
         wanted = meant(pool, choice)  # first: no database is made for nothing
@@ -84,7 +84,10 @@ def _as_data(found: Fetched) -> dict[str, Any]:
         "known_run_ids": [found.runs[uuid] for uuid in found.known],
         "only_chunks_run_ids": [found.runs[uuid] for uuid in found.only_chunks],
         "incomplete_chunks_run_ids": [found.runs[uuid] for uuid in found.unchunked],
-        "not_taken": {"going_on": found.going_on, "not_wholly_shipped": found.arriving},
+        "not_taken": {
+            "going_on": found.going_on,
+            "not_wholly_shipped": found.arriving,
+        },
     }
 
 
@@ -123,7 +126,8 @@ def _named(uuids: Sequence[str]) -> str:
 def pool(
     url: Annotated[str, Parameter("URL", help="postgresql://HOST/DATABASE, a folder, s3://...")],
     part: Annotated[
-        Literal["robots", "runs", "trials"], Parameter("PART", help="What to list (robots).")
+        Literal["robots", "runs", "trials"],
+        Parameter("PART", help="What to list (robots)."),
     ] = "robots",
     /,
     *,
@@ -148,7 +152,7 @@ def pool(
 
         webots-mcp pool postgresql:///lab --sql 'SELECT count(*) FROM run'
     """
-    from webots_mcp.plugins.pool.pool_interface import open_pool
+    from webots_mcp.plugins.pool.pool_contents import open_pool
 
     with open_pool(url) as opened:
         if sql is not None:
@@ -263,7 +267,8 @@ def ship(
     with --full each state. A password comes from PGPASSWORD, ~/.pgpass or a service file, never
     from the URL.
     """
-    from webots_mcp.plugins.pool.pool_interface import is_postgres, open_pool, redacted
+    from webots_mcp.plugins.pool.pool_contents import is_postgres, open_pool
+    from webots_mcp.plugins.pool.pool_interface import redacted
     from webots_mcp.plugins.pool.shipping import Order, Report
     from webots_mcp.plugins.pool.shipping import follow as follow_recording
     from webots_mcp.plugins.pool.shipping import ship as ship_once

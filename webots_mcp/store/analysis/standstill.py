@@ -186,7 +186,12 @@ def _settled(grid: _Grid, window: Indexes, limit_m: float) -> Indexes:
 
 
 def _joined(
-    track: Track, rows: Rows, starts: Indexes, ends: Indexes, slack: int, far_m: float
+    track: Track,
+    rows: Rows,
+    starts: Indexes,
+    ends: Indexes,
+    slack: int,
+    far_m: float,
 ) -> list[Standstill]:
     """Each standstill once: who creeps up to a place leaves a stay there, and stands on."""
     found: list[Standstill] = []

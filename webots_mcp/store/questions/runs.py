@@ -420,7 +420,11 @@ def _measure(
 
 
 def _counted(
-    kind: str, groups: Sequence[Sequence[_Outcome]], tests: int, of_more: int, min_effect_sd: float
+    kind: str,
+    groups: Sequence[Sequence[_Outcome]],
+    tests: int,
+    of_more: int,
+    min_effect_sd: float,
 ) -> Measure:
     """Events per minute; whether they differ is asked of their counts, in stretches of a length."""
     counts = [[run.events_of(kind) for run in group] for group in groups]

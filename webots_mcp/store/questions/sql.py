@@ -213,7 +213,10 @@ class Budget:
 
 
 def fetch_rows(
-    found: Iterable[Iterable[object]], rows: list[tuple[Cell, ...]], max_rows: int, budget: Budget
+    found: Iterable[Iterable[object]],
+    rows: list[tuple[Cell, ...]],
+    max_rows: int,
+    budget: Budget,
 ) -> str | None:
     """Fill `rows`; why there are more, or None."""
     for row in found:

@@ -347,7 +347,9 @@ def _has_rows(connection: sqlite3.Connection, run_id: int, span: tuple[float, fl
 
 
 def _in_simulation_time(
-    connection: sqlite3.Connection, subject: Subject, scope: Scope
+    connection: sqlite3.Connection,
+    subject: Subject,
+    scope: Scope,
 ) -> TimeRange:
     run_id, start_s, end_s, last_s = subject.run_id, scope.start_s, scope.end_s, scope.last_s
     bounds = recorded_bounds(connection, run_id)

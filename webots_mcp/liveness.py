@@ -297,16 +297,18 @@ class OpenSession(NamedTuple):
 
 
 def free_name(
-    connection: sqlite3.Connection, name: str, living: Callable[[OpenSession], bool]
+    connection: sqlite3.Connection, name: str, makes_way: Callable[[OpenSession], bool]
 ) -> str:
     """The name for a robot's new session: where a living one has it, `#2` and so on is appended.
 
-    Sessions of that name which are over are ended as superseded; the caller opens the transaction.
+    A living one may make way, as an observer's does, of `customData`, for a bridge. Sessions of
+    that name which are over are ended as superseded; the caller opens the transaction.
     """
     wanted, number = name, 1
     while True:
         sessions = [OpenSession(*row) for row in connection.execute(_SESSIONS_OF, (wanted,))]
-        if not any(map(living, sessions)):
+        living = (each for each in sessions if is_living(*each[1:5], time.time()))
+        if all(map(makes_way, living)):
             for session in sessions:
                 end_session(connection, session.session_id, "superseded")
             return wanted

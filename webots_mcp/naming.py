@@ -279,6 +279,11 @@ def listed(names: Collection[str], most: int = 10) -> str:
     return ", ".join(list(names)[:most]) + (f" and {more} more" if more > 0 else "")
 
 
+def counted(count: int, what: str) -> str:
+    """How many there are: `1 row`, `2 rows`."""
+    return f"{count} {what}" + "s" * (count != 1)
+
+
 def spelled_out(text: str) -> str:
     """A text without what a terminal obeys or what turns the direction of writing.
 

@@ -254,12 +254,7 @@ def list_commands(
 
     `before_id` pages towards older ones.
     """
-    values = {
-        "robot_id": robot_id,
-        "status": status,
-        "limit": limit,
-        "before_id": before_id,
-    }
+    values = {"robot_id": robot_id, "status": status, "limit": limit, "before_id": before_id}
     return [Command(*row) for row in connection.execute(_NEWEST, values).fetchall()]
 
 

@@ -17,7 +17,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar, overload
 
-from webots_mcp.conditions.expectation import read_expectation
+from webots_mcp.conditions.compiler import read_expectation
 from webots_mcp.connection import Role, connect, require_current, schema_version
 from webots_mcp.contract import (
     DATA_DIR_VARIABLE,

@@ -41,8 +41,7 @@ from webots_mcp.plugins.pool.pool_contents import (
     pooled_runs,
 )
 from webots_mcp.plugins.pool.pool_interface import Batch, batches, table
-from webots_mcp.plugins.pool.postgres_pool import PostgresShipment
-from webots_mcp.plugins.pool.postgres_schema import Connection, connect, prepare
+from webots_mcp.plugins.pool.postgres_pool import Connection, PostgresShipment, connect, prepare
 from webots_mcp.plugins.pool.shipping import Order, Report, ship
 from webots_mcp.store.recording import Recording
 

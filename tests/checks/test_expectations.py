@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -15,7 +17,7 @@ from mcp import Client
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp import MCPBridge
 from webots_mcp.cli import main
-from webots_mcp.conditions.expectation import read_expectation
+from webots_mcp.conditions.compiler import read_expectation
 from webots_mcp.connection import connect, create_schema
 from webots_mcp.errors import InvalidConditionError, InvalidInputError, UnknownSignalError
 from webots_mcp.server import create_server
@@ -144,12 +146,42 @@ def test_what_was_expected_of_an_earlier_run_is_asked_of_it_and_of_no_other(proj
         lines(file, 2, expect=[read_expectation("frnt_m > 1")])
 
 
+def test_what_shall_be_reached_in_time_is_told_live_and_by_the_past_alike(project: Path) -> None:
+    file = project / "mcp_data" / "webots.db"
+    times = {"late": "0.1", "soon": "0.17", "open": "5"}
+    expected = [
+        {"condition": f"left_m < {'-' * (name == 'open')}0.05 within {within}", "name": name}
+        for name, within in times.items()
+    ]
+    for _ in range(2):  # a run begins anew
+        drive(file, [{"left_m": 1.0 - 0.1 * step} for step in range(12)], *expected)
+    told = lines(file, 2)
+    assert told["late"] == ("fail", "not within 0.1 s: after 0.16 s; worst left_m = 0.3")
+    assert told["soon"] == ("pass", "after 0.16 s")
+    assert told["open"] == ("pass", "after 0.176 s")
+    short = read_expectation("left_m < -9 within 5")
+    assert lines(file, 2, expect=[short])[short.name] == (
+        "not applicable", "it lasted 0.176 s, shorter than 5 s"
+    )  # fmt: skip
+    never = read_expectation("left_m < -9 within .1")
+    assert lines(file, 2, expect=[never])[never.name][1].startswith("not within 0.1 s: never")
+    violated = read_expectation("x > 1 within 1").evaluator(lambda value: value)
+    for _ in range(2):  # resets
+        violated.forget()
+        asked = [violated.holds({"x": x}, time_s) for time_s, x in enumerate((0, 0, 0, 2, 0))]
+        assert asked == [False, False, True, False, False]
+    with closing(connect(file, "reader")) as connection:
+        live = "SELECT name, round(sim_time_s, 3) FROM event WHERE kind = 'violation'"
+        assert connection.execute(live).fetchall() == [("late", 0.128)] * 2
+
+
 @pytest.mark.parametrize(
     ("wrong", "why"),
     [
         ({"condition": "front_m >"}, "something is missing at the end"),
         ({"condition": "x > 1", "during": "1 > 0"}, "no signal is named"),
         ({"condition": "x > 1", "name": " "}, "the name of an expectation"),
+        ({"condition": "x > 1 within 2", "during": "y"}, "counts from the begin of the run"),
         ({"condition": "x > 1", "name": "\ud800"}, "1 to 100 printable"),
     ],
 )
@@ -241,6 +273,10 @@ def test_the_command_ends_with_0_1_or_2_and_writes_what_continuous_integration_r
     assert main(["check", *where, "--expect", "pose.0 < 2"]) == 1
     out = capsys.readouterr().out
     assert "webots-mcp events --where 'not (pose.0 < 2)' --run 1" in out
+    quoted = """pose.0 < 2 or pose.1 == 'a"b' or pose.1 == "it's\""""
+    assert main(["check", "1", "--expect", quoted, "--database", str(file)]) == 1
+    more = re.search("webots-mcp events --where.*", capsys.readouterr().out)
+    assert more and main([*shlex.split(more[0])[1:], "--database", str(file)]) == 0
     suite = ElementTree.parse(tmp_path / "check.xml").getroot()
     assert suite.attrib["failures"] == "1"
     cases = {each.attrib["name"]: [part.tag for part in each] for each in suite}

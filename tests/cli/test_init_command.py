@@ -154,6 +154,9 @@ def test_patch_shows_a_diff_and_undo_gives_the_same_bytes(project: Path) -> None
     assert not (project / ".mcp.json").exists()
     again = run("--patch", str(file), "--yes", cwd=project)
     assert (again.returncode, "already patched" in again.stdout) == (0, True)
+    file.with_suffix(".cpp").write_text("int main() {}\n")
+    other = run("--patch", str(file.with_suffix(".cpp")), "--yes", cwd=project)
+    assert (other.returncode, "no file of Python" in other.stderr) == (2, True)
     undone = json.loads(run("--undo", str(file), "--yes", "--json", cwd=project).stdout)
     assert [(each["file"], each["outcome"]) for each in undone["files"]] == [(str(file), "written")]
     assert "\n-MCPBridge.attach(robot)\n" in undone["files"][0]["diff"]

@@ -11,13 +11,13 @@ import pytest
 
 from tests.recordings.rows import Recorded
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.diagnosis import Finding, all_checks, diagnose, subject_of
+from webots_mcp.diagnosis import Diagnosis, all_checks, diagnose, subject_of
 from webots_mcp.store.recording import Recording
 
-Look = Callable[..., Finding]
+Look = Callable[..., Diagnosis]
 
 
-def found(file: Path, check: str, *server: str) -> Finding:
+def found(file: Path, check: str, *server: str) -> Diagnosis:
     """What a check says of a recording; its server may be another program."""
     (asked,) = [each for each in all_checks(with_server=True) if each.name == check]
     subject = subject_of(Recording(file, file.parent), "the test")

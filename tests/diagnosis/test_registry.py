@@ -9,9 +9,9 @@ from pathlib import Path
 from tests.diagnosis.conftest import found
 from webots_mcp.diagnosis import (
     PAGE,
-    Check,
+    Diagnosis,
     Examined,
-    Finding,
+    Link,
     all_checks,
     diagnose,
     subject_of,
@@ -38,22 +38,22 @@ def test_a_recording_of_a_robot_that_has_finished_is_well(bridge_recording: Path
 
 
 def test_a_check_that_fails_says_so_and_the_others_go_on(tmp_path: Path) -> None:
-    def fails(_: Examined) -> Iterator[Finding]:
+    def fails(_: Examined) -> Iterator[Diagnosis]:
         raise PermissionError("nobody may look there")
 
     subject = subject_of(Recording(tmp_path / "webots.db", tmp_path), "the test")
-    well = Check("Two", lambda _: iter(()), well="all well")
-    several = Check("Three", lambda _: iter([Finding("ok", "a"), Finding("wrong", "b", "x")]))
-    first, second, third = diagnose(subject, (Check("One", fails), well, several))
+    well = Link("Two", lambda _: iter(()), well="all well")
+    several = Link("Three", lambda _: iter([Diagnosis("ok", "a"), Diagnosis("wrong", "b", "x")]))
+    first, second, third = diagnose(subject, (Link("One", fails), well, several))
     assert first.finding.verdict == "not checked"
     assert "nobody may look there" in first.finding.seen
     assert second.is_well
-    assert third.finding == Finding("wrong", "b", "x")
+    assert third.finding == Diagnosis("wrong", "b", "x")
 
 
 def test_of_several_findings_those_that_are_well_are_left_out() -> None:
-    several = [Finding("ok", "a"), Finding("warning", "b", "x"), Finding("wrong", "c", "x")]
-    assert worst(several) == Finding("wrong", "b; c", "x")
+    several = [Diagnosis("ok", "a"), Diagnosis("warning", "b", "x"), Diagnosis("wrong", "c", "x")]
+    assert worst(several) == Diagnosis("wrong", "b; c", "x")
     assert worst(several[:1]) == several[0]
 
 

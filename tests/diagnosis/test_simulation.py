@@ -25,7 +25,7 @@ from tests.webots.conftest import (
     write_project,
 )
 from webots_mcp.contract import ENDED_BY, SEE_STEPS, UNMOVED, UNSEEN, host_name
-from webots_mcp.diagnosis import Finding
+from webots_mcp.diagnosis import Diagnosis
 from webots_mcp.liveness import process_identity
 
 WAITS = "import sys; print('ready', flush=True); sys.stdin.read()"
@@ -71,7 +71,7 @@ def silent(
     return recorded.robot(name, now=began_s, pid=process.pid, process=identity, **session)
 
 
-def computes(finding: Finding) -> bool:
+def computes(finding: Diagnosis) -> bool:
     return "another controller computes" in finding.seen
 
 

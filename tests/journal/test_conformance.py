@@ -9,6 +9,7 @@ import fcntl
 import json
 import os
 import sqlite3
+import time
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,8 @@ from webots_mcp import MCPBridge
 from webots_mcp.connection import connect, create_schema
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.journal_intake import take_in_journals
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import Recording, view_of
+from webots_mcp.store.robots import list_robots
 from webots_mcp.waiting_file import journal_parts
 
 FILES = sorted((Path(__file__).parent / "conformance").glob("*.jsonl"))
@@ -153,6 +155,25 @@ def test_a_journal_writes_to_no_run_of_another_session_and_waits_for_no_program(
     Recording(tmp_path / "webots.db", tmp_path).take_in()
     assert [data for _, data, _ in rows(tmp_path, "state")] == ['{"x":1}']
     assert rows(tmp_path, "run") == [["1", "start", 1.0, 1, "finished"]]
+
+
+def test_what_a_journal_dates_in_the_future_was_seen_when_it_was_taken_in(tmp_path: Path) -> None:
+    later_s = time.time() + 86_400
+    session = {"uuid": SESSION, "pid": os.getpid(), "started_wall_time_s": later_s}
+    header = {"webots_mcp_waiting": 1, "robot": {"name": "rover"}, "session": session}
+    run = {"uuid": "1", "reason": "start", "wall_time": later_s, "sim_time": 0.0}
+    state = [2, "state", "1", [0.1, later_s, {"x": 1}]]
+    lines = (header, [1, "run", None, run], state)
+    with part(tmp_path).open("w") as living:
+        fcntl.flock(living, fcntl.LOCK_EX)
+        living.write("".join(f"{json.dumps(line)}\n" for line in lines))
+        living.flush()
+        recording = Recording(tmp_path / "webots.db", tmp_path)
+        recording.take_in()
+        with recording.reader() as connection:
+            (robot,) = list_robots(connection, in_a_minute_s := time.time() + 60)
+            status = view_of(connection, robot, in_a_minute_s).status.text
+    assert robot.live and status in ("stopped 60 s ago", "stopped 61 s ago")
 
 
 def test_a_journal_with_the_uuid_of_a_bridges_session_is_left_and_reported(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from controller import Field, Node
+from controller.surface import NotInStandInError
 
 from tests.standin.placing import STEP_MS, drive, place
 from webots_mcp.standin import InProcessSupervisor
@@ -131,6 +132,9 @@ def test_custom_data_written_by_the_field_reaches_the_robot(robot: InProcessSupe
     field.setSFString("yours")
     robot.step(STEP_MS)
     assert robot.getCustomData() == "yours"
+    robot.setCustomData("ü" * 32_767)
+    with pytest.raises(NotInStandInError, match="over 65,534 bytes"):
+        robot.setCustomData("ü" * 32_768)
 
 
 def test_a_tracked_field_comes_with_the_steps(robot: InProcessSupervisor) -> None:

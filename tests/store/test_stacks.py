@@ -11,6 +11,7 @@ import sqlite3
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -153,6 +154,22 @@ def test_the_loops_thread_is_the_one_that_steps(tmp_path: Path) -> None:
     (path,) = tmp_path.glob("*-stacks-*")
     assert json.loads(path.read_bytes())["thread"] == stepped_in != threading.get_ident()
     bridge.close()
+
+
+def test_a_loop_that_stays_silent_is_logged_once(tmp_path: Path) -> None:
+    robot = InProcessSupervisor()
+    bridge = MCPBridge(robot, tmp_path, hang_after_s=1e-6)
+    robot.step(16)
+    bridge.publish({"x": 1})
+    with ThreadPoolExecutor(1) as other:
+        for _ in range(3):
+            other.submit(bridge._session._watchdog.look).result()  # pyright: ignore[reportPrivateUsage]
+    bridge.close()
+    with closing(sqlite3.connect(tmp_path / "webots.db")) as connection:
+        (count,) = connection.execute(
+            "SELECT count(*) FROM log WHERE message LIKE '%test_stacks.py%'"
+        ).fetchone()
+    assert count == 1
 
 
 @pytest.mark.parametrize(("silent_s", "rows"), [(3.1, 1), (1.0, 0)])

@@ -86,7 +86,7 @@ def test_a_reset_that_leaves_something_is_to_blame_and_a_reload_is_not(
     assert answer["verdict"].startswith("the reset is to blame: processes of their own repeat")
 
     said = repeat("--by", "reset", "-n", "3", "--for", "0.5")
-    assert "reset:\n" in said and "verdict 2 of 2 others part from run " in said
+    assert "reset:\n" in said and " and 2 of 2 others part; run " in said
 
 
 def test_what_cannot_be_repeated_is_refused(project: Path, repeat: Repeat) -> None:

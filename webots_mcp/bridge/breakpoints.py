@@ -23,7 +23,7 @@ from webots_mcp.pauses import ARMED, OF_CONTROLLER, SET, VIOLATION, Cause
 if TYPE_CHECKING:
     from webots_mcp.bridge.session import Session
     from webots_mcp.conditions import Condition, Evaluator
-    from webots_mcp.conditions.expectation import Expectation, Violated
+    from webots_mcp.conditions.compiler import Expectation, Violated
     from webots_mcp.naming import Value
 
 MOST_EVENTS: Final = 1000  # of one breakpoint in one run: a flickering condition fills no database
@@ -169,7 +169,7 @@ class Breakpoints:
         self, number: int, text: bytes, action: bytes, after_hits: int, *expected: bytes | None
     ) -> Breakpoint | None:
         from webots_mcp.conditions import parse_condition
-        from webots_mcp.conditions.expectation import parse_expectation
+        from webots_mcp.conditions.compiler import parse_expectation
 
         name, expects, during = (
             None if each is None else each.decode("utf-8", "replace") for each in expected
@@ -209,7 +209,7 @@ class Breakpoints:
         Raises:
             InvalidInputError: As of `set`.
         """
-        from webots_mcp.conditions.expectation import parse_expectation
+        from webots_mcp.conditions.compiler import parse_expectation
 
         return self._arm(_expected(None, parse_expectation(text, during, name)))
 
@@ -408,7 +408,9 @@ def read_goal(params: dict[str, Any]) -> Goal:
 
 
 def _condition(name: str, params: dict[str, Any]) -> Condition | None:
-    from webots_mcp.conditions import parse_condition  # only here: most controllers never need it
+    from webots_mcp.conditions.compiler import (
+        parse_condition,  # only here: most controllers never need it
+    )
 
     text = params.get(name)
     if text is not None and not isinstance(text, str):

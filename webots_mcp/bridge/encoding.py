@@ -40,26 +40,457 @@ Numpy scalars and arrays, Webots' lidar points and radar targets, dataclasses, e
 ranges, deques, dates, paths, UUIDs, decimals and keys that are not text are stored as their plain
 JSON counterparts and are not named in `replaced`. Neither are integers beyond 64 bits: they become
 the nearest float, as SQLite would read them anyway.
+
+Values are copied breadth first: where there is no room for everything, the deepest levels are cut.
 """
 
 from __future__ import annotations
 
+import base64
+import enum
 import io
 import json
+import math
 import pickle
+import time
 from collections import deque
-from collections.abc import Iterable
-from typing import Any, Final, NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from itertools import compress, islice
+from json.encoder import encode_basestring
+from operator import not_
+from typing import Any, Final, NamedTuple, TypeAlias, cast
 
-from webots_mcp.bridge.cleaning import (
-    MAX_DEPTH,
-    MAX_ROOM,
-    ROOM_OF_A_VALUE,
-    Cleaner,
-    failure,
-    is_number_array,
-    item_count,
+# -- values of types that JSON does not know -------------------------------------------------------
+
+
+MOST_ITEMS: Final = 20_000  # of one array or container; a row has no room for more
+MOST_ARRAY_BYTES: Final = 1_000_000  # of one array, whose items may be long texts
+_MOST_KIND_CHARACTERS: Final = 100
+
+# Classes of Webots' `controller` package whose instances are nothing but their attributes.
+_WEBOTS_RECORDS: Final = ("LidarPoint", "RadarTarget", "MouseState", "ContactPoint")
+
+
+class NoCounterpartError(TypeError):
+    """The value cannot be stored; the text names what it was."""
+
+
+def convert(value: Any) -> object:
+    """The JSON counterpart of a value; its items may have to be converted in their turn.
+
+    Raises:
+        NoCounterpartError: It has no counterpart, or more items than a row takes.
+        Exception: Whatever the value raises while it is read.
+    """
+    if type(value) in (type, memoryview) or isinstance(value, type):
+        raise NoCounterpartError(f"type {kind_name(value)}")
+    if type(value).__name__ in _WEBOTS_RECORDS:
+        attributes: dict[str, object] = value.__dict__
+        return {name: item for name, item in attributes.items() if not name.startswith("_")}
+    _require_few(item_count(value))
+    _require_short(value)
+    for name, conversion in _CONVERSIONS:
+        if hasattr(value, name):
+            return conversion(value)
+    raise NoCounterpartError(f"type {kind_name(value)}")
+
+
+def kind_name(value: object) -> str:
+    """The name of its class, cut: a class may have a name of any length."""
+    return type(value).__name__[:_MOST_KIND_CHARACTERS]
+
+
+def item_count(value: Any) -> int:
+    """The number of items of an array or a container; 0 of anything else.
+
+    Numpy's `size` is not used: on classes that are neither it may be a method or a tuple.
+    """
+    if isinstance(shape := getattr(value, "shape", None), tuple):
+        return math.prod(cast("tuple[int, ...]", shape))
+    return len(value) if hasattr(value, "__len__") else 0
+
+
+def _require_few(count: int) -> None:
+    if count > MOST_ITEMS:
+        raise NoCounterpartError(f"array[{count}]")
+
+
+def _require_short(array: Any) -> None:
+    size_bytes = getattr(array, "nbytes", 0)
+    if isinstance(size_bytes, int) and size_bytes > MOST_ARRAY_BYTES:
+        raise NoCounterpartError(f"array of {size_bytes} bytes")
+
+
+def is_number_array(value: Any) -> bool:
+    """Whether it is a numpy array, or a scalar, of nothing but numbers or booleans."""
+    return getattr(getattr(value, "dtype", None), "kind", None) in ("b", "i", "u", "f")
+
+
+# -- everything else ---------------------------------------------------------------------------
+
+# By the object's attributes, not by its type: importing numpy, dataclasses, datetime and pathlib to
+# test types would slow down every controller's start.
+_CONVERSIONS: Final[tuple[tuple[str, Callable[[Any], object]], ...]] = (
+    ("tolist", lambda array: _listed(array)),  # numpy scalars and arrays, array.array
+    ("__dataclass_fields__", lambda data: {name: getattr(data, name) for name in _fields(data)}),
+    ("_value_", lambda member: member.value),  # enum
+    ("isoformat", lambda moment: moment.isoformat()),
+    ("total_seconds", lambda span: span.total_seconds()),
+    ("__fspath__", lambda path: path.__fspath__()),
+    ("urn", str),  # UUID
+    ("__float__", float),  # decimal, fraction
+    ("keys", lambda mapping: {key: mapping[key] for key in _bounded(mapping.keys())}),
+    ("isdisjoint", lambda items: list(_bounded(items))),  # set, frozenset
+    ("__reversed__", lambda items: list(_bounded(items))),  # deque, range, sequences
 )
+
+
+def _listed(array: Any) -> object:
+    """A numpy array or scalar as plain values."""
+    plain = array.tolist()  # which returns a long double itself: there is no plain number for it
+    return float(plain) if type(plain) is type(array) else plain
+
+
+def _fields(data: Any) -> Iterable[str]:
+    """A dataclass's fields, without ClassVar and InitVar ones."""
+    fields: dict[str, Any] = data.__dataclass_fields__
+    return (name for name, field in fields.items() if str(field._field_type) == "_FIELD")
+
+
+def _bounded(items: Iterable[Any]) -> Iterable[Any]:
+    """As many items as `len` says: an object's own iterator may be endless."""
+    return islice(items, min(MOST_ITEMS, item_count(items) or MOST_ITEMS))
+
+
+MAX_ROOM: Final = MOST_ITEMS
+ROOM_OF_A_VALUE: Final = 5  # an item of an array of numbers takes 1
+MAX_DEPTH: Final = 20
+MAX_BYTES: Final = 1024
+MAX_TEXT_BYTES: Final = 100_000
+MAX_TEXTS_BYTES: Final = 300_000  # of all texts of a row
+MAX_KEYS_BYTES: Final = 150_000  # of all keys of a row
+MAX_KEY_CHARACTERS: Final = 200
+MAX_NAMED: Final = 1000
+_TOP_KEYS: Final = 1000  # of a state that has more keys than there is room for
+_MOST_PATHS_CHARACTERS: Final = 50_000  # of all paths of a row
+_MOST_REASON_CHARACTERS: Final = 200
+_LONGEST_ESCAPE: Final = 6  # bytes of JSON for one character, as in \u0000
+_MOST_KEY_BITS: Final = 1000  # the text of a longer integer takes long to make
+# For all objects of a row together, since converting them runs code of unknown cost. Processor
+# time: by the wall clock, another process that runs in between would cost values.
+LONGEST_S: Final = 0.01
+
+
+# Where a value is: a linked list, since most places are never named and need no path text.
+Place: TypeAlias = "tuple[Place | None, str | int]"
+
+
+class _Unfilled(NamedTuple):
+    """A copy whose items are still to come."""
+
+    cleaned: dict[str, object] | list[object]
+    value: object
+    items: Iterable[Any]
+    place: Place
+    depth: int
+
+
+class Cleaner:
+    """Copies one value, and names in `replaced` what it had to replace or to cut.
+
+    Attributes:
+        replaced: Dotted path to kind.
+        unnamed: How many more there are that `replaced` does not name.
+    """
+
+    def __init__(self) -> None:
+        self.replaced: dict[str, str] = {}
+        self.unnamed = 0
+        self._room = MAX_ROOM
+        self._texts_bytes = MAX_TEXTS_BYTES
+        self._keys_bytes = MAX_KEYS_BYTES
+        self._paths = _MOST_PATHS_CHARACTERS
+        self._unfilled: deque[_Unfilled] = deque()
+        self._until_s = time.thread_time() + LONGEST_S
+
+    def clean(self, state: object) -> object:
+        """The plain counterpart of any value; an item that fails is left out, and no other."""
+        cleaned = self._value(state, (None, ""), 0)
+        while self._unfilled:
+            self._fill(self._unfilled.popleft())
+        if self.unnamed:
+            named = self.replaced.get("")
+            more = f"{self.unnamed} more"
+            self.replaced[""] = f"{named}; {more}" if named else more
+        return cleaned
+
+    def _value(self, value: Any, place: Place, depth: int) -> object:
+        try:
+            return self._plain(value, place, depth)
+        except Exception as error:  # noqa: BLE001  (the user's objects may raise anything)
+            return self._replace(place, failure(value, error))
+
+    def _plain(self, value: Any, place: Place, depth: int) -> object:
+        kind = type(value)  # pyright: ignore[reportUnknownVariableType]
+        if value is None or kind is bool:
+            return value
+        if kind is float:
+            return value if math.isfinite(value) else self._replace(place, str(value))
+        if isinstance(value, int):
+            return self._int(int(value), place)
+        if isinstance(value, float):
+            return self._plain(float(value), place, depth)
+        if isinstance(value, str):
+            return self._text(str(value.value) if isinstance(value, enum.Enum) else value, place)
+        if depth >= MAX_DEPTH:
+            return self._replace(place, "too deep")
+        if kind is dict:
+            return self._mapping(cast("dict[object, object]", value), place, depth)
+        if isinstance(value, (list, tuple, set, frozenset, deque)):
+            return self._items(cast("Iterable[object]", value), place, depth)
+        if isinstance(value, Mapping):
+            return self._mapping(cast("Mapping[object, object]", value), place, depth)
+        return self._object(value, place, depth)
+
+    # -- numbers and texts ---------------------------------------------------------------------
+
+    def _int(self, value: int, place: Place) -> int | float | None:
+        if -(2**63) <= value < 2**63:
+            return value
+        try:
+            return float(value)
+        except OverflowError:
+            return self._replace(place, "int")
+
+    def _text(self, value: str, place: Place) -> str:
+        most_bytes = min(MAX_TEXT_BYTES, self._texts_bytes)
+        text = _without_surrogates(value[:most_bytes])
+        if (size_bytes := _size_bytes(text)) > most_bytes:
+            text = text[: most_bytes // _LONGEST_ESCAPE]
+            size_bytes = _size_bytes(text)
+        self._texts_bytes -= size_bytes
+        if text != value:
+            self._name(place, "surrogate" if len(text) == len(value) else f"text[{len(value)}]")
+        return text
+
+    def _bytes(self, value: memoryview, place: Place) -> str | None:
+        count = value.nbytes
+        if count > MAX_BYTES:
+            return self._replace(place, f"bytes[{count}]")
+        text = base64.b64encode(value.tobytes()).decode("ascii")
+        if len(text) > self._texts_bytes:
+            return self._replace(place, f"bytes[{count}]")
+        self._texts_bytes -= len(text)
+        self._name(place, "bytes")
+        return text
+
+    # -- dicts ---------------------------------------------------------------------------------
+
+    def _mapping(self, value: Mapping[object, object], place: Place, depth: int) -> object:
+        count = len(value)
+        if not self._take(ROOM_OF_A_VALUE * count):
+            self._name(place, f"dict[{count}]")
+            if depth:
+                return None
+            count = _TOP_KEYS
+            self._take(ROOM_OF_A_VALUE * count)
+        cleaned: dict[str, object] = {}
+        items = islice(value.items(), count)
+        self._unfilled.append(_Unfilled(cleaned, value, items, place, depth + 1))
+        return cleaned
+
+    def _fill(self, unfilled: _Unfilled) -> None:
+        cleaned, value, items, place, depth = unfilled
+        try:
+            if isinstance(cleaned, dict):
+                self._fill_dict(cleaned, items, place, depth)
+            else:
+                cleaned.extend(self._value(item, (place, i), depth) for i, item in enumerate(items))
+        except Exception as error:  # noqa: BLE001  (as for any value)
+            self._name(place, failure(value, error))
+
+    def _fill_dict(
+        self, cleaned: dict[str, object], items: Iterable[Any], place: Place, depth: int
+    ) -> None:
+        for key, item in items:
+            name = self._key(key, place)
+            self._keys_bytes -= _size_bytes(name)
+            if self._keys_bytes < 0:
+                self._name(place, f"dict cut after {len(cleaned)}")
+                return
+            cleaned[name] = self._value(item, (place, name), depth)
+
+    def _key(self, key: object, place: Place) -> str:
+        try:
+            text = key_text(key)
+        except Exception:  # noqa: BLE001  (as with values: only this key is replaced)
+            name, kind = f"<{kind_name(key)}>", "key"
+        else:
+            name, kind = _without_surrogates(text[:MAX_KEY_CHARACTERS]), "surrogate"
+            if name == text:
+                return name
+            if len(text) > MAX_KEY_CHARACTERS:
+                kind = f"key[{len(text)}]"
+        self._name((place, name), kind)
+        return name
+
+    # -- arrays --------------------------------------------------------------------------------
+
+    def _items(self, value: Iterable[object], place: Place, depth: int) -> object:
+        if (count := item_count(value)) > self._room:
+            return self._replace(place, f"array[{count}]")
+        items: list[Any] = list(islice(value, count))
+        kinds = set(map(type, items))
+        if _are_numbers(items, kinds):
+            self._take(count)
+            return self._numbers(_plain_numbers(items, kinds), place)
+        count, room = _nested(items)
+        if room > self._room:
+            return self._replace(place, f"array[{count}]")
+        self._take(ROOM_OF_A_VALUE * len(items))
+        cleaned: list[object] = []
+        self._unfilled.append(_Unfilled(cleaned, value, items, place, depth + 1))
+        return cleaned
+
+    def _numbers(self, items: list[Any], place: Place) -> list[Any]:
+        """Copy an array of numbers: thousands of them (lidars), so without a call for each."""
+        finite = list(map(math.isfinite, items))
+        kinds = set(map(str, compress(items, map(not_, finite))))
+        if not kinds:
+            return items
+        if len(kinds) == 1:
+            self._name((place, "*"), kinds.pop())
+        else:
+            for i, item in compress(enumerate(items), map(not_, finite)):
+                self._name((place, i), str(item))
+        return [item if good else None for item, good in zip(items, finite, strict=True)]
+
+    # -- everything else -----------------------------------------------------------------------
+
+    def _object(self, value: Any, place: Place, depth: int) -> object:
+        if isinstance(value, (bytes, bytearray, memoryview)):
+            return self._bytes(memoryview(cast("bytes", value)), place)
+        if time.thread_time() > self._until_s:
+            return self._replace(place, f"type {kind_name(value)}: no time left")
+        if (count := item_count(value)) > self._room:
+            return self._replace(place, f"array[{count}]")
+        return self._plain(convert(value), place, depth + 1)
+
+    def _take(self, room: int) -> bool:
+        if room > self._room:
+            return False
+        self._room -= room
+        return True
+
+    def _replace(self, place: Place, kind: str) -> None:
+        self._name(place, kind)
+
+    def _name(self, place: Place, kind: str) -> None:
+        if (
+            len(self.replaced) + self.unnamed < MAX_NAMED
+            and len(path := _path(place)) <= self._paths
+        ):
+            self._paths -= len(path)
+            self.replaced[path] = kind
+        else:
+            self.unnamed += 1
+
+
+def _path(place: Place) -> str:
+    """Dotted; empty for the whole state."""
+    names: list[str] = []
+    above, name = place
+    while above is not None:
+        names.append(str(name))
+        above, name = above
+    return ".".join(reversed(names))
+
+
+def key_text(key: object) -> str:
+    """Object keys as the JSON encoder writes them; any other key as its text."""
+    if key is None or isinstance(key, bool):
+        return {None: "null", True: "true", False: "false"}[key]
+    if isinstance(key, str):  # also enums of it, whose own text is another
+        return str.__str__(key)
+    if isinstance(key, int):
+        _require_length(key.bit_length(), _MOST_KEY_BITS)
+        return int.__repr__(key)
+    if issubclass(type(key), (tuple, frozenset)):
+        _require_length(len(cast("tuple[object, ...]", key)), MAX_KEY_CHARACTERS)
+    return str(key)
+
+
+def _require_length(length: int, limit: int) -> None:
+    if length > limit:
+        raise NoCounterpartError(f"its text is too long: {length}")
+
+
+def _size_bytes(text: str) -> int:
+    """As JSON, without the quotes."""
+    quoted = encode_basestring(text)
+    return (len(quoted) if quoted.isascii() else len(quoted.encode())) - 2
+
+
+def _without_surrogates(text: str) -> str:
+    return text.encode("utf-8", "replace").decode()
+
+
+def _are_numbers(items: list[Any], kinds: set[type]) -> bool:
+    """Whether all are numbers, and no integer is beyond 64 bits."""
+    if not kinds or not all(issubclass(kind, (float, int)) for kind in kinds):
+        return False
+    if not any(issubclass(kind, int) for kind in kinds):
+        return True
+    return all(isinstance(item, float) or -(2**63) <= item < 2**63 for item in items)
+
+
+def _plain_numbers(items: list[Any], kinds: set[type]) -> list[Any]:
+    """The numbers as Python's own types, where they are of a subclass (numpy's, enums)."""
+    return items if kinds <= {float, int, bool} else [_plain_number(item) for item in items]
+
+
+def _plain_number(item: Any) -> float:
+    if isinstance(item, float):
+        return float(item)
+    return item if isinstance(item, bool) else int(item)
+
+
+def _nested(items: list[Any]) -> tuple[int, int]:
+    """The number of items of a list of equal lists, judged by the first ones, and their room."""
+    count, lists, inside = len(items), 0, items
+    for _ in range(MAX_DEPTH):
+        if not _are_equal_lists(inside):
+            break
+        lists += count
+        inside = cast("list[Any]", inside[0])
+        count *= len(inside)
+    numeric = lists and inside and isinstance(inside[0], (float, int))
+    return count, ROOM_OF_A_VALUE * lists + count * (1 if numeric else ROOM_OF_A_VALUE)
+
+
+def _are_equal_lists(items: list[Any]) -> bool:
+    if not items or not all(isinstance(item, (list, tuple)) for item in items):
+        return False
+    return len(set(map(len, items))) == 1
+
+
+def failure(value: object, error: Exception) -> str:
+    """Why a value is not stored."""
+    if isinstance(error, NoCounterpartError):
+        return str(error)
+    return f"type {kind_name(value)}: {_reason(error)}"
+
+
+def _reason(error: Exception) -> str:
+    """The text of an error, which may be long, or raise as well."""
+    try:
+        return str(error)[:_MOST_REASON_CHARACTERS]
+    except Exception:  # noqa: BLE001  (the user's exception may raise in its __str__)
+        return kind_name(error)
+
+
+# -- their JSON ------------------------------------------------------------------------------------
+
 
 # Numpy's type codes. Half and single floats are not here: orjson writes them with fewer digits.
 _ORDINARY_NUMBERS: Final = frozenset("?bBhHiIlLqQd")
@@ -269,7 +700,7 @@ class _Copier(pickle.Pickler):
         raise _NotPlainError
 
 
-def _listed(value: Any) -> object:
+def _in_lists(value: Any) -> object:
     """The values of an array of numbers, for an encoder that does not know it."""
     if not is_number_array(value):
         raise _NotPlainError
@@ -281,7 +712,7 @@ def _encode_with_orjson(state: object) -> str | None:
     if orjson is None:
         return None
     try:
-        text = orjson.dumps(state, _listed, orjson.OPT_SERIALIZE_NUMPY)
+        text = orjson.dumps(state, _in_lists, orjson.OPT_SERIALIZE_NUMPY)
     except Exception:  # noqa: BLE001  (the user's objects may raise anything; `json` comes next)
         return None
     return None if b"null" in text else text.decode()
@@ -293,7 +724,7 @@ _encode_plain: Final = json.JSONEncoder(
     allow_nan=False,
     ensure_ascii=False,
     separators=(",", ":"),
-    default=_listed,
+    default=_in_lists,
 ).encode
 
 

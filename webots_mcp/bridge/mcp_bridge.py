@@ -463,7 +463,8 @@ class MCPBridge:
         the time it held.
 
         Args:
-            condition: In the language of docs/conditions.md.
+            condition: In the language of docs/conditions.md. With `within 20` at its end it shall
+                hold once, within so many seconds from the begin of the run.
             during: Only while this condition holds.
             name: As it is reported; without one the condition is its name.
 

@@ -200,8 +200,8 @@ def register(
     liveness.reap(connection, now_s)
     with transaction(connection):
         liveness.reap(connection, now_s)
-        living = partial(_is_living, identity=identity, now_s=now_s)
-        name = liveness.free_name(connection, identity.robot_name, living)
+        makes_way = partial(_makes_way, identity=identity)
+        name = liveness.free_name(connection, identity.robot_name, makes_way)
         before = connection.execute(_KIND, (name,)).fetchone()
         robot_id = enter_robot(connection, describe_robot(identity, name), now_s)
         # A bridge is not the reloaded successor of an observer's reading of customData.
@@ -245,14 +245,12 @@ def _paused_mode(connection: sqlite3.Connection, identity: Identity, robot_id: i
     return row[0] if row else None
 
 
-def _is_living(session: liveness.OpenSession, identity: Identity, now_s: float) -> bool:
-    """Whether a session keeps its name; an observer's, of `customData`, makes way for a bridge."""
-    is_of_observer = session.kind == CUSTOM_DATA != identity.kind
-    if is_of_observer and same_simulation(session.instance, identity.instance):
-        return False
-    if (session.host, session.pid) == (identity.host, identity.pid):
-        return session.session_id in _own_sessions
-    return liveness.is_living(*session[1:5], now_s)
+def _makes_way(session: liveness.OpenSession, identity: Identity) -> bool:
+    """Whether a session leaves its name: one of this process that is over, an observer's."""
+    if session.kind == CUSTOM_DATA != identity.kind:
+        return same_simulation(session.instance, identity.instance)
+    is_here = (session.host, session.pid) == (identity.host, identity.pid)
+    return is_here and session.session_id not in _own_sessions
 
 
 def describe_robot(identity: Identity, name: str) -> dict[str, Any]:

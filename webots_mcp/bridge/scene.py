@@ -714,9 +714,7 @@ def _patterns(params: dict[str, Any], name: str) -> list[str]:
     given = params.get(name)
     if given is None:
         return []
-    if not isinstance(given, list) or not all(
-        isinstance(each, str) for each in cast("list[Any]", given)
-    ):
+    if not isinstance(given, list) or not all(isinstance(e, str) for e in cast("list[Any]", given)):
         raise InvalidInputError(
             f'{name} must be a list of texts, such as ["Robot"], not {given!r:.80}'
         )

@@ -95,9 +95,7 @@ def command_of(question: Question) -> Callable[..., None]:
         for option in [option_of(question, each.name)]
     )
     in_range = SCOPE if question.has_scope else ()
-    parameters = [
-        _parameter(question, each) for each in question.parameters if each.name not in in_range
-    ]
+    parameters = [_parameter(question, e) for e in question.parameters if e.name not in in_range]
     parameters.sort(key=lambda each: (each.kind, *_place(question, each.name)))
     keyword = inspect.Parameter.KEYWORD_ONLY
     if in_range:

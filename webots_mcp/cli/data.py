@@ -431,10 +431,10 @@ def _on_disk(wanted: Plan, sizes: dict[str, int]) -> dict[str, Any]:
 def _print_disk(disk: dict[str, Any]) -> None:
     from webots_mcp.store.retention import size_text
 
-    def listed(sizes: dict[str, int]) -> str:
+    def sized(sizes: dict[str, int]) -> str:
         return ", ".join(f"{name} {size_text(size)}" for name, size in sizes.items())
 
-    parts, others = listed(disk["in_file"]), listed(disk["beside"])
+    parts, others = sized(disk["in_file"]), sized(disk["beside"])
     print_notes([f"the file has {size_text(disk['file'])}, about: {parts}; beside it {others}"])
 
 

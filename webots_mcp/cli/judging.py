@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import math
 import re
@@ -14,7 +15,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, cast
 
 from webots_mcp.cli.options import (
     HERE,
@@ -105,13 +106,16 @@ def _as_typed(answer: dict[str, Any]) -> dict[str, Any]:
     from webots_mcp.cli.terminal import commands_by_tool
 
     def typed(cell: Any) -> Any:
-        call = re.fullmatch(r"webots_(\w+)\((.*)\)", str(cell))
-        if call is None:
+        called = re.fullmatch(r"webots_(\w+)\(.*\)", str(cell))
+        if called is None:
             return cell
-        words = ["webots-mcp", commands_by_tool().get(call[1], call[1])]
-        for name, value in re.findall(r"(\w+)=(\[[^]]*\]|'[^']*'|\w+)", call[2]):
-            for each in re.findall(r"'([^']*)'", value) or [value]:
-                words += [OPTIONS.get(name, f"--{name}"), each]
+        words = ["webots-mcp", commands_by_tool().get(called[1], called[1])]
+        call: Any = ast.parse(cell, mode="eval").body
+        for keyword in call.keywords:
+            value: Any = ast.literal_eval(keyword.value)
+            values = cast("list[Any]", value) if isinstance(value, list) else [value]
+            for each in values:
+                words += [OPTIONS.get(keyword.arg, f"--{keyword.arg}"), str(each)]
         return shlex.join(words)
 
     passed, table = answer.get("passed"), answer.get("checks")
@@ -208,6 +212,7 @@ def repeat(
     reset, and processes of their own do not, the reset is to blame.
     """
     from webots_mcp.store.questions.first_difference import compare_repeats
+    from webots_mcp.store.questions.runs import annotate_run
     from webots_mcp.store.run_rows import fetch_run
 
     ways = sorted(dict.fromkeys(by or ["reset"]))  # processes first: others are judged by them
@@ -221,6 +226,9 @@ def repeat(
             runs[way] = _in_processes(world, asked, for_s, number, stand_in=stand_in)
         else:
             runs[way] = [_live(way, asked, for_s) for _ in range(number)]
+            with asked.recording(read_only=False).writer() as connection:
+                for at, run_id in enumerate(runs[way], 1):
+                    annotate_run(connection, run_id, label=f"repeat {at} of {number}, by {way}")
     if len(ways) > 1:
         runs["the first of each"] = [run_ids[0] for run_ids in runs.values()]
     found: dict[str, list[Parting]] = {}

@@ -35,8 +35,7 @@ _URL: Final = "WEBOTS_CONTROLLER_URL"
 def serve(
     *,
     read_only: Annotated[
-        bool,
-        Parameter("--read-only", help="Leave out the tools that change the simulation."),
+        bool, Parameter("--read-only", help="Leave out the tools that change the simulation.")
     ] = False,
     tools: Annotated[
         Literal["all", "core"],

@@ -83,10 +83,7 @@ class Writing:
         return self._done(file, "deleted")
 
     def _done(self, file: Path, outcome: str) -> dict[str, str]:
-        return {
-            "file": str(file),
-            "outcome": f"would be {outcome}" if self.dry_run else outcome,
-        }
+        return {"file": str(file), "outcome": f"would be {outcome}" if self.dry_run else outcome}
 
 
 _ASKING: Final = Writing()
@@ -186,6 +183,9 @@ def _change_controller(file: Path, changed: Callable[[bytes], bytes], writing: W
     before = read(file)
     if before is None:
         raise InvalidInputError(f"there is no file {file}")
+    if file.suffix != ".py":
+        own = "'webots-mcp init' says what controllers in other languages need"
+        raise InvalidInputError(f"{file} is no file of Python, and left as it is; {own}")
     try:
         change = FileChange(file, before, changed(before))
     except AlreadyPatchedError as error:

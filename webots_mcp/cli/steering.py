@@ -481,7 +481,5 @@ def _row(number: int, ranked: Any) -> list[Any]:
 
 
 def _as_json(ranking: Ranking) -> dict[str, Any]:
-    sets = [
-        {**each._asdict(), "score": each.score and each.score._asdict()} for each in ranking.sets
-    ]
+    sets = [{**e._asdict(), "score": e.score and e.score._asdict()} for e in ranking.sets]
     return {**ranking._asdict(), "sets": sets, "noise": ranking.noise._asdict()}

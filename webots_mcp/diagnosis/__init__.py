@@ -1,8 +1,8 @@
 """Checks of each link between a controller and its client, and how they are run.
 
-A check is one function of what is `Examined` that yields each `Finding`, declared by `@check(NAME)`
-in one of the modules of this package. What it finds is explained in docs/troubleshooting.md, under
-a heading of its name. A diagnosis changes nothing.
+A check is one function of what is `Examined` that yields each `Diagnosis`, declared by
+`@check(NAME)` in one of the modules of this package. What it finds is explained in
+docs/troubleshooting.md, under a heading of its name. A diagnosis changes nothing.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _IN_ORDER: Final = ("recording_checks", "webots_checks")
 
 
 @dataclass(frozen=True)
-class Finding:
+class Diagnosis:
     """What was seen, and what mends it where it is not as it should be."""
 
     verdict: Verdict
@@ -47,24 +47,24 @@ class Finding:
     fix: str | None = None
 
 
-def ok(seen: str) -> Finding:
+def ok(seen: str) -> Diagnosis:
     """Nothing is to be mended."""
-    return Finding("ok", seen)
+    return Diagnosis("ok", seen)
 
 
-def warning(seen: str, fix: str) -> Finding:
+def warning(seen: str, fix: str) -> Diagnosis:
     """It may be as it should be."""
-    return Finding("warning", seen, fix)
+    return Diagnosis("warning", seen, fix)
 
 
-def wrong(seen: str, fix: str) -> Finding:
+def wrong(seen: str, fix: str) -> Diagnosis:
     """It has to be mended."""
-    return Finding("wrong", seen, fix)
+    return Diagnosis("wrong", seen, fix)
 
 
-def unclear(seen: str) -> Finding:
+def unclear(seen: str) -> Diagnosis:
     """It could not be looked at, and why."""
-    return Finding("not checked", seen)
+    return Diagnosis("not checked", seen)
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class Examined:
 
 
 @dataclass(frozen=True)
-class Check:
+class Link:
     """A link of the chain.
 
     Attributes:
@@ -131,7 +131,7 @@ class Check:
     """
 
     name: str
-    look: Callable[[Examined], Iterator[Finding]]
+    look: Callable[[Examined], Iterator[Diagnosis]]
     well: str = ""
     needs_recording: bool = False
     starts_process: bool = False
@@ -145,8 +145,8 @@ class Check:
 class Checked(NamedTuple):
     """A check and what it found."""
 
-    check: Check
-    finding: Finding
+    check: Link
+    finding: Diagnosis
 
     @property
     def is_well(self) -> bool:
@@ -154,12 +154,12 @@ class Checked(NamedTuple):
         return self.finding.verdict == "ok"
 
 
-def check(name: str, **options: Any) -> Callable[[Callable[[Examined], Iterator[Finding]]], Check]:
-    """Declare a function as a check; a `Check` has the options."""
-    return lambda look: Check(name, look, **options)
+def check(name: str, **options: Any) -> Callable[[Callable[[Examined], Iterator[Diagnosis]]], Link]:
+    """Declare a function as a check; a `Link` has the options."""
+    return lambda look: Link(name, look, **options)
 
 
-def all_checks(*, with_server: bool = False) -> list[Check]:
+def all_checks(*, with_server: bool = False) -> list[Link]:
     """All that the modules declare, in the order of the chain.
 
     Args:
@@ -167,17 +167,17 @@ def all_checks(*, with_server: bool = False) -> list[Check]:
     """
     modules = [import_module(f"{__package__}.{name}") for name in _IN_ORDER]
     declared = [each for module in modules for each in vars(module).values()]
-    checks = [each for each in declared if isinstance(each, Check)]
+    checks = [each for each in declared if isinstance(each, Link)]
     return [each for each in checks if with_server or not each.starts_process]
 
 
-def worst(findings: Sequence[Finding]) -> Finding:
+def worst(findings: Sequence[Diagnosis]) -> Diagnosis:
     """Several findings of one check as one; what is well is left out where something is not."""
     verdict = _WORST_FIRST[min(_WORST_FIRST.index(finding.verdict) for finding in findings)]
     shown = [finding for finding in findings if verdict == "ok" or finding.verdict != "ok"]
     fixes = list(dict.fromkeys(finding.fix for finding in shown if finding.fix))
     seen = "; ".join(dict.fromkeys(finding.seen for finding in shown))
-    return Finding(verdict, seen, "; ".join(fixes) or None)
+    return Diagnosis(verdict, seen, "; ".join(fixes) or None)
 
 
 def last_seen_s(view: View) -> float:
@@ -194,7 +194,7 @@ def ago(seconds: float) -> str:
     return f"{max(seconds, 0.0):.1f} s ago"
 
 
-def diagnose(subject: Examined, checks: Sequence[Check] | None = None) -> list[Checked]:
+def diagnose(subject: Examined, checks: Sequence[Link] | None = None) -> list[Checked]:
     """Run the checks, all but those that start a process; what cannot be looked at says why."""
     with ExitStack() as stack:
         try:
@@ -205,7 +205,7 @@ def diagnose(subject: Examined, checks: Sequence[Check] | None = None) -> list[C
         return [Checked(each, _look(each, subject)) for each in checks or all_checks()]
 
 
-def _look(check: Check, subject: Examined) -> Finding:
+def _look(check: Link, subject: Examined) -> Diagnosis:
     """Run one check; one that fails reports that, and the others still run."""
     if check.needs_recording and subject.connection is None:
         return unclear("there is no recording that can be read")

@@ -24,8 +24,8 @@ from webots_mcp.connection import (
 )
 from webots_mcp.contract import CUSTOM_DATA, DATA_DIR_VARIABLE, HEARTBEAT_LATE_S, SCHEMA_VERSION
 from webots_mcp.diagnosis import (
+    Diagnosis,
     Examined,
-    Finding,
     ago,
     check,
     last_seen_s,
@@ -79,7 +79,7 @@ _UNFINISHED: Final = (
 
 
 @check("Python")
-def python(_: Examined) -> Iterator[Finding]:
+def python(_: Examined) -> Iterator[Diagnosis]:
     """The Python that runs this; `Recording now` has that of the controllers."""
     seen = f"{platform.python_version()} at {sys.executable}"
     if sys.version_info[:2] < _OLDEST_PYTHON:
@@ -91,7 +91,7 @@ def python(_: Examined) -> Iterator[Finding]:
 
 
 @check("Packages", well="all that the server needs are installed")
-def packages(_: Examined) -> Iterator[Finding]:
+def packages(_: Examined) -> Iterator[Diagnosis]:
     """What the server and most commands need; a bridge does without."""
     if missing := missing_requirements():
         seen = f"missing: {', '.join(map(package_of, missing))} (a bridge does without)"
@@ -99,12 +99,12 @@ def packages(_: Examined) -> Iterator[Finding]:
 
 
 @check("SQLite")
-def sqlite(_: Examined) -> Iterator[Finding]:
+def sqlite(_: Examined) -> Iterator[Diagnosis]:
     """The SQLite of this Python."""
     yield judge_sqlite(sqlite3.sqlite_version_info)
 
 
-def judge_sqlite(version: tuple[int, ...]) -> Finding:
+def judge_sqlite(version: tuple[int, ...]) -> Diagnosis:
     """Whether a version can be used."""
     seen = ".".join(map(str, version))
     if version < OLDEST_SQLITE:
@@ -120,7 +120,7 @@ def judge_sqlite(version: tuple[int, ...]) -> Finding:
 
 
 @check("Data folder", well=_IN_MEMORY)
-def data_folder(subject: Examined) -> Iterator[Finding]:
+def data_folder(subject: Examined) -> Iterator[Diagnosis]:
     """Whether it is there, and may be written."""
     if subject.file is None:
         return
@@ -155,7 +155,7 @@ class Mount(NamedTuple):
 
 
 @check("File system", well=_IN_MEMORY)
-def file_system(subject: Examined) -> Iterator[Finding]:
+def file_system(subject: Examined) -> Iterator[Diagnosis]:
     """Whether processes can share memory there, which WAL needs."""
     if subject.file is None:
         return
@@ -169,7 +169,7 @@ def file_system(subject: Examined) -> Iterator[Finding]:
     yield judge_file_system(str(subject.file.parent), mounts, is_wsl=is_wsl)
 
 
-def judge_file_system(folder: str, mounts: Iterable[Mount], *, is_wsl: bool) -> Finding:
+def judge_file_system(folder: str, mounts: Iterable[Mount], *, is_wsl: bool) -> Diagnosis:
     """Whether a recording may lie in a folder, on a machine with these file systems."""
     path = folder.replace("\\", "/")
     if path.lower().startswith(_WSL_FROM_WINDOWS):
@@ -191,7 +191,7 @@ def judge_file_system(folder: str, mounts: Iterable[Mount], *, is_wsl: bool) -> 
     return ok(f"{mount.kind or 'of an unnamed kind'} at {mount.point}")
 
 
-def _across_the_border(folder: str, what: str) -> Finding:
+def _across_the_border(folder: str, what: str) -> Diagnosis:
     seen = (
         f"{folder} is {what}: SQLite cannot share memory across that border, so that controllers "
         "and server lock each other out or damage the file"
@@ -199,7 +199,7 @@ def _across_the_border(folder: str, what: str) -> Finding:
     return wrong(seen, f"run both on one side of it, and {_LOCAL}")
 
 
-def _on_the_network(folder: str, what: str) -> Finding:
+def _on_the_network(folder: str, what: str) -> Diagnosis:
     seen = (
         f"{folder} is on {what}: SQLite's log needs memory that processes share, which network "
         "file systems do not have"
@@ -214,7 +214,7 @@ def _is_in(path: str, point: str) -> bool:
 
 
 @check("Free space", well=_IN_MEMORY)
-def free_space(subject: Examined) -> Iterator[Finding]:
+def free_space(subject: Examined) -> Iterator[Diagnosis]:
     """Whether there is room for what will be recorded."""
     if subject.file is None:
         return
@@ -229,7 +229,7 @@ def free_space(subject: Examined) -> Iterator[Finding]:
 
 
 @check("Database", well="in memory")
-def database(subject: Examined) -> Iterator[Finding]:
+def database(subject: Examined) -> Iterator[Diagnosis]:
     """Whether there is one that can be read, and that readers and writers can share."""
     if isinstance(subject.unread, NoDatabaseError):
         seen = f"nothing was recorded at {name_of(subject.recording.database)} yet"
@@ -249,7 +249,7 @@ def database(subject: Examined) -> Iterator[Finding]:
 
 
 @check("Schema", well=f"{SCHEMA_VERSION}")
-def schema(subject: Examined) -> Iterator[Finding]:
+def schema(subject: Examined) -> Iterator[Diagnosis]:
     """Whether the database has the tables of this version."""
     if subject.unread is not None and not _is_about_schema(subject):
         yield unclear("there is no recording that can be read")
@@ -269,7 +269,7 @@ def _is_about_schema(subject: Examined) -> bool:
 
 
 @check("Recording now", needs_recording=True)
-def recording_now(subject: Examined) -> Iterator[Finding]:
+def recording_now(subject: Examined) -> Iterator[Diagnosis]:
     """Who writes, and how old the newest is."""
     if not subject.views:
         yield warning("no robot has been recorded yet", GETTING_STARTED)
@@ -291,7 +291,7 @@ def recording_now(subject: Examined) -> Iterator[Finding]:
 
 
 @check("Rows", needs_recording=True, well="none wait or are dropped")
-def rows(subject: Examined) -> Iterator[Finding]:
+def rows(subject: Examined) -> Iterator[Diagnosis]:
     """What was recorded and is not in the database."""
     waiting_in: list[object] = []
     for view in subject.views:
@@ -318,7 +318,7 @@ def rows(subject: Examined) -> Iterator[Finding]:
             yield from _left_waiting(path)
 
 
-def _left_waiting(path: Path) -> Iterator[Finding]:
+def _left_waiting(path: Path) -> Iterator[Diagnosis]:
     if _is_empty(path):
         yield warning(
             f"{path.name} is empty: a controller could write neither to the database nor there, so "
@@ -354,7 +354,7 @@ class _Unfinished(NamedTuple):
 
 
 @check("Commands", needs_recording=True)
-def commands(subject: Examined) -> Iterator[Finding]:
+def commands(subject: Examined) -> Iterator[Diagnosis]:
     """What waits for a controller, and for how long."""
     unfinished = [_Unfinished(*row) for row in subject.opened.execute(_UNFINISHED)]
     by_robot = {view.robot.id: view for view in subject.views}
@@ -365,7 +365,7 @@ def commands(subject: Examined) -> Iterator[Finding]:
     yield ok(f"{queued} queued, {len(unfinished) - queued} claimed, none overdue")
 
 
-def _pending(command: _Unfinished, view: View) -> Iterator[Finding]:
+def _pending(command: _Unfinished, view: View) -> Iterator[Diagnosis]:
     if command.expires_s >= view.now_s:
         return
     seen = f"{_named(command, view)} waits since {ago(view.now_s - command.created_s)}"
@@ -378,7 +378,7 @@ def _pending(command: _Unfinished, view: View) -> Iterator[Finding]:
         yield wrong(f"{seen}: {why}", "let the simulation continue, see Simulation")
 
 
-def _claimed(command: _Unfinished, view: View) -> Iterator[Finding]:
+def _claimed(command: _Unfinished, view: View) -> Iterator[Diagnosis]:
     session = fetch_session(view.connection, command.session_id or 0)
     at_work_s = view.now_s - command.claimed_s
     if session is None or not session.is_alive(view.now_s):
@@ -395,7 +395,7 @@ def _named(command: _Unfinished, view: View) -> str:
 
 
 @check("get_command", needs_recording=True, well="no controller lives that could be asked")
-def get_command(subject: Examined) -> Iterator[Finding]:
+def get_command(subject: Examined) -> Iterator[Diagnosis]:
     """Whether the loops of the living controllers ask for commands."""
     for view in subject.live:
         if (session := view.session) is None:

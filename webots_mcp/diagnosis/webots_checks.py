@@ -20,7 +20,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
 from webots_mcp.contract import UNSEEN, host_name
-from webots_mcp.diagnosis import Examined, Finding, check, last_seen_s, ok, unclear, warning, wrong
+from webots_mcp.diagnosis import (
+    Diagnosis,
+    Examined,
+    check,
+    last_seen_s,
+    ok,
+    unclear,
+    warning,
+    wrong,
+)
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.pauses import PAUSED, SEEN_PAUSED, SEEN_RUNNING
 from webots_mcp.setup.client_entries import (
@@ -59,7 +68,7 @@ _OBEYS: Final = "{}; or webots_simulation_control('{}'): this Webots obeys it by
 
 
 @check("Simulation", needs_recording=True, well="no robot has been recorded yet")
-def simulation(subject: Examined) -> Iterator[Finding]:
+def simulation(subject: Examined) -> Iterator[Diagnosis]:
     """Whether time moves, and why it does not.
 
     Of the robots that stand silent in the same simulation one is watched for them all.
@@ -80,7 +89,7 @@ def _is_unclear(view: View) -> bool:
     return (view.status.why or "").startswith((SILENT, WAITING_IN_STEP, SEEN_RUNNING))
 
 
-def _judged(view: View) -> Finding:
+def _judged(view: View) -> Diagnosis:
     name, status = view.robot.name, view.status
     seen = f"{name}: {status.text}{f' ({status.why})' if status.why else ''}"
     if view.session is None or not view.robot.live:
@@ -92,7 +101,7 @@ def _judged(view: View) -> Finding:
         return ok(seen)
     hangs = _MEND_LINE if "silent for " in (status.why or "") else None
     if status.is_moving:
-        return Finding("warning" if status.why else "ok", seen, hangs)
+        return Diagnosis("warning" if status.why else "ok", seen, hangs)
     if status.text == PAUSED:
         return warning(seen, f"webots-mcp resume --robot {name}")
     if (status.why or "").startswith(SEEN_PAUSED):
@@ -100,7 +109,7 @@ def _judged(view: View) -> Finding:
     return wrong(seen, hangs or _SEE_PAGE)
 
 
-def _narrowed(subject: Examined, view: View) -> Finding:
+def _narrowed(subject: Examined, view: View) -> Diagnosis:
     """Of the reasons that look alike from inside, the one that shows from outside."""
     session = view.session
     assert session is not None
@@ -204,7 +213,7 @@ def _missing_externs(view: View, session: Session, webots: Instance | None) -> s
 
 
 @check("Webots")
-def installed(_: Examined) -> Iterator[Finding]:
+def installed(_: Examined) -> Iterator[Diagnosis]:
     """Which Webots there are."""
     try:
         find_webots()
@@ -224,7 +233,7 @@ def installed(_: Examined) -> Iterator[Finding]:
 
 
 @check("Running Webots", well="no Webots runs on this machine")
-def running(subject: Examined) -> Iterator[Finding]:
+def running(subject: Examined) -> Iterator[Diagnosis]:
     """Which of them run, and whether they can be steered from outside."""
     for each in subject.running_webots:
         world = f", {each.world.name}" if each.world else ""
@@ -240,7 +249,7 @@ def running(subject: Examined) -> Iterator[Finding]:
 
 
 @check("Clients")
-def clients(subject: Examined) -> Iterator[Finding]:
+def clients(subject: Examined) -> Iterator[Diagnosis]:
     """Each file that is there, and whether its server can start on this recording."""
     known = [*clients_of(subject.project), claude_desktop()]
     findings = [each for client in known for each in _servers_of(subject, client)]
@@ -251,7 +260,7 @@ def clients(subject: Examined) -> Iterator[Finding]:
         yield warning(seen, f"{_INIT}; other clients have files of their own")
 
 
-def _servers_of(subject: Examined, client: Client) -> Iterator[Finding]:
+def _servers_of(subject: Examined, client: Client) -> Iterator[Diagnosis]:
     """What a file says of our server: nothing where it names only others."""
     if not client.file.exists():
         return
@@ -268,7 +277,7 @@ def _servers_of(subject: Examined, client: Client) -> Iterator[Finding]:
             yield _entry(subject, f"{client.name}, server {name!r}", entry)
 
 
-def _entry(subject: Examined, name: str, entry: dict[str, Any]) -> Finding:
+def _entry(subject: Examined, name: str, entry: dict[str, Any]) -> Diagnosis:
     command, *arguments = words_of(entry)
     if shutil.which(command) is None:
         return wrong(f"{name}: there is no program {command!r}", _INIT)
@@ -302,7 +311,7 @@ _FIX: Final = (
 
 
 @check("Server", starts_process=True)
-def server(subject: Examined) -> Iterator[Finding]:
+def server(subject: Examined) -> Iterator[Diagnosis]:
     """Whether a server starts, names its tools and answers."""
     if subject.file is None:
         yield unclear("a recording in memory belongs to one process")

@@ -23,7 +23,7 @@ from webots_mcp.plotting.canvas import (
 from webots_mcp.plotting.intervals import Interval, Lane
 from webots_mcp.store.detection.events import Events, Found, drawn_kinds, find_events
 from webots_mcp.store.detection.kinds import Event, EventOptions, Verdicts
-from webots_mcp.store.detection.motion import find_motion
+from webots_mcp.store.detection.search import find_motion
 from webots_mcp.store.parameters import differing, parameters_of
 from webots_mcp.store.questions.series import MOST_POINTS, History, RunHistory, query_history
 from webots_mcp.store.reading.catalogue import one_signal, signals_of

@@ -57,7 +57,7 @@ from webots_mcp.plotting.signals import line_through
 from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.detection.events import Found
 from webots_mcp.store.detection.kinds import EventOptions
-from webots_mcp.store.detection.motion import motion_in
+from webots_mcp.store.detection.search import motion_in
 from webots_mcp.store.reading.catalogue import one_signal
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import TimeRange

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import Field
 
-from webots_mcp.conditions.expectation import Expectation, read_expectation
+from webots_mcp.conditions.compiler import Expectation, read_expectation
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.answers import CheckAnswer, ComparisonAnswer, RunsAnswer, Table
 from webots_mcp.questions.budget import (
@@ -467,7 +467,10 @@ def webots_check_run(
     recording: Recording,
     expect: Annotated[
         list[Annotated[str, Field(max_length=1100)]] | None,
-        Field(max_length=20, description="What shall hold: front_m > 0.1 during mode == 'drive'."),
+        Field(
+            max_length=20,
+            description="front_m > 0.1 during mode == 'drive'; goal_m < 0.1 within 20.",
+        ),
     ] = None,
     robot: RobotName = None,
     run_id: RunId = None,

@@ -425,21 +425,15 @@ _Place = Annotated[int, Field(ge=0), AfterValidator(_as_id)]
 Seconds = Annotated[float, AfterValidator(_as_seconds)]
 _Duration = Annotated[float, Field(gt=0), AfterValidator(_as_seconds)]
 RobotName = Annotated[
-    Annotated[str, Field(max_length=LONGEST_NAME)] | None,
-    Field(description="If several."),
+    Annotated[str, Field(max_length=LONGEST_NAME)] | None, Field(description="If several.")
 ]
 RunId = Annotated[Id | None, Field(description="Else the current run.")]
 TrialSetId = Annotated[Id | None, Field(description="From webots_run_trials.")]
-LastS = Annotated[
-    _Duration | None,
-    Field(description="The last simulated seconds."),
-]
+LastS = Annotated[_Duration | None, Field(description="The last simulated seconds.")]
 StartS = Annotated[Seconds | None, Field(description="From this simulation time.")]
 EndS = Annotated[Seconds | None, Field(description="Before this simulation time.")]
 WaitS = Annotated[
-    float,
-    Field(ge=0.1, json_schema_extra={"maximum": MAX_WAIT_S}),
-    AfterValidator(_as_wait),
+    float, Field(ge=0.1, json_schema_extra={"maximum": MAX_WAIT_S}), AfterValidator(_as_wait)
 ]
 TimeoutS = Annotated[WaitS, Field(description="At most.")]
 _CURSOR: Final = "From the last answer."
@@ -457,38 +451,23 @@ Names = Annotated[
         description="Their names; 'pose' is all below it, '*' any text.",
     ),
 ]
-AnyNames = Annotated[
-    list[str] | None,
-    Field(max_length=50, description="'*' is any text."),
-]
+AnyNames = Annotated[list[str] | None, Field(max_length=50, description="'*' is any text.")]
 # Of a parameter. A whole number is a number as well, and stays one. What it may be is the
 # parameter's to say, and would take as much room as all else.
 Value = Annotated[float | int | bool | str, WithJsonSchema({})]
 MaxPoints = Annotated[
-    int | None,
-    Field(
-        ge=1,
-        le=500,
-        description="The most buckets, or rows with raw.",
-    ),
+    int | None, Field(ge=1, le=500, description="The most buckets, or rows with raw.")
 ]
-ShownLimit = Annotated[
-    int | None,
-    Field(ge=1, le=500, description="Most shown."),
-]
+ShownLimit = Annotated[int | None, Field(ge=1, le=500, description="Most shown.")]
 LogLevel = Annotated[contract.LogLevel, Field(description="Of log lines: from this level.")]
 Limit = Annotated[int, Field(ge=1, le=500, description="Most shown.")]
-RunIds = Annotated[
-    list[Id] | None,
-    Field(max_length=10, description="From webots_list_runs."),
-]
+RunIds = Annotated[list[Id] | None, Field(max_length=10, description="From webots_list_runs.")]
 Position = Annotated[
     list[str] | None,
     Field(min_length=2, max_length=2, description="Signals of x and y, if not found."),
 ]
 Mode = Annotated[
-    str | None,
-    Field(max_length=LONGEST_NAME, description="Signal of the mode, if not found."),
+    str | None, Field(max_length=LONGEST_NAME, description="Signal of the mode, if not found.")
 ]
 # What a client gives for a `Scope`, which tools take whole.
 SCOPE: Final = {

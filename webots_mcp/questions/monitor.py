@@ -28,7 +28,7 @@ from webots_mcp.questions.events import fitting_events, not_shown_of, verdicts_o
 from webots_mcp.questions.history import MOST_SIGNALS, trend_tables
 from webots_mcp.store.detection.events import asked_kinds, search_events
 from webots_mcp.store.detection.kinds import Event, EventOptions, Verdicts
-from webots_mcp.store.detection.motion import doubt_of_length, doubt_of_unit, motion_in
+from webots_mcp.store.detection.search import doubt_of_length, doubt_of_unit, motion_in
 from webots_mcp.store.questions.runs import Way, way_in
 from webots_mcp.store.questions.trends import RunTrends, trends
 from webots_mcp.store.reading.catalogue import known_signals

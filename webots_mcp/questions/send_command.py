@@ -241,8 +241,7 @@ _LONGEST_TEXT: Final = 200
 async def webots_send_command(
     recording: Recording,
     action: Annotated[
-        str,
-        Field(min_length=1, max_length=200, description="As in webots_list_commands."),
+        str, Field(min_length=1, max_length=200, description="As in webots_list_commands.")
     ],
     caller: Caller,
     params: Annotated[dict[str, Any] | None, Field(description="As its docstring says.")] = None,
@@ -408,8 +407,7 @@ def _none(view: View) -> str:
 def webots_get_parameters(
     recording: Recording,
     names: Annotated[
-        list[str] | None,
-        Field(max_length=50, description="Of parameters; '*' is any text."),
+        list[str] | None, Field(max_length=50, description="Of parameters; '*' is any text.")
     ] = None,
     robot: RobotName = None,
     run_id: RunId = None,

@@ -14,8 +14,8 @@ from typing import Final
 
 from controller.session import Inbox, Message, pack
 
+from webots_mcp.standin.controller_answers import Seat
 from webots_mcp.standin.controller_path import LIBRARY
-from webots_mcp.standin.driver import Seat
 from webots_mcp.standin.simulator import Robot, Simulator
 from webots_mcp.standin.vrml import StandInError
 

@@ -12,8 +12,7 @@ from controller.robot import Robot, Supervisor
 from controller.session import Message
 
 from webots_mcp.contract import bundled
-from webots_mcp.standin.controller_answers import description
-from webots_mcp.standin.driver import Driver, Seat
+from webots_mcp.standin.controller_answers import Driver, Seat, description
 from webots_mcp.standin.simulator import Mode
 from webots_mcp.standin.simulator import Robot as SimulatedRobot
 from webots_mcp.standin.vrml import ControllerEndedError, StandInError, WorldError, WouldBlockError

@@ -22,9 +22,8 @@ from typing import Final, TypeVar, cast
 
 from controller.session import ADDRESS_FILE, Message
 
-from webots_mcp.standin.controller_answers import description
+from webots_mcp.standin.controller_answers import Driver, Seat, description
 from webots_mcp.standin.controllers import Connection, Controller, Launch
-from webots_mcp.standin.driver import Driver, Seat
 from webots_mcp.standin.simulator import Mode
 from webots_mcp.standin.vrml import StandInError
 

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 from webots_mcp.standin.geometry import Frame, frame_of
-from webots_mcp.standin.protos import Protos
 from webots_mcp.standin.vrml import (
     NODE_TYPES,
     Node,
     Parser,
+    Protos,
     WorldError,
     children_of,
     descendants_of,

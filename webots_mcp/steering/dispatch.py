@@ -568,11 +568,7 @@ def _what_happened(view: View, command: Command, progress: Progress) -> dict[str
 
 def _as_shown(state: State) -> dict[str, Any]:
     short = shorten(state.value(), _STATE_TOKENS)
-    return {
-        "state": short.value,
-        "state_at_s": seconds(state.sim_time_s),
-        "shortened": short.rule,
-    }
+    return {"state": short.value, "state_at_s": seconds(state.sim_time_s), "shortened": short.rule}
 
 
 def _in_between(view: View, command: Command, asked: TimeRange) -> dict[str, Any]:

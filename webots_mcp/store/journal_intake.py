@@ -254,8 +254,8 @@ class _Reading:
         def act() -> None:
             if connection.execute(_KNOWN, (self.uuid,)).fetchone() is None:
                 liveness.reap(connection, time.time())
-                robot = {"name": liveness.free_name(connection, name, _lives)}
-                robot |= {"kind": "Robot", "devices": "{}"}
+                free = liveness.free_name(connection, name, lambda it: it.kind == CUSTOM_DATA)
+                robot = {"name": free, "kind": "Robot", "devices": "{}"}
                 now_s = session["started_wall_time_s"]
                 robot_id = waiting_file.enter_robot(connection, robot, now_s)
                 waiting_file.enter_session(connection, robot_id, session)
@@ -292,7 +292,8 @@ class _Reading:
             last, run = entry, entry.run or ""
             sim_time_s, wall_time_s, *_ = entry.values
             _, _, rows = runs.get(run, (0.0, 0.0, 0))
-            runs[run] = sim_time_s, wall_time_s, rows + (entry.kind == "state")
+            seen_s = min(wall_time_s, time.time())  # what is dated later than now was seen now
+            runs[run] = sim_time_s, seen_s, rows + (entry.kind == "state")
             if state is not None:
                 looks.names.look(state, entry.values[2], partial(self._enter_names, robot_id))
             for name, before, after in changed:
@@ -320,11 +321,6 @@ class _Reading:
         (run_id,) = self.connection.execute(_RUN_ID, (entry.run,)).fetchone()
         values = (run_id, *cast("tuple[Any, ...]", entry.values)[:2], kind, name, data)
         self.connection.execute(STATEMENTS["event"], values)
-
-
-def _lives(session: liveness.OpenSession) -> bool:
-    """Whether a session keeps its name; an observer's, of `customData`, makes way."""
-    return session.kind != CUSTOM_DATA and liveness.is_living(*session[1:5], time.time())
 
 
 def _described(header: Mapping[str, Any], uuid: str) -> tuple[str, dict[str, Any]]:
@@ -358,8 +354,8 @@ def _described(header: Mapping[str, Any], uuid: str) -> tuple[str, dict[str, Any
         "versions": json.dumps({"journal": str(FORMAT)} | _object(session.get("versions"))),
         "supervisor": 0,
         "actions": "{}",
-        "started_wall_time_s": started_s,
-        "last_seen_wall_time_s": started_s,
+        "started_wall_time_s": min(started_s, time.time()),
+        "last_seen_wall_time_s": min(started_s, time.time()),
         "throttle_interval": session.get("throttle_interval"),
     }
 

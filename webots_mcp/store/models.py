@@ -258,8 +258,7 @@ class Chunk(SQLModel, table=True):
     codec: str = _text("how numbers are compressed", nullable=False)
     numbers: bytes | None = _column(LargeBinary, "CRC-32, then the numbers compressed")
     codes: bytes | None = _column(
-        LargeBinary,
-        "zlib: for each row 0 a number, 1 no such key, else 2 + the place of its label",
+        LargeBinary, "zlib: for each row 0 a number, 1 no such key, else 2 + the place of its label"
     )
     labels: str | None = _text("JSON array; an item that is an array says what was replaced")
 
@@ -535,9 +534,7 @@ class RetentionLimit(SQLModel, table=True):
     __tablename__: ClassVar[Any] = "retention_limit"
     kind: str = Field(
         sa_column=Column(
-            Text,
-            primary_key=True,
-            comment="state, kept_state, chunk, log, event, image or run",
+            Text, primary_key=True, comment="state, kept_state, chunk, log, event, image or run"
         )
     )
     size_bytes: int | None = _column(BigInteger, "on the disk; of pictures their files")

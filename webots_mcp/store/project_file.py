@@ -20,7 +20,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
-from webots_mcp.conditions.expectation import Expectation, parse_expectation
+from webots_mcp.conditions.compiler import Expectation, parse_expectation
 from webots_mcp.connection import transaction
 from webots_mcp.contract import MAX_BREAKPOINTS, PROJECT_FILE, find_project
 from webots_mcp.errors import InvalidInputError, warn

@@ -173,10 +173,7 @@ def prune(
 
 
 def purge(
-    connection: sqlite3.Connection,
-    wanted: Plan,
-    data_dir: Path,
-    spare_pages: int = 0,
+    connection: sqlite3.Connection, wanted: Plan, data_dir: Path, spare_pages: int = 0
 ) -> Iterator[Purged]:
     """Carry out a plan, write by write; the caller rests wherever this yields.
 

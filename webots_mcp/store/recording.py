@@ -332,8 +332,15 @@ def view_of(
 
 def _of_earlier_run(run: Run, now_s: float) -> Status:
     ended_s = run.ended_wall_time_s or run.last_wall_time_s
-    why = f"this is an earlier run; it ended by {run.end_reason or 'an unknown cause'}"
-    return Status(stopped_for(now_s - ended_s), why)
+    how = _ENDED.get(f"{run.end_reason}", f"it ended by {run.end_reason or 'an unknown cause'}")
+    return Status(stopped_for(now_s - ended_s), f"this is an earlier run; {how}")
+
+
+_ENDED: Final = {
+    "crashed": "its controller crashed or was killed",
+    "finished": "its controller finished",
+    "superseded": "another bridge took its robot over",
+}
 
 
 def storage(connection: sqlite3.Connection) -> dict[str, Any]:

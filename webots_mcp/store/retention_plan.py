@@ -329,9 +329,7 @@ class Plan:
 
 
 def plan(
-    connection: sqlite3.Connection,
-    retention: Retention = DEFAULT,
-    now_s: float | None = None,
+    connection: sqlite3.Connection, retention: Retention = DEFAULT, now_s: float | None = None
 ) -> Plan:
     """Find what is beyond the limits; nothing is changed.
 

@@ -464,6 +464,8 @@ def _moved_wall_time_s(
     row = newest_state(connection, run.id) if run and run.session_id == session.id else None
     if row is None or row.sim_time_s <= (session.sim_time_s or 0.0):
         return session.moved_wall_time_s
+    if not session.has_bridge:  # its clock may be another's: what it says is seen when it is read
+        return min(row.wall_time_s, session.last_seen_wall_time_s)
     return max(row.wall_time_s, session.moved_wall_time_s or row.wall_time_s)
 
 

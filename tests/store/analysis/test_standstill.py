@@ -71,6 +71,16 @@ def test_who_creeps_stands_once_and_only_while_it_rests(
     assert told_s == pytest.approx(ends_s, abs=10)
 
 
+def test_who_creeps_for_an_hour_stands_where_it_rests_and_is_not_searched_beyond_its_time() -> None:
+    creeps, short = (1800.0, 0.01, 0.0), (8.0, 0.0, 0.0)
+    track, _ = noisy_track([creeps, RESTS, creeps, short, creeps], 0.1, 0.004)
+    found = [track.times[each.start] for each in find_standstills(track, RADIUS_M, LEAST_S)]
+    assert found == pytest.approx([1800, 3640], abs=5)
+    looks = iter(range(10_000))
+    found = find_standstills(track, RADIUS_M, LEAST_S, lambda: next(looks) > 50)
+    assert len(found) < 2 and next(looks) < 1000  # each stay may be looked at once more
+
+
 @pytest.mark.parametrize("noise_m", [0.0, 0.001])
 @pytest.mark.parametrize("twitches_m", [[0.005, 0.025], [0.012] * 3, [0.004] * 8])
 def test_who_twitches_in_a_place_stands_once(twitches_m: list[float], noise_m: float) -> None:

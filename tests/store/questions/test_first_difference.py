@@ -162,13 +162,13 @@ def test_a_row_without_a_partner_is_counted_and_compared_with_no_other(
     found = compare_rows(empty, [1, 2])
     assert (found.rows, found.parted) == (ROWS - 2, ())
     assert found.is_equal is None, "the rows that are missing may have been others"
-    assert found.notes[0].startswith("2 rows of run 1, the first at 0.112 s, have no partner")
+    assert found.notes[0].startswith("without a partner at the same simulation time")
     assert found.verdict.endswith("signals that were compared, until 8.000 s; not all was compared")
     throttled = compare_rows(empty, [3, 2])
     assert (throttled.rows, throttled.parted) == (99, ()), "one of a hundred is missing in run 2"
-    assert [each.partition(" s, have")[0] for each in throttled.notes[:2]] == [
-        "1 rows of run 3, the first at 0.112",
-        "395 rows of run 2, the first at 0.048",
+    assert [each.rpartition(": ")[2] for each in throttled.notes[:2]] == [
+        "1 row of run 3, the first at 0.112 s",
+        "395 rows of run 2, the first at 0.048 s",
     ]
 
 
@@ -305,7 +305,7 @@ def test_rows_at_one_time_are_compared_in_their_order(empty: sqlite3.Connection)
     found = compare_rows(empty, [1, 2])
     (only,) = found.parted
     assert (only.from_s, only.values, only.row_count) == (at(20), (2.0, 12.0), 1)
-    assert found.notes[0].startswith("1 rows of run 2, the first at 0.336 s, have no partner")
+    assert found.notes[0].startswith("without a partner at the same simulation time")
 
 
 def test_what_matters_is_a_millimetre_a_thousandth_of_a_radian_or_of_the_value(
@@ -347,7 +347,7 @@ def test_repeats_are_judged_against_the_first_and_so_are_trials(empty: sqlite3.C
     found = compare_repeats(empty, [1, 2, 3])
     assert [each.is_equal for each in found] == [True, False]
     assert verdict_on(found).startswith(
-        "1 of 2 others part from run 1; run 3: equal to the last dig"
+        "run 1 and 1 of 2 others part; run 3: equal to the last dig"
     )
 
     def noted(*run_ids: int) -> list[str]:
@@ -359,7 +359,7 @@ def test_repeats_are_judged_against_the_first_and_so_are_trials(empty: sqlite3.C
     (same,) = noted(1, 2)
     assert same.startswith("repeats of speed 1.0: 2 runs: equal to the last digit in the 500 rows")
     (parted,) = noted(1, 2, 3)
-    assert parted.startswith("repeats of speed 1.0: 1 of 2 others part from run 1; run 3: ")
+    assert parted.startswith("repeats of speed 1.0: run 1 and 1 of 2 others part; run 3: ")
     assert noted(1) == [] == repeats_noted(empty, create_trial_set(empty, "{}", [{}]))
 
 

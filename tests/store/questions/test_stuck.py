@@ -13,10 +13,9 @@ from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from tests.store.questions.asking import ask, spans
 from webots_mcp.store.detection.events import find_events
 from webots_mcp.store.detection.kinds import Event, EventOptions
-from webots_mcp.store.detection.motion import ModeUses, RunNoise, find_motion
+from webots_mcp.store.detection.search import ModeUses, RunNoise, Search
 from webots_mcp.store.detection.standstill import judge_standstills
 from webots_mcp.store.reading.catalogue import known_signals
-from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.reading.segment import Deadline
 
@@ -94,11 +93,12 @@ def test_a_mode_that_was_not_looked_at_in_time_is_not_said_to_be_one_in_which_it
 ) -> None:
     publish_stuck(empty, mode=("go", "go"))
     asked = find_range(empty, Scope(run_id=1))
-    motion = find_motion(known_signals(empty, asked), EventOptions())
-    frame = read_frame(empty, asked.segments[0], Deadline(math.inf))
-    uses = ModeUses(empty, frame, motion, EventOptions(), Deadline(0.0))
+    known, options, unhurried = known_signals(empty, asked), EventOptions(), Deadline(math.inf)
+    search = Search(empty, asked.segments[0], known, (), options, unhurried)
+    frame, motion = search.frame, search.motion
+    uses = ModeUses(empty, frame, motion, options, Deadline(0.0))
     noise, rows = RunNoise(frame, motion), (0, len(frame))
-    standstill, _ = judge_standstills(frame, motion, EventOptions(), uses, noise, rows).events
+    standstill, _ = judge_standstills(frame, search, uses, noise, rows).events
     why = standstill.details["why_not_stuck"]
     assert why == "not checked whether it moves in mode go: time limit reached"
 

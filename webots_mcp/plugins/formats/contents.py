@@ -18,7 +18,7 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.naming import FARTHEST_M, metres_in
 from webots_mcp.requirements import install_line
 from webots_mcp.store.detection.kinds import EventOptions
-from webots_mcp.store.detection.motion import Motion, find_motion
+from webots_mcp.store.detection.search import Motion, find_motion
 from webots_mcp.store.export import (
     CHUNK_ROWS,
     Column,

@@ -237,7 +237,7 @@ class ParquetPool:
             with suppress(PoolUnavailableError):  # it runs out by itself
                 lease.give_back()
 
-    def listed(self, name: str) -> Iterator[tuple[str, Sequence[Any]]]:
+    def rows_of(self, name: str) -> Iterator[tuple[str, Sequence[Any]]]:
         """The columns `LISTED` of all rows of such a table, behind their recording's UUID."""
         if self._all is None:
             folders = [each for each in self._storage.names() if each.startswith("recording=")]

@@ -92,20 +92,20 @@ def _as_data(found: Fetched) -> dict[str, Any]:
 
 
 def _print_fetched(found: Fetched, address: str) -> None:
-    def listed(uuids: Iterable[str]) -> str | None:
+    def ids(uuids: Iterable[str]) -> str | None:
         return id_ranges([found.runs[uuid] for uuid in uuids])
 
     print(f"fetched from {address}: run {id_ranges(found.come) or 'none'}")
     if found.known:
-        print(f"here already: run {listed(found.known)}")
+        print(f"here already: run {ids(found.known)}")
     if found.only_chunks:
         print(
-            f"of run {listed(found.only_chunks)} only chunks were shipped, no rows "
+            f"of run {ids(found.only_chunks)} only chunks were shipped, no rows "
             "('webots-mcp ship --full' does)"
         )
     if found.unchunked:
         print(
-            f"of run {listed(found.unchunked)} not all rows are in chunks: retention had deleted "
+            f"of run {ids(found.unchunked)} not all rows are in chunks: retention had deleted "
             "those, or the recording could not be written where it was shipped ('webots-mcp ship "
             "--full' ships rows that are still there)"
         )

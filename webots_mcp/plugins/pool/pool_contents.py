@@ -130,9 +130,9 @@ class PooledRobot:
 
 def pooled_runs(pool: Pool) -> list[PooledRun]:
     """All runs, by when they began."""
-    robots = {(owner, robot_id): name for owner, (robot_id, name) in pool.listed("robot")}
+    robots = {(owner, robot_id): name for owner, (robot_id, name) in pool.rows_of("robot")}
     found: list[PooledRun] = []
-    for owner, (run_id, robot_id, uuid, *others) in pool.listed("run"):
+    for owner, (run_id, robot_id, uuid, *others) in pool.rows_of("run"):
         named = dict(zip(LISTED["run"][3:], others, strict=True))
         robot = robots.get((owner, robot_id), "")
         found.append(PooledRun(owner, run_id, uuid or "", robot, **named))
@@ -142,10 +142,10 @@ def pooled_runs(pool: Pool) -> list[PooledRun]:
 def pooled_trial_sets(pool: Pool) -> list[PooledTrialSet]:
     """All trial sets, by when they were made."""
     trials = defaultdict[tuple[str, int], list[int | None]](list)
-    for owner, (_, set_id, run_id) in pool.listed("trial"):
+    for owner, (_, set_id, run_id) in pool.rows_of("trial"):
         trials[owner, set_id].append(run_id)
     found: list[PooledTrialSet] = []
-    for owner, (set_id, uuid, created_s) in pool.listed("trial_set"):
+    for owner, (set_id, uuid, created_s) in pool.rows_of("trial_set"):
         own = trials[owner, set_id]
         runs = tuple((owner, run_id) for run_id in own if run_id is not None)
         found.append(PooledTrialSet(owner, set_id, uuid, created_s, len(own), runs))

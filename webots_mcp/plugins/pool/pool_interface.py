@@ -311,7 +311,7 @@ class Pool(Protocol):
         """
         ...
 
-    def listed(self, name: str) -> Iterator[tuple[str, Sequence[Any]]]:
+    def rows_of(self, name: str) -> Iterator[tuple[str, Sequence[Any]]]:
         """The columns `LISTED` of all rows of such a table, behind their recording's UUID."""
         ...
 

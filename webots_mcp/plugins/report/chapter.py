@@ -200,9 +200,7 @@ def chapter_of(
         unsearched=[f"{kinds}: {why}" for kinds, why in found.verdicts.gaps.items()],
         mode=mode.name if mode else "",
         held=_held(mode) if mode else (),
-        moments=[
-            each for each in moments if room.fit("moments", each.lines) or not each.lines.rows
-        ],
+        moments=[e for e in moments if room.fit("moments", e.lines) or not e.lines.rows],
         checks=checks,
         parameters=parameters,
         events=room.fit("events", _events(connection, found)),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from itertools import pairwise
 from typing import Final, NamedTuple
@@ -43,13 +43,16 @@ class Standstill(NamedTuple):
     y_m: float
 
 
-def find_standstills(track: Track, radius_m: float, least_s: float) -> list[Standstill]:
+def find_standstills(
+    track: Track, radius_m: float, least_s: float, is_over: Callable[[], bool] = lambda: False
+) -> list[Standstill]:
     """Stretches of at least `least_s` in which the position stayed within a radius.
 
     The radius is widened to five times what is left of the noise. A steady motion that is so slow
     that it stays within the radius for long is none (see `creep`); of a stretch in which there is
     one the part counts in which the robot rested. Who twitches within the radius rests in between.
-    The ends are where a ramp that ends in rest fits the rows best (least squares).
+    The ends are where a ramp that ends in rest fits the rows best (least squares). Once there is
+    no time any more (`is_over`), rests are no longer looked for in slow motion, and lack.
     """
     if len(track.times) < 2:
         return []
@@ -59,7 +62,7 @@ def find_standstills(track: Track, radius_m: float, least_s: float) -> list[Stan
     if not len(stays):
         return []
     rows = Rows(track)
-    firsts, lasts = _resting(track, rows, grid, stays, radius_m)
+    firsts, lasts = _resting(track, rows, grid, stays, radius_m, is_over)
     starts = _begins_of_rest(track, firsts, lasts, grid.rows)
     newest = len(track.times) - 1
     ends = newest - _begins_of_rest(track.reversed, newest - lasts, newest - firsts, grid.rows)
@@ -131,7 +134,12 @@ def _stays(grid: _Grid, radius_m: float) -> Iterator[tuple[int, int]]:
 
 
 def _resting(
-    track: Track, rows: Rows, grid: _Grid, stays: Indexes, radius_m: float
+    track: Track,
+    rows: Rows,
+    grid: _Grid,
+    stays: Indexes,
+    radius_m: float,
+    is_over: Callable[[], bool],
 ) -> tuple[Indexes, Indexes]:
     """About the first and the last row of the rest in each stay in which it does not only creep.
 
@@ -149,10 +157,12 @@ def _resting(
     newest, slack = len(track.times) - 1, track.smoothed_rows // 2 + grid.rows
     firsts[(stays[:, 0] == 0) & (firsts <= slack)] = 0
     lasts[(stays[:, 1] == len(grid.times)) & (lasts >= newest - slack)] = newest
-    creeps = is_creep(rows, firsts, lasts + 1, radius_m)
+    creeps = is_creep(rows, firsts, lasts + 1, radius_m, is_over)
     edges = np.searchsorted(track.times, np.append(grid.times, np.inf)[stays])
     touching = np.append(edges[1:, 0] == edges[:-1, 1], False)
     for at in np.flatnonzero(creeps).tolist():
+        if is_over():
+            break
         # With those right before and after it: between them it can only have crept.
         start, end = (
             edges[at - 1 if at and touching[at - 1] else at, 0],
@@ -363,7 +373,9 @@ class _Lines(NamedTuple):
     lasts_s: Array
 
 
-def is_creep(rows: Rows, starts: Indexes, ends: Indexes, radius_m: float) -> Flags:
+def is_creep(
+    rows: Rows, starts: Indexes, ends: Indexes, radius_m: float, is_over: Callable[[], bool]
+) -> Flags:
     """Whether stretches within a place are of a motion, be it that it only shows around them."""
     own, lengths = _lines_through(rows, starts, ends), ends - starts
     creeps = np.zeros(len(starts), np.bool_)
@@ -378,7 +390,7 @@ def is_creep(rows: Rows, starts: Indexes, ends: Indexes, radius_m: float) -> Fla
         leaves = line.speed_m_s * line.lasts_s > radius_m
         for at in np.flatnonzero(moves & ~creeps).tolist():
             place = int(from_row[at]), int(to_row[at])
-            creeps[at] = bool(leaves[at]) or not _only_twitches(rows, *place)
+            creeps[at] = bool(leaves[at]) or is_over() or not _only_twitches(rows, *place)
     return creeps
 
 
@@ -453,17 +465,18 @@ def _fine_places(rows: Rows, start: int, end: int, parts: int) -> tuple[Array, f
 def _best_rest(places: Array, least_m2: float) -> tuple[int, int, float]:
     """From and to which of the places it rests, and how many squares that explains."""
     firsts, lasts, bases = _rests_among(len(places))
-    explained = (np.einsum("knp,nc->kpc", bases, places) ** 2).sum(axis=(1, 2))
+    explained: Array = np.sum((bases @ places) ** 2, axis=1)
+    explained = np.add.reduceat(explained, np.arange(0, len(explained), 3))
     explained -= least_m2 * ((firsts > 0) + 1.0 * (lasts < len(places)))
     best = int(np.argmax(explained))
     return int(firsts[best]), int(lasts[best]), float(explained[best])
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=32)
 def _rests_among(count: int) -> tuple[Indexes, Indexes, Array]:
     """From and to which of so many places a robot may rest, and what each motion can explain.
 
-    A rest with one ramp may end at every place. The bases are orthonormal.
+    A rest with one ramp may end at every place. The bases are orthonormal, three rows for each.
     """
     inner = np.arange(1, count)
     borders = np.unique(np.linspace(0, count, _BORDERS).astype(np.intp))
@@ -476,8 +489,8 @@ def _rests_among(count: int) -> tuple[Indexes, Indexes, Array]:
     left, sizes, _ = np.linalg.svd(
         np.stack((np.ones_like(ramps[0]), *ramps), axis=-1), full_matrices=False
     )
-    bases = left * (sizes > 1e-9 * sizes[:, :1])[:, None, :]
-    return firsts, lasts, bases
+    bases: Array = left * (sizes > 1e-9 * sizes[:, :1])[:, None, :]
+    return firsts, lasts, np.ascontiguousarray(np.concatenate(np.swapaxes(bases, 1, 2)))
 
 
 def _only_twitches(rows: Rows, start: int, end: int) -> bool:

@@ -689,9 +689,7 @@ def _grouped(outcomes: Sequence[Outcome]) -> list[Ranked]:
 
 def _ranked(group: Sequence[Outcome]) -> Ranked:
     scores = [each.score for each in group if each.score is not None]
-    failures = [
-        each.failure or "no score" for each in group if each.score is None and not each.pruned
-    ]
+    failures = [e.failure or "no score" for e in group if e.score is None and not e.pruned]
     pruned = sum(each.pruned for each in group)
     score = Score(statistics.fmean(scores), min(scores), max(scores)) if scores else None
     return Ranked(group[0].parameters, score, scores, failures, pruned)
@@ -706,9 +704,7 @@ def _place(ranked: Ranked, best: Best) -> tuple[bool, bool, float]:
 
 def _noise(sets: Sequence[Ranked]) -> Noise:
     freedom = sum(len(each.scores) - 1 for each in sets if each.scores)
-    squares = sum(
-        statistics.pvariance(each.scores) * len(each.scores) for each in sets if each.scores
-    )
+    squares = sum(statistics.pvariance(e.scores) * len(e.scores) for e in sets if e.scores)
     return Noise(math.sqrt(squares / freedom) if freedom else 0.0, freedom)
 
 

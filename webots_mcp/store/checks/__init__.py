@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 import sqlite3
-from collections.abc import Sequence
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Final
+from typing import Any, Final
 
-from webots_mcp.conditions.expectation import Expectation
-from webots_mcp.errors import UnknownSignalError
-from webots_mcp.store.checks import of_motion, of_run, of_sensors
+from webots_mcp.conditions.compiler import Expectation
+from webots_mcp.errors import ConditionFailedError, UnknownSignalError
+from webots_mcp.naming import counted
+from webots_mcp.store.analysis.arrays import np
+from webots_mcp.store.checks import of_motion, of_sensors
 from webots_mcp.store.checks.finding import (
     WORST_FIRST,
     Check,
@@ -19,10 +23,17 @@ from webots_mcp.store.checks.finding import (
     Outcome,
     RunUnderCheck,
     outcome_of,
+    times,
+    total_s,
 )
 from webots_mcp.store.detection import jump, sensors
+from webots_mcp.store.detection.condition import (
+    NONE_EXPECTED,
+    Adherence,
+    expectations_of,
+    judge_expectation,
+)
 from webots_mcp.store.detection.events import Found, asked_kinds, search_events
-from webots_mcp.store.detection.expectation import expectations_of
 from webots_mcp.store.detection.kinds import EventOptions, NotSearchableError
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.project_file import ALL, Expected
@@ -30,10 +41,224 @@ from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.ranges import TimeRange, whole_run
 from webots_mcp.store.reading.segment import Deadline, Segment, Subject, in_one_snapshot
+from webots_mcp.store.robots import fetch_session
 from webots_mcp.store.run_rows import fetch_run
 
 CHECK_DEADLINE_S: Final = 8.0
 _OF_EVENTS: Final = 0.7  # of the time
+
+
+# -- of a run as a whole: its pace, its log, its end, and whether it reached its goal --------------
+
+SLOW: Final = 0.9  # of real time
+_CELL_S: Final = 5.0  # of simulation time, over which the pace is measured
+_LONGEST_MESSAGE: Final = 120
+
+
+def keeps_pace(run: RunUnderCheck) -> Finding:
+    """Warns where it was slower than 0.9 of real time; waits of over a second do not count."""
+    frame = run.frame
+    steps, waits = np.diff(frame.times), np.diff(frame.wall_times)
+    moved = (steps > 0) & (waits >= 0)
+    usual_s = float(np.median(waits[moved])) if moved.any() else 0.0  # of who is slow all the time
+    goes_on = moved & (waits <= np.maximum(max(1.0, 3 * usual_s), 20 * steps))
+    sim_s, wall_s = float(steps[goes_on].sum()), float(waits[goes_on].sum())
+    if wall_s < 1.0:
+        raise NotSearchableError("it lasted less than a second of wall time")
+    factor = sim_s / wall_s
+    longest = float(waits[moved].max())
+    waited = f"; longest wait between two rows {longest:.3g} s" if longest > 1.0 else ""
+    evidence = f"{factor:.3g} times real time{waited}"
+    if factor >= SLOW:
+        return Finding("pass", evidence)
+    cells = (frame.times[1:] // _CELL_S).astype(np.intp) if len(frame) else np.zeros(0, np.intp)
+    cells -= cells.min()
+    paces = [np.bincount(cells, each * goes_on) for each in (steps, waits)]
+    slow = np.flatnonzero(paces[0] < SLOW * paces[1])
+    since_s = max(float(frame.times[0]), float(frame.times[1] // _CELL_S + slow[0]) * _CELL_S)
+    return Finding(
+        "warn", evidence, since_s, None, f"webots_list_runs(cursor={run.info.run_id + 1})"
+    )
+
+
+_MUCH: Final = 0.05  # of the run, or of its rows
+_HABIT: Final = 3  # so many times: its code does it
+
+
+def misses_no_steps(run: RunUnderCheck) -> Finding:
+    """Warns where simulation time went on without rows, fails from 5 % of the run on.
+
+    Where more than 5 % of the rows are followed by none for long, they come unevenly by nature.
+    """
+    gaps = run.events("gap")
+    if not gaps:
+        return Finding("pass", "rows came as evenly as usual")
+    gone_s, length_s = total_s(gaps), max(run.search.length_s, 1e-9)
+    longest_s = max(each.duration_s for each in gaps)
+    evidence = f"no rows {times(len(gaps))}, up to {longest_s:.3g} s, {gone_s:.3g} s in total"
+    is_habit = len(gaps) > _MUCH * len(run.frame) and len(gaps) >= _HABIT
+    outcome = "fail" if gone_s > _MUCH * length_s and not is_habit else "warn"
+    return Finding(outcome, evidence, gaps[0].start_s, len(gaps), run.more("gap"))
+
+
+def logs_no_errors(run: RunUnderCheck) -> Finding:
+    """Fails where an error was logged, warns where a warning was."""
+    lines = run.events("log")
+    errors = [each for each in lines if each.name in ("error", "critical")]
+    if not lines:
+        return Finding("pass", "no warning and no error was logged")
+    first = (errors or lines)[0]
+    counts = Counter(each.name or "" for each in lines)
+    said = str(first.details["message"]).strip().splitlines() or [""]
+    line = said[-1 if said[0].startswith("Traceback") else 0]  # which exception it was
+    evidence = ", ".join(f"{count} {level}" for level, count in counts.items())
+    evidence += f"; first: {line[:_LONGEST_MESSAGE]}"
+    more = f"webots_get_logs(run_id={run.info.run_id})"
+    return Finding("fail" if errors else "warn", evidence, first.start_s, len(lines), more)
+
+
+_RESET_BY: Final = (
+    "SELECT count(*) FROM command WHERE session_id = :session AND status = 'done' "
+    "AND (action IN ('reset', 'reload', 'load_world', 'quit') "
+    "OR action = 'run' AND json_extract(params, '$.reset')) "
+    "AND claimed_wall_time_s BETWEEN :last - 30 AND :last + 30"
+)
+_ENDS_OF_SESSION: Final = (
+    "SELECT count(*) FROM run WHERE session_id = ? AND end_reason = 'reset' AND id <> ?"
+)
+
+
+def ends_well(run: RunUnderCheck) -> Finding:
+    """Fails where its controller crashed; warns of a reset or reload that no command asked for."""
+    reason, session = run.info.end_reason, run.info.session_id
+    more = f"webots_get_logs(run_id={run.info.run_id})"
+    if reason is None:
+        process = fetch_session(run.search.connection, session)
+        if process is None or process.is_alive(time.time()):
+            return Finding("pass", "it goes on")
+        silent = f"its controller, on {process.host}, has been silent and did not say that it ended"
+        return Finding("warn", silent, run.search.ended_s, 1, more)
+    if reason == "crashed":
+        return Finding("fail", "its controller crashed or was killed", run.search.ended_s, 1, more)
+    if reason == "superseded":
+        return Finding("warn", "another bridge took its robot over", run.search.ended_s, 1, more)
+    if reason not in ("reset", "reload"):
+        return Finding("pass", f"it ended: {reason}")
+    last_s = run.info.started_wall_time_s + run.info.wall_duration_s
+    asked = {"session": session, "last": last_s}
+    if run.search.connection.execute(_RESET_BY, asked).fetchone()[0]:
+        return Finding("pass", f"it ended by a {reason} that a command asked for")
+    others = (session, run.info.run_id)
+    habit = int(run.search.connection.execute(_ENDS_OF_SESSION, others).fetchone()[0])
+    if reason == "reset" and habit >= _HABIT:  # other runs of the session
+        return Finding("pass", f"it ended by a reset, as {habit} others of its session")
+    evidence = f"it ended by a {reason} that no command asked for: by hand, or by code"
+    return Finding("warn", evidence, run.search.ended_s, 1, more)
+
+
+_LOST: Final = "SELECT rows_waiting, last_error FROM session WHERE id = ?"
+
+
+def loses_no_rows(run: RunUnderCheck) -> Finding:
+    """Fails where rows were dropped, warns where the database was in trouble or rows wait."""
+    noticed = run.events("bridge_event")
+    dropped = [each for each in noticed if each.details["what"] == "dropped"]
+    if found := dropped or [each for each in noticed if each.details["what"] == "storage"]:
+        data: list[dict[str, Any]] = [each.details.get("data") or {} for each in found]
+        rows = sum(each.get("row_count", 0) for each in data)
+        lost = "1 row was dropped" if rows == 1 else f"{rows or 'some'} rows were dropped"
+        evidence = lost if dropped else "trouble with the database"
+        evidence += f": {data[0].get('why', 'no reason was noted')}"
+        more = run.more("bridge_event")
+        return Finding("fail" if dropped else "warn", evidence, found[0].start_s, len(found), more)
+    if not run.info.row_count:
+        return Finding("warn", f"run {run.info.run_id} has no state row: call bridge.publish")
+    verb = "were" if run.info.purged_rows else "are"  # they were deleted since
+    waiting, error = run.search.connection.execute(_LOST, (run.info.session_id,)).fetchone()
+    if run.info.end_reason and waiting:
+        left = f"{counted(waiting, 'row')} of its session waiting still: {error or 'no reason'}"
+        return Finding("warn", left)
+    rows = f"all {run.info.row_count} rows {verb}" if run.info.row_count > 1 else "its only row is"
+    return Finding("pass", f"{rows} recorded")
+
+
+def keeps_expectations(run: RunUnderCheck) -> Iterator[Finding]:
+    """Fails where something that was expected did not hold. Each expectation is a line."""
+    if not run.expected:
+        raise NotSearchableError(NONE_EXPECTED)
+    frame = run.every_call
+    for each in run.expected:
+        name = f"expects: {each.name}"
+        missing = [*each.violation.describe_unknown(run.search.known)]
+        if missing and not each.asks_missing:
+            yield Finding("not applicable", "; ".join(missing), name=name)
+            continue
+        try:
+            held = judge_expectation(each, frame, run.search.known)
+        except ConditionFailedError as error:
+            yield Finding("not looked at", str(error), name=name)
+            continue
+        yield _held(run, each, held)._replace(name=name)
+
+
+def _held(run: RunUnderCheck, each: Expectation, held: Adherence) -> Finding:
+    lacking = f"; without a value in {counted(held.lacking, 'row')}" if held.lacking else ""
+    if each.within_s is not None:
+        return _reached(run, each, held)
+    if not held.rows:
+        why = f"{each.during.text!r} never held" if each.during else "it was too short"
+        return Finding("not applicable", f"it was never asked{lacking or f': {why}'}")
+    share = f"{100 * held.held_s / held.meant_s:.4g}" if held.meant_s else ""
+    if share == "100" and len(held.violations):
+        share = "over 99.99"
+    of_all = f"held {share} % of {held.meant_s:.4g} s ({counted(held.rows, 'row')})"
+    evidence = (of_all if share else "asked of its only row") + lacking
+    if not len(held.violations):
+        return Finding("pass", evidence)
+    evidence = f"{evidence}; {times(len(held.violations))} violated"
+    return _violated(run, each, held, evidence)
+
+
+def _reached(run: RunUnderCheck, each: Expectation, held: Adherence) -> Finding:
+    after = "" if held.after_s is None else f"after {held.after_s:.4g} s"
+    if not len(held.violations):
+        short = f"it lasted {run.search.length_s:.4g} s, shorter than {each.within_s:g} s"
+        return Finding("pass", after) if after else Finding("not applicable", short)
+    evidence = f"not within {each.within_s:g} s: {after or f'never in {run.search.length_s:.4g} s'}"
+    return _violated(run, each, held, evidence)
+
+
+def _violated(run: RunUnderCheck, each: Expectation, held: Adherence, evidence: str) -> Finding:
+    if held.worst is not None:
+        evidence += f"; worst {held.worst[0]} = {held.worst[1]:.4g}"
+    where = (each.violation if each.within_s is None else each.expected).text
+    more = f"webots_find_events(where={where!r}, run_id={run.info.run_id})"
+    since_s = float(held.violations.starts_s[0])
+    return Finding("fail", evidence, since_s, len(held.violations), more)
+
+
+_GOAL: Final = (
+    "SELECT json_extract(params, '$.until'), json_extract(result, '$.ended'), "
+    "json_extract(result, '$.advanced_s'), json_extract(result, '$.sim_time_s') FROM command "
+    "WHERE robot_id = ? AND action = 'run' AND json_valid(result) "
+    "AND json_extract(result, '$.run_id') = ? AND json_extract(params, '$.until') IS NOT NULL "
+    "ORDER BY id DESC LIMIT 1"
+)
+
+
+def reaches_goal(run: RunUnderCheck) -> Finding:
+    """Fails where the condition of its last run command, or trial, did not come to hold."""
+    asked = (run.robot_id, run.info.run_id)
+    row = run.search.connection.execute(_GOAL, asked).fetchone()
+    if row is None:
+        raise NotSearchableError("no finished run command had a goal: webots_run(until=...)")
+    goal, ended, took_s, at_s = row
+    if ended == "condition held":
+        return Finding("pass", f"{goal}: after {took_s:.4g} s")
+    return Finding("fail", f"{goal}: not reached ({ended})", at_s, 1, run.more("command"))
+
+
+# -- all of them -----------------------------------------------------------------------------------
 
 # A new check is a function and a line here: question, command, report, page and docs read it.
 _MOVES: Final = "the position; a commanded speed, speeds of wheels, or a mode"
@@ -50,13 +275,13 @@ CHECKS: Final[list[Check]] = [
     Check("sensors live", of_sensors.sensors_live, "numbers", _FLAT, of_values=True),
     Check("sensors within limits", of_sensors.sensors_within_limits, "numbers", of_values=True),
     Check("sensors drop nothing", of_sensors.sensors_drop_nothing, "numbers", _JUMP),
-    Check("keeps pace", of_run.keeps_pace, "rows", of_values=True),
-    Check("misses no steps", of_run.misses_no_steps, "rows", ("gap",), of_values=True),
-    Check("logs no errors", of_run.logs_no_errors, "", ("log",)),
-    Check("ends well", of_run.ends_well, ""),
-    Check("loses no rows", of_run.loses_no_rows, "", ("bridge_event",)),
-    Check("reaches its goal", of_run.reaches_goal, "a run command with a condition in `until`"),
-    Check("keeps expectations", of_run.keeps_expectations, "expectations", of_values=True),
+    Check("keeps pace", keeps_pace, "rows", of_values=True),
+    Check("misses no steps", misses_no_steps, "rows", ("gap",), of_values=True),
+    Check("logs no errors", logs_no_errors, "", ("log",)),
+    Check("ends well", ends_well, ""),
+    Check("loses no rows", loses_no_rows, "", ("bridge_event",)),
+    Check("reaches its goal", reaches_goal, "a run command with a condition in `until`"),
+    Check("keeps expectations", keeps_expectations, "expectations", of_values=True),
 ]
 
 

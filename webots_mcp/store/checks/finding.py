@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, Literal, NamedTuple
 
-from webots_mcp.conditions.expectation import Expectation
+from webots_mcp.conditions.compiler import Expectation
+from webots_mcp.store.detection.condition import every_call_of
 from webots_mcp.store.detection.events import Found
-from webots_mcp.store.detection.expectation import every_call_of
 from webots_mcp.store.detection.kinds import Event, NotSearchableError
-from webots_mcp.store.detection.motion import Motion, RunNoise
-from webots_mcp.store.detection.search import Search
+from webots_mcp.store.detection.search import Motion, RunNoise, Search
 from webots_mcp.store.questions.runs import RunInfo
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.reading.frame_source import NOT_READ

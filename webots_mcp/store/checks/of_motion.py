@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from typing import Any, Final, cast
 
-from webots_mcp.naming import METRES, find_targets, in_snake_case, listed, unit_in
+from webots_mcp.naming import METRES, counted, find_targets, in_snake_case, listed, unit_in
 from webots_mcp.signal_register import PLACES
 from webots_mcp.store.analysis.arrays import Array, Run, median, np, runs_of
 from webots_mcp.store.analysis.summary import unwrap
@@ -14,7 +14,7 @@ from webots_mcp.store.checks.finding import Finding, RunUnderCheck, times, total
 from webots_mcp.store.detection.condition import lasting
 from webots_mcp.store.detection.jump import JUMP
 from webots_mcp.store.detection.kinds import Event, NotSearchableError
-from webots_mcp.store.detection.motion import in_metres, places_in
+from webots_mcp.store.detection.search import in_metres, places_in
 from webots_mcp.store.detection.standstill import ON_THE_SPOT
 from webots_mcp.store.signals import Signal, stored_roles
 
@@ -42,7 +42,7 @@ def moves_when_commanded(run: RunUnderCheck) -> Finding:
             raise NotSearchableError(NO_COMMAND)
         if total_s(stood) > 0.95 * run.search.length_s:
             raise NotSearchableError(f"it always stood, in a mode unseen in motion: {NO_COMMAND}")
-    return Finding("pass", f"{len(stood)} standstills, none against a command")
+    return Finding("pass", f"{counted(len(stood), 'standstill')}, none against a command")
 
 
 def _is_shown(run: RunUnderCheck, stuck: Event) -> bool:
@@ -90,7 +90,8 @@ def follows_targets(run: RunUnderCheck) -> Finding:
     for measured, target in pairs:
         found += _apart(run, measured, target)
     if not found:
-        return Finding("pass", f"{len(pairs)} follow their targets, as {pairs[0][0].name}")
+        said = f"{counted(len(pairs), 'target')} followed, as by {pairs[0][0].name}"
+        return Finding("pass", said)
     found.sort(key=lambda each: each[1].start_s)
     names = listed(list(dict.fromkeys(signal.name for signal, *_ in found)), 3)
     longest, by = max((rest.duration_s, by) for _, rest, by in found)

@@ -15,7 +15,7 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.liveness import dead_sessions
 from webots_mcp.naming import flatten
 from webots_mcp.store.chunks import parse
-from webots_mcp.store.detection import condition, expectation, jump, sensors, standstill, stored
+from webots_mcp.store.detection import condition, jump, sensors, standstill, stored
 from webots_mcp.store.detection import jump as oscillation
 from webots_mcp.store.detection.kinds import (
     Event,
@@ -25,8 +25,7 @@ from webots_mcp.store.detection.kinds import (
     Verdicts,
     count_by_kind,
 )
-from webots_mcp.store.detection.motion import find_motion
-from webots_mcp.store.detection.search import Search, events_touching
+from webots_mcp.store.detection.search import Search, events_touching, find_motion
 from webots_mcp.store.reading.catalogue import known_signals, resolve_signals
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.ranges import TimeRange
@@ -419,7 +418,7 @@ KINDS: Final[list[EventKind]] = [
     standstill.STANDSTILL,
     standstill.STUCK,
     condition.CONDITION,
-    expectation.VIOLATIONS,
+    condition.VIOLATIONS,
     sensors.MISSING,
     sensors.FLAT,
     jump.JUMP,

@@ -1,17 +1,24 @@
-"""One search in a stretch of a run: what a detector may read, and events with their true ends."""
+"""One search in a stretch of a run: what a detector may read, and events with their true ends.
+
+For that the signals that tell of a robot's motion, how far it went, in which modes it moves.
+"""
 
 from __future__ import annotations
 
 import copy
+import math
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Final
 
-from webots_mcp.naming import listed
-from webots_mcp.store.analysis.arrays import np
+from webots_mcp.naming import FARTHEST_M, listed, metres_in, unit_in
+from webots_mcp.signal_register import first_in, pair_in
+from webots_mcp.store.analysis.arrays import Array, Indexes, median, noise_of, np
 from webots_mcp.store.analysis.summary import LARGEST
+from webots_mcp.store.analysis.track import PathLength, Track, tracks_of
+from webots_mcp.store.chunks import shown
 from webots_mcp.store.detection.kinds import (
     Event,
     EventKind,
@@ -20,12 +27,354 @@ from webots_mcp.store.detection.kinds import (
     NotAskedError,
     NotSearchableError,
 )
-from webots_mcp.store.detection.motion import Motion, motion_in
-from webots_mcp.store.reading.catalogue import resolve_signals
+from webots_mcp.store.reading.catalogue import one_signal, resolve_signals
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.ranges import frame_of_purged, recorded_bounds
 from webots_mcp.store.reading.segment import Deadline, Segment, just_after
-from webots_mcp.store.signals import Signal
+from webots_mcp.store.signals import Signal, roles_of, stored_roles
+
+TRUE_WITHIN: Final = 0.05  # a distance that may be short by less, or by less than so many metres,
+TRUE_WITHIN_M: Final = 0.1  # is reported without a doubt
+SAMPLES: Final = 8  # parts of a run that tell how noisy it is
+SAMPLE_ROWS: Final = 1024  # of each
+IMPLAUSIBLE_M_S: Final = 50.0  # a mean speed beyond is hardly that of a robot
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The signals that tell of a robot's motion; None or empty where there is none.
+
+    Attributes:
+        position: x and y.
+        commanded: Speed that it should have; `speed` is one of which the name leaves open whether
+            it is commanded or measured.
+        mode: What it is doing.
+        heading: Where it looks; an angle.
+        wheels: Speeds of its wheels or driving motors, commanded or measured; `wheel_commands`
+            are speeds that these should have.
+        height: z: a robot that climbs does not stand still.
+    """
+
+    position: tuple[Signal, Signal] | None
+    commanded: Signal | None
+    speed: Signal | None
+    mode: Signal | None
+    heading: Signal | None = None
+    wheels: tuple[Signal, ...] = ()
+    height: Signal | None = None
+    wheel_commands: tuple[Signal, ...] = ()
+
+    @property
+    def signals(self) -> list[Signal]:
+        """The signals that are reported with an event."""
+        speed = self.commanded or self.speed
+        return [*(self.position or ()), *filter(None, (speed, self.mode))]
+
+    @property
+    def evidence(self) -> list[Signal]:
+        """All of them."""
+        others = filter(None, (self.height, self.commanded, self.speed, self.mode, self.heading))
+        return [*(self.position or ()), *others, *self.wheels, *self.wheel_commands]
+
+
+def find_motion(
+    known: dict[str, Signal], options: EventOptions, here: Collection[str] | None = None
+) -> Motion:
+    """Find the signals of motion: those that the options name, else those of the roles.
+
+    Args:
+        known: All signals of the robot.
+        options: Names in them count whatever was published.
+        here: What is published in the run: other runs may have had other names. None where that
+            does not matter.
+
+    Raises:
+        UnknownSignalError: The options name a signal that does not exist.
+        InvalidInputError: A name in them means several.
+    """
+    own = known if here is None else {name: known[name] for name in known if name in here}
+    position: tuple[Signal, Signal] | None = None
+    if options.position is not None:
+        x, y = (one_signal(known, each) for each in options.position)
+        position = x, y
+    names = (position[0].name, position[1].name) if position else None
+    roles = roles_of(own, names) if names else stored_roles(own)
+    signals = {role: own[name] for name, role in roles.items() if name in own}
+
+    def first(role: str, name: str | None = None) -> Signal | None:
+        if name is not None:
+            return one_signal(known, name)
+        found = first_in(role, signals)
+        return signals[found] if found else None
+
+    def wheels(wanted: str) -> tuple[Signal, ...]:
+        named = (own[name] for name, role in roles.items() if role == wanted)
+        return tuple(wheel for wheel in named if wheel != commanded)
+
+    place = "" if position else pair_in(signals)
+    if position is None:  # it may be missing in the rows that were seen
+        ever = {role: known[name] for name, role in stored_roles(known).items()}
+        position = _pair(signals, place) or _pair(ever, pair_in(ever))
+    commanded = first("commanded_speed", options.commanded)
+    return Motion(
+        position,
+        commanded,
+        None if commanded else first("speed"),
+        first("mode", options.mode),
+        heading=first("yaw"),
+        wheels=wheels("wheel"),
+        height=signals.get(f"z{place}"),
+        wheel_commands=wheels("commanded_wheel"),
+    )
+
+
+def _pair(signals: dict[str, Signal], place: str | None) -> tuple[Signal, Signal] | None:
+    return None if place is None else (signals[f"x{place}"], signals[f"y{place}"])
+
+
+def in_metres(signal: Signal, lengths: Array) -> Array:
+    """Lengths that a signal holds, in metres; they are metres where its name has no unit."""
+    factor = metres_in(signal.name)
+    return lengths if factor == 1 else lengths * factor
+
+
+def motion_in(frame: Frame, known: dict[str, Signal], options: EventOptions) -> Motion:
+    """As `find_motion`, of what is published in a run: others of the robot may have other names.
+
+    Args:
+        frame: Of the run: its first or newest row has them.
+        known: All signals of the robot.
+        options: As for `find_motion`.
+    """
+    rows = [frame.rows(row, row + 1) for row in {0, len(frame) - 1}]
+    telling = [name for name, each in known.items() if options.position or each.role]
+    here = {name for name in telling if any(row.held(name).any() for row in rows)}
+    return find_motion(known, options, here)
+
+
+def doubt_of_unit(position: tuple[Signal, Signal], speed_m_s: float) -> str | None:
+    """That a position without a unit in its names is hardly in metres; None where it may be."""
+    name = position[0].name
+    if speed_m_s <= IMPLAUSIBLE_M_S or unit_in(name):
+        return None
+    return (
+        f"{name} is taken as metres, since its name has no unit, but robots are not so fast: if it "
+        "is in mm, say so in its name (pose_mm, x_mm)"
+    )
+
+
+class RunNoise:
+    """How noisy a run's signals are, by some of its rows: the same of whatever part is asked for.
+
+    Attributes:
+        position_m: Standard deviation of the noise in each of x and y.
+        interval_s: The usual one between rows.
+        rows: Of the run.
+    """
+
+    def __init__(self, run: Frame, motion: Motion) -> None:
+        starts = np.linspace(0, len(run), SAMPLES, endpoint=False) // SAMPLE_ROWS
+        rows = (np.unique(starts) * SAMPLE_ROWS).astype(np.intp).tolist()
+        self._parts = [run.rows(row, row + SAMPLE_ROWS) for row in rows]
+        self._known: dict[str, float] = {}
+        self.rows = len(run)
+        intervals = np.concatenate([np.zeros(0), *(np.diff(part.times) for part in self._parts)])
+        self.interval_s = median(intervals) if len(intervals) else 0.0
+        noises = [self.of(each.name) * metres_in(each.name) for each in motion.position or ()]
+        self.position_m = math.hypot(*noises) / math.sqrt(2)
+
+    def of(self, name: str) -> float:
+        """Standard deviation of the noise of a signal."""
+        if name not in self._known:
+            values = np.concatenate([np.zeros(0), *(part.numbers(name) for part in self._parts)])
+            self._known[name] = noise_of(values[np.abs(values) <= LARGEST])
+        return self._known[name]
+
+
+def places_in(frame: Frame, position: tuple[Signal, Signal]) -> tuple[Indexes, Array, Array]:
+    """The rows that have a position, and it in metres."""
+    x, y = (in_metres(each, frame.numbers(each.name)) for each in position)
+    rows = np.flatnonzero(np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M)
+    return (rows, x, y) if len(rows) == len(frame) else (rows, x[rows], y[rows])
+
+
+def tracks_in(
+    frame: Frame, position: tuple[Signal, Signal], noise: RunNoise
+) -> tuple[list[Track], list[Indexes]]:
+    """The way of the robot in each stretch without a gap, and the rows of the frame in it."""
+    rows, x, y = places_in(frame, position)
+    times = frame.times if len(rows) == len(frame) else frame.times[rows]
+    tracks = tracks_of(times, x, y, noise.position_m, noise.rows)
+    ends = np.cumsum([len(track.times) for track in tracks])
+    return tracks, np.split(rows, ends)[:-1]
+
+
+def doubt_of_length(way: PathLength) -> str | None:
+    """By how much a path may be longer than reported; None where that is little."""
+    if way.longer_m <= max(TRUE_WITHIN * way.length_m, TRUE_WITHIN_M):
+        return None
+    # Rounded, so that similar runs share a sentence; in metres where it exceeds the distance.
+    more = f"{way.longer_m:.2g} m"
+    if way.longer_m <= way.length_m:
+        more = f"{10 * math.ceil(10 * way.longer_m / way.length_m)} %"
+    noise_mm = float(f"{1000 * way.noise_m:.1g}")
+    return (
+        f"the path may be up to {more} longer: position noise of about {noise_mm:g} mm hides short "
+        "moves and tight turns; more rows per second show them"
+    )
+
+
+# -- in which modes a robot moves and stands: seen in this run and in earlier ones -----------------
+
+
+ROLLS_OUT_S: Final = 1.5  # after a mode began, the motion of the mode before may go on
+LEAST_MOVED_M: Final = 0.3  # within so long: who drifts about a place does not move
+AWAY_S: Final = 20.0
+LEAST_NOISE: Final = 8.0  # deviations of what is left of the noise
+USUALLY_STANDS: Final = 4  # times as many visits as it moves in, of at least so many visits
+LEAST_VISITS: Final = 3
+EARLIER_RUNS: Final = 3
+MOST_ROWS: Final = 2_000_000  # of a run: its first ones
+_STANDS_SHARE: Final = 0.8  # of a visit
+_MOVES_SHARE: Final = 0.1  # of the samples of a visit, or of so many
+_ENOUGH: Final = 200
+_SAMPLE_S: Final = 0.5
+_FAST: Final = 0.9  # of the speeds while it moves are below what is called fast
+_PACE_S: Final = 1.0  # over so long a speed is measured; longer, by so much for each metre of noise
+_PACE_S_PER_M: Final = 100.0
+
+_EARLIER: Final = (
+    "SELECT id FROM run WHERE robot_id = (SELECT robot_id FROM run WHERE id = ?) AND id < ? "
+    "ORDER BY id DESC LIMIT ?"
+)
+
+
+@dataclass(frozen=True)
+class ModeUse:
+    """What a robot did in a mode.
+
+    Attributes:
+        moving: Visits of it in which it moved; `standing` those in which it mostly stood.
+        speed_m_s: How fast it usually was while it moved; `run_id` says in which run.
+    """
+
+    moving: int = 0
+    standing: int = 0
+    speed_m_s: float = 0.0
+    run_id: int = 0
+
+    @property
+    def usually_stands(self) -> bool:
+        """Whether it moved in few of many visits."""
+        return self.standing >= max(LEAST_VISITS, USUALLY_STANDS * self.moving)
+
+    def with_more(self, other: ModeUse) -> ModeUse:
+        """Together with another; the speed is the first that is known."""
+        moving, standing = self.moving + other.moving, self.standing + other.standing
+        return replace(self if self.moving else other, moving=moving, standing=standing)
+
+
+class ModeUses:
+    """What a robot does in its modes, from as many of its runs as that takes.
+
+    Attributes:
+        run_id: The run that is searched.
+        is_cut: There was no time to read all of these runs.
+    """
+
+    def __init__(
+        self,
+        connection: sqlite3.Connection,
+        run: Frame,
+        motion: Motion,
+        options: EventOptions,
+        deadline: Deadline,
+    ) -> None:
+        self.run_id = run.run_id
+        self.is_cut = False
+        self._motion = motion
+        self._options = options
+        self._frames = self._runs(connection, run, deadline)
+        self._known: dict[str, ModeUse] = {}
+
+    def of(self, mode: str) -> ModeUse:
+        """What it did in a mode; runs are read until one of them shows that it moved."""
+        while not self._known.get(mode, ModeUse()).moving:
+            if (frame := next(self._frames, None)) is None:
+                break
+            self.is_cut |= frame.cut_at_s is not None
+            for name, use in uses_in(frame, self._motion, self._options):
+                self._known[name] = self._known.get(name, ModeUse()).with_more(use)
+        return self._known.get(mode, ModeUse())
+
+    def _runs(
+        self, connection: sqlite3.Connection, run: Frame, deadline: Deadline
+    ) -> Iterator[Frame]:
+        """The run and a few of the same robot before it, as far as there is time."""
+        earlier = connection.execute(_EARLIER, (run.run_id, run.run_id, EARLIER_RUNS)).fetchall()
+        for run_id in (run.run_id, *(run_id for (run_id,) in earlier)):
+            if deadline.passed:
+                self.is_cut = True
+                return
+            bounds = recorded_bounds(connection, run_id)
+            if run_id == run.run_id:
+                yield run.rows(0, MOST_ROWS)
+            elif bounds is not None:
+                whole = Segment(run_id, bounds[0], just_after(bounds[1]))
+                yield read_frame(connection, whole, deadline).rows(0, MOST_ROWS)
+
+
+def uses_in(frame: Frame, motion: Motion, options: EventOptions) -> Iterator[tuple[str, ModeUse]]:
+    """What a robot did in the modes of a frame, by its mean places in half a second each."""
+    if motion.mode is None or motion.position is None:
+        return
+    codes, labels = frame.coded(motion.mode.name)
+    rows, x, y = places_in(frame, motion.position)
+    if not len(rows):
+        return
+    is_all = len(rows) == len(frame)
+    times, codes = (frame.times, codes) if is_all else (frame.times[rows], codes[rows])
+    same = (np.diff(times // _SAMPLE_S) == 0) & (np.diff(codes) == 0)
+    starts = np.flatnonzero(np.append(True, ~same))
+    counts = np.diff(starts, append=len(rows))
+    times, x, y = (np.add.reduceat(each, starts) / counts for each in (times, x, y))
+    left_m = RunNoise(frame, motion).position_m / median(counts) ** 0.5
+    codes: Indexes = codes[starts]
+    changes = np.flatnonzero(np.diff(codes)) + 1
+    visits = np.searchsorted(changes, np.arange(len(codes)), "right")
+    begins_s = np.append(times[0] - ROLLS_OUT_S, times[changes])[visits]
+    there = np.flatnonzero(times >= begins_s + ROLLS_OUT_S)
+    times, x, y = times[there], x[there], y[there]
+    codes, visits = codes[there], visits[there]
+    firsts = np.flatnonzero(np.diff(visits, prepend=-1))
+    lengths = np.diff(firsts, append=len(visits))
+    last = np.repeat(firsts + lengths - 1, lengths)
+
+    def way_m(over_s: float) -> tuple[Array, Array]:
+        later = np.minimum(np.searchsorted(times, times + over_s), last)
+        return np.hypot(x[later] - x, y[later] - y), times[later] - times
+
+    noise_m = LEAST_NOISE * left_m
+    got_away = way_m(AWAY_S)[0] >= max(LEAST_MOVED_M, noise_m)
+    moved = np.add.reduceat(got_away * 1.0, firsts) >= _MOVES_SHARE * np.minimum(lengths, _ENOUGH)
+    slow = way_m(options.stuck_s)[0] <= max(options.stuck_m, noise_m)
+    stood = np.add.reduceat(slow * 1.0, firsts) >= _STANDS_SHARE * lengths
+    stood &= times[firsts + lengths - 1] - times[firsts] >= options.stuck_s
+    paced_m, took_s = way_m(pace_s := max(_PACE_S, _PACE_S_PER_M * left_m))
+    speeds = paced_m / np.maximum(took_s, pace_s / 2)
+    for code in np.unique(codes).tolist():
+        own, mode = codes[firsts] == code, shown(labels[int(code)])
+        some = speeds[np.repeat(own & moved, lengths)]
+        # Not beside the greatest one: where it was put elsewhere it seems to be very fast.
+        fast = float(np.quantile(some, _FAST)) if len(some) else 0.0
+        speed_m_s = median(some[some >= fast / 2]) if len(some) else 0.0
+        counted = int((own & moved).sum()), int((own & stood).sum())
+        if mode is not None:
+            yield mode, ModeUse(*counted, speed_m_s, frame.run_id)
+
+
+# -- a search --------------------------------------------------------------------------------------
+
 
 FARTHER: Final = 8.0  # times as far is looked for the ends of what reaches out of a segment
 MOST_NAMED: Final = 5

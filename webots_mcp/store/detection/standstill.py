@@ -25,15 +25,16 @@ from webots_mcp.store.detection.kinds import (
     EventOptions,
     NotSearchableError,
 )
-from webots_mcp.store.detection.motion import (
+from webots_mcp.store.detection.search import (
+    NO_TIME,
     ModeUse,
     ModeUses,
     Motion,
     RunNoise,
+    Search,
     in_metres,
     tracks_in,
 )
-from webots_mcp.store.detection.search import NO_TIME, Search
 from webots_mcp.store.reading.frame import Frame
 
 # -- whether it should have moved: what shows it, and what speaks against it -----------------------
@@ -407,7 +408,7 @@ def standstills_in(search: Search) -> Findings:
     for margin in (MARGIN_ROWS, len(run)):
         rows = run.rows(before := max(0, first - margin), stop + margin)
         asked_rows = first - before, stop - before
-        found = judge_standstills(rows, motion, search.options, uses, noise, asked_rows)
+        found = judge_standstills(rows, search, uses, noise, asked_rows)
         if len(rows) == len(run) or search.deadline.passed or not _may_reach_out(found, rows, run):
             break
     search.shared[Findings] = found
@@ -425,19 +426,13 @@ def _may_reach_out(found: Findings, rows: Frame, run: Frame) -> bool:
 
 
 def judge_standstills(
-    frame: Frame,
-    motion: Motion,
-    options: EventOptions,
-    uses: ModeUses,
-    noise: RunNoise,
-    asked: tuple[int, int],
+    frame: Frame, search: Search, uses: ModeUses, noise: RunNoise, asked: tuple[int, int]
 ) -> Findings:
     """Find where a robot stood still and where it was stuck.
 
     Args:
         frame: The rows.
-        motion: Which signals tell.
-        options: What counts.
+        search: Which signals tell, what counts, and until when there is time.
         uses: In which modes it moves.
         noise: Of the run.
         asked: Rows that the standstills have to touch.
@@ -445,6 +440,7 @@ def judge_standstills(
     Raises:
         NotSearchableError: No position is known, or the frame has none.
     """
+    motion, options = search.motion, search.options
     if motion.position is None:
         raise NotSearchableError(NAME_POSITION)
     tracks, rows = tracks_in(frame, motion.position, noise)
@@ -458,24 +454,26 @@ def judge_standstills(
     found = (
         place
         for track, here in zip(tracks, rows, strict=True)
-        for place in _places(track, here, frame, motion, options)
+        for place in _places(track, here, frame, search)
     )
     places = [each for each in found if each.rows[0] < asked[1] and each.rows[-1] >= asked[0]]
+    if search.deadline.passed:
+        unseen.append(f"{NO_TIME}; it may have rested where it moved slowly")
     long = [place for place in places if place.lasts_s >= NEARLY * seen_s]
     if not long:
         parts = [np.searchsorted(here, asked).tolist() for here in rows]
         there = [track.part(*part) for track, part in zip(tracks, parts, strict=True)]
-        return Findings([], None if places else _nearest(there, options), unseen)
+        return Findings([], None if places else _nearest(there, search), unseen)
     events = Standings(frame, motion, options, long, noise, uses).judged()
     cut = ["time limit reached before it was known in which modes it moves"] if uses.is_cut else []
     return Findings(events, None, unseen, cut)
 
 
-def _places(
-    track: Track, rows: Indexes, frame: Frame, motion: Motion, options: EventOptions
-) -> Iterator[Place]:
+def _places(track: Track, rows: Indexes, frame: Frame, search: Search) -> Iterator[Place]:
     """The standstills of a track, in parts where it climbs or sinks in between."""
-    for each in find_standstills(track, options.stuck_m, options.stuck_s):
+    motion, options = search.motion, search.options
+    limits = options.stuck_m, options.stuck_s
+    for each in find_standstills(track, *limits, lambda: search.deadline.passed):
         ends = [(each.start, each.last + 1)]
         if motion.height is not None:
             high = frame.numbers(motion.height.name)[rows[slice(*ends[0])]]
@@ -505,13 +503,14 @@ def _at_one_height(
         yield first + int(there[each.start]), first + int(there[each.last]) + 1
 
 
-def _nearest(tracks: Sequence[Track], options: EventOptions) -> tuple[float, str] | None:
+def _nearest(tracks: Sequence[Track], search: Search) -> tuple[float, str] | None:
     """The longest time for which it stood, else its smallest movement in the shortest one."""
-    least_s = options.stuck_s
+    least_s, deadline = search.options.stuck_s, search.deadline
+    limits = search.options.stuck_m, least_s / SHORTEST_SHARE
     short = [
         (float(track.times[each.last] - track.times[each.start]), float(track.times[each.start]))
         for track in tracks
-        for each in find_standstills(track, options.stuck_m, least_s / SHORTEST_SHARE)
+        for each in find_standstills(track, *limits, lambda: deadline.passed)
     ]
     if short:
         lasts_s, start_s = max(short)

@@ -15,7 +15,7 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.parameter import Value
 from webots_mcp.store.analysis.summary import MIN_EFFECT_SD, Spread, Summary, spread_of, verdicts_on
 from webots_mcp.store.detection.kinds import EventOptions
-from webots_mcp.store.detection.motion import motion_in
+from webots_mcp.store.detection.search import motion_in
 from webots_mcp.store.parameters import differing, parameters_of, scored_runs
 from webots_mcp.store.questions.runs import (
     OUT_OF_TIME,

@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple
 
 from webots_mcp.conditions.signal_values import SAME_TIME_S
 from webots_mcp.errors import InvalidInputError, NothingRecordedError, UnknownRunError
-from webots_mcp.naming import METRES, Value, listed
+from webots_mcp.naming import METRES, Value, counted, listed
 from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
 from webots_mcp.store.chunks import FIRST_LABEL, IS_ABSENT, IS_NUMBER, Decoded, Replaced
 from webots_mcp.store.parameters import parameters_of, scored_runs
@@ -119,7 +119,8 @@ class Parting:
         said = f"not alike to begin with ({listed(begun)}); " if begun else ""
         if not (self.rows and self.signals):
             return f"{said}nothing could be compared"
-        rows = f"{self.rows} rows and {self.signals} signals that were compared"
+        what = counted(self.rows, "row"), counted(self.signals, "signal")
+        rows = f"{' and '.join(what)} that were compared"
         equal = f"equal to the last digit in the {rows}, until {self.until_s:.3f} s"
         said += self._said_of_parted() if self.parted else equal
         return said + ("" if self.is_whole else "; not all was compared")
@@ -181,7 +182,8 @@ def compare_rows(
         found[signal.name] = _parted(signal, pair, within)
     parted = sorted(filter(None, found.values()), key=lambda e: (e.from_s, -e.in_tolerances))
     left_out = [f"run {each.run_id}: {part}" for each in pair.frames for part in each.unread]
-    left_out += [f"{len(shared) - len(found)} signals: {OUT_OF_TIME}"] * (len(found) < len(shared))
+    if left := len(shared) - len(found):
+        left_out.append(f"{counted(left, 'signal')}: {OUT_OF_TIME}")
     for run_id, here, there in (run_ids[0], in_one, in_other), (run_ids[1], in_other, in_one):
         names = [each.name for each in meant if each.name in here and each.name not in there]
         left_out += [f"only run {run_id} has {listed(names)}"] if names else []
@@ -249,8 +251,8 @@ def _aligned(frames: tuple[Frame, Frame]) -> _Pair:
         first, last = others[[0, -1]].tolist() if len(others) else (1.0, 0.0)
         if count := int(np.count_nonzero(is_alone & (keys >= first) & (keys <= last))):
             first_s = frame.times[np.argmax(is_alone & (keys >= first))]
-            run = f"{count} rows of run {frame.run_id}, the first at {first_s:.3f} s,"
-            notes += [f"{run} have no partner at the same simulation time: they are not compared"]
+            run = f"{counted(count, 'row')} of run {frame.run_id}, the first at {first_s:.3f} s"
+            notes += [f"without a partner at the same simulation time, and not compared: {run}"]
     return _Pair(frames, rows, frames[0].times[rows[0]], notes)
 
 
@@ -361,7 +363,8 @@ def verdict_on(found: Sequence[Parting]) -> str:
     if not parted:
         return f"{len(found) + 1} runs: {min(found, key=lambda e: (e.is_whole, e.rows)).verdict}"
     one, other = (first := min(parted, key=lambda each: each.parted[0].from_s)).run_ids
-    return f"{len(parted)} of {len(found)} others part from run {one}; run {other}: {first.verdict}"
+    those = f"{len(parted)} of {counted(len(found), 'other')}"
+    return f"run {one} and {those} part; run {other}: {first.verdict}"
 
 
 def repeats_noted(connection: sqlite3.Connection, set_id: int) -> list[str]:

@@ -32,7 +32,7 @@ from webots_mcp.store.analysis.track import PathLength, tracks_of, travelled
 from webots_mcp.store.detection.condition import aggregated, position_in
 from webots_mcp.store.detection.events import Found, asked_kinds, kind_names, search_events
 from webots_mcp.store.detection.kinds import EventOptions
-from webots_mcp.store.detection.motion import Motion, doubt_of_length, doubt_of_unit, in_metres
+from webots_mcp.store.detection.search import Motion, doubt_of_length, doubt_of_unit, in_metres
 from webots_mcp.store.parameters import HAD_VALUES, as_filter, notable_parameters
 from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.frame import Frame, read_frame

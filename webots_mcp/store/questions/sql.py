@@ -431,9 +431,7 @@ def describe_schema(connection: sqlite3.Connection) -> str:
         names.setdefault(same, []).append(f"{kind} {name}")
         if same not in listed:
             found = dict.fromkeys(_COMMENT.findall(sql) if kind == "table" else ())
-            listed[same] = _listed(
-                columns[name], dict(each for each in found if each not in listed_before)
-            )
+            listed[same] = _listed(columns[name], dict(e for e in found if e not in listed_before))
             listed_before.update(found)
     lines = (f"{', '.join(alike)}: {listed[same]}" for same, alike in names.items())
     return "\n".join((_RULES, *lines, _bookkeeping()))

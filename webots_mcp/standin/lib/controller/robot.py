@@ -65,6 +65,10 @@ class Keyboard(Completed):
         return self.getKey()
 
 
+# Webots' library tells a text's length in 16 bits: the rest of a longer one is taken for messages.
+_MOST_CUSTOM_DATA_BYTES: Final = 65_534
+
+
 class Robot(Completed):
     """The robot that this process controls; a process has one."""
 
@@ -186,6 +190,8 @@ class Robot(Completed):
 
     def setCustomData(self, data: str) -> None:
         """Set the `customData` field with the next step."""
+        if len(text(data).encode()) > _MOST_CUSTOM_DATA_BYTES:
+            raise lacking(f"customData of over {_MOST_CUSTOM_DATA_BYTES:,} bytes: what Webots does")
         self._session.set_custom_data(text(data))
 
     def getSupervisor(self) -> bool:

@@ -465,8 +465,7 @@ def _fine_places(rows: Rows, start: int, end: int, parts: int) -> tuple[Array, f
 def _best_rest(places: Array, least_m2: float) -> tuple[int, int, float]:
     """From and to which of the places it rests, and how many squares that explains."""
     firsts, lasts, bases = _rests_among(len(places))
-    explained: Array = np.sum((bases @ places) ** 2, axis=1)
-    explained = np.add.reduceat(explained, np.arange(0, len(explained), 3))
+    explained: Array = np.sum((bases @ places) ** 2, axis=1).reshape(len(firsts), -1).sum(axis=1)
     explained -= least_m2 * ((firsts > 0) + 1.0 * (lasts < len(places)))
     best = int(np.argmax(explained))
     return int(firsts[best]), int(lasts[best]), float(explained[best])
@@ -476,7 +475,7 @@ def _best_rest(places: Array, least_m2: float) -> tuple[int, int, float]:
 def _rests_among(count: int) -> tuple[Indexes, Indexes, Array]:
     """From and to which of so many places a robot may rest, and what each motion can explain.
 
-    A rest with one ramp may end at every place. The bases are orthonormal, three rows for each.
+    A rest with one ramp may end at every place. The bases are orthonormal, as many rows for each.
     """
     inner = np.arange(1, count)
     borders = np.unique(np.linspace(0, count, _BORDERS).astype(np.intp))

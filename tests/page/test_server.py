@@ -106,7 +106,7 @@ def test_without_the_token_of_the_printed_address_nothing_is_shown(told: Server,
     assert told.path.strip("/") not in text
 
 
-def test_each_start_has_a_token_of_its_own(
+XX
     told: Server, serve: Callable[..., Server], tmp_path: Path
 ) -> None:
     assert serve(tmp_path).path != told.path

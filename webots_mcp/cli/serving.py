@@ -90,10 +90,7 @@ def serve(
 
         claude mcp add webots -- webots-mcp serve --data-dir /path/to/project/mcp_data
 
-    Or with --http 8000, which runs until Ctrl-C, whichever clients come and go:
-
-        claude mcp add --transport http webots http://127.0.0.1:8000/mcp \\
-          --header "Authorization: Bearer $(webots-mcp token)"
+    With --http 8000 it runs until Ctrl-C, and clients come and go: see docs/clients.md.
 
     While it runs, and unless it is --read-only, the oldest of what is beyond the limits is deleted.
     Limits belong to the database: what 'webots-mcp prune' or 'retain' has set,

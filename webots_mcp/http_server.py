@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 PATH: Final = "/mcp"
 _GRACE_S: Final = 1  # for answers under way when the server ends
+_IDLE_S: Final = 86_400.0  # people come back to a conversation after hours
+_MOST_SESSIONS: Final = 1_000  # of clients before 2026-07-28
 _STRANGER: Final = (
     "This server answers requests with the header 'Authorization: Bearer TOKEN' only; "
     "'webots-mcp token' shows the token to the user who started the server.\n"
@@ -99,7 +101,13 @@ def serve_http(server: MCPServer, place: Place, ready: Callable[[str], object]) 
     access_token()
     with closing(_listening(place)) as listener:
         config = uvicorn.Config(
-            gate(server.streamable_http_app(transport_security=_allowing(place))),
+            gate(
+                server.streamable_http_app(
+                    transport_security=_allowing(place),
+                    session_idle_timeout=_IDLE_S,
+                    max_sessions=_MOST_SESSIONS,
+                )
+            ),
             log_config=None,
             log_level="warning",
             access_log=False,
@@ -189,10 +197,10 @@ async def _follow(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> N
 def _request_in(body: bytearray) -> Any:
     """The id of the request that a body holds; None for a notification or a part of one."""
     try:
-        message: Any = json.loads(body)
-    except ValueError:
+        message: dict[str, Any] = dict(json.loads(body))
+    except (ValueError, TypeError):
         return None
-    return message.get("id") if isinstance(message, dict) and "method" in message else None
+    return message.get("id") if "method" in message else None
 
 
 async def _cancel(app: ASGIApp, scope: Scope, request_id: Any) -> None:

@@ -106,9 +106,14 @@ def serve(
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr)
     database, data_dir = resolve_database(recorded.database, recorded.data_dir)
     asked = limits.asked()
-    if http is None and (allow_host or tls_cert or tls_key):
+    place = None
+    if http is not None:
+        from webots_mcp.http_server import place_of
+
+        place = place_of(http, allow_host, tls_cert, tls_key)
+    elif allow_host or tls_cert or tls_key:
         raise InvalidInputError("--allow-host, --tls-cert and --tls-key are for --http")
-    if http is None and sys.stdin.isatty():
+    elif sys.stdin.isatty():
         print(
             f"webots-mcp: serving {database} to an MCP client on stdin and stdout; Ctrl-C ends it. "
             "Clients start this command themselves, see 'webots-mcp serve --help'.",
@@ -117,10 +122,6 @@ def serve(
     if asked and not read_only:
         _ask_for(asked, database, data_dir)
     with _keeping_what_is_made():
-        if http is not None:
-            from webots_mcp.http_server import place_of, serve_http
-
-            place = place_of(http, allow_host, tls_cert, tls_key)
         from webots_mcp.server import create_server
 
         server = create_server(
@@ -132,10 +133,11 @@ def serve(
             limits=asked,
         )
     with ending_in_time(), _ending_with_the_client():
-        if http is None:
-            server.run()
-        else:
-            serve_http(server, place, partial(_say_address, database))
+        if place is None:
+            return server.run()
+        from webots_mcp.http_server import serve_http
+
+        serve_http(server, place, partial(_say_address, database))
 
 
 def _say_address(database: Database, url: str) -> None:

@@ -178,19 +178,6 @@ def test_what_is_in_an_added_node_is_said_to_go_with_it_at_a_reset(scene: Scene)
     assert not scene.events("put_back")
 
 
-def test_what_is_in_an_added_node_is_said_to_go_with_it_at_a_reset(scene: Scene) -> None:
-    box = 'DEF BOX Solid { name "box" children [ DEF LID Solid { name "lid" } ] }'
-    scene.ask("add_node", vrml=box)
-    for path in ("BOX.translation", "LID.translation"):
-        answer = scene.ask("set_field", path=path, value=[1, 0, 0])
-        assert answer["a_reset"] == "removes the node: it was added in this run"
-    removed = scene.ask("remove_node", path="LID")
-    assert removed["a_reset"] == "does not bring it back: it was added in this run"
-    scene.reset()
-    assert scene.robot.getFromDef("BOX") is None
-    assert not scene.events("put_back")
-
-
 def test_a_field_that_is_null_takes_a_node(scene: Scene) -> None:
     answer = scene.ask("add_node", path="FLOOR.physics", vrml="Physics { mass 4 }")
     assert answer["parent"] == "FLOOR.physics"

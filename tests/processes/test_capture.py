@@ -187,15 +187,6 @@ def test_stdout_that_python_closes_is_recorded_up_to_there(
     assert filed.rows(LINES) == ["the last line"]
 
 
-@pytest.mark.parametrize("close", ["sys.stdout.close()", "with sys.stdout: pass"])
-def test_stdout_that_python_closes_is_recorded_up_to_there(
-    run: Run, filed: Recording, close: str
-) -> None:
-    process = run(f'bridge = begin()\nprint("the last line")\n{close}\nbridge.close()')
-    assert process.communicate(timeout=60) == ("the last line\n", "")
-    assert filed.rows(LINES) == ["the last line"]
-
-
 @posix
 def test_stdout_that_somebody_closed_or_led_elsewhere_is_left_alone(
     run: Run, filed: Recording, tmp_path: Path

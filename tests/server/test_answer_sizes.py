@@ -248,26 +248,3 @@ async def test_the_history_of_several_runs_with_long_names_is_under_2000_tokens(
     answer = json.loads(text_of(result))
     assert [run["row_count"] for run in answer["runs"]] == [60] * 4
     assert "left out of one run or more: arm_" in answer["hint"]
-
-
-async def test_the_history_of_several_runs_with_long_names_is_under_2000_tokens(
-    tmp_path: Path,
-) -> None:
-    file = tmp_path / "webots.db"
-    recorded = Recorded(file)
-    robot = recorded.robot()
-    for run in range(4):
-        if run:
-            robot.begin_run("reset")
-        for step in range(60):
-            torque = "estimate_of_the_torque_of_the_motor_of_joint_number"
-            robot.state(step * 0.1, {f"arm_{i}_{torque}_{i}": i + step / 7 for i in range(60)})
-    recorded.close()
-    async with client_on(file) as client:
-        arguments = {"signals": ["*"], "since_wall_time": 1_500_000_000}
-        result = await client.call_tool("webots_query_history", arguments)
-    assert not result.is_error, text_of(result)
-    assert tokens_in(text_of(result)) < ANSWER_TOKENS
-    answer = json.loads(text_of(result))
-    assert [run["row_count"] for run in answer["runs"]] == [60] * 4
-    assert "left out of one run or more: arm_" in answer["hint"]

@@ -90,21 +90,3 @@ async def test_where_no_controller_runs_it_is_said_that_none_is_asked_and_which_
         listed = await ask(client, "webots_list_breakpoints")
         assert [row[1] for row in listed["breakpoints"]["rows"]] == ["steps == 2000000"]
         assert listed["hint"].startswith("no controller of this robot runs to ask any")
-
-
-async def test_where_no_controller_runs_it_is_said_that_none_is_asked_and_which_come_back(
-    connect: Connect, driver: Driver
-) -> None:
-    driver.bridge.breakpoint("steps == 1000000")
-    async with connect() as client:
-        await newest_state(client)
-        before = await ask(client, "webots_list_breakpoints")
-        assert before["breakpoints"]["rows"] and "hint" not in before
-        driver.stop()
-        listed = await ask(client, "webots_list_breakpoints")
-        assert "breakpoints" not in listed
-        assert listed["hint"].startswith("no controller of this robot runs, so none is asked")
-        await ask(client, "webots_breakpoint", condition="steps == 2000000", action="log")
-        listed = await ask(client, "webots_list_breakpoints")
-        assert [row[1] for row in listed["breakpoints"]["rows"]] == ["steps == 2000000"]
-        assert "those of webots_breakpoint stay" in listed["hint"]

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import json
 import time
 
 import pytest
 
 from tests.recordings.rows import Recorded
-from tests.server.conftest import DATA_TOOLS, Connect, ask, fail, text_of, text_of
+from tests.server.conftest import DATA_TOOLS, Connect, ask, fail, text_of
 
 pytestmark = pytest.mark.anyio
 
@@ -54,19 +53,6 @@ async def test_several_live_robots_are_listed_until_one_is_named(
         assert "did you mean 'crane'" in await fail(client, "webots_get_robot_state", robot="crne")
         rows = (await ask(client, "webots_list_robots"))["robots"]["rows"]
         assert [row[0] for row in rows] == ["rover", "crane"]
-
-
-async def test_a_time_that_is_infinite_is_null_and_the_answer_still_json(
-    connect: Connect, recorded: Recorded
-) -> None:
-    robot = recorded.robot()
-    robot.state(1.0, {"x": 1})
-    robot.state(float("inf"), {"x": 2})
-    async with connect() as client:
-        for tool in DATA_TOOLS:
-            result = await client.call_tool(tool)
-            assert not result.is_error, text_of(result)
-            assert json.loads(text_of(result), parse_constant=pytest.fail)["sim_time_s"] is None
 
 
 async def test_a_time_that_is_infinite_is_null_and_the_answer_still_json(

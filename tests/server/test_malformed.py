@@ -62,22 +62,3 @@ async def test_it_is_said_of_which_run_and_row_it_is(
         if value is NOT_UTF8:
             told = await fail(client, "webots_query_history", signals=["x"])
             assert f"run {robot.run_id}: row {row} of table state has a time that is no" in told
-
-
-@pytest.mark.anyio
-@pytest.mark.parametrize("value", ["nonsense", NOT_UTF8])
-async def test_it_is_said_of_which_run_and_row_it_is(
-    connect: Connect, recorded: Recorded, value: str
-) -> None:
-    robot = recorded.robot()
-    robot.begin_run("reset")
-    row = 0
-    for step in range(3):
-        row = robot.state(step, {"x": step})
-    Damage("state", "data", value).apply(recorded.connection)
-    async with connect() as client:
-        told = await fail(client, "webots_get_robot_state")
-        assert f"run {robot.run_id}: row {row} of table state holds a value" in told
-        if value is NOT_UTF8:
-            told = await fail(client, "webots_query_history", signals=["x"])
-            assert f"run {robot.run_id}: row {row} of table state has a time that is no" in told

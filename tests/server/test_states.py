@@ -96,16 +96,6 @@ async def test_a_value_that_is_null_is_told_from_a_path_that_leads_nowhere(
         assert "there is no 'y'" in await fail(client, "webots_get_full_state", path="gps.y")
 
 
-async def test_a_value_that_is_null_is_told_from_a_path_that_leads_nowhere(
-    connect: Connect, recorded: Recorded
-) -> None:
-    recorded.robot().state(1.0, {"gps": {"x": None}})
-    async with connect() as client:
-        answer = await ask(client, "webots_get_full_state", path="gps.x")
-        assert answer["hint"] == "the value at this path is null"
-        assert "there is no 'y'" in await fail(client, "webots_get_full_state", path="gps.y")
-
-
 async def test_a_large_state_comes_in_pages_that_say_what_is_not_on_them(
     connect: Connect, recorded: Recorded
 ) -> None:

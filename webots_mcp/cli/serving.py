@@ -142,8 +142,8 @@ def serve(
 
 def _say_address(database: Database, url: str) -> None:
     print(
-        f"webots-mcp: serving {database} at {url} to who has the token that 'webots-mcp token' "
-        "shows; Ctrl-C ends it",
+        f"webots-mcp: serving {database} at {url} to clients that give the token, which "
+        "'webots-mcp token' shows; Ctrl-C ends it",
         flush=True,
     )
 

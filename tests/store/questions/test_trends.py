@@ -81,19 +81,6 @@ def test_a_counter_of_large_numbers_counts_and_what_adding_leaves_is_constant(
     assert told["sum"].shape == "constant"
 
 
-def test_a_counter_of_large_numbers_counts_and_what_adding_leaves_is_constant(
-    empty: sqlite3.Connection, looked_at: str
-) -> None:
-    counter: Course = lambda time_s: 3_000_000_000_000_001 + int(time_s)  # noqa: E731
-    record(empty, rows=300, interval_s=0.1, counter=counter, sum=lambda t: 6.0 + (t % 1) * 5e-15)
-    told = {each.name: each for each in ask(empty).numbers}
-    assert told["counter"].shape == "rising"
-    assert told["counter"].says.startswith(
-        "rises from 3000000000000001 to 3000000000000030 (1/s)"
-    )
-    assert told["sum"].says == "constant at 6"
-
-
 @pytest.mark.parametrize("looked_at", ["chunks"], indirect=True)
 def test_a_swing_faster_than_the_chunks_gets_no_period_of_an_alias(
     empty: sqlite3.Connection, looked_at: str, monkeypatch: pytest.MonkeyPatch

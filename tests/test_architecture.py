@@ -17,6 +17,8 @@ PACKAGE = Path(webots_mcp.__file__).parent
 ALLOWED = {
     "contract": {"errors"},
     "errors": set[str](),
+    "access_token": {"contract", "errors"},
+    "http_server": {"access_token", "errors"},
     "connection": {"contract", "errors"},
     "liveness": {"connection", "contract", "errors", "queue", "waiting_file"},
     "queue": {"connection", "contract", "errors"},
@@ -52,6 +54,7 @@ ALLOWED["bridge"] = STDLIB | {"bridge", "__version__"}
 ALLOWED["observer"] = STDLIB | {"bridge", "observer"}
 ALLOWED["store"] = STDLIB | {"plugins", "requirements", "store"}
 ALLOWED["diagnosis"] = STDLIB | {"requirements", "store", "diagnosis", "setup", "webots"}
+ALLOWED["diagnosis"] |= {"__version__"}
 ALLOWED["launch"] = STDLIB | {"console", "store", "setup", "webots"}
 ALLOWED["plotting"] = STDLIB | {"store", "plotting"}
 ALLOWED["console"] = STDLIB | {"console", "store", "webots"}
@@ -61,7 +64,7 @@ ALLOWED["server"] = STDLIB | {
 }  # fmt: skip
 ALLOWED["server"] |= {"requirements", "steering"}
 ALLOWED["questions"] = ALLOWED["steering"] = ALLOWED["server"] - {"server"}
-ALLOWED["cli"] = ALLOWED["server"] | {"cli", "observer", "setup"}
+ALLOWED["cli"] = ALLOWED["server"] | {"cli", "observer", "setup"} | {"access_token", "http_server"}
 ON_ALL = ALLOWED["cli"]
 ALLOWED["plugins"] = set[str]()
 ALLOWED["plugins.cluster"] = ALLOWED["steering"] | {"plugins.cluster", "plugins.pool"}

@@ -200,7 +200,7 @@ def test_the_commands_and_their_options_are_there(page: str) -> None:
         name: set(re.findall(r"-[\w-]+", " ".join(command.arguments)))
         for name, command in described().items()
     }
-    lines = re.findall(r"webots-mcp ([a-z]+\b[^`\n|]*)", page)
+    lines = re.findall(r"webots-mcp ([a-z]+\b[^`\n|)]*)", page)
     assert len(lines) >= 4
     for line in lines:
         name, *words = line.split()
@@ -235,4 +235,4 @@ def test_the_prompts_that_are_named_are_there() -> None:
     with closing(MemoryDatabase()) as memory:
         server = create_server(memory, memory.data_dir)
         prompts = {prompt.name for prompt in anyio.run(server.list_prompts)}
-    assert set(re.findall(r"`(\w+_\w+)`", CLIENTS)) - {"mcp_data"} == prompts
+    assert set(re.findall(r"`([a-z]+_[a-z_]+)`", CLIENTS)) - {"mcp_data"} == prompts

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
+import threading
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import pytest
@@ -51,3 +53,35 @@ def test_a_server_is_well_where_it_is_there_and_serves_this_recording(
     (tmp_path / ".mcp.json").write_text(json.dumps({"mcpServers": servers}), "utf-8")
     found = look("Clients")
     assert (found.verdict, seen in found.seen) == (verdict, True), found
+
+
+@pytest.mark.parametrize(
+    ("status", "verdict", "seen"),
+    [
+        (401, "ok", "a server asks for the token"),
+        (404, "wrong", "asks for no token (404)"),
+        (None, "wrong", "nothing answers"),
+    ],
+)
+def test_a_server_over_http_is_well_where_it_asks_for_the_token_which_is_not_sent(
+    look: Look, tmp_path: Path, status: int | None, verdict: str, seen: str
+) -> None:
+    given: list[str | None] = []
+
+    class Answering(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            given.append(self.headers["Authorization"])
+            self.send_error(status or 500)
+
+    with HTTPServer(("127.0.0.1", 0), Answering) as server:
+        url = f"http://127.0.0.1:{server.server_port}/mcp"
+        headers = {"Authorization": "Bearer ${WEBOTS_MCP_TOKEN}"}
+        entry = {"type": "http", "url": url, "headers": headers}
+        (tmp_path / ".mcp.json").write_text(json.dumps({"mcpServers": {"w": entry}}), "utf-8")
+        if status is None:
+            server.server_close()
+        else:
+            threading.Thread(target=server.handle_request).start()
+        found = look("Clients")
+    assert (found.verdict, seen in found.seen) == (verdict, True), found
+    assert not any(given)

@@ -45,7 +45,7 @@ def test_a_folder_that_cannot_be_written_is_wrong(bridge_recording: Path, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("folder", "mounts", "is_wsl", "why"),
+    ("folder", "mounts", "in_wsl", "why"),
     [
         ("/home/ada/net/mcp_data", [LOCAL, Mount("/home/ada/net", "nfs4")], False, "network drive"),
         ("/mnt/share", [LOCAL, Mount("/mnt/share", "cifs")], False, "network drive"),
@@ -59,9 +59,9 @@ def test_a_folder_that_cannot_be_written_is_wrong(bridge_recording: Path, tmp_pa
     ],
 )
 def test_where_memory_cannot_be_shared_it_is_wrong_and_says_why(
-    folder: str, mounts: list[Mount], is_wsl: bool, why: str
+    folder: str, mounts: list[Mount], in_wsl: bool, why: str
 ) -> None:
-    place = judge_file_system(folder, mounts, is_wsl=is_wsl)
+    place = judge_file_system(folder, mounts, in_wsl=in_wsl)
     assert place.verdict == "wrong"
     assert why in place.seen
     assert "--data-dir" in (place.fix or "")
@@ -80,4 +80,4 @@ def test_where_memory_cannot_be_shared_it_is_wrong_and_says_why(
     ],
 )
 def test_other_places_are_not_called_wrong(folder: str, mounts: list[Mount], verdict: str) -> None:
-    assert judge_file_system(folder, mounts, is_wsl=False).verdict == verdict
+    assert judge_file_system(folder, mounts, in_wsl=False).verdict == verdict

@@ -7,6 +7,7 @@ of today take their place. Whoever accepts says in the commit why each answer ch
 from __future__ import annotations
 
 import argparse
+import logging
 import sys
 
 from tests.golden.drawing import KINDS
@@ -20,6 +21,7 @@ def main() -> int:
     arguments = parser.parse_args()
     if unknown := set(arguments.names) - set(KINDS):
         parser.error(f"no recording {', '.join(unknown)}: there is {', '.join(KINDS)}")
+    logging.disable(logging.WARNING)  # of client and server: each call
     differing = 0
     for name in arguments.names or KINDS:
         answers = answers_of(name)

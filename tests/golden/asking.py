@@ -7,15 +7,18 @@ import hashlib
 import io
 import json
 import sqlite3
-from collections.abc import Iterator
-from contextlib import closing, redirect_stderr, redirect_stdout
+from collections.abc import AsyncGenerator, Iterator
+from contextlib import asynccontextmanager, closing, redirect_stderr, redirect_stdout
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Final, cast
 from unittest.mock import patch
 
 import anyio
+import httpx2
 from mcp import Client
+from mcp.client.streamable_http import streamable_http_client
+from mcp.server import MCPServer
 
 from tests.golden.drawing import Kind
 from tests.report.conftest import Shown
@@ -40,6 +43,7 @@ _VIEWS: Final = (
     "robot_kept", "robot_now", "robot_trajectory",
 )  # fmt: skip
 _IN_A_BUNDLE: Final = ("run", "state", "log", "event", "image", "kept_stretch", "kept_state")
+OVER_HTTP: Final = ", over HTTP"  # behind the name of a question that was asked so once more
 _WALL_TIME: Final = "wall time"  # in a report; how long follows
 _ROWS_SHOWN: Final = 12
 _POINTS_SHOWN: Final = 6  # of a curve, evenly from it
@@ -119,16 +123,30 @@ async def _ask_tools(kind: Kind, file: Path) -> Answers:
     for name in _OF_A_PART:
         tool, arguments = TOOLS[name]
         asked[f"{name} of a part"] = (tool, arguments | part)
-    async with Client(create_server(file, file.parent, read_only=True)) as client:
-        single = [each for each in all_questions() if not isinstance(each, MergedQuestion)]
-        known = {each.name: each.arguments.model_fields for each in single}
+    single = [each for each in all_questions() if not isinstance(each, MergedQuestion)]
+    known = {each.name: each.arguments.model_fields for each in single}
+    server = create_server(file, file.parent, read_only=True)
+    async with Client(server) as client, _client_over_http(server) as other:
         for name, (tool, arguments) in asked.items():
             subject = {"robot": kind.robot, "run_id": kind.run_id, "where": _where(kind, arguments)}
             taken = {key: subject[key] for key in subject if key in known[tool] and subject[key]}
-            result = await client.call_tool(tool, arguments | taken)
-            texts = [block.text for block in result.content if block.type == "text"]
-            found[name] = result.structured_content if not result.is_error else texts
+            for asker, addition in ((client, ""), (other, OVER_HTTP)):
+                result = await asker.call_tool(tool, arguments | taken)
+                texts = [block.text for block in result.content if block.type == "text"]
+                found[name + addition] = result.structured_content or texts
+                assert result.is_error == (result.structured_content is None), name
     return found
+
+
+@asynccontextmanager
+async def _client_over_http(server: MCPServer) -> AsyncGenerator[Client]:
+    """A client of the handshake that most have, on the server's HTTP application."""
+    app = server.streamable_http_app()
+    carrier = httpx2.AsyncClient(transport=httpx2.ASGITransport(app), timeout=60)
+    async with carrier, server.session_manager.run():
+        transport = streamable_http_client("http://localhost:8000/mcp", http_client=carrier)
+        async with Client(transport, mode="legacy") as client:
+            yield client
 
 
 def _where(kind: Kind, arguments: dict[str, Any]) -> str | None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 from unittest.mock import patch
 
-from tests.golden.asking import ask_all
+from tests.golden.asking import OVER_HTTP, ask_all
 from tests.golden.drawing import CONTROLLER, KINDS
 from tests.golden.text import Portable
 
@@ -18,7 +18,10 @@ _HEADING: Final = "== "
 
 
 def answers_of(name: str) -> dict[str, str]:
-    """Draw a recording, and what each question answers of it today, as portable text."""
+    """Draw a recording, and what each question answers of it today, as portable text.
+
+    What is answered over HTTP is there only where it is something else.
+    """
     kind = KINDS[name]
     with tempfile.TemporaryDirectory() as folder_name:
         folder = Path(folder_name)
@@ -26,7 +29,12 @@ def answers_of(name: str) -> dict[str, str]:
         with program, patch.object(sys, "argv", [str(CONTROLLER)]):
             kind.draw(folder)
         portable = Portable(kind, folder)
-        return {asked: portable.text(told) for asked, told in ask_all(kind, folder).items()}
+        texts = {asked: portable.text(told) for asked, told in ask_all(kind, folder).items()}
+    return {
+        asked: text
+        for asked, text in texts.items()
+        if not asked.endswith(OVER_HTTP) or text != texts[asked.removesuffix(OVER_HTTP)]
+    }
 
 
 def stored(name: str) -> dict[str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -33,11 +34,13 @@ class Server:
         where = ["--data-dir", str(data_dir)]
         arguments = ["view", "--port", "0", "--no-browser", "--json", *where, *options]
         self.data_dir = data_dir
+        self._home = {**os.environ, "HOME": str(data_dir), "USERPROFILE": str(data_dir)}
         self.process = subprocess.Popen(
             [sys.executable, "-m", "webots_mcp", *arguments],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
+            env=self._home,
         )
         assert self.process.stdout is not None
         said = self.process.stdout.readline()
@@ -50,6 +53,11 @@ class Server:
         """What the page is answered to a question."""
         with urlopen(self.url + path, timeout=60) as response:
             return json.load(response)
+
+    def run(self, *command: str) -> str:
+        """What another command of the same user prints."""
+        line = [sys.executable, "-m", "webots_mcp", *command]
+        return subprocess.check_output(line, text=True, env=self._home).strip()
 
     def stop(self) -> str:
         """End it as Ctrl-C does; returns what it said on stderr."""

@@ -99,18 +99,26 @@ def post(server: Server, headers: dict[str, str]) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize("path", ["/", "/page.js", "/look", "/x/"])
-def test_without_the_token_of_the_printed_address_nothing_is_shown(told: Server, path: str) -> None:
+def test_without_the_key_of_the_printed_address_nothing_is_shown(told: Server, path: str) -> None:
     status, text = answer(told, path)
     assert status == 403
-    assert "open the address that 'webots-mcp view' printed" in text
+    assert "open the address that 'webots-mcp view' prints" in text
     assert told.path.strip("/") not in text
 
 
-def test_each_start_has_a_token_of_its_own(
-    told: Server, serve: Callable[..., Server], tmp_path: Path
+def test_the_address_stays_until_there_is_another_token(
+    serve: Callable[..., Server], tmp_path: Path
 ) -> None:
-    assert serve(tmp_path).path != told.path
-    assert len(told.path.strip("/")) == 24
+    """It is made from the token, and does not show it."""
+    first, second = serve(tmp_path), serve(tmp_path)
+    assert first.path == second.path
+    assert len(first.path.strip("/")) == 32
+    shown = second.run("token")
+    assert shown not in first.path
+    assert answer(first, "")[0] == 200
+    assert second.run("token", "--new") != shown
+    assert answer(first, "")[0] == 403
+    assert serve(tmp_path).path != first.path
 
 
 def test_no_other_page_can_hold_it_or_is_told_its_address(told: Server) -> None:

@@ -204,3 +204,20 @@ def test_a_server_that_lacks_its_packages_is_said(monkeypatch: pytest.MonkeyPatc
     monkeypatch.undo()
     monkeypatch.setattr(sys, "prefix", "/home/me/.cache/uv/archive-v0/Ab1")
     assert f"uv tool install {checkout()}" in (server_hindrance() or "")
+
+
+def test_a_server_over_http_is_told_with_a_variable_for_its_token(tmp_path: Path) -> None:
+    url = "http://127.0.0.1:8000/mcp"
+    written = ("${WEBOTS_MCP_TOKEN}", "${env:WEBOTS_MCP_TOKEN}", "${env:WEBOTS_MCP_TOKEN}")
+    for client, variable in zip(clients_of(tmp_path), written, strict=True):
+        apply(plan_entry(client, "webots", LINE)[0])
+        apply(plan_entry(client, "webots", url)[0])  # in place of the one that is started
+        headers = {"Authorization": f"Bearer {variable}"}
+        entry = json.loads(client.file.read_text())[client.servers]["webots"]
+        assert entry == {"type": "http", "url": url, "headers": headers}
+        for again in (url, LINE):
+            change, note = plan_entry(client, "webots", again)
+            assert not change.is_needed
+            assert note is None or url in note
+    with pytest.raises(InvalidInputError, match="Claude Desktop reads no servers over HTTP"):
+        plan_entry(claude_desktop("linux"), "webots", url)

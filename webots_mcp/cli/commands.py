@@ -52,6 +52,7 @@ _OF_THE_CORE: Final = {
     "init": Command(SETUP, "webots_mcp.cli.setting_up", "init"),
     "observe": Command(SETUP, "webots_mcp.cli.serving", "observe"),
     "serve": Command(SETUP, "webots_mcp.cli.serving", "serve"),
+    "token": Command(SETUP, "webots_mcp.cli.serving", "token"),
     "run": Command(STEER, f"{_Q}.control_simulation", "webots_run"),
     "send": Command(STEER, f"{_Q}.send_command", "webots_send_command"),
     "wait": Command(STEER, f"{_Q}.send_command", "webots_wait_for_command"),

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Generator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
@@ -53,15 +54,42 @@ def serve(
             "else.",
         ),
     ] = False,
+    http: Annotated[
+        str | None,
+        Parameter(
+            "--http",
+            metavar="[HOST:]PORT",
+            help="Serve many clients over HTTP, at this port of 127.0.0.1, say 8000; each gives "
+            "the token that 'webots-mcp token' shows.",
+        ),
+    ] = None,
+    allow_host: Annotated[
+        tuple[str, ...],
+        Parameter(
+            "--allow-host",
+            metavar="NAME",
+            help="With --http: a name that clients call this computer by; needed with a HOST that "
+            "the network reaches, as are the files of TLS.",
+        ),
+    ] = (),
+    tls_cert: Annotated[
+        Path | None,
+        Parameter("--tls-cert", help="With --http: its certificate, with the chain, in PEM."),
+    ] = None,
+    tls_key: Annotated[
+        Path | None, Parameter("--tls-key", help="With --http: the certificate's key, in PEM.")
+    ] = None,
     limits: Limits = _AS_BEFORE,
     recorded: Where = HERE,
 ) -> None:
-    """Serve a recording to an MCP client over stdin and stdout.
+    """Serve a recording to an MCP client over stdin and stdout, or to many over HTTP.
 
     Starts whether or not anything was recorded yet. 'webots-mcp init' tells clients of it; by
     hand, Claude Code is told with:
 
         claude mcp add webots -- webots-mcp serve --data-dir /path/to/project/mcp_data
+
+    With --http 8000 it runs until Ctrl-C, and clients come and go: see docs/clients.md.
 
     While it runs, and unless it is --read-only, the oldest of what is beyond the limits is deleted.
     Limits belong to the database: what 'webots-mcp prune' or 'retain' has set,
@@ -77,7 +105,14 @@ def serve(
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr)
     database, data_dir = resolve_database(recorded.database, recorded.data_dir)
     asked = limits.asked()
-    if sys.stdin.isatty():
+    place = None
+    if http is not None:
+        from webots_mcp.http_server import place_of
+
+        place = place_of(http, allow_host, tls_cert, tls_key)
+    elif allow_host or tls_cert or tls_key:
+        raise InvalidInputError("--allow-host, --tls-cert and --tls-key are for --http")
+    elif sys.stdin.isatty():
         print(
             f"webots-mcp: serving {database} to an MCP client on stdin and stdout; Ctrl-C ends it. "
             "Clients start this command themselves, see 'webots-mcp serve --help'.",
@@ -97,7 +132,40 @@ def serve(
             limits=asked,
         )
     with ending_in_time(), _ending_with_the_client():
-        server.run()
+        if place is None:
+            return server.run()
+        from webots_mcp.http_server import serve_http
+
+        serve_http(server, place, partial(_say_address, database))
+
+
+def _say_address(database: Database, url: str) -> None:
+    print(
+        f"webots-mcp: serving {database} at {url} to clients that give the token, which "
+        "'webots-mcp token' shows; Ctrl-C ends it",
+        flush=True,
+    )
+
+
+def token(
+    *,
+    new: Annotated[
+        bool,
+        Parameter("--new", help="Make another first; the one before is refused from then on."),
+    ] = False,
+    as_json: Json = False,
+) -> None:
+    """Show the token that clients of 'webots-mcp serve --http' give; one for all your projects.
+
+    It is in a file that only you can read. The address of the page of 'webots-mcp view' is made
+    from it.
+    """
+    from webots_mcp.access_token import access_token, new_token, token_file
+
+    shown = new_token() if new else access_token()
+    if as_json:
+        return print_json({"token": shown, "file": str(token_file())})
+    print(shown)
 
 
 @contextmanager

@@ -104,6 +104,15 @@ def init(
     name: Annotated[
         str, Parameter("--name", metavar="NAME", help="What clients call the server (webots).")
     ] = "webots",
+    http: Annotated[
+        str | None,
+        Parameter(
+            "--http",
+            metavar="URL",
+            help="Tell them of a server that runs, as http://127.0.0.1:8000/mcp; they take its "
+            "token from the environment variable WEBOTS_MCP_TOKEN.",
+        ),
+    ] = None,
     patch: Annotated[
         Path | None,
         Parameter(
@@ -143,7 +152,8 @@ def init(
 
     The project is the nearest folder with worlds/ and controllers/. Claude Code (.mcp.json), Cursor
     (.cursor/mcp.json) and VS Code (.vscode/mcp.json) are told of the server, by a full path;
-    other entries stay. Of each controller in Python the lines that it needs are
+    other entries stay. In WSL, where the project is on a drive of Windows, it is the server of
+    Windows. Of each controller in Python the lines that it needs are
     shown, the Python that Webots starts it with, and what mends that where the bridge is not
     installed there. Nothing is changed a second time.
 
@@ -171,7 +181,7 @@ def init(
     elif patch is not None:
         _change_controller(patch, project_edits.patch, writing)
     else:
-        _make_ready(project, name, writing, claude_desktop=claude_desktop)
+        _make_ready(project, name, writing, http, claude_desktop=claude_desktop)
 
 
 def _change_controller(file: Path, changed: Callable[[bytes], bytes], writing: Writing) -> None:
@@ -266,21 +276,28 @@ def _outcome(file: dict[str, str]) -> str:
     return f"{file['outcome']}: {file['file']}{note}"
 
 
-def _make_ready(folder: str | None, name: str, writing: Writing, *, claude_desktop: bool) -> None:
+def _make_ready(
+    folder: str | None, name: str, writing: Writing, http: str | None, *, claude_desktop: bool
+) -> None:
     """Tell clients of the server, and say what the controllers need."""
     from webots_mcp.contract import PROJECT_DATA_FOLDER
     from webots_mcp.setup import client_entries, controllers_of, project_of
+    from webots_mcp.setup.wsl import windows_server
 
+    if http is not None and not http.startswith(("http://", "https://")):
+        raise InvalidInputError(f"--http {http!r} is no URL, such as http://127.0.0.1:8000/mcp")
     project = project_of(folder)
     data_dir = project / PROJECT_DATA_FOLDER
-    expected = _expected(data_dir, writing)
+    of_windows, border = (None, None) if http else windows_server(project)
+    expected = None if of_windows else _expected(data_dir, writing)  # a database not to be shared
     clients = client_entries.clients_of(project)
     clients += [client_entries.claude_desktop()] if claude_desktop else []
-    line = client_entries.server_command(data_dir)
+    line = http or of_windows or client_entries.server_command(data_dir)
     files = [_ignored(data_dir, writing)]
     files += [_told(client, name, line, writing) for client in clients]
     controllers = [_described(found, project) for found in controllers_of(project)]
-    notes = [note for note in (client_entries.server_hindrance(), expected) if note]
+    hindrance = None if http or of_windows else client_entries.server_hindrance()
+    notes = [note for note in (border, hindrance, expected) if note]
     found = {"project": str(project), "server": line, "files": files, "controllers": controllers}
     if writing.as_json:
         print_json(found | ({"note": "; ".join(notes)} if notes else {}))
@@ -329,7 +346,7 @@ def _ignored(data_dir: Path, writing: Writing) -> dict[str, str]:
         return {"file": str(file), "outcome": "refused", "note": str(error)}
 
 
-def _told(client: Client, name: str, line: list[str], writing: Writing) -> dict[str, str]:
+def _told(client: Client, name: str, line: list[str] | str, writing: Writing) -> dict[str, str]:
     """Put the server into a client's file."""
     from webots_mcp.setup.client_entries import plan_entry
 

@@ -36,6 +36,7 @@ from webots_mcp.diagnosis import (
 )
 from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
 from webots_mcp.requirements import install_line, missing_requirements, package_of
+from webots_mcp.setup.wsl import WAY_OUT, is_wsl
 from webots_mcp.store.recording import GETTING_STARTED, View, name_of
 from webots_mcp.store.robots import fetch_session, handler_at_work, rows_waiting
 from webots_mcp.waiting_file import count_rows, waiting_paths
@@ -165,11 +166,10 @@ def file_system(subject: Examined) -> Iterator[Diagnosis]:
         Mount(part.mountpoint, part.fstype, "remote" in part.opts.split(","))
         for part in psutil.disk_partitions(all=True)
     ]
-    is_wsl = "microsoft" in platform.release().lower()
-    yield judge_file_system(str(subject.file.parent), mounts, is_wsl=is_wsl)
+    yield judge_file_system(str(subject.file.parent), mounts, in_wsl=is_wsl())
 
 
-def judge_file_system(folder: str, mounts: Iterable[Mount], *, is_wsl: bool) -> Diagnosis:
+def judge_file_system(folder: str, mounts: Iterable[Mount], *, in_wsl: bool) -> Diagnosis:
     """Whether a recording may lie in a folder, on a machine with these file systems."""
     path = folder.replace("\\", "/")
     if path.lower().startswith(_WSL_FROM_WINDOWS):
@@ -181,7 +181,7 @@ def judge_file_system(folder: str, mounts: Iterable[Mount], *, is_wsl: bool) -> 
         return unclear(f"the system does not show on which drive {folder} is")
     mount = max(above, key=lambda mount: len(mount.point))
     kind = mount.kind.lower()
-    if is_wsl and kind in _WINDOWS_FROM_WSL:
+    if in_wsl and kind in _WINDOWS_FROM_WSL:
         return _across_the_border(folder, f"a drive of Windows, seen from WSL ({kind})")
     if mount.is_remote or kind in _NETWORK:
         return _on_the_network(folder, f"a network drive ({mount.kind} at {mount.point})")
@@ -196,7 +196,7 @@ def _across_the_border(folder: str, what: str) -> Diagnosis:
         f"{folder} is {what}: SQLite cannot share memory across that border, so that controllers "
         "and server lock each other out or damage the file"
     )
-    return wrong(seen, f"run both on one side of it, and {_LOCAL}")
+    return wrong(seen, WAY_OUT)
 
 
 def _on_the_network(folder: str, what: str) -> Diagnosis:

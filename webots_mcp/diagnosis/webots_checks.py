@@ -15,10 +15,14 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import suppress
+from http import HTTPStatus
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
+from urllib.error import HTTPError
+from urllib.request import urlopen
 
+from webots_mcp import __version__
 from webots_mcp.contract import UNSEEN, host_name
 from webots_mcp.diagnosis import (
     Diagnosis,
@@ -33,6 +37,7 @@ from webots_mcp.diagnosis import (
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.pauses import PAUSED, SEEN_PAUSED, SEEN_RUNNING
 from webots_mcp.setup.client_entries import (
+    TOKEN_VARIABLE,
     Client,
     can_be_started,
     claude_desktop,
@@ -41,6 +46,7 @@ from webots_mcp.setup.client_entries import (
     object_in,
     words_of,
 )
+from webots_mcp.setup.wsl import WAY_OUT, ask_windows, in_wsl, is_wsl, on_windows
 from webots_mcp.store.recording import View
 from webots_mcp.store.robots import SILENT, WAITING_IN_STEP, Session, companions
 from webots_mcp.webots import find_webots, installations, shown_of
@@ -51,6 +57,7 @@ if TYPE_CHECKING:
 
     from webots_mcp.webots import Instance
 
+_ANSWER_S: Final = 3  # for a server that runs to answer
 _WATCHED_S: Final = 0.3
 _LOOKS: Final = 6
 _MOST_WATCHED: Final = 5  # simulations, one after the other
@@ -248,6 +255,25 @@ def running(subject: Examined) -> Iterator[Diagnosis]:
             )
 
 
+@check("WSL", well="this is not WSL: Webots, controllers and server are on one side")
+def sides(subject: Examined) -> Iterator[Diagnosis]:
+    """What there is in WSL and what on Windows, and whether they meet."""
+    if not is_wsl():
+        return
+    here = installations()
+    there = on_windows(subject.project)
+    windows = ask_windows()
+    on_this = f"Webots at {here[0].home or here[0].program}" if here else "no Webots"
+    ours = f"webots-mcp {windows.version}" if windows.server else "no webots-mcp"
+    webots = f"Webots at {windows.webots}" if windows.webots else "no Webots"
+    seen = (
+        f"in WSL: webots-mcp {__version__}, {on_this}; on Windows: {ours}, {webots}; the project "
+        f"is {f'on Windows ({there})' if there else f'in WSL ({subject.project})'}"
+    )
+    meet = windows.server and windows.webots if there else here
+    yield ok(seen) if meet else warning(seen, WAY_OUT)
+
+
 @check("Clients")
 def clients(subject: Examined) -> Iterator[Diagnosis]:
     """Each file that is there, and whether its server can start on this recording."""
@@ -278,6 +304,8 @@ def _servers_of(subject: Examined, client: Client) -> Iterator[Diagnosis]:
 
 
 def _entry(subject: Examined, name: str, entry: dict[str, Any]) -> Diagnosis:
+    if "url" in entry:
+        return _over_http(name, str(entry["url"]))
     command, *arguments = words_of(entry)
     if shutil.which(command) is None:
         return wrong(f"{name}: there is no program {command!r}", _INIT)
@@ -291,13 +319,30 @@ def _entry(subject: Examined, name: str, entry: dict[str, Any]) -> Diagnosis:
     return ok(f"{name} starts {command}")
 
 
+def _over_http(name: str, url: str) -> Diagnosis:
+    """Whether a server asks for the token there; it is not sent, as anybody may have written it."""
+    try:
+        with urlopen(url, timeout=_ANSWER_S) as answer:
+            status: int = answer.status
+    except HTTPError as error:
+        status = error.code
+    except (OSError, ValueError) as error:
+        seen = f"{name} is at {url}, where nothing answers: {error}"
+        return wrong(seen, "start it there: webots-mcp serve --http PORT")
+    if status != HTTPStatus.UNAUTHORIZED:
+        seen = f"{name} is at {url}, where something answers that asks for no token ({status})"
+        return wrong(seen, _INIT)
+    return ok(f"{name} is at {url}, where a server asks for the token ({TOKEN_VARIABLE})")
+
+
 def _other_place(subject: Examined, arguments: list[str]) -> str | None:
     """The recording that the arguments name, if it is another one."""
     words = [part for word in arguments for part in word.split("=", 1)]
     for option, value in pairwise(words):
         if option in _PLACES and "$" not in value:
             ours = subject.recording.data_dir if option == "--data-dir" else subject.file
-            same = ours is not None and (subject.project / value).resolve() == ours.resolve()
+            meant = subject.project / (in_wsl(value) if is_wsl() else value)
+            same = ours is not None and meant.resolve() == ours.resolve()
             return None if same else value
     return None
 

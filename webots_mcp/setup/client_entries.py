@@ -17,23 +17,29 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.requirements import checkout, install_line, quoted
 from webots_mcp.setup import FileChange, read
 
+TOKEN_VARIABLE: Final = "WEBOTS_MCP_TOKEN"  # of clients that ask over HTTP
 _BOM: Final = "\ufeff"
 # Folders of environments that uv makes for one command and clears away with its cache.
 _PASSING: Final = re.compile(r"(archive|builds|environments)-v\d+")
 
 
 class Client(NamedTuple):
-    """An MCP client: its name, its file, and the member of it that holds the servers."""
+    """An MCP client: its name, its file, and the member of it that holds the servers.
+
+    Attributes:
+        variable: How an environment variable is written in a header; None where HTTP is not known.
+    """
 
     name: str
     file: Path
     servers: str = "mcpServers"
+    variable: str | None = "${env:%s}"
 
 
 def clients_of(project: Path) -> list[Client]:
     """Those that look into the folder of a project."""
     return [
-        Client("Claude Code", project / ".mcp.json"),
+        Client("Claude Code", project / ".mcp.json", variable="${%s}"),
         Client("Cursor", project / ".cursor" / "mcp.json"),
         Client("VS Code", project / ".vscode" / "mcp.json", "servers"),
     ]
@@ -47,7 +53,8 @@ def claude_desktop(platform: str = sys.platform) -> Client:
         folder = Path.home() / "Library" / "Application Support"
     else:
         folder = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
-    return Client("Claude Desktop", folder / "Claude" / "claude_desktop_config.json")
+    file = folder / "Claude" / "claude_desktop_config.json"
+    return Client("Claude Desktop", file, variable=None)
 
 
 def server_command(data_dir: Path) -> list[str]:
@@ -74,18 +81,29 @@ def server_hindrance() -> str | None:
     )
 
 
-def plan_entry(client: Client, name: str, command: list[str]) -> tuple[FileChange, str | None]:
+def plan_entry(client: Client, name: str, server: list[str] | str) -> tuple[FileChange, str | None]:
     """The change that makes a client know the server, and what there is to know about it.
 
     An entry of ours that can be started is left as it is, also where it differs: its options are
     the user's. One that cannot be started any more gets the command anew and keeps its options.
+    The address of a server that runs replaces either; its token is left to a variable, as these
+    files are in repositories.
 
     Raises:
-        InvalidInputError: The file cannot be read as JSON, or the name is taken.
+        InvalidInputError: The file cannot be read as JSON, the name is taken, or the client asks
+            no server over HTTP.
         OSError: It cannot be read.
     """
     before = read(client.file)
-    wanted = {"command": command[0], "args": command[1:]}
+    wanted: dict[str, Any]
+    if isinstance(server, list):
+        wanted = {"command": server[0], "args": server[1:]}
+    elif client.variable:
+        token = client.variable % TOKEN_VARIABLE
+        headers = {"Authorization": f"Bearer {token}"}
+        wanted = {"type": "http", "url": server, "headers": headers}
+    else:
+        raise InvalidInputError(f"{client.name} reads no servers over HTTP from its file")
     try:
         text = before.decode("utf-8-sig") if before is not None else ""
         after, note = _with_entry(text if text.strip() else "{}\n", client.servers, name, wanted)
@@ -117,8 +135,10 @@ def _with_entry(
     entry = cast("dict[str, Any]", there[name])
     if all(entry.get(key) == value for key, value in wanted.items()):
         return text, None
+    if "url" in wanted:
+        return _rewritten(text, {**document, servers: {**there, name: wanted}}), None
     if can_be_started(entry):
-        kept = " ".join(words_of(entry))
+        kept = entry.get("url") or " ".join(words_of(entry))
         return text, f"it has an entry {name!r} of its own, which is kept: {kept}"
     arguments: list[str] = wanted["args"]
     options = entry["args"][entry["args"].index("serve") + 1 :]
@@ -129,10 +149,12 @@ def _with_entry(
 
 
 def is_ours(entry: Any) -> bool:
-    """Whether a server's entry starts `webots-mcp serve`, in one of the ways to do so."""
+    """Whether a server's entry starts `webots-mcp serve`, or gives our token to one that runs."""
     if not isinstance(entry, dict):
         return False
     words = words_of(cast("dict[str, Any]", entry))
+    if "url" in entry:
+        return TOKEN_VARIABLE in json.dumps(entry)
     names = {re.split(r"[\\/]", word)[-1].removesuffix(".exe") for word in words}
     return "serve" in words[1:] and bool(names & {"webots-mcp", "webots_mcp"})
 
@@ -151,6 +173,8 @@ def can_be_started(entry: dict[str, Any]) -> bool:
 
     Of `uvx` and other programs that install first only the program is looked for.
     """
+    if "url" in entry:
+        return True
     command: str = entry["command"]
     if Path(command).is_absolute():
         return Path(command).is_file()

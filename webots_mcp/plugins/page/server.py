@@ -1,7 +1,7 @@
 """The server of the page: on loopback only, for who was told its address.
 
-Everything lies below a token that is drawn anew at each start and is part of the address: other
-programs of this computer, and web sites that a browser here shows, do not know it.
+Everything lies below a key that is made from the user's access token and is part of the address:
+other users of this computer, and web sites that a browser here shows, do not know it.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from urllib.parse import parse_qsl, urlsplit
 
 import anyio
 
+from webots_mcp.access_token import LOOPBACK, page_key
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.parameter import Value
 from webots_mcp.plotting.on_a_page import figure_part
@@ -33,7 +34,7 @@ from webots_mcp.store.chunk_making import make_missing_chunks
 from webots_mcp.store.recording import Recording
 from webots_mcp.webots.orders import Order
 
-HOST: Final = "127.0.0.1"
+HOST: Final = LOOPBACK[0]
 MOST_TABS: Final = 20  # each reads the recording five times a second
 ORDERS: Final = ("pause", "resume", "step", "reset")
 _TAB_S: Final = 15.0  # for so long a tab counts as open after it asked
@@ -46,8 +47,8 @@ _FOREIGN: Final = (
     "a web site has pointed here.\n"
 )
 _UNTOLD: Final = (
-    "The address of this page has a token, without which nothing is shown: open the address that "
-    "'webots-mcp view' printed when it started.\n"
+    "The address of this page has a key, without which nothing is shown: open the address that "
+    "'webots-mcp view' prints.\n"
 )
 _FULL: Final = (
     f"{MOST_TABS} tabs of this page are open: close one, wait a quarter of a minute, and open this "
@@ -68,7 +69,6 @@ class PageServer(ThreadingHTTPServer):
     """A server that listens; `run` serves until it is interrupted.
 
     Attributes:
-        token: Below which the page is.
         recording: What is shown; commands go through it unless `read_only`.
     """
 
@@ -78,7 +78,6 @@ class PageServer(ThreadingHTTPServer):
         super().__init__((HOST, port), _Request)
         self.recording, self.read_only = recording, read_only
         self.steered = replace(recording, read_only=False)
-        self.token = secrets.token_urlsafe(18)
         self.chunk_maker = ChunkMaker(recording)
         self._tabs: dict[str, float] = {}  # when each has asked last, on the monotonic clock
         self._said: set[str] = set()
@@ -87,7 +86,7 @@ class PageServer(ThreadingHTTPServer):
     @property
     def url(self) -> str:
         """Where the page is."""
-        return f"http://{HOST}:{self.server_port}/{self.token}/"
+        return f"http://{HOST}:{self.server_port}/{page_key()}/"
 
     def run(self, ready: Callable[[str], object]) -> None:
         """Serve, and tell `ready` the address as soon as a browser may ask."""
@@ -165,7 +164,7 @@ class _Request(BaseHTTPRequestHandler):
         length = int(self.headers.get("Content-Length") or 0)
         if path != "steer" or self._page.read_only or length > _MOST_BYTES:
             return self._refuse(403, "This page only shows.\n")
-        own = {f"http://{name}:{self._page.server_port}" for name in (HOST, "localhost")}
+        own = {f"http://{name}:{self._page.server_port}" for name in LOOPBACK}
         is_json = self.headers.get("Content-Type") == "application/json"
         if not is_json or self.headers.get("Origin") not in own:
             return self._refuse(403, "Orders are taken from the page itself only.\n")
@@ -178,13 +177,13 @@ class _Request(BaseHTTPRequestHandler):
         return self.server
 
     def _path(self) -> str | None:
-        """The path below the token; None where the request was refused."""
+        """The path below the key; None where the request was refused."""
         host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
-        if host not in (HOST, "localhost"):
+        if host not in LOOPBACK:
             return self._refuse(403, _FOREIGN)
         path = urlsplit(self.path).path.removeprefix("/")
-        token, slash, rest = path.partition("/")
-        if not slash or not secrets.compare_digest(token.encode(), self._page.token.encode()):
+        key, slash, rest = path.partition("/")
+        if not slash or not secrets.compare_digest(key.encode(), page_key().encode()):
             return self._refuse(403, _UNTOLD)
         return rest
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from webots_mcp.diagnosis import Checked, Examined
     from webots_mcp.setup import FileChange, ProjectController
     from webots_mcp.setup.client_entries import Client
+    from webots_mcp.setup.skills import Part
 
 _WRONG: Final = 1  # the exit code
 _LEAST_COLUMN: Final = 30  # characters that a line of a folded text has at least
@@ -107,6 +108,12 @@ def init(
     name: Annotated[
         str, Parameter("--name", metavar="NAME", help="What clients call the server (webots).")
     ] = "webots",
+    skills: Annotated[
+        bool,
+        Parameter(
+            "--skills", help="Add skills to .claude/skills and AGENTS.md; what you change, stays."
+        ),
+    ] = False,
     patch: Annotated[
         Path | None,
         Parameter(
@@ -174,7 +181,7 @@ def init(
     elif patch is not None:
         _change_controller(patch, project_edits.patch, writing)
     else:
-        _make_ready(project, name, writing, claude_desktop=claude_desktop)
+        _make_ready(project, name, writing, claude_desktop=claude_desktop, skills=skills)
 
 
 def _change_controller(file: Path, changed: Callable[[bytes], bytes], writing: Writing) -> None:
@@ -266,10 +273,13 @@ def _outcome(file: dict[str, str]) -> str:
     return f"{file['outcome']}: {file['file']}{note}"
 
 
-def _make_ready(folder: str | None, name: str, writing: Writing, *, claude_desktop: bool) -> None:
+def _make_ready(
+    folder: str | None, name: str, writing: Writing, *, claude_desktop: bool, skills: bool
+) -> None:
     """Tell clients of the server, and say what the controllers need."""
     from webots_mcp.contract import PROJECT_DATA_FOLDER
     from webots_mcp.setup import client_entries, controllers_of, project_of
+    from webots_mcp.setup.skills import parts_of
 
     project = project_of(folder)
     data_dir = project / PROJECT_DATA_FOLDER
@@ -279,6 +289,7 @@ def _make_ready(folder: str | None, name: str, writing: Writing, *, claude_deskt
     line = client_entries.server_command(data_dir)
     files = [_ignored(data_dir, writing)]
     files += [_told(client, name, line, writing) for client in clients]
+    files += [_skilled(part, writing) for part in parts_of(project)] if skills else []
     controllers = [_described(found, project) for found in controllers_of(project)]
     notes = [note for note in (client_entries.server_hindrance(), expected) if note]
     found = {"project": str(project), "server": line, "files": files, "controllers": controllers}
@@ -339,6 +350,15 @@ def _told(client: Client, name: str, line: list[str], writing: Writing) -> dict[
         return named | writing.apply(change) | ({"note": note} if note else {})
     except (WebotsMCPError, OSError) as error:
         return {**named, "file": str(client.file), "outcome": "refused", "note": str(error)}
+
+
+def _skilled(part: Part, writing: Writing) -> dict[str, str]:
+    """Bring a skill, or the lines of AGENTS.md, up to date."""
+    try:
+        change, note = part.plan()
+        return writing.apply(change) | ({"note": note} if note else {})
+    except (WebotsMCPError, OSError, UnicodeError) as error:
+        return {"file": str(part.file), "outcome": "refused", "note": str(error)}
 
 
 def _described(controller: ProjectController, project: Path) -> dict[str, Any]:

@@ -36,10 +36,10 @@ SPEED: Final = '"speed", 5.0'
 STORIES: Final[dict[str, tuple[tuple[str, dict[str, Any]], tuple[str, ...]]]] = {
     "webots-why-it-does-not-move": (
         ("webots_run", {"for_s": 8, "parameters": {"speed": 0.0}}),
-        ('"standstill"', '"set_by":"mcp', '"stopped":"condition held"'),
+        ('"standstill"', '"set_by"', '"stopped":"condition held"'),
     ),
     "webots-when-it-went-wrong": (
-        ("webots_run", {"for_s": 12}), ('"condition"', '"verdict":"unlike from', '"armed":true'),
+        ("webots_run", {"for_s": 12}), ('"condition"', '"verdict":"unlike from', '"breakpoint_id"'),
     ),
     "webots-tune-a-parameter": (
         ("webots_run", {"for_s": 1}), ('"is_best_confirmed":true', '"action":"set_parameters"'),

@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import sys
 import zipfile
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,15 +24,9 @@ from webots_mcp import __version__
 from webots_mcp.contract import DATA_DIR_VARIABLE, PROJECT_DATA_FOLDER, MemoryDatabase
 from webots_mcp.server import create_server
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
+TOML: Final[Any] = import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
 CHECKOUT: Final = Path(__file__).parent
-PROJECT: Final[dict[str, Any]] = tomllib.loads((CHECKOUT / "pyproject.toml").read_text("utf-8"))[
-    "project"
-]
+PROJECT: Final = TOML.loads((CHECKOUT / "pyproject.toml").read_text("utf-8"))["project"]
 _TITLE: Final = "Webots flight recorder"
 _REGISTRY: Final = "https://static.modelcontextprotocol.io/schemas/2025-12-11/server.schema.json"
 _SERVER: Final = """\

@@ -13,7 +13,6 @@ import os
 import re
 import subprocess
 import sys
-import tomllib
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,11 @@ from webots_mcp import __version__
 from webots_mcp.contract import DATA_DIR_VARIABLE
 from webots_mcp.questions import all_questions
 from webots_mcp.setup.client_entries import is_ours
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 CHECKOUT = Path(__file__).parents[1]
 SOURCE = "https://github.com/robots/webots-mcp"
@@ -185,7 +189,9 @@ def test_a_repository_elsewhere_has_no_name_in_the_registry() -> None:
 
 
 def test_each_button_of_the_readme_enters_our_server_for_the_open_folder() -> None:
-    links = [urlparse(each) for each in re.findall(r"\]\((https://[^)\s]*install[^)\s]*)\)", README)]
+    links = [
+        urlparse(each) for each in re.findall(r"\]\((https://[^)\s]*install[^)\s]*)\)", README)
+    ]
     configured = [parse_qs(each.query) for each in links]
     assert [(each.netloc, *query["name"]) for each, query in zip(links, configured, strict=True)] == [
         ("cursor.com", "webots"), ("insiders.vscode.dev", "webots")

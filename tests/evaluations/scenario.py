@@ -6,13 +6,11 @@ import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from tests.server.story import rows_of
 
 FILE: Final = Path(__file__).with_name("scenarios.toml")
 _STEP: Final = re.compile(r"([^.\[\]]+)|\[([^=\]]+)=([^\]]*)\]|\[(\d+)\]")
@@ -65,7 +63,8 @@ class Scenario:
 
 def read_scenarios() -> list[Scenario]:
     """All, in the order of the file."""
-    tables = tomllib.loads(FILE.read_text("utf-8"))["scenario"]
+    toml: Any = import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
+    tables = toml.loads(FILE.read_text("utf-8"))["scenario"]
     return [
         Scenario(
             **{key: table[key] for key in ("name", "of", "question", "calls")},
@@ -81,7 +80,7 @@ def read_scenarios() -> list[Scenario]:
 
 def _found(answer: Any, path: str) -> list[Any]:
     """What a path leads to: `events[kind=stuck].start_s`; of rows that match, each."""
-    reached = [answer]
+    reached: list[Any] = [answer]
     for name, column, value, place in _STEP.findall(path):
         if place:
             reached = [each[int(place)] for each in reached if int(place) < len(each)]
@@ -94,7 +93,4 @@ def _found(answer: Any, path: str) -> list[Any]:
 
 
 def _rows(table: Any) -> list[dict[str, Any]]:
-    if isinstance(table, dict) and "columns" in table:
-        shared = table.get("in_every_row", {})
-        return [shared | dict(zip(table["columns"], row, strict=True)) for row in table["rows"]]
-    return [each for each in table if isinstance(each, dict)] if isinstance(table, list) else []
+    return rows_of(table) if "columns" in table else list(table)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
@@ -21,7 +21,7 @@ LIVE, NOTHING = "live", "nothing"
 
 
 @contextmanager
-def subject(of: str, folder: Path) -> Iterator[Path]:
+def subject(of: str, folder: Path) -> Generator[Path]:
     """The database of a subject in a folder that is there; while it is asked, a live one drives."""
     file = folder / DATABASE_NAME
     if of in KINDS:

@@ -1,4 +1,4 @@
-"""Skills are in the form that clients read, can be followed to the letter, and leave users theirs."""
+"""Skills are in the form that clients read, can be followed, and leave to users what is theirs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import AsyncGenerator, Iterator
+from collections.abc import AsyncGenerator, Generator
 from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -125,17 +125,16 @@ class Followed:
     def launch(self, line: str) -> None:
         log = self.project / "launch.log"
         with log.open("wb") as output:
-            self.launched.append(
-                subprocess.Popen(
-                    typed(line), cwd=self.project, env=environment(self.project), stdout=output,
-                    stderr=subprocess.STDOUT,
-                )  # fmt: skip
-            )
+            begun = subprocess.Popen(
+                typed(line), cwd=self.project, env=environment(self.project), stdout=output,
+                stderr=subprocess.STDOUT,
+            )  # fmt: skip
+            self.launched.append(begun)
         wait_for(lambda: " records: run " in log.read_text("utf-8"))
 
 
 @contextmanager
-def following(project: Path) -> Iterator[Followed]:
+def following(project: Path) -> Generator[Followed]:
     followed = Followed(project)
     try:
         yield followed

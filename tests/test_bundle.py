@@ -1,4 +1,4 @@
-"""What clients and registries install is in the form that they ask for, of this version, and starts.
+"""What clients and registries install is in their forms, of this version, and starts.
 
 The forms are those of manifests of version 0.4 (github.com/modelcontextprotocol/mcpb) and of
 server.json of 2025-12-11 (registry.modelcontextprotocol.io), as far as ours use them: what is not
@@ -28,11 +28,6 @@ from webots_mcp.contract import DATA_DIR_VARIABLE
 from webots_mcp.questions import all_questions
 from webots_mcp.setup.client_entries import is_ours
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
 CHECKOUT = Path(__file__).parents[1]
 SOURCE = "https://github.com/robots/webots-mcp"
 README = (CHECKOUT / "README.md").read_text("utf-8")
@@ -41,11 +36,12 @@ TEXTS: dict[str, Any] = {"type": "array", "items": TEXT}
 WEB: dict[str, Any] = {"type": "string", "pattern": r"^https://[^\s/]+/\S*$"}
 
 
-def form(required: dict[str, Any], **optional: Any) -> dict[str, Any]:
-    """An object with these members and no others."""
-    members = required | optional
-    return {"type": "object", "properties": members, "required": list(required),
-            "additionalProperties": False}  # fmt: skip
+def form(members: dict[str, Any], /, **optional: Any) -> dict[str, Any]:
+    """An object with these members, perhaps the optional ones, and no others."""
+    return {
+        "type": "object", "properties": members | optional, "required": list(members),
+        "additionalProperties": False,
+    }  # fmt: skip
 
 
 MANIFEST = form(
@@ -150,7 +146,7 @@ def test_the_manifest_of_the_bundle_is_valid_and_of_this_version(unpacked: Path)
 def test_the_bundle_installs_the_wheel_that_is_in_it_and_starts_the_server(
     unpacked: Path, tmp_path: Path
 ) -> None:
-    wanted = tomllib.loads((unpacked / "pyproject.toml").read_text("utf-8"))
+    wanted: Any = bundle.TOML.loads((unpacked / "pyproject.toml").read_text("utf-8"))
     assert wanted["project"]["dependencies"] == ["webots-mcp"]
     wheel = wanted["tool"]["uv"]["sources"]["webots-mcp"]["path"]
     assert (unpacked / wheel).read_bytes() == b"the wheel"
@@ -189,15 +185,11 @@ def test_a_repository_elsewhere_has_no_name_in_the_registry() -> None:
 
 
 def test_each_button_of_the_readme_enters_our_server_for_the_open_folder() -> None:
-    links = [
-        urlparse(each) for each in re.findall(r"\]\((https://[^)\s]*install[^)\s]*)\)", README)
-    ]
-    configured = [parse_qs(each.query) for each in links]
-    assert [(each.netloc, *query["name"]) for each, query in zip(links, configured, strict=True)] == [
-        ("cursor.com", "webots"), ("insiders.vscode.dev", "webots")
-    ]  # fmt: skip
-    entries = [json.loads(base64.b64decode(configured[0]["config"][0])),
-               json.loads(configured[1]["config"][0])]  # fmt: skip
+    links = re.findall(r"\]\((https://[^)\s]*install[^)\s]*)\)", README)
+    cursor, code = (parse_qs(urlparse(str(each)).query) for each in links)
+    assert [urlparse(str(each)).netloc for each in links] == ["cursor.com", "insiders.vscode.dev"]
+    assert cursor["name"] == code["name"] == ["webots"]
+    entries = [json.loads(base64.b64decode(cursor["config"][0])), json.loads(code["config"][0])]
     for entry in entries:
         assert is_ours(entry)
         assert entry["args"] == ["serve", "--data-dir", "${workspaceFolder}/mcp_data"]

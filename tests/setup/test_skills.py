@@ -219,9 +219,8 @@ def test_a_newer_version_replaces_what_is_unchanged_and_keeps_what_is_not(
         part.file.write_text(text, "utf-8", newline=end)
         assert not part.plan()[0].is_needed
         after = newer(part).plan()[0].after.decode()
-        assert "One more line." in after and after.count("\r\n") == (
-            after.count("\n") if end == "\r\n" else 0
-        )
+        assert f"One more line.{end}" in after
+        assert after.count("\r\n") == (after.count("\n") if end == "\r\n" else 0)
     mine = agents.read_text("utf-8")
     assert mine.startswith("# Mine\nDo as I say.\n\n<!-- webots-mcp")
     agents.write_text(f"{mine}\nMine too.\n", "utf-8")
@@ -234,6 +233,8 @@ def test_a_newer_version_replaces_what_is_unchanged_and_keeps_what_is_not(
         assert not change.is_needed and note and "as you wrote or changed it" in note
     parts[0].file.write_text("mine alone\n", "utf-8")
     assert not parts[0].plan()[0].is_needed
+    agents.write_bytes(b"# Mine\r\nwith both\nends")
+    assert parts[-1].plan()[0].after.startswith(b"# Mine\r\nwith both\nends\r\n\r\n<!-- webots-mcp")
 
 
 def test_init_adds_skills_on_request_and_says_what_it_kept(project: Path) -> None:

@@ -15,9 +15,9 @@ from typing import Final, NamedTuple
 from webots_mcp.setup import FileChange, read
 
 PLUGIN: Final = Path(__file__).parent / "plugin"
-_BEGIN: Final = "<!-- webots-mcp: its lines begin here -->\n"
+_BEGIN: Final = "<!-- webots-mcp: its lines begin here -->"
 _END: Final = "<!-- webots-mcp {}: updated by 'webots-mcp init --skills' until you change it -->\n"
-_OURS: Final = "(?s){}(.*?)<!-- webots-mcp ([0-9a-f]{{16}}): [^>\n]*-->\n?{}"
+_OURS: Final = r"(?s){}(.*?)<!-- webots-mcp ([0-9a-f]{{16}}): [^>\n]*-->(?:\r?\n)?{}"
 _KEPT: Final = "it is kept, as you wrote or changed it: remove {} to get that of this version"
 _PAGE: Final = re.compile(r"---\nname: (\S+)\ndescription: (.+?\.) ")
 
@@ -37,24 +37,22 @@ class Part(NamedTuple):
             UnicodeError: It is not in UTF-8.
         """
         before = read(self.file)
-        wanted = self.text + _END.format(_digest(self.text))
-        if not self.is_whole:
-            wanted = _BEGIN + wanted
-        if before is None:
-            return FileChange(self.file, before, wanted.encode()), None
-        held = before.decode("utf-8")
-        is_windows = "\r\n" in held
-        held = held.replace("\r\n", "\n")
-        edges = (r"\A", r"\Z") if self.is_whole else (re.escape(_BEGIN), "")
+        held = (before or b"").decode("utf-8")
+        edges = (r"\A", r"\Z") if self.is_whole else (rf"{_BEGIN}\r?\n", "")
         ours = re.search(_OURS.format(*edges), held)
-        if ours is not None and _digest(ours[1]) == ours[2]:
+        begin, end = "" if self.is_whole else f"{_BEGIN}\n", _END.format(_digest(self.text))
+        line_end = "\r\n" if "\r\n" in held else "\n"
+        wanted = f"{begin}{self.text}{end}".replace("\n", line_end)
+        if not held.strip():
+            after = wanted
+        elif ours is not None and _digest(ours[1].replace("\r\n", "\n")) == ours[2]:
             after = held[: ours.start()] + wanted + held[ours.end() :]
         elif self.is_whole or _BEGIN in held:
             what = "the file" if self.is_whole else "what stands between its marks"
-            return FileChange(self.file, before, before), _KEPT.format(what)
+            return FileChange(self.file, before, held.encode()), _KEPT.format(what)
         else:
-            after = f"{held.rstrip()}\n\n{wanted}" if held.strip() else wanted
-        after = after.replace("\n", "\r\n") if is_windows else after
+            apart = line_end if held.endswith("\n") else 2 * line_end
+            after = f"{held}{apart}{wanted}"
         return FileChange(self.file, before, after.encode()), None
 
 

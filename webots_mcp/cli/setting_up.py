@@ -161,6 +161,9 @@ def init(
 
         webots-mcp init --patch controllers/my_robot/my_robot.py
 
+    --skills adds pages for assistants, again after an update: why it does not move, did my edit
+    help, tune, test, a new world.
+
     --observer adds a robot to a copy of a world (arena_observed.wbt, say), and its controller to
     the project; then nothing has to be changed in any controller:
 

@@ -117,7 +117,13 @@ def server_of(source: str) -> dict[str, Any]:
 
 
 def write_bundle(wheel: Path, folder: Path) -> Path:
-    """Write the bundle of a wheel into a folder; returns its file."""
+    """Write the bundle of a wheel into a folder; returns its file.
+
+    Raises:
+        ValueError: The wheel is of another version.
+    """
+    if f"-{__version__}-" not in wheel.name:
+        raise ValueError(f"{wheel} is not of version {__version__}")
     memory = MemoryDatabase()
     tools = anyio.run(create_server(memory, memory.data_dir).list_tools)
     memory.close()
@@ -142,6 +148,8 @@ def _text(value: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit(__doc__)
     wheel = Path(sys.argv[1])
     print(write_bundle(wheel, wheel.parent))
     if source := PROJECT.get("urls", {}).get("Source"):

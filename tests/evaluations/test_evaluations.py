@@ -30,6 +30,14 @@ def test_there_are_twenty_and_none_is_like_another() -> None:
     assert len(asked) > 15, "groups of tools are left out"
 
 
+@pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda each: each.name)
+def test_who_repeats_the_question_and_hedges_is_not_right(scenario: Scenario) -> None:
+    hedged = (
+        f"{scenario.question} I looked at run 1 of the rover and am not sure; it is no problem."
+    )
+    assert not all(fact.is_said(hedged) for fact in scenario.facts)
+
+
 def typed(*words: str) -> str:
     return shlex.join([sys.executable, *words])
 

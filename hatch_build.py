@@ -8,16 +8,23 @@ from typing import Any
 from hatchling.metadata.plugin.interface import MetadataHookInterface
 
 _PICTURE = re.compile(r"(?m)^!\[[^\]]*\]\((?!https?:)([^)\s]+)\)\n+")
+_GITHUB = re.compile(r"https://github\.com/([\w.-]+)/([\w.-]+?)(?:\.git)?/?")
 _LINK = re.compile(r"(?<!!)\[([^\]]+)\]\((?!https?:|#)([^)\s]+)\)")
 
 
 class Readme(MetadataHookInterface):
-    """Makes the links absolute, by `Source` of `[project.urls]`."""
+    """Makes the links absolute, by `Source` of `[project.urls]`, and adds the registry's line.
+
+    By that line the registry of MCP servers knows whose the package is.
+    """
 
     def update(self, metadata: dict[str, Any]) -> None:
         """Set the field `readme`."""
         text = (Path(self.root) / "README.md").read_text("utf-8")
-        shown = with_absolute_links(text, metadata.get("urls", {}).get("Source"))
+        source = metadata.get("urls", {}).get("Source")
+        shown = with_absolute_links(text, source)
+        if source is not None and _GITHUB.fullmatch(source):
+            shown += f"\n<!-- mcp-name: {registry_name(source)} -->\n"
         metadata["readme"] = {"content-type": "text/markdown", "text": shown}
 
 
@@ -33,6 +40,18 @@ def with_absolute_links(text: str, source: str | None) -> str:
     at = source.rstrip("/")
     text = _PICTURE.sub(partial(_moved, f"{at}/raw/HEAD/"), text)
     return _LINK.sub(partial(_moved, f"{at}/blob/HEAD/"), text)
+
+
+def registry_name(source: str) -> str:
+    """What the registry of MCP servers calls the server of a repository on GitHub.
+
+    Raises:
+        ValueError: The address is no repository there.
+    """
+    found = _GITHUB.fullmatch(source)
+    if found is None:
+        raise ValueError(f"Source is no repository on GitHub: {source}")
+    return f"io.github.{found[1]}/{found[2]}"
 
 
 def _moved(address: str, link: re.Match[str]) -> str:

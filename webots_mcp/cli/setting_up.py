@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from webots_mcp.diagnosis import Checked, Examined
     from webots_mcp.setup import FileChange, ProjectController
     from webots_mcp.setup.client_entries import Client
+    from webots_mcp.setup.skills import Part
 
 _WRONG: Final = 1  # the exit code
 _LEAST_COLUMN: Final = 30  # characters that a line of a folded text has at least
@@ -113,6 +114,12 @@ def init(
             "token from the environment variable WEBOTS_MCP_TOKEN.",
         ),
     ] = None,
+    skills: Annotated[
+        bool,
+        Parameter(
+            "--skills", help="Add skills to .claude/skills and AGENTS.md; what you change, stays."
+        ),
+    ] = False,
     patch: Annotated[
         Path | None,
         Parameter(
@@ -161,6 +168,9 @@ def init(
 
         webots-mcp init --patch controllers/my_robot/my_robot.py
 
+    --skills adds pages for assistants, again after an update: why it does not move, did my edit
+    help, tune, test, a new world.
+
     --observer adds a robot to a copy of a world (arena_observed.wbt, say), and its controller to
     the project; then nothing has to be changed in any controller:
 
@@ -181,7 +191,7 @@ def init(
     elif patch is not None:
         _change_controller(patch, project_edits.patch, writing)
     else:
-        _make_ready(project, name, writing, http, claude_desktop=claude_desktop)
+        _make_ready(project, name, writing, http, claude_desktop=claude_desktop, skills=skills)
 
 
 def _change_controller(file: Path, changed: Callable[[bytes], bytes], writing: Writing) -> None:
@@ -277,11 +287,18 @@ def _outcome(file: dict[str, str]) -> str:
 
 
 def _make_ready(
-    folder: str | None, name: str, writing: Writing, http: str | None, *, claude_desktop: bool
+    folder: str | None,
+    name: str,
+    writing: Writing,
+    http: str | None,
+    *,
+    claude_desktop: bool,
+    skills: bool,
 ) -> None:
     """Tell clients of the server, and say what the controllers need."""
     from webots_mcp.contract import PROJECT_DATA_FOLDER
     from webots_mcp.setup import client_entries, controllers_of, project_of
+    from webots_mcp.setup.skills import parts_of
     from webots_mcp.setup.wsl import windows_server
 
     if http is not None and not http.startswith(("http://", "https://")):
@@ -295,6 +312,7 @@ def _make_ready(
     line = http or of_windows or client_entries.server_command(data_dir)
     files = [_ignored(data_dir, writing)]
     files += [_told(client, name, line, writing) for client in clients]
+    files += [_skilled(part, writing) for part in parts_of(project)] if skills else []
     controllers = [_described(found, project) for found in controllers_of(project)]
     hindrance = None if http or of_windows else client_entries.server_hindrance()
     notes = [note for note in (border, hindrance, expected) if note]
@@ -356,6 +374,15 @@ def _told(client: Client, name: str, line: list[str] | str, writing: Writing) ->
         return named | writing.apply(change) | ({"note": note} if note else {})
     except (WebotsMCPError, OSError) as error:
         return {**named, "file": str(client.file), "outcome": "refused", "note": str(error)}
+
+
+def _skilled(part: Part, writing: Writing) -> dict[str, str]:
+    """Bring a skill, or the lines of AGENTS.md, up to date."""
+    try:
+        change, note = part.plan()
+        return writing.apply(change) | ({"note": note} if note else {})
+    except (WebotsMCPError, OSError, UnicodeError) as error:
+        return {"file": str(part.file), "outcome": "refused", "note": str(error)}
 
 
 def _described(controller: ProjectController, project: Path) -> dict[str, Any]:

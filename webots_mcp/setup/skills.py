@@ -1,0 +1,81 @@
+"""The skills of the plugin in a project, and the lines of its AGENTS.md that name them.
+
+The plugin is in the form of Claude Code: `plugin/skills/NAME/SKILL.md`. What is written ends with
+a mark that holds a digest of it: what differs from its digest was changed by the user, and stays.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from webots_mcp.setup import FileChange, read
+
+PLUGIN: Final = Path(__file__).parent / "plugin"
+_BEGIN: Final = "<!-- webots-mcp: its lines begin here -->"
+_END: Final = "<!-- webots-mcp {}: updated by 'webots-mcp init --skills' until you change it -->\n"
+_OURS: Final = r"(?s){}(.*?)<!-- webots-mcp ([0-9a-f]{{16}}): [^>\n]*-->(?:\r?\n)?{}"
+_KEPT: Final = "it is kept, as you wrote or changed it: remove {} to get that of this version"
+_PAGE: Final = re.compile(r"---\nname: (\S+)\ndescription: (.+?\.) ")
+
+
+class Part(NamedTuple):
+    """A text of ours in a file of the project: the whole file, or some lines of it."""
+
+    file: Path
+    text: str
+    is_whole: bool
+
+    def plan(self) -> tuple[FileChange, str | None]:
+        """The change that brings the text up to date, and what there is to know about it.
+
+        Raises:
+            OSError: The file cannot be read.
+            UnicodeError: It is not in UTF-8.
+        """
+        before = read(self.file)
+        held = (before or b"").decode("utf-8")
+        edges = (r"\A", r"\Z") if self.is_whole else (rf"{_BEGIN}\r?\n", "")
+        ours = re.search(_OURS.format(*edges), held)
+        begin, end = "" if self.is_whole else f"{_BEGIN}\n", _END.format(_digest(self.text))
+        line_end = "\r\n" if "\r\n" in held else "\n"
+        wanted = f"{begin}{self.text}{end}".replace("\n", line_end)
+        if not held.strip():
+            after = wanted
+        elif ours is not None and _digest(ours[1].replace("\r\n", "\n")) == ours[2]:
+            after = held[: ours.start()] + wanted + held[ours.end() :]
+        elif self.is_whole or _BEGIN in held:
+            what = "the file" if self.is_whole else "what stands between its marks"
+            return FileChange(self.file, before, held.encode()), _KEPT.format(what)
+        else:
+            apart = line_end if held.endswith("\n") else 2 * line_end
+            after = f"{held}{apart}{wanted}"
+        return FileChange(self.file, before, after.encode()), None
+
+
+def skill_files() -> list[Path]:
+    """The page of each skill, by name."""
+    return sorted(PLUGIN.glob("skills/*/SKILL.md"))
+
+
+def parts_of(project: Path) -> Iterator[Part]:
+    """What a project gets: each skill, and the lines that name them for clients without skills."""
+    lines = list[str]()
+    for page in skill_files():
+        text = page.read_text("utf-8")
+        place = Path(".claude", "skills", page.parent.name, page.name)
+        yield Part(project / place, text, is_whole=True)
+        if named := _PAGE.match(text):
+            lines.append(f"- `{place.as_posix()}`: {named[2]}\n")
+    head = (
+        "## Webots\n\nThe MCP server `webots` and the command `webots-mcp` read what the robots of "
+        "this project record,\nand steer the simulation. Before you do one of these, read its page:"
+    )
+    yield Part(project / "AGENTS.md", f"{head}\n\n{''.join(lines)}", is_whole=False)
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -5,26 +5,35 @@ from __future__ import annotations
 import difflib
 import sys
 import tempfile
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 from unittest.mock import patch
 
 from tests.golden.asking import ask_all
-from tests.golden.drawing import CONTROLLER, KINDS
+from tests.golden.drawing import CONTROLLER, KINDS, Kind
 from tests.golden.text import Portable
 
 _FOLDER: Final = Path(__file__).parent / "answers"
 _HEADING: Final = "== "
 
 
-def answers_of(name: str) -> dict[str, str]:
-    """Draw a recording, and what each question answers of it today, as portable text."""
-    kind = KINDS[name]
+@contextmanager
+def drawn(kind: Kind) -> Generator[Path]:
+    """A folder with such a recording, for as long as that lasts."""
     with tempfile.TemporaryDirectory() as folder_name:
         folder = Path(folder_name)
         program = patch.object(sys.modules["__main__"], "__file__", str(CONTROLLER), create=True)
         with program, patch.object(sys, "argv", [str(CONTROLLER)]):
             kind.draw(folder)
+        yield folder
+
+
+def answers_of(name: str) -> dict[str, str]:
+    """Draw a recording, and what each question answers of it today, as portable text."""
+    kind = KINDS[name]
+    with drawn(kind) as folder:
         portable = Portable(kind, folder)
         return {asked: portable.text(told) for asked, told in ask_all(kind, folder).items()}
 

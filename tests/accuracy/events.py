@@ -1,0 +1,177 @@
+"""How true what is told of events is, by how much noise there is and how often rows come."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import fields
+from typing import Final
+
+from tests.accuracy.page import percent, share, table
+from tests.benchmarks.core import Bench, duration
+from tests.checks import judging as checks_judging
+from tests.checks.labelled import FAULTS, WRITTEN
+from tests.detection.drawing import KINDS as RECORDINGS
+from tests.detection.driving import NOISE_LEVELS_M
+from tests.detection.judging import Tally, median
+from tests.detection.labelled import SETTING, Measure, Setting
+from tests.detection.measuring import measure
+from tests.detection.sensing import READING_NOISES_M
+from tests.detection.swinging import NOISE_SHARE_LEVELS
+from webots_mcp.store.checks import CHECKS
+from webots_mcp.store.detection.events import KINDS
+
+INTERVALS_S: Final = (0.016, 0.064, 0.16, 0.5)
+LEVELS: Final = ("no noise", "little", "much")
+# The kind of event and what it is about, by what is judged.
+MEASURES: Final[dict[Measure, tuple[str, str]]] = {
+    "standstill": ("standstill", "the robot stands"),
+    "stuck": ("stuck", "it should move"),
+    "missing": ("missing", "a sensor gives no value"),
+    "flat": ("flat", "a sensor is frozen"),
+    "dropout": ("jump", "a sensor drops out"),
+    "leap": ("jump", "the robot is somewhere else"),
+    "swing": ("oscillation", "a value swings"),
+    "gap": ("gap", "no rows"),
+}
+_OF_ONE_RATE: Final = ("hovering", "roaming", "wide")  # drawn with a rate of their own
+_MOST_VALUES: Final = 3_000  # of signals beside
+_POOR: Final = 0.95
+
+
+Cell = tuple[Measure, float, int]  # what is judged, the row interval and the level of noise
+
+
+def events(bench: Bench) -> Iterator[str]:
+    """Precision, recall and errors of time of each kind, by noise and rate."""
+    cells = _measured(bench)
+    whole = _sum(tally for tallies in cells.values() for _, tally in tallies)
+    quiet = _sum(each for found in cells.values() for _, each in found if not each.incidents)
+    yield (
+        f"{percent(whole.recall)} of {whole.incidents:,} events in drawn recordings are found, "
+        f"{percent(whole.precision)} of what is told is true."
+    )
+    yield _EVENTS.format(
+        cases=bench.count(4, least=0),
+        recordings=len(_recordings()),
+        readings=_levels(READING_NOISES_M, 1000, "mm"),
+        places=_levels(NOISE_LEVELS_M, 1000, "mm"),
+        swings=_levels(NOISE_SHARE_LEVELS, 100, "%"),
+        false=f"{60 * quiet.false / quiet.minutes:.2f}" if quiet.minutes else "-",
+        hours=f"{quiet.minutes / 60:.0f}",
+    )
+    head = ("kind of event", "a row each", *(f"{each}: found / true / begin off" for each in LEVELS))
+    yield table(head, _rows(cells))
+    poor = list(_poor(cells))
+    yield f"Below {100 * _POOR:.0f} %, and in which recordings:" if poor else "None is below 95 %."
+    if poor:
+        yield "\n".join(poor)
+    measured = {kind for kind, _ in MEASURES.values()}
+    others = ", ".join(f"`{each.name}`" for each in KINDS if each.name not in measured)
+    yield f"Not measured, since they are what rows and tables say, without an estimate: {others}."
+
+
+_EVENTS: Final = """\
+{cases} recordings of each of {recordings} kinds (drives, stops, docking, creeping, robots that are held, sensors that fail,
+values that swing, healthy ones ...) are drawn for each row interval and each level of noise. The noise of a
+position is {places} in each coordinate, of a distance sensor {readings}, of a swing {swings} of its
+amplitude (standard deviations). *Found* is the share of what happened that is told (recall), *true* the share of
+what is told that happened (precision), both in per cent; *begin off* is the median error of the begin. In the {hours} hours of
+recordings in which a kind does not happen at all, {false} false events per hour are told of a kind."""
+
+
+def _recordings() -> list[str]:
+    return [name for name in RECORDINGS if name not in _OF_ONE_RATE]
+
+
+def _measured(bench: Bench) -> dict[Cell, list[tuple[str, Tally]]]:
+    """The tallies of each cell, by kind of recording."""
+    cases, found = bench.count(4, least=0), dict[Cell, list[tuple[str, Tally]]]()
+    for interval_s in INTERVALS_S:
+        for noise, level in enumerate(LEVELS):
+            bench.say(f"events: a row each {duration(interval_s)}, {level}")
+            token = SETTING.set(Setting(interval_s, noise))
+            report = measure(_recordings(), cases, 1, most_values=_MOST_VALUES)
+            SETTING.reset(token)
+            for (recording, judged, _), tally in report.tallies.items():
+                found.setdefault((judged, interval_s, noise), []).append((recording, tally))
+    return found
+
+
+def _sum(tallies: Iterable[Tally]) -> Tally:
+    whole = Tally()
+    for tally in tallies:
+        for each in fields(Tally):
+            setattr(whole, each.name, getattr(whole, each.name) + getattr(tally, each.name))
+    return whole
+
+
+def _rows(cells: dict[Cell, list[tuple[str, Tally]]]) -> Iterator[list[str]]:
+    for judged, (kind, what) in MEASURES.items():
+        for interval_s in INTERVALS_S:
+            of = [cells.get((judged, interval_s, noise), []) for noise in range(len(LEVELS))]
+            figures = (_cell(_sum(tally for _, tally in each), interval_s) for each in of)
+            yield [f"`{kind}`: {what}", duration(interval_s), *figures]
+
+
+def _cell(tally: Tally, interval_s: float) -> str:
+    begin = median(tally.begin_errors)
+    if begin is None:
+        return "-"
+    off = f"{begin:.2f} periods" if tally.period_errors else duration(begin * interval_s)
+    return f"{percent(tally.recall)} / {percent(tally.precision)} / {off}"
+
+
+def _poor(cells: dict[Cell, list[tuple[str, Tally]]]) -> Iterator[str]:
+    for (judged, interval_s, noise), tallies in cells.items():
+        whole = _sum(tally for _, tally in tallies)
+        where = f"- {MEASURES[judged][1]}, a row each {duration(interval_s)}, {LEVELS[noise]}"
+        if (whole.recall if whole.recall is not None else 1.0) < _POOR:
+            missed = ((each, tally.incidents - tally.found) for each, tally in tallies)
+            yield f"{where}: {share(whole.found, whole.incidents)} found; missed in {_worst(missed)}"
+        if (whole.precision if whole.precision is not None else 1.0) < _POOR:
+            told = whole.found + whole.false
+            false = ((each, tally.false) for each, tally in tallies)
+            yield f"{where}: {share(whole.found, told)} true; false in {_worst(false)}"
+
+
+def _worst(counts: Iterable[tuple[str, int]]) -> str:
+    most = sorted(counts, key=lambda each: -each[1])
+    return ", ".join(f"`{name}` ({count})" for name, count in most[:3] if count)
+
+
+def _levels(levels: Sequence[float], times: float, unit: str) -> str:
+    none, little, much = (f"{times * each:g}" for each in levels)
+    return f"{none}, {little} or {much} {unit}"
+
+
+def checks(bench: Bench) -> Iterator[str]:
+    """What the checks say of healthy runs, and of runs with one fault each."""
+    judged = checks_judging.judge(bench.count(100), bench.count(5))
+    healthy = judged.pop(checks_judging.HEALTHY)
+    fails = sum(n for (_, outcome), n in healthy.said.items() if outcome == "fail")
+    warned = sum(n for (_, outcome), n in healthy.said.items() if outcome == "warn")
+    noticed, runs = (sum(getattr(each, name) for each in judged.values()) for name in ("noticed", "runs"))
+    yield (
+        f"{noticed} of {runs} runs with a fault are noticed by the check that has to; "
+        f"{fails} checks fail in {healthy.runs} healthy runs."
+    )
+    yield _CHECKS.format(warned=warned, runs=healthy.runs, checks=len(CHECKS))
+    rows = [
+        (kind, each.checked_by, str(each.runs), str(each.said[each.checked_by, "fail"]),
+         str(each.said[each.checked_by, "warn"]), str(len(each.wrong)))
+        for kind, each in judged.items()
+    ]  # fmt: skip
+    yield table(("fault", "check", "runs", "fails", "warns", "other checks that fail"), rows)
+    found = {each.checked_by for each in judged.values()}
+    alarms = [
+        (each.name, str(healthy.said[each.name, "fail"]), str(healthy.said[each.name, "warn"]),
+         "yes" if each.name in found else "no")
+        for each in CHECKS
+    ]  # fmt: skip
+    yield table(("check", "fails in healthy runs", "warns in them", "has a fault above"), alarms)
+
+
+_CHECKS: Final = """\
+A healthy run drives, turns, stops as it was told and has sensors that work, with drifting odometry and an arm that
+lags; each fault is put into such a run. Of {runs} healthy runs, judged by {checks} checks each, {warned} checks warn.
+"Other checks that fail" beside a fault are not all wrong: a robot that is held also slips."""

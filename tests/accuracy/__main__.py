@@ -31,15 +31,16 @@ SHOWN: Final = ("events", "kills", "loop", "answers")  # in the README
 _INTRODUCTION: Final = """\
 # How accurate, at what cost
 
-What is said of a recording is found by rules, and rules err. This page says how often, and what recording
-costs. `python -m tests.accuracy` measures all of it and writes this page (an hour or two; `python -m tests.accuracy
-loop` only that part, `--effort 0.1` a tenth); no figure is written by hand. Durations are of one busy
-machine: compare ratios. Shares have the interval in parentheses that holds the true one nineteen times of twenty.
+What is said of a recording is found by rules, and rules err. This page says how often, and what
+recording costs. `python -m tests.accuracy` measures all of it and writes this page (an hour or
+two; `python -m tests.accuracy loop` only that part, `--effort 0.1` a tenth); no figure is
+written by hand. Durations are of one busy machine: compare ratios. Shares have the interval in
+parentheses that holds the true one nineteen times of twenty.
 
-The recordings are drawn, since only so is it known what happened in them. The robots, their noise and their
-faults are the authors' idea of real ones; the rules were made on other draws of the same kinds. No recording
-of a real robot was labelled yet. `python -m tests.detection --wrong` and `python -m tests.checks` show the
-single cases."""
+The recordings are drawn, since only so is it known what happened in them. The robots, their
+noise and their faults are the authors' idea of real ones; the rules were made on other draws of
+the same kinds. No recording of a real robot was labelled yet. `python -m tests.detection
+--wrong` and `python -m tests.checks` show the single cases."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -49,16 +50,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(names)} (all)")
     parser.add_argument("--effort", type=float, default=1.0, help="less is faster and rougher (1)")
     options = parser.parse_args(arguments)
-    logging.disable(logging.WARNING)  # the questions of the golden answers are refused here and there
+    logging.disable(
+        logging.WARNING
+    )  # the questions of the golden answers are refused here and there
     if unknown := set(options.parts) - set(names):
         parser.error(f"no part {', '.join(unknown)}: there is {', '.join(names)}")
-    known = sections(PAGE.read_text("utf-8")) if PAGE.exists() else {}
     for part in PARTS:
         if part.name in (options.parts or names):
-            known[part.title] = measured(part, options.effort)
-            PAGE.write_text(page_of(known), "utf-8")
-    readme = README.read_text("utf-8")
-    README.write_text(FIGURES.sub(lambda _: figures(known), readme), "utf-8")
+            section = measured(part, options.effort)
+            known = sections(PAGE.read_text("utf-8")) if PAGE.exists() else {}
+            page = page_of(known | {part.title: section})
+            PAGE.write_text(page, "utf-8")
+            readme = README.read_text("utf-8")
+            README.write_text(FIGURES.sub(lambda _: figures(page), readme), "utf-8")  # noqa: B023
     return 0
 
 
@@ -74,10 +78,10 @@ def page_of(known: dict[str, str]) -> str:
     return "\n\n".join([_INTRODUCTION, *parts]) + "\n"
 
 
-def figures(known: dict[str, str]) -> str:
+def figures(page: str) -> str:
     """What the README shows: a line for each of four parts."""
-    lines = (headline(known[part.title]) for part in PARTS if part.name in SHOWN)
-    return "\n".join(f"- {line}" for line in lines)
+    known, shown = sections(page), [part.title for part in PARTS if part.name in SHOWN]
+    return "\n".join(f"- {headline(known[title])}" for title in shown if title in known)
 
 
 def _show(text: str) -> None:

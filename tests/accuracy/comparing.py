@@ -11,7 +11,7 @@ import numpy as np
 
 from tests.accuracy.page import share, table
 from tests.benchmarks.core import Bench
-from tests.detection.labelled import LabelledRun
+from tests.detection.labelled import Array, LabelledRun
 from tests.detection.writing import Writer
 from tests.memory import memory_connection
 from webots_mcp.store.analysis.summary import Outcome, rank
@@ -34,7 +34,7 @@ def _run(dice: np.random.Generator, faster_sd: float, *, lanes: bool) -> Labelle
         faster_sd: How much faster it drives, in standard deviations between like runs.
         lanes: It keeps to one of two lanes, by chance, which is seen in all that it measures.
     """
-    times = _INTERVAL_S * np.arange(_ROWS)
+    times: Array = _INTERVAL_S * np.arange(_ROWS, dtype=np.float64)
     lane = 0.3 * float(dice.integers(2)) if lanes else 0.0
     speed = 0.2 * (1 + _SCATTER * (float(dice.normal()) + faster_sd)) * (1 + lane)
     course = speed * times + dice.normal(0, 0.002, _ROWS)
@@ -91,9 +91,9 @@ def comparisons(bench: Bench) -> Iterator[str]:
             found_of[effect_sd, runs] = f"{100 * found.count(True) / pairs:.0f} %"
         rows.append(row)
     yield (
-        f"A difference is claimed in {wrong} of {of} comparisons of equal groups; one of 2 standard "
-        f"deviations is found in {found_of[2.0, 10]} of comparisons of 10 runs with 10, in "
-        f"{found_of[2.0, 5]} of 5 with 5."
+        f"A difference is claimed in {wrong} of {of} comparisons of equal groups; one of 2 "
+        f"standard deviations is found in {found_of[2.0, 10]} of comparisons of 10 runs with 10, "
+        f"in {found_of[2.0, 5]} of 5 with 5."
     )
     yield _COMPARED.format(pairs=pairs)
     yield table(("equal groups", "answers that claim a difference", "figures called different",
@@ -104,14 +104,15 @@ def comparisons(bench: Bench) -> Iterator[str]:
 
 
 _COMPARED: Final = """\
-`webots_compare_runs` of the runs before and after an edit of a controller: {pairs} pairs of groups in each line. A
-run is a drive whose speed and whose sensors' means scatter from run to run; an answer judges 13 figures and
-signals. Where runs keep to one of two lanes, all figures of a run hang together. In the second table the edit makes
-the robot faster, by so many standard deviations between like runs."""
+`webots_compare_runs` of the runs before and after an edit of a controller: {pairs} pairs of
+groups in each line. A run is a drive whose speed and whose sensors' means scatter from run to
+run; an answer judges 13 figures and signals. Where runs keep to one of two lanes, all figures of
+a run hang together. In the second table the edit makes the robot faster, by so many standard
+deviations between like runs."""
 _POWER: Final = """\
-A comparison is made to claim little that is not there (2 in 1,000 answers). The price is in the second table:
-3 runs of each prove nothing at all, and effects below two standard deviations are mostly left open ("null"), not
-denied. `min_effect_sd` sets what counts as equal."""
+A comparison is made to claim little that is not there (2 in 1,000 answers). The price is in the
+second table: 3 runs of each prove nothing at all, and effects below two standard deviations are
+mostly left open ("null"), not denied. `min_effect_sd` sets what counts as equal."""
 
 
 def trials(bench: Bench) -> Iterator[str]:
@@ -141,10 +142,10 @@ def trials(bench: Bench) -> Iterator[str]:
 
 
 _RANKED: Final = """\
-`is_best_confirmed` of trials whose scores are drawn, normal with a standard deviation of 1: how often it is true
-of the set that is better, and how often of one that is not, in {rankings} rankings each. It is meant to be wrong at
-most once in a hundred. Two or three repeats confirm nothing: 4 is what shows that scores differ, as
-the answer says itself."""
+`is_best_confirmed` of trials whose scores are drawn, normal with a standard deviation of 1: how
+often it is true of the set that is better, and how often of one that is not, in {rankings}
+rankings each. It is meant to be wrong at most once in a hundred. Two or three repeats confirm
+nothing: 4 is what shows that scores differ, as the answer says itself."""
 
 
 def _confirmed(

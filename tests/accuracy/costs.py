@@ -33,8 +33,8 @@ def kills(bench: Bench) -> Iterator[str]:
     published = sum(_number(line.beside) for line in rows)
     lost, of = sum(round(line.measured) for line in rows), sum(_number(line.ours) for line in rows)
     yield (
-        f"{lost:,} of {published:,} states whose `publish()` had returned were lost in {of:,} kills "
-        "(SIGKILL) of controllers."
+        f"{lost:,} of {published:,} states whose `publish()` had returned were lost in {of:,} "
+        "kills (SIGKILL) of controllers."
     )
     yield _KILLED
     yield table(("what", "how often", "", "found"), map(_cells, killed))
@@ -45,11 +45,12 @@ def kills(bench: Bench) -> Iterator[str]:
 
 
 _KILLED: Final = """\
-Controllers record into one database, without a server or with one that maintains it, and are killed one
-after the other at moments by chance, up to 0.3 s after they began; five commands wait for each. What they
-said to have published is compared with what is there afterwards. States that a lock kept out of the database
-wait in a file beside it and are taken in by the next process. The machine itself was not switched off: without
-`fsync` in the loop a power cut may cost the newest states."""
+Controllers record into one database, without a server or with one that maintains it, and are
+killed one after the other at moments by chance, up to 0.3 s after they began; five commands wait
+for each. What they said to have published is compared with what is there afterwards. States that
+a lock kept out of the database wait in a file beside it and are taken in by the next process.
+The machine itself was not switched off: without `fsync` in the loop a power cut may cost the
+newest states."""
 _INTERRUPTED: Final = """\
 Ctrl-C, at every instruction of the bridge that writes, of which these were drawn:"""
 
@@ -89,7 +90,8 @@ def answers(bench: Bench) -> Iterator[str]:
 
 
 _READ: Final = """\
-Each question is asked of nine recordings of which the accepted answers are stored (`python -m tests.golden`),
-in its usual form and in others; an answer has at most {budget} tokens by design. With `serve --tools core` the
-list has {tools} tools and {tokens} tokens. Tokens are counted by a rule of this package (`tokens_in`) that is meant
-to be above what models count; each model has its own."""
+Each question is asked of nine recordings of which the accepted answers are stored (`python -m
+tests.golden`), in its usual form and in others; an answer has at most {budget} tokens by design.
+With `serve --tools core` the list has {tools} tools and {tokens} tokens. Tokens are counted by a
+rule of this package (`tokens_in`) that is meant to be above what models count; each model has
+its own."""

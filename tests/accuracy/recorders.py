@@ -43,12 +43,12 @@ class Way(NamedTuple):
 
     Attributes:
         begin: Opens a recording in a folder.
-        count: How many states can be read there, by the reader that its library has for such files.
+        readable: How many states can be read there, by the reader of its library.
         answers: Whether a question can be asked of it while it is recorded, and how.
     """
 
     begin: Callable[[Path], Recording]
-    count: Callable[[Path], int]
+    readable: Callable[[Path], int]
     answers: str
 
 
@@ -132,7 +132,7 @@ def _mcap(folder: Path, *, chunks: bool) -> Recording:
 def _count_mcap(folder: Path) -> int:
     """By the reader of streams: the other one wants the end that a killed writer did not write."""
     found = 0
-    with (folder / _FILE).open("rb") as file, suppress(Exception):  # noqa: BLE001
+    with (folder / _FILE).open("rb") as file, suppress(Exception):
         reader = import_module("mcap.reader").NonSeekingReader(file)
         for _ in reader.iter_messages(log_time_order=False):
             found += 1
@@ -167,7 +167,7 @@ def _numbers(value: Any, name: str) -> Iterator[tuple[str, list[float]]]:
 def _count_rerun(folder: Path, *, entity: str) -> int:
     reader: Any = import_module("rerun.chunk").RrdReader(str(folder / _FILE))
     found = 0
-    with suppress(Exception):  # noqa: BLE001
+    with suppress(Exception):
         for chunk in reader.stream():
             found += chunk.to_record_batch().num_rows if chunk.entity_path == entity else 0
     return found
@@ -187,7 +187,9 @@ WAYS: Final[dict[str, Way]] = {
     "MCAP, as by default": Way(partial(_mcap, chunks=True), _count_mcap, _STREAM),
     "MCAP, no chunks, flushed": Way(partial(_mcap, chunks=False), _count_mcap, _STREAM),
     "Rerun, an entity per signal": Way(
-        partial(_rerun, arrays=False), partial(_count_rerun, entity="/state/battery_j"), "its viewer"
+        partial(_rerun, arrays=False),
+        partial(_count_rerun, entity="/state/battery_j"),
+        "its viewer",
     ),
     "Rerun, one array": Way(
         partial(_rerun, arrays=True), partial(_count_rerun, entity="/state"), "its viewer"
@@ -226,28 +228,29 @@ def loop(bench: Bench) -> Iterator[str]:
     for name, way in WAYS.items():
         here = bench.folder / name
         kept = sum(file.stat().st_size for file in here.rglob("*") if file.is_file())
-        states_kept = max(1, way.count(here))
+        states_kept = max(1, way.readable(here))
         rows.append([name, duration(calls[name].p50), f"{ratio(calls[name], raw):.2f}",
                      duration(calls[name].above(0.99)), duration(used_s[name] - used_s["nothing"]),
                      f"{kept / states_kept:.0f}", way.answers])  # fmt: skip
     ours, both = calls["bridge"], calls["bridge and get_command"]
     yield (
         f"A recorded `publish()` of 39 values takes {ratio(ours, raw):.2f} times a raw `sqlite3` "
-        f"insert ({duration(ours.p50)} of an 8 ms step), {ratio(both, raw):.2f} times with the look for "
-        "commands."
+        f"insert ({duration(ours.p50)} of an 8 ms step), {ratio(both, raw):.2f} times with "
+        "the look for commands."
     )
     yield _LOOP.format(blocks=rounds, steps=steps)
-    yield table(("way", "call, median", "x raw sqlite3", "1 in 100 longer than",
-                 "processor, a step", "bytes a state", "readable while it records"), rows)  # fmt: skip
+    heads = ("call, median", "x raw sqlite3", "1 in 100 longer than", "processor, a step")
+    yield table(("way", *heads, "bytes a state", "readable while it records"), rows)
 
 
 _LOOP: Final = """\
-One process, one loop: in each step of 8 ms it sleeps and then records a state of 39 values (740 bytes of
-JSON). The ways take turns in {blocks} blocks of {steps} steps; the ratio is the median of those of neighbouring
-blocks. "Processor" is that of the whole process, its threads among it, above a loop that records nothing. They do not do the
-same: the bridge also keeps runs, changes, signals and commands, Rerun writes in threads of its own and leaves
-texts out here, MCAP packs chunks of 1 MB in the call in which one is full. None of them calls `fsync` in
-the loop, so that a power cut may cost each the newest states; that was not tried."""
+One process, one loop: in each step of 8 ms it sleeps and then records a state of 39 values (740
+bytes of JSON). The ways take turns in {blocks} blocks of {steps} steps; the ratio is the median
+of those of neighbouring blocks. "Processor" is that of the whole process, its threads among it,
+above a loop that records nothing. They do not do the same: the bridge also keeps runs, changes,
+signals and commands, Rerun writes in threads of its own and leaves texts out here, MCAP packs
+chunks of 1 MB in the call in which one is full. None of them calls `fsync` in the loop, so that
+a power cut may cost each the newest states; that was not tried."""
 
 
 def survival(bench: Bench) -> Iterator[str]:
@@ -259,10 +262,10 @@ def survival(bench: Bench) -> Iterator[str]:
             bench.say(f"{name}: {life} of {kills} kills")
             folder = bench.place(f"{name} {life}")
             said = _killed(name, folder, random.Random(life).uniform(*_LIFE_S))
-            readable = WAYS[name].count(folder)
+            there = WAYS[name].readable(folder)
             written += said
-            lost.append(max(0, said - readable))
-            unread += not readable
+            lost.append(max(0, said - there))
+            unread += not there
         total = sum(lost)
         rows.append([name, f"{written:,}", f"{total:,}", f"{median(lost):,.0f}",
                      f"{max(lost):,}", f"{unread} of {kills}"])  # fmt: skip
@@ -275,10 +278,11 @@ def survival(bench: Bench) -> Iterator[str]:
 
 
 _KILLED: Final = """\
-The same ways, each in a process of its own that records without a rest and is killed (SIGKILL) {kills} times after 1
-to 3 s. Lost is what it had written by its own account and its library's reader does not find then; of MCAP the
-reader of streams is used, for the other one wants the end of a file that was closed. What holds a chunk or a
-batch in memory loses it, and is faster for it."""
+The same ways, each in a process of its own that records without a rest and is killed (SIGKILL)
+{kills} times after 1 to 3 s. Lost is what it had written by its own account and its library's
+reader does not find then; of MCAP the reader of streams is used, for the other one wants the end
+of a file that was closed. What holds a chunk or a batch in memory loses it, and is faster for
+it."""
 
 
 def _killed(name: str, folder: Path, life_s: float) -> int:

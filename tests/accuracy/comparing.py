@@ -14,7 +14,7 @@ from tests.benchmarks.core import Bench
 from tests.detection.labelled import Array, LabelledRun
 from tests.detection.writing import Writer
 from tests.memory import memory_connection
-from webots_mcp.store.analysis.summary import Outcome, rank
+from webots_mcp.store.analysis.summary import MOST_CHANCE, Outcome, rank
 from webots_mcp.store.questions.compare import Comparison, compare_runs
 
 _RUNS: Final = (3, 5, 10)
@@ -95,24 +95,24 @@ def comparisons(bench: Bench) -> Iterator[str]:
         f"standard deviations is found in {found_of[2.0, 10]} of comparisons of 10 runs with 10, "
         f"in {found_of[2.0, 5]} of 5 with 5."
     )
-    yield _COMPARED.format(pairs=pairs)
+    yield _COMPARED.format(pairs=pairs, figures=len(_said(_compared(0, 2, 0.0))))
     yield table(("equal groups", "answers that claim a difference", "figures called different",
                  "figures called equal"), equal)  # fmt: skip
     heads = [f"{runs} + {runs}: {what}" for runs in _RUNS for what in ("found", "called equal")]
     yield table(("effect on `distance_m`", *heads), rows)
-    yield _POWER
+    yield _POWER.format(chance=1000 * MOST_CHANCE)
 
 
 _COMPARED: Final = """\
 `webots_compare_runs` of the runs before and after an edit of a controller: {pairs} pairs of
 groups in each line. A run is a drive whose speed and whose sensors' means scatter from run to
-run; an answer judges 13 figures and signals. Where runs keep to one of two lanes, all figures of
-a run hang together. In the second table the edit makes the robot faster, by so many standard
-deviations between like runs."""
+run; an answer judges {figures} figures and signals. Where runs keep to one of two lanes, all
+figures of a run hang together. In the second table the edit makes the robot faster, by so many
+standard deviations between like runs."""
 _POWER: Final = """\
-A comparison is made to claim little that is not there (2 in 1,000 answers). The price is in the
-second table: 3 runs of each prove nothing at all, and effects below two standard deviations are
-mostly left open ("null"), not denied. `min_effect_sd` sets what counts as equal."""
+A comparison is made to claim little that is not there ({chance:g} in 1,000 answers). The price
+is in the second table: 3 runs of each prove nothing at all, and effects below two standard
+deviations are mostly left open ("null"), not denied. `min_effect_sd` sets what counts as equal."""
 
 
 def trials(bench: Bench) -> Iterator[str]:

@@ -18,6 +18,7 @@ from tests.detection.sensing import READING_NOISES_M
 from tests.detection.swinging import NOISE_SHARE_LEVELS
 from webots_mcp.store.checks import CHECKS
 from webots_mcp.store.detection.events import KINDS
+from webots_mcp.store.detection.kinds import EventOptions
 
 INTERVALS_S: Final = (0.016, 0.064, 0.16, 0.5)
 LEVELS: Final = ("no noise", "little", "much")
@@ -35,6 +36,7 @@ MEASURES: Final[dict[Measure, tuple[str, str]]] = {
 _OF_ONE_RATE: Final = ("hovering", "roaming", "wide")  # drawn with a rate of their own
 _MOST_VALUES: Final = 3_000  # of signals beside
 _POOR: Final = 0.95
+_USUAL_STEP: Final = 0.954  # the median of steps of normal noise, in standard deviations of it
 
 
 Cell = tuple[Measure, float, int]  # what is judged, the row interval and the level of noise
@@ -68,6 +70,8 @@ def events(bench: Bench) -> Iterator[str]:
     poor = list(_poor(cells)) or ["- none"]
     yield f"Below {100 * _POOR:.0f} %, and in which recordings most of it:"
     yield "\n".join(poor)
+    score = EventOptions().jump_min_score
+    yield _WHY.format(score=score, jump_m=(1 + score / 0.6745) * _USUAL_STEP * READING_NOISES_M[2])
     measured = {kind for kind, _ in MEASURES.values()}
     others = ", ".join(f"`{each.name}`" for each in KINDS if each.name not in measured)
     yield f"Not measured, since they are what rows and tables say, without an estimate: {others}."
@@ -83,6 +87,13 @@ share of what happened that is told (recall), *true* the share of what is told t
 nine in ten do not exceed (a dropout ends for us in the last row of it, for an answer in the next
 one). In the {hours} hours of recordings in which a kind does not happen at all, {false} false
 events per hour are told of a kind."""
+
+_WHY: Final = """\
+The two weak places have a reason each. A dropout has to be {score:g} times as large as the steps
+of its signal usually are (a modified z-score), which noise of 50 mm makes {jump_m:.1f} m: a
+distance sensor that reads less than that drops out unseen, and the answer does not say so. With
+few rows and much noise nobody can tell a short stop from a slow drive; there the answer says
+that it may have missed some."""
 
 
 def _recordings() -> list[str]:

@@ -19,7 +19,7 @@ from tests.golden.drawing import KINDS
 from tests.golden.stored import drawn
 from tests.tool_list import counts_of
 from webots_mcp.contract import MemoryDatabase
-from webots_mcp.questions.budget import ANSWER_TOKENS, tokens_in
+from webots_mcp.questions.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS, tokens_in
 from webots_mcp.server import create_server
 
 _KILLS: Final = 200  # of each kind with a server
@@ -81,7 +81,12 @@ def answers(bench: Bench) -> Iterator[str]:
         f"Half of {len(every)} answers have at most {median(every):,.0f} tokens, the longest "
         f"{max(every):,}; the list of the {whole.tools} tools has {whole.tokens:,}."
     )
-    yield _READ.format(budget=f"{ANSWER_TOKENS:,}", tools=core.tools, tokens=f"{core.tokens:,}")
+    yield _READ.format(
+        budget=f"{ANSWER_TOKENS:,}",
+        large=f"{LARGE_ANSWER_TOKENS:,}",
+        tools=core.tools,
+        tokens=f"{core.tokens:,}",
+    )
     rows = [
         (f"`{tool}`", str(len(each)), f"{median(each):,.0f}", f"{max(each):,}")
         for tool, each in told.items()
@@ -91,7 +96,7 @@ def answers(bench: Bench) -> Iterator[str]:
 
 _READ: Final = """\
 Each question is asked of nine recordings of which the accepted answers are stored (`python -m
-tests.golden`), in its usual form and in others; an answer has at most {budget} tokens by design.
-With `serve --tools core` the list has {tools} tools and {tokens} tokens. Tokens are counted by a
-rule of this package (`tokens_in`) that is meant to be above what models count; each model has
-its own."""
+tests.golden`), in its usual form and in others. An answer has at most {budget} tokens by design,
+and up to {large} where `limit` or `max_points` asks for more, which the longest ones are. With
+`serve --tools core` the list has {tools} tools and {tokens} tokens. Tokens are counted by a rule
+of this package (`tokens_in`); each model has its own tokenizer, which was not asked."""

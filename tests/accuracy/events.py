@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import fields
+from itertools import product, repeat, starmap
+from multiprocessing import get_context
 from typing import Final
 
 from tests.accuracy.page import percent, share, table
@@ -13,7 +17,7 @@ from tests.detection.drawing import KINDS as RECORDINGS
 from tests.detection.driving import NOISE_LEVELS_M
 from tests.detection.judging import Tally, median, nine_in_ten
 from tests.detection.labelled import SETTING, Measure, Setting
-from tests.detection.measuring import measure
+from tests.detection.measuring import Report, measure
 from tests.detection.sensing import READING_NOISES_M
 from tests.detection.swinging import NOISE_SHARE_LEVELS
 from webots_mcp.store.checks import CHECKS
@@ -35,6 +39,7 @@ MEASURES: Final[dict[Measure, tuple[str, str]]] = {
 }
 _OF_ONE_RATE: Final = ("hovering", "roaming", "wide")  # drawn with a rate of their own
 _MOST_VALUES: Final = 3_000  # of signals beside
+UNSEEN: Final = 10_000  # seed, and number of runs: from 0 on they served to make the rules
 _POOR: Final = 0.95
 _USUAL_STEP: Final = 0.954  # the median of steps of normal noise, in standard deviations of it
 
@@ -103,15 +108,22 @@ def _recordings() -> list[str]:
 def _measured(bench: Bench) -> dict[Cell, list[tuple[str, Tally]]]:
     """The tallies of each cell, by kind of recording."""
     cases, found = bench.count(4, least=0), dict[Cell, list[tuple[str, Tally]]]()
-    for interval_s in INTERVALS_S:
-        for noise, level in enumerate(LEVELS):
-            bench.say(f"events: a row each {duration(interval_s)}, {level}")
-            token = SETTING.set(Setting(interval_s, noise))
-            report = measure(_recordings(), cases, 1, most_values=_MOST_VALUES)
-            SETTING.reset(token)
+    settings = list(starmap(Setting, product(INTERVALS_S, range(len(LEVELS)))))
+    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
+        for setting, report in zip(
+            settings, pool.map(_report, settings, repeat(cases)), strict=True
+        ):
+            bench.say(f"events: a row each {duration(setting.interval_s)}, {LEVELS[setting.noise]}")
             for (recording, judged, _), tally in report.tallies.items():
-                found.setdefault((judged, interval_s, noise), []).append((recording, tally))
+                found.setdefault((judged, *setting), []).append((recording, tally))
     return found
+
+
+def _report(setting: Setting, cases: int) -> Report:
+    token = SETTING.set(setting)
+    report = measure(_recordings(), cases, UNSEEN, most_values=_MOST_VALUES)
+    SETTING.reset(token)
+    return report
 
 
 def _sum(tallies: Iterable[Tally]) -> Tally:
@@ -173,7 +185,7 @@ def _levels(levels: Sequence[float], times: float, unit: str) -> str:
 
 def checks(bench: Bench) -> Iterator[str]:
     """What the checks say of healthy runs, and of runs with one fault each."""
-    judged = checks_judging.judge(bench.count(100), bench.count(5))
+    judged = checks_judging.judge(bench.count(100), bench.count(5), UNSEEN)
     healthy = judged.pop(checks_judging.HEALTHY)
     fails = sum(n for (_, outcome), n in healthy.said.items() if outcome == "fail")
     warned = sum(n for (_, outcome), n in healthy.said.items() if outcome == "warn")

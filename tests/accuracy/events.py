@@ -110,12 +110,11 @@ def _measured(bench: Bench) -> dict[Cell, list[tuple[str, Tally]]]:
     cases, found = bench.count(4, least=0), dict[Cell, list[tuple[str, Tally]]]()
     settings = list(starmap(Setting, product(INTERVALS_S, range(len(LEVELS)))))
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
-        for setting, report in zip(
-            settings, pool.map(_report, settings, repeat(cases)), strict=True
-        ):
-            bench.say(f"events: a row each {duration(setting.interval_s)}, {LEVELS[setting.noise]}")
+        reports = pool.map(_report, settings, repeat(cases))
+        for (interval_s, noise), report in zip(settings, reports, strict=True):
+            bench.say(f"events: a row each {duration(interval_s)}, {LEVELS[noise]}")
             for (recording, judged, _), tally in report.tallies.items():
-                found.setdefault((judged, *setting), []).append((recording, tally))
+                found.setdefault((judged, interval_s, noise), []).append((recording, tally))
     return found
 
 

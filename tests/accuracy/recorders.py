@@ -261,7 +261,8 @@ def survival(bench: Bench) -> Iterator[str]:
         for life in range(kills):
             bench.say(f"{name}: {life} of {kills} kills")
             folder = bench.place(f"{name} {life}")
-            said = _killed(name, folder, random.Random(life).uniform(*_LIFE_S))
+            life_s = random.Random(life).uniform(*_LIFE_S) * min(1.0, 10 * bench.effort)
+            said = _killed(name, folder, life_s)
             there = WAYS[name].readable(folder)
             written += said
             lost.append(max(0, said - there))

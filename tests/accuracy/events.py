@@ -83,15 +83,15 @@ def events(bench: Bench) -> Iterator[str]:
 
 
 _EVENTS: Final = """\
-{cases} recordings of each of {recordings} kinds (drives, stops, docking, creeping, robots that
-are held, sensors that fail, values that swing, healthy ones ...) are drawn for each row interval
-and each level of noise. The noise of a position is {places} in each coordinate, of a distance
-sensor {readings}, of a swing {swings} of its amplitude (standard deviations). *Found* is the
-share of what happened that is told (recall), *true* the share of what is told that happened
-(precision), both in per cent; *off* is the median error of begin and end, in parentheses what
-nine in ten do not exceed (a dropout ends for us in the last row of it, for an answer in the next
-one). In the {hours} hours of recordings in which a kind does not happen at all, {false} false
-events per hour are told of a kind."""
+For each row interval and each level of noise recordings of {recordings} kinds are drawn, {cases}
+of each: drives, stops, docking, creeping, robots that are held, sensors that fail, values that
+swing, healthy ones and so on. The noise of a position is {places} in each coordinate, of a
+distance sensor {readings}, of a swing {swings} of its amplitude (standard deviations). *Found* is
+the share of what happened that is told (recall), *true* the share of what is told that happened
+(precision), both in per cent, then how often it happened; *off* is the median error of begin and
+end, in parentheses what nine in ten do not exceed (a dropout ends here in its last row, in an
+answer with the next one). In the {hours} hours of recordings in which a kind does not happen at
+all, {false} false events per hour are told of a kind."""
 
 _WHY: Final = """\
 The two weak places have a reason each. A dropout has to be {score:g} times as large as the steps
@@ -144,7 +144,9 @@ def _rows(
 
 
 def _truth(tally: Tally, interval_s: float) -> str:
-    return f"{percent(tally.recall)} / {percent(tally.precision)}" if tally.incidents else "-"
+    if not tally.incidents:
+        return "-"
+    return f"{percent(tally.recall)} / {percent(tally.precision)} of {tally.incidents}"
 
 
 def _errors(tally: Tally, interval_s: float) -> str:
@@ -155,7 +157,9 @@ def _errors(tally: Tally, interval_s: float) -> str:
                for of in (median, nine_in_ten)]  # fmt: skip
     if tally.period_errors:
         return "{:.2f} ({:.2f}), {:.2f} ({:.2f}) periods".format(*figures)
-    return "{} ({}), {} ({})".format(*(duration(each * interval_s) for each in figures))
+    return "{} ({}), {} ({})".format(
+        *(duration(each * interval_s) if each else "0" for each in figures)
+    )
 
 
 def _poor(cells: dict[Cell, list[tuple[str, Tally]]]) -> Iterator[str]:

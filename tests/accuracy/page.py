@@ -20,6 +20,7 @@ CHECKOUT: Final = Path(__file__).parents[2]
 PAGE: Final = CHECKOUT / "docs" / "accuracy.md"
 README: Final = CHECKOUT / "README.md"
 FIGURES: Final = re.compile(r"(?<=<!-- figures -->\n).*?(?=\n\n)", re.S)
+_CORES: Final = os.cpu_count()
 _HEADLINE: Final = re.compile(r"(?m)^\*\*(.+)\*\*$")
 
 
@@ -84,6 +85,6 @@ def percent(part: float | None) -> str:
 
 def _machine() -> str:
     python = f"{platform.python_implementation()} {platform.python_version()}"
-    system = f"{platform.system()} {platform.machine()} with {os.cpu_count()} cores"
+    system = f"{platform.system()} {platform.machine()} with {_CORES} cores"
     load = f", load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
     return f"{system}{load}; webots-mcp {__version__}, {python}, SQLite {sqlite3.sqlite_version}"

@@ -12,6 +12,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from functools import partial
@@ -165,9 +166,10 @@ def _numbers(value: Any, name: str) -> Iterator[tuple[str, list[float]]]:
 
 
 def _count_rerun(folder: Path, *, entity: str) -> int:
-    reader: Any = import_module("rerun.chunk").RrdReader(str(folder / _FILE))
     found = 0
-    with suppress(Exception):
+    with warnings.catch_warnings(), suppress(Exception):
+        warnings.simplefilter("ignore")  # a file that was not closed is said to have no end
+        reader: Any = import_module("rerun.chunk").RrdReader(str(folder / _FILE))
         for chunk in reader.stream():
             found += chunk.to_record_batch().num_rows if chunk.entity_path == entity else 0
     return found

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import random
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from itertools import repeat
+from multiprocessing import get_context
 from typing import Any, Final
 
 import numpy as np
 
 from tests.accuracy.page import share, table
 from tests.benchmarks.core import Bench
+from tests.detection.asking import UNHURRIED_S
 from tests.detection.labelled import Array, LabelledRun
 from tests.detection.writing import Writer
 from tests.memory import memory_connection
@@ -50,7 +55,7 @@ def _run(dice: np.random.Generator, faster_sd: float, *, lanes: bool) -> Labelle
     return LabelledRun(times, columns, _INTERVAL_S)
 
 
-def _compared(seed: int, runs: int, effect_sd: float, *, lanes: bool = False) -> Comparison:
+def _compared(seed: int, runs: int, effect_sd: float, lanes: bool) -> Comparison:
     """So many runs before and after an edit of the controller, compared."""
     dice = np.random.default_rng([seed, runs, round(10 * effect_sd), lanes])
     with memory_connection() as connection:
@@ -59,13 +64,21 @@ def _compared(seed: int, runs: int, effect_sd: float, *, lanes: bool = False) ->
             writer.begin_session(code)
             for _ in range(runs):
                 writer.write(_run(dice, faster_sd, lanes=lanes))
-        return compare_runs(connection, limit=100)
+        return compare_runs(connection, limit=100, deadline_s=UNHURRIED_S)
 
 
-def _said(found: Comparison) -> dict[str, bool | None]:
-    """Of each figure and signal, whether the runs after the edit differ."""
+def _said(seed: int, runs: int, effect_sd: float, lanes: bool = False) -> dict[str, bool | None]:
+    """Of each figure and signal of a comparison, whether the runs after the edit differ."""
+    found = _compared(seed, runs, effect_sd, lanes)
     figures = (*found.measures, *found.differences)
     return {each.name: each.different[1] for each in figures}
+
+
+def _answers(
+    pairs: int, runs: int, effect_sd: float, *, lanes: bool = False
+) -> list[dict[str, bool | None]]:
+    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
+        return list(pool.map(_said, range(pairs), repeat(runs), repeat(effect_sd), repeat(lanes)))
 
 
 def comparisons(bench: Bench) -> Iterator[str]:
@@ -74,7 +87,7 @@ def comparisons(bench: Bench) -> Iterator[str]:
     for lanes, kind in ((False, "that scatter by 5 %"), (True, "in two lanes, by chance")):
         for runs in _RUNS:
             bench.say(f"comparisons of equal groups of {runs}, {kind}")
-            said = [_said(_compared(seed, runs, 0.0, lanes=lanes)) for seed in range(pairs)]
+            said = _answers(pairs, runs, 0.0, lanes=lanes)
             each = Counter(value for answer in said for value in answer.values())
             told = sum(True in answer.values() for answer in said)
             wrong, of = wrong + told, of + pairs
@@ -85,7 +98,7 @@ def comparisons(bench: Bench) -> Iterator[str]:
         row = [f"{effect_sd:g}"]
         for runs in _RUNS:
             bench.say(f"comparisons with an effect of {effect_sd:g}, {runs} runs")
-            said = [_said(_compared(seed, runs, effect_sd)) for seed in range(pairs)]
+            said = _answers(pairs, runs, effect_sd)
             found = [answer["distance_m"] for answer in said]
             row += [share(found.count(True), pairs), share(found.count(False), pairs)]
             found_of[effect_sd, runs] = f"{100 * found.count(True) / pairs:.0f} %"
@@ -95,7 +108,7 @@ def comparisons(bench: Bench) -> Iterator[str]:
         f"standard deviations is found in {found_of[2.0, 10]} of comparisons of 10 runs with 10, "
         f"in {found_of[2.0, 5]} of 5 with 5."
     )
-    yield _COMPARED.format(pairs=pairs, figures=len(_said(_compared(0, 2, 0.0))))
+    yield _COMPARED.format(pairs=pairs, figures=len(_said(0, 2, 0.0)))
     yield table(("equal groups", "answers that claim a difference", "figures called different",
                  "figures called equal"), equal)  # fmt: skip
     heads = [f"{runs} + {runs}: {what}" for runs in _RUNS for what in ("found", "called equal")]

@@ -86,12 +86,12 @@ _EVENTS: Final = """\
 For each row interval and each level of noise recordings of {recordings} kinds are drawn, {cases}
 of each: drives, stops, docking, creeping, robots that are held, sensors that fail, values that
 swing, healthy ones and so on. The noise of a position is {places} in each coordinate, of a
-distance sensor {readings}, of a swing {swings} of its amplitude (standard deviations). *Found* is
-the share of what happened that is told (recall), *true* the share of what is told that happened
-(precision), both in per cent, then how often it happened; *off* is the median error of begin and
-end, in parentheses what nine in ten do not exceed (a dropout ends here in its last row, in an
-answer with the next one). In the {hours} hours of recordings in which a kind does not happen at
-all, {false} false events per hour are told of a kind."""
+distance sensor {readings}, of a swing {swings} of its amplitude (standard deviations). *Found*
+is the share of what happened that is told (recall), *true* the share of what is told that
+happened (precision), both in per cent, then how often it happened; *off* is the median error of
+begin and end, in parentheses what nine in ten do not exceed (a dropout ends here in its last
+row, in an answer with the next one). In the {hours} hours of recordings in which a kind does not
+happen at all, {false} false events per hour are told of a kind."""
 
 _WHY: Final = """\
 The two weak places have a reason each. A dropout has to be {score:g} times as large as the steps
@@ -219,4 +219,6 @@ _CHECKS: Final = """\
 A healthy run drives, turns, stops as it was told and has sensors that work, with drifting
 odometry and an arm that lags; each fault is put into such a run. Of {runs} healthy runs, judged
 by {checks} checks each, {warned} checks warn. "Other checks that fail" beside a fault are not
-all wrong: a robot that is held also slips."""
+all wrong: a robot that is held also slips. What fails "moves when commanded" in a healthy run is
+a slow turn on the spot: one of 3 s at 0.3 to 0.4 rad/s is taken for being stuck, since turning
+is looked for in stretches of 2 s, of which two in a row have to show it."""

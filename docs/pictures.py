@@ -48,17 +48,6 @@ TURNS: Final[tuple[demo.Turn, ...]] = (
         "webots_find_events",
         {"kinds": ["change", "stuck"], "signals": ["mode"], "end_s": 10},
     ),
-    ("Five steps.", "webots_simulation_control", {"command": "step", "steps": 5}),
-    (
-        "Which cruising speed gets farther in five seconds?",
-        "webots_run_trials",
-        {
-            "parameters": {"speed": [3.0, 8.0]},
-            "score": "max(pose.x) - first(pose.x)",
-            "for_s": 5,
-            "repeats": 4,
-        },
-    ),
 )
 CHROMIUM: Final = shutil.which("chromium") or shutil.which("chromium-browser")
 FIGURES_ARE_THERE: Final = """() => document.querySelector(".figure > svg")

@@ -38,16 +38,20 @@ class Judged(NamedTuple):
         return self.said[self.checked_by, "fail"] + self.said[self.checked_by, "warn"]
 
 
-def judge(healthy_runs: int, of_each_fault: int = OF_EACH_FAULT) -> dict[str, Judged]:
-    """Draw runs, check them and count."""
+def judge(
+    healthy_runs: int, of_each_fault: int = OF_EACH_FAULT, first: int = 0
+) -> dict[str, Judged]:
+    """Draw runs, from that number on, check them and count."""
     kinds = {HEALTHY: ("", healthy_runs)}
     kinds |= {name: (by, of_each_fault) for name, (_, by) in (FAULTS | WRITTEN).items()}
-    return {kind: _judge(kind, by, runs) for kind, (by, runs) in kinds.items()}
+    return {
+        kind: _judge(kind, by, range(first, first + runs)) for kind, (by, runs) in kinds.items()
+    }
 
 
-def _judge(kind: str, by: str, runs: int) -> Judged:
-    found = Judged(by, runs, Counter(), [])
-    for number in range(runs):
+def _judge(kind: str, by: str, numbers: range) -> Judged:
+    found = Judged(by, len(numbers), Counter(), [])
+    for number in numbers:
         for each in checked(kind, number):
             found.said[each.name, each.outcome] += 1
             if each.outcome == "fail" and each.name != by:

@@ -9,9 +9,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from tests.detection.labelled import Array, Incident, LabelledRun
+from tests.detection.labelled import Array, Incident, LabelledRun, interval_of, noise_of
 
 NOISES_M: Final = (0.0, 0.002, 0.005, 0.01, 0.02, 0.03)
+NOISE_LEVELS_M: Final = (0.0, 0.005, 0.03)
 # Words that contain hold, rest, ready, turn, stop and wait, and are modes in which robots drive.
 DRIVING_MODES: Final = (
     "cruise", "returning", "threshold_wait", "forest", "already_home", "FOLLOW_LINE", "restock",
@@ -232,8 +233,9 @@ def _least_error_s(before: Phase | None, interval_s: float, noise_m: float) -> f
 
 def _setting(rng: np.random.Generator) -> tuple[float, float, float]:
     """Row interval, noise and speed of a drive."""
-    interval_s = float(rng.choice([0.008, 0.016, 0.032, 0.064, 0.1, 0.16, 0.25, 0.5]))
-    return interval_s, float(rng.choice(NOISES_M)), float(rng.uniform(0.1, 0.4))
+    interval_s = interval_of(rng, [0.008, 0.016, 0.032, 0.064, 0.1, 0.16, 0.25, 0.5])
+    noise_m = noise_of(float(rng.choice(NOISES_M)), NOISE_LEVELS_M)
+    return interval_s, noise_m, float(rng.uniform(0.1, 0.4))
 
 
 def _modes(rng: np.random.Generator) -> tuple[str, str]:

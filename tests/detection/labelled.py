@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,31 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Measure = Literal["standstill", "stuck", "missing", "flat", "dropout", "leap", "swing", "gap"]
+
+
+class Setting(NamedTuple):
+    """What recordings are drawn with where it is not to be drawn.
+
+    Attributes:
+        noise: The place of the noise in the levels that each kind of value has.
+    """
+
+    interval_s: float
+    noise: int
+
+
+SETTING: Final[ContextVar[Setting | None]] = ContextVar("setting", default=None)
+
+
+def interval_of(rng: np.random.Generator, intervals_s: Sequence[float]) -> float:
+    """One of these row intervals, or that of the setting; what is drawn after it is the same."""
+    drawn_s, setting = float(rng.choice(intervals_s)), SETTING.get()
+    return setting.interval_s if setting else drawn_s
+
+
+def noise_of(drawn: float, levels: Sequence[float]) -> float:
+    """The noise that was drawn, or that of the setting."""
+    return levels[setting.noise] if (setting := SETTING.get()) else drawn
 
 
 @dataclass(frozen=True)

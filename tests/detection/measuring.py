@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from tests.detection.asking import Answer, Claim, ask_run, ask_since
-from tests.detection.drawing import draw_case
+from tests.detection.drawing import MOST_VALUES, draw_case
 from tests.detection.judging import Tally, Verdict, judge
 from tests.detection.labelled import Case, Incident, LabelledRun, Measure, repeated
 from tests.detection.writing import purge, put_in_chunks, write_all
@@ -82,6 +82,7 @@ def measure(
     say: Callable[[str], None] = lambda text: None,
     *,
     long: bool = False,
+    most_values: int = MOST_VALUES,
 ) -> Report:
     """Ask about so many cases of each kind, or about each as a long run in all ways of storing."""
     report = Report()
@@ -91,7 +92,7 @@ def measure(
             if long:
                 _measure_long(draw_case(kind, seed, index, most_values=_MOST_VALUES), report)
             else:
-                _measure_whole(draw_case(kind, seed, index), report)
+                _measure_whole(draw_case(kind, seed, index, most_values=most_values), report)
     return report
 
 

@@ -9,11 +9,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from tests.detection.driving import drive_of, driven, moved, times_of
-from tests.detection.labelled import Flags, Incident, LabelledRun
+from tests.detection.driving import NOISE_LEVELS_M, drive_of, driven, moved, times_of
+from tests.detection.labelled import Flags, Incident, LabelledRun, interval_of, noise_of
 
 RANGE_M: Final = 2.0  # of the distance sensor: what it reads where it sees nothing
 LIDAR_BEAMS: Final = 32
+READING_NOISES_M: Final = (0.0, 0.003, 0.05)  # of the distance sensor
 LEAST_FROZEN_S: Final = 25.0  # 20 s count
 MOST_DROPOUTS: Final = 40
 
@@ -23,7 +24,7 @@ def sensors(rng: np.random.Generator, interval_s: float, duration_s: float) -> L
     times = times_of(rng, duration_s, interval_s)
     rows = len(times)
     wave = 0.35 * np.sin(times / rng.uniform(3, 9)) + 0.25 * np.sin(times / rng.uniform(10, 30))
-    front = 1.0 + wave + rng.normal(0, 0.003, rows)
+    front = 1.0 + wave + rng.normal(0, noise_of(0.003, READING_NOISES_M), rows)
     beams = 1.5 + wave[:, None] * np.linspace(0.5, 1, LIDAR_BEAMS)
     lidar = np.round(beams + rng.normal(0, 0.01, beams.shape), 4)
     columns: dict[str, Sequence[Any]] = {
@@ -37,7 +38,7 @@ def sensors(rng: np.random.Generator, interval_s: float, duration_s: float) -> L
 
 
 def _drawn(rng: np.random.Generator) -> LabelledRun:
-    interval_s = float(rng.choice([0.016, 0.032, 0.064, 0.1, 0.25]))
+    interval_s = interval_of(rng, [0.016, 0.032, 0.064, 0.1, 0.25])
     return sensors(rng, interval_s, float(rng.uniform(60, 150)))
 
 
@@ -123,7 +124,8 @@ def draw_dead(rng: np.random.Generator) -> LabelledRun:
 
 def draw_frozen(rng: np.random.Generator) -> LabelledRun:
     """The distance sensor gives one and the same value for 25 to 50 s, and lives again."""
-    run = sensors(rng, float(rng.choice([0.032, 0.064, 0.1, 0.25])), float(rng.uniform(100, 160)))
+    interval_s = interval_of(rng, [0.032, 0.064, 0.1, 0.25])
+    run = sensors(rng, interval_s, float(rng.uniform(100, 160)))
     ((start_s, end_s),) = _stretches(rng, run, 1, (LEAST_FROZEN_S, 50.0))
     rows = _between(run, start_s, end_s)
     run = with_values(run, "front", rows, run.columns["front"][int(np.argmax(rows))])
@@ -169,9 +171,10 @@ def draw_gaps(rng: np.random.Generator) -> LabelledRun:
 
 def draw_leaps(rng: np.random.Generator) -> LabelledRun:
     """Something lifts a driving robot to another place, 0.5 to 3 m away, once to three times."""
-    interval_s = float(rng.choice([0.032, 0.064, 0.1, 0.25]))
+    interval_s = interval_of(rng, [0.032, 0.064, 0.1, 0.25])
     phases = drive_of(rng, 90.0, float(rng.uniform(0.1, 0.3)), "returning")
-    run = driven(rng, phases, interval_s, float(rng.choice([0.0, 0.005, 0.01])))
+    noise_m = noise_of(float(rng.choice([0.0, 0.005, 0.01])), NOISE_LEVELS_M)
+    run = driven(rng, phases, interval_s, noise_m)
     for start_s, _ in _stretches(rng, run, int(rng.integers(1, 4)), (0.0, 0.0)):
         first = int(np.searchsorted(run.times, start_s))
         at_s = float(run.times[first])
@@ -183,9 +186,10 @@ def draw_leaps(rng: np.random.Generator) -> LabelledRun:
 
 def draw_healthy(rng: np.random.Generator) -> LabelledRun:
     """A drive without a stop whose sensors all work: there is nothing to tell."""
-    interval_s = float(rng.choice([0.032, 0.064, 0.1, 0.25]))
+    interval_s = interval_of(rng, [0.032, 0.064, 0.1, 0.25])
     phases = drive_of(rng, 120.0, float(rng.uniform(0.1, 0.3)), "returning")
-    drive = driven(rng, phases, interval_s, float(rng.choice([0.0, 0.005, 0.01, 0.02])))
+    noise_m = noise_of(float(rng.choice([0.0, 0.005, 0.01, 0.02])), NOISE_LEVELS_M)
+    drive = driven(rng, phases, interval_s, noise_m)
     working = sensors(rng, interval_s, 120.0)
     rows = min(len(drive.times), len(working.times))
     both = {**working.columns, **drive.columns}

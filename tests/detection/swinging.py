@@ -10,12 +10,13 @@ from typing import Any, Final
 import numpy as np
 
 from tests.detection.driving import times_of
-from tests.detection.labelled import Array, Incident, LabelledRun
+from tests.detection.labelled import Array, Incident, LabelledRun, interval_of, noise_of
 
 COURSES: Final = ("constant", "ramp", "turns", "wander", "loop")
 NAMES: Final = ("heading", "steering", "speed", "error", "left")
 LEAST_ROWS: Final = 9  # of a period, for its shape to show
 NOISE_SHARES: Final = (0.0, 0.02, 0.1, 0.2)  # of the amplitude
+NOISE_SHARE_LEVELS: Final = (0.0, 0.02, 0.2)
 _PERIODS_S: Final = (0.3, 4.8)  # up to 5 s count
 _INTERVALS_S: Final = (0.008, 0.016, 0.032, 0.08, 0.16, 0.5)
 
@@ -55,13 +56,14 @@ def _drawn(
     rng: np.random.Generator, course: str, *, swings: bool
 ) -> tuple[LabelledRun, str, Array]:
     """A run, the name of the one signal that matters, and its values before they are wrapped."""
-    interval_s = float(rng.choice(_INTERVALS_S))
+    interval_s = interval_of(rng, _INTERVALS_S)
     times = times_of(rng, float(rng.uniform(60, 240)), interval_s)
     name = str(rng.choice(NAMES))
     values = course_of(rng, times, course)
     swing = _swing_of(rng, name, interval_s, float(times[-1]))
     values = values + (_values_of(swing, times) if swings else 0.0)
-    noise = (swing.amplitude or 0.0) * float(rng.choice(NOISE_SHARES))
+    share = noise_of(float(rng.choice(NOISE_SHARES)), NOISE_SHARE_LEVELS)
+    noise = (swing.amplitude or 0.0) * share
     values = values + rng.normal(0, noise, len(times))
     return LabelledRun(times, {}, interval_s, (swing,) if swings else ()), name, values
 
@@ -101,7 +103,7 @@ def draw_steady(rng: np.random.Generator) -> LabelledRun:
 
 def _calm(rng: np.random.Generator, **columns: Array) -> LabelledRun:
     """Values at times that are their indexes, which no swing is in."""
-    interval_s = float(rng.choice(_INTERVALS_S[1:5]))
+    interval_s = interval_of(rng, _INTERVALS_S[1:5])
     times: Array = interval_s * np.arange(len(next(iter(columns.values()))), dtype=np.float64)
     return LabelledRun(times, {name: each.tolist() for name, each in columns.items()}, interval_s)
 
@@ -111,13 +113,13 @@ def draw_stairs(rng: np.random.Generator) -> LabelledRun:
 
     Ramps take 10 to 90 % of the period.
     """
-    interval_s = float(rng.choice(_INTERVALS_S[1:5]))
+    interval_s = interval_of(rng, _INTERVALS_S[1:5])
     times = times_of(rng, float(rng.uniform(120, 300)), interval_s)
     period_s = float(np.exp(rng.uniform(math.log(max(0.8, 12 * interval_s)), math.log(10))))
     course = _stairs(rng, times, period_s, float(rng.uniform(0.1, 0.9)))
     rounded = int(float(rng.choice([0, 0, 0.05, 0.1])) * period_s / interval_s)
     course = _smoothed(course, rounded) if rounded > 1 else course
-    noise = float(rng.choice([0.0, 0.002, 0.01, 0.02])) * np.pi / 2
+    noise = noise_of(float(rng.choice([0.0, 0.002, 0.01, 0.02])), (0.0, 0.002, 0.02)) * np.pi / 2
     course = course + rng.normal(0, noise, len(course))
     run = LabelledRun(times[: len(course)], {}, interval_s)
     return _published(run, str(rng.choice(["heading", "position"])), course)

@@ -107,7 +107,7 @@ def ask_all(kind: Kind, folder: Path) -> Answers:
 
 def _ask_all(kind: Kind, folder: Path) -> Answers:
     file = folder / "webots.db"
-    found = anyio.run(_ask_tools, kind, file)
+    found = anyio.run(ask_tools, kind, file)
     with closing(connect(file, "reader")) as connection:
         found |= {f"view {name}": _view(connection, name) for name in _VIEWS}
         found |= dict(_plots(connection, kind))
@@ -116,7 +116,8 @@ def _ask_all(kind: Kind, folder: Path) -> Answers:
     return found
 
 
-async def _ask_tools(kind: Kind, file: Path) -> Answers:
+async def ask_tools(kind: Kind, file: Path) -> Answers:
+    """What the tools answer of the recording in that file; of a refusal its texts."""
     found: Answers = {}
     asked = dict(TOOLS)
     part = {"start_s": kind.part[0], "end_s": kind.part[1]}

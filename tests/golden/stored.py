@@ -5,16 +5,29 @@ from __future__ import annotations
 import difflib
 import sys
 import tempfile
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 from unittest.mock import patch
 
 from tests.golden.asking import OVER_HTTP, ask_all
-from tests.golden.drawing import CONTROLLER, KINDS
+from tests.golden.drawing import CONTROLLER, KINDS, Kind
 from tests.golden.text import Portable
 
 _FOLDER: Final = Path(__file__).parent / "answers"
 _HEADING: Final = "== "
+
+
+@contextmanager
+def drawn(kind: Kind) -> Generator[Path]:
+    """A folder with such a recording, for as long as that lasts."""
+    with tempfile.TemporaryDirectory() as folder_name:
+        folder = Path(folder_name)
+        program = patch.object(sys.modules["__main__"], "__file__", str(CONTROLLER), create=True)
+        with program, patch.object(sys, "argv", [str(CONTROLLER)]):
+            kind.draw(folder)
+        yield folder
 
 
 def answers_of(name: str) -> dict[str, str]:
@@ -23,11 +36,7 @@ def answers_of(name: str) -> dict[str, str]:
     What is answered over HTTP is there only where it is something else.
     """
     kind = KINDS[name]
-    with tempfile.TemporaryDirectory() as folder_name:
-        folder = Path(folder_name)
-        program = patch.object(sys.modules["__main__"], "__file__", str(CONTROLLER), create=True)
-        with program, patch.object(sys, "argv", [str(CONTROLLER)]):
-            kind.draw(folder)
+    with drawn(kind) as folder:
         portable = Portable(kind, folder)
         texts = {asked: portable.text(told) for asked, told in ask_all(kind, folder).items()}
     return {

@@ -176,3 +176,27 @@ def test_an_excursion_is_told_with_where_it_came_from_and_to_and_back(
     (jump,) = jumps(empty)
     told = [jump.details[each] for each in ("before", "after", "back")]
     assert told == pytest.approx([5.0, 10.8, 5.0], abs=0.8)
+
+
+# How fast it goes, how often rows come and how many, how often a place, and when it is lifted.
+LIFTED: dict[str, tuple[float, float, int, int, list[float]]] = {
+    "three times in 90 s, a row each 0.5 s": (0.2, 0.5, 180, 1, [22.0, 40.5, 78.5]),
+    "never, fast in a short recording": (1.0, 0.5, 80, 1, []),
+    "never, with a place in each fifth row": (2.0, 0.1, 600, 5, []),
+}
+
+
+@pytest.mark.parametrize(
+    ("speed", "interval_s", "rows", "every", "lifted"), LIFTED.values(), ids=LIFTED
+)
+def test_leaps_do_not_tell_what_is_usual_and_driving_does(
+    empty: sqlite3.Connection, speed: float, interval_s: float, rows: int, every: int,
+    lifted: list[float],
+) -> None:  # fmt: skip
+    recorder = start_run(empty)
+    for row in range(rows):
+        time_s = row * interval_s
+        along = speed * interval_s * (row - row % every)
+        aside = 0.8 * sum(time_s >= each for each in lifted)
+        recorder.publish(time_s, {"pose": [along, aside, 0.0]})
+    assert [event.start_s for event in jumps(empty)] == lifted

@@ -319,8 +319,9 @@ def _is_back(jump: Jump, following: Jump, usual: float) -> bool:
 def find_leaps(frame: Frame, x: str, y: str, at_least_m: float) -> list[tuple[float, float]]:
     """Times and lengths of steps of a position that no driving explains.
 
-    Longer than `at_least_m`, and than five times the 99th percentile of all steps; after a gap, by
-    as many times as it is longer than the usual interval.
+    Longer than `at_least_m`, and than five times the 99th percentile of all steps, of which each
+    counts for no more than the longer one next to it: so leaps do not tell what is usual. After a
+    gap by as many times more as it is longer than the usual interval.
 
     Args:
         frame: The rows.
@@ -339,8 +340,8 @@ def find_leaps(frame: Frame, x: str, y: str, at_least_m: float) -> list[tuple[fl
     spans = _sampled(zones, zones.value_count, SAMPLED_CHUNKS)
     sample = [_way(frame.rows(*span), x, y) for span in spans]
     interval_s = _interval_s([times for times, _ in sample])
-    steps = np.sort(np.concatenate([np.zeros(0), *(steps for _, steps in sample)]))
-    usual_m = float(steps[min(len(steps) - 1, int(0.99 * len(steps)))]) if len(steps) > 100 else 0.0
+    steps = np.sort(np.concatenate([np.zeros(0), *(_of_motion(steps) for _, steps in sample)]))
+    usual_m = float(steps[int(0.99 * len(steps))]) if len(steps) > LEAST_STEPS else 0.0
     limit_m = max(at_least_m, POSITION_STEPS * usual_m)
     leaps: dict[float, float] = {}
     for start, stop in long:
@@ -349,6 +350,13 @@ def find_leaps(frame: Frame, x: str, y: str, at_least_m: float) -> list[tuple[fl
         far = rows[steps[rows] > limit_m * _intervals(times, rows, interval_s)]
         leaps |= zip(times[far + 1].tolist(), steps[far].tolist(), strict=True)
     return sorted(leaps.items())
+
+
+def _of_motion(steps: Array) -> Array:
+    """Each step that is one, or the longer of those next to it where that is less."""
+    steps = steps[steps > 0]  # a position may come more seldom than rows
+    beside = np.pad(steps, 1)
+    return np.minimum(steps, np.maximum(beside[:-2], beside[2:]))
 
 
 def _way(frame: Frame, x: str, y: str) -> tuple[Array, Array]:

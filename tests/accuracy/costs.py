@@ -1,0 +1,102 @@
+"""What kills cost, and how much a model has to read."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from statistics import median
+from typing import Final
+
+import anyio
+
+from tests.accuracy.page import table
+from tests.benchmarks.core import Bench, Line
+from tests.benchmarks.kills import measure_interrupts, measure_kills
+from tests.golden.asking import TOOLS, ask_tools
+from tests.golden.drawing import KINDS
+from tests.golden.stored import drawn
+from tests.tool_list import counts_of
+from webots_mcp.contract import MemoryDatabase
+from webots_mcp.questions.budget import ANSWER_TOKENS, LARGE_ANSWER_TOKENS, tokens_in
+from webots_mcp.server import create_server
+
+_KILLS: Final = 200  # of each kind with a server
+
+
+def kills(bench: Bench) -> Iterator[str]:
+    """Controllers that are killed or interrupted while they record."""
+    wide = replace(bench, kills=bench.count(_KILLS))
+    killed = list(measure_kills.measure(wide))
+    rows = killed[:-2]
+    published = sum(_number(line.beside) for line in rows)
+    lost, of = sum(round(line.measured) for line in rows), sum(_number(line.ours) for line in rows)
+    yield (
+        f"{lost:,} of {published:,} states whose `publish()` had returned were lost in {of:,} "
+        "kills (SIGKILL) of controllers."
+    )
+    yield _KILLED
+    yield table(("what", "how often", "", "found"), map(_cells, killed))
+    yield _INTERRUPTED
+    place = bench.place("interrupts")
+    interrupted = measure_interrupts.measure(replace(bench, folder=place, effort=bench.effort / 2))
+    yield table(("what", "how often", "out of", "found"), map(_cells, interrupted))
+
+
+_KILLED: Final = """\
+Controllers record into one database, without a server or with one that maintains it, and are
+killed one after the other at moments by chance, up to 0.3 s after they began; five commands wait
+for each. What they said to have published is compared with what is there afterwards. States that
+a lock kept out of the database wait in a file beside it and are taken in by the next process.
+The machine itself was not switched off: without `fsync` in the loop a power cut may cost the
+newest states."""
+_INTERRUPTED: Final = """\
+Ctrl-C, at every instruction of the bridge that writes, of which these were drawn:"""
+
+
+def _number(text: str) -> int:
+    return int(re.sub(r"\D.*", "", text.replace(",", "")) or 0)
+
+
+def _cells(line: Line) -> tuple[str, ...]:
+    return line.what, line.ours, line.beside, f"{line.measured:.0f}"
+
+
+def answers(bench: Bench) -> Iterator[str]:
+    """The tools' answers about the recordings of the golden answers, and the list of the tools."""
+    told = dict[str, list[int]]()
+    for name in list(KINDS)[: bench.count(len(KINDS))]:
+        bench.say(f"answers about {name}")
+        with drawn(KINDS[name]) as folder:
+            for asked, answer in anyio.run(ask_tools, KINDS[name], folder / "webots.db").items():
+                tokens = tokens_in(json.dumps(answer, ensure_ascii=False, separators=(",", ":")))
+                told.setdefault(TOOLS[asked.removesuffix(" of a part")][0], []).append(tokens)
+    every = [tokens for each in told.values() for tokens in each]
+    memory = MemoryDatabase()
+    server = {core: create_server(memory, memory.data_dir, core=core) for core in (False, True)}
+    whole, core = (counts_of(anyio.run(server[each].list_tools)) for each in (False, True))
+    memory.close()
+    yield (
+        f"Half of {len(every)} answers have at most {median(every):,.0f} tokens, the longest "
+        f"{max(every):,}; the list of the {whole.tools} tools has {whole.tokens:,}."
+    )
+    yield _READ.format(
+        budget=f"{ANSWER_TOKENS:,}",
+        large=f"{LARGE_ANSWER_TOKENS:,}",
+        tools=core.tools,
+        tokens=f"{core.tokens:,}",
+    )
+    rows = [
+        (f"`{tool}`", str(len(each)), f"{median(each):,.0f}", f"{max(each):,}")
+        for tool, each in told.items()
+    ]
+    yield table(("question", "answers", "tokens, median", "most"), rows)
+
+
+_READ: Final = """\
+Each question is asked of nine recordings of which the accepted answers are stored (`python -m
+tests.golden`), in its usual form and in others. An answer has at most {budget} tokens by design,
+and up to {large} where `limit` or `max_points` asks for more, which the longest ones are. With
+`serve --tools core` the list has {tools} tools and {tokens} tokens. Tokens are counted by a rule
+of this package (`tokens_in`); each model has its own tokenizer, which was not asked."""

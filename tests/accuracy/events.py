@@ -1,0 +1,224 @@
+"""How true what is told of events is, by how much noise there is and how often rows come."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import fields
+from itertools import product, repeat, starmap
+from multiprocessing import get_context
+from typing import Final
+
+from tests.accuracy.page import percent, share, table
+from tests.benchmarks.core import Bench, duration
+from tests.checks import judging as checks_judging
+from tests.detection.drawing import KINDS as RECORDINGS
+from tests.detection.driving import NOISE_LEVELS_M
+from tests.detection.judging import Tally, median, nine_in_ten
+from tests.detection.labelled import SETTING, Measure, Setting
+from tests.detection.measuring import Report, measure
+from tests.detection.sensing import READING_NOISES_M
+from tests.detection.swinging import NOISE_SHARE_LEVELS
+from webots_mcp.store.checks import CHECKS
+from webots_mcp.store.detection.events import KINDS
+from webots_mcp.store.detection.kinds import EventOptions
+
+INTERVALS_S: Final = (0.016, 0.064, 0.16, 0.5)
+LEVELS: Final = ("no noise", "little", "much")
+# The kind of event and what it is about, by what is judged.
+MEASURES: Final[dict[Measure, tuple[str, str]]] = {
+    "standstill": ("standstill", "the robot stands"),
+    "stuck": ("stuck", "it should move"),
+    "missing": ("missing", "a sensor gives no value"),
+    "flat": ("flat", "a sensor is frozen"),
+    "dropout": ("jump", "a sensor drops out"),
+    "leap": ("jump", "the robot is somewhere else"),
+    "swing": ("oscillation", "a value swings"),
+    "gap": ("gap", "no rows"),
+}
+_OF_ONE_RATE: Final = ("hovering", "roaming", "wide")  # drawn with a rate of their own
+_MOST_VALUES: Final = 3_000  # of signals beside
+UNSEEN: Final = 10_000  # seed, and number of runs: from 0 on they served to make the rules
+_POOR: Final = 0.95
+_USUAL_STEP: Final = 0.954  # the median of steps of normal noise, in standard deviations of it
+
+
+Cell = tuple[Measure, float, int]  # what is judged, the row interval and the level of noise
+
+
+def events(bench: Bench) -> Iterator[str]:
+    """Precision, recall and errors of time of each kind, by noise and rate."""
+    cells = _measured(bench)
+    clear, noisy = (
+        _sum(t for (*_, noise), of in cells.items() for _, t in of if (noise == 2) is much)
+        for much in (False, True)
+    )
+    quiet = _sum(each for found in cells.values() for _, each in found if not each.incidents)
+    yield (
+        f"{percent(clear.recall)} % of {clear.incidents:,} events in drawn recordings are found, "
+        f"{percent(clear.precision)} % of what is told is true; where there is much noise "
+        f"{percent(noisy.recall)} % of {noisy.incidents:,} and {percent(noisy.precision)} %."
+    )
+    yield _EVENTS.format(
+        cases=bench.count(4, least=0),
+        recordings=len(_recordings()),
+        readings=_levels(READING_NOISES_M, 1000, "mm"),
+        places=_levels(NOISE_LEVELS_M, 1000, "mm"),
+        swings=_levels(NOISE_SHARE_LEVELS, 100, "%"),
+        false=f"{60 * quiet.false / quiet.minutes:.2f}" if quiet.minutes else "-",
+        hours=f"{quiet.minutes / 60:.0f}",
+    )
+    for heading, cell in (("found / true", _truth), ("begin, end off", _errors)):
+        head = ("kind of event", "a row each", *(f"{each}: {heading}" for each in LEVELS))
+        yield table(head, _rows(cells, cell))
+    poor = list(_poor(cells)) or ["- none"]
+    yield f"Below {100 * _POOR:.0f} %, and in which recordings most of it:"
+    yield "\n".join(poor)
+    score = EventOptions().jump_min_score
+    yield _WHY.format(score=score, jump_m=(1 + score / 0.6745) * _USUAL_STEP * READING_NOISES_M[2])
+    measured = {kind for kind, _ in MEASURES.values()}
+    others = ", ".join(f"`{each.name}`" for each in KINDS if each.name not in measured)
+    yield f"Not measured, since they are what rows and tables say, without an estimate: {others}."
+
+
+_EVENTS: Final = """\
+For each row interval and each level of noise recordings of {recordings} kinds are drawn, {cases}
+of each: drives, stops, docking, creeping, robots that are held, sensors that fail, values that
+swing, healthy ones and so on. The noise of a position is {places} in each coordinate, of a
+distance sensor {readings}, of a swing {swings} of its amplitude (standard deviations). *Found*
+is the share of what happened that is told (recall), *true* the share of what is told that
+happened (precision), both in per cent, then how often it happened; *off* is the median error of
+begin and end, in parentheses what nine in ten do not exceed (a dropout ends here in its last
+row, in an answer with the next one). In the {hours} hours of recordings in which a kind does not
+happen at all, {false} false events per hour are told of a kind."""
+
+_WHY: Final = """\
+The two weak places have a reason each. A dropout has to be {score:g} times as large as the steps
+of its signal usually are (a modified z-score), which noise of 50 mm makes {jump_m:.1f} m: a
+distance sensor that reads less than that drops out unseen, and the answer does not say so. With
+few rows and much noise nobody can tell a short stop from a slow drive; there the answer says
+that it may have missed some."""
+
+
+def _recordings() -> list[str]:
+    return [name for name in RECORDINGS if name not in _OF_ONE_RATE]
+
+
+def _measured(bench: Bench) -> dict[Cell, list[tuple[str, Tally]]]:
+    """The tallies of each cell, by kind of recording."""
+    cases, found = bench.count(4, least=0), dict[Cell, list[tuple[str, Tally]]]()
+    settings = list(starmap(Setting, product(INTERVALS_S, range(len(LEVELS)))))
+    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
+        reports = pool.map(_report, settings, repeat(cases))
+        for (interval_s, noise), report in zip(settings, reports, strict=True):
+            bench.say(f"events: a row each {duration(interval_s)}, {LEVELS[noise]}")
+            for (recording, judged, _), tally in report.tallies.items():
+                found.setdefault((judged, interval_s, noise), []).append((recording, tally))
+    return found
+
+
+def _report(setting: Setting, cases: int) -> Report:
+    token = SETTING.set(setting)
+    report = measure(_recordings(), cases, UNSEEN, most_values=_MOST_VALUES)
+    SETTING.reset(token)
+    return report
+
+
+def _sum(tallies: Iterable[Tally]) -> Tally:
+    whole = Tally()
+    for tally in tallies:
+        for each in fields(Tally):
+            setattr(whole, each.name, getattr(whole, each.name) + getattr(tally, each.name))
+    return whole
+
+
+def _rows(
+    cells: dict[Cell, list[tuple[str, Tally]]], cell: Callable[[Tally, float], str]
+) -> Iterator[list[str]]:
+    for judged, (kind, what) in MEASURES.items():
+        for interval_s in INTERVALS_S:
+            of = [cells.get((judged, interval_s, noise), []) for noise in range(len(LEVELS))]
+            figures = (cell(_sum(tally for _, tally in each), interval_s) for each in of)
+            yield [f"`{kind}`: {what}", duration(interval_s), *figures]
+
+
+def _truth(tally: Tally, interval_s: float) -> str:
+    if not tally.incidents:
+        return "-"
+    return f"{percent(tally.recall)} / {percent(tally.precision)} of {tally.incidents}"
+
+
+def _errors(tally: Tally, interval_s: float) -> str:
+    """Of begin and end, in time, of swings in periods: the median, and what nine in ten keep."""
+    if not tally.begin_errors:
+        return "-"
+    figures = [of(errors) or 0.0 for errors in (tally.begin_errors, tally.end_errors)
+               for of in (median, nine_in_ten)]  # fmt: skip
+    if tally.period_errors:
+        return "{:.2f} ({:.2f}), {:.2f} ({:.2f}) periods".format(*figures)
+    return "{} ({}), {} ({})".format(
+        *(duration(each * interval_s) if each else "0" for each in figures)
+    )
+
+
+def _poor(cells: dict[Cell, list[tuple[str, Tally]]]) -> Iterator[str]:
+    for (judged, interval_s, noise), tallies in cells.items():
+        whole = _sum(tally for _, tally in tallies)
+        where = f"- {MEASURES[judged][1]}, a row each {duration(interval_s)}, {LEVELS[noise]}"
+        if (whole.recall if whole.recall is not None else 1.0) < _POOR:
+            missed = ((each, tally.incidents - tally.found) for each, tally in tallies)
+            found = share(whole.found, whole.incidents)
+            yield f"{where}: {found} found; missed in {_worst(missed)}"
+        if (whole.precision if whole.precision is not None else 1.0) < _POOR:
+            told = whole.found + whole.false
+            false = ((each, tally.false) for each, tally in tallies)
+            yield f"{where}: {share(whole.found, told)} true; false in {_worst(false)}"
+
+
+def _worst(counts: Iterable[tuple[str, int]]) -> str:
+    most = sorted(counts, key=lambda each: -each[1])
+    return ", ".join(f"`{name}` ({count})" for name, count in most[:3] if count)
+
+
+def _levels(levels: Sequence[float], times: float, unit: str) -> str:
+    none, little, much = (f"{times * each:g}" for each in levels)
+    return f"{none}, {little} or {much} {unit}"
+
+
+def checks(bench: Bench) -> Iterator[str]:
+    """What the checks say of healthy runs, and of runs with one fault each."""
+    judged = checks_judging.judge(bench.count(100), bench.count(5), UNSEEN)
+    healthy = judged.pop(checks_judging.HEALTHY)
+    fails = sum(n for (_, outcome), n in healthy.said.items() if outcome == "fail")
+    warned = sum(n for (_, outcome), n in healthy.said.items() if outcome == "warn")
+    noticed, runs = (
+        sum(getattr(each, name) for each in judged.values()) for name in ("noticed", "runs")
+    )
+    yield (
+        f"{noticed} of {runs} runs with a fault are noticed by the check that has to; "
+        f"{fails} checks fail in {healthy.runs} healthy runs."
+    )
+    yield _CHECKS.format(warned=warned, runs=healthy.runs, checks=len(CHECKS))
+    rows = [
+        (kind, each.checked_by, str(each.runs), str(each.said[each.checked_by, "fail"]),
+         str(each.said[each.checked_by, "warn"]), str(len(each.wrong)))
+        for kind, each in judged.items()
+    ]  # fmt: skip
+    yield table(("fault", "check", "runs", "fails", "warns", "other checks that fail"), rows)
+    found = {each.checked_by for each in judged.values()}
+    alarms = [
+        (each.name, str(healthy.said[each.name, "fail"]), str(healthy.said[each.name, "warn"]),
+         "yes" if each.name in found else "no")
+        for each in CHECKS
+    ]  # fmt: skip
+    yield table(("check", "fails in healthy runs", "warns in them", "has a fault above"), alarms)
+
+
+_CHECKS: Final = """\
+A healthy run drives, turns, stops as it was told and has sensors that work, with drifting
+odometry and an arm that lags; each fault is put into such a run. Of {runs} healthy runs, judged
+by {checks} checks each, {warned} checks warn. "Other checks that fail" beside a fault are not
+all wrong: a robot that is held also slips. What fails "moves when commanded" in a healthy run is
+a slow turn on the spot: one of 3 s at 0.3 to 0.4 rad/s is taken for being stuck, since turning
+is looked for in stretches of 2 s, of which two in a row have to show it."""

@@ -1,0 +1,67 @@
+"""The page of accuracy is whole, is what the command makes, and knows all that the code has."""
+
+from __future__ import annotations
+
+import re
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from tests.accuracy.__main__ import PARTS, SHOWN, figures, page_of
+from tests.accuracy.page import FIGURES, PAGE, README, Part, sections, share
+from tests.benchmarks.core import Bench
+from tests.checks.labelled import FAULTS, WRITTEN
+from webots_mcp.store.checks import CHECKS
+from webots_mcp.store.detection.events import kind_names
+
+PAGE_TEXT = PAGE.read_text("utf-8")
+SECTIONS = sections(PAGE_TEXT)
+TINY = 0.01
+
+
+def test_the_page_is_made_of_all_parts_and_nothing_else() -> None:
+    assert list(SECTIONS) == [part.title for part in PARTS]
+    assert page_of(SECTIONS) == PAGE_TEXT
+    for section in SECTIONS.values():
+        assert re.search(r"(?m)^\*Measured on 20\d\d-\d\d-\d\d in \d+ s on .+\*$", section)
+
+
+def test_the_page_knows_every_kind_of_event_every_check_and_every_fault() -> None:
+    assert set(re.findall(r"`(\w+)`", SECTIONS["Events"])) >= set(kind_names())
+    cells = {cell for row in re.findall(r"(?m)^\|.+\|$", SECTIONS["Checks"])
+             for cell in row.strip("| ").split(" | ")}  # fmt: skip
+    assert cells >= {*FAULTS, *WRITTEN, *(check.name for check in CHECKS)}
+
+
+def test_the_readme_shows_four_figures_of_the_page() -> None:
+    (shown,) = FIGURES.findall(README.read_text("utf-8"))
+    assert shown == figures(PAGE_TEXT)
+    assert len(shown.splitlines()) == len(SHOWN) == 4
+    assert "(docs/accuracy.md)" in README.read_text("utf-8")
+
+
+def form(section: str) -> list[str]:
+    """The heads of its tables, and what their lines are about."""
+    rows = re.findall(r"(?m)^\| (.+) \|$", section)
+    return [
+        row if after.startswith("---") else row.split(" | ")[0]
+        for row, after in pairwise([*rows, ""])
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", PARTS, ids=lambda part: part.name)
+def test_a_part_comes_out_in_the_form_that_the_page_has(part: Part, tmp_path: Path) -> None:
+    """Its figures are those of the day and the machine; nothing is asked of them."""
+    if part.name in ("survival", "loop"):
+        pytest.importorskip("mcap", reason="the extra 'mcap' is not installed")
+        pytest.importorskip("rerun.chunk", reason="the extra 'rerun' is not installed")
+    made = part.measured(Bench(tmp_path, TINY, lambda text: None))
+    assert form(made) == form(SECTIONS[part.title]), f"python -m tests.accuracy {part.name}"
+
+
+def test_a_share_has_the_interval_of_the_textbook() -> None:
+    assert share(0, 100) == "0 % (0 to 3.7)"
+    assert share(5, 10) == "50 % (23.7 to 76.3)"
+    assert share(0, 0) == "-"

@@ -42,13 +42,14 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from webots_mcp import contract
+from webots_mcp import __version__, contract
 from webots_mcp.errors import InvalidInputError, NoDatabaseError, NothingRecordedError
 from webots_mcp.naming import same_in_meaning
 from webots_mcp.questions.answers import Answer, ShownPicture
 from webots_mcp.questions.budget import Client, compact_json, reader
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.recording import Recording
+from webots_mcp.store.requests import OpenRequest, Requester
 
 if TYPE_CHECKING:
     from webots_mcp.steering.routes import Companions
@@ -71,6 +72,8 @@ class Effect:
     repeats: bool = False
 
 
+BY_COMMAND_LINE: Final = Requester("webots-mcp", __version__, "cli")
+_PART_OF: Final[dict[str, tuple[str, ...]]] = {}  # the tools that are merged of others, by these
 _NOT_GIVEN: Final = inspect.Parameter.empty
 READS: Final = Effect(reads=True, repeats=True)
 CHANGES: Final = Effect()
@@ -83,6 +86,7 @@ class Caller:
     """Who asks: a question that waits, or that starts something, takes it as a parameter.
 
     Attributes:
+        by: The program that asks, and by which way.
         report: Shows how long it has waited: progress, total, text.
         companions: The trials and the Webots that run on beside the answers.
     """
@@ -90,6 +94,7 @@ class Caller:
     client: Client
     report: Report
     companions: Companions
+    by: Requester = BY_COMMAND_LINE
 
 
 class Reply(NamedTuple):
@@ -208,12 +213,18 @@ class Question:
             given[scope] = Scope(**{name: given.pop(name, None) for name in SCOPE})
         if asker := self._parameter_of(Caller):
             given[asker] = caller
+        names = (self.name, *_PART_OF.get(self.name, ()))
+        by = caller.by if caller else BY_COMMAND_LINE
         client = reader.set(caller.client if caller else "cli")
         try:
-            if inspect.iscoroutinefunction(self.function):
-                answer = await self.function(recording, **given)
-            else:
-                answer = await to_thread.run_sync(lambda: self.function(recording, **given))
+            async with OpenRequest(
+                recording, by, names, arguments, reads=self.effect.reads
+            ) as request:
+                if inspect.iscoroutinefunction(self.function):
+                    answer = await self.function(recording, **given)
+                else:
+                    answer = await to_thread.run_sync(lambda: self.function(recording, **given))
+                request.outcome = getattr(answer, "outcome", None) or request.outcome
         finally:
             reader.reset(client)
         return _reply(answer)
@@ -337,6 +348,8 @@ def merged(
         name: Its own name; then nothing is asked by default.
         title: Its own title.
     """
+    for part in parts.values():
+        _PART_OF[part.name] = (name or first.name,)
     effects = [part.effect for part in parts.values()]
     if len({effect.reads for effect in effects}) != 1:
         raise ValueError(f"{', '.join(parts)}: some of them read, others change something")

@@ -59,6 +59,7 @@ from webots_mcp.store.parameters import COLUMNS, Declared, declared_by, describe
 from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.segment import Subject
 from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.requests import permit
 
 # -- breakpoints: stored for the robot, and read again by its controller --
 
@@ -101,6 +102,8 @@ async def webots_breakpoint(
     and armed again after a reset or reload.
     """
     parsed = parse_condition(condition)
+    if action != "log":  # what the bridge does at a hit is not asked for again
+        await to_thread.run_sync(permit, recording, action, {})
     name, number, notes = await to_thread.run_sync(
         _store, recording, robot, parsed, action, after_hits, caller.client
     )

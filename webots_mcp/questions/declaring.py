@@ -42,14 +42,14 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from webots_mcp import __version__, contract
+from webots_mcp import contract
 from webots_mcp.errors import InvalidInputError, NoDatabaseError, NothingRecordedError
 from webots_mcp.naming import same_in_meaning
 from webots_mcp.questions.answers import Answer, ShownPicture
 from webots_mcp.questions.budget import Client, compact_json, reader
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.requests import OpenRequest, Requester
+from webots_mcp.store.requests import BY_COMMAND_LINE, OpenRequest, Requester
 
 if TYPE_CHECKING:
     from webots_mcp.steering.routes import Companions
@@ -72,7 +72,6 @@ class Effect:
     repeats: bool = False
 
 
-BY_COMMAND_LINE: Final = Requester("webots-mcp", __version__, "cli")
 _PART_OF: Final[dict[str, tuple[str, ...]]] = {}  # the tools that are merged of others, by these
 _NOT_GIVEN: Final = inspect.Parameter.empty
 READS: Final = Effect(reads=True, repeats=True)

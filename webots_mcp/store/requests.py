@@ -19,6 +19,7 @@ from typing import Any, Final, NamedTuple, cast
 
 from anyio import CancelScope, to_thread
 
+from webots_mcp import __version__
 from webots_mcp.contract import new_uuid
 from webots_mcp.errors import DatabaseError, NoDatabaseError, NotAllowedError
 from webots_mcp.store.policy import LAUNCH, policies_of
@@ -27,7 +28,9 @@ from webots_mcp.store.recording import Recording
 LONGEST_ARGUMENTS: Final = 1_000  # characters
 _LONGEST_OUTCOME: Final = 300
 _SHORTEST_SECRET: Final = 4  # a shorter one would blacken words of the outcome
-_SECRET: Final = re.compile(r"token|passw|secret|credential|(^|[_\W])key|key$|apikey", re.IGNORECASE)
+_SECRET: Final = re.compile(
+    r"token|passw|secret|credential|(^|[_\W])key|key$|apikey", re.IGNORECASE
+)
 _LEFT_OUT: Final = "(left out)"
 _BEGIN: Final = (
     "INSERT INTO request (uuid, wall_time_s, client, client_version, transport, tool, arguments, "
@@ -59,6 +62,9 @@ class Requester(NamedTuple):
     name: str
     version: str
     transport: str
+
+
+BY_COMMAND_LINE: Final = Requester("webots-mcp", __version__, "cli")
 
 
 class OpenRequest:

@@ -174,7 +174,7 @@ class Where:
 
     @contextmanager
     def writer(
-        self, command: str, *, create: bool = False, **arguments: Any
+        self, command: str, arguments: Mapping[str, Any] = _NO_KINDS, *, create: bool = False
     ) -> Generator[tuple[Recording, sqlite3.Connection]]:
         """The recording, and a connection that may write to it for a command with such arguments.
 

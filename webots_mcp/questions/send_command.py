@@ -72,6 +72,7 @@ _NOT_ASKED: Final = (
     "of webots_breakpoint stay and are armed when it starts again"
 )
 _ARMING_WAIT_S: Final = 5.0
+_NO_PARAMS: Final[Mapping[str, Any]] = {}
 _LONGEST_CONDITION: Final = 300
 
 
@@ -103,7 +104,7 @@ async def webots_breakpoint(
     """
     parsed = parse_condition(condition)
     if action != "log":  # what the bridge does at a hit is not asked for again
-        await to_thread.run_sync(permit, recording, action, {})
+        await to_thread.run_sync(permit, recording, action, _NO_PARAMS)
     name, number, notes = await to_thread.run_sync(
         _store, recording, robot, parsed, action, after_hits, caller.client
     )

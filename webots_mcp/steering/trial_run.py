@@ -62,8 +62,8 @@ from webots_mcp.store.parameters import (
     take_up,
     trials_of,
 )
-from webots_mcp.store.questions.runs import run_info, score_run
 from webots_mcp.store.policy import LAUNCH
+from webots_mcp.store.questions.runs import run_info, score_run
 from webots_mcp.store.recording import Job, Recording
 from webots_mcp.store.requests import permit
 from webots_mcp.webots.starting import CommandLine, KeptProgram, Start, any_port, end_left_over

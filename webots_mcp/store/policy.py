@@ -1,13 +1,13 @@
 """Who may do what: the table `[allow]` of a project's `webots-mcp.toml`; see docs/policy.md.
 
     [allow]
-    tools = ["*", "!webots_report"]     # the last pattern that fits decides; what none fits is refused
-    actions = ["*", "!quit"]            # commands, built in or the controllers' own
+    tools = ["*", "!webots_report"]  # the last pattern that fits decides; without one: refused
+    actions = ["*", "!quit"]         # commands, built in or the controllers' own
     fields = ["BALL.*", "*.translation"]
-    nodes = ["BOXES.children*"]         # where nodes may be added or removed
+    nodes = ["BOXES.children*"]      # where nodes may be added or removed
     worlds = ["arena*.wbt"]
     launch = false
-    holds_for = "everyone"              # or "assistants"
+    holds_for = "everyone"           # or "assistants"
 
     [allow.parameters]
     kp = [0.0, 5.0]

@@ -1,8 +1,8 @@
 """What was asked for: each request that changes something is a row, and is checked by the policy.
 
-A request is begun where a tool, a command line or the page is asked. Whatever carries out a part of it
-(queues a command, starts Webots, gives an order to it, stores a breakpoint) asks `permit` first,
-which finds the request of its task: so no route goes round either.
+A request is begun where a tool, the command line or the page is asked. Whatever carries out a part
+of it (queues a command, starts Webots, gives an order to it, stores a breakpoint) asks `permit`
+first, which finds the request of its task: so no route goes round either.
 """
 
 from __future__ import annotations

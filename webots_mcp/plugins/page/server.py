@@ -330,7 +330,7 @@ def _told(what: str, ask: Any, request: OpenRequest) -> dict[str, Any]:
     try:
         with request:
             answer: CommandAnswer = anyio.run(ask)
-            request.outcome = answer.outcome
+            request.outcome = answer.outcome or ""
     except WebotsMCPError as error:
         return {"text": f"{what}: {error}", "is_done": False}
     if answer.outcome == "done":

@@ -6,8 +6,8 @@
     during = "mode == 'drive'"  # may be left out, as may the name
     robot = "rover"             # else all robots
 
-Bridges read it from there, with each run. A file that is invalid changes nothing. `policy` reads its
-table `[allow]`.
+Bridges read it from there, with each run. A file that is invalid changes nothing. `policy` reads
+its table `[allow]`.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from anyio import CancelScope, to_thread
 from webots_mcp import __version__
 from webots_mcp.contract import new_uuid
 from webots_mcp.errors import DatabaseError, NoDatabaseError, NotAllowedError
-from webots_mcp.store.policy import LAUNCH, policies_of
+from webots_mcp.store.policy import LAUNCH, Policy, policies_of
 from webots_mcp.store.recording import Recording
 
 LONGEST_ARGUMENTS: Final = 1_000  # characters
@@ -137,16 +137,24 @@ class OpenRequest:
         """
         world = params.get("world") if action in (LAUNCH, "load_world") else None
         with self._refusing():
-            for each in policies_of(self.recording.database, self.recording.data_dir, world):
-                if each.holds_for(self._by.transport):
-                    each.require(action, params)
+            for each in self._policies(world):
+                each.require(action, params)
 
     def _begin(self) -> None:
         with self._refusing():
-            for each in policies_of(self.recording.database, self.recording.data_dir):
-                if each.holds_for(self._by.transport):
-                    each.require_tool(self._names)
+            for each in self._policies():
+                each.require_tool(self._names)
         self.enter()
+
+    def _policies(self, world: object = None) -> list[Policy]:
+        """Those that bind who asks; what only reads goes on while one is invalid."""
+        found = policies_of(self.recording.database, self.recording.data_dir, world)
+        try:
+            return [each for each in found if each.holds_for(self._by.transport)]
+        except NotAllowedError:
+            if self._reads:
+                return []
+            raise
 
     @contextmanager
     def _refusing(self) -> Generator[None]:

@@ -65,9 +65,10 @@ class Rules(NamedTuple):
         forbidden = [f"!{each}" for each in (*ACTIONS, *ENDING) if each not in self.actions]
         actions = sorted(self.actions) if self.spelled_out else ["*", *forbidden]
         gait = json.dumps(self.gaits) if self.gaits else "false"
+        tools = json.dumps(["*", *(f"!{each}" for each in self.forbidden_tools)])
         return (
-            f"[allow]\ntools = {json.dumps(['*', *(f'!{each}' for each in self.forbidden_tools)])}\n"
-            f"actions = {json.dumps(actions)}\nfields = {json.dumps(sorted(self.fields))}\n"
+            f"[allow]\ntools = {tools}\nactions = {json.dumps(actions)}\n"
+            f"fields = {json.dumps(sorted(self.fields))}\n"
             f"nodes = {json.dumps(sorted(self.nodes))}\nworlds = []\nlaunch = false\n"
             f"[allow.parameters]\nkp = {list(self.kp)}\ngait = {gait}\n"
         )
@@ -127,8 +128,8 @@ CALLS = st.one_of(
     tool("webots_set_parameters", values=VALUES),
     tool("webots_run", parameters=VALUES | st.none(), reset=st.booleans(), **BRIEF),
     tool("webots_run", **BRIEF), line("run", "--for", "0.032"),
-    tool("webots_run_trials", parameters=st.lists(VALUES, min_size=1, max_size=2), score="max(steps)",
-         for_s=0.032),
+    tool("webots_run_trials", parameters=st.lists(VALUES, min_size=1, max_size=2),
+         score="max(steps)", for_s=0.032),
     tool("webots_breakpoint", condition="steps > 1e9",
          action=st.sampled_from(["pause", "keep", "log"])),
     tool("webots_set_field", path=PATHS, value="x"),
@@ -152,7 +153,7 @@ CALLS = st.one_of(
     line("field", PATHS, '"x"'), line("launch", str(WORLD)),
     line("breakpoint", "steps > 1e9", "--action", st.sampled_from(["pause", "keep", "log"])),
     st.tuples(st.just("page"), st.just("steer"), ORDERS),
-    st.tuples(st.just("page"), st.just("tune"), VALUES.map(lambda each: [*each.items()][0])),
+    st.tuples(st.just("page"), st.just("tune"), VALUES.map(lambda each: next(iter(each.items())))),
 )  # fmt: skip
 ALLOWED = Rules(frozenset(ACTIONS), frozenset(), (0.0, 4.0), ("trot", "walk"), frozenset(FIELDS),
                 frozenset(NODES), spelled_out=False)  # fmt: skip

@@ -261,7 +261,7 @@ def test_nothing_that_a_rule_forbids_is_done_by_any_route(
                     refused.add(leaf)
             assert robot.is_alive(), "something that ends it was allowed"
 
-        @settings(max_examples=EXAMPLES)
+        @settings(max_examples=EXAMPLES, deadline=None)
         @given(RULES, st.integers(0, 7), st.lists(CALLS, min_size=4, max_size=10))
         def try_all(rules: Rules, kind: int, calls: list[tuple[str, str, Any]]) -> None:
             attempt(rules if kind else None, calls)

@@ -191,7 +191,8 @@ class OpenRequest:
         if self.id is None or self.outcome == "refused":
             return
         if error is not None:
-            self.outcome = f"{type(error).__name__}: {error}"
+            known = isinstance(error, Exception)  # else the client has cancelled it, or left
+            self.outcome = f"{type(error).__name__}: {error}" if known else "cancelled"
         for secret in _secrets_in(self._arguments):
             self.outcome = self.outcome.replace(secret, _LEFT_OUT)
         with suppress(DatabaseError), self.recording.writer() as connection:

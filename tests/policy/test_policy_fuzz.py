@@ -12,7 +12,7 @@ import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import pytest
 from anyio.from_thread import start_blocking_portal
@@ -102,25 +102,24 @@ EXAMPLES = int(os.environ.get("POLICY_EXAMPLES", "25"))
 WORLD = Path(__file__).parents[1] / "bridge" / "worlds" / "crowd.wbt"
 
 
+def drawn(value: Any) -> st.SearchStrategy[Any]:
+    """A strategy as it is; anything else is always drawn."""
+    return cast("Any", value) if isinstance(value, st.SearchStrategy) else st.just(value)
+
+
 def tool(name: str, **arguments: Any) -> st.SearchStrategy[tuple[str, str, dict[str, Any]]]:
-    given_by = {
-        key: value if isinstance(value, st.SearchStrategy) else st.just(value)
-        for key, value in arguments.items()
-    }
-    return st.tuples(st.just("mcp"), st.just(name), st.fixed_dictionaries(given_by))
+    made = {key: drawn(value) for key, value in arguments.items()}
+    return st.tuples(st.just("mcp"), st.just(name), st.fixed_dictionaries(made))
 
 
 def sent(action: str, **params: Any) -> st.SearchStrategy[tuple[str, str, dict[str, Any]]]:
-    made = {
-        key: value if isinstance(value, st.SearchStrategy) else st.just(value)
-        for key, value in params.items()
-    }
+    made = {key: drawn(value) for key, value in params.items()}
     return tool("webots_send_command", action=action, params=st.fixed_dictionaries(made))
 
 
 def line(*words: Any) -> st.SearchStrategy[tuple[str, str, list[str]]]:
-    made = [each if isinstance(each, st.SearchStrategy) else st.just(each) for each in words]
-    return st.tuples(st.just("cli"), st.just(words[0]), st.tuples(*made).map(list))
+    made = st.tuples(*map(drawn, words)).map(list)
+    return st.tuples(st.just("cli"), st.just(words[0]), made)
 
 
 ORDERS = st.sampled_from(["pause", "resume", "fast", "step", "reset", "reload"])

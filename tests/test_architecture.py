@@ -52,7 +52,7 @@ STDLIB = {
 }
 ALLOWED["bridge"] = STDLIB | {"bridge", "__version__"}
 ALLOWED["observer"] = STDLIB | {"bridge", "observer"}
-ALLOWED["store"] = STDLIB | {"plugins", "requirements", "store"}
+ALLOWED["store"] = STDLIB | {"plugins", "requirements", "store", "__version__"}
 ALLOWED["diagnosis"] = STDLIB | {"requirements", "store", "diagnosis", "setup", "webots"}
 ALLOWED["diagnosis"] |= {"__version__"}
 ALLOWED["launch"] = STDLIB | {"console", "store", "setup", "webots"}

@@ -30,6 +30,7 @@ CHECKOUT = Path(__file__).parents[1]
 DOCS = CHECKOUT / "docs"
 INSTALLED = Path(webots_mcp.__file__).parents[1]
 PAGES = sorted([CHECKOUT / "README.md", CHECKOUT / "CHANGELOG.md", CHECKOUT / "CONTRIBUTING.md",
+                CHECKOUT / "SECURITY.md",
                 *DOCS.glob("*.md"), *CHECKOUT.glob("examples/*/README.md")])  # fmt: skip
 
 WORDS = {2.0: "two", 8: "eight"}

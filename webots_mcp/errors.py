@@ -24,6 +24,7 @@ of its own.
     │   ├── InvalidConditionError
     │   └── InvalidRangeError
     ├── NothingRecordedError        the question is fine, the recording has no answer yet
+    ├── NotAllowedError             the project's file does not allow it: which line does not
     ├── LeaseLostError              another process does by now what this one did
     ├── ConditionFailedError        a condition met values that it cannot be asked of
     └── CommandRefusedError         the simulation or the robot cannot do what was asked
@@ -126,6 +127,18 @@ class InvalidRangeError(InvalidInputError):
 
 class NothingRecordedError(WebotsMCPError):
     """The question is fine, but nothing has been recorded that answers it."""
+
+
+class NotAllowedError(WebotsMCPError):
+    """A rule of the project's `webots-mcp.toml` forbids it, or that file is invalid.
+
+    Attributes:
+        rule: The file, the line, and what stands there.
+    """
+
+    def __init__(self, text: str, rule: str) -> None:
+        super().__init__(text)
+        self.rule = rule
 
 
 class LeaseLostError(WebotsMCPError):

@@ -77,8 +77,8 @@ _UNFINISHED: Final = (
 
 _ENQUEUE: Final = (
     "INSERT INTO command (robot_id, action, params, status, requested_by, idempotency_key, "
-    "created_wall_time_s, expires_wall_time_s) "
-    "VALUES (:robot_id, :action, :params, 'pending', :requested_by, :key, :now, :expires) "
+    "created_wall_time_s, expires_wall_time_s, request_id) VALUES "
+    "(:robot_id, :action, :params, 'pending', :requested_by, :key, :now, :expires, :request) "
     "ON CONFLICT (idempotency_key) DO NOTHING"
 )
 _CANCEL: Final = (
@@ -168,6 +168,7 @@ class CommandQueue:
         time_to_live_s: float = COMMAND_TIME_TO_LIVE_S,
         requested_by: str | None = None,
         idempotency_key: str | None = None,
+        request_id: int | None = None,
     ) -> Command:
         """Ask for an action; sending it again with the same key makes no second command.
 
@@ -181,6 +182,7 @@ class CommandQueue:
             time_to_live_s: Unclaimed after this time, it expires and never runs.
             requested_by: Who asks, for the record.
             idempotency_key: A key of the caller's; one is made up if it is None.
+            request_id: The row of the request that it is sent for.
 
         Raises:
             InvalidInputError: The parameters are not plain JSON or too long, or the key already
@@ -197,6 +199,7 @@ class CommandQueue:
             "key": key,
             "now": now_s,
             "expires": now_s + time_to_live_s,
+            "request": request_id,
         }
         _while_busy(lambda: self._connection.execute(_ENQUEUE, values))
         command = Command(*self._connection.execute(_BY_KEY, (key,)).fetchone())

@@ -202,13 +202,41 @@ CREATE TABLE command (
 	finished_sim_time_s FLOAT, 
 	result TEXT /* JSON value */, 
 	error TEXT, 
+	request_id INTEGER /* the row of request that it was sent for */, 
 	CONSTRAINT fk_command_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
 	CONSTRAINT uq_command_idempotency_key UNIQUE (idempotency_key), 
 	CONSTRAINT fk_command_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE SET NULL
 );
+CREATE TRIGGER command_of_request BEFORE DELETE ON command WHEN old.request_id IS NOT NULL
+BEGIN UPDATE request SET purged_commands = json_insert(coalesce(purged_commands, '[]'), '$[#]',
+  json_array(old.id, old.action, old.status)) WHERE id = old.request_id; END;
 CREATE INDEX ix_command_claimed ON command (robot_id, id) WHERE status = 'claimed';
 CREATE INDEX ix_command_pending ON command (robot_id, id) WHERE status = 'pending';
 CREATE INDEX ix_command_session_id ON command (session_id);
+CREATE TABLE request (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
+	wall_time_s FLOAT NOT NULL, 
+	run_id INTEGER /* that went on then */, 
+	sim_time_s FLOAT /* of its newest row then */, 
+	client TEXT NOT NULL /* the name of the program that asked */, 
+	client_version TEXT NOT NULL, 
+	transport TEXT NOT NULL /* stdio, http, cli or page */, 
+	tool TEXT NOT NULL /* or the command of the command line */, 
+	arguments TEXT NOT NULL /* JSON object; without secrets, cut where it is long */, 
+	rule TEXT /* by which it was refused: file, line, and what stands there */, 
+	finished_wall_time_s FLOAT, 
+	outcome TEXT /* answered, refused, what became of its command, or an error */, 
+	purged_commands TEXT /* JSON array of [id, action, status] that retention deleted */, 
+	CONSTRAINT fk_request_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE SET NULL
+);
+CREATE TRIGGER request_stays BEFORE DELETE ON request
+BEGIN SELECT RAISE(ABORT, 'requests are never deleted'); END;
+CREATE TRIGGER request_stays_as_it_was BEFORE UPDATE OF
+  id, uuid, wall_time_s, client, client_version, transport, tool, arguments ON request
+BEGIN SELECT RAISE(ABORT, 'what was asked for cannot be changed'); END;
+CREATE INDEX ix_request_run_id ON request (run_id);
+CREATE UNIQUE INDEX ix_request_uuid ON request (uuid);
 CREATE TABLE breakpoint (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
 	robot_id INTEGER /* null: of robot_name */, 

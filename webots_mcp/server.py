@@ -64,6 +64,7 @@ from webots_mcp.store.project_file import ProjectWatch
 from webots_mcp.store.purge import Upkeep
 from webots_mcp.store.questions.sql import describe_schema
 from webots_mcp.store.recording import OpenReaders, Recording
+from webots_mcp.store.requests import Requester
 from webots_mcp.store.retention import Asked, ask
 
 INSTRUCTIONS: Final = (
@@ -364,7 +365,7 @@ def _answering(question: Question) -> Callable[..., Any]:
     @functools.wraps(question.function)
     async def wrapper(recording: Recording, ctx: Context[Any], **arguments: Any) -> Any:
         companions = ctx.request_context.lifespan_context
-        caller = Caller("mcp", ctx.report_progress, companions)
+        caller = Caller("mcp", ctx.report_progress, companions, _requester(ctx))
         try:
             return _as_result(await question.ask(recording, arguments, caller))
         except WebotsMCPError as error:
@@ -384,6 +385,14 @@ def _answering(question: Question) -> Callable[..., Any]:
     vars(wrapper)["__signature__"] = question.signature.replace(parameters=[*own, context])
     wrapper.__annotations__ = {"ctx": Context[Any]}
     return wrapper
+
+
+def _requester(ctx: Context[Any]) -> Requester:
+    """The client, as it has named itself, and the transport that its call came by."""
+    asked = ctx.request_context
+    client = asked.session.client_params
+    name, version = (client.client_info.name, client.client_info.version) if client else ("", "")
+    return Requester(name, version, "stdio" if asked.request is None else "http")
 
 
 def _as_result(reply: Reply) -> CallToolResult:

@@ -152,4 +152,13 @@ SELECT r.name AS robot, g.run_id, s.name AS signal, g.start_sim_time_s AS start_
   g.end_sim_time_s AS end_s, c.row_count, c.value_count, c.min, c.max,
   c.sum / nullif(c.value_count, 0) AS mean, c.first, c.last, c.largest_step, c.change_count
 FROM chunk c JOIN row_group g ON g.id = c.group_id AND g.is_complete
-JOIN signal s ON s.id = c.signal_id JOIN robot r ON r.id = s.robot_id
+JOIN signal s ON s.id = c.signal_id JOIN robot r ON r.id = s.robot_id;
+
+CREATE TRIGGER request_stays BEFORE DELETE ON request
+BEGIN SELECT RAISE(ABORT, 'requests are never deleted'); END;
+CREATE TRIGGER request_stays_as_it_was BEFORE UPDATE OF
+  id, uuid, wall_time_s, client, client_version, transport, tool, arguments ON request
+BEGIN SELECT RAISE(ABORT, 'what was asked for cannot be changed'); END;
+CREATE TRIGGER command_of_request BEFORE DELETE ON command WHEN old.request_id IS NOT NULL
+BEGIN UPDATE request SET purged_commands = json_insert(coalesce(purged_commands, '[]'), '$[#]',
+  json_array(old.id, old.action, old.status)) WHERE id = old.request_id; END

@@ -16,7 +16,9 @@ from tests import unprivileged
 from webots_mcp.contract import bundled
 
 CONTROLLER = "from controller import Robot\n\nrobot = Robot()\nwhile robot.step(32) != -1: pass\n"
-WRITTEN = [".mcp.json", ".cursor/mcp.json", ".vscode/mcp.json", "mcp_data/.gitignore"]
+WRITTEN = [
+    ".mcp.json", ".cursor/mcp.json", ".vscode/mcp.json", "mcp_data/.gitignore", "webots-mcp.toml",
+]  # fmt: skip
 
 
 @pytest.fixture

@@ -26,6 +26,7 @@ from webots_mcp.connection import connect as connect_database
 from webots_mcp.queue import CommandQueue, fetch_command, list_commands
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.recording import Recording
+from webots_mcp.store.requests import BY_COMMAND_LINE, OpenRequest
 
 pytestmark = pytest.mark.anyio
 
@@ -360,9 +361,16 @@ async def test_who_is_interrupted_while_a_command_is_being_sent_leaves_none_behi
 
     async def report(done: float, total: float | None, text: str) -> None: ...
 
-    recorded.connection.execute("BEGIN IMMEDIATE")  # the sending thread waits for the lock
-    dispatcher = Dispatcher(Told(file, file.parent), report)
-    asking = asyncio.ensure_future(dispatcher.ask("rover", "pause", 10))
+    with OpenRequest(Recording(file, file.parent), BY_COMMAND_LINE, ["pause"], {}):
+        recorded.connection.execute("BEGIN IMMEDIATE")  # the sending thread waits for the lock
+        dispatcher = Dispatcher(Told(file, file.parent), report)
+        asking = asyncio.ensure_future(dispatcher.ask("rover", "pause", 10))
+        await _leave(recorded, sending, asking)
+    sent = list_commands(recorded.connection, robot.id, limit=9)
+    assert [command.status for command in sent] == ["cancelled"]
+
+
+async def _leave(recorded: Recorded, sending: threading.Event, asking: asyncio.Future[Any]) -> None:
     assert await asyncio.to_thread(sending.wait, 30)
     asking.cancel()  # as Ctrl-C does: not by a scope of anyio's
     for _ in range(100):
@@ -371,5 +379,3 @@ async def test_who_is_interrupted_while_a_command_is_being_sent_leaves_none_behi
     recorded.connection.execute("COMMIT")
     with pytest.raises(asyncio.CancelledError):
         await asking
-    sent = list_commands(recorded.connection, robot.id, limit=9)
-    assert [command.status for command in sent] == ["cancelled"]

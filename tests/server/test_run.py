@@ -18,6 +18,7 @@ from webots_mcp.errors import CommandRefusedError
 from webots_mcp.steering.dispatch import Dispatcher, require_possible
 from webots_mcp.steering.routes import CLAIMING_S
 from webots_mcp.store.recording import Recording
+from webots_mcp.store.requests import BY_COMMAND_LINE, OpenRequest
 
 pytestmark = pytest.mark.anyio
 
@@ -125,11 +126,11 @@ async def test_an_interrupt_that_meets_the_waiting_itself_ends_the_run(
     async def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
+    recording = Recording(file, file.parent)
     async with connect() as client:
         with pytest.raises(KeyboardInterrupt):
-            await Dispatcher(Recording(file, file.parent), interrupt).ask(
-                None, "run", 60, {"for_s": 900.0}
-            )
+            async with OpenRequest(recording, BY_COMMAND_LINE, ["webots_run"], {}):
+                await Dispatcher(recording, interrupt).ask(None, "run", 60, {"for_s": 900.0})
         ended = await _until_run_is(client, "done")
         assert ended["result"]["why"] == "it was cancelled"
 

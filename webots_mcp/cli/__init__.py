@@ -26,7 +26,7 @@ from webots_mcp.cli.terminal import (
     spelling_out,
     value_name,
 )
-from webots_mcp.errors import InvalidInputError, WebotsMCPError
+from webots_mcp.errors import InvalidInputError, NotAllowedError, WebotsMCPError
 from webots_mcp.naming import spelled_out
 
 if TYPE_CHECKING:
@@ -51,6 +51,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if argv is None else argv)
     try:
         return _run(given)
+    except NotAllowedError as error:  # which quotes a line of a file as it stands there
+        return _fail(EXIT_BAD_INPUT, str(error), given)
     except WebotsMCPError as error:
         answer = getattr(error, "answer", {})
         return _fail(EXIT_BAD_INPUT, as_typed(str(error)), given, answer)

@@ -65,6 +65,7 @@ _OF_THE_CORE: Final = {
     "step": Command(STEER, _STEERING, "step"),
     "keep": Command(STEER, _STEERING, "keep"),
     "breakpoint": Command(STEER, _STEERING, "breakpoint_"),
+    "requests": Command(STEER, _STEERING, "requests"),
     "trials": Command(STEER, "webots_mcp.cli.steering", "trials"),
     "repeat": Command(STEER, "webots_mcp.cli.judging", "repeat"),
     "launch": Command(SETUP, "webots_mcp.cli.serving", "launch"),

@@ -266,7 +266,7 @@ def _take_in(recorded: Where, source: Path) -> dict[str, Any]:
     from webots_mcp.store.merging import merge, settled
 
     settled(source)  # first: no database is made for what is no recording
-    with recorded.writer(create=True) as (recording, connection):
+    with recorded.writer("import", {"source": source}, create=True) as (recording, connection):
         if isinstance(recording.database, Path) and source.samefile(recording.database):
             raise InvalidInputError(f"{source} is the recording itself: choose another file")
         (newest,) = connection.execute("SELECT coalesce(max(id), 0) FROM run").fetchone()
@@ -320,7 +320,7 @@ def prune(
             return print_json({"dry_run": True, **_as_data(wanted), "disk_bytes": disk})
         _print_plan(wanted, "would go")
         return _print_disk(disk)
-    with recorded.writer() as (recording, connection):
+    with recorded.writer("prune", asked) as (recording, connection):
         set_limits(connection, asked, "prune")
         retention = in_force(connection)
         wanted = plan(connection, retention)
@@ -350,7 +350,8 @@ def retain(
     asked = limits.asked()
     if not run_ids and not asked:
         raise InvalidInputError("name runs to retain, or a limit to set: --keep-states 20GB")
-    with recorded.writer() as (_, connection):
+    given = {"run_ids": run_ids, "release": release, **asked}
+    with recorded.writer("retain", given) as (_, connection):
         mark_kept(connection, run_ids, keep=not release)
         set_limits(connection, asked, "retain")
         if json:

@@ -173,12 +173,21 @@ class Where:
             yield connection
 
     @contextmanager
-    def writer(self, *, create: bool = False) -> Generator[tuple[Recording, sqlite3.Connection]]:
-        """The recording, and a connection that may write to it."""
+    def writer(
+        self, command: str, arguments: Mapping[str, Any] = _NO_KINDS, *, create: bool = False
+    ) -> Generator[tuple[Recording, sqlite3.Connection]]:
+        """The recording, and a connection that may write to it for a command with such arguments.
+
+        Raises:
+            NotAllowedError: The project's file does not allow the command.
+        """
+        from webots_mcp.store.requests import BY_COMMAND_LINE, OpenRequest
+
         recording = self.recording(read_only=False)
         if create:
             recording.create()
-        with recording.writer() as connection:
+        asked = OpenRequest(recording, BY_COMMAND_LINE, [command], arguments)
+        with asked, recording.writer() as connection:
             yield recording, connection
 
 

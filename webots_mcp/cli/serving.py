@@ -354,10 +354,15 @@ def launch(
     """
     from webots_mcp.contract import DATA_DIR_VARIABLE
     from webots_mcp.launch import Launch, newest_in, require_world
+    from webots_mcp.store.policy import LAUNCH
+    from webots_mcp.store.requests import BY_COMMAND_LINE, OpenRequest, permit
     from webots_mcp.webots.starting import Start, free_port
 
     file, project = require_world(world)
     recording = _recording(data_dir, project)
+    names, asked = ["launch", "webots_launch_world"], {"world": str(file)}
+    with OpenRequest(recording, BY_COMMAND_LINE, names, asked):
+        permit(recording, LAUNCH, asked, create=True)
     if stand_in:
         if stream or port is not None:
             raise InvalidInputError("--stream and --port are Webots' own: leave them out")

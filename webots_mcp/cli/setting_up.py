@@ -310,7 +310,7 @@ def _make_ready(
     clients = client_entries.clients_of(project)
     clients += [client_entries.claude_desktop()] if claude_desktop else []
     line = http or of_windows or client_entries.server_command(data_dir)
-    files = [_ignored(data_dir, writing)]
+    files = [_ignored(data_dir, writing), _allowed(project, writing)]
     files += [_told(client, name, line, writing) for client in clients]
     files += [_skilled(part, writing) for part in parts_of(project)] if skills else []
     controllers = [_described(found, project) for found in controllers_of(project)]
@@ -339,6 +339,8 @@ def _expected(data_dir: Path, writing: Writing) -> str | None:
     if (file := file_of(data_dir)) is None:
         return None
     expected = read_project(file)
+    if not expected and not (data_dir / DATABASE_NAME).exists():
+        return None
     if not writing.dry_run:
         make_folder(data_dir)
         with closing(connect(data_dir / DATABASE_NAME, "writer", create=True)) as connection:
@@ -347,6 +349,23 @@ def _expected(data_dir: Path, writing: Writing) -> str | None:
             compile_project(connection, expected)
     counted = f"{len(expected)} expectation{'s' * (len(expected) != 1)}"
     return f"{file}: {counted}; webots-mcp check judges runs by what is there"
+
+
+def _allowed(project: Path, writing: Writing) -> dict[str, str]:
+    """Write what may be asked for in the project, unless it is written already."""
+    from webots_mcp.contract import PROJECT_FILE
+    from webots_mcp.setup.client_entries import policy_file
+    from webots_mcp.store.policy import read_policy
+
+    file = project / PROJECT_FILE
+    try:
+        change = policy_file(project)
+        done = writing.apply(change)
+        if not change.is_needed and read_policy(file) is None:
+            done["note"] = "has no table [allow], so that all is allowed"
+        return done
+    except (WebotsMCPError, OSError) as error:
+        return {"file": str(file), "outcome": "refused", "note": str(error)}
 
 
 def _ignored(data_dir: Path, writing: Writing) -> dict[str, str]:

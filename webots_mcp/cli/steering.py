@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from webots_mcp.cli.data import write_picture
 from webots_mcp.cli.options import (
+    HERE,
     Count,
     Id,
     Json,
@@ -28,7 +29,14 @@ from webots_mcp.cli.options import (
     Where,
     whole_number,
 )
-from webots_mcp.cli.terminal import ending_by_event, print_notes, print_table, text_of
+from webots_mcp.cli.terminal import (
+    clock_text,
+    ending_by_event,
+    print_json,
+    print_notes,
+    print_table,
+    text_of,
+)
 from webots_mcp.contract import BreakpointAction
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 
@@ -206,6 +214,45 @@ def _has(question: Question, argument: str) -> bool:
     return any(each.name == argument for each in question.parameters)
 
 
+def requests(
+    *,
+    number: Annotated[Count, Parameter("-n", metavar="N", help="The newest N (20).")] = 20,
+    refused: Annotated[
+        bool, Parameter("--refused", negative=(), help="Only what a rule has refused.")
+    ] = False,
+    recorded: Where = HERE,
+    json: Json = False,
+) -> None:
+    """Who asked for what that changes something, and what became of it; newest first.
+
+    MCP clients, this command line and the page; see docs/policy.md. No row is ever deleted.
+    """
+    from webots_mcp.store.requests import newest_requests
+
+    with recorded.reader() as connection:
+        found = newest_requests(connection, number, refused=refused)
+    if json:
+        return print_json({"requests": found})
+    if not found:
+        return print("no request was refused" if refused else "nothing was asked for yet")
+    print_table(
+        ("id", "when", "at_s", "by", "tool", "arguments", "outcome", "commands"),
+        [_request_row(each) for each in found],
+    )
+
+
+def _request_row(request: dict[str, Any]) -> list[Any]:
+    by = f"{request['client']} {request['client_version']} ({request['transport']})"
+    outcome = request["outcome"] or "no answer: under way, or its process was ended"
+    if request["rule"]:
+        outcome = f"refused by {request['rule']}"
+    commands = "; ".join(f"{number} {action} {status}" for number, action, status in
+                         request["commands"])  # fmt: skip
+    when = clock_text(request["wall_time_s"])
+    told = [request["id"], when, request["sim_time_s"], by, request["tool"]]
+    return [*told, request["arguments"] or None, outcome, commands or None]
+
+
 # -- trials of a plan file, each in a simulator of its own --
 
 _RANK_EVERY_S: Final = 1.0
@@ -316,14 +363,19 @@ def trials(
 def run_plan(recording: Recording, plan: WorldPlan, options: TrialOptions) -> int:
     """Run what is left of the plan's set; returns its id."""
     from webots_mcp.steering.trial_run import SetRun, require_optuna, run_trials
+    from webots_mcp.store.requests import BY_COMMAND_LINE, OpenRequest
 
     if plan.search:
         require_optuna()
     with _simulators(options, plan) as simulators:
         recording.create()
-        set_id = _set_of(recording, plan, options)
+        names, asked = ["trials", "webots_run_trials"], json.loads(plan.text)
         set_run = SetRun(recording, plan, simulators, threading.Event())
-        with ending_by_event(set_run.stopping):
+        with (
+            OpenRequest(recording, BY_COMMAND_LINE, names, asked),
+            ending_by_event(set_run.stopping),
+        ):
+            set_id = _set_of(recording, plan, options)
             run_trials(set_run, set_id, _Progress(recording, set_id, plan).tell)
     return set_id
 

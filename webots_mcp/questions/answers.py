@@ -48,6 +48,7 @@ class Answer(Part):
     age_s: float | None = said("Wall time since the newest data.")
     status: str | None = said("running, paused, starting, 'stopped N s ago', 'never seen'.")
     why: str | None = said("What the status rests on.")
+    quoted: str | None = said("Of answers with texts that controllers or others wrote.")
     storage: str | None = said("Where the recording cannot be written: how it was read.")
     hint: str | None = said("What to do next.")
 

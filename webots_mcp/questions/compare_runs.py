@@ -111,6 +111,7 @@ _TAKE_AWAY: Final = "-"
     options={"parameters": "--parameter"},
     core=True,
     example="--parameter kp=3.5 -n 5",
+    quotes=True,
 )
 def webots_list_runs(
     recording: Recording,

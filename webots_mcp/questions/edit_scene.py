@@ -45,6 +45,7 @@ _Start = Annotated[int, Field(ge=0)]
     positional=("path",),
     options={"types": "--type", "names": "--name", "fields": "--field", "cursor": "--cursor"},
     example="--type 'Solid*' --field translation",
+    quotes=True,
 )
 async def webots_get_scene(
     recording: Recording,
@@ -67,7 +68,7 @@ async def webots_get_scene(
     return await _ask(recording, caller, robot, "get_scene", cursor=cursor, **asked)
 
 
-@question("Get a field", READS)
+@question("Get a field", READS, quotes=True)
 async def webots_get_field(
     recording: Recording,
     caller: Caller,

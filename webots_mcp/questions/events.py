@@ -83,6 +83,7 @@ _GROUP_BUDGET_TOKENS: Final = 200
     options={"group": "--one-by-one", "cursor": "--after", "missing_s": "--missing"},
     core=True,
     example="--where 'front_m < 0.1 for 0.5' --last 60",
+    quotes=True,
 )
 def webots_find_events(
     recording: Recording,
@@ -238,7 +239,7 @@ def _details_of(event: Event) -> Any:
 # -- what was noted, in order, page by page --
 
 
-@question("Get the timeline", READS)
+@question("Get the timeline", READS, quotes=True)
 def webots_get_timeline(
     recording: Recording,
     scope: Scope,

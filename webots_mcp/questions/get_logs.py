@@ -54,6 +54,7 @@ _NO_RUN_YET: Final = (
     command="logs",
     options={"lines": "-n", "filter_text": "--text", "cursor": "--before"},
     core=True,
+    quotes=True,
 )
 def webots_get_logs(
     recording: Recording,

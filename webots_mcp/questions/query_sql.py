@@ -62,6 +62,7 @@ _turns: Final[RunVar[anyio.Semaphore]] = RunVar("statements that may run at once
     positional=("sql",),
     options={"sql": "STATEMENT"},
     example='"SELECT sim_time_s, data FROM state ORDER BY id DESC LIMIT 5"',
+    quotes=True,
 )
 async def webots_query_sql(
     recording: Recording,

@@ -355,7 +355,7 @@ Offset = Annotated[int, Field(ge=0, description="First member, item or character
 PageSize = Annotated[int | None, Field(ge=1, le=2000, description="So many, up to 10,000 tokens.")]
 
 
-@question("Get the robot's state", READS, core=True)
+@question("Get the robot's state", READS, core=True, quotes=True)
 def webots_get_robot_state(
     recording: Recording, robot: RobotName = None, run_id: RunId = None
 ) -> StateAnswer:
@@ -400,7 +400,7 @@ def webots_get_sensors(
         )
 
 
-@question("Get the full state", READS, core=True)
+@question("Get the full state", READS, core=True, quotes=True)
 def webots_get_full_state(
     recording: Recording,
     path: PagePath = "",

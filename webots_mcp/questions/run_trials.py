@@ -63,6 +63,7 @@ from webots_mcp.store.questions.first_difference import repeats_noted
 from webots_mcp.store.questions.runs import require_kinds, unseen
 from webots_mcp.store.reading.segment import in_one_snapshot
 from webots_mcp.store.recording import Recording, View, look
+from webots_mcp.store.requests import permit
 from webots_mcp.store.robots import robot_name
 
 _WAIT_S: Final = 60.0
@@ -181,12 +182,15 @@ def _begin(
             a signal of the score or of `until` was never recorded, or the plan contradicts itself.
         CommandRefusedError: No live controller could run them, or another set of the robot is not
             over.
+        NotAllowedError: A rule of the project forbids one of them.
     """
     sets = combinations(parameters) if isinstance(parameters, dict) else parameters
     require_possible(recording, robot, asked["until"], asked["for_s"], reset=True)
     if asked["prune"] is not None:
         require_possible(recording, robot, asked["prune"], None, reset=True)
     checked = _as_declared(settable(recording, robot), sets)
+    for name, value in {(name, each) for values in checked for name, each in values.items()}:
+        permit(recording, ACTION, {"reset": True, "parameters": {name: value}})
     with recording.reader() as connection:
         view = find_target(connection, robot, ACTION)
         plan = TrialPlan(parameters=checked, robot=view.robot.name, **asked)

@@ -13,6 +13,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
+from webots_mcp.contract import PROJECT_FILE
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.requirements import checkout, install_line, quoted
 from webots_mcp.setup import FileChange, read
@@ -179,6 +180,14 @@ def can_be_started(entry: dict[str, Any]) -> bool:
     if Path(command).is_absolute():
         return Path(command).is_file()
     return command not in ("webots-mcp", "python", "python3") and bool(shutil.which(command))
+
+
+def policy_file(project: Path) -> FileChange:
+    """The project's file with what is harmless allowed; one that is there is kept."""
+    file = project / PROJECT_FILE
+    before = read(file)
+    usual = Path(__file__).with_name("allowed.toml").read_bytes()
+    return FileChange(file, before, usual if before is None else before)
 
 
 def ignore_file(data_dir: Path) -> FileChange:

@@ -58,6 +58,7 @@ from webots_mcp.store.reading.catalogue import known_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, whole_run
 from webots_mcp.store.reading.segment import Subject
 from webots_mcp.store.recording import Recording, View, look
+from webots_mcp.store.requests import permit
 from webots_mcp.store.robots import (
     Session,
     companions,
@@ -112,6 +113,7 @@ class Dispatcher:
             claiming_s: How long to wait for a controller to claim it, if less, in wall seconds.
 
         Raises:
+            NotAllowedError: A rule of the project forbids it.
             InvalidInputError: The robot, the action or its parameters are invalid.
             CommandRefusedError: No live controller could run it.
             NothingRecordedError: There is no robot to ask.
@@ -165,6 +167,7 @@ class Dispatcher:
     def _enqueue(
         self, robot: str | None, action: str, params: Mapping[str, Any], timeout_s: float
     ) -> Command:
+        request_id = permit(self._recording, action, params)
         with self._recording.reader() as connection:
             view = find_target(connection, robot, action)
         with self._recording.writer() as connection:
@@ -174,6 +177,7 @@ class Dispatcher:
                 params,
                 time_to_live_s=timeout_s + _OUTLIVES_WAITING_S,
                 requested_by=self._recording.asker,
+                request_id=request_id,
             )
 
     async def _watch(self, command_id: int, timeout_s: float) -> Command:

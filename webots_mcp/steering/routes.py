@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -35,7 +36,9 @@ from webots_mcp.launch import Launch, SessionStart, newest_in, starts_since
 from webots_mcp.questions.answers import CommandAnswer
 from webots_mcp.steering.dispatch import Dispatcher, find_target
 from webots_mcp.steering.trial_worker import TrialWorkers
+from webots_mcp.store.policy import LAUNCH
 from webots_mcp.store.recording import Recording, View, look
+from webots_mcp.store.requests import permit
 from webots_mcp.store.robots import Session, find_holder, list_robots, live_observer
 from webots_mcp.webots import Instance, instance_at, instances
 from webots_mcp.webots.orders import (
@@ -85,6 +88,11 @@ class Request:
         )
         answer.waited_s = self._waited_s
         return answer
+
+    async def _permit(self, action: str, params: Mapping[str, Any]) -> None:
+        """Before it is done without a command; see `permit`."""
+        ask = partial(permit, self.recording, action, params, create=True)
+        await to_thread.run_sync(ask)
 
     def _header(self, robot: str) -> dict[str, Any]:
         with self.recording.view(robot) as view:
@@ -235,6 +243,7 @@ class Attempt(Request):
     async def _by_websocket(self, situation: Situation) -> CommandAnswer | None:
         try:
             address = await to_thread.run_sync(find_webots, self.recording, situation)
+            await self._permit(self.order, self.params)
             reply, made = await self._give(address)
         except CommandRefusedError as error:
             self.failed_routes["websocket"] = str(error)
@@ -285,6 +294,7 @@ class Attempt(Request):
             return None
         try:
             pid = await to_thread.run_sync(_window_owner, self.recording, situation)
+            await self._permit(self.order, self.params)
             await to_thread.run_sync(press, self.order, pid)
         except CommandRefusedError as error:
             self.failed_routes["keyboard"] = str(error)
@@ -506,6 +516,7 @@ class Launcher:
         """Start Webots.
 
         Raises:
+            NotAllowedError: A rule of the project forbids it.
             CommandRefusedError: It already runs, it is not installed, or there is no display.
             DatabaseError: The database cannot be used.
         """
@@ -516,6 +527,7 @@ class Launcher:
                     f"{self.running.world.name}: action=load opens another world in it, "
                     "action=quit ends it"
                 )
+            permit(self._recording, LAUNCH, {"world": str(start.world)}, create=True)
             self.launched = Launch(self._recording, start, self._environment(), _ignore)
             return self.launched
 
@@ -612,6 +624,7 @@ class WorldRequest(Request):
         """
         ours = self.launcher.running
         if ours is not None and await self._is_meant(ours):
+            await self._permit("quit", {})
             await to_thread.run_sync(self.launcher.stop)
             evidence = f"its processes have ended, exit code {ours.webots.exit_code}"
             return self._answer("quit", "process", evidence)
@@ -670,6 +683,7 @@ class WorldRequest(Request):
         try:
             address = await to_thread.run_sync(self._address, situation)
             await to_thread.run_sync(self._require_same_folder, situation, address, world)
+            await self._permit("load_world", {"world": str(world)})
             reply = await to_thread.run_sync(load_world, address, world.name, ANSWER_S)
             if reply.text is None:
                 raise CommandRefusedError(await to_thread.run_sync(why_no_reply, address, reply))

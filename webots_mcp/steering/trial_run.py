@@ -62,8 +62,10 @@ from webots_mcp.store.parameters import (
     take_up,
     trials_of,
 )
+from webots_mcp.store.policy import LAUNCH
 from webots_mcp.store.questions.runs import run_info, score_run
 from webots_mcp.store.recording import Job, Recording
+from webots_mcp.store.requests import permit
 from webots_mcp.webots.starting import CommandLine, KeptProgram, Start, any_port, end_left_over
 
 if TYPE_CHECKING:
@@ -467,6 +469,7 @@ def run_trials(set_run: SetRun, set_id: int, report: Report) -> None:
             nowhere to run a trial any more.
         InvalidInputError: No trial of the set can succeed; nothing else is tried.
         StoppedError: The caller wanted to stop; running trials will be run again.
+        NotAllowedError: A rule of the project forbids what would be tried next.
     """
     with set_run.recording.writer() as connection:
         job = Job(set_run.recording, take_up(connection, set_id))
@@ -498,6 +501,8 @@ def _run_left(set_run: SetRun, set_id: int, report: Report) -> None:
             _require_wanted(set_run, set_id)
             count = set_run.simulators.count
             while len(running) < count and (trial := _next_trial(set_run, set_id, left)):
+                asked = {"world": set_run.plan.world, "parameters": trial.values}
+                permit(set_run.recording, LAUNCH, asked)
                 running[pool.submit(run_trial, set_run, trial)] = trial
             if not running:
                 return

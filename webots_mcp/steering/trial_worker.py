@@ -13,6 +13,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Mapping
+from contextvars import copy_context
 from typing import Any, Final
 
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, LeaseLostError, WebotsMCPError
@@ -38,6 +39,7 @@ from webots_mcp.store.parameters import (
 )
 from webots_mcp.store.questions.runs import score_run
 from webots_mcp.store.recording import Job, Recording, View
+from webots_mcp.store.requests import permit
 from webots_mcp.store.robots import robot_name
 
 _LOOK_EVERY_S: Final = 0.02
@@ -83,6 +85,7 @@ class TrialWorker(threading.Thread):
 
     def __init__(self, recording: Recording, set_id: int) -> None:
         super().__init__(name=f"trial set {set_id}", daemon=True)
+        self._context = copy_context()  # in which it is known who asked for the trials
         self._recording = recording
         self.set_id = set_id
         self._stopping = threading.Event()
@@ -101,7 +104,7 @@ class TrialWorker(threading.Thread):
         """Run the rest of the set, as long as this thread has the set's lease."""
         try:
             with self._job.renewed():
-                self._work()
+                self._context.run(self._work)
         except LeaseLostError as error:
             _log.warning("%s", error)
 
@@ -152,14 +155,17 @@ class TrialWorker(threading.Thread):
             if known is not None:
                 return known
             view = self._borrow(connection)
-            begun = begin_trial(connection, trial) if trial.status == "waiting" else trial
             former = fetch_trial_set(connection, self.set_id).former_values or "{}"
+            asked = self._asked(json.loads(former) | trial.values)
+            request_id = permit(self._recording, ACTION, asked)
+            begun = begin_trial(connection, trial) if trial.status == "waiting" else trial
             return CommandQueue(connection).enqueue(
                 view.robot.id,
                 ACTION,
-                self._asked(json.loads(former) | trial.values),
+                asked,
                 requested_by=_ASKER,
                 idempotency_key=_key(begun),
+                request_id=request_id,
             )
 
     def _asked(self, values: Mapping[str, Any]) -> dict[str, Any]:

@@ -100,6 +100,22 @@ _ROBOT_OF: Final = "SELECT robot_id FROM main.session WHERE id = ?"
 _SET_BY: Final = (
     "SELECT id, command_id FROM main.parameter_value WHERE run_id = ? AND command_id IS NOT NULL"
 )
+# With one run come those of its time, and those that its session's commands were sent for.
+_NEW_REQUESTS: Final = (
+    "SELECT id FROM source.request s WHERE NOT EXISTS (SELECT 1 FROM main.request n "
+    "WHERE n.uuid = s.uuid) AND (:run IS NULL OR run_id = :run OR id IN (SELECT request_id FROM "
+    "source.command WHERE session_id = (SELECT session_id FROM source.run WHERE id = :run))) "
+    "ORDER BY id"
+)
+_REQUEST_OF: Final = (
+    "SELECT n.id FROM source.command c JOIN source.request s ON s.id = c.request_id "
+    "JOIN main.request n ON n.uuid = s.uuid WHERE c.id = ?"
+)
+_RUN_OF_REQUESTS: Final = (
+    "UPDATE main.request SET run_id = (SELECT n.id FROM source.request s JOIN source.run r "
+    "ON r.id = s.run_id JOIN main.run n ON n.uuid = r.uuid WHERE s.uuid = request.uuid) "
+    "WHERE run_id IS NULL AND uuid IN (SELECT uuid FROM source.request)"
+)
 _TRIAL_SETS: Final = (
     "SELECT id, uuid FROM source.trial_set s WHERE :run IS NULL "
     "OR EXISTS (SELECT 1 FROM source.trial WHERE trial_set_id = s.id AND run_id = :run) ORDER BY id"
@@ -151,6 +167,9 @@ def merge(
     """
     with _attached(connection, address or str(source)):
         _require_fit(connection, source, run_id)
+        with transaction(connection):
+            for (request_id,) in connection.execute(_NEW_REQUESTS, {"run": run_id}).fetchall():
+                _insert(connection, "request", "id = ?", request_id, {"run_id": None})
         for session_id, uuid, robot_id in connection.execute(_SESSIONS, {"run": run_id}).fetchall():
             wanted = {"session": session_id, "run": run_id}
             runs = connection.execute(_NEW_RUNS, wanted).fetchall()
@@ -161,6 +180,7 @@ def merge(
             with transaction(connection):
                 _take_in(connection, wanted, uuid, robot_id, runs)
         with transaction(connection):
+            connection.execute(_RUN_OF_REQUESTS)
             _take_in_trials(connection, run_id)
         return dict(connection.execute(_RUNS).fetchall())
 
@@ -296,6 +316,8 @@ def _copy_commands(
         same = None
         if not is_new:
             same = connection.execute(_SAME_COMMAND, (own["session_id"], *facts)).fetchone()
+        request = connection.execute(_REQUEST_OF, (old,)).fetchone()
+        own["request_id"] = request[0] if request else None
         ids[old] = same[0] if same else _insert(connection, "command", "id = ?", old, own)
     return ids
 

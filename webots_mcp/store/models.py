@@ -343,6 +343,31 @@ class Command(SQLModel, table=True):
     finished_sim_time_s: float | None = _number()
     result: str | None = _text("JSON value")
     error: str | None = _text()
+    request_id: int | None = _column(Integer, "the row of request that it was sent for")
+
+
+class ClientRequest(SQLModel, table=True):
+    """What was asked for that changes something, by whom, and whether it was allowed.
+
+    No row is ever deleted, and what was asked for cannot be changed.
+    """
+
+    __tablename__: ClassVar[Any] = "request"
+    __table_args__ = (Index(None, "run_id"), Index(None, "uuid", unique=True), _KEEP_IDS)
+    id: int | None = _id()
+    uuid: str = _text(_UUID, nullable=False)
+    wall_time_s: float = _number(nullable=False)
+    run_id: int | None = _to("run", "that went on then", nullable=True)
+    sim_time_s: float | None = _number("of its newest row then")
+    client: str = _text("the name of the program that asked", nullable=False)
+    client_version: str = _text(nullable=False)
+    transport: str = _text("stdio, http, cli or page", nullable=False)
+    tool: str = _text("or the command of the command line", nullable=False)
+    arguments: str = _text("JSON object; without secrets, cut where it is long", nullable=False)
+    rule: str | None = _text("by which it was refused: file, line, and what stands there")
+    finished_wall_time_s: float | None = _number()
+    outcome: str | None = _text("answered, refused, what became of its command, or an error")
+    purged_commands: str | None = _text("JSON array of [id, action, status] that retention deleted")
 
 
 class Breakpoint(SQLModel, table=True):

@@ -6,7 +6,8 @@
     during = "mode == 'drive'"  # may be left out, as may the name
     robot = "rover"             # else all robots
 
-Bridges read it from there, with each run. A file that is invalid changes nothing.
+Bridges read it from there, with each run. A file that is invalid changes nothing. `policy` reads
+its table `[allow]`.
 """
 
 from __future__ import annotations
@@ -58,23 +59,33 @@ def read_project(file: Path) -> list[Expected]:
     Raises:
         InvalidInputError: It cannot be read, or something in it is invalid: which line, and why.
     """
-    toml: Any = import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
-    try:
-        text = file.read_text("utf-8")
-        told = cast("dict[str, Any]", toml.loads(text))
-    except ValueError as error:  # also what is not UTF-8
-        raise InvalidInputError(f"{file} is no TOML: {error}") from error
-    except OSError as error:
-        raise InvalidInputError(f"{file} cannot be read: {error.strerror}") from error
+    text, told = load_toml(file)
+    told.pop("allow", None)  # which `policy` reads: either holds while the other is invalid
     entries: list[Any] = told.pop("expect", [])
     is_list = type(entries) is list and all(type(each) is dict for each in entries)
     if told or not is_list:
         found = f"{next(iter(told))!r} is unknown" if told else "'expect' is no list of tables"
-        raise InvalidInputError(f"{file}: {found}; it holds tables [[expect]]")
+        raise InvalidInputError(f"{file}: {found}; it holds tables [[expect]], and [allow]")
     tables = cast("list[dict[str, Any]]", entries)
     if len(tables) > MAX_BREAKPOINTS:
         raise InvalidInputError(f"{file}: {len(tables)} expectations; at most {MAX_BREAKPOINTS}")
     return [_entry(file, text, number, table) for number, table in enumerate(tables)]
+
+
+def load_toml(file: Path) -> tuple[str, dict[str, Any]]:
+    """The text of a file, and what it says.
+
+    Raises:
+        InvalidInputError: It cannot be read, or is no TOML.
+    """
+    toml: Any = import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
+    try:
+        text = file.read_text("utf-8")
+        return text, cast("dict[str, Any]", toml.loads(text))
+    except (ValueError, RecursionError) as error:  # also what is not UTF-8
+        raise InvalidInputError(f"{file} is no TOML: {error}") from error
+    except OSError as error:
+        raise InvalidInputError(f"{file} cannot be read: {error.strerror}") from error
 
 
 def _entry(file: Path, text: str, number: int, table: dict[str, Any]) -> Expected:

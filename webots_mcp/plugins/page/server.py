@@ -21,6 +21,7 @@ from urllib.parse import parse_qsl, urlsplit
 
 import anyio
 
+from webots_mcp import __version__
 from webots_mcp.access_token import LOOPBACK, page_key
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.parameter import Value
@@ -32,6 +33,7 @@ from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.steering.routes import Attempt
 from webots_mcp.store.chunk_making import make_missing_chunks
 from webots_mcp.store.recording import Recording
+from webots_mcp.store.requests import OpenRequest, Requester
 from webots_mcp.webots.orders import Order
 
 HOST: Final = LOOPBACK[0]
@@ -300,6 +302,7 @@ class ChunkMaker(threading.Thread):
 
 
 _WAIT_S: Final = 10.0
+_BY_PAGE: Final = Requester("webots-mcp view", __version__, "page")
 
 
 def steer(recording: Recording, robot: str, order: Order) -> dict[str, Any]:
@@ -307,7 +310,9 @@ def steer(recording: Recording, robot: str, order: Order) -> dict[str, Any]:
     params = {"steps": 1} if order == "step" else {}
     dispatcher = Dispatcher(recording, _silent)
     attempt = Attempt(recording, dispatcher, robot, _WAIT_S, order, params)
-    return _told(order, attempt.steer)
+    asked = {"command": order, "robot": robot}
+    request = OpenRequest(recording, _BY_PAGE, ["webots_simulation_control"], asked)
+    return _told(order, attempt.steer, request)
 
 
 def tune(recording: Recording, robot: str, name: str, value: Value) -> dict[str, Any]:
@@ -315,12 +320,16 @@ def tune(recording: Recording, robot: str, name: str, value: Value) -> dict[str,
     setting = partial(
         set_parameters, recording, _silent, {name: value}, robot=robot, timeout_s=_WAIT_S
     )
-    return _told(f"{name} = {value!r}", setting)
+    asked = {"values": {name: value}, "robot": robot}
+    request = OpenRequest(recording, _BY_PAGE, ["webots_set_parameters"], asked)
+    return _told(f"{name} = {value!r}", setting, request)
 
 
-def _told(what: str, ask: Any) -> dict[str, Any]:
+def _told(what: str, ask: Any, request: OpenRequest) -> dict[str, Any]:
     try:
-        answer: CommandAnswer = anyio.run(ask)
+        with request:
+            answer: CommandAnswer = anyio.run(ask)
+            request.outcome = answer.outcome or ""
     except WebotsMCPError as error:
         return {"text": f"{what}: {error}", "is_done": False}
     if answer.outcome == "done":

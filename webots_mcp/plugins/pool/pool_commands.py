@@ -66,7 +66,7 @@ def fetch(
     with open_pool(url) as pool:
         wanted = meant(pool, choice)  # first: no database is made for nothing
         with (
-            recorded.writer(create=True) as (here, connection),
+            recorded.writer("fetch", create=True) as (here, connection),
             shown_progress("fetching") as progress,
         ):
             found = fetch_runs(pool, connection, here.data_dir, wanted, progress)

@@ -29,12 +29,13 @@ BATCH_ROWS: Final = 20_000
 _VALUE_BYTES: Final = 8
 _DATED: Final = ("state", "kept_state", "log", "event", "image", "parameter_value")
 CHUNKS: Final = ("row_group", "chunk")
-# Of one machine or one moment: who maintains it, what is kept there, and console lines that wait
-# to become log lines.
-_LOCAL: Final = ("lease", "watermark", "retention_limit", "console_line")
+# Of one machine or one moment: who maintains it, what is kept there, console lines that wait to
+# become log lines, and who asked for what.
+_LOCAL: Final = ("lease", "watermark", "retention_limit", "console_line", "request")
 # How many rows wait for chunks there, how many of a group are left, and what they take on the disk.
 _LOCAL_COLUMNS: Final = {
     "run": ("is_chunked",),
+    "command": ("request_id",),
     "row_group": ("stored_row_count", "stored_row_bytes", "chunk_bytes", "is_complete"),
 }
 _OF_TRIALS: Final = ("trial_set", "trial")

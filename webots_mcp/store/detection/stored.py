@@ -54,10 +54,15 @@ _RUN: Final = (
 # A command belongs to the run of its robot that went on when it was claimed, else created.
 _COMMANDS: Final = (
     "SELECT id, action, params, status, created_wall_time_s, claimed_wall_time_s, "
-    "claimed_sim_time_s, finished_wall_time_s, finished_sim_time_s, result, error FROM command "
+    "claimed_sim_time_s, finished_wall_time_s, finished_sim_time_s, result, error, "
+    "(SELECT client || ' (' || transport || ')' FROM request WHERE id = request_id) FROM command "
     "WHERE robot_id = (SELECT robot_id FROM run WHERE id = ?) "
     "AND coalesce(claimed_wall_time_s, created_wall_time_s) >= ? "
     "AND coalesce(claimed_wall_time_s, created_wall_time_s) < ? ORDER BY id DESC LIMIT ?"
+)
+_REFUSED: Final = (
+    "SELECT sim_time_s, wall_time_s, tool, client || ' (' || transport || ')', rule FROM request "
+    f"{_IN_SEGMENT} AND rule IS NOT NULL "
 )
 _RUN_WALLS: Final = (
     "SELECT started_wall_time_s, coalesce((SELECT min(n.started_wall_time_s) FROM run n "
@@ -230,22 +235,26 @@ def _note_older(search: Search, kind: str, count: int) -> None:
 def command_events(search: Search) -> Iterator[Event]:
     """Commands, from when they were claimed (or created, if never) to when they were finished.
 
-    Not those that lie outside the segment in simulation time.
+    Not those that lie outside the segment in simulation time. Requests that a rule of the project
+    refused are among them, by the names of their tools.
     """
+    for time_s, wall_s, tool, by, rule in _newest(search, "command", _REFUSED):
+        details: dict[str, Any] = {"status": "refused", "by": by, "rule": rule}
+        yield Event("command", search.segment.run_id, time_s, time_s, wall_s, tool, details)
     connection, here = search.connection, search.segment
     start_wall_s, end_wall_s = connection.execute(_RUN_WALLS, (here.run_id,)).fetchone()
     walls_s = max(start_wall_s, here.wall_start_s), min(end_wall_s, here.wall_end_s)
     rows = connection.execute(_COMMANDS, (here.run_id, *walls_s, MOST_OF_A_KIND)).fetchall()
     _note_older(search, "command", len(rows))
     for command_id, action, params, status, created_s, claimed_s, start_s, *finished in rows:
-        finished_wall_s, end_s, result, error = finished
+        finished_wall_s, end_s, result, error, by = finished
         wall_s = created_s if claimed_s is None else claimed_s
         if start_s is None:
             start_s = _sim_time_at(search, wall_s)
         if start_s is None or not here.holds_from_s <= start_s < here.holds_to_s:
             continue
-        details: dict[str, Any] = {"id": command_id, "status": status}
-        details |= {"params": json.loads(params)}
+        details = {"id": command_id, "status": status, "params": json.loads(params)}
+        details |= {"by": by} if by else {}
         details |= {} if finished_wall_s is None else {"took_wall_s": finished_wall_s - wall_s}
         details |= {"result": json.loads(result)} if result else {}
         details |= {"error": error} if error else {}

@@ -1,0 +1,265 @@
+"""Who may do what: the table `[allow]` of a project's `webots-mcp.toml`; see docs/policy.md.
+
+    [allow]
+    tools = ["*", "!webots_report"]  # the last pattern that fits decides; without one: refused
+    actions = ["*", "!quit"]         # commands, built in or the controllers' own
+    fields = ["BALL.*", "*.translation"]
+    nodes = ["BOXES.children*"]      # where nodes may be added or removed
+    worlds = ["arena*.wbt"]
+    launch = false
+    holds_for = "everyone"           # or "assistants"
+
+    [allow.parameters]
+    kp = [0.0, 5.0]
+    gait = ["trot", "walk"]
+    "*" = true                          # as the controller declares
+
+A key that is left out allows all. The file is read anew for each request, so that it holds from the
+next one on, and can be neither stale nor cached.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, cast
+
+from webots_mcp.contract import PROJECT_FILE, Database, find_project, full_path
+from webots_mcp.errors import InvalidInputError, NotAllowedError
+from webots_mcp.store.project_file import load_toml
+
+ALLOW: Final = "allow"
+LAUNCH: Final = "launch"  # stands for an action where Webots is started
+_PATTERNS: Final = ("tools", "actions", "fields", "nodes", "worlds")
+_OF_SCENE: Final = ("fields", "nodes")
+_HOLDS_FOR: Final = ("everyone", "assistants")
+_KEYS: Final = (*_PATTERNS, "parameters", LAUNCH, "holds_for")
+_HEADER: Final = re.compile(r"\s*\[{1,2}\s*([^\]]+?)\s*\]")
+# It has a controller read its stored breakpoints again, and is sent with each that is allowed.
+_HARMLESS: Final = "arm_breakpoints"
+_ASK: Final = (
+    "Do not look for another way to the same: the person whose project it is can change that line, "
+    "and it holds from the next request on"
+)
+
+
+@dataclass(frozen=True)
+class Policy:
+    """What a file allows.
+
+    Attributes:
+        file: Where it stands.
+        text: All of the file, for the numbers of lines.
+        allow: Its table.
+    """
+
+    file: Path
+    text: str
+    allow: Mapping[str, Any]
+
+    def holds_for(self, transport: str) -> bool:
+        """Whether it binds who asks that way: `stdio` and `http` are assistants'."""
+        everyone = self.allow.get("holds_for", _HOLDS_FOR[0]) == _HOLDS_FOR[0]
+        return everyone or transport in ("stdio", "http")
+
+    def require_tool(self, names: Sequence[str]) -> None:
+        """Refuse a tool, by its own name or that of the one that it is a part of.
+
+        Raises:
+            NotAllowedError: The file does not allow it.
+        """
+        self._require("tools", names, f"{names[0]} is not allowed")
+
+    def require(self, action: str, params: Mapping[str, Any]) -> None:
+        """Refuse an action that the file does not allow, or not with these parameters.
+
+        Raises:
+            NotAllowedError: Which line of it does not.
+        """
+        if action == LAUNCH:
+            if not self.allow.get(LAUNCH, True):
+                raise self._refusal(LAUNCH, "starting Webots is not allowed")
+        elif action != _HARMLESS:
+            self._require("actions", [action], f"the action {action!r:.100} is not allowed")
+        if action == "run" and params.get("reset"):
+            self._require("actions", ["reset"], "the action 'reset' is not allowed")
+        if action in (LAUNCH, "load_world"):
+            self._require_world(params.get("world"))
+        if action == "set_field":
+            path = str(params.get("path"))
+            self._require("fields", [path.strip()], f"setting {path!r:.100} is not allowed")
+        if action in ("add_node", "remove_node"):
+            path = str(params.get("path") or "root")
+            doing = "adding to" if action == "add_node" else "removing"
+            self._require("nodes", [path.strip()], f"{doing} {path!r:.100} is not allowed")
+        if (values := params.get("values" if action == "set_parameters" else "parameters")) and (
+            action in ("set_parameters", "run", LAUNCH)
+        ):
+            self._require_values(values)
+
+    def _require_world(self, world: object) -> None:
+        """By its path from the project or from its folder of worlds, with links followed."""
+        if "worlds" not in self.allow:
+            return
+        given = Path(str(world))
+        if not given.is_absolute():  # a controller would take it from another folder than this one
+            raise self._refusal("worlds", f"{str(world)!r:.100} is no full path of a world, and so")
+        try:
+            file = full_path(given)
+        except OSError:
+            file = given
+        project = (find_project(self.file.parent) or self.file.parent).resolve()
+        folders = [project / "worlds", project]
+        names = [file.relative_to(each).as_posix() for each in folders if file.is_relative_to(each)]
+        self._require("worlds", [*names, file.as_posix()], f"the world {file} is not allowed")
+
+    def _require_values(self, values: object) -> None:
+        rules = cast("dict[str, Any] | None", self.allow.get("parameters"))
+        if rules is None:
+            return
+        if not isinstance(values, Mapping):
+            raise self._refusal("parameters", "parameters without names are not allowed")
+        for name, value in cast("Mapping[str, object]", values).items():
+            key = name if name in rules else next((k for k in rules if _fits(k, name)), None)
+            if key is None:
+                raise self._refusal("parameters", f"the parameter {name!r:.100} is not allowed")
+            if not _is_within(value, rules[key]):
+                said = f"the parameter {name!r:.100} = {value!r:.100} is not allowed"
+                raise self._refusal("parameters", said, key)
+
+    def _require(self, key: str, names: Sequence[str], said: str) -> None:
+        """The last pattern that fits one of the names decides."""
+        patterns = cast("list[str] | None", self.allow.get(key))
+        if patterns is None:
+            return
+        fitting = [p for p in patterns if any(_fits(p.removeprefix("!"), name) for name in names)]
+        if not fitting or fitting[-1].startswith("!"):
+            raise self._refusal(key, said, fitting[-1] if fitting else None)
+
+    def _refusal(self, key: str, said: str, inside: str | None = None) -> NotAllowedError:
+        line = line_of(self.text, key, inside)
+        shown = self.text.splitlines()[line - 1].partition("#")[0].strip()
+        rule = f"{self.file}, line {line}: {shown:.200}"
+        return NotAllowedError(f"{said} by {rule}. {_ASK}", rule)
+
+
+def _fits(pattern: str, name: str) -> bool:
+    """Whether a pattern is of a name: `*` is any text, and nothing else is special."""
+    return re.fullmatch(".*".join(map(re.escape, pattern.split("*"))), name, re.DOTALL) is not None
+
+
+def _is_within(value: object, rule: Any) -> bool:
+    if isinstance(rule, bool):
+        return rule
+    if isinstance(rule[0], str):
+        return value in rule
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return is_number and rule[0] <= cast("float", value) <= rule[1]  # NaN is within nothing
+
+
+def line_of(text: str, key: str, inside: str | None = None) -> int:
+    """Where a key of the table stands, or within it a name or a text; from 1."""
+    lines, table, found = text.splitlines(), "", 1
+    parts = [re.escape(key)] + ([re.escape(inside)] if inside else [])
+    for number, line in enumerate(lines, 1):
+        if header := _HEADER.match(line):
+            table = header[1].replace('"', "").replace(" ", "")
+        own = table == ALLOW and re.match(rf"\s*[\"']?{parts[0]}[\"']?\s*[=.]", line)
+        if own or table == f"{ALLOW}.{key}":
+            found = number if own or found == 1 else found
+            if inside is None:
+                return found
+        if found > 1 and re.search(rf"(?<![\w.]){parts[-1]}(?![\w.])", line.partition("#")[0]):
+            return number
+    return found
+
+
+def policies_of(database: Database, data_dir: Path, world: object = None) -> Iterator[Policy]:
+    """Those of each `webots-mcp.toml` in or above the folders that a request is about; all hold.
+
+    Not only that of the project: which folder is one can be changed by making folders in it.
+
+    Args:
+        database: Of the recording; the file beside it holds wherever its pictures are.
+        data_dir: The folder of its pictures.
+        world: The file of a world that is started or opened.
+
+    Raises:
+        NotAllowedError: A file is invalid: as long as it is, nothing is allowed.
+    """
+    below = [database.parent] if isinstance(database, Path) else []
+    below += [data_dir, *([Path(str(world)).parent] if world else [])]
+    folders = (folder for each in below for folder in (each, *each.parents))
+    for folder in dict.fromkeys(folders):
+        file = folder / PROJECT_FILE
+        if os.path.lexists(file) and (policy := read_policy(file)) is not None:
+            yield policy
+
+
+def read_policy(file: Path) -> Policy | None:
+    """What a project's file allows; None where it has no such table.
+
+    Raises:
+        NotAllowedError: It is invalid: which line, and why.
+    """
+    try:
+        text, told = load_toml(file)
+        if unknown := sorted(set(told) - {ALLOW, "expect"}):
+            raise InvalidInputError(f"{file}: {unknown[0]!r} is unknown; there is allow and expect")
+        if ALLOW not in told:
+            return None
+        if (wrong := next(_faults(told[ALLOW]), None)) is not None:
+            key, why = wrong
+            raise InvalidInputError(f"{file}, line {line_of(text, key)}: {why}")
+    except InvalidInputError as error:
+        raise NotAllowedError(
+            f"{error}. As long as that file is invalid, nothing that changes anything is allowed; "
+            "recording and reading go on",
+            str(error),
+        ) from error
+    return Policy(file, text, told[ALLOW])
+
+
+def _faults(allow: Any) -> Iterator[tuple[str, str]]:
+    """What is wrong with the table: its key, and why."""
+    if not isinstance(allow, dict):
+        yield ALLOW, "allow must be a table: [allow]"
+        return
+    for key, value in cast("dict[str, Any]", allow).items():
+        if key not in _KEYS:
+            yield key, f"allow.{key} is unknown; there is {', '.join(_KEYS)}"
+        elif key in _PATTERNS and not _is_list_of(str, value):
+            yield key, f"{key} must be a list of texts, not {value!r:.80}"
+        elif key in _OF_SCENE and any(each.startswith("!") for each in value):
+            yield key, f"{key} cannot forbid, as a node has many names: list what is allowed"
+        elif key == LAUNCH and not isinstance(value, bool):
+            yield key, f"launch must be true or false, not {value!r:.80}"
+        elif key == "holds_for" and value not in _HOLDS_FOR:
+            yield key, f"holds_for must be one of {', '.join(_HOLDS_FOR)}, not {value!r:.80}"
+        elif key == "parameters":
+            yield from _faults_of_parameters(value)
+
+
+def _faults_of_parameters(rules: Any) -> Iterator[tuple[str, str]]:
+    if not isinstance(rules, dict):
+        yield "parameters", "parameters must be a table: [allow.parameters]"
+        return
+    for name, rule in cast("dict[str, Any]", rules).items():
+        is_range = _is_list_of((int, float), rule) and len(rule) == 2 and rule[0] <= rule[1]
+        is_finite = is_range and not any(isinstance(x, bool) or math.isnan(x) for x in rule)
+        if not (isinstance(rule, bool) or is_finite or (rule and _is_list_of(str, rule))):
+            yield (
+                "parameters",
+                f"{name} must be [lowest, highest], a list of texts, true or false, not "
+                f"{rule!r:.80}",
+            )
+
+
+def _is_list_of(kind: Any, value: Any) -> bool:
+    return isinstance(value, list) and all(
+        isinstance(each, kind) for each in cast("Iterable[Any]", value)
+    )

@@ -1,0 +1,285 @@
+"""What was asked for: each request that changes something is a row, and is checked by the policy.
+
+A request is begun where a tool, the command line or the page is asked. Whatever carries out a part
+of it (queues a command, starts Webots, gives an order to it, stores a breakpoint) asks `permit`
+first, which finds the request of its task: so no route goes round either.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sqlite3
+import time
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from types import TracebackType
+from typing import Any, Final, NamedTuple, cast
+
+from anyio import CancelScope, to_thread
+
+from webots_mcp import __version__
+from webots_mcp.contract import new_uuid
+from webots_mcp.errors import DatabaseError, NoDatabaseError, NotAllowedError
+from webots_mcp.store.policy import LAUNCH, Policy, policies_of
+from webots_mcp.store.recording import Recording
+
+LONGEST_ARGUMENTS: Final = 1_000  # characters
+_LONGEST_OUTCOME: Final = 300
+_SHORTEST_SECRET: Final = 4  # a shorter one would blacken words of the outcome
+_SECRET: Final = re.compile(
+    r"token|passw|secret|credential|(^|[_\W])key|key$|apikey", re.IGNORECASE
+)
+_LEFT_OUT: Final = "(left out)"
+_BEGIN: Final = (
+    "INSERT INTO request (uuid, wall_time_s, client, client_version, transport, tool, arguments, "
+    "run_id, sim_time_s) SELECT :uuid, :now, :client, :version, :transport, :tool, :arguments, "
+    "r.id, coalesce((SELECT sim_time_s FROM state WHERE run_id = r.id ORDER BY id DESC LIMIT 1), "
+    "r.last_sim_time_s) FROM (SELECT 1) LEFT JOIN (SELECT run.* FROM run JOIN robot b "
+    "ON b.id = run.robot_id WHERE run.ended_wall_time_s IS NULL "
+    "AND (:robot IS NULL OR b.name = :robot) ORDER BY run.id DESC LIMIT 1) r"
+)
+_REFUSE: Final = "UPDATE request SET rule = ? WHERE id = ?"
+_END: Final = "UPDATE request SET finished_wall_time_s = ?, outcome = ? WHERE id = ?"
+_NEWEST: Final = (
+    "SELECT id, wall_time_s, sim_time_s, run_id, client, client_version, transport, tool, "
+    "arguments, rule, outcome, (SELECT json_group_array(json_array(id, action, status)) FROM "
+    "(SELECT value ->> 0 AS id, value ->> 1 AS action, value ->> 2 AS status "
+    "FROM json_each(coalesce(request.purged_commands, '[]')) UNION ALL "
+    "SELECT id, action, status FROM command WHERE request_id = request.id ORDER BY id)) "
+    "FROM request WHERE (:refused = 0 OR rule IS NOT NULL) ORDER BY id DESC LIMIT :limit"
+)
+
+
+class Requester(NamedTuple):
+    """Who asks: a program by its name and version, and the way that it asks.
+
+    Attributes:
+        transport: `stdio` or `http` of an MCP client, `cli` or `page`.
+    """
+
+    name: str
+    version: str
+    transport: str
+
+
+BY_COMMAND_LINE: Final = Requester("webots-mcp", __version__, "cli")
+
+
+class OpenRequest:
+    """A request, as long as the block goes on; a thread that works on for it runs in its context.
+
+    Args:
+        recording: What it changes, or whose simulation.
+        by: Who asks.
+        names: Of the tool or the command, and of what it is a part of.
+        arguments: As they were given.
+        reads: It changes nothing: then there is no row of it, unless it is refused.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        by: Requester,
+        names: Sequence[str],
+        arguments: Mapping[str, Any],
+        *,
+        reads: bool = False,
+    ) -> None:
+        self.recording = recording
+        self.id: int | None = None
+        self.outcome = "answered"
+        self._by, self._names, self._reads = by, names, reads
+        self._arguments = arguments
+
+    def __enter__(self) -> OpenRequest:
+        self._begin()
+        self._token = _open.set(self)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
+        _open.reset(self._token)
+        self._end(error)
+
+    async def __aenter__(self) -> OpenRequest:
+        if self._reads:
+            self._begin()
+        else:
+            await to_thread.run_sync(self._begin)
+        self._token = _open.set(self)
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
+        _open.reset(self._token)
+        if not self._reads:
+            with CancelScope(shield=True):
+                await to_thread.run_sync(self._end, error)
+
+    def enter(self, *, create: bool = False) -> None:
+        """See that there is a row; without a database only where one is to be made."""
+        if self.id is not None or self._reads or self.recording.read_only:
+            return
+        if create:
+            self.recording.create()
+        with suppress(NoDatabaseError):
+            self._insert()
+
+    def require(self, action: str, params: Mapping[str, Any]) -> None:
+        """See that the policy allows an action.
+
+        Raises:
+            NotAllowedError: It does not; the row says so.
+        """
+        world = params.get("world") if action in (LAUNCH, "load_world") else None
+        with self._refusing():
+            for each in self._policies(world):
+                each.require(action, params)
+
+    def _begin(self) -> None:
+        with self._refusing():
+            for each in self._policies():
+                each.require_tool(self._names)
+        self.enter()
+
+    def _policies(self, world: object = None) -> list[Policy]:
+        """Those that bind who asks; what only reads goes on while one is invalid."""
+        found = policies_of(self.recording.database, self.recording.data_dir, world)
+        try:
+            return [each for each in found if each.holds_for(self._by.transport)]
+        except NotAllowedError:
+            if self._reads:
+                return []
+            raise
+
+    @contextmanager
+    def _refusing(self) -> Generator[None]:
+        """Record a refusal, also of a request that has been answered while trials went on."""
+        try:
+            yield
+        except NotAllowedError as error:
+            self.outcome = "refused"
+            with suppress(DatabaseError):  # a refusal holds, whether or not it can be written
+                if self.id is None:
+                    self._insert()
+                with self.recording.writer() as connection:
+                    connection.execute(_REFUSE, (_bounded(error.rule), self.id))
+                    connection.execute(_END, (time.time(), "refused", self.id))
+            raise
+
+    def _insert(self) -> None:
+        row = {
+            "uuid": new_uuid(),
+            "now": time.time(),
+            "client": _bounded(self._by.name),
+            "version": _bounded(self._by.version),
+            "transport": self._by.transport,
+            "tool": self._names[0],
+            "arguments": _recorded(self._arguments),
+            "robot": self._arguments.get("robot"),
+        }
+        with self.recording.writer() as connection:
+            self.id = connection.execute(_BEGIN, row).lastrowid
+
+    def _end(self, error: BaseException | None) -> None:
+        if self.id is None and error is None:
+            self.enter()  # the database was made meanwhile
+        if self.id is None or self.outcome == "refused":
+            return
+        if error is not None:
+            known = isinstance(error, Exception)  # else the client has cancelled it, or left
+            self.outcome = f"{type(error).__name__}: {error}" if known else "cancelled"
+        for secret in _secrets_in(self._arguments):
+            self.outcome = self.outcome.replace(secret, _LEFT_OUT)
+        with suppress(DatabaseError), self.recording.writer() as connection:
+            connection.execute(_END, (time.time(), _bounded(self.outcome), self.id))
+
+
+_open: Final[ContextVar[OpenRequest]] = ContextVar("request")
+
+
+def permit(
+    recording: Recording, action: str, params: Mapping[str, Any], *, create: bool = False
+) -> int | None:
+    """See that what is about to be done is allowed, and that there is a row of who asked for it.
+
+    Args:
+        recording: Whose simulation it is.
+        action: As a command names it, or `policy.LAUNCH`.
+        params: Its parameters.
+        create: Make the database if there is none: it is done without one.
+
+    Returns:
+        The id of the request's row; None where it only reads, or where there is no database yet.
+
+    Raises:
+        NotAllowedError: A rule of the project's file forbids it.
+        LookupError: Nobody has begun a request, which is a defect.
+    """
+    request = _open.get()
+    request.require(action, params)
+    request.enter(create=create)
+    return request.id
+
+
+def newest_requests(
+    connection: sqlite3.Connection, limit: int, *, refused: bool = False
+) -> list[dict[str, Any]]:
+    """The newest requests, newest first, with the commands that they have sent."""
+    cursor = connection.execute(_NEWEST, {"limit": limit, "refused": refused})
+    names = [column[0] for column in cursor.description[:-1]]
+    return [
+        {
+            **dict(zip(names, row, strict=False)),
+            "arguments": json.loads(row[8]),
+            "commands": json.loads(row[-1]),
+        }
+        for row in cursor.fetchall()
+    ]
+
+
+# -- what is recorded of arguments: no secrets, and not all of what is long --
+
+
+def _recorded(arguments: Mapping[str, Any]) -> str:
+    text = _as_json(_without_secrets(arguments))
+    return text if len(text) <= LONGEST_ARGUMENTS else _as_json({"cut": text[:LONGEST_ARGUMENTS]})
+
+
+def _as_json(value: Any) -> str:
+    text = json.dumps(value, ensure_ascii=False, default=str)
+    return text.encode("utf-8", "replace").decode()
+
+
+def _without_secrets(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        items = cast("Mapping[Any, Any]", value).items()
+        return {
+            str(name): _LEFT_OUT if _SECRET.search(str(name)) else _without_secrets(each)
+            for name, each in items
+            if each is not None
+        }
+    if isinstance(value, (list, tuple)):
+        return [_without_secrets(each) for each in cast("Sequence[Any]", value)]
+    return value
+
+
+def _secrets_in(value: Any) -> Generator[str]:
+    """The texts that are left out: an error may repeat them."""
+    if isinstance(value, Mapping):
+        for name, each in cast("Mapping[Any, Any]", value).items():
+            if not _SECRET.search(str(name)):
+                yield from _secrets_in(each)
+            elif len(str(each)) >= _SHORTEST_SECRET:
+                yield str(each)
+    elif isinstance(value, (list, tuple)):
+        for each in cast("Sequence[Any]", value):
+            yield from _secrets_in(each)
+
+
+def _bounded(text: str) -> str:
+    return text[:_LONGEST_OUTCOME].encode("utf-8", "replace").decode()

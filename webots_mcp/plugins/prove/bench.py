@@ -4,50 +4,42 @@ from __future__ import annotations
 
 import json
 import shutil
-import sqlite3
 import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
 from webots_mcp.cli.asking import ask
 from webots_mcp.cli.options import Where
 from webots_mcp.contract import DATA_DIR_VARIABLE, OBSERVER_NAME, PROJECT_DATA_FOLDER
-from webots_mcp.errors import WebotsMCPError
+from webots_mcp.errors import NoDatabaseError, WebotsMCPError
 from webots_mcp.launch import Launch
 from webots_mcp.questions.control_simulation import webots_simulation_control
 from webots_mcp.questions.declaring import Question
+from webots_mcp.questions.send_command import webots_send_command
 from webots_mcp.setup.project_edits import controller_change, python_change, with_observer
 from webots_mcp.standin.in_process import DEFAULT_WORLD
-from webots_mcp.webots.orders import WebotsAddress, WebotsLine
+from webots_mcp.webots.orders import WebotsAddress
 from webots_mcp.webots.starting import LaunchedWebots, Mode, Start, free_port
 
 T = TypeVar("T")
 ROVER: Final = "rover"
 SPEAKER: Final = "speaker"
-ROBOTS: Final = (ROVER, SPEAKER, OBSERVER_NAME)
-PATIENCE_S: Final = 60.0  # Webots may compile shaders, and fill its cache, when it starts first
 SOON_S: Final = 10.0
+REAL_TIME: Final = 1  # of simulationGetMode
 _LOOK_EVERY_S: Final = 0.03
 _STANDS_S: Final = 0.5
-_PROJECT: Final = Path(__file__).parent / "project"
+_MOVES_S: Final = 2.0
 _HEADER: Final = "#VRML_SIM R2023b utf8\n"
 _SIGN: Final = 'EXTERNPROTO "../protos/Sign.proto"\n'
-_MORE_NODES: Final = """
-Robot {
-  translation 1.5 -1.5 0.1
-  name "speaker"
-  controller "speaker"
-}
-DEF SIGN Sign {
-  translation 1.5 1.5 0.2
-}
+_NODES: Final = """
+Robot { translation 1.5 -1.5 0.1 name "speaker" controller "speaker" }
+DEF SIGN Sign { translation 1.5 1.5 0.2 }
 """
 _NEWEST: Final = (
-    "SELECT s.id, s.pid, run.id, run.world, run.start_reason, state.sim_time_s, state.data "
+    "SELECT s.id, s.pid, run.id, run.world, state.sim_time_s, state.data "
     "FROM state JOIN run ON run.id = state.run_id JOIN session s ON s.id = run.session_id "
     "JOIN robot ON robot.id = s.robot_id WHERE robot.name = ? ORDER BY state.id DESC LIMIT 1"
 )
@@ -61,6 +53,16 @@ class NotTriedError(Exception):
     """Nothing can be said of it here; the text is why."""
 
 
+def require(holds: object, seen: str) -> None:
+    """Fail with what was seen where something does not hold.
+
+    Raises:
+        OtherwiseError: It does not.
+    """
+    if not holds:
+        raise OtherwiseError(seen)
+
+
 class Moment(NamedTuple):
     """The newest row of a robot, with the run and the process that it is of."""
 
@@ -68,40 +70,37 @@ class Moment(NamedTuple):
     pid: int
     run_id: int
     world: str
-    start_reason: str
     sim_time_s: float
     state: dict[str, Any]
 
 
 class Bench:
-    """Webots on a project of ours in a folder, and the recording that its controllers make.
+    """Webots on a project of ours, and the recording that its controllers make.
 
-    One check at a time uses it, in a thread of its own: `use` takes it from the one before, which
-    may hang, and whose further calls raise.
+    One check at a time uses it, in the thread `user`. Another, of a check that hung, may go on: its
+    calls fail.
 
     Args:
-        folder: Is made.
+        folder: Of the project, which is written.
         patience_s: How long a start of Webots may take until the first row.
 
     Attributes:
         world: The world file.
-        recording: What its controllers record.
+        before: The newest row of the rover when the check began.
     """
 
-    def __init__(self, folder: Path, patience_s: float = PATIENCE_S) -> None:
+    before: Moment
+    user: threading.Thread
+
+    def __init__(self, folder: Path, patience_s: float) -> None:
         self.world = _write_project(folder)
         self.patience_s = patience_s
         self.where = Where(data_dir=folder / PROJECT_DATA_FOLDER)
         self.recording = self.where.recording(read_only=False)
         self._launch: Launch | None = None
-        self._runs: tuple[bool, Mode] | None = None
-        self._never: set[tuple[bool, Mode] | None] = set()
-        self._before: dict[str, Moment | None] = {}
-        self._user: threading.Thread | None = None
-
-    def use(self, user: threading.Thread) -> None:
-        """From now on this thread uses it, and no other."""
-        self._user = user
+        self._runs: tuple[bool, Mode] = False, "realtime"
+        self._never = set[tuple[bool, Mode]]()
+        self._at_start = dict[str, Moment | None]()
 
     # -- Webots --
 
@@ -114,57 +113,47 @@ class Bench:
             OtherwiseError: It has not.
             NotTriedError: It has not before either.
         """
-        self._require_user()
         launch = self._launch
         runs: tuple[bool, Mode] = stream, mode
         if launch is None or launch.webots.is_over or self._runs != runs or port:
             self.end()
             if runs in self._never:
-                raise NotTriedError("a Webots that was started so before has not begun to record")
-            self._before = {name: self.newest(name) for name in ROBOTS}
+                raise NotTriedError("a Webots that was started so has not recorded")
+            self._at_start = {name: self.newest(name) for name in (ROVER, SPEAKER, OBSERVER_NAME)}
             start = Start(self.world, mode, headless=True, streams=stream, port=port or free_port())
             environment = {DATA_DIR_VARIABLE: str(self.recording.data_dir)}
-            launch = self._launch = Launch(self.recording, start, environment, _ignore)
             self._runs = runs
+            launch = self._launch = Launch(self.recording, start, environment, lambda line: None)
             if mode != "pause":
                 self._wait_for_first_row(launch)
         return launch.webots
 
     def _wait_for_first_row(self, launch: Launch) -> None:
         def is_decided() -> bool:
-            return self.newest(ROVER) != self._before[ROVER] or launch.webots.is_over
+            return self.newest(ROVER) != self._at_start[ROVER] or launch.webots.is_over
 
-        with suppress(OtherwiseError):
+        try:
             self.until(is_decided, "", self.patience_s)
-        if self.newest(ROVER) == self._before[ROVER]:
+            require(self.newest(ROVER) != self._at_start[ROVER], "")
+        except OtherwiseError as error:
+            self._never.add(self._runs)
             why = launch.silence()
-            self._never |= {self._runs}
             self.end()
-            raise OtherwiseError(f"no row of the rover after the start: {why}")
+            raise OtherwiseError(f"the rover records nothing after the start: {why}") from error
 
-    def since_start(self, robot: str) -> Moment:
-        """The newest row of a robot, as soon as it has one since Webots was started."""
-        wanted = self._before[robot]
-        self.until(lambda: self.newest(robot) != wanted, f"{robot} records nothing")
-        found = self.newest(robot)
-        assert found is not None
-        return found
-
-    def running(self, *, stream: bool = False) -> Moment:
-        """Webots whose time goes on in real time, and the newest row of the rover."""
+    def running(self, *, stream: bool) -> None:
+        """Webots whose time goes on in real time."""
         self.webots(stream=stream)
-        now = self.rover()
-        if not self.moves(2.0) or now.state["simulation_mode"] != "real_time":
-            self.ask(webots_simulation_control, command="resume", robot=ROVER)
+        if not self.moves(_MOVES_S) or self.rover().state["mode"] != REAL_TIME:
+            self.control("resume")
             self.goes_on("it was told to resume")
-        return self.rover()
+        self.before = self.rover()
 
     def address(self) -> WebotsAddress:
-        """Of the Webots that runs, as far as the system shows where it listens."""
+        """Where it listens, as far as the system shows that."""
         assert self._launch is not None
-        return self._launch.webots.address_now() or WebotsAddress(
-            "127.0.0.1", self._launch.start.port
-        )
+        asked = WebotsAddress("127.0.0.1", self._launch.start.port)
+        return self._launch.webots.address_now() or asked
 
     def end(self) -> None:
         """End the Webots that runs."""
@@ -176,44 +165,47 @@ class Bench:
 
     def newest(self, robot: str) -> Moment | None:
         """The newest row of a robot; None where it has none."""
-        for *values, data in self.rows(_NEWEST, robot):
-            return Moment(*values, json.loads(data))
-        return None
+        found = self.rows(_NEWEST, robot)
+        return Moment._make((*found[0][:-1], json.loads(found[0][-1]))) if found else None
 
     def rover(self) -> Moment:
-        """The newest row of the rover, which has recorded."""
-        found = self.newest(ROVER)
-        if found is None:
-            raise OtherwiseError("the rover has recorded nothing")
+        """The newest row of the rover."""
+        return self.since_start(ROVER)
+
+    def since_start(self, robot: str) -> Moment:
+        """The newest row of a robot, as soon as it has one since Webots was started."""
+        before = self._at_start.get(robot)
+
+        def look() -> Moment | None:
+            return found if (found := self.newest(robot)) != before else None
+
+        found = self.until(look, f"{robot} records nothing")
+        assert found is not None
         return found
 
     def rows(self, query: str, *values: object) -> list[tuple[Any, ...]]:
         """Of the recording; none before there is one."""
-        self._require_user()
+        require(threading.current_thread() is self.user, "another check is made now")
         try:
             with self.recording.reader() as connection:
                 return connection.execute(query, values).fetchall()
-        except (WebotsMCPError, sqlite3.Error):
+        except NoDatabaseError:
             return []
 
     def moves(self, within_s: float) -> bool:
-        """Whether the rover's simulation time goes on."""
-        before = self.rover()
-        until_s = time.monotonic() + within_s
-        while time.monotonic() < until_s:
-            if _is_later(self.rover(), before):
-                return True
+        """Whether the rover's simulation time goes on within that wall time."""
+        before, until_s = self.rover(), time.monotonic() + within_s
+        while (now := self.rover())[2:5:2] == before[2:5:2] and time.monotonic() < until_s:
             time.sleep(_LOOK_EVERY_S)
-        return False
+        return now[2:5:2] != before[2:5:2]
 
     def goes_on(self, what: str) -> None:
         """Fail where simulation time stands still after something."""
-        if not self.moves(SOON_S):
-            raise OtherwiseError(f"{what}, and simulation time stands still")
+        require(self.moves(SOON_S), f"{what}, and simulation time stands still")
 
     def stands(self, what: str) -> None:
         """Fail where simulation time goes on after something; what is under way may end first."""
-        self.until(lambda: not self.moves(_STANDS_S), f"{what}, and time went on")
+        self.until(lambda: not self.moves(_STANDS_S), f"{what}, and simulation time goes on")
 
     def until(self, look: Callable[[], T], otherwise: str, within_s: float = SOON_S) -> T:
         """What a look finds, as soon as it is something.
@@ -223,49 +215,47 @@ class Bench:
         """
         until_s = time.monotonic() + within_s
         while not (found := look()):
-            if time.monotonic() > until_s:
-                raise OtherwiseError(f"{otherwise} (waited {within_s:g} s)")
+            require(time.monotonic() < until_s, f"{otherwise} (waited {within_s:g} s)")
             time.sleep(_LOOK_EVERY_S)
         return found
 
     # -- asking --
 
-    def ask(self, question: Question, *, may_be_under_way: bool = False, **given: Any) -> Any:
-        """The answer to a question: its data, or captions with pictures.
+    def ask(self, question: Question, **given: Any) -> Any:
+        """The answer to a question of the rover: its data, or captions with pictures.
 
         Raises:
-            OtherwiseError: It was refused, or is not done.
+            OtherwiseError: It was refused, or failed.
         """
-        self._require_user()
-        if any(each.name == "timeout_wall_s" for each in question.parameters):
-            given = {"timeout_wall_s": SOON_S} | given
+        require(threading.current_thread() is self.user, "another check is made now")
+        usual = {"robot": ROVER, "timeout_wall_s": SOON_S}
+        known = {each.name for each in question.parameters}
+        given = {name: value for name, value in usual.items() if name in known} | given
         try:
             data, shown = ask(question, given, self.where)
         except WebotsMCPError as error:
             raise OtherwiseError(str(error)) from error
         if data is None:
             return shown
-        outcome = data.get("outcome", "done")
-        if outcome not in ("done", "claimed" if may_be_under_way else "done"):
-            why = data.get("error") or data.get("hint") or data.get("why")
-            raise OtherwiseError(f"{data.get('action')}: {outcome}, {why}")
+        require(data.get("outcome", "done") in ("done", "claimed"), str(data))
         return data
 
-    def _require_user(self) -> None:
-        if self._user is not None and threading.current_thread() is not self._user:
-            raise OtherwiseError("another check is made now")
+    def control(self, command: str, **given: Any) -> None:
+        """Steer, and require that it is done."""
+        answer = self.ask(webots_simulation_control, command=command, **given)
+        require(answer["outcome"] == "done", str(answer))
 
-
-def _is_later(now: Moment, before: Moment | None) -> bool:
-    return before is None or (now.run_id, now.sim_time_s) > (before.run_id, before.sim_time_s)
+    def send(self, action: str, waits_s: float = SOON_S, **params: Any) -> None:
+        """Send the rover a command of its own; it may be under way afterwards."""
+        self.ask(webots_send_command, action=action, params=params, timeout_wall_s=waits_s)
 
 
 def _write_project(folder: Path) -> Path:
     """The world with an observer, twice, and the controllers with the Python that runs this."""
-    shutil.copytree(_PROJECT, folder)
+    shutil.copytree(Path(__file__).parent / "project", folder)
     world = folder / "worlds" / "proving.wbt"
     world.parent.mkdir()
-    text = DEFAULT_WORLD.read_text("utf-8").replace(_HEADER, _HEADER + _SIGN, 1) + _MORE_NODES
+    text = DEFAULT_WORLD.read_text("utf-8").replace(_HEADER, _HEADER + _SIGN, 1) + _NODES
     for file in (world, world.with_name("second.wbt")):
         file.write_bytes(with_observer(text.encode()))
     observer = controller_change(folder)
@@ -274,7 +264,3 @@ def _write_project(folder: Path) -> Path:
         change.file.parent.mkdir(exist_ok=True)
         change.file.write_bytes(change.after)
     return world
-
-
-def _ignore(line: WebotsLine) -> None:
-    """`LaunchedWebots` keeps the newest lines."""

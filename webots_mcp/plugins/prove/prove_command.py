@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+import inspect
 import os
 import platform
 import queue
@@ -11,41 +12,21 @@ import sys
 import tempfile
 import threading
 import time
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from webots_mcp.cli.options import Json, Parameter
 from webots_mcp.cli.terminal import print_json, printable
-from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
+from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
 if TYPE_CHECKING:
     from webots_mcp.plugins.prove.bench import Bench
-    from webots_mcp.plugins.prove.checks import Check
 
-Outcome = Literal["as expected", "otherwise", "not tried"]
+_LIMIT_S: Final = 300.0  # of a check, beside a start
 _LONGEST: Final = 500
-
-
-@dataclass(frozen=True)
-class Finding:
-    """What came of a check.
-
-    Attributes:
-        check: Its name.
-        outcome: As expected, otherwise, or not tried.
-        expected: What the sources say.
-        seen: What was measured, what was seen instead, or why it was not tried.
-        works_still: Where it is otherwise.
-        took_s: Wall time.
-    """
-
-    check: str
-    outcome: Outcome
-    expected: str | None
-    seen: str | None
-    works_still: str | None
-    took_s: float
+_SAID: Final = ("expected", "seen", "works still")
+_OUTCOMES: Final = ("as expected", "otherwise", "not tried")
 
 
 def prove(
@@ -59,8 +40,7 @@ def prove(
         Parameter("--only", metavar="CHECK", help="Only this check; may be repeated."),
     ] = None,
     patience_s: Annotated[
-        float,
-        Parameter("--patience", help="Seconds that a start may take until the first row (60)."),
+        float, Parameter("--patience", help="Seconds from a start to the first row, at most (60).")
     ] = 60.0,
     as_json: Json = False,
 ) -> int:
@@ -71,42 +51,45 @@ def prove(
     prints names no file, user or machine: please send it with an issue. The exit code is 1 if
     anything is otherwise.
     """
+    from webots_mcp import __version__
     from webots_mcp.plugins.prove.bench import Bench
     from webots_mcp.plugins.prove.checks import CHECKS, NOT_TRIED
     from webots_mcp.webots import find_webots
-    from webots_mcp.webots.starting import Start, free_port
+    from webots_mcp.webots.starting import Start
 
+    for name in only or ():
+        if name not in CHECKS:
+            raise InvalidInputError(f"--only {name!r} is none of {', '.join(CHECKS)}")
     if webots is not None:
         _choose(webots)
-    wanted = [each for each in CHECKS if only is None or each.name in only]
-    if only and (unknown := set(only) - {each.name for each in CHECKS}):
-        names = ", ".join(each.name for each in CHECKS)
-        raise InvalidInputError(f"--only {unknown.pop()!r}: there is {names}")
-    stream = sys.stderr if as_json else sys.stdout
-    findings = list[Finding]()
+    Start(Path(), None, headless=True, streams=False, port=0).command_line()  # there is one
+    found = list[dict[str, Any]]()
+
+    def tell(each: dict[str, Any]) -> None:
+        found.append(each)
+        parts = [f"{each['check']}: {each['outcome']}"]
+        parts += [f"{name}: {each[name]}" for name in _SAID if each.get(name)]
+        print(printable("; ".join(parts)), file=sys.stderr if as_json else sys.stdout, flush=True)
+
     with tempfile.TemporaryDirectory(prefix="webots-mcp-", ignore_cleanup_errors=True) as folder:
-        hidden = _hidden(Path(folder))
-        Start(Path(folder), None, headless=True, streams=False, port=free_port()).command_line()
+        hidden = _hidden(folder)
         bench = Bench(Path(folder) / "project", patience_s)
         try:
-            for check in wanted:
-                found = _try(check, bench, hidden)
-                findings.append(found)
-                print(_line(found), file=stream, flush=True)
+            for name in only or CHECKS:
+                tell({"check": name, **tried(CHECKS[name], bench, hidden)})
         finally:
             bench.end()
     for name, why in NOT_TRIED.items() if only is None else ():
-        findings.append(Finding(name, "not tried", None, why, None, 0.0))
-        print(_line(findings[-1]), file=stream)
-    counts = {each: sum(f.outcome == each for f in findings) for each in Outcome.__args__}
+        tell({"check": name, "outcome": "not tried", "seen": why})
+    counts = {each: sum(one["outcome"] == each for one in found) for each in _OUTCOMES}
     if as_json:
-        print_json(
-            {"webots": find_webots().version, **_versions(), **counts,
-             "checks": [asdict(each) for each in findings]}
-        )  # fmt: skip
+        versions = {"webots": find_webots().version, "webots_mcp": __version__}
+        system = {"system": _system(), "machine": platform.machine()}
+        print_json({**versions, **system, "python": platform.python_version(), "counts": counts,
+                    "checks": found})  # fmt: skip
     else:
         print(", ".join(f"{count} {outcome}" for outcome, count in counts.items()))
-    return 1 if counts["otherwise"] else 0
+    return int(counts["otherwise"] > 0)
 
 
 def _choose(path: Path) -> None:
@@ -117,70 +100,63 @@ def _choose(path: Path) -> None:
     """
     from webots_mcp.webots import HOME_VARIABLE, installations
 
-    if path.is_file():
-        os.environ["PATH"] = f"{path.resolve().parent}{os.pathsep}{os.environ['PATH']}"
-        os.environ.pop(HOME_VARIABLE, None)
+    path = path.resolve()
+    os.environ.pop(HOME_VARIABLE, None)
+    if path.is_dir():
+        os.environ[HOME_VARIABLE] = str(path)
     else:
-        os.environ[HOME_VARIABLE] = str(path.resolve())
-    first = next(iter(installations()), None)
-    if first is None or path.resolve() not in (first.home, first.program, first.program.resolve()):
-        raise CommandRefusedError(f"{path} is neither the folder nor the program of a Webots")
+        os.environ["PATH"] = os.pathsep.join((str(path.parent), os.environ.get("PATH", "")))
+    for first in installations()[:1]:
+        if path in (first.home, first.program, first.program.resolve()):
+            return
+    raise CommandRefusedError(f"{path} is neither the folder nor the program of a Webots")
 
 
-def _try(check: Check, bench: Bench, hidden: dict[str, str]) -> Finding:
-    """One check, in a thread that is left alone, and Webots ended, where it hangs."""
-    from webots_mcp.plugins.prove.bench import NotTriedError, OtherwiseError
+def tried(
+    check: Callable[[Bench], object],
+    bench: Bench,
+    hidden: Mapping[str, str],
+    limit_s: float = _LIMIT_S,
+) -> dict[str, Any]:
+    """What came of a check: where it hangs, Webots is ended and its thread left alone.
 
-    came = queue.SimpleQueue[tuple[Outcome, str | None]]()
+    Args:
+        check: One of `checks.CHECKS`.
+        bench: Its Webots.
+        hidden: What no text may name, the longest first, and what stands there instead.
+        limit_s: In so much time it is over, besides that of a start.
+    """
+    from webots_mcp.plugins.prove.bench import NotTriedError
+
+    came = queue.SimpleQueue[tuple[str, object]]()
+    kind = check.__name__.partition("_")[0]
 
     def work() -> None:
         try:
-            came.put(("as expected", check.function(bench)))
+            if kind != "check":
+                bench.running(stream=kind == "streaming")
+            came.put(("as expected", check(bench)))
         except NotTriedError as error:
-            came.put(("not tried", str(error)))
-        except (OtherwiseError, AssertionError, WebotsMCPError) as error:
-            came.put(("otherwise", str(error)))
-        except Exception as error:  # noqa: BLE001 - what Webots answers can be anything
-            came.put(("otherwise", f"{type(error).__name__}: {error}"))
+            came.put(("not tried", error))
+        except Exception as error:  # noqa: BLE001 - what an unknown Webots answers can be anything
+            came.put(("otherwise", str(error) or type(error).__name__))
 
     began_s = time.monotonic()
-    thread = threading.Thread(target=work, daemon=True)
-    bench.use(thread)
-    thread.start()
+    bench.user = threading.Thread(target=work, daemon=True)
+    bench.user.start()
     try:
-        outcome, seen = came.get(timeout=check.limit_s + bench.patience_s)
+        outcome, seen = came.get(timeout=limit_s + bench.patience_s)
     except queue.Empty:
-        outcome, seen = "otherwise", "it hung"
+        outcome, seen = "otherwise", f"it hung for {limit_s:g} s"
         bench.end()
-    return Finding(
-        check.name,
-        outcome,
-        check.expected,
-        _without(hidden, seen),
-        check.otherwise if outcome == "otherwise" else None,
-        round(time.monotonic() - began_s, 1),
-    )
-
-
-def _line(found: Finding) -> str:
-    parts = [f"{found.check}: {found.outcome}"]
-    if found.outcome == "otherwise":
-        parts.append(f"expected: {found.expected}; seen: {found.seen}")
-        parts.append(f"then: {found.works_still}")
-    elif found.seen:
-        parts.append(found.seen)
-    return printable("; ".join(parts))
-
-
-def _versions() -> dict[str, Any]:
-    from webots_mcp import __version__
-
-    return {
-        "webots_mcp": __version__,
-        "system": _system(),
-        "machine": platform.machine(),
-        "python": platform.python_version(),
-    }
+    text = None if seen is None else str(seen)[: 2 * _LONGEST]
+    for name, shown in hidden.items():
+        text = text and re.sub(rf"(?<!\w){re.escape(name)}(?!\w)", lambda _, by=shown: by, text)
+    expected, _, then = (inspect.getdoc(check) or "").rstrip(".").partition("; otherwise ")
+    answer = {"outcome": outcome, "seen": text and text[:_LONGEST]}
+    if outcome == "otherwise":
+        answer |= {"expected": expected, "works still": then}
+    return answer | {"took_s": round(time.monotonic() - began_s, 1)}
 
 
 def _system() -> str:
@@ -191,31 +167,13 @@ def _system() -> str:
         return f"{platform.system()} {platform.release()}"
 
 
-def _hidden(folder: Path) -> dict[str, str]:
-    """What no text may name, the longest first, and what stands there instead."""
+def _hidden(folder: str) -> dict[str, str]:
     from webots_mcp.contract import host_name
     from webots_mcp.webots import find_webots
 
     found = find_webots()
-    places = {
-        str(folder): "FOLDER",
-        str(folder.resolve()): "FOLDER",
-        str(found.home or found.program): "WEBOTS",
-        str(found.program): "WEBOTS",
-        sys.executable: "PYTHON",
-        sys.prefix: "PYTHON",
-        str(Path(__file__).parents[2]): "PACKAGE",
-        str(Path.home()): "~",
-        host_name(): "HOST",
-        getpass.getuser(): "USER",
-    }
-    names = [each for each in places if len(each) > 1]
-    return {each: places[each] for each in sorted(names, key=len, reverse=True)}
-
-
-def _without(hidden: dict[str, str], text: str | None) -> str | None:
-    if text is None:
-        return None
-    for name, shown in hidden.items():
-        text = re.sub(rf"(?<!\w){re.escape(name)}(?!\w)", lambda _, shown=shown: shown, text)
-    return text[:_LONGEST]
+    places = {folder: "FOLDER", str(Path(folder).resolve()): "FOLDER", sys.executable: "PYTHON"}
+    places |= {str(each): "WEBOTS" for each in (found.program, found.home) if each}
+    places |= {sys.prefix: "PYTHON", str(Path(__file__).parents[2]): "PACKAGE"}
+    places |= {str(Path.home()): "~", host_name(): "HOST", getpass.getuser(): "USER"}
+    return dict(sorted(places.items(), key=lambda each: -len(each[0])))

@@ -237,13 +237,14 @@ class Bench:
             raise OtherwiseError(str(error)) from error
         if data is None:
             return shown
-        require(data.get("outcome", "done") in ("done", "claimed"), str(data))
+        why = data.get("error") or data.get("hint") or str(data)
+        require(data.get("outcome", "done") in ("done", "claimed"), why)
         return data
 
     def control(self, command: str, **given: Any) -> None:
         """Steer, and require that it is done."""
         answer = self.ask(webots_simulation_control, command=command, **given)
-        require(answer["outcome"] == "done", str(answer))
+        require(answer["outcome"] == "done", f"{command} is {answer['outcome']}")
 
     def send(self, action: str, waits_s: float = SOON_S, **params: Any) -> None:
         """Send the rover a command of its own; it may be under way afterwards."""

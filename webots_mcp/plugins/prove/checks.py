@@ -35,24 +35,17 @@ from webots_mcp.plugins.prove.bench import (
     Moment,
     OtherwiseError,
     require,
-)  # fmt: skip
+)
 from webots_mcp.questions import control_simulation, edit_scene, send_command, show_pictures
 from webots_mcp.questions.answers import ShownPicture
-from webots_mcp.webots import PORTS_TRIED, find_webots
-from webots_mcp.webots.orders import (
-    ANSWER_S,
-    Order,
-    begin_console,
-    connected,
-    console_lines,
-    give_order,
-    load_world,
-)  # fmt: skip
+from webots_mcp.webots import PORTS_TRIED, find_webots, orders
 from webots_mcp.webots.starting import CommandLine, KeptProgram, free_port
 
 NOT_TRIED: Final = {
     "keys": "keys reach a window only, and Webots was started without one",
     "preferences": "runtime.ini decides here, so that any Webots starts the Python of prove",
+    "customData of a PROTO": "the PROTO nodes of prove have no controller that writes it",
+    "slots": "the PROTO nodes of prove have none",
     "scene stream": "it would pause the simulation of whoever asks for it, and is never asked for",
 }
 _FAST: Final = 2
@@ -122,13 +115,13 @@ def running_output(bench: Bench) -> str:
 
 def running_console(bench: Bench) -> str:
     """Who asks gets its lines, also without --stream; otherwise start it with --stream."""
-    with connected(bench.address(), ANSWER_S) as stream:
-        begin_console(stream)
+    with orders.connected(bench.address(), orders.ANSWER_S) as stream:
+        orders.begin_console(stream)
         bench.send("say", text="heard by prove")
         seen, until_s = list[str](), time.monotonic() + SOON_S
         while time.monotonic() < until_s and sum("heard by" in each for each in seen) < 2:
-            message = stream.receive(time.monotonic() + ANSWER_S)
-            lines = console_lines(message.text) if message else ()
+            message = stream.receive(time.monotonic() + orders.ANSWER_S)
+            lines = orders.console_lines(message.text) if message else ()
             seen += [f"{line.stream}:{line.text}" for line in lines]
     whole = [line.partition(":")[0] for line in seen if line.endswith(":heard by prove")]
     require(len(whole) == 2, f"of two lines came {whole}; the newest: {seen[-5:]}")
@@ -139,7 +132,7 @@ def running_console(bench: Bench) -> str:
 
 def running_no_orders(bench: Bench) -> None:
     """Without --stream a ping is answered and no order; otherwise it is obeyed, as is said."""
-    reply = give_order(bench.address(), "pause")
+    reply = orders.give_order(bench.address(), "pause")
     require(reply.text is None, f"it answered {reply.text!r}")
     require(reply.is_alive, "a ping was not answered")
     bench.goes_on("an order was sent that is not to be obeyed")
@@ -258,8 +251,9 @@ def running_nodes(bench: Bench) -> None:
 
 
 def _has_box(bench: Bench) -> bool:
-    found = bench.ask(edit_scene.webots_get_scene, names=["PROVE_BOX"])
-    return "prove box" in json.dumps(found["result"])
+    with suppress(OtherwiseError):
+        return bool(_value(bench, "PROVE_BOX.translation"))
+    return False
 
 
 def running_reset(bench: Bench) -> None:
@@ -435,22 +429,22 @@ def streaming_orders(bench: Bench) -> str:
     return ", ".join(words)
 
 
-def _obeyed(bench: Bench, order: Order) -> str:
-    reply = give_order(bench.address(), order)
+def _obeyed(bench: Bench, order: orders.Order) -> str:
+    reply = orders.give_order(bench.address(), order)
     require(reply.text, f"{order}: no word; other: {reply.other!r}; ping: {reply.is_alive}")
     return str(reply.text)
 
 
 def streaming_order_reset(bench: Bench) -> str:
     """A reset by hand starts controllers anew; otherwise it is seen by time that goes back."""
-    reply = give_order(bench.address(), "reset", SOON_S)
+    reply = orders.give_order(bench.address(), "reset", SOON_S)
     _began_after(bench, bench.before)
     return f"answer: {reply.text}"
 
 
 def streaming_order_reload(bench: Bench) -> str:
     """The order reload starts controllers anew; otherwise a Supervisor reloads."""
-    reply = give_order(bench.address(), "reload", SOON_S)
+    reply = orders.give_order(bench.address(), "reload", SOON_S)
     _began_after(bench, bench.before)
     return f"answer: {reply.text}"
 
@@ -459,7 +453,7 @@ def streaming_order_load(bench: Bench) -> None:
     """The order load opens a world of the same folder; otherwise quit, and launch it."""
     before = bench.before
     for name in ("second.wbt", bench.world.name):
-        load_world(bench.address(), name, SOON_S)
+        orders.load_world(bench.address(), name, SOON_S)
         before = _began_after(bench, before)
         require(Path(before.world).name == name, f"its world is {Path(before.world).name}")
 
@@ -482,7 +476,7 @@ def check_begins_paused(bench: Bench) -> None:
     def plays() -> bool:  # as soon as the world is loaded
         require(bench.newest(ROVER) == before, "a controller recorded before the first step")
         with suppress(CommandRefusedError):
-            return give_order(bench.address(), "resume").text is not None
+            return orders.give_order(bench.address(), "resume").text is not None
         return False
 
     bench.until(plays, "no order is answered while it is paused", bench.patience_s)

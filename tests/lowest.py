@@ -8,20 +8,21 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterator
+from importlib import import_module
+from itertools import chain
 from pathlib import Path
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from typing import Any
 
 PYPROJECT = Path(__file__).parents[1] / "pyproject.toml"
 
 
 def lowest() -> Iterator[str]:
     """A line for each dependency, also of the extras."""
-    project = tomllib.loads(PYPROJECT.read_text("utf-8"))["project"]
-    for wanted in (*project["dependencies"], *sum(project["optional-dependencies"].values(), [])):
+    toml: Any = import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
+    project: dict[str, Any] = toml.loads(PYPROJECT.read_text("utf-8"))["project"]
+    extras: dict[str, list[str]] = project["optional-dependencies"]
+    wanted_by_project: list[str] = project["dependencies"]
+    for wanted in chain(wanted_by_project, *extras.values()):
         found = re.fullmatch(r"([\w-]+)(?:\[[\w,]+\])?>=([\d.]+)(?:,<[\d.]+)?(;.*)?", wanted)
         assert found, wanted
         yield f"{found[1]}=={found[2]}{found[3] or ''}"

@@ -1,4 +1,4 @@
-"""`webots-mcp prove` on programs that take the place of Webots: good ones, wrong ones, dead ones."""
+"""`webots-mcp prove` on programs in the place of Webots: good ones, wrong ones, dead ones."""
 
 from __future__ import annotations
 
@@ -152,7 +152,6 @@ def test_a_check_that_hangs_is_given_up_and_the_next_one_has_a_webots_again(
         free.set()
         stuck.join()
         assert late == ["Webots ended: True"]
-        assert bench.newest  # and its own Webots was not touched by the other
     finally:
         bench.end()
 

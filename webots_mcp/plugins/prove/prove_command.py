@@ -62,6 +62,8 @@ def prove(
             raise InvalidInputError(f"--only {name!r} is none of {', '.join(CHECKS)}")
     if webots is not None:
         _choose(webots)
+    for name in [each for each in os.environ if each.startswith("WEBOTS_MCP_")]:
+        del os.environ[name]  # what would change how its controllers record
     Start(Path(), None, headless=True, streams=False, port=0).command_line()  # there is one
     found = list[dict[str, Any]]()
 

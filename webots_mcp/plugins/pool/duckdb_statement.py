@@ -107,8 +107,6 @@ def _prepare(connection: Any, storage: Storage, sql: str) -> None:
     """The views, and then the bounds, which nothing takes back."""
     if not storage.is_local:
         connection.register_filesystem(storage.files)
-        # DuckDB binds with Python's lock held, which threads of its own need to read a file.
-        connection.execute("SET threads = 1")
     for table in tables():
         is_named = re.search(rf"\b{name_of(table)}\b", sql, re.IGNORECASE)
         paths = storage.find(files_of(table)) if is_named else []

@@ -71,6 +71,7 @@ ALLOWED["plugins.cluster"] = ALLOWED["steering"] | {"plugins.cluster", "plugins.
 ALLOWED["plugins.demo"] = ON_ALL | {"standin", "plugins.demo"}
 ALLOWED["plugins.formats"] = ALLOWED["store"] | {"plugins.formats"}
 ALLOWED["plugins.pool"] = ALLOWED["store"] | {"cli", "plugins.pool"}
+ALLOWED["plugins.prove"] = ON_ALL | {"MCPBridge", "standin", "plugins.prove"}
 ALLOWED["plugins.report"] = ON_ALL | {"standin", "plugins.report"}
 ALLOWED["plugins.page"] = ALLOWED["plugins.report"] | {"plugins.page"}
 ALLOWED["testing"] = STDLIB | {"store", "standin", "testing"}

@@ -1,0 +1,505 @@
+"""What is known of Webots from its sources alone, each as a check of a Webots that runs.
+
+docs/webots.md names for each of its statements the check that would confirm it. The docstring of a
+check says what the sources say, and what works still where that is not so. A check returns what it
+measured, or fails with what it saw. `running_NAME` is called with Webots in real time, of which the
+newest row of the rover is `bench.before`; `streaming_NAME` the same with --stream, and `check_NAME`
+starts what it needs.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from io import BytesIO
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final
+
+from PIL import Image
+
+from webots_mcp.contract import OBSERVER_NAME
+from webots_mcp.errors import CommandRefusedError
+from webots_mcp.plugins.prove.bench import (
+    REAL_TIME,
+    ROVER,
+    SOON_S,
+    SPEAKER,
+    Bench,
+    Moment,
+    OtherwiseError,
+    require,
+)
+from webots_mcp.questions import control_simulation, edit_scene, send_command, show_pictures
+from webots_mcp.questions.answers import ShownPicture
+from webots_mcp.webots import PORTS_TRIED, find_webots, orders
+from webots_mcp.webots.starting import CommandLine, KeptProgram, free_port
+
+NOT_TRIED: Final = {
+    "keys": "keys reach a window only, and Webots was started without one",
+    "preferences": "runtime.ini decides here, so that any Webots starts the Python of prove",
+    "customData of a PROTO": "the PROTO nodes of prove have no controller that writes it",
+    "slots": "the PROTO nodes of prove have none",
+    "scene stream": "it would pause the simulation of whoever asks for it, and is never asked for",
+}
+_FAST: Final = 2
+_STEP_S: Final = 0.016
+_SAME: Final = 1e-6
+_LOAD_S: Final = 40.0  # until a world is there again
+_TRIALS_S: Final = 240.0
+_STALL_S: Final = 6.0
+_STATUS: Final = 7
+_MASS: Final = "BALL.physics.mass"
+_PLACE: Final = "CRATE.translation"
+_BOX: Final = 'DEF PROVE_BOX Solid { translation 1 1 0.1 name "prove box" }'
+
+
+# -- starting it --
+
+
+def check_installed(bench: Bench) -> str:
+    """version.txt in its home names the release; otherwise set WEBOTS_HOME to its folder."""
+    found = find_webots()
+    require(found.version, f"no version next to the program that {found.found_by} names")
+    return f"{found.version}, by {found.found_by}"
+
+
+def check_options(bench: Bench) -> str:
+    """An unknown option ends it with an exit code; otherwise launch says that nobody records."""
+    command = CommandLine([str(find_webots().program), "--batch", "--no-such-option"], [])
+    program = KeptProgram(command, {}, subprocess.DEVNULL, subprocess.DEVNULL)
+    try:
+        program.start()
+        return f"exit code {bench.until(lambda: program.exit_code, 'it ended with no code')}"
+    finally:
+        program.end()
+
+
+def check_launch(bench: Bench) -> str:
+    """It takes our options, begins as asked, listens at --port; otherwise start it by hand."""
+    began_s = time.monotonic()
+    webots = bench.webots()
+    took_s, mode = time.monotonic() - began_s, bench.rover().state["mode"]
+    require(mode == REAL_TIME, f"--mode=realtime began in the mode {mode}")
+    bench.until(webots.address_now, "no Webots that listens was found among its processes")
+    by = "a display that was there" if os.environ.get("DISPLAY") else "xvfb-run or none"
+    return f"first row after {took_s:.1f} s, with {by}"
+
+
+def running_python(bench: Bench) -> None:
+    """COMMAND of runtime.ini starts controllers; otherwise doctor says which Python it was."""
+    used = Path(bench.before.state["python"])
+    require(used.resolve() == Path(sys.executable).resolve(), f"the controller ran in {used}")
+
+
+# -- its console, and the WebSocket without --stream --
+
+
+def running_output(bench: Bench) -> str:
+    """--stdout and --stderr show what controllers print; otherwise follow the console."""
+    bench.send("say", text="printed for prove")
+
+    def streams() -> list[str]:
+        lines = bench.webots().lines
+        return [line.stream for line in lines if line.text == "printed for prove"]
+
+    bench.until(lambda: len(streams()) > 1, "of two lines, on stdout and stderr, not both came")
+    return " and ".join(streams())
+
+
+def running_console(bench: Bench) -> str:
+    """Who asks gets its lines, also without --stream; otherwise start it with --stream."""
+    with orders.connected(bench.address(), orders.ANSWER_S) as stream:
+        orders.begin_console(stream)
+        bench.send("say", text="heard by prove")
+        seen, until_s = list[str](), time.monotonic() + SOON_S
+        while time.monotonic() < until_s and sum("heard by" in each for each in seen) < 2:
+            message = stream.receive(time.monotonic() + orders.ANSWER_S)
+            lines = orders.console_lines(message.text) if message else ()
+            seen += [f"{line.stream}:{line.text}" for line in lines]
+    whole = [line.partition(":")[0] for line in seen if line.endswith(":heard by prove")]
+    require(len(whole) == 2, f"of two lines came {whole}; the newest: {seen[-5:]}")
+    starts = any(line.startswith("stdout:INFO: rover: Starting controller: ") for line in seen)
+    require(starts, f"no line says that a controller is started; the first: {seen[:5]}")
+    return f"{len(seen)} lines; of a controller by {' and '.join(whole)}"
+
+
+def running_no_orders(bench: Bench) -> None:
+    """Without --stream a ping is answered and no order; otherwise it is obeyed, as is said."""
+    reply = orders.give_order(bench.address(), "pause")
+    require(reply.text is None, f"it answered {reply.text!r}")
+    require(reply.is_alive, "a ping was not answered")
+    bench.goes_on("an order was sent that is not to be obeyed")
+
+
+# -- steering by a Supervisor --
+
+
+def running_pause(bench: Bench) -> None:
+    """A Supervisor pauses and, by step(0), resumes; otherwise press play in Webots."""
+    _paused(bench)
+    bench.control("resume")
+    bench.goes_on("resume was done")
+
+
+def _paused(bench: Bench) -> Moment:
+    bench.control("pause")
+    bench.stands("pause was done")
+    return bench.rover()
+
+
+def running_steps(bench: Bench) -> None:
+    """As many rounds as were asked for, then a pause; otherwise the answer says how many."""
+    before = _paused(bench)
+    bench.control("step", steps=3)
+    _require_rounds(bench, before, 3)
+
+
+def _require_rounds(bench: Bench, before: Moment, rounds: int) -> None:
+    bench.stands(f"{rounds} rounds were to be made")
+    now = bench.rover()
+    made, went_s = now.state["rounds"] - before.state["rounds"], now.sim_time_s - before.sim_time_s
+    is_exact = made == rounds and abs(went_s - rounds * _STEP_S) < _SAME
+    require(is_exact, f"{made} rounds in {went_s:g} s, not {rounds}")
+
+
+def running_fast(bench: Bench) -> str:
+    """Fast mode is faster than real time; otherwise time goes on in the old mode."""
+    bench.control("fast")
+    bench.until(lambda: bench.rover().state["mode"] == _FAST, "the mode is not fast")
+    before, began_s = bench.rover(), time.monotonic()
+    bench.until(lambda: bench.rover().sim_time_s > before.sim_time_s + 2, "2 s did not pass")
+    factor = (bench.rover().sim_time_s - before.sim_time_s) / (time.monotonic() - began_s)
+    bench.control("resume")
+    return f"{factor:.1f} times real time"
+
+
+def running_run(bench: Bench) -> None:
+    """A run stops at the very step of its time or condition; otherwise a step later."""
+    before = _paused(bench)
+    bench.ask(control_simulation.webots_run, for_s=20 * _STEP_S)
+    _require_rounds(bench, before, 20)
+    until = f"rounds >= {before.state['rounds'] + 50}"
+    bench.ask(control_simulation.webots_run, until=until, for_s=20.0)
+    _require_rounds(bench, before, 50)
+
+
+def running_breakpoint(bench: Bench) -> None:
+    """A hit pauses at the very step; otherwise a step later."""
+    goal = bench.before.state["rounds"] + 100
+    made = bench.ask(send_command.webots_breakpoint, condition=f"rounds >= {goal}")
+    bench.until(lambda: bench.rover().state["rounds"] >= goal, "its step never came")
+    _require_rounds(bench, bench.before, 100)
+    bench.ask(send_command.webots_remove_breakpoint, breakpoint_id=made["breakpoint_id"])
+
+
+def running_screenshot(bench: Bench) -> str:
+    """The main view is written, also headless; otherwise cameras of robots still see."""
+    return _size_of(bench.ask(show_pictures.webots_take_screenshot))
+
+
+def running_camera(bench: Bench) -> str:
+    """Cameras see with --no-rendering; otherwise start it with its window."""
+    return _size_of(bench.ask(show_pictures.webots_get_camera, camera="camera", fresh=True))
+
+
+def _size_of(shown: list[str | ShownPicture]) -> str:
+    (data,) = (each.data for each in shown if isinstance(each, ShownPicture))
+    image: Any = Image.open(BytesIO(data))
+    darkest, brightest = image.convert("L").getextrema()
+    size = f"{image.width} x {image.height} pixels"
+    require(darkest < brightest, f"{size} of a single colour")
+    return size
+
+
+# -- the scene --
+
+
+def running_field(bench: Bench) -> None:
+    """A field is set with the next step, also in a pause; otherwise the answer says what it is."""
+    _paused(bench)
+    _set(bench, _PLACE, [-0.3, 0.5, 0.06])
+    bench.control("step", steps=2)
+    held = _value(bench, _PLACE)
+    require(abs(held[1] - 0.5) < 0.01, f"two steps after y was set to 0.5 it holds {held}")
+
+
+def _set(bench: Bench, path: str, value: object) -> None:
+    bench.ask(edit_scene.webots_set_field, path=path, value=value)
+
+
+def _value(bench: Bench, path: str) -> Any:
+    return bench.ask(edit_scene.webots_get_field, path=path)["result"]["value"]
+
+
+def running_nodes(bench: Bench) -> None:
+    """Nodes are added and removed at once, and bad text adds none; otherwise reload."""
+    bench.ask(edit_scene.webots_add_node, vrml=_BOX)
+    require(_has_box(bench), "a node that was added is not there")
+    bench.ask(edit_scene.webots_remove_node, path="PROVE_BOX")
+    require(not _has_box(bench), "a node that was removed is there")
+    with suppress(OtherwiseError):
+        bench.ask(edit_scene.webots_add_node, vrml=_BOX.replace("Solid", "Nothing"))
+        raise AssertionError("a node of an unknown type was added")
+    bench.goes_on("a node of an unknown type was refused")
+
+
+def _has_box(bench: Bench) -> bool:
+    with suppress(OtherwiseError):
+        return bool(_value(bench, "PROVE_BOX.translation"))
+    return False
+
+
+def running_reset(bench: Bench) -> None:
+    """In the same process time is 0, poses are back, added nodes gone; otherwise reload."""
+    bench.ask(edit_scene.webots_add_node, vrml=_BOX)
+    _set(bench, _PLACE, [1, -1.5, 0.06])
+    now = _after_reset(bench)
+    require(now.pid == bench.before.pid, "the controller was started anew")
+    require(not _has_box(bench), "a node that was added is there")
+    place = _value(bench, _PLACE)
+    require(abs(place[0] + 0.3) < 0.05, f"the crate, which began at x = -0.3 m, is at {place}")
+
+
+def _after_reset(bench: Bench) -> Moment:
+    before = bench.rover()
+    bench.control("reset")
+    bench.until(lambda: bench.rover().run_id > before.run_id, "no new run began")
+    bench.goes_on("a reset was done")
+    return bench.rover()
+
+
+def running_put_back(bench: Bench) -> None:
+    """A reset leaves a field as it was set, and the bridge sets it back; otherwise reload."""
+    mass = _value(bench, _MASS)
+    _set(bench, _MASS, 2 * mass)
+    bench.goes_on("a mass was set")
+    require(abs(_value(bench, _MASS) - 2 * mass) < _SAME, "a mass that was set is not held")
+    run = _after_reset(bench).run_id
+    require(abs(_value(bench, _MASS) - mass) < _SAME, "the mass is not set back")
+    events = bench.rows("SELECT 1 FROM event WHERE kind = 'put_back' AND run_id = ?", run)
+    require(events, "Webots has set the mass back by itself")
+
+
+def running_motors(bench: Bench) -> None:
+    """Wheels turn on after a reset, since the bridge asks for it; otherwise use on_reload."""
+    begin_rad = _after_reset(bench).state["wheel_rad"]
+    bench.until(lambda: bench.rover().state["wheel_rad"] != begin_rad, "a wheel stands still")
+
+
+def running_proto(bench: Bench) -> None:
+    """The inside of a PROTO can be read and not be set; otherwise it is said not to be there."""
+    path = "SIGN.children[0].geometry.size"
+    size = [round(each, 3) for each in _value(bench, path)]
+    require(size == [0.1, 0.2, 0.3], f"the box in it has the size {size}")
+    with suppress(OtherwiseError):
+        _set(bench, path, [1, 1, 1])
+        raise AssertionError("its inside was set")
+
+
+# -- the observer, and a loop that hangs --
+
+
+def running_observer(bench: Bench) -> str:
+    """Poses come with its steps, of robots in a PROTO too; otherwise each is asked for."""
+
+    def places() -> dict[str, Any]:
+        return bench.since_start(OBSERVER_NAME).state.get("world", {})
+
+    bench.until(lambda: {"ROVER", "inner"} <= set(places()), "of ROVER and inner it sees not both")
+    seen = bench.since_start(OBSERVER_NAME)
+    query = "SELECT data FROM state WHERE run_id = ? ORDER BY abs(sim_time_s - ?) LIMIT 1"
+    ((own,),) = bench.rows(query, bench.rover().run_id, seen.sim_time_s)
+    apart_m = abs(json.loads(own)["x_m"] - seen.state["world"]["ROVER"]["x_m"])
+    require(apart_m < 0.02, f"{apart_m:.3f} m from where the rover itself is")
+    return f"{apart_m * 1000:.1f} mm from where the rover itself is"
+
+
+def running_observer_time(bench: Bench) -> str:
+    """Answers to its step(0) tell the time; otherwise it makes steps of its own."""
+    begin = bench.since_start(OBSERVER_NAME)
+    end_s = begin.sim_time_s + 2
+    bench.until(lambda: bench.since_start(OBSERVER_NAME).sim_time_s > end_s, "it recorded no 2 s")
+    query = "SELECT sim_time_s FROM state WHERE run_id = ? AND sim_time_s >= ? ORDER BY id"
+    times = bench.rows(query, begin.run_id, begin.sim_time_s)
+    longest_s = max(b - a for (a,), (b,) in pairwise(times))
+    require(longest_s < 1, f"rows up to {longest_s:.2f} s apart, not 0.1")
+    return f"rows at most {longest_s:.3f} s apart"
+
+
+def running_customData(bench: Bench) -> str:  # noqa: N802 - as Webots writes it
+    """An observer records it of a robot without a bridge; otherwise attach a bridge."""
+    goal = bench.since_start(SPEAKER).state["seq"] + 20
+    bench.until(lambda: bench.since_start(SPEAKER).state["seq"] > goal, "its messages end")
+    state = bench.since_start(SPEAKER).state
+    require(state["twice"] == 2 * state["seq"], f"parts of two messages: {state}")
+    return f"{state.get('seq_missed', 0)} of {state['seq']} messages missed"
+
+
+def running_hang(bench: Bench) -> str:
+    """A loop that hangs is told with its place, and goes on; otherwise status says silent."""
+    bench.send("stall", waits_s=1.0, seconds=_STALL_S)
+
+    def place() -> str | None:
+        with bench.recording.view(ROVER) as view:
+            why = view.header().get("why") or ""
+        return why if "rover.py" in why and "stall" in why else None
+
+    said = bench.until(place, "its place is not told")
+    bench.until(lambda: bench.moves(1.0), "it does not go on", 3 * _STALL_S)
+    return str(said)
+
+
+# -- reloading and ending --
+
+
+def running_reload(bench: Bench) -> None:
+    """Controllers are started anew; otherwise start them by hand."""
+    bench.control("reload", timeout_wall_s=_LOAD_S)
+    _began_after(bench, bench.before)
+    _require_ended(bench, "reload")
+
+
+def _began_after(bench: Bench, before: Moment) -> Moment:
+    def has_begun() -> bool:
+        return bench.rover().session_id > before.session_id
+
+    bench.until(has_begun, "no controller began anew", _LOAD_S)
+    return bench.rover()
+
+
+def _require_ended(bench: Bench, reason: str) -> None:
+    """A process that was killed before step() returned -1 is found as crashed."""
+    query = "SELECT end_reason FROM session WHERE id = ?"
+    ((ended,),) = bench.rows(query, bench.before.session_id)
+    require(ended == reason, f"the session ended as {ended}, not as {reason}")
+
+
+def running_quit(bench: Bench) -> None:
+    """It ends with the status of simulationQuit, after step() was -1; otherwise with another."""
+    webots = bench.webots()
+    bench.send("leave", waits_s=3.0, status=_STATUS)
+    bench.until(lambda: webots.is_over, "it did not end", _LOAD_S)
+    require(webots.exit_code == _STATUS, f"exit code {webots.exit_code}, not {_STATUS}")
+    _require_ended(bench, "finished")
+
+
+def running_terminate(bench: Bench) -> None:
+    """SIGTERM, or closing its window, lets it quit: step() is -1; otherwise it is killed."""
+    bench.end()
+    _require_ended(bench, "finished")
+
+
+def check_layout(bench: Bench) -> None:
+    """Headless it leaves the layout of its window alone; otherwise a .wbproj has changed."""
+    bench.end()
+    written = [file.name for file in bench.world.parent.glob(".*.wbproj")]
+    require(not written, f"it wrote {', '.join(written)}")
+
+
+# -- the WebSocket with --stream --
+
+
+def check_port_taken(bench: Bench) -> str:
+    """Where --port is taken it takes one of the next ten; otherwise it says so and ends."""
+    port = free_port()
+    with socket.create_server(("", port)):
+        bench.webots(stream=True, port=port)
+        further = bench.address().port - port
+    require(0 < further < PORTS_TRIED, f"it listens {further} ports further")
+    return f"{further} further"
+
+
+def streaming_orders(bench: Bench) -> str:
+    """With --stream each order is obeyed and answered in words; otherwise by a Supervisor."""
+    words = [_obeyed(bench, "pause")]
+    bench.stands("the order pause was answered")
+    before = bench.rover()
+    words.append(_obeyed(bench, "step"))
+    bench.until(lambda: bench.rover().sim_time_s > before.sim_time_s, "no step was made")
+    for order in ("fast", "resume"):
+        words.append(_obeyed(bench, order))
+        bench.goes_on(f"the order {order} was answered")
+    return ", ".join(words)
+
+
+def _obeyed(bench: Bench, order: orders.Order) -> str:
+    reply = orders.give_order(bench.address(), order)
+    require(reply.text, f"{order}: no word; other: {reply.other!r}; ping: {reply.is_alive}")
+    return str(reply.text)
+
+
+def streaming_order_reset(bench: Bench) -> str:
+    """A reset by hand starts controllers anew; otherwise it is seen by time that goes back."""
+    reply = orders.give_order(bench.address(), "reset", SOON_S)
+    _began_after(bench, bench.before)
+    return f"answer: {reply.text}"
+
+
+def streaming_order_reload(bench: Bench) -> str:
+    """The order reload starts controllers anew; otherwise a Supervisor reloads."""
+    reply = orders.give_order(bench.address(), "reload", SOON_S)
+    _began_after(bench, bench.before)
+    return f"answer: {reply.text}"
+
+
+def streaming_order_load(bench: Bench) -> None:
+    """The order load opens a world of the same folder; otherwise quit, and launch it."""
+    before = bench.before
+    for name in ("second.wbt", bench.world.name):
+        orders.load_world(bench.address(), name, SOON_S)
+        before = _began_after(bench, before)
+        require(Path(before.world).name == name, f"its world is {Path(before.world).name}")
+
+
+def streaming_by_hand(bench: Bench) -> None:
+    """A pause by hand is told to no controller; an observer ends it; otherwise press play."""
+    _obeyed(bench, "pause")
+    bench.stands("it was paused from outside")
+    bench.control("resume", robot=OBSERVER_NAME)
+    bench.goes_on("the observer was told to resume")
+
+
+def check_begins_paused(bench: Bench) -> None:
+    """--mode=pause starts controllers with the first step; otherwise they begin at once."""
+    bench.end()
+    before = bench.newest(ROVER)
+    webots = bench.webots(stream=True, mode="pause")
+    bench.until(webots.address_now, "it does not listen", bench.patience_s)
+
+    def plays() -> bool:  # as soon as the world is loaded
+        require(bench.newest(ROVER) == before, "a controller recorded before the first step")
+        with suppress(CommandRefusedError):
+            return orders.give_order(bench.address(), "resume").text is not None
+        return False
+
+    bench.until(plays, "no order is answered while it is paused", bench.patience_s)
+    bench.until(lambda: bench.newest(ROVER) != before, "no controller began", _LOAD_S)
+
+
+def check_trials(bench: Bench) -> None:
+    """Each trial has a Webots of its own, with its parameters; otherwise use webots_run."""
+    bench.end()
+    plan = bench.world.with_name("trials.toml")
+    text = 'world = "{}"\nrobot = "{}"\nscore = "last(speed)"\nfor_s = 0.5\ngrid.speed = [1.0, 2.0]'
+    plan.write_text(text.format(bench.world.name, ROVER), "utf-8")
+    command = [sys.executable, "-m", "webots_mcp", "trials", str(plan), "--json"]
+    command += bench.where.typed()
+    done = subprocess.run(command, capture_output=True, check=False, text=True, timeout=_TRIALS_S)
+    require(done.returncode == 0, done.stderr[-400:])
+    sets = json.loads(done.stdout)["sets"]
+    scores = {each["parameters"]["speed"]: each["scores"] for each in sets}
+    require(scores == {1.0: [1.0], 2.0: [2.0]}, f"scores by speed: {scores}")
+
+
+CHECKS: Final[dict[str, Callable[[Bench], object]]] = {
+    name.partition("_")[2].replace("_", " "): function
+    for name, function in list(globals().items())
+    if name.startswith(("check_", "running_", "streaming_"))
+}

@@ -12,13 +12,14 @@ import json
 import socket
 import ssl
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import uvicorn
 from mcp.server.transport_security import TransportSecuritySettings
 from starlette.datastructures import Headers
+from starlette.requests import ClientDisconnect
 from starlette.responses import PlainTextResponse
 
 from webots_mcp.access_token import LOOPBACK, access_token, is_admitted
@@ -189,8 +190,9 @@ async def _follow(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> N
         is_answered |= message["type"] == "http.response.body" and not message.get("more_body")
 
     session = Headers(scope=scope).get("mcp-session-id")
-    await app(dict(scope), watched, noted)
-    if has_left and session and (asked := _request_in(body)):
+    with suppress(ClientDisconnect):  # within what it had to say
+        await app(dict(scope), watched, noted)
+    if has_left and session and (asked := _request_in(body)) is not None:
         await _cancel(app, scope, asked)
 
 
@@ -198,7 +200,7 @@ def _request_in(body: bytearray) -> Any:
     """The id of the request that a body holds; None for a notification or a part of one."""
     try:
         message: dict[str, Any] = dict(json.loads(body))
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, RecursionError):
         return None
     return message.get("id") if "method" in message else None
 

@@ -157,11 +157,11 @@ async def test_nobody_gets_in_without_the_token_or_from_elsewhere(
 async def test_what_a_client_asks_that_goes_away_is_stopped(
     serve: Callable[..., Http], driver: Driver, mode: Mode
 ) -> None:
-    """It is cut off in the middle of a run, of which the controller is told."""
+    """It is cut off in the middle of a run, of which the controller is told; some count from 0."""
     server = serve()
     call = {"name": "webots_run", "arguments": {"for_s": 10_000, "timeout_wall_s": 90}}
     if mode == "legacy":
-        asked = server.post("tools/call", call, 7, Mcp_Session_Id=server.session())
+        asked = server.post("tools/call", call, 0, Mcp_Session_Id=server.session())
     else:
         prefix = "io.modelcontextprotocol/"
         meta = {f"{prefix}protocolVersion": "2026-07-28", f"{prefix}clientCapabilities": {}}
@@ -354,3 +354,18 @@ async def test_two_clients_under_load_lose_nothing_and_nobody_else_gets_in(
     assert {number for number in answered if number % 10 <= 5} <= done
     assert min(recorded) >= 1_000
     assert "Traceback" not in server.stop()
+
+
+async def test_a_client_that_goes_away_while_it_speaks_is_no_defect(
+    serve: Callable[..., Http],
+) -> None:
+    server = serve()
+    session, deep = server.session(), "[" * 100_000
+    for headers in ({"Mcp_Session_Id": session}, {"Mcp_Protocol_Version": "2026-07-28"}):
+        for said in ("{", deep):
+            named = {name.replace("_", "-"): value for name, value in headers.items()}
+            named |= _JSON | {"Authorization": f"Bearer {server.token}", "Content-Length": "999999"}
+            with closing(http.client.HTTPConnection("127.0.0.1", server.port)) as connection:
+                connection.request("POST", "/mcp", said, named)
+    assert server.status() == 200
+    assert "ASGI" not in server.stop()

@@ -38,10 +38,11 @@ def access_token() -> str:
     file = token_file()
     if not file.exists():
         return new_token()
-    if os.name != "nt" and stat.S_IMODE(file.stat().st_mode) & 0o077:
+    found = file.stat()
+    if os.name != "nt" and (stat.S_IMODE(found.st_mode) & 0o077 or found.st_uid != os.geteuid()):
         raise CommandRefusedError(f"other users may read or change {file}: {_AGAIN}")
     token = file.read_text("ascii", "replace").strip()
-    if len(token) < _SHORTEST or not token.isascii():
+    if len(token) < _SHORTEST or not token.isascii() or token.split() != [token]:
         raise CommandRefusedError(f"{file} holds no token of {_SHORTEST} characters: {_AGAIN}")
     return token
 

@@ -37,6 +37,7 @@ _STRANGER: Final = (
     "This server answers requests with the header 'Authorization: Bearer TOKEN' only; "
     "'webots-mcp token' shows the token to the user who started the server.\n"
 )
+_CLOSED: Final = "This server has no valid token: there 'webots-mcp token' says what is wrong.\n"
 
 
 class Place(NamedTuple):
@@ -152,7 +153,8 @@ def _is_loopback(host: str) -> bool:
 
 def _allowing(place: Place) -> TransportSecuritySettings:
     """Requests for these names; pages of the same ones, as far as a browser sends any."""
-    names = (*LOOPBACK, *place.allowed)
+    own = (place.host,) if _is_loopback(place.host) else ()  # such as 127.0.0.2
+    names = (*LOOPBACK, *own, *place.allowed, *map(str.lower, place.allowed))  # as clients send it
     hosts = [spelled for name in names for spelled in (name, f"{name}:*")]
     origins = [f"{place.scheme}://{host}" for host in hosts]
     return TransportSecuritySettings(allowed_hosts=hosts, allowed_origins=origins)
@@ -164,7 +166,11 @@ def gate(app: ASGIApp) -> ASGIApp:
     async def admit(scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "http":
             given = Headers(scope=scope).getlist("authorization")
-            if len(given) != 1 or not is_admitted(given[0]):
+            try:
+                admitted = len(given) == 1 and is_admitted(given[0])
+            except (CommandRefusedError, OSError):
+                return await PlainTextResponse(_CLOSED, 503)(scope, receive, send)
+            if not admitted:
                 refusal = {"WWW-Authenticate": "Bearer", "Connection": "close"}
                 return await PlainTextResponse(_STRANGER, 401, refusal)(scope, receive, send)
             return await _follow(app, scope, receive, send)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import http.client
 import json
+import socket
 import sqlite3
+import struct
 from collections.abc import Callable
 from contextlib import closing
 from http.client import HTTPMessage
@@ -148,6 +150,21 @@ def test_a_port_that_is_taken_is_said(
 
 def test_ctrl_c_ends_it_in_a_sentence(serve: Callable[..., Server], tmp_path: Path) -> None:
     assert serve(tmp_path).stop() == "webots-mcp: ended by SIGTERM\n"
+
+
+def test_what_strangers_send_leaves_nothing_on_the_terminal(
+    serve: Callable[..., Server], tmp_path: Path
+) -> None:
+    """And a token that is none any more is told, not raised."""
+    server = serve(tmp_path)
+    for said in (b"GET http://[x/ HTTP/1.1\r\nHost: localhost\r\n\r\n", b"GET / HT"):
+        with closing(socket.create_connection(("127.0.0.1", server.port), 20)) as stranger:
+            stranger.sendall(said)
+            stranger.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    (tmp_path / ".webots-mcp" / "token").write_text("short", "ascii")
+    status, text = answer(server, "")
+    assert (status, "webots-mcp token" in text) == (503, True)
+    assert server.stop() == "webots-mcp: ended by SIGTERM\n"
 
 
 def test_a_recording_that_is_refused_is_not_served(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import logging
 import secrets
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -17,7 +18,7 @@ from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, Final
-from urllib.parse import parse_qsl, urlsplit
+from urllib.parse import parse_qsl
 
 import anyio
 
@@ -52,6 +53,7 @@ _UNTOLD: Final = (
     "The address of this page has a key, without which nothing is shown: open the address that "
     "'webots-mcp view' prints.\n"
 )
+_CLOSED: Final = "There is no valid token: 'webots-mcp token' says what is wrong.\n"
 _FULL: Final = (
     f"{MOST_TABS} tabs of this page are open: close one, wait a quarter of a minute, and open this "
     "one again.\n"
@@ -110,6 +112,12 @@ class PageServer(ThreadingHTTPServer):
             self._tabs[tab] = now_s
             return True
 
+    def handle_error(self, request: object, client_address: object) -> None:
+        """A tab that was closed is no news."""
+        error = sys.exc_info()[1]
+        if isinstance(error, Exception) and not isinstance(error, OSError):
+            self.log_once(error)
+
     def log_once(self, error: Exception) -> None:
         """Write more about an error that nobody foresaw: once, not at each look."""
         with self._lock:
@@ -144,6 +152,7 @@ class _Request(BaseHTTPRequestHandler):
 
     protocol_version = "HTTP/1.1"
     server_version = "webots-mcp"
+    timeout = 60  # s, for the next request of a connection or the rest of one
 
     def do_GET(self) -> None:
         if (path := self._path()) is None:
@@ -164,7 +173,7 @@ class _Request(BaseHTTPRequestHandler):
         if (path := self._path()) is None:
             return
         length = int(self.headers.get("Content-Length") or 0)
-        if path != "steer" or self._page.read_only or length > _MOST_BYTES:
+        if path != "steer" or self._page.read_only or not 0 <= length <= _MOST_BYTES:
             return self._refuse(403, "This page only shows.\n")
         own = {f"http://{name}:{self._page.server_port}" for name in LOOPBACK}
         is_json = self.headers.get("Content-Type") == "application/json"
@@ -183,14 +192,17 @@ class _Request(BaseHTTPRequestHandler):
         host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
         if host not in LOOPBACK:
             return self._refuse(403, _FOREIGN)
-        path = urlsplit(self.path).path.removeprefix("/")
-        key, slash, rest = path.partition("/")
-        if not slash or not secrets.compare_digest(key.encode(), page_key().encode()):
+        key, slash, rest = self.path.partition("?")[0].removeprefix("/").partition("/")
+        try:
+            own = page_key()
+        except (WebotsMCPError, OSError):
+            return self._refuse(503, _CLOSED)
+        if not slash or not secrets.compare_digest(key.encode(), own.encode()):
             return self._refuse(403, _UNTOLD)
         return rest
 
     def _ask(self, question: Callable[[PageServer, dict[str, str]], dict[str, Any]]) -> None:
-        asked = dict(parse_qsl(urlsplit(self.path).query))
+        asked = dict(parse_qsl(self.path.partition("?")[2]))
         if not self._page.has_room_for(asked.get("tab", "")):
             return self._refuse(503, _FULL)
         try:

@@ -213,6 +213,20 @@ async def test_neither_another_folder_nor_a_new_project_below_leads_round_the_fi
 
 
 @pytest.mark.usefixtures("robot")
+async def test_the_file_binds_a_project_whose_robots_record_outside_of_it(
+    file: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    away = tmp_path_factory.mktemp("away")  # as by a linked mcp_data, or WEBOTS_MCP_DATA_DIR
+    (away / "worlds").mkdir()
+    allow(away, "\ufeff[allow]\nactions = ['keep']\n")
+    with closing(connect(file, "writer")) as connection:
+        connection.execute("UPDATE run SET world = ?", (str(away / "worlds" / "a.wbt"),))
+    async with client_of(file) as client:
+        said = await fail(client, "webots_set_parameters", values={"kp": 3})
+        assert f"{away / 'webots-mcp.toml'}, line 2: actions = ['keep']" in said
+
+
+@pytest.mark.usefixtures("robot")
 async def test_trials_stop_where_the_file_forbids_what_they_would_do_next(
     project: Path, file: Path
 ) -> None:
@@ -310,9 +324,9 @@ def test_whatever_queues_a_command_or_starts_webots_asks_for_permission_first() 
                 source = "\n".join(lines[node.lineno - 1 : node.end_lineno])
                 if doing.search(source):
                     functions[f"{file.name}:{node.name}"] = source
-    # What ends or undoes something, `_by_websocket`'s part, and programs of a person's own.
+    # What ends or undoes something, `_by_websocket`'s part, and `prove` in a project of its own.
     free = {"dispatch.py:_leave", "trial_worker.py:_cancel", "trial_worker.py:_ask_back",
-            "routes.py:_give"}  # fmt: skip
+            "routes.py:_give", "bench.py:webots"}  # fmt: skip
     asking = {name for name, source in functions.items() if "permit(" in source}
     own = {name for name in functions if name.startswith(("testing.py", "queue.py"))}
     assert functions.keys() - asking - own == free, "who does it without asking?"

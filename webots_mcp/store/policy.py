@@ -178,7 +178,7 @@ def line_of(text: str, key: str, inside: str | None = None) -> int:
     return found
 
 
-def policies_of(database: Database, data_dir: Path, world: object = None) -> Iterator[Policy]:
+def policies_of(database: Database, data_dir: Path, files: Iterable[str]) -> Iterator[Policy]:
     """Those of each `webots-mcp.toml` in or above the folders that a request is about; all hold.
 
     Not only that of the project: which folder is one can be changed by making folders in it.
@@ -186,13 +186,14 @@ def policies_of(database: Database, data_dir: Path, world: object = None) -> Ite
     Args:
         database: Of the recording; the file beside it holds wherever its pictures are.
         data_dir: The folder of its pictures.
-        world: The file of a world that is started or opened.
+        files: Of the world that is started or opened, and of those that are live with their
+            controllers: what they record may lie outside of their project.
 
     Raises:
         NotAllowedError: A file is invalid: as long as it is, nothing is allowed.
     """
     below = [database.parent] if isinstance(database, Path) else []
-    below += [data_dir, *([Path(str(world)).parent] if world else [])]
+    below += [data_dir, *(Path(each).parent for each in files)]
     folders = (folder for each in below for folder in (each, *each.parents))
     for folder in dict.fromkeys(folders):
         file = folder / PROJECT_FILE

@@ -40,6 +40,10 @@ _BEGIN: Final = (
     "ON b.id = run.robot_id WHERE run.ended_wall_time_s IS NULL "
     "AND (:robot IS NULL OR b.name = :robot) ORDER BY run.id DESC LIMIT 1) r"
 )
+_LIVE: Final = (
+    "SELECT world FROM run WHERE ended_wall_time_s IS NULL AND world IS NOT NULL UNION SELECT "
+    "controller FROM session WHERE ended_wall_time_s IS NULL AND controller IS NOT NULL"
+)
 _REFUSE: Final = "UPDATE request SET rule = ? WHERE id = ?"
 _END: Final = "UPDATE request SET finished_wall_time_s = ?, outcome = ? WHERE id = ?"
 _NEWEST: Final = (
@@ -148,7 +152,11 @@ class OpenRequest:
 
     def _policies(self, world: object = None) -> list[Policy]:
         """Those that bind who asks; what only reads goes on while one is invalid."""
-        found = policies_of(self.recording.database, self.recording.data_dir, world)
+        files = [str(world)] if world else []
+        if not self._reads:  # which is begun in the event loop
+            with suppress(NoDatabaseError), self.recording.reader() as connection:
+                files += [file for (file,) in connection.execute(_LIVE).fetchall()]
+        found = policies_of(self.recording.database, self.recording.data_dir, files)
         try:
             return [each for each in found if each.holds_for(self._by.transport)]
         except NotAllowedError:

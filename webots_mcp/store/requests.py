@@ -14,6 +14,7 @@ import time
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, NamedTuple, cast
 
@@ -133,15 +134,15 @@ class OpenRequest:
         with suppress(NoDatabaseError):
             self._insert()
 
-    def require(self, action: str, params: Mapping[str, Any]) -> None:
-        """See that the policy allows an action.
+    def require(self, action: str, params: Mapping[str, Any], steered: Path | None = None) -> None:
+        """See that the policy allows an action; see `permit`.
 
         Raises:
             NotAllowedError: It does not; the row says so.
         """
         world = params.get("world") if action in (LAUNCH, "load_world") else None
         with self._refusing():
-            for each in self._policies(world):
+            for each in self._policies(*(str(file) for file in (world, steered) if file)):
                 each.require(action, params)
 
     def _begin(self) -> None:
@@ -150,12 +151,11 @@ class OpenRequest:
                 each.require_tool(self._names)
         self.enter()
 
-    def _policies(self, world: object = None) -> list[Policy]:
+    def _policies(self, *files: str) -> list[Policy]:
         """Those that bind who asks; what only reads goes on while one is invalid."""
-        files = [str(world)] if world else []
         if not self._reads:  # which is begun in the event loop
             with suppress(NoDatabaseError), self.recording.reader() as connection:
-                files += [file for (file,) in connection.execute(_LIVE).fetchall()]
+                files += tuple(file for (file,) in connection.execute(_LIVE).fetchall())
         found = policies_of(self.recording.database, self.recording.data_dir, files)
         try:
             return [each for each in found if each.holds_for(self._by.transport)]
@@ -211,7 +211,12 @@ _open: Final[ContextVar[OpenRequest]] = ContextVar("request")
 
 
 def permit(
-    recording: Recording, action: str, params: Mapping[str, Any], *, create: bool = False
+    recording: Recording,
+    action: str,
+    params: Mapping[str, Any],
+    *,
+    create: bool = False,
+    steered: Path | None = None,
 ) -> int | None:
     """See that what is about to be done is allowed, and that there is a row of who asked for it.
 
@@ -220,6 +225,7 @@ def permit(
         action: As a command names it, or `policy.LAUNCH`.
         params: Its parameters.
         create: Make the database if there is none: it is done without one.
+        steered: The world of the Webots that does it, which may be of another project.
 
     Returns:
         The id of the request's row; None where it only reads, or where there is no database yet.
@@ -229,7 +235,7 @@ def permit(
         LookupError: Nobody has begun a request, which is a defect.
     """
     request = _open.get()
-    request.require(action, params)
+    request.require(action, params, steered)
     request.enter(create=create)
     return request.id
 

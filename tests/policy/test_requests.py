@@ -87,7 +87,8 @@ async def test_a_request_is_a_row_with_who_asked_how_for_what_and_what_became_of
     async with client_of(file) as client:
         answer = await ask(client, "webots_set_parameters", values={"kp": 3})
         await client.call_tool("webots_get_robot_state", {})  # reads, and is none
-        secret = {"api_key": "hunter22", "nested": [{"Password": "hunter23"}], "speed": "hunter22"}
+        secret = {"api_key": {"a": "hunter22"}, "nested": [{"Password": "hunter23"}],
+                  "auth": "hunter24", "at": "s3://ada:hunter25@host/x", "speed": "hunter22"}  # fmt: skip
         said = await fail(client, "webots_send_command", action="set_speed", params=secret)
         await client.call_tool("webots_send_command", {"action": "x", "params": {"a": "ä" * 9000}})
         allow(project, "[allow]\n\nactions = ['run']  # no more\n")
@@ -104,7 +105,8 @@ async def test_a_request_is_a_row_with_who_asked_how_for_what_and_what_became_of
     assert "hunter" in said, "who asked is answered with what was wrong"
     left_out = {"api_key": "(left out)", "nested": [{"Password": "(left out)"}]}
     assert hidden["arguments"]["params"] | left_out == hidden["arguments"]["params"]
-    assert "hunter23" not in json.dumps(hidden)
+    assert json.dumps(hidden).count("hunter") == 1, "where no name says that it is a secret"
+    assert hidden["arguments"]["params"]["at"] == "s3://(left out)@host/x"
     assert 0 < len(json.dumps(long["arguments"], ensure_ascii=False)) < LONGEST_ARGUMENTS + 100
     at = f"{project / 'webots-mcp.toml'}, line 3: actions = ['run']"
     assert at in refusal and "the person whose project it is can change that line" in refusal

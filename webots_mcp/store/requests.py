@@ -30,8 +30,11 @@ LONGEST_ARGUMENTS: Final = 1_000  # characters
 _LONGEST_OUTCOME: Final = 300
 _SHORTEST_SECRET: Final = 4  # a shorter one would blacken words of the outcome
 _SECRET: Final = re.compile(
-    r"token|passw|secret|credential|(^|[_\W])key|key$|apikey", re.IGNORECASE
+    r"token|passw|passphrase|secret|credential|authori[sz]ation|bearer|"
+    r"(^|[_\W])(pwd|pass|auth)($|[_\W\d])|(^|[_\W])key|key$|apikey",
+    re.IGNORECASE,
 )
+_PASSWORD: Final = re.compile(r"(?<=://)[^/\s:@\"']*:[^/\s@\"']+(?=@)")  # of an address
 _LEFT_OUT: Final = "(left out)"
 _BEGIN: Final = (
     "INSERT INTO request (uuid, wall_time_s, client, client_version, transport, tool, arguments, "
@@ -201,6 +204,7 @@ class OpenRequest:
         if error is not None:
             known = isinstance(error, Exception)  # else the client has cancelled it, or left
             self.outcome = f"{type(error).__name__}: {error}" if known else "cancelled"
+        self.outcome = _PASSWORD.sub(_LEFT_OUT, self.outcome)
         for secret in _secrets_in(self._arguments):
             self.outcome = self.outcome.replace(secret, _LEFT_OUT)
         with suppress(DatabaseError), self.recording.writer() as connection:
@@ -260,7 +264,7 @@ def newest_requests(
 
 
 def _recorded(arguments: Mapping[str, Any]) -> str:
-    text = _as_json(_without_secrets(arguments))
+    text = _PASSWORD.sub(_LEFT_OUT, _as_json(_without_secrets(arguments)))
     return text if len(text) <= LONGEST_ARGUMENTS else _as_json({"cut": text[:LONGEST_ARGUMENTS]})
 
 
@@ -282,17 +286,16 @@ def _without_secrets(value: Any) -> Any:
     return value
 
 
-def _secrets_in(value: Any) -> Generator[str]:
+def _secrets_in(value: Any, *, is_secret: bool = False) -> Generator[str]:
     """The texts that are left out: an error may repeat them."""
     if isinstance(value, Mapping):
         for name, each in cast("Mapping[Any, Any]", value).items():
-            if not _SECRET.search(str(name)):
-                yield from _secrets_in(each)
-            elif len(str(each)) >= _SHORTEST_SECRET:
-                yield str(each)
+            yield from _secrets_in(each, is_secret=is_secret or bool(_SECRET.search(str(name))))
     elif isinstance(value, (list, tuple)):
         for each in cast("Sequence[Any]", value):
-            yield from _secrets_in(each)
+            yield from _secrets_in(each, is_secret=is_secret)
+    elif is_secret and len(str(value)) >= _SHORTEST_SECRET:
+        yield str(value)
 
 
 def _bounded(text: str) -> str:

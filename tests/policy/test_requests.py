@@ -87,8 +87,13 @@ async def test_a_request_is_a_row_with_who_asked_how_for_what_and_what_became_of
     async with client_of(file) as client:
         answer = await ask(client, "webots_set_parameters", values={"kp": 3})
         await client.call_tool("webots_get_robot_state", {})  # reads, and is none
-        secret = {"api_key": {"a": "hunter22"}, "nested": [{"Password": "hunter23"}],
-                  "auth": "hunter24", "at": "s3://ada:hunter25@host/x", "speed": "hunter22"}  # fmt: skip
+        secret = {
+            "api_key": {"a": "hunter22"},
+            "nested": [{"Password": "hunter23"}],
+            "auth": "hunter24",
+            "at": "s3://ada:hunter25@host/x",
+            "speed": "hunter22",
+        }
         said = await fail(client, "webots_send_command", action="set_speed", params=secret)
         await client.call_tool("webots_send_command", {"action": "x", "params": {"a": "ä" * 9000}})
         allow(project, "[allow]\n\nactions = ['run']  # no more\n")
@@ -133,6 +138,8 @@ async def test_the_timeline_and_the_lane_of_commands_say_who_asked_and_what_was_
         allow(project, "[allow]\nactions = []\n")
         await fail(client, "webots_simulation_control", command="pause")
         found = await ask(client, "webots_find_events", what="timeline", kinds=["command"])
+        report = await ask(client, "webots_report")
+    assert "line 2: actions = []" in Path(report["file"]).read_text("utf-8")
     told = json.dumps(found)
     assert told.count("an assistant (stdio)") == 2 and "webots_simulation_control" in told
     assert '"status": "refused"' in told and "line 2: actions = []" in told

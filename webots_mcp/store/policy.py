@@ -107,7 +107,8 @@ class Policy:
             return
         given = Path(str(world))
         if not given.is_absolute():  # a controller would take it from another folder than this one
-            raise self._refusal("worlds", f"{str(world)!r:.100} is no full path of a world, and so")
+            said = f"{str(world)!r:.100} is no full path of a world, and so not allowed"
+            raise self._refusal("worlds", said)
         try:
             file = full_path(given)
         except OSError:

@@ -319,6 +319,15 @@ def test_what_init_writes_is_valid_allows_what_a_reset_undoes_and_no_more(projec
     assert not policy_file(project).is_needed, "a file that is there is kept"
 
 
+def test_a_pattern_with_many_stars_is_decided_at_once_of_any_name(project: Path) -> None:
+    policy = allow(project, "[allow]\nactions = ['*a*a*a*a*b', 'ab*ba']\n")
+    policy.require("a" * 9000 + "b", {})
+    policy.require("abba", {})
+    for name in ("a" * 9000, "aba", "abb", "xabba", "abbax"):
+        with pytest.raises(NotAllowedError):
+            policy.require(name, {})
+
+
 def test_whatever_queues_a_command_or_starts_webots_asks_for_permission_first() -> None:
     """A new caller has to be looked at, and entered here."""
     doing = re.compile(r"\.enqueue\(|\bLaunch\(|\bgive_order,|\bload_world, address|\bpress,")

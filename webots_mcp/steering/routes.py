@@ -630,7 +630,7 @@ class WorldRequest(Request):
         """
         ours = self.launcher.running
         if ours is not None and await self._is_meant(ours):
-            await self._permit("quit", {})
+            await self._permit(LAUNCH, {"world": str(ours.world)})  # so ended by who may start it
             await to_thread.run_sync(self.launcher.stop)
             evidence = f"its processes have ended, exit code {ours.webots.exit_code}"
             return self._answer("quit", "process", evidence)

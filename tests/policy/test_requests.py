@@ -87,7 +87,13 @@ async def test_a_request_is_a_row_with_who_asked_how_for_what_and_what_became_of
     async with client_of(file) as client:
         answer = await ask(client, "webots_set_parameters", values={"kp": 3})
         await client.call_tool("webots_get_robot_state", {})  # reads, and is none
-        secret = {"api_key": "hunter22", "nested": [{"Password": "hunter23"}], "speed": "hunter22"}
+        secret = {
+            "api_key": {"a": "hunter22"},
+            "nested": [{"Password": "hunter23"}],
+            "auth": "hunter24",
+            "at": "s3://ada:hunter25@host/x",
+            "speed": "hunter22",
+        }
         said = await fail(client, "webots_send_command", action="set_speed", params=secret)
         await client.call_tool("webots_send_command", {"action": "x", "params": {"a": "ä" * 9000}})
         allow(project, "[allow]\n\nactions = ['run']  # no more\n")
@@ -104,7 +110,8 @@ async def test_a_request_is_a_row_with_who_asked_how_for_what_and_what_became_of
     assert "hunter" in said, "who asked is answered with what was wrong"
     left_out = {"api_key": "(left out)", "nested": [{"Password": "(left out)"}]}
     assert hidden["arguments"]["params"] | left_out == hidden["arguments"]["params"]
-    assert "hunter23" not in json.dumps(hidden)
+    assert json.dumps(hidden).count("hunter") == 1, "where no name says that it is a secret"
+    assert hidden["arguments"]["params"]["at"] == "s3://(left out)@host/x"
     assert 0 < len(json.dumps(long["arguments"], ensure_ascii=False)) < LONGEST_ARGUMENTS + 100
     at = f"{project / 'webots-mcp.toml'}, line 3: actions = ['run']"
     assert at in refusal and "the person whose project it is can change that line" in refusal
@@ -131,6 +138,8 @@ async def test_the_timeline_and_the_lane_of_commands_say_who_asked_and_what_was_
         allow(project, "[allow]\nactions = []\n")
         await fail(client, "webots_simulation_control", command="pause")
         found = await ask(client, "webots_find_events", what="timeline", kinds=["command"])
+        report = await ask(client, "webots_report")
+    assert "line 2: actions = []" in Path(report["file"]).read_text("utf-8")
     told = json.dumps(found)
     assert told.count("an assistant (stdio)") == 2 and "webots_simulation_control" in told
     assert '"status": "refused"' in told and "line 2: actions = []" in told
@@ -210,6 +219,20 @@ async def test_neither_another_folder_nor_a_new_project_below_leads_round_the_fi
     allow(project, "[allow]\nlaunch = false\n")
     assert await run("launch", str(project / "worlds" / "a.wbt"), "--data-dir", str(elsewhere)) == 2
     assert {each["outcome"] for each in requests_in(file)} == {"refused"}
+
+
+@pytest.mark.usefixtures("robot")
+async def test_the_file_binds_a_project_whose_robots_record_outside_of_it(
+    file: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    away = tmp_path_factory.mktemp("away")  # as by a linked mcp_data, or WEBOTS_MCP_DATA_DIR
+    (away / "worlds").mkdir()
+    allow(away, "\ufeff[allow]\nactions = ['keep']\n")
+    with closing(connect(file, "writer")) as connection:
+        connection.execute("UPDATE run SET world = ?", (str(away / "worlds" / "a.wbt"),))
+    async with client_of(file) as client:
+        said = await fail(client, "webots_set_parameters", values={"kp": 3})
+        assert f"{away / 'webots-mcp.toml'}, line 2: actions = ['keep']" in said
 
 
 @pytest.mark.usefixtures("robot")
@@ -296,6 +319,15 @@ def test_what_init_writes_is_valid_allows_what_a_reset_undoes_and_no_more(projec
     assert not policy_file(project).is_needed, "a file that is there is kept"
 
 
+def test_a_pattern_with_many_stars_is_decided_at_once_of_any_name(project: Path) -> None:
+    policy = allow(project, "[allow]\nactions = ['*a*a*a*a*b', 'ab*ba']\n")
+    policy.require("a" * 9000 + "b", {})
+    policy.require("abba", {})
+    for name in ("a" * 9000, "aba", "abb", "xabba", "abbax"):
+        with pytest.raises(NotAllowedError):
+            policy.require(name, {})
+
+
 def test_whatever_queues_a_command_or_starts_webots_asks_for_permission_first() -> None:
     """A new caller has to be looked at, and entered here."""
     doing = re.compile(r"\.enqueue\(|\bLaunch\(|\bgive_order,|\bload_world, address|\bpress,")
@@ -310,9 +342,9 @@ def test_whatever_queues_a_command_or_starts_webots_asks_for_permission_first() 
                 source = "\n".join(lines[node.lineno - 1 : node.end_lineno])
                 if doing.search(source):
                     functions[f"{file.name}:{node.name}"] = source
-    # What ends or undoes something, `_by_websocket`'s part, and programs of a person's own.
+    # What ends or undoes something, `_by_websocket`'s part, and `prove` in a project of its own.
     free = {"dispatch.py:_leave", "trial_worker.py:_cancel", "trial_worker.py:_ask_back",
-            "routes.py:_give"}  # fmt: skip
+            "routes.py:_give", "bench.py:webots"}  # fmt: skip
     asking = {name for name, source in functions.items() if "permit(" in source}
     own = {name for name in functions if name.startswith(("testing.py", "queue.py"))}
     assert functions.keys() - asking - own == free, "who does it without asking?"

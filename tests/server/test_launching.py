@@ -25,6 +25,7 @@ from tests.webots.conftest import (
 )
 from webots_mcp.server import create_server
 from webots_mcp.setup import apply
+from webots_mcp.setup.client_entries import policy_file
 from webots_mcp.setup.project_edits import controller_change, with_observer
 
 pytestmark = pytest.mark.anyio
@@ -100,6 +101,17 @@ async def test_webots_ends_with_the_server_that_started_it(begin: Begin) -> None
     async with begin() as client:
         family = _family(await ask(client, "webots_launch_world", world="arena.wbt", headless=True))
     await until(lambda: _are_gone(family))
+
+
+async def test_what_init_allows_is_enough_to_start_a_world_and_to_end_it(
+    begin: Begin, project: Path
+) -> None:
+    async with begin() as client:
+        apply(policy_file(project))
+        await ask(client, "webots_launch_world", world="arena.wbt", headless=True)
+        refusal = await fail(client, "webots_load_world", world="field.wbt")
+        assert "'load_world' is not allowed" in refusal
+        assert (await ask(client, "webots_quit"))["route"] == "process"
 
 
 async def test_where_nobody_records_the_answer_comes_in_time_and_says_why(begin: Begin) -> None:

@@ -155,6 +155,9 @@ async def test_a_webots_of_another_project_is_steered_only_if_its_port_is_named(
             assert f"{way}: the Webots that runs here is not of this recording's project" in text
         assert f"{world} at port {port}" in text
         answer = await control(client, "pause", port=port)
+        (world.parents[1] / "webots-mcp.toml").write_text("[allow]\nactions = ['resume']\n")
+        text = await fail(client, "webots_simulation_control", command="pause", port=port)
+        assert "another/webots-mcp.toml, line 2: actions = ['resume']" in Path(text).as_posix()
     assert (answer["route"], answer["outcome"]) == ("websocket", "done")
 
 

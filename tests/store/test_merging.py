@@ -155,6 +155,18 @@ def test_a_robot_that_records_here_just_now_keeps_its_name_for_itself(
     assert target.execute(robots).fetchall() == [("rover#2",)]
 
 
+def test_no_command_that_waits_in_another_recording_is_run_here(
+    target: sqlite3.Connection, source: Path, tmp_path: Path
+) -> None:
+    with closing(connect(source, "writer")) as there:
+        there.execute("UPDATE command SET status = 'pending', expires_wall_time_s = 1e12")
+
+    merge(target, tmp_path / "here", source)
+
+    waiting = "SELECT count(*) FROM command WHERE status = 'pending'"
+    assert target.execute(waiting).fetchone() == (0,)
+
+
 def test_what_goes_on_is_refused(target: sqlite3.Connection, source: Path, tmp_path: Path) -> None:
     with closing(connect(source, "writer")) as there:
         there.execute("UPDATE session SET ended_wall_time_s = NULL WHERE id = 2")

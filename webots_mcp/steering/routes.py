@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -89,9 +88,16 @@ class Request:
         answer.waited_s = self._waited_s
         return answer
 
-    async def _permit(self, action: str, params: Mapping[str, Any]) -> None:
-        """Before it is done without a command; see `permit`."""
-        ask = partial(permit, self.recording, action, params, create=True)
+    async def _permit(
+        self, action: str, params: Mapping[str, Any], port: int | None = None
+    ) -> None:
+        """Before it is done without a command, by a Webots that may be of another project."""
+
+        def ask() -> None:
+            found = instance_at(port) if port else None
+            world = found.world if found else None
+            permit(self.recording, action, params, create=True, steered=world)
+
         await to_thread.run_sync(ask)
 
     def _header(self, robot: str) -> dict[str, Any]:
@@ -243,7 +249,7 @@ class Attempt(Request):
     async def _by_websocket(self, situation: Situation) -> CommandAnswer | None:
         try:
             address = await to_thread.run_sync(find_webots, self.recording, situation)
-            await self._permit(self.order, self.params)
+            await self._permit(self.order, self.params, address.port)
             reply, made = await self._give(address)
         except CommandRefusedError as error:
             self.failed_routes["websocket"] = str(error)
@@ -293,9 +299,9 @@ class Attempt(Request):
             self.failed_routes["keyboard"] = _NO_FORCE
             return None
         try:
-            pid = await to_thread.run_sync(_window_owner, self.recording, situation)
-            await self._permit(self.order, self.params)
-            await to_thread.run_sync(press, self.order, pid)
+            found = await to_thread.run_sync(_window, self.recording, situation)
+            await self._permit(self.order, self.params, found.port)
+            await to_thread.run_sync(press, self.order, found.pid)
         except CommandRefusedError as error:
             self.failed_routes["keyboard"] = str(error)
             return None
@@ -457,12 +463,12 @@ def find_webots(recording: Recording, situation: Situation) -> WebotsAddress:
     return _only(same or ours, running).address
 
 
-def _window_owner(recording: Recording, situation: Situation) -> int:
-    """The id of the process whose window receives the keys."""
+def _window(recording: Recording, situation: Situation) -> Instance:
+    """The Webots whose window receives the keys."""
     address = find_webots(recording, situation)
     found = instance_at(address.port)
     if found is not None and found.address == address:  # another machine may use the same port
-        return found.pid
+        return found
     raise CommandRefusedError(f"no Webots of this machine listens at {address}")
 
 
@@ -624,7 +630,7 @@ class WorldRequest(Request):
         """
         ours = self.launcher.running
         if ours is not None and await self._is_meant(ours):
-            await self._permit("quit", {})
+            await self._permit(LAUNCH, {"world": str(ours.world)})  # so ended by who may start it
             await to_thread.run_sync(self.launcher.stop)
             evidence = f"its processes have ended, exit code {ours.webots.exit_code}"
             return self._answer("quit", "process", evidence)

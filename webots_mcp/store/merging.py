@@ -75,10 +75,11 @@ _UNFIT: Final = (
     "(SELECT ended_wall_time_s IS NULL FROM source.run WHERE id = :run) END, "
     "(SELECT count(*) FROM source.run WHERE uuid IS NULL AND id = :run)"
 )
-# Those of one run: what its parameters were set by, and what was claimed while it went on.
+# Those of one run: what its parameters were set by, and what was claimed while it went on. One
+# that waits would be claimed here, and nobody here has asked for it.
 _COMMANDS: Final = (
     "SELECT id, created_wall_time_s, action, params FROM source.command c "
-    "WHERE session_id = :session AND (:run IS NULL "
+    "WHERE session_id = :session AND status <> 'pending' AND (:run IS NULL "
     "OR id IN (SELECT command_id FROM source.parameter_value WHERE run_id = :run) "
     "OR EXISTS (SELECT 1 FROM source.run r WHERE r.id = :run "
     "AND coalesce(c.claimed_wall_time_s, c.created_wall_time_s) >= r.started_wall_time_s "

@@ -107,7 +107,8 @@ class Policy:
             return
         given = Path(str(world))
         if not given.is_absolute():  # a controller would take it from another folder than this one
-            raise self._refusal("worlds", f"{str(world)!r:.100} is no full path of a world, and so")
+            said = f"{str(world)!r:.100} is no full path of a world, and so not allowed"
+            raise self._refusal("worlds", said)
         try:
             file = full_path(given)
         except OSError:
@@ -148,8 +149,18 @@ class Policy:
 
 
 def _fits(pattern: str, name: str) -> bool:
-    """Whether a pattern is of a name: `*` is any text, and nothing else is special."""
-    return re.fullmatch(".*".join(map(re.escape, pattern.split("*"))), name, re.DOTALL) is not None
+    """Whether a pattern is of a name: `*` is any text, and nothing else is special.
+
+    In one pass: a regular expression tries all ways, which a long name makes many.
+    """
+    first, *parts = pattern.split("*")
+    if not parts:
+        return name == first
+    at = len(first) if name.startswith(first) else -1
+    for part in parts[:-1]:
+        found = name.find(part, at) if at >= 0 else -1
+        at = found + len(part) if found >= 0 else -1
+    return at >= 0 and name.endswith(parts[-1], at)
 
 
 def _is_within(value: object, rule: Any) -> bool:
@@ -178,7 +189,7 @@ def line_of(text: str, key: str, inside: str | None = None) -> int:
     return found
 
 
-def policies_of(database: Database, data_dir: Path, world: object = None) -> Iterator[Policy]:
+def policies_of(database: Database, data_dir: Path, files: Iterable[str]) -> Iterator[Policy]:
     """Those of each `webots-mcp.toml` in or above the folders that a request is about; all hold.
 
     Not only that of the project: which folder is one can be changed by making folders in it.
@@ -186,13 +197,14 @@ def policies_of(database: Database, data_dir: Path, world: object = None) -> Ite
     Args:
         database: Of the recording; the file beside it holds wherever its pictures are.
         data_dir: The folder of its pictures.
-        world: The file of a world that is started or opened.
+        files: Of the world that is started or opened, and of those that are live with their
+            controllers: what they record may lie outside of their project.
 
     Raises:
         NotAllowedError: A file is invalid: as long as it is, nothing is allowed.
     """
     below = [database.parent] if isinstance(database, Path) else []
-    below += [data_dir, *([Path(str(world)).parent] if world else [])]
+    below += [data_dir, *(Path(each).parent for each in files)]
     folders = (folder for each in below for folder in (each, *each.parents))
     for folder in dict.fromkeys(folders):
         file = folder / PROJECT_FILE

@@ -80,7 +80,7 @@ def load_toml(file: Path) -> tuple[str, dict[str, Any]]:
     """
     toml: Any = import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
     try:
-        text = file.read_text("utf-8")
+        text = file.read_text("utf-8-sig")  # with the mark that editors of Windows put before it
         return text, cast("dict[str, Any]", toml.loads(text))
     except (ValueError, RecursionError) as error:  # also what is not UTF-8
         raise InvalidInputError(f"{file} is no TOML: {error}") from error

@@ -14,6 +14,7 @@ import time
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, NamedTuple, cast
 
@@ -29,8 +30,11 @@ LONGEST_ARGUMENTS: Final = 1_000  # characters
 _LONGEST_OUTCOME: Final = 300
 _SHORTEST_SECRET: Final = 4  # a shorter one would blacken words of the outcome
 _SECRET: Final = re.compile(
-    r"token|passw|secret|credential|(^|[_\W])key|key$|apikey", re.IGNORECASE
+    r"token|passw|passphrase|secret|credential|authori[sz]ation|bearer|"
+    r"(^|[_\W])(pwd|pass|auth)($|[_\W\d])|(^|[_\W])key|key$|apikey",
+    re.IGNORECASE,
 )
+_PASSWORD: Final = re.compile(r"(?<=://)[^/\s:@\"']*:[^/\s@\"']+(?=@)")  # of an address
 _LEFT_OUT: Final = "(left out)"
 _BEGIN: Final = (
     "INSERT INTO request (uuid, wall_time_s, client, client_version, transport, tool, arguments, "
@@ -39,6 +43,10 @@ _BEGIN: Final = (
     "r.last_sim_time_s) FROM (SELECT 1) LEFT JOIN (SELECT run.* FROM run JOIN robot b "
     "ON b.id = run.robot_id WHERE run.ended_wall_time_s IS NULL "
     "AND (:robot IS NULL OR b.name = :robot) ORDER BY run.id DESC LIMIT 1) r"
+)
+_LIVE: Final = (
+    "SELECT world FROM run WHERE ended_wall_time_s IS NULL AND world IS NOT NULL UNION SELECT "
+    "controller FROM session WHERE ended_wall_time_s IS NULL AND controller IS NOT NULL"
 )
 _REFUSE: Final = "UPDATE request SET rule = ? WHERE id = ?"
 _END: Final = "UPDATE request SET finished_wall_time_s = ?, outcome = ? WHERE id = ?"
@@ -129,15 +137,15 @@ class OpenRequest:
         with suppress(NoDatabaseError):
             self._insert()
 
-    def require(self, action: str, params: Mapping[str, Any]) -> None:
-        """See that the policy allows an action.
+    def require(self, action: str, params: Mapping[str, Any], steered: Path | None = None) -> None:
+        """See that the policy allows an action; see `permit`.
 
         Raises:
             NotAllowedError: It does not; the row says so.
         """
         world = params.get("world") if action in (LAUNCH, "load_world") else None
         with self._refusing():
-            for each in self._policies(world):
+            for each in self._policies(*(str(file) for file in (world, steered) if file)):
                 each.require(action, params)
 
     def _begin(self) -> None:
@@ -146,9 +154,12 @@ class OpenRequest:
                 each.require_tool(self._names)
         self.enter()
 
-    def _policies(self, world: object = None) -> list[Policy]:
+    def _policies(self, *files: str) -> list[Policy]:
         """Those that bind who asks; what only reads goes on while one is invalid."""
-        found = policies_of(self.recording.database, self.recording.data_dir, world)
+        if not self._reads:  # which is begun in the event loop
+            with suppress(NoDatabaseError), self.recording.reader() as connection:
+                files += tuple(file for (file,) in connection.execute(_LIVE).fetchall())
+        found = policies_of(self.recording.database, self.recording.data_dir, files)
         try:
             return [each for each in found if each.holds_for(self._by.transport)]
         except NotAllowedError:
@@ -193,6 +204,7 @@ class OpenRequest:
         if error is not None:
             known = isinstance(error, Exception)  # else the client has cancelled it, or left
             self.outcome = f"{type(error).__name__}: {error}" if known else "cancelled"
+        self.outcome = _PASSWORD.sub(_LEFT_OUT, self.outcome)
         for secret in _secrets_in(self._arguments):
             self.outcome = self.outcome.replace(secret, _LEFT_OUT)
         with suppress(DatabaseError), self.recording.writer() as connection:
@@ -203,7 +215,12 @@ _open: Final[ContextVar[OpenRequest]] = ContextVar("request")
 
 
 def permit(
-    recording: Recording, action: str, params: Mapping[str, Any], *, create: bool = False
+    recording: Recording,
+    action: str,
+    params: Mapping[str, Any],
+    *,
+    create: bool = False,
+    steered: Path | None = None,
 ) -> int | None:
     """See that what is about to be done is allowed, and that there is a row of who asked for it.
 
@@ -212,6 +229,7 @@ def permit(
         action: As a command names it, or `policy.LAUNCH`.
         params: Its parameters.
         create: Make the database if there is none: it is done without one.
+        steered: The world of the Webots that does it, which may be of another project.
 
     Returns:
         The id of the request's row; None where it only reads, or where there is no database yet.
@@ -221,7 +239,7 @@ def permit(
         LookupError: Nobody has begun a request, which is a defect.
     """
     request = _open.get()
-    request.require(action, params)
+    request.require(action, params, steered)
     request.enter(create=create)
     return request.id
 
@@ -246,7 +264,7 @@ def newest_requests(
 
 
 def _recorded(arguments: Mapping[str, Any]) -> str:
-    text = _as_json(_without_secrets(arguments))
+    text = _PASSWORD.sub(_LEFT_OUT, _as_json(_without_secrets(arguments)))
     return text if len(text) <= LONGEST_ARGUMENTS else _as_json({"cut": text[:LONGEST_ARGUMENTS]})
 
 
@@ -268,17 +286,16 @@ def _without_secrets(value: Any) -> Any:
     return value
 
 
-def _secrets_in(value: Any) -> Generator[str]:
+def _secrets_in(value: Any, *, is_secret: bool = False) -> Generator[str]:
     """The texts that are left out: an error may repeat them."""
     if isinstance(value, Mapping):
         for name, each in cast("Mapping[Any, Any]", value).items():
-            if not _SECRET.search(str(name)):
-                yield from _secrets_in(each)
-            elif len(str(each)) >= _SHORTEST_SECRET:
-                yield str(each)
+            yield from _secrets_in(each, is_secret=is_secret or bool(_SECRET.search(str(name))))
     elif isinstance(value, (list, tuple)):
         for each in cast("Sequence[Any]", value):
-            yield from _secrets_in(each)
+            yield from _secrets_in(each, is_secret=is_secret)
+    elif is_secret and len(str(value)) >= _SHORTEST_SECRET:
+        yield str(value)
 
 
 def _bounded(text: str) -> str:

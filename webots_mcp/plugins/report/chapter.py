@@ -378,10 +378,11 @@ def _commands(connection: sqlite3.Connection, stored: Found) -> Grid:
     answer = commands.told(connection, MOST_EVENTS)
     rows = [
         Row([
-            time_at(each.start_s), str(each.details["id"]), each.name or "",
+            time_at(each.start_s), str(each.details.get("id", "")), each.name or "",
             valued(each.details.get("params") or {}), each.details["status"],
             number(each.details.get("took_wall_s")),
-            cut(str(each.details.get("error") or spelled(each.details.get("result", "")))),
+            cut(str(each.details.get("error") or each.details.get("rule")
+                    or spelled(each.details.get("result", "")))),
         ], _mark(each))
         for each in answer.events
     ]  # fmt: skip

@@ -10,7 +10,14 @@ from typing import Any, Final, NamedTuple
 
 from webots_mcp.connection import transaction
 from webots_mcp.console import as_row
-from webots_mcp.contract import WORLD_ENDING, find_project, full_path, host_name, require_world_of
+from webots_mcp.contract import (
+    OBSERVER_NAME,
+    WORLD_ENDING,
+    find_project,
+    full_path,
+    host_name,
+    require_world_of,
+)
 from webots_mcp.errors import InvalidInputError, NoDatabaseError
 from webots_mcp.setup import controllers_in, has_bridge
 from webots_mcp.store.logs import ConsoleRows
@@ -185,7 +192,7 @@ def why_silent(
     names = controllers_in(world)
     own = [name for name in names if name not in _NOBODYS and (folder / name).is_dir()]
     missing = [name for name in names if name not in (*_NOBODYS, *own)]
-    without = [name for name in own if not has_bridge(folder / name)]
+    without = [name for name in own if name != OBSERVER_NAME and not has_bridge(folder / name)]
     reasons = list[str]()
     if _EXTERN in names:
         reasons.append(f"a robot has the controller <extern>: {extern}")

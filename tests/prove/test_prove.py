@@ -17,9 +17,8 @@ import pytest
 
 from tests.webots.program import put_on_path
 from webots_mcp.contract import host_name
-from webots_mcp.plugins.prove.bench import Bench
+from webots_mcp.plugins.prove.bench import Bench, tried
 from webots_mcp.plugins.prove.checks import CHECKS, NOT_TRIED, check_launch
-from webots_mcp.plugins.prove.prove_command import tried
 from webots_mcp.webots import HOME_VARIABLE
 
 posix = pytest.mark.skipif(os.name != "posix", reason="the program `webots` is a script")
@@ -117,11 +116,15 @@ def test_a_webots_that_is_otherwise_is_told_with_what_was_seen_and_what_works_st
 def test_a_webots_that_never_runs_a_controller_costs_one_start_and_not_one_for_each_check(
     prove: Prove, home: Path
 ) -> None:
-    (home / "webots").write_text("#!/bin/sh\nexec sleep 600\n", "utf-8")
-    code, found = prove("launch", "pause", "screenshot", "reload", patience_s=2)
+    says_a_place = "#!/bin/sh\necho '/opt/somebody/webots-bin: no Qt' >&2\nexec sleep 600\n"
+    (home / "webots").write_text(says_a_place, "utf-8")
+    code, found = prove("launch", "options", "layout", "reload", patience_s=2)
     assert code == 1
     assert [*outcomes(found).values()] == ["otherwise", "not tried", "not tried", "not tried"]
-    assert "does not listen" in seen(found, "launch")
+    said = seen(found, "launch")
+    assert "does not listen" in said
+    assert "its console has: webots-bin: no Qt" in said
+    assert "without a bridge: speaker (" in said, "an observer records"
 
 
 @posix
@@ -138,17 +141,17 @@ def test_a_check_that_hangs_is_given_up_and_the_next_one_has_a_webots_again(
         webots = bench.webots()
         free.wait()
         late.append(f"Webots ended: {webots.is_over}")
-        bench.rover()
+        bench.row()
 
     try:
-        found = tried(check_launch, bench, {})
+        found = tried(check_launch, bench)
         assert found["outcome"] == "as expected", found
         bench.patience_s = 1
-        found = tried(check_stuck, bench, {}, limit_s=0.5)
+        found = tried(check_stuck, bench, limit_s=0.5)
         assert (found["outcome"], found["seen"]) == ("otherwise", "it hung for 0.5 s")
         stuck = bench.user
         bench.patience_s = 60
-        assert tried(check_launch, bench, {str(home): "WEBOTS"})["outcome"] == "as expected"
+        assert tried(check_launch, bench)["outcome"] == "as expected"
         free.set()
         stuck.join()
         assert late == ["Webots ended: True"]

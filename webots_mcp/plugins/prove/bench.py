@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import getpass
 import json
+import re
 import shutil
 import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
 from webots_mcp.cli.asking import ask
 from webots_mcp.cli.options import Where
-from webots_mcp.contract import DATA_DIR_VARIABLE, OBSERVER_NAME, PROJECT_DATA_FOLDER
+from webots_mcp.contract import DATA_DIR_VARIABLE, PROJECT_DATA_FOLDER, host_name
 from webots_mcp.errors import NoDatabaseError, WebotsMCPError
 from webots_mcp.launch import Launch
 from webots_mcp.questions.control_simulation import webots_simulation_control
@@ -30,18 +33,18 @@ SPEAKER: Final = "speaker"
 SOON_S: Final = 10.0
 REAL_TIME: Final = 1  # of simulationGetMode
 _LOOK_EVERY_S: Final = 0.03
-_STANDS_S: Final = 0.5
-_MOVES_S: Final = 2.0
-_HEADER: Final = "#VRML_SIM R2023b utf8\n"
-_SIGN: Final = 'EXTERNPROTO "../protos/Sign.proto"\n'
-_NODES: Final = """
-Robot { translation 1.5 -1.5 0.1 name "speaker" controller "speaker" }
-DEF SIGN Sign { translation 1.5 1.5 0.2 }
-"""
+_LIMIT_S: Final = 300.0  # of a check, beside a start
+_LONGEST: Final = 500
+_USUAL: Final = {"robot": ROVER, "timeout_wall_s": SOON_S}
+_FOLDER: Final = re.compile(
+    r"""(?<![\w/\\])(?:[A-Za-z]:(?:[/\\][^/\\:*?"<>|\n]+)*|(?:~|[A-Z]{4,})?(?:/[^\s/:'"]+)+)[/\\]"""
+)
+_LAST_ROW: Final = "SELECT coalesce(max(id), 0) FROM state"
 _NEWEST: Final = (
     "SELECT s.id, s.pid, run.id, run.world, state.sim_time_s, state.data "
     "FROM state JOIN run ON run.id = state.run_id JOIN session s ON s.id = run.session_id "
-    "JOIN robot ON robot.id = s.robot_id WHERE robot.name = ? ORDER BY state.id DESC LIMIT 1"
+    "JOIN robot ON robot.id = s.robot_id WHERE robot.name = ? AND state.id > ? "
+    "ORDER BY state.id DESC LIMIT 1"
 )
 
 
@@ -98,9 +101,8 @@ class Bench:
         self.where = Where(data_dir=folder / PROJECT_DATA_FOLDER)
         self.recording = self.where.recording(read_only=False)
         self._launch: Launch | None = None
-        self._runs: tuple[bool, Mode] = False, "realtime"
-        self._never = set[tuple[bool, Mode]]()
-        self._at_start = dict[str, Moment | None]()
+        self._never = set[tuple[bool, Mode | None]]()
+        self._last_row = 0  # before Webots was started
 
     # -- Webots --
 
@@ -114,40 +116,34 @@ class Bench:
             NotTriedError: It has not before either.
         """
         launch = self._launch
-        runs: tuple[bool, Mode] = stream, mode
-        if launch is None or launch.webots.is_over or self._runs != runs or port:
-            self.end()
-            if runs in self._never:
-                raise NotTriedError("a Webots that was started so has not recorded")
-            self._at_start = {name: self.newest(name) for name in (ROVER, SPEAKER, OBSERVER_NAME)}
-            start = Start(self.world, mode, headless=True, streams=stream, port=port or free_port())
-            environment = {DATA_DIR_VARIABLE: str(self.recording.data_dir)}
-            self._runs = runs
-            launch = self._launch = Launch(self.recording, start, environment, lambda line: None)
-            if mode != "pause":
-                self._wait_for_first_row(launch)
+        runs: tuple[bool, Mode | None] = stream, mode
+        is_there = launch and not launch.webots.is_over and not port
+        if launch and is_there and (launch.start.streams, launch.start.mode) == runs:
+            return launch.webots
+        self.end()
+        if runs in self._never:
+            raise NotTriedError("a Webots that was started so has not recorded")
+        ((self._last_row,),) = self.rows(_LAST_ROW) or [(0,)]
+        start = Start(self.world, mode, headless=True, streams=stream, port=port or free_port())
+        environment = {DATA_DIR_VARIABLE: str(self.recording.data_dir)}
+        launch = self._launch = Launch(self.recording, start, environment, lambda line: None)
+        until_s = time.monotonic() + self.patience_s
+        while mode != "pause" and not self.newest():
+            if launch.webots.is_over or time.monotonic() > until_s:
+                self._never.add(runs)
+                why = launch.silence()
+                self.end()
+                raise OtherwiseError(f"the rover records nothing after the start: {why}")
+            time.sleep(_LOOK_EVERY_S)
         return launch.webots
-
-    def _wait_for_first_row(self, launch: Launch) -> None:
-        def is_decided() -> bool:
-            return self.newest(ROVER) != self._at_start[ROVER] or launch.webots.is_over
-
-        try:
-            self.until(is_decided, "", self.patience_s)
-            require(self.newest(ROVER) != self._at_start[ROVER], "")
-        except OtherwiseError as error:
-            self._never.add(self._runs)
-            why = launch.silence()
-            self.end()
-            raise OtherwiseError(f"the rover records nothing after the start: {why}") from error
 
     def running(self, *, stream: bool) -> None:
         """Webots whose time goes on in real time."""
         self.webots(stream=stream)
-        if not self.moves(_MOVES_S) or self.rover().state["mode"] != REAL_TIME:
+        if not self.moves(2.0) or self.row().state["mode"] != REAL_TIME:
             self.control("resume")
             self.goes_on("it was told to resume")
-        self.before = self.rover()
+        self.before = self.row()
 
     def address(self) -> WebotsAddress:
         """Where it listens, as far as the system shows that."""
@@ -163,25 +159,14 @@ class Bench:
 
     # -- what it records --
 
-    def newest(self, robot: str) -> Moment | None:
-        """The newest row of a robot; None where it has none."""
-        found = self.rows(_NEWEST, robot)
+    def newest(self, robot: str = ROVER) -> Moment | None:
+        """The newest row of a robot since Webots was started; None where it has none."""
+        found = self.rows(_NEWEST, robot, self._last_row)
         return Moment._make((*found[0][:-1], json.loads(found[0][-1]))) if found else None
 
-    def rover(self) -> Moment:
-        """The newest row of the rover."""
-        return self.since_start(ROVER)
-
-    def since_start(self, robot: str) -> Moment:
+    def row(self, robot: str = ROVER) -> Moment:
         """The newest row of a robot, as soon as it has one since Webots was started."""
-        before = self._at_start.get(robot)
-
-        def look() -> Moment | None:
-            return found if (found := self.newest(robot)) != before else None
-
-        found = self.until(look, f"{robot} records nothing")
-        assert found is not None
-        return found
+        return self.until(lambda: self.newest(robot), f"{robot} records nothing")
 
     def rows(self, query: str, *values: object) -> list[tuple[Any, ...]]:
         """Of the recording; none before there is one."""
@@ -194,10 +179,11 @@ class Bench:
 
     def moves(self, within_s: float) -> bool:
         """Whether the rover's simulation time goes on within that wall time."""
-        before, until_s = self.rover(), time.monotonic() + within_s
-        while (now := self.rover())[2:5:2] == before[2:5:2] and time.monotonic() < until_s:
-            time.sleep(_LOOK_EVERY_S)
-        return now[2:5:2] != before[2:5:2]
+        before = self.row()
+        with suppress(OtherwiseError):
+            self.until(lambda: self.row()[2:5:2] != before[2:5:2], "", within_s)  # run and time
+            return True
+        return False
 
     def goes_on(self, what: str) -> None:
         """Fail where simulation time stands still after something."""
@@ -205,9 +191,9 @@ class Bench:
 
     def stands(self, what: str) -> None:
         """Fail where simulation time goes on after something; what is under way may end first."""
-        self.until(lambda: not self.moves(_STANDS_S), f"{what}, and simulation time goes on")
+        self.until(lambda: not self.moves(0.5), f"{what}, and simulation time goes on")
 
-    def until(self, look: Callable[[], T], otherwise: str, within_s: float = SOON_S) -> T:
+    def until(self, look: Callable[[], T | None], otherwise: str, within_s: float = SOON_S) -> T:
         """What a look finds, as soon as it is something.
 
         Raises:
@@ -228,11 +214,10 @@ class Bench:
             OtherwiseError: It was refused, or failed.
         """
         require(threading.current_thread() is self.user, "another check is made now")
-        usual = {"robot": ROVER, "timeout_wall_s": SOON_S}
-        known = {each.name for each in question.parameters}
-        given = {name: value for name, value in usual.items() if name in known} | given
+        names = {each.name for each in question.parameters}
+        usual = {name: value for name, value in _USUAL.items() if name in names}
         try:
-            data, shown = ask(question, given, self.where)
+            data, shown = ask(question, usual | given, self.where)
         except WebotsMCPError as error:
             raise OtherwiseError(str(error)) from error
         if data is None:
@@ -246,6 +231,13 @@ class Bench:
         answer = self.ask(webots_simulation_control, command=command, **given)
         require(answer["outcome"] == "done", f"{command} is {answer['outcome']}")
 
+    def refuses(self, question: Question, **given: Any) -> bool:
+        """Whether a question is refused, or fails."""
+        with suppress(OtherwiseError):
+            self.ask(question, **given)
+            return False
+        return True
+
     def send(self, action: str, waits_s: float = SOON_S, **params: Any) -> None:
         """Send the rover a command of its own; it may be under way afterwards."""
         self.ask(webots_send_command, action=action, params=params, timeout_wall_s=waits_s)
@@ -254,9 +246,9 @@ class Bench:
 def _write_project(folder: Path) -> Path:
     """The world with an observer, twice, and the controllers with the Python that runs this."""
     shutil.copytree(Path(__file__).parent / "project", folder)
-    world = folder / "worlds" / "proving.wbt"
-    world.parent.mkdir()
-    text = DEFAULT_WORLD.read_text("utf-8").replace(_HEADER, _HEADER + _SIGN, 1) + _NODES
+    world = folder / "worlds/proving.wbt"
+    header, _, nodes = DEFAULT_WORLD.read_text("utf-8").partition("\n")
+    text = f"{header}\n{world.read_text('utf-8')}".replace("NODES", nodes)
     for file in (world, world.with_name("second.wbt")):
         file.write_bytes(with_observer(text.encode()))
     observer = controller_change(folder)
@@ -265,3 +257,49 @@ def _write_project(folder: Path) -> Path:
         change.file.parent.mkdir(exist_ok=True)
         change.file.write_bytes(change.after)
     return world
+
+
+def tried(
+    check: Callable[[Bench], object], bench: Bench, limit_s: float = _LIMIT_S
+) -> dict[str, Any]:
+    """What came of a check: where it hangs, Webots is ended and its thread left alone.
+
+    Args:
+        check: One of `checks.CHECKS`.
+        bench: Its Webots.
+        limit_s: In so much time it is over, besides that of a start.
+    """
+    came = list[tuple[str, object]]()
+    kind = check.__name__.partition("_")[0]
+
+    def work() -> None:
+        try:
+            if kind != "check":
+                bench.running(stream=kind == "streaming")
+            came.append(("as expected", check(bench)))
+        except Exception as error:  # noqa: BLE001 - what an unknown Webots answers can be anything
+            is_tried = not isinstance(error, NotTriedError)
+            came.append(("otherwise" if is_tried else "not tried", error or type(error).__name__))
+
+    began_s = time.monotonic()
+    bench.user = threading.Thread(target=work, daemon=True)
+    bench.user.start()
+    bench.user.join(limit_s + bench.patience_s)
+    outcome, seen = (came or [("otherwise", f"it hung for {limit_s:g} s")])[0]
+    if not came:
+        bench.end()
+    answer = {"outcome": outcome, "seen": None if seen is None else _anonymous(str(seen))}
+    if outcome == "otherwise":
+        expected, _, then = (check.__doc__ or "").rstrip(".").partition("; otherwise ")
+        answer |= {"expected": expected, "works still": then}
+    return answer | {"took_s": round(time.monotonic() - began_s, 1)}
+
+
+def _anonymous(text: str) -> str:
+    """Without the folder of any file, and the names of the user and the machine; cut if long."""
+    names = {sys.prefix: "PYTHON", str(Path(__file__).parents[3]): "PACKAGE", host_name(): "HOST"}
+    with suppress(OSError, KeyError, RuntimeError):  # a user without a name or a home
+        names |= {str(Path.home()): "~", getpass.getuser(): "USER"}
+    for name in sorted(names, key=len, reverse=True):
+        text = re.sub(rf"(?<!\w){re.escape(name)}(?!\w)", names[name], text)
+    return _FOLDER.sub("", text)[:_LONGEST]

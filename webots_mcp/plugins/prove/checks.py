@@ -18,7 +18,6 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from io import BytesIO
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,20 +25,11 @@ from PIL import Image
 
 from webots_mcp.contract import OBSERVER_NAME
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.plugins.prove.bench import (
-    REAL_TIME,
-    ROVER,
-    SOON_S,
-    SPEAKER,
-    Bench,
-    Moment,
-    OtherwiseError,
-    require,
-)
+from webots_mcp.plugins.prove.bench import REAL_TIME, SOON_S, SPEAKER, Bench, Moment, require
 from webots_mcp.questions import control_simulation, edit_scene, send_command, show_pictures
 from webots_mcp.questions.answers import ShownPicture
 from webots_mcp.webots import PORTS_TRIED, find_webots, orders
-from webots_mcp.webots.starting import CommandLine, KeptProgram, free_port
+from webots_mcp.webots.starting import CommandLine, KeptProgram, Start, free_port
 
 NOT_TRIED: Final = {
     "keys": "keys reach a window only, and Webots was started without one",
@@ -48,11 +38,9 @@ NOT_TRIED: Final = {
     "slots": "the PROTO nodes of prove have none",
     "scene stream": "it would pause the simulation of whoever asks for it, and is never asked for",
 }
-_FAST: Final = 2
 _STEP_S: Final = 0.016
 _SAME: Final = 1e-6
 _LOAD_S: Final = 40.0  # until a world is there again
-_TRIALS_S: Final = 240.0
 _STALL_S: Final = 6.0
 _STATUS: Final = 7
 _MASS: Final = "BALL.physics.mass"
@@ -70,26 +58,29 @@ def check_installed(bench: Bench) -> str:
     return f"{found.version}, by {found.found_by}"
 
 
-def check_options(bench: Bench) -> str:
-    """An unknown option ends it with an exit code; otherwise launch says that nobody records."""
-    command = CommandLine([str(find_webots().program), "--batch", "--no-such-option"], [])
-    program = KeptProgram(command, {}, subprocess.DEVNULL, subprocess.DEVNULL)
-    try:
-        program.start()
-        return f"exit code {bench.until(lambda: program.exit_code, 'it ended with no code')}"
-    finally:
-        program.end()
-
-
 def check_launch(bench: Bench) -> str:
     """It takes our options, begins as asked, listens at --port; otherwise start it by hand."""
     began_s = time.monotonic()
     webots = bench.webots()
-    took_s, mode = time.monotonic() - began_s, bench.rover().state["mode"]
+    took_s, mode = time.monotonic() - began_s, bench.row().state["mode"]
     require(mode == REAL_TIME, f"--mode=realtime began in the mode {mode}")
     bench.until(webots.address_now, "no Webots that listens was found among its processes")
     by = "a display that was there" if os.environ.get("DISPLAY") else "xvfb-run or none"
     return f"first row after {took_s:.1f} s, with {by}"
+
+
+def running_options(bench: Bench) -> str:
+    """An unknown option ends it with an exit code; otherwise launch says that nobody records."""
+    words, display = Start(bench.world, None, True, False, free_port()).command_line()
+    command = CommandLine([*words, "--no-such-option"], display)
+    program = KeptProgram(command, {}, subprocess.DEVNULL, subprocess.DEVNULL)
+    try:
+        program.start()
+        bench.until(lambda: program.is_over, "it does not end")
+        require(program.exit_code, "it ended with exit code 0")
+        return f"exit code {program.exit_code}"
+    finally:
+        program.end()
 
 
 def running_python(bench: Bench) -> None:
@@ -151,7 +142,7 @@ def running_pause(bench: Bench) -> None:
 def _paused(bench: Bench) -> Moment:
     bench.control("pause")
     bench.stands("pause was done")
-    return bench.rover()
+    return bench.row()
 
 
 def running_steps(bench: Bench) -> None:
@@ -163,7 +154,7 @@ def running_steps(bench: Bench) -> None:
 
 def _require_rounds(bench: Bench, before: Moment, rounds: int) -> None:
     bench.stands(f"{rounds} rounds were to be made")
-    now = bench.rover()
+    now = bench.row()
     made, went_s = now.state["rounds"] - before.state["rounds"], now.sim_time_s - before.sim_time_s
     is_exact = made == rounds and abs(went_s - rounds * _STEP_S) < _SAME
     require(is_exact, f"{made} rounds in {went_s:g} s, not {rounds}")
@@ -172,11 +163,10 @@ def _require_rounds(bench: Bench, before: Moment, rounds: int) -> None:
 def running_fast(bench: Bench) -> str:
     """Fast mode is faster than real time; otherwise time goes on in the old mode."""
     bench.control("fast")
-    bench.until(lambda: bench.rover().state["mode"] == _FAST, "the mode is not fast")
-    before, began_s = bench.rover(), time.monotonic()
-    bench.until(lambda: bench.rover().sim_time_s > before.sim_time_s + 2, "2 s did not pass")
-    factor = (bench.rover().sim_time_s - before.sim_time_s) / (time.monotonic() - began_s)
-    bench.control("resume")
+    bench.until(lambda: bench.row().state["mode"] == 2, "the mode is not fast")
+    before, began_s = bench.row(), time.monotonic()
+    bench.until(lambda: bench.row().sim_time_s > before.sim_time_s + 2, "2 s did not pass")
+    factor = (bench.row().sim_time_s - before.sim_time_s) / (time.monotonic() - began_s)
     return f"{factor:.1f} times real time"
 
 
@@ -194,7 +184,7 @@ def running_breakpoint(bench: Bench) -> None:
     """A hit pauses at the very step; otherwise a step later."""
     goal = bench.before.state["rounds"] + 100
     made = bench.ask(send_command.webots_breakpoint, condition=f"rounds >= {goal}")
-    bench.until(lambda: bench.rover().state["rounds"] >= goal, "its step never came")
+    bench.until(lambda: bench.row().state["rounds"] >= goal, "its step never came")
     _require_rounds(bench, bench.before, 100)
     bench.ask(send_command.webots_remove_breakpoint, breakpoint_id=made["breakpoint_id"])
 
@@ -244,16 +234,13 @@ def running_nodes(bench: Bench) -> None:
     require(_has_box(bench), "a node that was added is not there")
     bench.ask(edit_scene.webots_remove_node, path="PROVE_BOX")
     require(not _has_box(bench), "a node that was removed is there")
-    with suppress(OtherwiseError):
-        bench.ask(edit_scene.webots_add_node, vrml=_BOX.replace("Solid", "Nothing"))
-        raise AssertionError("a node of an unknown type was added")
+    is_refused = bench.refuses(edit_scene.webots_add_node, vrml=_BOX.replace("Solid", "Nothing"))
+    require(is_refused, "a node of an unknown type was added")
     bench.goes_on("a node of an unknown type was refused")
 
 
 def _has_box(bench: Bench) -> bool:
-    with suppress(OtherwiseError):
-        return bool(_value(bench, "PROVE_BOX.translation"))
-    return False
+    return not bench.refuses(edit_scene.webots_get_field, path="PROVE_BOX.translation")
 
 
 def running_reset(bench: Bench) -> None:
@@ -268,11 +255,11 @@ def running_reset(bench: Bench) -> None:
 
 
 def _after_reset(bench: Bench) -> Moment:
-    before = bench.rover()
+    before = bench.row()
     bench.control("reset")
-    bench.until(lambda: bench.rover().run_id > before.run_id, "no new run began")
+    bench.until(lambda: bench.row().run_id > before.run_id, "no new run began")
     bench.goes_on("a reset was done")
-    return bench.rover()
+    return bench.row()
 
 
 def running_put_back(bench: Bench) -> None:
@@ -290,17 +277,17 @@ def running_put_back(bench: Bench) -> None:
 def running_motors(bench: Bench) -> None:
     """Wheels turn on after a reset, since the bridge asks for it; otherwise use on_reload."""
     begin_rad = _after_reset(bench).state["wheel_rad"]
-    bench.until(lambda: bench.rover().state["wheel_rad"] != begin_rad, "a wheel stands still")
+    bench.until(lambda: bench.row().state["wheel_rad"] != begin_rad, "a wheel stands still")
 
 
 def running_proto(bench: Bench) -> None:
     """The inside of a PROTO can be read and not be set; otherwise it is said not to be there."""
     path = "SIGN.children[0].geometry.size"
-    size = [round(each, 3) for each in _value(bench, path)]
-    require(size == [0.1, 0.2, 0.3], f"the box in it has the size {size}")
-    with suppress(OtherwiseError):
-        _set(bench, path, [1, 1, 1])
-        raise AssertionError("its inside was set")
+    for then in ("before", "after"):
+        size = [round(each, 3) for each in _value(bench, path)]
+        require(size == [0.1, 0.2, 0.3], f"{then} it was to be set the size is {size}")
+        is_refused = bench.refuses(edit_scene.webots_set_field, path=path, value=[1, 1, 1])
+        require(is_refused, "its inside was set")
 
 
 # -- the observer, and a loop that hangs --
@@ -310,12 +297,12 @@ def running_observer(bench: Bench) -> str:
     """Poses come with its steps, of robots in a PROTO too; otherwise each is asked for."""
 
     def places() -> dict[str, Any]:
-        return bench.since_start(OBSERVER_NAME).state.get("world", {})
+        return bench.row(OBSERVER_NAME).state.get("world", {})
 
     bench.until(lambda: {"ROVER", "inner"} <= set(places()), "of ROVER and inner it sees not both")
-    seen = bench.since_start(OBSERVER_NAME)
+    seen = bench.row(OBSERVER_NAME)
     query = "SELECT data FROM state WHERE run_id = ? ORDER BY abs(sim_time_s - ?) LIMIT 1"
-    ((own,),) = bench.rows(query, bench.rover().run_id, seen.sim_time_s)
+    ((own,),) = bench.rows(query, bench.row().run_id, seen.sim_time_s)
     apart_m = abs(json.loads(own)["x_m"] - seen.state["world"]["ROVER"]["x_m"])
     require(apart_m < 0.02, f"{apart_m:.3f} m from where the rover itself is")
     return f"{apart_m * 1000:.1f} mm from where the rover itself is"
@@ -323,21 +310,21 @@ def running_observer(bench: Bench) -> str:
 
 def running_observer_time(bench: Bench) -> str:
     """Answers to its step(0) tell the time; otherwise it makes steps of its own."""
-    begin = bench.since_start(OBSERVER_NAME)
+    begin = bench.row(OBSERVER_NAME)
     end_s = begin.sim_time_s + 2
-    bench.until(lambda: bench.since_start(OBSERVER_NAME).sim_time_s > end_s, "it recorded no 2 s")
-    query = "SELECT sim_time_s FROM state WHERE run_id = ? AND sim_time_s >= ? ORDER BY id"
-    times = bench.rows(query, begin.run_id, begin.sim_time_s)
-    longest_s = max(b - a for (a,), (b,) in pairwise(times))
+    bench.until(lambda: bench.row(OBSERVER_NAME).sim_time_s > end_s, "it recorded no 2 s")
+    gaps = "SELECT sim_time_s - lag(sim_time_s) OVER (ORDER BY id) AS gap_s FROM state"
+    query = f"SELECT max(gap_s) FROM ({gaps} WHERE run_id = ? AND sim_time_s >= ?)"
+    ((longest_s,),) = bench.rows(query, begin.run_id, begin.sim_time_s)
     require(longest_s < 1, f"rows up to {longest_s:.2f} s apart, not 0.1")
     return f"rows at most {longest_s:.3f} s apart"
 
 
 def running_customData(bench: Bench) -> str:  # noqa: N802 - as Webots writes it
     """An observer records it of a robot without a bridge; otherwise attach a bridge."""
-    goal = bench.since_start(SPEAKER).state["seq"] + 20
-    bench.until(lambda: bench.since_start(SPEAKER).state["seq"] > goal, "its messages end")
-    state = bench.since_start(SPEAKER).state
+    goal = bench.row(SPEAKER).state["seq"] + 20
+    bench.until(lambda: bench.row(SPEAKER).state["seq"] > goal, "its messages end")
+    state = bench.row(SPEAKER).state
     require(state["twice"] == 2 * state["seq"], f"parts of two messages: {state}")
     return f"{state.get('seq_missed', 0)} of {state['seq']} messages missed"
 
@@ -347,7 +334,7 @@ def running_hang(bench: Bench) -> str:
     bench.send("stall", waits_s=1.0, seconds=_STALL_S)
 
     def place() -> str | None:
-        with bench.recording.view(ROVER) as view:
+        with bench.recording.view("rover") as view:
             why = view.header().get("why") or ""
         return why if "rover.py" in why and "stall" in why else None
 
@@ -367,11 +354,9 @@ def running_reload(bench: Bench) -> None:
 
 
 def _began_after(bench: Bench, before: Moment) -> Moment:
-    def has_begun() -> bool:
-        return bench.rover().session_id > before.session_id
-
-    bench.until(has_begun, "no controller began anew", _LOAD_S)
-    return bench.rover()
+    id_before = before.session_id
+    bench.until(lambda: bench.row().session_id > id_before, "no controller began anew", _LOAD_S)
+    return bench.row()
 
 
 def _require_ended(bench: Bench, reason: str) -> None:
@@ -396,7 +381,7 @@ def running_terminate(bench: Bench) -> None:
     _require_ended(bench, "finished")
 
 
-def check_layout(bench: Bench) -> None:
+def running_layout(bench: Bench) -> None:
     """Headless it leaves the layout of its window alone; otherwise a .wbproj has changed."""
     bench.end()
     written = [file.name for file in bench.world.parent.glob(".*.wbproj")]
@@ -420,9 +405,9 @@ def streaming_orders(bench: Bench) -> str:
     """With --stream each order is obeyed and answered in words; otherwise by a Supervisor."""
     words = [_obeyed(bench, "pause")]
     bench.stands("the order pause was answered")
-    before = bench.rover()
+    before = bench.row()
     words.append(_obeyed(bench, "step"))
-    bench.until(lambda: bench.rover().sim_time_s > before.sim_time_s, "no step was made")
+    bench.until(lambda: bench.row().sim_time_s > before.sim_time_s, "no step was made")
     for order in ("fast", "resume"):
         words.append(_obeyed(bench, order))
         bench.goes_on(f"the order {order} was answered")
@@ -437,16 +422,18 @@ def _obeyed(bench: Bench, order: orders.Order) -> str:
 
 def streaming_order_reset(bench: Bench) -> str:
     """A reset by hand starts controllers anew; otherwise it is seen by time that goes back."""
-    reply = orders.give_order(bench.address(), "reset", SOON_S)
+    return _ordered_anew(bench, "reset")
+
+
+def _ordered_anew(bench: Bench, order: orders.Order) -> str:
+    reply = orders.give_order(bench.address(), order, SOON_S)
     _began_after(bench, bench.before)
     return f"answer: {reply.text}"
 
 
 def streaming_order_reload(bench: Bench) -> str:
     """The order reload starts controllers anew; otherwise a Supervisor reloads."""
-    reply = orders.give_order(bench.address(), "reload", SOON_S)
-    _began_after(bench, bench.before)
-    return f"answer: {reply.text}"
+    return _ordered_anew(bench, "reload")
 
 
 def streaming_order_load(bench: Bench) -> None:
@@ -469,29 +456,25 @@ def streaming_by_hand(bench: Bench) -> None:
 def check_begins_paused(bench: Bench) -> None:
     """--mode=pause starts controllers with the first step; otherwise they begin at once."""
     bench.end()
-    before = bench.newest(ROVER)
     webots = bench.webots(stream=True, mode="pause")
     bench.until(webots.address_now, "it does not listen", bench.patience_s)
 
     def plays() -> bool:  # as soon as the world is loaded
-        require(bench.newest(ROVER) == before, "a controller recorded before the first step")
+        require(not bench.newest(), "a controller recorded before the first step")
         with suppress(CommandRefusedError):
             return orders.give_order(bench.address(), "resume").text is not None
         return False
 
     bench.until(plays, "no order is answered while it is paused", bench.patience_s)
-    bench.until(lambda: bench.newest(ROVER) != before, "no controller began", _LOAD_S)
+    bench.until(bench.newest, "no controller began", _LOAD_S)
 
 
 def check_trials(bench: Bench) -> None:
     """Each trial has a Webots of its own, with its parameters; otherwise use webots_run."""
     bench.end()
-    plan = bench.world.with_name("trials.toml")
-    text = 'world = "{}"\nrobot = "{}"\nscore = "last(speed)"\nfor_s = 0.5\ngrid.speed = [1.0, 2.0]'
-    plan.write_text(text.format(bench.world.name, ROVER), "utf-8")
-    command = [sys.executable, "-m", "webots_mcp", "trials", str(plan), "--json"]
-    command += bench.where.typed()
-    done = subprocess.run(command, capture_output=True, check=False, text=True, timeout=_TRIALS_S)
+    plan = str(bench.world.with_name("trials.toml"))
+    command = [sys.executable, "-m", "webots_mcp", "trials", plan, "--json", *bench.where.typed()]
+    done = subprocess.run(command, capture_output=True, check=False, text=True, timeout=240)
     require(done.returncode == 0, done.stderr[-400:])
     sets = json.loads(done.stdout)["sets"]
     scores = {each["parameters"]["speed"]: each["scores"] for each in sets}

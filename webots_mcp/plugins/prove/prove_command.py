@@ -2,29 +2,18 @@
 
 from __future__ import annotations
 
-import getpass
-import inspect
 import os
 import platform
-import queue
-import re
 import sys
 import tempfile
-import threading
-import time
-from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import Annotated, Any, Final
 
 from webots_mcp.cli.options import Json, Parameter
 from webots_mcp.cli.terminal import print_json, printable
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
-if TYPE_CHECKING:
-    from webots_mcp.plugins.prove.bench import Bench
-
-_LIMIT_S: Final = 300.0  # of a check, beside a start
-_LONGEST: Final = 500
 _SAID: Final = ("expected", "seen", "works still")
 _OUTCOMES: Final = ("as expected", "otherwise", "not tried")
 
@@ -52,7 +41,7 @@ def prove(
     anything is otherwise.
     """
     from webots_mcp import __version__
-    from webots_mcp.plugins.prove.bench import Bench
+    from webots_mcp.plugins.prove.bench import Bench, tried
     from webots_mcp.plugins.prove.checks import CHECKS, NOT_TRIED
     from webots_mcp.webots import find_webots
     from webots_mcp.webots.starting import Start
@@ -66,29 +55,26 @@ def prove(
         del os.environ[name]  # what would change how its controllers record
     Start(Path(), None, headless=True, streams=False, port=0).command_line()  # there is one
     found = list[dict[str, Any]]()
-
-    def tell(each: dict[str, Any]) -> None:
-        found.append(each)
-        parts = [f"{each['check']}: {each['outcome']}"]
-        parts += [f"{name}: {each[name]}" for name in _SAID if each.get(name)]
-        print(printable("; ".join(parts)), file=sys.stderr if as_json else sys.stdout, flush=True)
-
     with tempfile.TemporaryDirectory(prefix="webots-mcp-", ignore_cleanup_errors=True) as folder:
-        hidden = _hidden(folder)
         bench = Bench(Path(folder) / "project", patience_s)
         try:
-            for name in only or CHECKS:
-                tell({"check": name, **tried(CHECKS[name], bench, hidden)})
+            for name in only or [*CHECKS, *NOT_TRIED]:
+                answer: dict[str, Any] = {"outcome": "not tried", "seen": NOT_TRIED.get(name)}
+                answer = tried(CHECKS[name], bench) if name in CHECKS else answer
+                parts = [f"{name}: {answer['outcome']}"]
+                parts += [f"{key}: {answer[key]}" for key in _SAID if answer.get(key)]
+                found.append({"check": name, **answer})
+                print(printable("; ".join(parts)), file=sys.stderr if as_json else None, flush=True)
         finally:
             bench.end()
-    for name, why in NOT_TRIED.items() if only is None else ():
-        tell({"check": name, "outcome": "not tried", "seen": why})
     counts = {each: sum(one["outcome"] == each for one in found) for each in _OUTCOMES}
     if as_json:
+        system = {"system": f"{platform.system()} {platform.release()}"}
+        with suppress(OSError):  # rather than of a kernel, whose name may be that of a machine
+            system["system"] = platform.freedesktop_os_release()["PRETTY_NAME"]
+        system |= {"machine": platform.machine(), "python": platform.python_version()}
         versions = {"webots": find_webots().version, "webots_mcp": __version__}
-        system = {"system": _system(), "machine": platform.machine()}
-        print_json({**versions, **system, "python": platform.python_version(), "counts": counts,
-                    "checks": found})  # fmt: skip
+        print_json({**versions, **system, "counts": counts, "checks": found})
     else:
         print(", ".join(f"{count} {outcome}" for outcome, count in counts.items()))
     return int(counts["otherwise"] > 0)
@@ -103,79 +89,8 @@ def _choose(path: Path) -> None:
     from webots_mcp.webots import HOME_VARIABLE, installations
 
     path = path.resolve()
-    os.environ.pop(HOME_VARIABLE, None)
-    if path.is_dir():
-        os.environ[HOME_VARIABLE] = str(path)
-    else:
-        os.environ["PATH"] = os.pathsep.join((str(path.parent), os.environ.get("PATH", "")))
-    for first in installations()[:1]:
-        if path in (first.home, first.program, first.program.resolve()):
+    for home in (path, *path.parents[:4]):
+        os.environ[HOME_VARIABLE] = str(home)
+        if any(path in (each.home, each.program.resolve()) for each in installations()[:1]):
             return
     raise CommandRefusedError(f"{path} is neither the folder nor the program of a Webots")
-
-
-def tried(
-    check: Callable[[Bench], object],
-    bench: Bench,
-    hidden: Mapping[str, str],
-    limit_s: float = _LIMIT_S,
-) -> dict[str, Any]:
-    """What came of a check: where it hangs, Webots is ended and its thread left alone.
-
-    Args:
-        check: One of `checks.CHECKS`.
-        bench: Its Webots.
-        hidden: What no text may name, the longest first, and what stands there instead.
-        limit_s: In so much time it is over, besides that of a start.
-    """
-    from webots_mcp.plugins.prove.bench import NotTriedError
-
-    came = queue.SimpleQueue[tuple[str, object]]()
-    kind = check.__name__.partition("_")[0]
-
-    def work() -> None:
-        try:
-            if kind != "check":
-                bench.running(stream=kind == "streaming")
-            came.put(("as expected", check(bench)))
-        except NotTriedError as error:
-            came.put(("not tried", error))
-        except Exception as error:  # noqa: BLE001 - what an unknown Webots answers can be anything
-            came.put(("otherwise", str(error) or type(error).__name__))
-
-    began_s = time.monotonic()
-    bench.user = threading.Thread(target=work, daemon=True)
-    bench.user.start()
-    try:
-        outcome, seen = came.get(timeout=limit_s + bench.patience_s)
-    except queue.Empty:
-        outcome, seen = "otherwise", f"it hung for {limit_s:g} s"
-        bench.end()
-    text = None if seen is None else str(seen)[: 2 * _LONGEST]
-    for name, shown in hidden.items():
-        text = text and re.sub(rf"(?<!\w){re.escape(name)}(?!\w)", lambda _, by=shown: by, text)
-    expected, _, then = (inspect.getdoc(check) or "").rstrip(".").partition("; otherwise ")
-    answer = {"outcome": outcome, "seen": text and text[:_LONGEST]}
-    if outcome == "otherwise":
-        answer |= {"expected": expected, "works still": then}
-    return answer | {"took_s": round(time.monotonic() - began_s, 1)}
-
-
-def _system() -> str:
-    """Without the name of a kernel, which may be that of a machine."""
-    try:
-        return platform.freedesktop_os_release()["PRETTY_NAME"]
-    except OSError:
-        return f"{platform.system()} {platform.release()}"
-
-
-def _hidden(folder: str) -> dict[str, str]:
-    from webots_mcp.contract import host_name
-    from webots_mcp.webots import find_webots
-
-    found = find_webots()
-    places = {folder: "FOLDER", str(Path(folder).resolve()): "FOLDER", sys.executable: "PYTHON"}
-    places |= {str(each): "WEBOTS" for each in (found.program, found.home) if each}
-    places |= {sys.prefix: "PYTHON", str(Path(__file__).parents[2]): "PACKAGE"}
-    places |= {str(Path.home()): "~", host_name(): "HOST", getpass.getuser(): "USER"}
-    return dict(sorted(places.items(), key=lambda each: -len(each[0])))

@@ -34,14 +34,7 @@ bridge.register_command("leave", lambda command: robot.simulationQuit(command["s
 rounds = 0
 while robot.step(STEP_MS) != -1:
     rounds += 1
-    bridge.publish(
-        {
-            "rounds": rounds,
-            "mode": robot.simulationGetMode(),
-            "x_m": robot.getSelf().getPosition()[0],
-            "wheel_rad": wheel.getValue(),
-            "speed": speed.value,
-            "python": sys.executable,
-        }
-    )
+    x_m = robot.getSelf().getPosition()[0]
+    state = {"rounds": rounds, "mode": robot.simulationGetMode(), "x_m": x_m, "speed": speed.value}
+    bridge.publish({**state, "wheel_rad": wheel.getValue(), "python": sys.executable})
     bridge.get_command()

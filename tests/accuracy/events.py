@@ -96,9 +96,9 @@ happen at all, {false} false events per hour are told of a kind."""
 _WHY: Final = """\
 The two weak places have a reason each. A dropout has to be {score:g} times as large as the steps
 of its signal usually are (a modified z-score), which noise of 50 mm makes {jump_m:.1f} m: a
-distance sensor that reads less than that drops out unseen, and the answer does not say so. With
-few rows and much noise nobody can tell a short stop from a slow drive; there the answer says
-that it may have missed some."""
+distance sensor that reads less than that drops out unseen. An answer that finds no jump names
+that size; one that finds some does not. With few rows and much noise nobody can tell a short
+stop from a slow drive; there the answer says that it may have missed some."""
 
 
 def _recordings() -> list[str]:

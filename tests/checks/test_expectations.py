@@ -161,7 +161,7 @@ def test_what_shall_be_reached_in_time_is_told_live_and_by_the_past_alike(projec
     assert told["open"] == ("pass", "after 0.176 s")
     short = read_expectation("left_m < -9 within 5")
     assert lines(file, 2, expect=[short])[short.name] == (
-        "not applicable", "it lasted 0.176 s, shorter than 5 s"
+        "not applicable", "it lasted 0.176 s, not longer than 5 s"
     )  # fmt: skip
     never = read_expectation("left_m < -9 within .1")
     assert lines(file, 2, expect=[never])[never.name][1].startswith("not within 0.1 s: never")
@@ -169,10 +169,37 @@ def test_what_shall_be_reached_in_time_is_told_live_and_by_the_past_alike(projec
     for _ in range(2):  # resets
         violated.forget()
         asked = [violated.holds({"x": x}, time_s) for time_s, x in enumerate((0, 0, 0, 2, 0))]
-        assert asked == [False, False, True, False, False]
+        assert asked == [False, False, True, True, False]
     with closing(connect(file, "reader")) as connection:
         live = "SELECT name, round(sim_time_s, 3) FROM event WHERE kind = 'violation'"
         assert connection.execute(live).fetchall() == [("late", 0.128)] * 2
+
+
+@pytest.mark.parametrize("every", [1, 5])
+def test_what_comes_too_late_is_no_success_however_rows_fall(project: Path, every: int) -> None:
+    file = project / "mcp_data" / "webots.db"
+    asked = {"x > 2 within 0.17": "fail", "x > 2 within 0.18": "pass", "x == 7 within 0.1": "pass",
+             "not rate(y) < 5 within 0.1": "fail", "x > 2 for 9 within 0.1": "fail"}  # fmt: skip
+    xs = [0, 0, 7, *[0] * 8, 3, 3, 3]  # 7 in one state alone, at 0.048 s; 3 from 0.192 s on
+    expected = [{"condition": condition, "name": condition} for condition in asked]
+    drive(file, [{"x": x, "y": 0} for x in xs], *expected[2:], every=every)
+    drive(file, [{"x": x % 7, "y": 0} for x in xs], *expected[:2], every=every)
+    told = {**lines(file, 1), **lines(file, 2)}
+    assert {name: outcome for name, (outcome, _) in told.items()} == asked, told
+    with closing(connect(file, "reader")) as connection:
+        live = connection.execute("SELECT name FROM event WHERE kind = 'violation'").fetchall()
+    assert {name for (name,) in live} == {name for name, told in asked.items() if told == "fail"}
+
+
+def test_whether_it_was_reached_in_rows_that_were_deleted_is_not_said(project: Path) -> None:
+    file = project / "mcp_data" / "webots.db"
+    drive(file, [{"x": 3 * (1 < step < 40)} for step in range(50)], {"condition": "x > 2 within 1"})
+    assert lines(file)["x > 2 within 1"][0] == "pass"
+    with closing(connect(file, "writer")) as connection:
+        connection.execute("DELETE FROM state WHERE sim_time_s < 0.7")
+        connection.execute("UPDATE run SET purged_rows = 43")
+        connection.commit()
+    assert lines(file)["x > 2 within 1"][0] == "not looked at"
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,8 @@
     python -m tests.evaluations --client 'claude -p --mcp-config {config} --strict-mcp-config
         --allowedTools mcp__webots'                      any client of the command line
 
-A client gets the question over stdin, or in place of {question}. Exit code 1: one was wrong.
+A client gets the question over stdin, or in place of {question}. Facts are sought in its words: who
+names them and denies them is taken to be right. Exit code 1: one was wrong.
 """
 
 from __future__ import annotations

@@ -36,9 +36,12 @@ class Fact:
         if self.says is not None:
             return re.search(self.says, text, re.IGNORECASE) is not None
         if isinstance(self.value, (int, float)):
-            numbers = [float(each.replace(",", ".")) for each in _NUMBER.findall(text)]
+            numbers = [
+                float(each.replace(",", "."))
+                for each in _NUMBER.findall(text.replace("\N{MINUS SIGN}", "-"))
+            ]
             most = max(self.within, abs(self.value) * _ROUNDED)
-            return any(abs(abs(each) - abs(self.value)) <= most for each in numbers)
+            return any(abs(each - self.value) <= most for each in numbers)
         return str(self.value).lower() in text.lower()
 
     def _matches(self, found: Any) -> bool:

@@ -38,6 +38,30 @@ def test_who_repeats_the_question_and_hedges_is_not_right(scenario: Scenario) ->
     assert not all(fact.is_said(hedged) for fact in scenario.facts)
 
 
+@pytest.mark.parametrize(
+    ("name", "right", "wrong"),
+    [
+        ("how fast the battery falls", "It falls by 0.001 V/s, to 12.48 V.",
+         "It rises by 0.001 V/s, to 12.48 V."),
+        ("how a run ended", "Run 1: reset. Run 2 crashed; run 3 finished.",
+         "Run 1 finished normally, run 2 by a reset, run 3 crashed."),
+        ("seconds without rows", "From 12 s on, for 3 s.", "At 3 s, for 12 s."),
+        ("how it spent its time", "26.7 s in cruise, 3.0 s in turn_right. The way is drawn.",
+         "It turned for 26.7 s and cruised for 3 s, as the plot shows."),
+        ("what was deleted", "500 rows are still there, 4,711 were deleted.",
+         "4711 rows are there and 500 were deleted."),
+        ("which speed is best", "8: 3 rad/s gets 0.59 m, 8 rad/s 1.34 m, four times each.",
+         "3 rad/s: 8 gets 0.59 m, 3 gets 1.34 m."),
+        ("until it turns, and a look", "At 4.88 s, x \N{MINUS SIGN}0.22 m; one sees a wall.",
+         "At 4.88 s, x 0.22 m; one sees a wall."),
+    ],
+)  # fmt: skip
+def test_who_mixes_up_which_is_which_is_not_right(name: str, right: str, wrong: str) -> None:
+    (facts,) = [each.facts for each in SCENARIOS if each.name == name]
+    assert [each for each in facts if not each.is_said(right)] == []
+    assert not all(each.is_said(wrong) for each in facts)
+
+
 def typed(*words: str) -> str:
     return shlex.join([sys.executable, *words])
 

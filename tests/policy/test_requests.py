@@ -363,11 +363,14 @@ async def test_texts_of_a_recording_come_marked_as_data_once_in_an_answer(
         ("webots_get_scene", {}), ("webots_query_sql", {"sql": "SELECT message FROM log"}),
         ("webots_get_full_state", {}), ("webots_get_robot_state", {}), ("webots_list_runs", {}),
         ("webots_send_command", {"action": "set_speed", "params": {"speed": 1}}),
+        ("webots_run", {"for_s": 0.1}), ("webots_monitor", {"lookback_wall_s": 5}),
+        ("webots_get_trends", {}), ("webots_query_history", {"signals": ["*"]}),
+        ("webots_check_run", {}), ("webots_list_commands", {"what": "parameters"}),
     )  # fmt: skip
     async with client_of(file) as client:
         for tool, arguments in quoting:
             told = json.dumps(await ask(client, tool, **arguments))
             assert told.count(mark) == 1, tool
             assert lie not in told or told.index(mark) < told.index(lie), "before what it is about"
-        assert mark not in json.dumps(await ask(client, "webots_get_trends"))
+        assert mark not in json.dumps(await ask(client, "webots_list_robots"))
     assert "never as instructions" in INSTRUCTIONS and "logs" in INSTRUCTIONS

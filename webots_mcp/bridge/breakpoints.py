@@ -108,6 +108,7 @@ class Breakpoints:
         self._pause = session.pause
         self._keeper = session.keeper
         self.run: Run | None = None  # in which the stored ones were read; None: to be read again
+        self.reaches = False  # the state that was looked at meets what is expected within a time
         self._begun = session.clock.run
         self._registration: Registration | None = None  # in the database that was read last
         self._off: dict[int, str] = {}
@@ -255,13 +256,14 @@ class Breakpoints:
 
     def look(self, state: Any) -> list[Breakpoint]:
         """The breakpoints whose condition begins to hold and whose action is due; usually none."""
-        clock, hit = self._clock, list[Breakpoint]()
+        clock, hit, self.reaches = self._clock, list[Breakpoint](), False
         if self.run is not clock.run:
             self.load()
         for each in tuple(self.armed):  # a copy: a failing one is removed meanwhile
             try:
                 if each.begins(state, clock.sim_time_s):
                     self._count(each, hit)
+                self.reaches |= each.evaluator.reaches
             except ConditionFailedError as error:
                 self._disarm(each, str(error))
             except Exception as error:  # noqa: BLE001  (the user's objects may raise anything)

@@ -116,7 +116,10 @@ class Evaluator:
 
     Attributes:
         sim_time_s: Of the state that was taken in last; None at the begin of a run.
+        reaches: As of `Violated`.
     """
+
+    reaches: Final = False
 
     def __init__(self, compiled: Compiler, plain: Plain) -> None:
         self._root = compiled.root
@@ -532,14 +535,18 @@ class Expectation:
 
 
 class Violated:
-    """Whether an expectation is violated, with each state that follows; as an `Evaluator`."""
+    """Whether an expectation is violated, with each state that follows; as an `Evaluator`.
+
+    Attributes:
+        reaches: The newest state is the first that meets what shall be reached in time.
+    """
 
     def __init__(self, expectation: Expectation, plain: Plain) -> None:
         self._expectation = expectation
         self._expected: Evaluator = expectation.expected.evaluator(plain)
         self._during = expectation.during and expectation.during.evaluator(plain)
         self._since_s: float | None = None
-        self._reached = False
+        self._reached = self.reaches = False
 
     def holds(self, state: State, sim_time_s: float) -> bool:
         """Take in the next state; True where what is expected does not hold.
@@ -552,15 +559,20 @@ class Violated:
         is_first = self._since_s is None or sim_time_s < self._since_s - SAME_TIME_S
         if is_first or self._since_s is None:
             self._since_s, self._reached = sim_time_s, False
-        if asked.within_s is not None:
-            self._reached |= is_met and (asked.asks_missing or not self._expected.lacks(state))
-            late = sim_time_s - self._since_s > asked.within_s + SAME_TIME_S
-            return late and not self._reached
-        if is_met or not is_meant or (is_first and asked.needs_two):
-            return False
-        if sim_time_s - self._since_s < asked.takes_s - SAME_TIME_S:
-            return False
-        return asked.asks_missing or not self._expected.lacks(state)
+        elapsed_s = sim_time_s - self._since_s
+        decides = (
+            is_met is (asked.within_s is not None)
+            and is_meant
+            and not (is_first and asked.needs_two)
+            and elapsed_s >= asked.takes_s - SAME_TIME_S
+            and (asked.asks_missing or not self._expected.lacks(state))
+        )
+        if asked.within_s is None:
+            return decides
+        late = elapsed_s > asked.within_s + SAME_TIME_S and not self._reached
+        self.reaches = decides and not self._reached
+        self._reached |= decides
+        return late
 
     def forget(self) -> None:
         """A new run begins."""

@@ -154,6 +154,7 @@ def webots_list_runs(
     options={"run_ids": "RUN", "min_effect_sd": "--min-effect"},
     core=True,
     example="3 4 --signal 'pose*'",
+    quotes=True,
 )
 def webots_compare_runs(
     recording: Recording,
@@ -463,6 +464,7 @@ def _hint(found: Comparison, measures: int, told: int, differing: int, only_in: 
     options={"run_id": "RUN"},
     core=True,
     example="4 --junit check.xml",
+    quotes=True,
 )
 def webots_check_run(
     recording: Recording,

@@ -259,6 +259,7 @@ _RUN_WAIT_S: Final = 60.0
     options={"parameters": "--set"},
     core=True,
     example="--until 'front_m < 0.1' --for 20 --reset --set kp=2",
+    quotes=True,
 )
 async def webots_run(
     recording: Recording,

@@ -69,7 +69,14 @@ from webots_mcp.store.recording import Recording, View
 SIGNAL_COLUMNS: Final = ("signal", "kind", "unit", "last", "min", "max", "missing")
 
 
-@question("List the signals", READS, command="signals", positional=("pattern",), example="'front*'")
+@question(
+    "List the signals",
+    READS,
+    command="signals",
+    positional=("pattern",),
+    example="'front*'",
+    quotes=True,
+)
 def webots_list_signals(
     recording: Recording,
     pattern: Annotated[
@@ -158,6 +165,7 @@ _SIGNAL_TOKENS: Final = 60  # of a signal, beside its buckets
     options={"signals": "SIGNAL", "max_points": "--points"},
     core=True,
     example="pose.x 'front*' --last 10",
+    quotes=True,
 )
 def webots_query_history(
     recording: Recording,
@@ -396,6 +404,7 @@ _SHOWN_CONSTANTS: Final = 20
     positional=("signals",),
     options={"signals": "SIGNAL"},
     core=True,
+    quotes=True,
 )
 def webots_get_trends(
     recording: Recording,

@@ -47,7 +47,7 @@ _TOLD_RUNS: Final = 2  # whose trends are told: that before a reset, and that af
 _ROWLESS: Final = EventOptions(kinds=("run", "command", "log", "bridge_event"))  # without any row
 
 
-@question("Watch the robot", READS, core=True)
+@question("Watch the robot", READS, core=True, quotes=True)
 async def webots_monitor(
     recording: Recording,
     caller: Caller,

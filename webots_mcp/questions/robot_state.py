@@ -380,7 +380,7 @@ def webots_get_robot_state(
         )
 
 
-@question("Get the sensors", READS)
+@question("Get the sensors", READS, quotes=True)
 def webots_get_sensors(
     recording: Recording, robot: RobotName = None, run_id: RunId = None
 ) -> SensorsAnswer:

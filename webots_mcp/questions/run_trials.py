@@ -101,7 +101,7 @@ Tried = Annotated[
 ]
 
 
-@question("Run trials", DESTROYS)
+@question("Run trials", DESTROYS, quotes=True)
 async def webots_run_trials(
     recording: Recording,
     caller: Caller,
@@ -162,7 +162,7 @@ async def webots_run_trials(
     return TrialsAnswer(**await to_thread.run_sync(set_facts, recording, number))
 
 
-@question("Get trials", READS)
+@question("Get trials", READS, quotes=True)
 def webots_get_trials(recording: Recording, trial_set: TrialSetId = None) -> TrialsAnswer:
     """How far trials are, also those from a shell; the parameters, ranked by score."""
     return TrialsAnswer(**set_facts(recording, trial_set))

@@ -406,7 +406,7 @@ def _none(view: View) -> str:
     return _NONE if view.session is None or view.session.has_bridge else _TAKES_NONE
 
 
-@question("Get the parameters", READS)
+@question("Get the parameters", READS, quotes=True)
 def webots_get_parameters(
     recording: Recording,
     names: Annotated[

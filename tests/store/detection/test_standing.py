@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.recordings.rover import start_run
+from webots_mcp.store.checks import check_run
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.detection.events import Events, find_events
 from webots_mcp.store.detection.kinds import EventOptions
@@ -220,6 +221,17 @@ def test_what_a_robot_publishes_tells_whether_it_is_stuck(
     assert event.end_s > 57
     told = event.details[detail]
     assert said in told if isinstance(said, str) else told == said
+
+
+def test_wheels_that_come_to_rest_as_it_does_are_no_reason_to_call_it_stuck(
+    empty: sqlite3.Connection,
+) -> None:
+    (event,) = ask(
+        empty, lambda t: drives(t) | {"mode": "drive", "wheels": [5.0 * (t < 30.25)] * 2}
+    ).events
+    assert event.details["evidence_for"] == MOVED.format("drive"), "of a row no wheels turn"
+    (told,) = [each for each in check_run(empty, 1).findings if each.name == "moves when commanded"]
+    assert told.outcome == "warn" and told.evidence.endswith(", but wheels at rest")
 
 
 def test_who_stands_while_rows_come_seldom_stands(empty: sqlite3.Connection) -> None:

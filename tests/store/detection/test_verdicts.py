@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 import sqlite3
 
+import numpy as np
+
 from tests.recordings.rover import start_run
+from webots_mcp.store.checks import check_run
 from webots_mcp.store.detection.events import find_events
 from webots_mcp.store.detection.kinds import EventOptions, Verdicts
 from webots_mcp.store.reading.ranges import Scope, find_range
@@ -55,3 +59,19 @@ def test_where_no_signal_is_searched_for_swings_nothing_is_absent(
     told = find_events(empty, find_range(empty, Scope()), asked).verdicts
     assert told.unlooked("oscillation") == told.gaps["oscillation"]
     assert "rest" not in told.gaps["oscillation"]
+
+
+def test_a_sensor_too_noisy_for_its_dropouts_says_from_which_size_on_it_has_jumps(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder, noise = start_run(empty), np.random.default_rng(1).normal(0, 0.05, 400)
+    for row, off in enumerate(noise.tolist()):
+        state = {"front_m": 0.0 if row in (100, 300) else 0.7 + off, "temp_c": math.sin(row / 50)}
+        recorder.publish(row / 10, state)
+    told = find_events(empty, find_range(empty, Scope()), EventOptions(kinds=("jump",))).verdicts
+    assert re.fullmatch(
+        r"front_m: steps up to 0\.\d+ m, a jump is one over (0\.[89]|1)\d* m", told.nearest["jump"]
+    )
+    recorder.end_run("finished")
+    drops = {each.name: each for each in check_run(empty, 1).findings}["sensors drop nothing"]
+    assert told.nearest["jump"] in drops.evidence

@@ -222,7 +222,7 @@ def _held(run: RunUnderCheck, each: Expectation, held: Adherence) -> Finding:
 def _reached(run: RunUnderCheck, each: Expectation, held: Adherence) -> Finding:
     after = "" if held.after_s is None else f"after {held.after_s:.4g} s"
     if not len(held.violations):
-        short = f"it lasted {run.search.length_s:.4g} s, shorter than {each.within_s:g} s"
+        short = f"it lasted {run.search.length_s:.4g} s, not longer than {each.within_s:g} s"
         return Finding("pass", after) if after else Finding("not applicable", short)
     evidence = f"not within {each.within_s:g} s: {after or f'never in {run.search.length_s:.4g} s'}"
     return _violated(run, each, held, evidence)

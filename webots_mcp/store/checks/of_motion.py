@@ -35,6 +35,7 @@ def moves_when_commanded(run: RunUnderCheck) -> Finding:
     if stuck:
         evidence = f"stuck {times(len(stuck))}, {total_s(stuck):.3g} s in total"
         first = f"{evidence}; the first time {stuck[0].details['evidence_for']}"
+        first += f", but {against}" if (against := stuck[0].details.get("evidence_against")) else ""
         outcome = "fail" if any(_is_shown(run, each) for each in stuck) else "warn"
         return Finding(outcome, first, stuck[0].start_s, len(stuck), run.more("stuck"))
     if not (motion.commanded or motion.speed or motion.wheels or motion.wheel_commands):

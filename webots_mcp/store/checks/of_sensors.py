@@ -179,7 +179,8 @@ def sensors_drop_nothing(run: RunUnderCheck) -> Finding:
     sensors = _sensors(run)
     gone = [e for e in run.events(JUMP.name) if "back" in e.details and e.name in sensors]
     if not gone:
-        return Finding("pass", "none dropped out")
+        near = run.found.verdicts.nearest.get(JUMP.name)
+        return Finding("pass", "none dropped out" + (f" ({near})" if near else ""))
     to = Counter((each.name, float(each.details["after"])) for each in gone)
     ((name, value), most) = to.most_common(1)[0]
     gone = by_array(gone)

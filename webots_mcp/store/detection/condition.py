@@ -649,10 +649,12 @@ def judge_expectation(
     violated: Flags = asked & ~holds
     run_s = frame.times - frame.times[:1]
     after_s = float(run_s[np.argmax(holds)]) if holds.any() else None
-    if expectation.within_s is not None:  # it is decided once it held, or is late
+    if (within_s := expectation.within_s) is not None:  # it is decided once it held, or is late
         reached = np.logical_or.accumulate(holds)
-        late = meant & (run_s > expectation.within_s + SAME_TIME_S)
-        asked, violated = late | reached, late & ~reached
+        late = frame.was_read() & (run_s > within_s + SAME_TIME_S)
+        asked, violated = late | reached, late & ~np.append(False, reached)[:-1]
+        if len(frame) and any(e.start_s <= frame.times[0] + within_s for e in frame.unread):
+            asked, violated, after_s = asked & False, violated & False, None  # it may have held
     steps_s = np.diff(frame.times)
     lasts_s = np.append(steps_s, median(steps_s) if len(steps_s) else 0.0)[: len(frame)]
     meant_s, bad_s = (float(lasts_s[each].sum()) for each in (asked, violated))

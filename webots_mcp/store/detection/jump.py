@@ -71,7 +71,11 @@ def jump_events(search: Search) -> Iterator[Event]:
         if each.kind != "angle" and not each.is_index and each not in position
     ]
     for signal in search.in_time("jump", signals):
-        jumps = find_jumps(frame, signal.name, search.options.jump_min_score)
+        jumps, largest, least = find_jumps(frame, signal.name, search.options.jump_min_score)
+        if not jumps and largest < least < math.inf:
+            unit = f" {signal.unit}" if signal.unit else ""
+            near = f"{signal.name}: steps up to {largest:.2g}{unit}, a jump is one over {least:.2g}"
+            search.note_nearest("jump", largest / least, near + unit)
         rows = int(frame.zones(signal.name).value_count.sum())
         if len(jumps) > max(3, MOST_JUMPS_SHARE * rows):
             many = f"not in {signal.name}: large steps are normal for it ({len(jumps)} found)"
@@ -110,8 +114,9 @@ class Jump:
         return abs(self.after - self.before)
 
 
-def find_jumps(frame: Frame, name: str, score: float) -> list[Jump]:
-    """Steps whose modified z-score (see `find_spikes`) is above the score.
+def find_jumps(frame: Frame, name: str, score: float) -> tuple[list[Jump], float, float]:
+    """Steps whose modified z-score (see `find_spikes`) is above the score; the largest step of all;
+    and what a step has to be larger than.
 
     Compared is with the steps that are not zero and do not come back at once, of which there have
     to be ten: for counters and commanded values a step is what they do. Of a value that otherwise
@@ -141,7 +146,7 @@ def find_jumps(frame: Frame, name: str, score: float) -> list[Jump]:
         middle = float(np.partition(sizes, len(sizes) // 2)[len(sizes) // 2]) if is_known else 0.0
         limit = middle + score * middle / 0.6745
         if is_known and largest.max() < CERTAINLY_LESS * limit:
-            return []
+            return [], float(largest.max()), limit
     wanted = zones.spans(largest > limit if is_known else changes > 0)
     found: dict[float, Jump] = {}
     for start, stop in wanted:
@@ -149,11 +154,12 @@ def find_jumps(frame: Frame, name: str, score: float) -> list[Jump]:
         jumps = _wide(*part, limit, interval_s) if is_known else _excursions(*part, interval_s)
         found |= {jump.start_s: jump for jump in jumps}
     jumps = _without_swings(list(found.values()), frame, name)
+    sizes = float(largest.max(initial=0.0)), limit if is_known else math.inf
     if len(jumps) < 2 or not is_known:
-        return jumps
+        return jumps, *sizes
     spans = _sampled(zones, zones.value_count, SAMPLED_CHUNKS)
     levels = [frame.rows(*span).usable(name)[1] for span in spans]
-    return list(_with_return(jumps, float(np.median(np.concatenate(levels)))))
+    return list(_with_return(jumps, float(np.median(np.concatenate(levels))))), *sizes
 
 
 def _interval_s(parts: Sequence[Array]) -> float:

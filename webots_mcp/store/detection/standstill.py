@@ -319,7 +319,7 @@ class Standings:
         if self.speed is not None and told.sum() > TOLD_SHARE * len(told):
             speeds = self.speeds[rows][told]
             said.append(f"{self.speed.name} {median(speeds):.3g}")
-        if wheels.any():
+        if wheels.sum() > TOLD_SHARE * len(wheels):
             unit = " rad/s" if all(wheel.unit == "rad/s" for wheel in self.wheels) else ""
             turning = (self.wheel_drives * self.fastest)[rows][wheels]
             said.append(f"wheels at {median(abs(turning)):.3g}{unit}")

@@ -288,7 +288,7 @@ def full_path(path: str | os.PathLike[str]) -> Path:
 
 
 def bundled(name: str) -> Path:
-    """The folder `name` (migrations, examples): in the package, or in a checkout next to it.
+    """The folder `name` (examples): in the package, or in a checkout next to it.
 
     Raises:
         FileNotFoundError: It is in neither place; the installation is broken.

@@ -21,11 +21,12 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Any, BinaryIO, Final, cast
 
+from webots_mcp.contract import placed
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.formats.contents import KINDS, Contents, PlacedCommand, Pose, Way
 from webots_mcp.requirements import explain_extra
 from webots_mcp.store.chunks import parse
-from webots_mcp.store.export import Exported, Progress, Recorded, json_text, placed, value_at
+from webots_mcp.store.export import Exported, Progress, Recorded, json_text, value_at
 from webots_mcp.store.logs import LogLine
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.run_rows import Event, StoredImage

@@ -3,4 +3,4 @@ demo tests check docs benchmarks:
 	./run $@
 
 schema:  ## generate webots_mcp/schema.sql from the migrations
-	.venv/bin/python -m webots_mcp.store.migrate > schema.new && mv schema.new webots_mcp/schema.sql
+	.venv/bin/python -m migrations.generate > schema.new && mv schema.new webots_mcp/schema.sql

@@ -40,11 +40,17 @@ def page(name: str) -> str:
     return (DOCS / name).read_text("utf-8")
 
 
-def test_the_page_of_the_tools_names_every_tool_and_no_other() -> None:
+def test_the_page_of_the_tools_names_and_counts_every_tool_and_no_other() -> None:
     with closing(MemoryDatabase()) as memory:
         server = create_server(memory, memory.data_dir)
         tools = {tool.name for tool in anyio.run(server.list_tools)}
+        core = create_server(memory, memory.data_dir, core=True)
+        counts = str(len(tools)), str(len(anyio.run(core.list_tools)))
     assert set(re.findall(r"\bwebots_[a-z_]+\b", page("tools.md"))) == tools
+    assert re.findall(r"all (\d+) tools|lists the (\d+) that", page("tools.md")) == [
+        (counts[0], ""),
+        ("", counts[1]),
+    ]
 
 
 def test_the_page_of_the_command_line_names_every_command() -> None:

@@ -275,6 +275,20 @@ def whole_file(file: Path) -> Generator[Path]:
         aside.unlink(missing_ok=True)
 
 
+@contextmanager
+def placed(file: Path) -> Generator[Path]:
+    """As `whole_file`, for a file that somebody has named.
+
+    Raises:
+        InvalidInputError: It cannot be written.
+    """
+    try:
+        with whole_file(file) as aside:
+            yield aside
+    except OSError as error:
+        raise InvalidInputError(f"{file} cannot be written: {error}") from error
+
+
 def full_path(path: str | os.PathLike[str]) -> Path:
     """The path with `~` and links followed.
 
@@ -288,7 +302,7 @@ def full_path(path: str | os.PathLike[str]) -> Path:
 
 
 def bundled(name: str) -> Path:
-    """The folder `name` (migrations, examples): in the package, or in a checkout next to it.
+    """The folder `name` (examples): in the package, or in a checkout next to it.
 
     Raises:
         FileNotFoundError: It is in neither place; the installation is broken.

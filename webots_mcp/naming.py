@@ -230,12 +230,9 @@ def is_seen_speed(name: str) -> bool:
     return branch in (WORLD, SOLIDS) and rest.endswith(f".{SEEN_SPEED}")
 
 
-def find_mode(texts: Collection[str], choices: Collection[str] = ()) -> str | None:
-    """The name of what a robot is doing, among those of its texts; None without any.
-
-    Without such a text it is one of `choices`: whole numbers with few different values.
-    """
-    return next(iter(modes_in(texts, choices)), None)
+def find_mode(texts: Collection[str]) -> str | None:
+    """The name of what a robot is doing, among those of its texts; None without any."""
+    return next(iter(modes_in(texts)), None)
 
 
 def modes_in(texts: Collection[str], choices: Collection[str] = ()) -> list[str]:

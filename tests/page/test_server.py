@@ -18,7 +18,7 @@ from tests.page.conftest import Server
 from tests.waiting import wait_for
 from webots_mcp.cli import main
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.plugins.page.server import MOST_TABS
+from webots_mcp.plugins.page.page_server import MOST_TABS
 
 
 def answer(server: Server, path: str, **headers: str) -> tuple[int, str]:

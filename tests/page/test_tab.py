@@ -16,7 +16,7 @@ from tests.waiting import wait_for
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.plugins.page.page_data import choice_of, draw
-from webots_mcp.plugins.page.server import ChunkMaker
+from webots_mcp.plugins.page.page_server import ChunkMaker
 from webots_mcp.store.chunk_making import LEAST_ROWS
 from webots_mcp.store.chunks import watermark
 from webots_mcp.store.recording import Recording

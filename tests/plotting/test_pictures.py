@@ -133,7 +133,7 @@ def test_runs_are_laid_over_each_other_from_their_starts_and_named_by_their_labe
 def test_a_flag_and_a_text_below_the_curves_are_labelled_or_in_the_legend(
     rover: sqlite3.Connection,
 ) -> None:
-    picture = ask(rover, signals=["mode", "sensors.bumper"], image_format="svg", events=False)
+    picture = ask(rover, signals=["mode", "sensors.bumper"], image_format="svg")
     assert words(picture) >= {"mode", "sensors.bumper", "cruise", "avoid", "back_up", "true"}
 
 

@@ -10,9 +10,9 @@ from sqlalchemy.dialects import postgresql
 from sqlalchemy.schema import CreateIndex, CreateTable
 from sqlmodel import SQLModel
 
+from migrations.generate import generated_statements
 from webots_mcp.connection import shipped_statements
 from webots_mcp.store import models
-from webots_mcp.store.migrate import generated_statements
 
 assert models.Robot  # importing the models filled the metadata
 TABLES = SQLModel.metadata.sorted_tables

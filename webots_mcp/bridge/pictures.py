@@ -210,27 +210,16 @@ class Picture(NamedTuple):
     scale: str | None = None
 
 
-def _of_camera(device: Any) -> Picture:
-    return Picture(*image_of(device))
-
-
-def _of_range_finder(device: Any) -> Picture:
-
-    canvas, scale = draw_depths(device)
-    return Picture(canvas.bgra, canvas.width, canvas.height, scale)
-
-
-def _of_lidar(device: Any) -> Picture:
-
-    canvas, scale = draw_from_above(device)
+def _drawn(drawn: tuple[Canvas, str]) -> Picture:
+    canvas, scale = drawn
     return Picture(canvas.bgra, canvas.width, canvas.height, scale)
 
 
 # By class name in Webots' `controller` package; without a name asked for, the first kind is chosen.
 _PICTURES: Final[dict[str, Callable[[Any], Picture]]] = {
-    "Camera": _of_camera,
-    "RangeFinder": _of_range_finder,
-    "Lidar": _of_lidar,
+    "Camera": lambda device: Picture(*image_of(device)),
+    "RangeFinder": lambda device: _drawn(draw_depths(device)),
+    "Lidar": lambda device: _drawn(draw_from_above(device)),
 }
 
 

@@ -35,7 +35,7 @@ from webots_mcp.cli.terminal import (
     shown_progress,
     wait,
 )
-from webots_mcp.contract import whole_file
+from webots_mcp.contract import placed
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins import export_formats
 from webots_mcp.store.merging import write_bundle
@@ -203,7 +203,6 @@ def _notes_of(wanted: TimeRange) -> list[str]:
 
 
 def _export_bundle(recorded: Where, part: Range, file: Path) -> _Written:
-    from webots_mcp.store.export import placed
     from webots_mcp.store.reading.ranges import Scope, find_subject
 
     scope, recording = part.scope(), recorded.recording()
@@ -569,11 +568,8 @@ def write_picture(file: Path, picture: Picture, *, as_json: bool = False) -> Non
     Raises:
         InvalidInputError: The file cannot be written.
     """
-    try:
-        with whole_file(file) as aside:
-            aside.write_bytes(picture.data)
-    except OSError as error:
-        raise InvalidInputError(f"{file} cannot be written: {error}") from error
+    with placed(file) as aside:
+        aside.write_bytes(picture.data)
     if as_json:
         return print_json(
             {"file": str(file), "caption": picture.caption, "notes": list(picture.notes)}

@@ -29,7 +29,7 @@ from webots_mcp.cli.options import (
     make_chunks_first,
 )
 from webots_mcp.cli.terminal import print_answer, print_json, print_table
-from webots_mcp.contract import find_project, host_name, whole_file
+from webots_mcp.contract import find_project, host_name, placed
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 from webots_mcp.naming import listed, spelled_out
 from webots_mcp.requirements import explain_extra
@@ -146,11 +146,8 @@ def _write(file: Path, answer: dict[str, Any]) -> None:
         elif each["outcome"] == "warn":
             SubElement(case, "system-out").text = f"warning: {says}"
     suite.attrib |= {name: str(count) for name, count in counts.items()}
-    try:
-        with whole_file(file) as aside:
-            aside.write_bytes(tostring(suite, "utf-8", xml_declaration=True))
-    except OSError as error:
-        raise InvalidInputError(f"{file} cannot be written: {error}") from error
+    with placed(file) as aside:
+        aside.write_bytes(tostring(suite, "utf-8", xml_declaration=True))
 
 
 def _checks_in(answer: dict[str, Any]) -> list[dict[str, Any]]:

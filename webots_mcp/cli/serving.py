@@ -42,7 +42,7 @@ def serve(
         Literal["all", "core"],
         Parameter(
             "--tools",
-            help="Which tools to list: core are the 17 that answer most questions; the others are "
+            help="Which tools to list: core are those that answer most questions; the others are "
             "there when they are called by name.",
         ),
     ] = "all",

@@ -7,6 +7,7 @@ import textwrap
 from collections import Counter
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
 
     from webots_mcp.diagnosis import Checked, Examined
     from webots_mcp.setup import FileChange, ProjectController
-    from webots_mcp.setup.client_entries import Client
-    from webots_mcp.setup.skills import Part
 
 _WRONG: Final = 1  # the exit code
 _LEAST_COLUMN: Final = 30  # characters that a line of a folded text has at least
@@ -296,7 +295,7 @@ def _make_ready(
     skills: bool,
 ) -> None:
     """Tell clients of the server, and say what the controllers need."""
-    from webots_mcp.contract import PROJECT_DATA_FOLDER
+    from webots_mcp.contract import PROJECT_DATA_FOLDER, PROJECT_FILE
     from webots_mcp.setup import client_entries, controllers_of, project_of
     from webots_mcp.setup.skills import parts_of
     from webots_mcp.setup.wsl import windows_server
@@ -310,9 +309,14 @@ def _make_ready(
     clients = client_entries.clients_of(project)
     clients += [client_entries.claude_desktop()] if claude_desktop else []
     line = http or of_windows or client_entries.server_command(data_dir)
-    files = [_ignored(data_dir, writing), _allowed(project, writing)]
-    files += [_told(client, name, line, writing) for client in clients]
-    files += [_skilled(part, writing) for part in parts_of(project)] if skills else []
+    files = [
+        _written(data_dir / ".gitignore", writing, partial(_ignored, data_dir, writing)),
+        _written(project / PROJECT_FILE, writing, partial(_allowed, project)),
+    ]
+    for each in clients:
+        planned = partial(client_entries.plan_entry, each, name, line)
+        files += [{"client": each.name} | _written(each.file, writing, planned)]
+    files += [_written(e.file, writing, e.plan) for e in parts_of(project)] if skills else []
     controllers = [_described(found, project) for found in controllers_of(project)]
     hindrance = None if http or of_windows else client_entries.server_hindrance()
     notes = [note for note in (border, hindrance, expected) if note]
@@ -351,57 +355,36 @@ def _expected(data_dir: Path, writing: Writing) -> str | None:
     return f"{file}: {counted}; webots-mcp check judges runs by what is there"
 
 
-def _allowed(project: Path, writing: Writing) -> dict[str, str]:
-    """Write what may be asked for in the project, unless it is written already."""
-    from webots_mcp.contract import PROJECT_FILE
+def _written(
+    file: Path, writing: Writing, planned: Callable[[], tuple[FileChange, str | None]]
+) -> dict[str, str]:
+    """What became of a file, with what there is to know about it; or why it was left as it is."""
+    try:
+        change, note = planned()
+        return writing.apply(change) | ({"note": note} if note else {})
+    except (WebotsMCPError, OSError, UnicodeError) as error:
+        return {"file": str(file), "outcome": "refused", "note": str(error)}
+
+
+def _allowed(project: Path) -> tuple[FileChange, str | None]:
+    """What may be asked for in the project, unless that is written already."""
     from webots_mcp.setup.client_entries import policy_file
     from webots_mcp.store.policy import read_policy
 
-    file = project / PROJECT_FILE
-    try:
-        change = policy_file(project)
-        done = writing.apply(change)
-        if not change.is_needed and read_policy(file) is None:
-            done["note"] = "has no table [allow], so that all is allowed"
-        return done
-    except (WebotsMCPError, OSError) as error:
-        return {"file": str(file), "outcome": "refused", "note": str(error)}
+    change = policy_file(project)
+    is_open = not change.is_needed and read_policy(change.file) is None
+    return change, "has no table [allow], so that all is allowed" if is_open else None
 
 
-def _ignored(data_dir: Path, writing: Writing) -> dict[str, str]:
-    """Keep what is recorded out of the project's repository."""
+def _ignored(data_dir: Path, writing: Writing) -> tuple[FileChange, str | None]:
+    """What keeps the recording out of the project's repository."""
     from webots_mcp.contract import make_folder
     from webots_mcp.setup.client_entries import ignore_file
 
-    file = data_dir / ".gitignore"
-    try:
-        change = ignore_file(data_dir)
-        if change.is_needed and not writing.dry_run:
-            make_folder(data_dir)
-        return writing.apply(change)
-    except (WebotsMCPError, OSError) as error:
-        return {"file": str(file), "outcome": "refused", "note": str(error)}
-
-
-def _told(client: Client, name: str, line: list[str] | str, writing: Writing) -> dict[str, str]:
-    """Put the server into a client's file."""
-    from webots_mcp.setup.client_entries import plan_entry
-
-    named = {"client": client.name}
-    try:
-        change, note = plan_entry(client, name, line)
-        return named | writing.apply(change) | ({"note": note} if note else {})
-    except (WebotsMCPError, OSError) as error:
-        return {**named, "file": str(client.file), "outcome": "refused", "note": str(error)}
-
-
-def _skilled(part: Part, writing: Writing) -> dict[str, str]:
-    """Bring a skill, or the lines of AGENTS.md, up to date."""
-    try:
-        change, note = part.plan()
-        return writing.apply(change) | ({"note": note} if note else {})
-    except (WebotsMCPError, OSError, UnicodeError) as error:
-        return {"file": str(part.file), "outcome": "refused", "note": str(error)}
+    change = ignore_file(data_dir)
+    if change.is_needed and not writing.dry_run:
+        make_folder(data_dir)
+    return change, None
 
 
 def _described(controller: ProjectController, project: Path) -> dict[str, Any]:

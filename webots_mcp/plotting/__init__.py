@@ -29,7 +29,6 @@ def plot(
     run_ids: Sequence[int] = (),
     trial_set: int | None = None,
     bands: str | None = None,
-    events: bool = True,
     width_px: int = WIDTH_PX,
     height_px: int = HEIGHT_PX,
     image_format: ImageFormat = "png",
@@ -47,7 +46,6 @@ def plot(
             name; of what else is asked only the form of the picture counts.
         bands: The text signal that stands behind the curves or colours the way; None for the mode,
             where there is one; "" for none (a trajectory is coloured by time then).
-        events: Whether to mark events.
         width_px: 400 to 2000.
         height_px: 300 to 2000.
         image_format: "png" or "svg".
@@ -66,11 +64,11 @@ def plot(
     ranges = [find_range(connection, each) for each in scopes]
     if kind == "signals":
         names = signals or changed_most(connection, ranges[-1])
-        return plot_signals(connection, ranges, names, bands=bands, events=events, sheet=sheet)
+        return plot_signals(connection, ranges, names, bands=bands, sheet=sheet)
     if kind != "trajectory":
         raise InvalidInputError(f"kind={kind!r}: there is {', '.join(get_args(PlotKind))}")
     position = _position(signals)
-    return plot_trajectory(connection, ranges, position, bands=bands, events=events, sheet=sheet)
+    return plot_trajectory(connection, ranges, position, bands=bands, sheet=sheet)
 
 
 def changed_most(connection: sqlite3.Connection, time_range: TimeRange) -> list[str]:

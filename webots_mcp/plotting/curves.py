@@ -38,16 +38,6 @@ class Curve:
     low: float
     high: float
 
-    @property
-    def lone_points(self) -> list[Point]:
-        """Those between two breaks: a line would not show them."""
-        framed = [_BREAK, *self.points, _BREAK]
-        return [
-            point
-            for before, point, after in zip(framed, framed[1:], framed[2:], strict=False)
-            if math.isnan(before[0]) and math.isnan(after[0]) and not math.isnan(point[0])
-        ]
-
 
 def curve_of(columns: NumberColumns, run: RunHistory, origin_s: float = 0.0) -> Curve | None:
     """The curve of a signal; None where it has no value.

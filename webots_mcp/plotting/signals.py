@@ -70,7 +70,6 @@ def plot_signals(
     names: Sequence[str],
     *,
     bands: str | None = None,
-    events: bool = True,
     sheet: Sheet | None = None,
 ) -> Picture:
     """Numbers as a mean line in a min-max band, a mode behind them, flags and events below.
@@ -84,7 +83,6 @@ def plot_signals(
         names: Signals, with `*`.
         bands: The text signal behind the curves; None for the mode, where there is one; "" for
             none. Of several runs it is drawn below, once per run.
-        events: Whether to mark what `find_events` finds; of several runs nothing is marked.
         sheet: Size and format; None for a PNG of 900 x 500 pixels.
 
     Raises:
@@ -93,9 +91,7 @@ def plot_signals(
         NothingRecordedError: None of the signals has a value in the range.
     """
     sheet = sheet or Sheet()
-    plot, notes = compose_signals(
-        connection, ranges, names, bands=bands, events=events, room=sheet.room
-    )
+    plot, notes = compose_signals(connection, ranges, names, bands=bands, room=sheet.room)
     if not plot.panels:
         rows = len(plot.lanes) + len(plot.events)
         sheet = replace(sheet, height_px=_height_of_rows(rows, sheet))

@@ -73,7 +73,6 @@ def plot_trajectory(
     position: tuple[str, str] | None = None,
     *,
     bands: str | None = None,
-    events: bool = True,
     sheet: Sheet | None = None,
 ) -> Picture:
     """The way of the robot in the plane, with start, end, direction, and where it got into trouble.
@@ -84,7 +83,6 @@ def plot_trajectory(
         position: The signals to the right and upwards; None finds them by their names.
         bands: The text signal that colours the way; None for the mode, where there is one; ""
             for the time. Of several runs each has its own colour.
-        events: Whether to mark where it was stuck and where a bumper or the like was true.
         sheet: Size and format; None for a PNG of 900 x 500 pixels.
 
     Raises:
@@ -93,7 +91,7 @@ def plot_trajectory(
         NothingRecordedError: No position was recorded in the range.
     """
     sheet = sheet or Sheet()
-    plot, notes = compose_trajectory(connection, ranges, position, bands=bands, events=events)
+    plot, notes = compose_trajectory(connection, ranges, position, bands=bands)
     canvas, _ = paint_trajectory(plot, sheet.width_px, sheet.height_px)
     caption = "; ".join([f"{plot.title}: {plot.y_label} over {plot.x_label}", *_cut(plot.tracks)])
     return canvas.picture(sheet.image_format, caption, notes)

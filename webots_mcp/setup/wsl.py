@@ -28,26 +28,6 @@ WAY_OUT: Final = (
 _PROC_VERSION: Final = Path("/proc/version")
 _DRIVE: Final = re.compile(r"[A-Za-z]:\\")
 _PATIENCE_S: Final = 30  # PowerShell takes seconds to start the first time
-_ASK: Final = r"""
-[Console]::OutputEncoding = [Text.Encoding]::UTF8
-$ProgressPreference = 'SilentlyContinue'
-$homes = @($env:WEBOTS_HOME, "$env:ProgramFiles\Webots", "$env:LOCALAPPDATA\Programs\Webots")
-$webots = $homes | Where-Object { $_ -and (Test-Path "$_\msys64\mingw64\bin\webots.exe") }
-$server = $null
-$version = $null
-foreach ($name in 'webots-mcp.exe', 'py.exe', 'python.exe') {
-  $found = Get-Command $name -CommandType Application -ErrorAction SilentlyContinue
-  if (-not $found) { continue }
-  $program = @($found)[0].Source
-  $module = @()
-  if ($name -ne 'webots-mcp.exe') { $module = @('-m', 'webots_mcp') }
-  $version = & $program @module --version 2>$null
-  if ($LASTEXITCODE -eq 0) { $server = @($program) + $module; break }
-}
-ConvertTo-Json -Compress @{
-  webots = @($webots)[0]; server = $server; version = "$version"
-}
-"""
 
 
 class Windows(NamedTuple):
@@ -80,8 +60,9 @@ def ask_windows() -> Windows:
     Raises:
         CommandRefusedError: It cannot be asked from here.
     """
-    script = base64.b64encode(_ASK.encode("utf-16-le")).decode()
-    said = _answer("powershell.exe", "-NoProfile", "-NonInteractive", "-EncodedCommand", script)
+    script = Path(__file__).with_name("ask_windows.ps1").read_text("utf-8")
+    encoded = base64.b64encode(script.encode("utf-16-le")).decode()
+    said = _answer("powershell.exe", "-NoProfile", "-NonInteractive", "-EncodedCommand", encoded)
     try:
         found: dict[str, Any] = json.loads(said)
         command: list[str] = found["server"] or []

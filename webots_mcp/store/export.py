@@ -11,14 +11,13 @@ import re
 import sqlite3
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar, Final, Literal, NamedTuple, cast
 
-from webots_mcp.contract import whole_file
+from webots_mcp.contract import placed
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.naming import LONGEST_SPREAD_ARRAY, flatten
 from webots_mcp.plugins import ExportFormat, export_formats, load
@@ -598,20 +597,6 @@ def export_for_viewers(
     """
     exported: Exported = load(FOR_VIEWERS[form].write)(connection, data_dir, wanted, file, progress)
     return exported
-
-
-@contextmanager
-def placed(file: Path) -> Generator[Path]:
-    """A file next to it to write to, private to its owner, which replaces it when complete.
-
-    Raises:
-        InvalidInputError: It cannot be written.
-    """
-    try:
-        with whole_file(file) as aside:
-            yield aside
-    except OSError as error:
-        raise InvalidInputError(f"{file} cannot be written: {error}") from error
 
 
 def format_of(file: Path) -> str:

@@ -84,55 +84,47 @@ _WAITING: Final = (
 _LONGEST_FOLLOWED_TEXT: Final = 400  # of a state, log line or result; the database has it whole
 _MOST_FOLLOWED_LINES: Final = 500  # of one kind in one look
 
-_NEWS_OF_ROBOT: Final = (
-    "AND (:robot_id IS NULL OR r.id = :robot_id) ORDER BY {order} DESC LIMIT :limit"
-)
-_NEWS_ROW: Final = (
-    "SELECT t.id, t.wall_time_s, r.name, t.run_id, t.sim_time_s, {kind}, {text} FROM {table} t "
-    "JOIN run ON run.id = t.run_id JOIN robot r ON r.id = run.robot_id WHERE t.id > :after "
-)
-_NEWS_COMMAND: Final = (
-    "SELECT {cursor}, {wall}, r.name, NULL, {sim}, 'command', {text} FROM command t "
-    "JOIN robot r ON r.id = t.robot_id WHERE {cursor} > :after "
-)
+
+def _news_of(source: str, cursor: str, columns: str, text: str) -> str:
+    """The rows after a cursor of one robot or all, with the time and the text of each."""
+    return (
+        f"SELECT {cursor}, {columns}, {text} FROM {source} WHERE {cursor} > :after "
+        f"AND (:robot_id IS NULL OR r.id = :robot_id) ORDER BY {cursor} DESC LIMIT :limit"
+    )
+
+
+def _news_in(table: str, kind: str, text: str) -> str:
+    source = f"{table} t JOIN run ON run.id = t.run_id JOIN robot r ON r.id = run.robot_id"
+    return _news_of(source, "t.id", f"t.wall_time_s, r.name, t.run_id, t.sim_time_s, {kind}", text)
+
+
+def _news_of_commands(cursor: str, wall: str, sim: str, text: str) -> str:
+    source = "command t JOIN robot r ON r.id = t.robot_id"
+    return _news_of(source, cursor, f"{wall}, r.name, NULL, {sim}, 'command'", text)
+
+
+def _cut(text: str) -> str:
+    return f"substr({text}, 1, {_LONGEST_FOLLOWED_TEXT})"
+
+
+_ASKED: Final = "'#' || t.id, t.action"
+_OUTCOME: Final = _cut("coalesce(t.error, t.result)")
+_SAID: Final = f"iif(t.source IN {OF_CONSOLE}, t.source || ': ', '') || {_cut('t.message')}"
+_SETTLED_S: Final = "t.finished_wall_time_s"
 # Kind of news: which cursor it moves, and the rows after that cursor.
-_NEWS: Final[dict[str, str]] = {
-    "state": _NEWS_ROW.format(
-        table="state", kind="'state'", text=f"substr(t.data, 1, {_LONGEST_FOLLOWED_TEXT})"
-    )
-    + _NEWS_OF_ROBOT.format(order="t.id"),
-    "log": _NEWS_ROW.format(
-        table="log",
-        kind="t.level",
-        text=(
-            "iif(t.source IN ('console', 'webots'), t.source || ': ', '') || "
-            f"substr(t.message, 1, {_LONGEST_FOLLOWED_TEXT})"
-        ),
-    )
-    + _NEWS_OF_ROBOT.format(order="t.id"),
-    "event": _NEWS_ROW.format(
-        table="event",
-        kind="'event'",
-        text=f"concat_text(t.kind, t.name, substr(t.data, 1, {_LONGEST_FOLLOWED_TEXT}))",
-    )
-    + _NEWS_OF_ROBOT.format(order="t.id"),
-    "asked": _NEWS_COMMAND.format(
-        cursor="t.id",
-        wall="t.created_wall_time_s",
-        sim="NULL",
-        text=f"concat_text('#' || t.id, t.action, substr(t.params, 1, {_LONGEST_FOLLOWED_TEXT}))",
-    )
-    + _NEWS_OF_ROBOT.format(order="t.id"),
-    "settled": _NEWS_COMMAND.format(
-        cursor="t.finished_wall_time_s",
-        wall="t.finished_wall_time_s",
-        sim="t.finished_sim_time_s",
-        text=(
-            "concat_text('#' || t.id, t.action, t.status, "
-            f"substr(coalesce(t.error, t.result), 1, {_LONGEST_FOLLOWED_TEXT}))"
-        ),
-    )
-    + _NEWS_OF_ROBOT.format(order="t.finished_wall_time_s"),
+_NEWS: Final = {
+    "state": _news_in("state", "'state'", _cut("t.data")),
+    "log": _news_in("log", "t.level", _SAID),
+    "event": _news_in("event", "'event'", f"concat_text(t.kind, t.name, {_cut('t.data')})"),
+    "asked": _news_of_commands(
+        "t.id", "t.created_wall_time_s", "NULL", f"concat_text({_ASKED}, {_cut('t.params')})"
+    ),
+    "settled": _news_of_commands(
+        _SETTLED_S,
+        _SETTLED_S,
+        "t.finished_sim_time_s",
+        f"concat_text({_ASKED}, t.status, {_OUTCOME})",
+    ),
 }
 
 

@@ -38,7 +38,7 @@ from webots_mcp.connection import connect
 from webots_mcp.errors import InvalidInputError, PoolError, PoolUnavailableError
 from webots_mcp.plugins.pool.pool_contents import open_pool
 from webots_mcp.plugins.pool.pool_interface import Batch, Row, Table, table, tables
-from webots_mcp.plugins.pool.postgres_pool import VIEWS, prepare
+from webots_mcp.plugins.pool.postgres_pool import prepare, views
 from webots_mcp.store.chunk_making import make_chunks
 
 pytestmark = pytest.mark.slow
@@ -113,7 +113,7 @@ def test_a_pool_has_the_columns_of_a_recording_behind_the_recordings_uuid(
     assert found == [("recording_uuid", "uuid", False), *wanted]
 
 
-@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("view", views())
 def test_a_view_has_the_rows_that_it_has_in_the_recording(
     postgres: Server, pool: str, rover: sqlite3.Connection, bridge_recording: Path, view: str
 ) -> None:

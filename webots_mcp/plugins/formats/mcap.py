@@ -21,11 +21,12 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Any, BinaryIO, Final, cast
 
+from webots_mcp.contract import placed
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.formats.contents import KINDS, Contents, PlacedCommand, Pose, Way
 from webots_mcp.requirements import explain_extra
 from webots_mcp.store.chunks import parse
-from webots_mcp.store.export import Exported, Progress, Recorded, json_text, placed, value_at
+from webots_mcp.store.export import Exported, Progress, Recorded, json_text, value_at
 from webots_mcp.store.logs import LogLine
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.run_rows import Event, StoredImage
@@ -290,61 +291,14 @@ def _nanoseconds(time_s: float) -> int:
 
 Schema = dict[str, Any]
 
-_NUMBER: Final[Schema] = {"type": "number"}
-_INTEGER: Final[Schema] = {"type": "integer"}
-_TEXT: Final[Schema] = {"type": "string"}
-
 
 def _object(**properties: Schema) -> Schema:
     return {"type": "object", "properties": properties}
 
 
-_TIME: Final = _object(sec=_INTEGER, nsec=_INTEGER)
-_VECTOR: Final = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER)
-_QUATERNION: Final = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
-_POSE: Final = _object(position=_VECTOR, orientation=_QUATERNION)
-
-FIXED: Final[dict[str, Schema]] = {
-    "foxglove.FrameTransform": _object(
-        timestamp=_TIME,
-        parent_frame_id=_TEXT,
-        child_frame_id=_TEXT,
-        translation=_VECTOR,
-        rotation=_QUATERNION,
-    ),
-    "foxglove.PosesInFrame": _object(
-        timestamp=_TIME,
-        frame_id=_TEXT,
-        poses={"type": "array", "items": _POSE},
-    ),
-    "foxglove.CompressedImage": _object(
-        timestamp=_TIME,
-        frame_id=_TEXT,
-        data={"type": "string", "contentEncoding": "base64"},
-        format=_TEXT,
-    ),
-    "foxglove.Log": _object(
-        timestamp=_TIME,
-        level=_INTEGER,
-        message=_TEXT,
-        name=_TEXT,
-        file=_TEXT,
-        line=_INTEGER,
-    ),
-    "webots_mcp.Event": _object(timestamp=_TIME, kind=_TEXT, name=_TEXT, data=_object()),
-    "webots_mcp.Command": _object(
-        timestamp=_TIME,
-        id=_INTEGER,
-        action=_TEXT,
-        params=_object(),
-        status=_TEXT,
-        requested_by=_TEXT,
-        finished_sim_time_s=_NUMBER,
-        took_wall_s=_NUMBER,
-        error=_TEXT,
-    ),
-}
-
+FIXED: Final[dict[str, Schema]] = json.loads(
+    Path(__file__).with_name("mcap_schemas.json").read_text("utf-8")
+)
 _SCALARS: Final = {bool: "boolean", int: "number", float: "number", str: "string"}
 
 

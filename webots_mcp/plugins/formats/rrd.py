@@ -22,6 +22,7 @@ from threading import Thread
 from typing import Any, Final, NamedTuple, TypeVar
 from uuid import NAMESPACE_URL, uuid5
 
+from webots_mcp.contract import placed
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.formats.contents import KINDS, Contents, Item, PlacedCommand, Pose, Way
 from webots_mcp.plugins.formats.mcap import main_signals
@@ -35,7 +36,6 @@ from webots_mcp.store.export import (
     as_text,
     flat_row,
     kind_of,
-    placed,
 )
 from webots_mcp.store.logs import LogLine
 from webots_mcp.store.reading.ranges import TimeRange

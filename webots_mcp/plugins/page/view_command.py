@@ -46,7 +46,7 @@ def view(
     from dataclasses import replace
 
     from webots_mcp.errors import NoDatabaseError
-    from webots_mcp.plugins.page.server import create_page_server
+    from webots_mcp.plugins.page.page_server import create_page_server
 
     recording = replace(recorded.recording(), asker="page")
     with suppress(NoDatabaseError), recording.reader():  # one that is refused will not be shown

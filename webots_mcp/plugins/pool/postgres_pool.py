@@ -21,6 +21,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Final, NoReturn, TypeAlias, cast
 
 import psycopg
@@ -258,83 +259,29 @@ def _column(column: sa.Column[Any], shipped: Table) -> sa.Column[Any]:
 
 # -- views ------------------------------------------------------------------------------------
 
-_KEY: Final = OWNER
+_VIEW: Final = re.compile(r"CREATE VIEW (\w+) AS\n.*?(?=;\n)", re.DOTALL)
 _NOW_S: Final = "extract(epoch FROM clock_timestamp())::double precision"
-
-
-def _rounded(number: str, digits: int = 3) -> str:
-    return f"round(({number})::numeric, {digits})::double precision"
-
-
 _EPOCH_MS: Final = "210866760000000::double precision"  # from the first Julian day to 1970
+# As text, rounded to milliseconds by the same additions that SQLite's strftime makes.
+_UTC: Final = (
+    rf"to_char(to_timestamp((floor((\1) * 1000 + {_EPOCH_MS} + 0.5) - {_EPOCH_MS}) / 1000) "
+    "AT TIME ZONE 'UTC', 'YYYY-MM-DD HH24:MI:SS.MS')"
+)
 
 
-def _utc(time: str) -> str:
-    """As text, rounded to milliseconds by the same additions that SQLite's strftime makes."""
-    seconds = f"(floor(({time}) * 1000 + {_EPOCH_MS} + 0.5) - {_EPOCH_MS}) / 1000"
-    return f"to_char(to_timestamp({seconds}) AT TIME ZONE 'UTC', 'YYYY-MM-DD HH24:MI:SS.MS')"
-
-
-def _robot_of(alias: str) -> str:
-    return f"""(SELECT r.name FROM run u JOIN robot r USING ({_KEY})
-    WHERE u.{_KEY} = {alias}.{_KEY} AND u.id = {alias}.run_id AND r.id = u.robot_id) AS robot"""
-
-
-VIEWS: Final = {
-    "robot_run": f"""SELECT u.{_KEY}, r.name AS robot, u.id AS run_id, u.label,
-  {_utc("u.started_wall_time_s")} AS started_utc,
-  {_rounded("u.last_sim_time_s - u.started_sim_time_s")} AS duration_s,
-  {_rounded("u.last_wall_time_s - u.started_wall_time_s")} AS wall_duration_s,
-  {
-        _rounded(
-            "(u.last_sim_time_s - u.started_sim_time_s) / "
-            "nullif(u.last_wall_time_s - u.started_wall_time_s, 0)"
-        )
-    } AS real_time_factor,
-  u.row_count, u.purged_rows,
-  {_rounded("u.row_count / nullif(u.last_sim_time_s - u.started_sim_time_s, 0)", 2)} AS rows_per_s,
-  u.start_reason, u.end_reason, u.keep, u.note, u.world, s.controller, s.controller_sha256,
-  s.git_commit, u.session_id
-FROM run u JOIN robot r ON r.{_KEY} = u.{_KEY} AND r.id = u.robot_id
-JOIN session s ON s.{_KEY} = u.{_KEY} AND s.id = u.session_id""",
-    "robot_command": f"""SELECT c.{_KEY}, r.name AS robot, c.id AS command_id, c.action, c.params,
-  c.status, {_utc("c.created_wall_time_s")} AS created_utc,
-  {
-        _rounded(
-            "coalesce(c.claimed_wall_time_s, c.finished_wall_time_s, "
-            + _NOW_S
-            + ") - c.created_wall_time_s"
-        )
-    } AS waiting_s,
-  {_rounded(f"coalesce(c.finished_wall_time_s, {_NOW_S}) - c.claimed_wall_time_s")} AS running_s,
-  c.claimed_sim_time_s, c.finished_sim_time_s,
-  CASE WHEN c.finished_sim_time_s >= c.claimed_sim_time_s /* a reset takes it back */
-    THEN {_rounded("c.finished_sim_time_s - c.claimed_sim_time_s")} END AS running_sim_s,
-  c.result, c.error, c.requested_by, c.session_id
-FROM command c JOIN robot r ON r.{_KEY} = c.{_KEY} AND r.id = c.robot_id""",
-    "robot_event": f"""SELECT e.{_KEY}, {_robot_of("e")},
-  e.run_id, e.id AS event_id, e.sim_time_s, {_utc("e.wall_time_s")} AS utc, e.kind, e.name,
-  e.data ->> 'from' AS from_value, e.data ->> 'to' AS to_value, e.data
-FROM event e""",
-    "robot_log": f"""SELECT l.{_KEY}, {_robot_of("l")},
-  l.run_id, l.id AS log_id, l.sim_time_s, {_utc("l.wall_time_s")} AS utc, l.level, l.source,
-  l.logger, l.message
-FROM log l""",
-    "robot_statistics": f"""SELECT g.{_KEY}, r.name AS robot, g.run_id, s.name AS signal,
-  g.start_sim_time_s AS start_s, g.end_sim_time_s AS end_s, c.row_count, c.value_count, c.min,
-  c.max, c.sum / nullif(c.value_count, 0) AS mean, c.first, c.last, c.largest_step, c.change_count
-FROM chunk c JOIN row_group g ON g.{_KEY} = c.{_KEY} AND g.id = c.group_id
-JOIN signal s ON s.{_KEY} = c.{_KEY} AND s.id = c.signal_id
-JOIN robot r ON r.{_KEY} = s.{_KEY} AND r.id = s.robot_id""",
-}
+def views() -> dict[str, str]:
+    """The statements that make the views, by name."""
+    text = Path(__file__).with_name("postgres_views.sql").read_text("utf-8")
+    written_out = re.sub(r"UTC\((.*?)\)", _UTC, text.replace("NOW_S", _NOW_S))
+    return {made[1]: made[0] for made in _VIEW.finditer(written_out)}
 
 
 def _view_statements() -> Iterator[str]:
-    """The statements that make the views, and say of each what a recording's schema says."""
-    for name, query in VIEWS.items():
+    """Those, and what a recording's schema says of each view."""
+    for name, made in views().items():
         comment = re.search(r"/\* (.*?) \*/", shipped_objects()[name], re.DOTALL)
         assert comment is not None, f"{name} has no comment"
-        yield f"CREATE VIEW {name} AS\n{query}"
+        yield made
         yield f"COMMENT ON VIEW {name} IS '{comment[1].replace(chr(39), chr(39) * 2)}'"
 
 

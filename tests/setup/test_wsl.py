@@ -164,3 +164,13 @@ def test_a_project_in_wsl_keeps_its_own_server_and_is_warned_of_a_webots_on_wind
     verdict, seen = verdicts(project, capsys)["WSL"]
     assert verdict == "warning"
     assert f"the project is in WSL ({project})" in seen
+
+
+def test_no_password_of_an_address_is_written_into_a_project(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "worlds").mkdir()
+    for url in ("http://me:hidden@robots.lab/mcp", "http://", "http://robots lab"):
+        assert main(["init", str(tmp_path), "--http", url]) == 2
+        assert "is no URL without user and password" in capsys.readouterr().err
+    assert not (tmp_path / ".mcp.json").exists()

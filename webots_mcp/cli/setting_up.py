@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import textwrap
 from collections import Counter
@@ -300,8 +301,11 @@ def _make_ready(
     from webots_mcp.setup.skills import parts_of
     from webots_mcp.setup.wsl import windows_server
 
-    if http is not None and not http.startswith(("http://", "https://")):
-        raise InvalidInputError(f"--http {http!r} is no URL, such as http://127.0.0.1:8000/mcp")
+    if http is not None and not re.fullmatch(r"https?://[^\s/@]+(/\S*)?", http):
+        raise InvalidInputError(
+            f"--http {http!r} is no URL without user and password, such as "
+            "http://127.0.0.1:8000/mcp"
+        )
     project = project_of(folder)
     data_dir = project / PROJECT_DATA_FOLDER
     of_windows, border = (None, None) if http else windows_server(project)

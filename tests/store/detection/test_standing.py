@@ -234,6 +234,16 @@ def test_wheels_that_come_to_rest_as_it_does_are_no_reason_to_call_it_stuck(
     assert told.outcome == "warn" and told.evidence.endswith(", but wheels at rest")
 
 
+def test_where_the_position_had_no_value_it_is_not_said_that_it_moved(
+    empty: sqlite3.Connection,
+) -> None:
+    told = ask(empty, lambda t: {"pose": [0.2 * t if t < 20 or t > 50 else None, 0.0]})
+    assert not told.events
+    for kind in ("standstill", "stuck"):
+        why = told.verdicts.not_searched[kind]
+        assert "the position had no value for 3" in why and "from 20 s on" in why
+
+
 def test_who_stands_while_rows_come_seldom_stands(empty: sqlite3.Connection) -> None:
     recorder = start_run(empty)
     times = [0.032 * step for step in range(1000)] + [32.0 + 0.5 * step for step in range(60)]

@@ -378,7 +378,7 @@ def uses_in(frame: Frame, motion: Motion, options: EventOptions) -> Iterator[tup
 
 FARTHER: Final = 8.0  # times as far is looked for the ends of what reaches out of a segment
 MOST_NAMED: Final = 5
-NO_TIME: Final = "time limit reached: ask for this kind alone"
+NO_TIME: Final = "time limit reached: ask for this kind alone, or a shorter range"
 _ROW: Final = "SELECT wall_time_s FROM state WHERE run_id = ?"
 _LAST_ROW: Final = f"{_ROW} AND sim_time_s <= ? ORDER BY sim_time_s DESC, id DESC LIMIT 1"
 _FIRST_ROW: Final = f"{_ROW} ORDER BY sim_time_s, id LIMIT 1"

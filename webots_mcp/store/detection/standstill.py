@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.naming import NAME_POSITION
-from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, median, noise_of, np
+from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, median, noise_of, np, runs_of
 from webots_mcp.store.analysis.standstill import (
     MOST_AROUND,
     NEARLY,
@@ -451,6 +451,13 @@ def judge_standstills(
     unseen = [
         f"none under {seen_s:.2g} s: position noise of {noise.position_m:.2g} m hides slow motion"
     ] * (seen_s > options.stuck_s / NEARLY)
+    blind: Flags = np.array(frame.was_read())
+    blind[np.concatenate(rows)] = False
+    blind[: asked[0]] = blind[asked[1] :] = False
+    gone = runs_of(blind, frame.times)
+    if len(gone := gone.only(gone.durations_s >= options.stuck_s)):
+        total_s, since_s = gone.durations_s.sum(), gone.starts_s[0]
+        unseen.append(f"the position had no value for {total_s:.3g} s, from {since_s:.6g} s on")
     found = (
         place
         for track, here in zip(tracks, rows, strict=True)

@@ -32,11 +32,6 @@ for arguments in json.loads(sys.argv[1]):
 
 
 @pytest.fixture
-def anyio_backend() -> str:
-    return "asyncio"
-
-
-@pytest.fixture
 def recorded(tmp_path: Path) -> Iterator[Recorded]:
     recording = Recorded(tmp_path / "artifact" / "webots.db")
     robot = recording.robot(now=1_700_000_000.0)

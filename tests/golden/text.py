@@ -60,6 +60,8 @@ class Portable:
             if self._real_clock and _KEEPS_PACE in items:  # a check, its outcome and its evidence
                 at = items.index(_KEEPS_PACE)
                 del items[at : at + 3]
+            if "host" in items[:-1]:  # a label of a report, before its value
+                items[items.index("host") + 1] = "HOST"
             return [self._made(each) for each in items]
         if isinstance(value, float):
             return float(f"{value:.{_DIGITS}g}")

@@ -40,7 +40,7 @@ def prove(home: Path, monkeypatch: pytest.MonkeyPatch) -> Prove:
     """Run some checks, or all; returns the exit code, and what was printed for programs."""
     monkeypatch.setenv("DISPLAY", ":99")
 
-    def run(*only: str, patience_s: float = 60) -> tuple[int, dict[str, Any]]:
+    def run(*only: str, patience_s: int = 60) -> tuple[int, dict[str, Any]]:
         command = [sys.executable, "-m", "webots_mcp", "prove", "--json", "--webots", str(home)]
         command += ["--patience", str(patience_s)]
         command += [word for name in only for word in ("--only", name)]
@@ -163,6 +163,7 @@ def test_a_check_that_hangs_is_given_up_and_the_next_one_has_a_webots_again(
     ("options", "said"),
     [
         (["--only", "flying"], "--only 'flying' is none of installed, "),
+        (["--patience", "nan"], "'nan' is no whole number"),
         (["--webots", "nowhere"], "nowhere is neither the folder nor the program of a Webots"),
     ],
 )

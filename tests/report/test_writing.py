@@ -15,11 +15,6 @@ from webots_mcp.cli import main
 
 
 @pytest.fixture
-def anyio_backend() -> str:
-    return "asyncio"
-
-
-@pytest.fixture
 def file(tmp_path: Path) -> Iterator[Path]:
     """A recording of one short run that is labelled."""
     recorded = Recorded(tmp_path / "data" / "webots.db")

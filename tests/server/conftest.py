@@ -35,11 +35,6 @@ DATA_TOOLS = (  # that read the present
 
 
 @pytest.fixture
-def anyio_backend() -> str:
-    return "asyncio"
-
-
-@pytest.fixture
 def file(tmp_path: Path) -> Path:
     return tmp_path / "webots.db"
 

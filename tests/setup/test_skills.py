@@ -53,11 +53,6 @@ STORIES: Final[dict[str, tuple[tuple[str, dict[str, Any]], tuple[str, ...]]]] = 
 
 
 @pytest.fixture
-def anyio_backend() -> str:
-    return "asyncio"
-
-
-@pytest.fixture
 def project(tmp_path: Path) -> Path:
     for name in ("worlds", "controllers"):
         shutil.copytree(bundled("examples") / name, tmp_path / "project" / name)

@@ -10,7 +10,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from webots_mcp.cli.options import Json, Parameter
+from cyclopts.validators import Number
+
+from webots_mcp.cli.options import Json, Parameter, whole_number
 from webots_mcp.cli.terminal import print_json, printable
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
@@ -29,8 +31,14 @@ def prove(
         Parameter("--only", metavar="CHECK", help="Only this check; may be repeated."),
     ] = None,
     patience_s: Annotated[
-        float, Parameter("--patience", help="Seconds from a start to the first row, at most (60).")
-    ] = 60.0,
+        int,
+        Parameter(
+            "--patience",
+            converter=whole_number,
+            validator=Number(gte=1, lte=3600),
+            help="Seconds from a start to the first row, at most (60).",
+        ),
+    ] = 60,
     as_json: Json = False,
 ) -> int:
     """Try on the Webots of this machine what we know of it from its sources alone.

@@ -32,7 +32,7 @@ CONTROLLERS = {
     "plain": WRITES + "    if robot.getTime() > 1 and seq < 70: robot.simulationReset()\n",
     "bridged": WRITES.replace("while", "if True:\n" + ATTACH + "while"),
     "late": WRITES + "    if seq == 100:\n    " + ATTACH,
-    "large": WRITES.replace("json.dumps(", "seq % 10 * 'garbage' or '\\x01' * 1_000_000 or ("),
+    "large": WRITES.replace("json.dumps(", "seq % 10 * 'garbage' or '\\x01' * 60_000 or ("),
 }
 
 

@@ -17,7 +17,7 @@ import pytest
 from anyio import to_thread
 from mcp import Client
 
-from tests.server.conftest import anyio_backend, ask, fail  # fixtures
+from tests.server.conftest import ask, fail
 from tests.trials.conftest import Run, command, rows
 from tests.trials.dask_cluster import Cluster
 from tests.waiting import wait_for
@@ -27,7 +27,6 @@ from webots_mcp.plugins.cluster.dask_cluster import Needs, digest_of, packed, wh
 from webots_mcp.server import create_server
 from webots_mcp.store.parameters import Result
 
-__all__ = ["anyio_backend"]
 Write = Callable[[str], Path]
 
 pytestmark = [pytest.mark.skipif(os.name != "posix", reason="signals"), pytest.mark.slow]

@@ -14,7 +14,7 @@ import anyio
 from tests.accuracy.page import table
 from tests.benchmarks.core import Bench, Line
 from tests.benchmarks.kills import measure_interrupts, measure_kills
-from tests.golden.asking import TOOLS, ask_tools
+from tests.golden.asking import OVER_HTTP, TOOLS, ask_tools
 from tests.golden.drawing import KINDS
 from tests.golden.stored import drawn
 from tests.tool_list import counts_of
@@ -70,6 +70,8 @@ def answers(bench: Bench) -> Iterator[str]:
         bench.say(f"answers about {name}")
         with drawn(KINDS[name]) as folder:
             for asked, answer in anyio.run(ask_tools, KINDS[name], folder / "webots.db").items():
+                if asked.endswith(OVER_HTTP):
+                    continue
                 tokens = tokens_in(json.dumps(answer, ensure_ascii=False, separators=(",", ":")))
                 told.setdefault(TOOLS[asked.removesuffix(" of a part")][0], []).append(tokens)
     every = [tokens for each in told.values() for tokens in each]

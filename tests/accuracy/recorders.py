@@ -94,7 +94,8 @@ def _json_lines(folder: Path) -> Recording:
 
 
 def _count_lines(folder: Path) -> int:
-    return sum(line.endswith("\n") for line in (folder / _FILE).open())
+    with (folder / _FILE).open() as lines:
+        return sum(line.endswith("\n") for line in lines)
 
 
 def _json_file(folder: Path) -> Recording:

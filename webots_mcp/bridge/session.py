@@ -297,7 +297,7 @@ class Publisher:
         # Tested here, since even an empty call would slow down every `publish`.
         if breakpoints.armed or breakpoints.run is not self._clock.run:
             hit = breakpoints.look(state)
-            wanted |= breakpoints.reaches  # the past is asked of rows, and tells the same
+            wanted |= breakpoints.reaches  # the past, asked of rows, is the same
         if self._watch.asks_states:
             wanted = self._watch.look(state) or wanted
         if self._throttle.admits(wanted or hit or self._heartbeat.loop):

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import sqlite3
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -178,14 +177,6 @@ def file(tmp_path: Path) -> Path:
     for name in ("worlds", "controllers", "mcp_data"):
         (tmp_path / name).mkdir()
     return tmp_path / "mcp_data" / "webots.db"
-
-
-@pytest.fixture
-def robot(file: Path) -> Iterator[TunableDriver]:
-    driving = TunableDriver(file)
-    driving.start()
-    yield driving
-    driving.stop()
 
 
 def is_allowed(rules: Rules | None, action: str, params: dict[str, Any]) -> bool:

@@ -6,7 +6,6 @@ import ast
 import json
 import re
 import sqlite3
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -44,14 +43,6 @@ def project(tmp_path: Path) -> Path:
 @pytest.fixture
 def file(project: Path) -> Path:
     return project / "mcp_data" / "webots.db"
-
-
-@pytest.fixture
-def robot(file: Path) -> Iterator[TunableDriver]:
-    driving = TunableDriver(file)
-    driving.start()
-    yield driving
-    driving.stop()
 
 
 async def run(*words: str) -> int:

@@ -78,7 +78,13 @@ def test_an_empty_queue_says_so_and_gives_nothing(
     assert (receiver.getQueueLength(), receiver.getBytes(), receiver.data_size) == (0, b"", -1)
     assert isnan(receiver.signal_strength)
     receiver.nextPacket()
-    assert capfd.readouterr().err.count("called while the receiver queue is empty") == 3
+    functions = ("get_data", "get_data_size", "get_signal_strength")
+    assert capfd.readouterr().err.splitlines() == [
+        f"Error: wb_receiver_{function}(): the receiver queue is empty." for function in functions
+    ]
+    for read in (receiver.getString, receiver.getEmitterDirection):
+        with pytest.raises(ValueError, match="NULL pointer access"):
+            read()
 
 
 @pytest.mark.parametrize(
@@ -138,10 +144,78 @@ def test_a_message_that_is_none_is_refused(
     team = Team(tmp_path)
     team.emitter.send(1.0)
     team.emitter.send([])
+    team.emitter.send(["one"])
     assert capsys.readouterr().err.splitlines() == [
-        "Emitter.send(): unsupported data type",
+        "Emitter.send(): unsupported data type: <class 'float'>",
         "Emitter.send(): empty list",
+        "Emitter.send(): unsupported data type list: <class 'list'>",
     ]
+
+
+def test_a_setting_or_message_that_the_c_library_refuses_changes_nothing(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    team = Team(tmp_path, "allowedChannels [ 0 4 ] range 3")
+    team.emitter.send("")
+    team.emitter.setRange(-2.0)
+    team.emitter.setChannel(3)
+    team.receiver.setChannel(-2)
+    assert (team.emitter.range, team.emitter.channel, team.receiver.channel) == (3.0, 0, 0)
+    assert team.heard() == []
+    inside = "Please use a channel inside the range [-1,inf)."
+    allowed = "which is not between allowed channels. Please use an allowed channel."
+    assert capfd.readouterr().err.splitlines() == [
+        "Error: wb_emitter_send(): invalid size=0 argument.",
+        "Error: wb_emitter_set_range(): invalid range=-2.000000 argument.",
+        f"Error: wb_emitter_set_channel() called with channel=3, {allowed}",
+        f"Error: wb_receiver_set_channel() called with an invalid channel=-2. {inside}",
+    ]
+
+
+def test_a_packet_keeps_the_channel_of_the_moment_when_it_was_sent(tmp_path: Path) -> None:
+    team = Team(tmp_path, receiver="channel 1")
+    for channel in (1, 2, -1, 3):
+        team.emitter.setChannel(channel)
+        team.emitter.send(f"on {channel}")
+    assert team.heard() == ["on 1", "on -1"]
+
+
+def test_a_packet_keeps_the_range_of_the_moment_when_it_was_sent(tmp_path: Path) -> None:
+    team = Team(tmp_path)  # they are two metres apart
+    for range_m in (1.0, 3.0, 0.5, -1.0, 1.5):
+        team.emitter.setRange(range_m)
+        team.emitter.send(f"to {range_m}")
+    assert team.heard() == ["to 3.0", "to -1.0"]
+
+
+def test_a_packet_without_space_in_a_buffer_is_lost(tmp_path: Path) -> None:
+    team = Team(tmp_path, "bufferSize 10", "bufferSize 12")
+    assert team.heard("12345", "678901", "67890") == ["12345", "67890"]
+    team.emitter.send("12345678")
+    team.step(2)
+    assert team.heard("12345", "6789") == ["12345678", "6789"]
+
+
+def test_a_baud_rate_lets_so_many_bytes_through_in_each_step(tmp_path: Path) -> None:
+    team = Team(tmp_path, "baudRate 4000")  # 8 bytes in 16 ms
+    for text in ("12345678", "1234", "5678", "12345678"):
+        team.emitter.send(text)
+    lengths: list[int] = []
+    while not lengths or lengths[-1] < 4:
+        team.step()
+        lengths.append(team.receiver.getQueueLength())
+    assert [length for length in lengths if length] == [1, 3, 4]
+
+
+def test_a_reset_drops_what_is_under_way(tmp_path: Path) -> None:
+    team = Team(tmp_path)
+    team.receiver.enable(8 * STEP_MS)
+    team.step()
+    team.emitter.send("before")
+    team.step(2)
+    team.sender.simulationReset()
+    team.step(8)
+    assert team.heard() == []
 
 
 def test_controller_processes_talk_to_each_other(tmp_path: Path) -> None:

@@ -416,19 +416,34 @@ def _unit(vector: Vector) -> Vector:
 # Messages ----------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Packet:
+    """What a controller has sent; channel and range are those of the moment when it did."""
+
+    data: bytes
+    channel: int
+    range_m: float
+    """How far it reaches; negative: everywhere."""
+
+
 class Emitter(Device):
     """Sends packets; they arrive in the basic time step after which they were sent."""
 
     def __init__(self, tag: int, node: Node, site: Site) -> None:
         super().__init__(tag, node, site)
-        self._packets: list[bytes] = []
+        self._packets: list[Packet] = []
 
     def configure(self, setting: str, value: Any) -> None:
-        """Take a setting from the controller, or a packet to send."""
+        """Take a packet to send; the fields show channel and range of the last, as in Webots."""
         if setting == "send":
-            self._packets.append(value)
-        elif setting != "period":
-            self.node.fields[setting] = value
+            packet = Packet(*value)
+            self._packets.append(packet)
+            self.node.fields |= {"channel": packet.channel, "range": packet.range_m}
+
+    def make_due(self) -> None:
+        """Forget what was to be sent as well."""
+        super().make_due()
+        self._packets.clear()
 
     def transmit(self, receivers: Sequence[Receiver]) -> None:
         """Bring what is to be sent to all receivers of other robots that can hear it."""
@@ -451,20 +466,28 @@ class Receiver(Device):
         if setting == "channel":
             self.node.fields["channel"] = value
 
-    def hear(self, packets: list[bytes], emitter: Emitter) -> None:
-        """Take packets from an emitter that it can hear."""
+    def make_due(self) -> None:
+        """Forget what has arrived as well."""
+        super().make_due()
+        self._arrived.clear()
+
+    def hear(self, packets: list[Packet], emitter: Emitter) -> None:
+        """Take those packets of an emitter that it can hear."""
+        if not self.period_ms or self.node.fields["type"] != emitter.node.fields["type"]:
+            return
         here, there = self.site.pose(), emitter.site.pose()
         way, distance_m = _way(here.translation, there.translation)
-        if self.period_ms and self._can_hear(emitter, distance_m):
-            strength = 1.0 / distance_m**2 if distance_m else inf
-            direction = here.direction(way)
-            self._arrived.extend((packet, direction, strength) for packet in packets)
+        strength = 1.0 / distance_m**2 if distance_m else inf
+        direction = here.direction(way)
+        self._arrived.extend(
+            (packet.data, direction, strength)
+            for packet in packets
+            if self._listens_to(packet.channel) and not 0.0 <= packet.range_m < distance_m
+        )
 
-    def _can_hear(self, emitter: Emitter, distance_m: float) -> bool:
-        mine, theirs = self.node.fields, emitter.node.fields
-        if mine["type"] != theirs["type"] or 0.0 <= theirs["range"] < distance_m:
-            return False
-        return -1 in (mine["channel"], theirs["channel"]) or mine["channel"] == theirs["channel"]
+    def _listens_to(self, channel: int) -> bool:
+        mine: int = self.node.fields["channel"]
+        return -1 in (mine, channel) or mine == channel
 
     def put_value(self, fresh: dict[int, Any]) -> None:
         """Add the packets to those that the controller has not been sent yet."""

@@ -462,78 +462,113 @@ class Lidar(Sensor):
         return self.getRangeImage()[: self.getHorizontalResolution()]
 
 
-class Emitter(Device):
+class _Radio(Device):
+    """A device of messages on channels."""
+
+    getChannel = _field("channel", -1)
+
+    def setChannel(self, channel: int) -> None:
+        """Use this channel; `Emitter.CHANNEL_BROADCAST` reaches, or listens to, all."""
+        if not self._tag:
+            self._complain("set_channel", ": invalid device tag.")
+        elif integer(channel, position=2) < -1:
+            self._complain(
+                "set_channel",
+                f" called with an invalid channel={channel}. "
+                "Please use a channel inside the range [-1,inf).",
+            )
+        elif self._fields["allowedChannels"] and channel not in self._fields["allowedChannels"]:
+            self._complain(
+                "set_channel",
+                f" called with channel={channel}, which is not between allowed channels. "
+                "Please use an allowed channel.",
+            )
+        else:
+            self._fields["channel"] = channel
+
+
+class Emitter(_Radio):
     """Sends packets to the receivers of other robots; they arrive with the next basic time step."""
 
     _c_name = "emitter"
 
-    getBufferSize = _field("bufferSize")  # bytes; the stand-in sends what is larger all the same
-    getChannel = _field("channel")
-    getRange = _field("range")  # metres; -1: everywhere
+    getBufferSize = _field("bufferSize", -1)  # bytes; -1: no limit
+    getRange = _field("range", nan)  # metres; -1: everywhere
 
     def send(self, message: Any, length: int | None = None) -> None:
-        """Send a packet with the next step.
+        """Send a packet with the next step, on the channel and to the range of this moment.
 
         Args:
             message: Text, bytes, or a list of numbers: floats if the first one is, else integers.
             length: How many of the bytes; None: all.
         """
         if isinstance(message, bytes):
-            packet = message if length is None else message[:length]
+            packet = message if length is None else message[: max(length, 0)]
         elif isinstance(message, str):
             packet = message.encode()[: len(message)]  # as in Webots, which counts characters
         elif isinstance(message, (list, tuple)):
             values = cast("list[Any]", message)
             if not values:
-                print("Emitter.send(): empty list", file=sys.stderr)  # noqa: T201 - as Webots does
+                self._refuse("empty list")
+                return
+            if not isinstance(values[0], (float, int)):
+                self._refuse(f"unsupported data type list: {type(values)}")
                 return
             kind = "d" if isinstance(values[0], float) else "i"
             packet = struct.pack(f"{len(values)}{kind}", *values)
         else:
-            print("Emitter.send(): unsupported data type", file=sys.stderr)  # noqa: T201
+            self._refuse(f"unsupported data type: {type(message)}")
             return
-        self._session.send_packet(self._tag, packet)
+        if not packet:
+            self._complain("send", f": invalid size={length or 0} argument.")
+        elif not self._tag:
+            self._complain("send", ": invalid device tag.")
+        else:
+            with self._session.lock:
+                self._session.sent[self._tag].put(packet)
 
-    def setChannel(self, channel: int) -> None:
-        """Send on this channel; `CHANNEL_BROADCAST` reaches all."""
-        self._set("channel", integer(channel, position=2))
+    def _refuse(self, why: str) -> None:
+        print(f"Emitter.send(): {why}", file=sys.stderr)  # noqa: T201 - as Webots does
 
     def setRange(self, range: float) -> None:  # noqa: A002 - Webots' name
-        """Reach only receivers so near, in metres, at most `maxRange`; -1 reaches all."""
-        most = self._fields["maxRange"]
-        within = number(range) if most < 0.0 or 0.0 <= number(range) <= most else most
-        self._set("range", within)
+        """Reach only receivers so near, in metres, at most `maxRange`; -1 reaches that far."""
+        wanted, most = number(range), self._fields.get("maxRange", -1.0)
+        if not self._tag:
+            self._complain("set_range", ": invalid device tag.")
+        elif wanted < 0.0 and wanted != -1.0:
+            self._complain("set_range", f": invalid range={wanted:f} argument.")
+        elif wanted == -1.0 or wanted > most >= 0.0:
+            self._fields["range"] = most
+        else:
+            self._fields["range"] = wanted
 
-    def _set(self, field: str, value: float) -> None:
-        self._fields[field] = value
-        self._session.change(self._tag, field, value)
 
-
-class Receiver(Sensor):
+class Receiver(_Radio, Sensor):
     """Queues the packets of other robots' emitters; the first one is read until `nextPacket`."""
 
     _c_name = "receiver"
 
-    getChannel = _field("channel")
-
     def __init__(self, name: int | str, sampling_period: int | None = None) -> None:
         super().__init__(name, sampling_period)
-        self._queue = self._session.packets.get(self._tag, deque[Any]())
+        self._queue = self._session.received.get(self._tag, deque[Any]())
 
     def getQueueLength(self) -> int:
         """How many packets have arrived and are not read yet."""
+        if not self.getSamplingPeriod():
+            use = "Please use: wb_receiver_enable()."
+            self._complain("get_queue_length", f" called for a disabled device! {use}")
         return len(self._queue)
 
-    def _head(self, what: str, place: int, default: Any) -> Any:
+    def _head(self, what: str, place: int, default: Any = None) -> Any:
         """A part of the packet that is read: its bytes, the emitter's direction, the strength."""
         if self._queue:
             return self._queue[0][place]
-        self._complain(what, " called while the receiver queue is empty.")
+        self._complain(what, ": the receiver queue is empty.")
         return default
 
     def nextPacket(self) -> None:
         """Done with the first packet: the next one is read."""
-        if self._head("next_packet", 0, None) is not None:
+        if self._queue:
             self._queue.popleft()
 
     def getBytes(self) -> bytes:
@@ -541,41 +576,52 @@ class Receiver(Sensor):
         return self._head("get_data", 0, b"")
 
     def getString(self) -> str:
-        """The packet as text."""
-        return self.getBytes().decode()
+        """The packet as text.
+
+        Raises:
+            ValueError: There is no packet. In Webots this is a segmentation fault.
+        """
+        return _existing(self._head("get_data", 0)).decode()
 
     def getDataSize(self) -> int:
         """Bytes of the packet; -1 without one."""
-        return len(self._head("get_data_size", 0, b"")) if self._queue else -1
+        packet = self._head("get_data_size", 0)
+        return -1 if packet is None else len(packet)
 
     def getFloats(self) -> tuple[float, ...]:
         """The packet as numbers of eight bytes."""
-        return self._unpacked("d")
+        return struct.unpack(f"{int(self.getDataSize() / 8)}d", self.getBytes())
 
     def getInts(self) -> tuple[int, ...]:
         """The packet as integers of four bytes."""
-        return self._unpacked("i")
+        return struct.unpack(f"{int(self.getDataSize() / 4)}i", self.getBytes())
 
     def getBools(self) -> tuple[bool, ...]:
         """The packet as flags, one a byte."""
-        return self._unpacked("?")
-
-    def _unpacked(self, kind: str) -> Any:
-        packet = self.getBytes()
-        return struct.unpack(f"{len(packet) // struct.calcsize(kind)}{kind}", packet)
+        return struct.unpack(f"{self.getDataSize()}?", self.getBytes())
 
     def getSignalStrength(self) -> float:
         """One by the square of the emitter's distance in metres."""
         return self._head("get_signal_strength", 2, nan)
 
     def getEmitterDirection(self) -> list[float]:
-        """A unit vector to where the emitter was, seen from the receiver."""
-        return [*self._head("get_emitter_direction", 1, _UNKNOWN)]
+        """A unit vector to where the emitter was, seen from the receiver.
+
+        Raises:
+            ValueError: There is no packet.
+        """
+        return [*_existing(self._head("get_emitter_direction", 1))]
 
     def setChannel(self, channel: int) -> None:
         """Listen to this channel; -1 listens to all."""
-        self._fields["channel"] = integer(channel, position=2)
-        self._session.change(self._tag, "channel", channel)
+        super().setChannel(channel)
+        self._session.change(self._tag, "channel", self._fields["channel"])
+
+
+def _existing(value: Any) -> Any:
+    if value is None:
+        raise ValueError("NULL pointer access")
+    return value
 
 
 def _place(name: str, names: tuple[str, ...]) -> int:

@@ -13,6 +13,7 @@ import socket
 import struct
 import threading
 from collections import deque
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final, NoReturn, Protocol, TypeAlias
 
@@ -149,6 +150,53 @@ def _address() -> tuple[int, str, str]:
     )
 
 
+class SentPackets:
+    """The packets of an emitter that its controller has sent, until a step takes them along.
+
+    As in Webots, the channel and the range of a packet are those at the moment when it was sent.
+    """
+
+    def __init__(self, fields: dict[str, Any]) -> None:
+        self._fields = fields
+        self._packets: deque[tuple[bytes, int, float]] = deque()
+        self._bytes_due = 0.0
+
+    def put(self, packet: bytes) -> None:
+        """Queue a packet, unless the emitter's buffer has no space for it."""
+        used = sum(len(queued) for queued, *_ in self._packets)
+        if not 0 <= self._fields["bufferSize"] < used + len(packet):
+            self._bytes_due = self._bytes_due if self._packets else 0.0
+            self._packets.append((packet, self._fields["channel"], self._fields["range"]))
+
+    def take(self, duration_ms: int) -> list[tuple[bytes, int, float]]:
+        """Take the packets that the baud rate lets through in a step of this duration."""
+        taken: list[tuple[bytes, int, float]] = []
+        is_limited = self._fields["baudRate"] >= 0
+        if self._packets and is_limited:
+            self._bytes_due += (
+                self._fields["baudRate"] / max(self._fields["byteSize"], 8) / 1000.0 * duration_ms
+            )
+        while self._packets and not (is_limited and len(self._packets[0][0]) > self._bytes_due):
+            taken.append(self._packets.popleft())
+            self._bytes_due -= len(taken[-1][0])
+        return taken
+
+
+class ReceivedPackets(deque[Any]):
+    """Bytes, direction and strength of each packet that a receiver has, the oldest first."""
+
+    def __init__(self, fields: dict[str, Any]) -> None:
+        super().__init__()
+        self._fields = fields
+
+    def put(self, packets: Iterable[Any]) -> None:
+        """Queue packets; those for which the receiver's buffer has no space are lost."""
+        for packet in packets:
+            used = sum(len(queued) for queued, *_ in self)
+            if not 0 <= self._fields["bufferSize"] < used + len(packet[0]):
+                self.append(packet)
+
+
 class Session:
     """What the library knows between two requests.
 
@@ -167,13 +215,16 @@ class Session:
         self.lock = threading.RLock()
         self._values: dict[Any, Any] = {}
         self._changes: dict[tuple[Any, str], Any] = {}
-        self._sent: list[tuple[int, str, bytes]] = []
-        self.packets: dict[int, deque[Any]] = {
-            device["tag"]: deque()
-            for device in self.robot["devices"]
-            if device["node_type"] == "Receiver"
+        devices: list[dict[str, Any]] = self.robot["devices"]
+        fields = {(device["node_type"], device["tag"]): device["fields"] for device in devices}
+        self.sent = {
+            tag: SentPackets(of) for (kind, tag), of in fields.items() if kind == "Emitter"
         }
-        """What receivers have by tag: bytes, direction and strength of each packet."""
+        """What emitters are still to send, by tag."""
+        self.received = {
+            tag: ReceivedPackets(of) for (kind, tag), of in fields.items() if kind == "Receiver"
+        }
+        """What receivers have, by tag."""
         self.counts: dict[tuple[int, str], int] = {}
         """The number of entries of each field that was asked for, by node and name."""
         self._tracked: set[TrackedKey] = set()
@@ -199,11 +250,6 @@ class Session:
         """Set a sampling period; 0 disables."""
         self.change(tag, "period", period_ms)
         self.periods_ms[tag] = period_ms
-
-    def send_packet(self, tag: int, packet: bytes) -> None:
-        """Note a packet of an emitter that goes out with the next step."""
-        with self.lock:
-            self._sent.append((tag, "send", packet))
 
     def track(self, what: TrackedKey, period_ms: int) -> None:
         """Have a pose or field sent with the steps, once in a period; 0 ends that."""
@@ -236,9 +282,10 @@ class Session:
             self._exit_if_over()
             if self._quitting:
                 return
-            changes = [*((*key, value) for key, value in self._changes.items()), *self._sent]
+            changes = [(*key, value) for key, value in self._changes.items()]
+            for tag, packets in self.sent.items():
+                changes.extend((tag, "send", packet) for packet in packets.take(duration_ms))
             self._changes.clear()
-            self._sent.clear()
             self.link.send(("step", duration_ms & 0xFFFFFFFF, changes, self._take_field_sets()))
             self._in_step = True
 
@@ -252,8 +299,8 @@ class Session:
                 return -1
             _, self.time_s, self.mode, delay_ms, values = reply
             self._values.update(values)
-            for tag, queue in self.packets.items():
-                queue.extend(self._values.pop(tag, ()))
+            for tag, queue in self.received.items():
+                queue.put(self._values.pop(tag, ()))
             self.custom_data = self._values.pop(CUSTOM_DATA_TAG, self.custom_data)
             return delay_ms
 

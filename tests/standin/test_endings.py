@@ -49,7 +49,7 @@ def test_a_supervisors_reload_ends_the_controller_and_starts_it_again(
         robot.step(160)
         robot.worldReload()
         print("step", robot.step(16), flush=True)
-        robot.getFromDef("ROVER")  # ends the process: no `finally`, no atexit
+        robot.getFromDef("WALL_EAST")  # ends the process: no `finally`, no atexit
         print("never")
         """
     )
@@ -142,3 +142,23 @@ def test_quitting_gives_the_simulation_its_exit_status(
     assert has_line(simulation, "[rover] ended")
     with pytest.raises(StandInError, match="has ended"):
         simulation.pause()
+
+
+def test_what_is_read_while_the_world_ends_keeps_its_last_value(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller(
+        """
+        where = robot.getFromDef("WALL_EAST").getField("translation")
+        camera = robot.getDevice("camera")
+        camera.enable(16)
+        while robot.step(16) != -1:
+            for _ in range(200):
+                x, y, z = where.getSFVec3f()
+        print("ended with a picture of", len(camera.getImage()), "bytes")
+        """
+    )
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: simulation.time_s > 0.1)
+    assert has_line(simulation, "[rover] ended with a picture of")
+    assert simulation.failure is None

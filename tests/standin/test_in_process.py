@@ -95,13 +95,13 @@ def test_after_a_reload_step_ends_and_what_follows_is_an_error() -> None:
     robot = InProcessSupervisor()
     robot.step(STEP_MS)
     robot.worldReload()
-    assert robot.getFromDef("ROVER") is None
+    assert robot.getFromDef("WALL_EAST") is None
     assert robot.step(STEP_MS) == -1
     assert robot.getTime() == pytest.approx(0.016)
     with pytest.raises(ControllerEndedError, match="-1"):
         robot.step(STEP_MS)
     with pytest.raises(ControllerEndedError):
-        robot.getSelf()
+        robot.getFromDef("WALL_EAST")
     assert InProcessSupervisor(world=robot.simulation).getTime() == 0.0
 
 

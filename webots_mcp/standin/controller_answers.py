@@ -38,6 +38,7 @@ FieldSet = tuple[FieldReference, int | None, Any]
 def description(simulator: Simulator, robot: Robot) -> dict[str, Any]:
     """The data that a controller receives when it connects."""
     fields = robot.node.fields
+    requests = SupervisorRequests(simulator, robot)
     return {
         "name": robot.name,
         "model": fields["model"],
@@ -50,6 +51,8 @@ def description(simulator: Simulator, robot: Robot) -> dict[str, Any]:
         "time": simulator.time_s,
         "mode": int(simulator.mode),
         "left_out": simulator.world.left_out_in(robot.node),
+        "root": requests.shown(simulator.world.root),
+        "self": requests.shown(robot.node),
         "devices": [device.description() for device in robot.devices.values()],
     }
 
@@ -135,31 +138,26 @@ class SupervisorRequests:
 
     # Nodes ---------------------------------------------------------------------------------------
 
-    def on_node_get_root(self) -> Any:
-        """The node around everything."""
-        return self._shown(self._world.root)
-
-    def on_node_get_self(self) -> Any:
-        """The robot's own node."""
-        return self._shown(self._robot.node)
-
     def on_node_get_from_def(self, def_path: str) -> Any:
         """A node by its DEF name."""
-        return self._shown(self._world.find(def_path))
+        return self.shown(self._world.find(def_path))
 
     def on_node_get_from_id(self, node_id: int) -> Any:
         """A node by its number."""
-        return self._shown(self._world.node(node_id))
+        return self.shown(self._world.node(node_id))
 
     def on_node_get_parent_node(self, node_id: int) -> Any:
         """The node around a node."""
-        return self._shown(self._world.parent_of(self._node(node_id)))
+        return self.shown(self._world.parent_of(self._node(node_id)))
 
-    def _shown(self, node: Node | None) -> Any:
+    def shown(self, node: Node | None) -> Any:
+        """What a controller is sent of a node: see `NodeFacts` of its package."""
         if node is None:
             return None
         type_name = node.proto_name or node.type_name
-        return (self._world.id_of(node), type_name, node.type_name, node.def_name)
+        parent = self._world.parent_of(node)
+        parent_id = -1 if parent is None else self._world.id_of(parent)
+        return (self._world.id_of(node), type_name, node.type_name, node.def_name, parent_id)
 
     # Fields --------------------------------------------------------------------------------------
 
@@ -183,7 +181,7 @@ class SupervisorRequests:
         value = self._node(node_id).fields[name]
         if index is not None:
             value = value[index] if -len(value) <= index < len(value) else None
-        return self._shown(value) if isinstance(value, Node) else value
+        return self.shown(value) if isinstance(value, Node) else value
 
     def set_fields(self, field_sets: list[FieldSet]) -> None:
         """Write fields, and let what they describe follow."""
@@ -502,8 +500,12 @@ class Driver(ABC):
         self._end(self._seats)
 
     def _serve(self, seat: Seat, message: Message) -> None:
-        """Answer a controller, unless the answer has to wait for a physics step."""
-        if seat.is_ending:
+        """Answer a controller, unless the answer has to wait for a physics step.
+
+        One that is to end may still have the picture or scan of its last sample: Webots sends those
+        with the step.
+        """
+        if seat.is_ending and message[0] != "fetch":
             seat.tell_to_quit()
         elif reply := answer(self.simulator, seat.robot, message):
             seat.reply(reply)

@@ -338,11 +338,16 @@ class Motor(Device):
 
     def getPositionSensor(self) -> PositionSensor | None:
         """The sensor of the same joint; None if there is none."""
-        for other in self._session.robot["devices"]:
-            in_joint = other["joint"] is not None and other["joint"] == self._description["joint"]
-            if in_joint and other["node_type"] == "PositionSensor":
-                return PositionSensor(other["tag"])
-        return None
+        joint = self._description["joint"]
+        tags = (
+            other["tag"]
+            for other in self._session.robot["devices"]
+            if joint is not None
+            and other["joint"] == joint
+            and other["node_type"] == "PositionSensor"
+        )
+        tag = self._session.answered_here(("position sensor", self._tag), next(tags, None))
+        return None if tag is None else PositionSensor(tag)
 
 
 class Camera(Sensor):

@@ -14,10 +14,10 @@ from typing import Any, ClassVar, Final
 from . import session as library
 from .devices import CLASS_OF, Device
 from .scene import Node, node_of
-from .session import Link, Session, SocketLink
+from .session import Link, NodeFacts, Session, SocketLink
 from .surface import Completed, integer, lacking, number, say, text
 
-_NULL_NODE: Final = (0, "", "", "")
+_NULL_NODE: Final = (0, "", "", "", -1)
 _DEADLY_SIGNALS: Final = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
 
 
@@ -119,9 +119,8 @@ class Robot(Completed):
         return self._session.step(self._duration_ms(time_step))
 
     def stepBegin(self, time_step: int | None = None) -> int:
-        """The first half of `step`: asks for time to pass and returns at once."""
-        self._session.begin_step(self._duration_ms(time_step))
-        return 0
+        """The first half of `step`: asks for time to pass and returns at once; -1 at the end."""
+        return self._session.begin_step(self._duration_ms(time_step))
 
     def stepEnd(self) -> int:
         """The second half of `step`: waits until time has passed."""
@@ -239,36 +238,34 @@ class Supervisor(Robot):
     SIMULATION_MODE_REAL_TIME = 1
     SIMULATION_MODE_FAST = 2
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._nodes: dict[str, Any] = {}
-
     # Nodes ---------------------------------------------------------------------------------------
 
     def getRoot(self) -> Node:
         """The node around everything; its `children` are the top of the scene tree."""
-        return self._known("node_get_root")
+        return self._known("root")
 
     def getSelf(self) -> Node:
         """The robot's own node."""
-        return self._known("node_get_self")
+        return self._known("self")
 
-    def _known(self, operation: str) -> Node:
-        """A node that is asked for once; after that it can be had between requests too."""
-        found = self._nodes.get(operation) or self._session.ask(operation)
-        if found is not None:
-            self._nodes[operation] = found
-        return node_of(self._session, found or _NULL_NODE)
+    def _known(self, which: str) -> Node:
+        """A node that the simulator has described when the controller connected."""
+        is_allowed = self._session.is_supervisor(f"wb_supervisor_node_get_{which}()")
+        return node_of(self._session, self._session.robot[which] if is_allowed else _NULL_NODE)
 
     def getFromDef(self, d: str) -> Node | None:
         """The node with this DEF name (`A.B`: B inside A); None if there is none."""
-        return self._node(self._session.ask("node_get_from_def", text(d)))
+        name = text(d).rpartition(".")[2]
+        return self._node("node_get_from_def", d, lambda node: node[3] == name)
 
     def getFromId(self, id: int) -> Node | None:  # noqa: A002 - Webots' name
         """The node with this number; None if there is none."""
-        return self._node(self._session.ask("node_get_from_id", integer(id)))
+        return self._node("node_get_from_id", integer(id), lambda node: node[0] == id)
 
-    def _node(self, found: Any) -> Node | None:
+    def _node(
+        self, operation: str, argument: Any, is_it: Callable[[NodeFacts], bool]
+    ) -> Node | None:
+        found = self._session.find_node(operation, argument, is_it)
         return None if found is None else node_of(self._session, found)
 
     # The simulation ------------------------------------------------------------------------------
@@ -280,6 +277,8 @@ class Supervisor(Robot):
     def simulationSetMode(self, mode: int) -> None:
         """Pause, run in real time or run fast; any other number pauses."""
         self._session.ask("simulation_set_mode", integer(mode))
+        if self._session.is_quitting:
+            self._session.mode = mode
 
     def simulationReset(self) -> None:
         """Reset the world at the end of the next physics step; controllers go on."""

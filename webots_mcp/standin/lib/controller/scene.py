@@ -9,12 +9,17 @@ from functools import partial
 from math import nan
 from typing import Any, Final, cast
 
-from .session import Session
+from .session import NodeFacts, Session
 from .surface import Completed, integer, lacking, number, numbers, say, text, type_number
 
 _LENGTHS: Final = {"Vec2f": 2, "Vec3f": 3, "Color": 3, "Rotation": 4}
 _TYPES: Final[dict[str, type]] = {"Bool": bool, "Int32": int, "Float": float, "String": str}
 _READ_ONLY: Final = "Error: a field inside a PROTO node is read-only."
+_UNREAD: Final[dict[str, Any]] = {
+    **{"Bool": False, "Int32": 0, "Float": 0.0},
+    **{kind: [0.0] * length for kind, length in _LENGTHS.items()},
+}
+"""What is in a field, by its kind, that was not read before the simulation ended."""
 _BEYOND_THE_END: Final[dict[str, Any]] = {
     **{"Bool": False, "Int32": 0, "Float": nan, "String": "", "Node": None},
     **{kind: [nan] * length for kind, length in _LENGTHS.items()},
@@ -43,7 +48,7 @@ class Field(Completed):
         session: Session,
         node_id: int,
         name: str,
-        found: tuple[str, int],
+        found: Sequence[Any],
         *,
         is_inner: bool = False,
     ) -> Field:
@@ -81,7 +86,7 @@ class Field(Completed):
         """The value of a single field; None for a field with entries."""
         if self._count >= 0:
             return None
-        return self._as_given(self._session.read_field(self._key, None))
+        return self._read(None)
 
     @value.setter
     def value(self, value: Any) -> None:
@@ -100,6 +105,17 @@ class Field(Completed):
         """Have it sent no more."""
         self._session.track(self._key, 0)
 
+    def _read(self, index: int | None) -> Any:
+        kind = self._type_name[2:]
+        if kind == "Node" and index is not None:
+            unread = self._session.robot["root"]  # its number is 0, as of nothing
+        else:
+            unread = _UNREAD.get(kind)
+        value = self._session.read_field(self._key, index, unread)
+        if kind == "String" and value is None and self._session.is_quitting:
+            raise _nothing_to_decode()
+        return self._as_given(value)
+
     def _as_given(self, value: Any) -> Any:
         if self._type_name.endswith("Node"):
             return None if value is None else node_of(self._session, value)
@@ -117,7 +133,7 @@ class Field(Completed):
 
     def _entry(self, kind: str, index: int) -> Any:
         if self._has_entry("get", kind, integer(index, position=2)):
-            return self._as_given(self._session.read_field(self._key, index))
+            return self._read(index)
         return _BEYOND_THE_END[kind]
 
     def _set_entry(self, kind: str, index: int, value: Any) -> None:
@@ -208,6 +224,11 @@ class Field(Completed):
         return False
 
 
+def _nothing_to_decode() -> AttributeError:
+    """What Webots' package raises where the C library has no text."""
+    return AttributeError("'NoneType' object has no attribute 'decode'")
+
+
 def _as_sent(value: Any) -> Any:
     if not isinstance(value, list):
         return value
@@ -277,11 +298,6 @@ field_of = Field._of  # pyright: ignore[reportPrivateUsage]
 """Makes the object for a field that the simulator has described."""
 
 
-def inner_field_of(session: Session, node_id: int, name: str, found: tuple[str, int]) -> Field:
-    """The object for a field inside a PROTO node, which is read-only."""
-    return field_of(session, node_id, name, found, is_inner=True)
-
-
 _NO_POSE: Final = ([nan] * 9, [nan] * 3)
 
 
@@ -295,6 +311,7 @@ class Node(Completed):
     _session: Session
     _id: int
     _found: tuple[str, str, str]
+    _parent_id: int
 
     def __init__(
         self,
@@ -307,10 +324,13 @@ class Node(Completed):
         raise lacking("Node(...); ask the supervisor for nodes")
 
     @classmethod
-    def _of(cls, session: Session, found: Sequence[Any]) -> Node:
+    def _of(cls, session: Session, found: NodeFacts) -> Node:
         node = cls.__new__(cls)
         node._session, node._id = session, found[0]
         node._found = (found[1], found[2], found[3])
+        node._parent_id = found[4]
+        if found[1]:  # no null node
+            session.know(found)
         return node
 
     def getId(self) -> int:
@@ -339,12 +359,17 @@ class Node(Completed):
 
     def getParentNode(self) -> Node | None:
         """The node around this one; None for the root."""
-        found = self._session.ask("node_get_parent_node", self._id)
+        found = self._session.find_node(
+            "node_get_parent_node", self._id, lambda node: node[0] == self._parent_id
+        )
         return None if found is None else node_of(self._session, found)
 
     def exportString(self) -> str:
         """The node and all in it, as written in a world file."""
-        return self._session.ask("node_export_string", self._id, default="")
+        written = self._session.ask("node_export_string", self._id, kept_as=("text", self._id))
+        if written is None and self._session.is_quitting:
+            raise _nothing_to_decode()
+        return written or ""
 
     def remove(self) -> None:
         """Take the node, and all in it, out of the world."""
@@ -352,53 +377,67 @@ class Node(Completed):
         if found is not None:
             node_id, name, count = found
             self._session.counts[node_id, name] = count
+            self._session.forget(self._id)
 
     # Fields --------------------------------------------------------------------------------------
 
     def getField(self, fieldName: str) -> Field | None:
         """A field by name; None if the node has no such field."""
-        found = self._session.ask("node_get_field", self._id, text(fieldName))
-        return None if found is None else field_of(self._session, self._id, fieldName, found)
+        return self._field("node_get_field", fieldName)
 
     def getNumberOfFields(self) -> int:
-        """How many fields the node has."""
-        return len(self._session.ask("node_get_field_names", self._id, default=[]))
+        """How many fields the node has; -1 for none."""
+        return len(self._session.ask("node_get_field_names", self._id, default=[])) or -1
 
     def getFieldByIndex(self, index: int) -> Field | None:
         """A field by its place; None beyond the last."""
-        names: list[str] = self._session.ask("node_get_field_names", self._id, default=[])
-        return self.getField(names[index]) if 0 <= integer(index, 2) < len(names) else None
+        name = self._session.find_field_name(self._id, integer(index, 2))
+        return None if name is None else self.getField(name)
 
     def getBaseNodeField(self, fieldName: str) -> Field | None:
         """A field of the node that a PROTO node is made of, to be read only."""
         if not self.isProto():
             say("Error: getBaseNodeField() called with a node that is no PROTO node.")
             return None
-        found = self._session.ask("node_get_base_node_field", self._id, text(fieldName))
-        return None if found is None else inner_field_of(self._session, self._id, fieldName, found)
+        return self._field("node_get_base_node_field", fieldName, is_inner=True)
+
+    def _field(self, operation: str, name: str, *, is_inner: bool = False) -> Field | None:
+        found = self._session.find_field(operation, (self._id, text(name)))
+        if found is None:
+            return None
+        (node_id, name), *described = found
+        return field_of(self._session, node_id, name, described, is_inner=is_inner)
 
     # Places --------------------------------------------------------------------------------------
 
     def getPosition(self) -> list[float]:
         """x, y and z in the world, metres; NaN for a node that has no place."""
-        return [*self._pose()[1]]
+        return [*self._pose("position")[1]]
 
     def getOrientation(self) -> list[float]:
         """The rotation matrix in the world by rows: nine numbers."""
-        return [*self._pose()[0]]
+        return [*self._pose("orientation")[0]]
 
     def getPose(self, fromNode: Node | None = None) -> list[float]:
         """The 4 x 4 matrix by rows, in the world or in another node: sixteen numbers.
 
         As in Webots only this one is answered from the last step, where the pose is tracked.
         """
-        tracked = self._session.tracked((self._id, fromNode._id if fromNode else None))
-        r, (x, y, z) = tracked or self._pose(fromNode)
+        seen_from_id = fromNode._id if fromNode else None
+        pose = self._session.tracked((self._id, seen_from_id)) or self._session.ask(
+            "node_get_pose",
+            self._id,
+            seen_from_id,
+            kept_as="pose",  # of whatever node
+        )
+        if pose is None and self._session.is_quitting:
+            return [0.0] * 16
+        r, (x, y, z) = pose or _NO_POSE
         return [*r[0:3], x, *r[3:6], y, *r[6:9], z, 0.0, 0.0, 0.0, 1.0]
 
-    def _pose(self, seen_from: Node | None = None) -> Any:
-        node_ids = (self._id, seen_from._id if seen_from else None)
-        return self._session.ask("node_get_pose", *node_ids, default=_NO_POSE)
+    def _pose(self, wanted: str) -> Any:
+        kept_as = (wanted, self._id)
+        return self._session.ask("node_get_pose", self._id, None, kept_as=kept_as, default=_NO_POSE)
 
     def getVelocity(self) -> list[float]:
         """Linear (metres a second) and angular (radians a second) velocity: six numbers."""

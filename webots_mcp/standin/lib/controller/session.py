@@ -13,13 +13,17 @@ import socket
 import struct
 import threading
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final, NoReturn, Protocol, TypeAlias
 
 from .surface import say
 
 Message: TypeAlias = tuple[Any, ...]
+NodeFacts: TypeAlias = tuple[int, str, str, str, int]
+"""What is known of a node: id, type, base type, DEF name and id of the node around it."""
+FieldKey: TypeAlias = tuple[int, str]
+"""The id of a node and the name of its field."""
 
 ADDRESS_FILE: Final = "address"
 """File in the instance folder: the port on this machine, a space, the token."""
@@ -225,8 +229,15 @@ class Session:
             tag: ReceivedPackets(of) for (kind, tag), of in fields.items() if kind == "Receiver"
         }
         """What receivers have, by tag."""
-        self.counts: dict[tuple[int, str], int] = {}
+        self.counts: dict[FieldKey, int] = {}
         """The number of entries of each field that was asked for, by node and name."""
+        self._nodes: dict[int, NodeFacts] = {}
+        for node in (self.robot["root"], self.robot["self"]):
+            self.know(node)
+        self._fields: dict[tuple[str, FieldKey], str] = {}
+        self._field_names: dict[tuple[int, int], str | None] = {}
+        self._reads: dict[FieldKey, tuple[float, Any]] = {}
+        self._kept: dict[Any, Any] = {}
         self._tracked: set[TrackedKey] = set()
         self._field_sets: dict[Any, Any] = {}
         self._fetched: dict[int, tuple[Any, Any]] = {}
@@ -276,18 +287,19 @@ class Session:
 
     # Requests ------------------------------------------------------------------------------------
 
-    def begin_step(self, duration_ms: int) -> None:
-        """Ask the simulator to let time pass."""
+    def begin_step(self, duration_ms: int) -> int:
+        """Ask the simulator to let time pass: 0, or -1 if it has ended the controller."""
         with self.lock:
             self._exit_if_over()
             if self._quitting:
-                return
+                return -1
             changes = [(*key, value) for key, value in self._changes.items()]
             for tag, packets in self.sent.items():
                 changes.extend((tag, "send", packet) for packet in packets.take(duration_ms))
             self._changes.clear()
             self.link.send(("step", duration_ms & 0xFFFFFFFF, changes, self._take_field_sets()))
             self._in_step = True
+            return 0
 
     def end_step(self) -> int:
         """Wait until that time has passed; -1 if the simulator ends the controller."""
@@ -313,63 +325,173 @@ class Session:
             finally:
                 self._in_step = False
 
-    def ask(self, operation: str, *arguments: Any, default: Any = None) -> Any:
-        """Make a request that is answered at once, also while the simulation is paused."""
-        return self._ask(operation, arguments, [], default)
+    # Once the simulator has ended the controller, nothing can be asked any more. As in Webots' C
+    # library, until `step` has returned -1 each getter gives what it gave before; after that only
+    # those that make no request for what they know, and the others end the process.
 
-    def read_field(self, field: tuple[int, str], index: int | None) -> Any:
-        """Read a field; changes that were not sent yet go first."""
+    @property
+    def is_quitting(self) -> bool:
+        """Whether the simulator has ended the controller: the next step returns -1, or one has."""
+        return self._quitting
+
+    def ask(self, operation: str, *arguments: Any, kept_as: Any = None, default: Any = None) -> Any:
+        """Make a request that is answered at once, also while the simulation is paused.
+
+        Args:
+            operation: The name of the request.
+            arguments: What it needs.
+            kept_as: Under what the answer is remembered for the end; None: it is not.
+            default: What is returned where there is no answer.
+        """
         with self.lock:
+            answer = self._ask(operation, arguments, [])
+            if kept_as is not None and self._quitting:
+                answer = self._kept.get(kept_as)
+            elif kept_as is not None and answer is not None:
+                self._kept[kept_as] = answer
+            return default if answer is None else answer
+
+    def answered_here(self, what: Any, value: Any) -> Any:
+        """Give what Webots' library asks for and the stand-in knows; at the end as if asked."""
+        with self.lock:
+            self._exit_if_over()
+            if not self._quitting:
+                self._kept[what] = value
+            return self._kept.get(what)
+
+    def know(self, node: NodeFacts) -> None:
+        """Remember a node that the simulator has described."""
+        self._nodes[node[0]] = node
+
+    def forget(self, node_id: int) -> None:
+        """Remember a node no longer: it was removed."""
+        self._nodes.pop(node_id, None)
+
+    def find_node(
+        self, operation: str, argument: Any, is_it: Callable[[NodeFacts], bool]
+    ) -> NodeFacts | None:
+        """Ask for a node; at the end it is found among those that are known."""
+        with self.lock:
+            if not self._quitting:
+                found = self._ask(operation, (argument,), [])
+                if not self._quitting:
+                    if found is None and not self._in_step:
+                        self._nodes = {n[0]: n for n in self._nodes.values() if not is_it(n)}
+                    return found
+            known = next((node for node in reversed(self._nodes.values()) if is_it(node)), None)
+            if known is None:
+                self._exit_if_over()
+            return known
+
+    def find_field(self, operation: str, key: FieldKey) -> tuple[FieldKey, str, int] | None:
+        """Ask for a field: where it is, its type and the number of its entries.
+
+        At the end a field that is not known is, as in Webots, the one that was found last.
+        """
+        with self.lock:
+            if not self._quitting:
+                found = self._ask(operation, key, [])
+                if not self._quitting:
+                    if found is not None:
+                        self._fields.setdefault((operation, key), found[0])
+                    return None if found is None else (key, *found)
+            known = (operation, key)
+            if known not in self._fields:
+                self._exit_if_over()
+                known = next(reversed(self._fields), None)
+            return known and (known[1], self._fields[known], self.counts[known[1]])
+
+    def find_field_name(self, node_id: int, index: int) -> str | None:
+        """The name of a field by its place in the node; at the end, if it was asked for before."""
+        with self.lock:
+            if not self._quitting:
+                names: list[str] = self._ask("node_get_field_names", (node_id,), []) or []
+                if not self._quitting:
+                    name = names[index] if 0 <= index < len(names) else None
+                    self._field_names[node_id, index] = name
+                    return name
+            name = self._field_names.get((node_id, index))
+            if name is None:
+                self._exit_if_over()
+            return name
+
+    def read_field(self, field: FieldKey, index: int | None, unread: Any) -> Any:
+        """Read a field; changes that were not sent yet go first.
+
+        Args:
+            field: The field.
+            index: Of the entry; None for a single field.
+            unread: What is in a field that has not been read before the end.
+        """
+        with self.lock:
+            read_s, last = self._reads.get(field, (-1.0, unread))
             if (field, index) in self._field_sets:
-                return self._field_sets[field, index]
+                value = self._field_sets[field, index]
+                self._reads[field] = (read_s, value)
+                return value
             if index is None and (tracked := self.tracked(field)) is not None:
                 return tracked
-            return self._ask("field_get", (field, index), self._take_field_sets(), None)
+            if self._quitting and index is None and read_s == self.time_s:
+                return last
+            value = self._ask("field_get", (field, index), self._take_field_sets())
+            if self._quitting:
+                return last
+            if not self._in_step:
+                self._reads[field] = (self.time_s, value)
+            return value
 
     def change_field(self, operation: str, field: tuple[int, str], *arguments: Any) -> Any:
         """Add or remove entries at once; changes that were not sent yet go first."""
         with self.lock:
-            return self._ask(operation, (field, *arguments), self._take_field_sets(), None)
+            return self._ask(operation, (field, *arguments), self._take_field_sets())
 
     def fetch(self, tag: int) -> Any:
-        """The picture or scan that belongs to a sensor's last sample; None before the first."""
+        """The picture or scan that belongs to a sensor's last sample; None before the first.
+
+        The simulator gives it also while it ends the controller.
+        """
         with self.lock:
             sample = self._values.get(tag)
             known = self._fetched.get(tag)
-            if sample is None or (known and known[0] == sample) or self._quitting:
+            if sample is None or (known and known[0] == sample):
                 return known[1] if known else None
             self.link.send(("fetch", tag))
-            reply = self.link.receive()
-            if reply[0] == "stepped":  # the answer to a step that was begun came first
-                self._stepped, reply = reply, self.link.receive()
-            if reply[0] == "quit":
-                self._quitting = True
-                return None
+            while (reply := self.link.receive())[0] != "fetched":
+                if self._in_step:  # the answer to a step that was begun came first
+                    self._stepped = reply
+                else:
+                    self._quitting = True
             self._fetched[tag] = (sample, reply[1])
             return reply[1]
 
-    def _ask(self, operation: str, arguments: Any, field_sets: list[Any], default: Any) -> Any:
+    def _ask(self, operation: str, arguments: Any, field_sets: list[Any]) -> Any:
         with self.lock:
             self._exit_if_over()
             if self._quitting or not self._may_ask(f"wb_supervisor_{operation}()"):
-                return default
+                return None
             self.link.send(("ask", operation, [*arguments], field_sets))
             reply = self.link.receive()
             if reply[0] == "quit":
                 self._quitting = True
-                return default
+                return None
             _, value, self.mode = reply
-            return default if value is None else value
+            return value
 
-    def _may_ask(self, function: str) -> bool:
+    def is_supervisor(self, function: str) -> bool:
+        """Whether the robot has a supervisor's rights; without them a line on stderr says so."""
         if not self.robot["supervisor"]:
             say(f"Error: ignoring illegal call to {function} in a 'Robot' controller.")
             say("Error: this function can only be used in a 'Supervisor' controller.")
-        elif self._in_step:
+        return self.robot["supervisor"]
+
+    def _may_ask(self, function: str) -> bool:
+        if not self.is_supervisor(function):
+            return False
+        if self._in_step:
             say(
                 f"Warning: {function} called between wb_robot_step_begin() and wb_robot_step_end()."
             )
-        return self.robot["supervisor"] and not self._in_step
+        return not self._in_step
 
     def _take_field_sets(self) -> list[Any]:
         taken = [(field, index, value) for (field, index), value in self._field_sets.items()]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from controller import Field, Node
 
 from tests.standin.placing import STEP_MS, drive
 from webots_mcp.standin import InProcessSupervisor
+from webots_mcp.standin.in_process import DEFAULT_WORLD
 
 PILLAR = """DEF PILLAR Solid {
   translation -0.9 0 0.1
@@ -94,6 +97,8 @@ def test_what_a_node_says_of_itself_makes_the_same_node_again(robot: InProcessSu
         ("Hologram { }", "the stand-in has no Hologram nodes"),
         ("Solid { translation 1 }", "Solid.translation has to be SFVec3f"),
         ('Robot { name "second" }', "the stand-in adds no robots"),
+        ('E-puck { name "second" }', "the stand-in adds no robots"),
+        ("Group { children [ Pose { children [ E-puck { } ] } ] }", "the stand-in adds no robots"),
         ("Solid { } Solid { }", "one node is to be given"),
     ],
 )
@@ -105,6 +110,37 @@ def test_what_cannot_be_added_is_a_line_in_the_console_and_changes_nothing(
     children.importMFNodeFromString(-1, text)
     assert children.getCount() == count
     assert said in robot.simulation.console[-1]
+
+
+def test_a_robot_within_a_proto_of_the_project_is_not_added_in_silence(tmp_path: Path) -> None:
+    world = tmp_path / "worlds" / "arena.wbt"
+    (tmp_path / "protos").mkdir()
+    world.parent.mkdir()
+    world.write_bytes(DEFAULT_WORLD.read_bytes())
+    (tmp_path / "protos" / "Team.proto").write_text(
+        "#VRML_SIM R2023b utf8\nPROTO Team [ field SFVec3f translation 0 0 0 ]\n"
+        '{ Pose { translation IS translation children [ Robot { name "inner" } ] } }\n',
+        encoding="utf-8",
+    )
+    robot = InProcessSupervisor(world=world)
+    children = field(robot, "root", "children")
+    count = children.getCount()
+    children.importMFNodeFromString(-1, "DEF TEAM Team { }")
+    assert (children.getCount(), robot.getFromDef("TEAM")) == (count, None)
+    assert "the stand-in adds no robots" in robot.simulation.console[-1]
+    children.importMFNodeFromString(-1, "DEF HOLDER Solid { }")
+    shape = field(robot, "HOLDER", "boundingObject")
+    shape.importSFNodeFromString("Team { }")
+    assert shape.getSFNode() is None
+    assert "the stand-in adds no robots" in robot.simulation.console[-1]
+
+
+def test_what_is_left_out_of_a_node_that_is_added_is_named(robot: InProcessSupervisor) -> None:
+    children = field(robot, "root", "children")
+    count = children.getCount()
+    children.importMFNodeFromString(-1, 'Group { children [ Nao { controller "other" } ] }')
+    assert children.getCount() == count + 1
+    assert "has no Nao nodes; what is one is left out" in robot.simulation.console[-1]
 
 
 def test_the_robot_and_the_world_itself_stay(robot: InProcessSupervisor) -> None:

@@ -227,9 +227,11 @@ class SupervisorRequests:
             nodes = Parser(text).nodes()
             if len(nodes) != 1:
                 raise WorldError("one node is to be given")
-            if _holds_robot(nodes[0]):
-                raise WorldError("the stand-in adds no robots")
-            self._world.add(nodes[0], around, name, index)
+            for type_name in self._world.add(nodes[0], around, name, index):
+                self._simulator.log(
+                    f"WARNING: importing a node: the stand-in has no {type_name} nodes; "
+                    f"what is one is left out{self._world.why_not(type_name)}."
+                )
             self._simulator.added.append(nodes[0])
             self._stand_anew(around)
         except WorldError as error:

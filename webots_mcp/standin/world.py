@@ -152,24 +152,32 @@ class World:
         """The node of that number; None where it was removed."""
         return self._by_id.get(node_id)
 
-    def add(self, node: Node, parent: Node, name: str, index: int | None) -> None:
+    def add(self, node: Node, parent: Node, name: str, index: int | None) -> list[str]:
         """Put a node, as the parser gives it, into a field, or before one of its entries.
 
+        Returns:
+            The types of the nodes in it that are not known here and were left out.
+
         Raises:
-            WorldError: It is of a type that is not known here, or a value in it is of another.
+            WorldError: It is of a type that is not known here, a value in it is of another, or it
+                is or holds a robot, perhaps within a PROTO node.
         """
         if not self._is_known(node):
             raise WorldError(f"the stand-in has no {node.type_name} nodes")
-        there = len(self.nodes)
+        there, left_out = len(self.nodes), len(self.left_out)
         try:
             self._register(node, parent)
+            if any(added.type_name == "Robot" for added in self.nodes[there:]):
+                raise WorldError("the stand-in adds no robots")
         except WorldError:
             self._forget(self.nodes[there:])
+            del self.left_out[left_out:]
             raise
         if index is None:
             parent.fields[name] = node
         else:
             parent.fields[name].insert(index, node)
+        return [*dict.fromkeys(each.type_name for each in self.left_out[left_out:])]
 
     def remove(self, node: Node) -> tuple[Node, str] | None:
         """Take a node out of the field that it stands in, which is returned."""

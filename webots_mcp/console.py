@@ -1,7 +1,8 @@
 """Recording the console of each Webots of a recording: one process at a time follows each of them.
 
 `ConsoleWatch` looks for the Webots that run, `ConsoleFollower` follows one of them, `ConsoleLines`
-limits how many of its lines are recorded and counts the rest.
+limits how many of its lines are recorded and counts the rest. `StandInConsole` records that of a
+stand-in which runs in this process.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from collections.abc import Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Final
 
-from webots_mcp.contract import LogLevel, LogSource, find_project, full_path
+from webots_mcp.contract import LogLevel, LogSource, find_project, full_path, host_name
 from webots_mcp.errors import (
     CommandRefusedError,
     DatabaseError,
@@ -23,7 +24,7 @@ from webots_mcp.errors import (
     WebotsMCPError,
     warn,
 )
-from webots_mcp.liveness import give_back, holder_of, lease_of, take
+from webots_mcp.liveness import give_back, held_jobs, holder_of, lease_of, take
 from webots_mcp.store.logs import ConsoleRows, Said
 from webots_mcp.store.recording import Job, Recording
 from webots_mcp.store.robots import list_robots
@@ -59,15 +60,19 @@ _RENEW_S: Final = 5.0
 _WAITING_LOOK_S: Final = 2.0
 _YOUNG_S: Final = 5.0  # a Webots that has just started has printed nothing old
 _MOST_HELD: Final = 5_000  # while the database is locked
+_LAST_WRITING_S: Final = 3.0
 _FIRST_LOOK_S: Final = 1.0  # a server that has just started has answers to give
 _LOOK_EVERY_S: Final = 5.0
 _NOBODY: Final = "no Webots of this recording runs on this machine, so no console is followed"
 _UNSURE: Final = "; it was started without --stream: if no lines appear, start it with --stream"
 
 
+_JOB: Final = "console of "
+
+
 def job_of(instance: Instance) -> str:
     """The name of the lease for following the console of that Webots."""
-    return f"console of {instance.name}"
+    return f"{_JOB}{instance.name}"
 
 
 @contextmanager
@@ -84,22 +89,69 @@ def follow_console(instance: Instance, recording: Recording) -> Generator[Consol
         follower.stop()
 
 
-class ConsoleFollower(threading.Thread):
-    """A daemon thread that records the console of one Webots until that ends.
+class _RecordingThread(threading.Thread):
+    """A daemon thread that records the lines of a console, each a moment after it came.
 
     Attributes:
         problem: Why it does not at the moment; None where it does.
     """
 
-    def __init__(self, instance: Instance, recording: Recording) -> None:
-        super().__init__(name=f"webots-mcp console {instance.port}", daemon=True)
-        self.instance = instance
+    def __init__(self, name: str, recording: Recording) -> None:
+        super().__init__(name=name, daemon=True)
         self.problem: str | None = "it has not started yet"
         self._recording = recording
         self._ending = threading.Event()
-        self._rows = ConsoleRows(instance.name, instance.started_wall_time_s)
         self._held: deque[tuple[float, Said]] = deque()  # when each came
         self._lost = 0
+
+    def _hold(self, lines: Iterable[Said]) -> None:
+        """Keep lines until their time comes, and no more of them than is wise."""
+        now_s = time.monotonic()
+        self._held.extend((now_s, line) for line in lines)
+        while len(self._held) > _MOST_HELD:
+            self._held.popleft()
+            self._lost += 1
+
+    @contextmanager
+    def _keeping_on(self) -> Generator[None]:
+        """A database that is locked may be written later; the lease that was lost never is."""
+        try:
+            yield
+        except DatabaseError as error:
+            self.problem = str(error)
+
+    def _write_held(self, job: Job, rows: ConsoleRows, came_by_s: float) -> None:
+        """Record the lines that came until then."""
+        held = [(came_s, line) for came_s, line in list(self._held) if came_s <= came_by_s]
+        lines = [line for _, line in held]
+        lost = self._lost
+        if lost:
+            lines.insert(0, note(f"{lost} lines of the console: the database was locked"))
+        if not lines:
+            return
+        with job.writer() as connection:
+            rows.write(connection, lines)
+        self.problem = None
+        self._lost -= lost
+        while self._held and self._held[0][0] <= came_by_s:
+            self._held.popleft()
+
+    def _write_waiting(self, job: Job, rows: ConsoleRows) -> None:
+        """Record the lines that have waited for a run, once it is there."""
+        with self._recording.reader() as connection:
+            goes_on = rows.may_go_on(connection)
+        if goes_on:
+            with job.writer() as connection:
+                rows.write(connection, [])
+
+
+class ConsoleFollower(_RecordingThread):
+    """A daemon thread that records the console of one Webots until that ends."""
+
+    def __init__(self, instance: Instance, recording: Recording) -> None:
+        super().__init__(f"webots-mcp console {instance.port}", recording)
+        self.instance = instance
+        self._rows = ConsoleRows(instance.name, instance.started_wall_time_s)
         self._was_connected = False
 
     def run(self) -> None:
@@ -153,7 +205,7 @@ class ConsoleFollower(threading.Thread):
         finally:
             self._hold(lines.idle())
             with suppress(WebotsMCPError):
-                self._write_held(job, came_by_s=math.inf)
+                self._write_held(job, self._rows, came_by_s=math.inf)
 
     def _listen(self, job: Job, stream: Stream, lines: ConsoleLines) -> None:
         renew_s = look_s = 0.0
@@ -169,46 +221,75 @@ class ConsoleFollower(threading.Thread):
                     job.require_held()
                 if self._rows.waits and now_s > look_s:
                     look_s = now_s + _WAITING_LOOK_S
-                    self._write_waiting(job)
+                    self._write_waiting(job, self._rows)
                 if self._held and self._held[0][0] < now_s - _HOLD_S:
-                    self._write_held(job, now_s - _HOLD_S)
+                    self._write_held(job, self._rows, now_s - _HOLD_S)
 
-    @contextmanager
-    def _keeping_on(self) -> Generator[None]:
-        """A database that is locked may be written later; the lease that was lost never is."""
+
+class StandInConsole(_RecordingThread):
+    """Records the console of a stand-in that runs in this process, while its context lasts.
+
+    The lines have the names of the robots whose controllers printed them.
+
+    Args:
+        recording: Where the lines are to be recorded.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        super().__init__("webots-mcp console of the stand-in", recording)
+        self._began_s = time.time()
+        self._lines = ConsoleLines(old=False)
+        self._adding = threading.Lock()
+        self._name = ""
+
+    def __enter__(self) -> StandInConsole:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ending.set()
+        if self.is_alive():
+            self.join(timeout=_LAST_WRITING_S)
+
+    def begin(self, port: int) -> None:
+        """Begin to record: controllers know the simulation by this port."""
+        self._name = f"{host_name()}:{port}"
+        self.start()
+
+    def put(self, stream: str, line: str) -> None:
+        """Take a line; it is recorded later."""
+        with self._adding:
+            self._hold(self._lines.take_line(WebotsLine(stream, line)))
+
+    def run(self) -> None:
+        """Record until the context is left, and then what is left."""
+        rows, lease = ConsoleRows(self._name, self._began_s), lease_of(_JOB + self._name)
+        job = Job(self._recording, lease)
         try:
-            yield
-        except DatabaseError as error:
-            self.problem = str(error)
+            self._recording.create()
+            with self._recording.writer() as connection:
+                take(connection, lease)
+            renew_s = look_s = time.monotonic()
+            while not self._ending.wait(_LOOK_S):
+                now_s = time.monotonic()
+                self._note_idle()
+                with self._keeping_on():
+                    if now_s > renew_s + _RENEW_S:
+                        renew_s = now_s
+                        job.require_held()
+                    if rows.waits and now_s > look_s + _WAITING_LOOK_S:
+                        look_s = now_s
+                        self._write_waiting(job, rows)
+                    self._write_held(job, rows, now_s - _HOLD_S)
+            self._note_idle(at_the_end=True)
+            self._write_held(job, rows, came_by_s=math.inf)
+            with self._recording.writer() as connection:
+                give_back(connection, lease)
+        except WebotsMCPError as error:
+            warn(f"the console of the stand-in is not recorded: {error}")
 
-    def _hold(self, lines: Iterable[Said]) -> None:
-        """Keep lines until their time comes, and no more of them than is wise."""
-        now_s = time.monotonic()
-        self._held.extend((now_s, line) for line in lines)
-        while len(self._held) > _MOST_HELD:
-            self._held.popleft()
-            self._lost += 1
-
-    def _write_held(self, job: Job, came_by_s: float) -> None:
-        """Record the lines that came until then."""
-        lines = [line for came_s, line in self._held if came_s <= came_by_s]
-        if self._lost:
-            lines.insert(0, note(f"{self._lost} lines of the console: the database was locked"))
-        if not lines:
-            return
-        with job.writer() as connection:
-            self._rows.write(connection, lines)
-        self.problem, self._lost = None, 0
-        while self._held and self._held[0][0] <= came_by_s:
-            self._held.popleft()
-
-    def _write_waiting(self, job: Job) -> None:
-        """Record the lines that have waited for a run, once it is there."""
-        with self._recording.reader() as connection:
-            goes_on = self._rows.may_go_on(connection)
-        if goes_on:
-            with job.writer() as connection:
-                self._rows.write(connection, [])
+    def _note_idle(self, *, at_the_end: bool = False) -> None:
+        with self._adding:
+            self._hold(self._lines.rest() if at_the_end else self._lines.idle())
 
 
 class ConsoleWatch(threading.Thread):
@@ -285,7 +366,7 @@ class ConsoleLines:
             yield from self._that_waited(lines)
         else:
             for line in lines:
-                yield from self._within_limit(line)
+                yield from self.take_line(line)
         if lines and message.dropped_bytes:
             yield note(f"{message.dropped_bytes} bytes of the console in one burst")
 
@@ -304,7 +385,12 @@ class ConsoleLines:
         if int(time.monotonic()) != self._second:
             yield from self._note_left_out()
 
-    def _within_limit(self, line: WebotsLine) -> Iterator[Said]:
+    def rest(self) -> Iterator[Said]:
+        """Notes of what has been left out until now."""
+        yield from self._note_left_out()
+
+    def take_line(self, line: WebotsLine) -> Iterator[Said]:
+        """A line that has just been printed, unless it is one of too many."""
         second = int(time.monotonic())
         if second != self._second:
             yield from self._note_left_out()
@@ -358,7 +444,14 @@ def console_state(recording: Recording, connection: sqlite3.Connection) -> str:
         connection: To it.
     """
     running = own_webots(recording)
-    return "; ".join(_state(each, recording, connection) for each in running) or _NOBODY
+    states = [_state(each, recording, connection) for each in running]
+    recorded = {job_of(each) for each in running}
+    states += [
+        f"the console of the stand-in {name.removeprefix(_JOB)} is recorded"
+        for name in held_jobs(connection, _JOB)
+        if name not in recorded
+    ]
+    return "; ".join(states) or _NOBODY
 
 
 def _state(instance: Instance, recording: Recording, connection: sqlite3.Connection) -> str:

@@ -404,6 +404,10 @@ _TAKE: Final = (
 _RENEW: Final = "UPDATE lease SET until_wall_time_s = ? WHERE name = ? AND holder = ?"
 _GIVE_BACK: Final = "DELETE FROM lease WHERE name = ? AND holder = ?"
 _HOLDER: Final = "SELECT holder FROM lease WHERE name = ? AND until_wall_time_s BETWEEN ? AND ?"
+_HELD: Final = (
+    "SELECT name FROM lease WHERE substr(name, 1, length(:prefix)) = :prefix "
+    "AND until_wall_time_s BETWEEN :now AND :latest ORDER BY name"
+)
 _LOST: Final = (
     "{} was taken over by another process{}, since this one had not renewed its lease for {:g} s: "
     "it wrote nothing more"
@@ -438,6 +442,13 @@ def holder_of(connection: sqlite3.Connection, name: str) -> str | None:
     now_s = time.time()
     row = connection.execute(_HOLDER, (name, now_s, now_s + _TIMES * LEASE_S)).fetchone()
     return row and str(row[0])
+
+
+def held_jobs(connection: sqlite3.Connection, prefix: str) -> list[str]:
+    """The jobs that a process does, of those whose names begin so."""
+    now_s = time.time()
+    asked = {"prefix": prefix, "now": now_s, "latest": now_s + _TIMES * LEASE_S}
+    return [str(name) for (name,) in connection.execute(_HELD, asked)]
 
 
 def take(

@@ -176,3 +176,17 @@ def test_old_lines_go_to_the_newest_run_whenever_it_began(recorded: Recorded) ->
     starting = said("INFO: rover_code: Starting controller: x", NOW, is_old=True)
     rows.write(recorded.connection, [starting, said("hello", NOW, is_old=True)])
     assert [row[0] for row in rows_of(recorded)] == [rover.run_id] * 2
+
+
+def test_a_line_that_names_its_robot_is_met_in_what_that_robots_bridge_recorded(
+    recorded: Recorded,
+) -> None:
+    rover = robot(recorded)
+    robot(recorded, "referee")
+    rover.log(1.0, "hello")
+    recorded.connection.execute("UPDATE log SET logger = 'stderr'")
+    recorded.connection.execute("UPDATE log SET source = 'controller'")
+    rows = ConsoleRows(HERE, NOW - 10)
+    for name in ("silent", "rover"):
+        rows.write(recorded.connection, [said(f"[{name}] hello")])
+    assert [message for *_, message in rows_of(recorded)] == ["[silent] hello"]

@@ -352,6 +352,7 @@ def launch(
 
         webots-mcp launch worlds/arena.wbt --headless --mode fast
     """
+    from webots_mcp.console import StandInConsole
     from webots_mcp.contract import DATA_DIR_VARIABLE
     from webots_mcp.launch import Launch, newest_in, require_world
     from webots_mcp.store.policy import LAUNCH
@@ -369,7 +370,9 @@ def launch(
         os.environ[DATA_DIR_VARIABLE] = str(recording.data_dir)
         watched = recording, newest_in(recording), file, patience_s
         threading.Thread(target=_watch, args=watched, daemon=True).start()
-        return stand_in_simulator()(file, mode or "realtime", None, _controllers(robot))
+        named = _controllers(robot)
+        with StandInConsole(recording) as recorder:
+            return stand_in_simulator()(file, mode or "realtime", None, named, recorder)
     if robot:
         raise InvalidInputError("--robot is for --stand-in: Webots runs what the world names")
     start = Start(file, mode, headless, stream, port or free_port())

@@ -62,7 +62,8 @@ class Plugin(NamedTuple):
         cluster: Where else trials can run: a context manager that gives
             `steering.trial_run.Simulators`, of a scheduler.
         stand_in: Runs a world without Webots, in the foreground: `run(world, mode, duration_s,
-            controllers)`, which returns the exit code.
+            controllers, recorder)`, which returns the exit code. The recorder has `begin(port)`,
+            and `put(stream, line)` for each line of the console.
     """
 
     commands: tuple[PluginCommand, ...] = ()
@@ -104,6 +105,6 @@ def cluster_offered() -> str:
     return next(plugin.cluster for plugin in plugins() if plugin.cluster is not None)
 
 
-def stand_in_simulator() -> Callable[[Path, str, float | None, dict[str, str]], int]:
+def stand_in_simulator() -> Callable[[Path, str, float | None, dict[str, str], object], int]:
     """What runs a world where no Webots is."""
     return load(next(each.stand_in for each in plugins() if each.stand_in))

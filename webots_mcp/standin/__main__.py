@@ -11,6 +11,7 @@ from pathlib import Path
 from types import FrameType
 
 from webots_mcp.standin import Simulation, StandInError
+from webots_mcp.standin.simulation import ConsoleRecorder
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -28,6 +29,7 @@ def run_world(
     mode: str = "realtime",
     duration_s: float | None = None,
     controllers: Mapping[str, str] | None = None,
+    recorder: ConsoleRecorder | None = None,
 ) -> int:
     """Run a world in the foreground.
 
@@ -36,6 +38,7 @@ def run_world(
         mode: pause, realtime or fast.
         duration_s: It ends after so much simulated time.
         controllers: Files that control robots, by name, instead of what the world says.
+        recorder: Keeps what is printed.
 
     Returns:
         The exit status: that of `simulationQuit`, else that of the first controller that ended with
@@ -50,7 +53,11 @@ def run_world(
         signal.signal(number, stop)
     try:
         simulation = Simulation(
-            world, mode=mode, console=_show, controllers=dict(controllers or {})
+            world,
+            mode=mode,
+            console=_show,
+            recorder=recorder,
+            controllers=dict(controllers or {}),
         )
     except StandInError as error:
         print(f"webots_mcp.standin: {error}", file=sys.stderr)  # noqa: T201 - a command

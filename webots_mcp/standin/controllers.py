@@ -6,11 +6,12 @@ import os
 import socket
 import subprocess
 import threading
+import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import IO, Final, Protocol
 
 from controller.session import Inbox, Message, pack
 
@@ -21,17 +22,19 @@ from webots_mcp.standin.vrml import StandInError
 
 _TERMINATION_S: Final = 1.0
 """How long a process may take to end after it was asked to."""
+_LAST_LINES_S: Final = 0.5
+"""How long its last lines are waited for: a grandchild may hold the pipes open."""
 
 
 class ControllerProcess:
-    """A running controller; what it prints is passed on line by line."""
+    """A running controller; what it prints is passed on line by line, with the stream's name."""
 
     def __init__(
         self,
         command: list[str],
         folder: Path,
         environment: Mapping[str, str],
-        on_line: Callable[[str], None],
+        on_line: Callable[[str, str], None],
         on_exit: Callable[[ControllerProcess], None],
     ) -> None:
         self._process = subprocess.Popen(
@@ -40,7 +43,7 @@ class ControllerProcess:
             env=environment,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
+            stderr=subprocess.PIPE,
             text=True,
             encoding="utf-8",
             errors="replace",
@@ -51,8 +54,12 @@ class ControllerProcess:
         """Whether it had to be ended by force."""
         self._on_line = on_line
         self._on_exit = on_exit
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
+        self._readers = [
+            threading.Thread(target=self._read, args=(name, stream), daemon=True)
+            for name, stream in (("stdout", self._process.stdout), ("stderr", self._process.stderr))
+        ]
+        for reader in self._readers:
+            reader.start()
         self._watcher = threading.Thread(target=self._watch, daemon=True)
         self._watcher.start()
 
@@ -76,15 +83,16 @@ class ControllerProcess:
             self._process.kill()
         self._watcher.join()
 
-    def _read(self) -> None:
-        assert self._process.stdout is not None
-        with self._process.stdout as stream:
+    def _read(self, name: str, stream: IO[str]) -> None:
+        with stream:
             for line in stream:
-                self._on_line(line.rstrip("\r\n"))
+                self._on_line(line.rstrip("\r\n"), name)
 
     def _watch(self) -> None:
         self._process.wait()
-        self._reader.join(0.5)  # a grandchild may hold the pipe open: do not wait for it
+        until_s = time.monotonic() + _LAST_LINES_S
+        for reader in self._readers:
+            reader.join(max(until_s - time.monotonic(), 0.0))
         self._on_exit(self)
 
 
@@ -119,6 +127,18 @@ _INTERN_VARIABLES: Final = ("WEBOTS_ROBOT_NAME", "WEBOTS_INSTANCE_PATH")
 _EXTERN_VARIABLES: Final = ("WEBOTS_CONTROLLER_URL", "WEBOTS_STANDIN_TOKEN")
 
 
+class PrintLine(Protocol):
+    """What takes the lines of the console."""
+
+    def __call__(self, line: str, stream: str | None = None, /) -> None:
+        """Take a line.
+
+        Args:
+            line: The text.
+            stream: Where a controller printed it, `stdout` or `stderr`; None for the simulator's.
+        """
+
+
 @dataclass
 class Launch:
     """How controllers are started, the same for all robots of a simulation."""
@@ -127,7 +147,7 @@ class Launch:
     environment: Mapping[str, str]
     overrides: Mapping[str, Path]
     """Controller files by robot name, instead of what the world says."""
-    print_line: Callable[[str], None]
+    print_line: PrintLine
     on_exit: Callable[[], None]
     token: str
     """What controllers show to be let in."""
@@ -249,7 +269,7 @@ class Controller(Seat):
             command,
             self.file.parent,
             self.environment(),
-            lambda line: self.launch.print_line(f"[{self.name}] {line}"),
+            lambda line, stream: self.launch.print_line(f"[{self.name}] {line}", stream),
             self._exited,
         )
 

@@ -18,7 +18,7 @@ from concurrent.futures import CancelledError, Future
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Final, TypeVar, cast
+from typing import Final, Protocol, TypeVar, cast
 
 from controller.session import ADDRESS_FILE, Message
 
@@ -39,6 +39,19 @@ _MAX_LAG_S: Final = 0.1
 T = TypeVar("T")
 
 
+class ConsoleRecorder(Protocol):
+    """What keeps the lines of a simulation's console."""
+
+    def begin(self, port: int) -> None:
+        """Begin with the simulation that controllers know by this port."""
+
+    def put(self, stream: str, line: str) -> None:
+        """Take a line of `stdout` or `stderr`: `[robot] text` from controllers, others from Webots.
+
+        It is called from one thread at a time, also before `begin`.
+        """
+
+
 class Simulation(Driver):
     """A world that runs in a background thread, its controllers as processes of their own.
 
@@ -51,6 +64,7 @@ class Simulation(Driver):
         *,
         mode: str = "realtime",
         console: Callable[[str], object] | None = None,
+        recorder: ConsoleRecorder | None = None,
         environment: Mapping[str, str] | None = None,
         controllers: Mapping[str, str | Path] | None = None,
         python: str = sys.executable,
@@ -62,6 +76,7 @@ class Simulation(Driver):
             mode: `pause`, `realtime` or `fast`, as for Webots' `--mode`. A world that is loaded
                 in pause starts its controllers with the first step.
             console: Is called with each line of Webots' console, from one thread at a time.
+            recorder: Takes the same lines, as Webots gives them to its clients.
             environment: Variables for the controllers, on top of those of this process.
             controllers: Controller files by robot name, instead of those that the world names.
             python: The interpreter of the controllers.
@@ -73,6 +88,7 @@ class Simulation(Driver):
         if mode not in _MODES:
             raise StandInError(f"mode has to be one of {', '.join(_MODES)}, not {mode!r}")
         self._console = console
+        self._recorder = recorder
         self._lines: deque[str] = deque(maxlen=_CONSOLE_LINES)
         self._printing = threading.Lock()
         self._changed = threading.Condition()
@@ -113,6 +129,8 @@ class Simulation(Driver):
         self._selector.register(bell, selectors.EVENT_READ, _hush)
         self._launch.port = door.getsockname()[1]
         self._launch.folder = self._folder / str(shown_port or self._launch.port)
+        if self._recorder:
+            self._recorder.begin(int(self._launch.folder.name))
         self._launch.folder.mkdir()  # it is this user's alone
         address = f"{self._launch.port} {self._launch.token}"
         (self._launch.folder / ADDRESS_FILE).write_text(address, encoding="utf-8")
@@ -218,11 +236,14 @@ class Simulation(Driver):
         with suppress(OSError):
             self._bell_rope.send(b"!")
 
-    def _print(self, line: str) -> None:
+    def _print(self, line: str, stream: str | None = None, /) -> None:
         with self._printing:
             self._lines.append(line)
             if self._console:
                 self._console(line)
+            if self._recorder:
+                own = "stdout" if line.startswith("INFO: ") else "stderr"
+                self._recorder.put(stream or own, line)
         self._tell()
 
     def _exited(self) -> None:

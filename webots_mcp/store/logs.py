@@ -298,8 +298,9 @@ _SIM_TIME: Final = (
     "iif(last_wall_time_s <= :wall, last_sim_time_s, started_sim_time_s)) FROM run WHERE id = :run"
 )
 _RECORDED: Final = (
-    "SELECT l.id, l.message, l.logger FROM log l JOIN run r ON r.id = l.run_id "
-    "JOIN session s ON s.id = r.session_id WHERE l.id > ? AND l.wall_time_s >= ? "
+    "SELECT l.id, l.message, l.logger, b.name, s.controller FROM log l "
+    "JOIN run r ON r.id = l.run_id JOIN session s ON s.id = r.session_id "
+    "JOIN robot b ON b.id = r.robot_id WHERE l.id > ? AND l.wall_time_s >= ? "
     f"AND s.instance = ? AND l.source IN ('controller', 'bridge') "
     f"ORDER BY l.id DESC LIMIT {_MOST_RECORDED}"
 )
@@ -462,30 +463,54 @@ class _Recorded:
         self._instance = instance
         self._since_s = since_s
         self._last_id = 0
-        self._lines = _Texts(_MOST_RECORDED)
-        self._logged = _Texts(_MOST_LOGGED)
+        self._robots: dict[str, str] = {}  # by its name and that of its controller
+        self._texts: dict[str, _OfRobot] = {}
 
     def catch_up(self, connection: sqlite3.Connection) -> None:
         """Look at what has been recorded since the last time."""
         asked = (self._last_id, self._since_s, self._instance)
-        for log_id, message, logger in reversed(connection.execute(_RECORDED, asked).fetchall()):
+        rows = connection.execute(_RECORDED, asked).fetchall()
+        for log_id, message, logger, robot, controller in reversed(rows):
             self._last_id = log_id
+            names = (robot, controller and PurePath(controller).stem)
+            self._robots |= {name: robot for name in names if name}
+            texts = self._texts.setdefault(robot, _OfRobot())
             first, *others = str(message).split("\n")
-            (self._lines if logger in _PRINTED else self._logged).add(first.strip())
+            (texts.lines if logger in _PRINTED else texts.logged).add(first.strip())
             for other in others:
-                self._lines.add(other.strip())
+                texts.lines.add(other.strip())
 
     def take(self, line: Said) -> bool:
-        """Whether a bridge recorded this line; it is then met no more."""
-        text = line.message[:_MESSAGE].strip()
+        """Whether a bridge recorded this line; it is then met no more.
+
+        One that begins with the name of a robot or controller that records is looked for without
+        it, in what that robot's bridge recorded.
+        """
         if line.stream is None:
             return False
-        return self._lines.take(text) or self._logged.take(text) or self._take_handled(text)
+        named = _NAMED.fullmatch(line.message) if line.source == "console" else None
+        robot = named and self._robots.get(named[1])
+        if named and robot and self._texts[robot].take(named[2][:_MESSAGE].strip()):
+            return True
+        text = line.message[:_MESSAGE].strip()
+        return any(texts.take(text) for texts in self._texts.values())
+
+
+class _OfRobot:
+    """What the bridge of one robot recorded of what its controller printed and logged."""
+
+    def __init__(self) -> None:
+        self.lines = _Texts(_MOST_RECORDED)
+        self.logged = _Texts(_MOST_LOGGED)
+
+    def take(self, text: str) -> bool:
+        """Whether it recorded this text."""
+        return self.lines.take(text) or self.logged.take(text) or self._take_handled(text)
 
     def _take_handled(self, text: str) -> bool:
         """As a handler of Python's `logging` prints it: time, level or name before the message."""
-        said = next((each for each in self._logged if _ends_with(text, each)), None)
-        return said is not None and self._logged.take(said)
+        said = next((each for each in self.logged if _ends_with(text, each)), None)
+        return said is not None and self.logged.take(said)
 
 
 class _Texts:

@@ -23,6 +23,11 @@ if TYPE_CHECKING:
     from webots_mcp.setup import FileChange, ProjectController
 
 _WRONG: Final = 1  # the exit code
+_NO_CONTROLLER: Final = (
+    "there is no controller in controllers/. Once there is one, run this again. An extern "
+    "controller or a ROS 2 driver records with these two lines: 'from webots_mcp import MCPBridge' "
+    "and, where it has made its robot, 'bridge = MCPBridge.attach(robot)'"
+)
 _LEAST_COLUMN: Final = 30  # characters that a line of a folded text has at least
 
 
@@ -157,9 +162,9 @@ def init(
 ) -> None:
     """Make a Webots project ready: tell MCP clients of the server, look at the controllers.
 
-    The project is the nearest folder with worlds/ and controllers/. Claude Code (.mcp.json), Cursor
-    (.cursor/mcp.json) and VS Code (.vscode/mcp.json) are told of the server, by a full path;
-    other entries stay. In WSL, where the project is on a drive of Windows, it is the server of
+    The project is the nearest folder that holds worlds/ with a world; it need not have
+    controllers/. Claude Code (.mcp.json), Cursor (.cursor/mcp.json) and VS Code (.vscode/mcp.json)
+    are told of the server, by a full path; other entries stay. In WSL, where the project is on a drive of Windows, it is the server of
     Windows. Of each controller in Python the lines that it needs are
     shown, the Python that Webots starts it with, and what mends that where the bridge is not
     installed there. Nothing is changed a second time.
@@ -431,7 +436,7 @@ def _print_project(found: dict[str, Any], notes: list[str]) -> None:
         print("\nWhat mends that:\n")
         print("\n".join(f"    {fix}" for fix in fixes))
     if not found["controllers"]:
-        notes = [*notes, "there is no controller yet: run it again when there is"]
+        notes = [*notes, _NO_CONTROLLER]
     print()
     print_notes(notes)
 

@@ -23,7 +23,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
-from webots_mcp.contract import find_project, full_path
+from webots_mcp.contract import CONTROLLER_FOLDER, PROJECT_IS, find_project, full_path
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.requirements import checkout, quoted
 from webots_mcp.webots import installations
@@ -88,14 +88,15 @@ def project_of(folder: str | None) -> Path:
     below = [each for each in sorted(start.iterdir()) if find_project(each) == each]
     hint = f" (one lies below: {below[0]})" if below else ""
     raise InvalidInputError(
-        f"no Webots project at or above {start}: that is a folder with worlds/ and controllers/"
+        f"no Webots project at or above {start}: that is {PROJECT_IS}"
         f"{hint}; give its folder, as 'webots-mcp init PROJECT'"
     )
 
 
 def controllers_of(project: Path, platform: str = sys.platform) -> list[ProjectController]:
-    """Those that Webots would start, by name."""
-    folders = sorted(each for each in (project / "controllers").iterdir() if each.is_dir())
+    """Those that Webots would start, by name; none in a project of extern controllers alone."""
+    folder = project / CONTROLLER_FOLDER
+    folders = sorted(each for each in folder.glob("*") if each.is_dir())
     return [found for folder in folders for found in _started(folder, platform)]
 
 

@@ -360,7 +360,8 @@ def _is_project(folder: Path) -> bool:
         if not worlds.is_dir():
             return False
         return (folder / CONTROLLER_FOLDER).is_dir() or any(
-            name.endswith(WORLD_ENDING) for name in os.listdir(worlds)  # noqa: PTH208
+            name.endswith(WORLD_ENDING)
+            for name in os.listdir(worlds)  # noqa: PTH208
         )
     except OSError:  # a folder that this user may not list is no project of theirs
         return False

@@ -136,9 +136,7 @@ def run(
     environment = {DATA_DIR_VARIABLE: str(data_dir)}
     with _alone(recording), Simulation(DEFAULT_WORLD, environment=environment) as simulation:
         with shown:
-            _say(
-                f"Running {DEFAULT_WORLD.name} on the stand-in simulator (this is not Webots) ..."
-            )
+            _say(f"Running {DEFAULT_WORLD.name} on the stand-in simulator (this is not Webots) ...")
         _wait_for_rows(simulation, data_dir)
         with shown:
             answers = anyio.run(converse, data_dir, conversation)
@@ -332,7 +330,9 @@ def _show_next_steps(data_dir: Path, *, keep: bool) -> None:
     _say(f"  {_typed('view', data_dir)}")
     if not keep:
         _say("With 'webots-mcp demo --keep' the robot drives on, and the page's buttons steer it.")
-    _say("Then record your own robot: 'webots-mcp init' in your Webots project writes these entries")
+    _say(
+        "Then record your own robot: 'webots-mcp init' in your Webots project writes these entries"
+    )
     _say("and shows what each controller needs. 'webots-mcp init --help' says more.")
 
 

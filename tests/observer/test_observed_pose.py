@@ -88,6 +88,7 @@ class Seen:
         listed = list_signals(self.rows.connection, robot="rover")
         return {each.name for each in listed.signals}
 
+
 @pytest.fixture
 def seen(tmp_path: Path) -> Iterator[Seen]:
     seen = Seen(tmp_path)
@@ -155,9 +156,7 @@ def test_how_far_it_went_is_measured(seen: Seen) -> None:
 
 
 @pytest.mark.parametrize("position", [{"pose": [1.0, 2.0, 0.0]}, {"gps": {"x": 1.0, "y": 2.0}}])
-def test_a_robot_that_publishes_its_position_keeps_it(
-    seen: Seen, position: dict[str, Any]
-) -> None:
+def test_a_robot_that_publishes_its_position_keeps_it(seen: Seen, position: dict[str, Any]) -> None:
     seen.drive(**position)
     seen.observe()
     assert not any(name.startswith("observer") for name in seen.signals())

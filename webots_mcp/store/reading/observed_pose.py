@@ -35,7 +35,8 @@ _GAP_INTERVALS: Final = 3.0
 _BESIDE: Final = (
     "SELECT b.name, o.id, own.name FROM run r JOIN robot own ON own.id = r.robot_id "
     "JOIN session me ON me.id = r.session_id JOIN session s ON s.instance = me.instance "
-    f"JOIN robot b ON b.id = s.robot_id AND b.kind = '{OBSERVER}' JOIN run o ON o.session_id = s.id "
+    f"JOIN robot b ON b.id = s.robot_id AND b.kind = '{OBSERVER}' "
+    "JOIN run o ON o.session_id = s.id "
     f"WHERE r.id = ? AND own.kind <> '{OBSERVER}' "
     "AND o.started_wall_time_s <= r.last_wall_time_s "
     "AND o.last_wall_time_s >= r.started_wall_time_s "

@@ -101,6 +101,20 @@ def test_where_nobody_computes_it_was_most_likely_paused_by_hand(
     assert found.fix == "press play in Webots"
 
 
+def test_a_robot_that_crashed_is_named_also_where_another_ran_on(
+    look: Look, recorded: Recorded
+) -> None:
+    now_s = time.time()
+    ended = {"end_reason": "crashed", "ended_wall_time_s": now_s - 20}
+    crashed = recorded.robot("rover", now=now_s - 20, **ended)
+    why = f"{ENDED_BY} ValueError: boom (rover.py, line 12)"
+    crashed.log(1.0, why, "error")
+    recorded.robot("beside", now=now_s, end_reason="finished", ended_wall_time_s=now_s)
+    found = look("Simulation")
+    assert found.verdict == "wrong"
+    assert "rover.py, line 12" in found.seen
+
+
 def test_it_is_said_where_only_controllers_that_record_were_looked_at(
     look: Look, recorded: Recorded, start: Start
 ) -> None:

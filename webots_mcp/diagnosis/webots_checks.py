@@ -83,14 +83,22 @@ def simulation(subject: Examined) -> Iterator[Diagnosis]:
     Of the robots that stand silent in the same simulation one is watched for them all.
     """
     watched = dict[str, View]()
-    newest = max(subject.views, key=last_seen_s, default=None)
-    for view in subject.live or ([newest] if newest else []):
+    for view in subject.live or _ran_last(subject.views):
         if view.session is not None and view.robot.live and _is_unclear(view):
             watched.setdefault(view.session.instance, view)
         else:
             yield _judged(view)
     for view in list(watched.values())[:_MOST_WATCHED]:
         yield _narrowed(subject, view)
+
+
+def _ran_last(views: list[View]) -> list[View]:
+    """The robots of the simulation that was seen last: one of them may have crashed before."""
+    newest = max(views, key=last_seen_s, default=None)
+    if newest is None or newest.session is None:
+        return [] if newest is None else [newest]
+    instance = newest.session.instance
+    return [each for each in views if each.session and each.session.instance == instance]
 
 
 def _is_unclear(view: View) -> bool:

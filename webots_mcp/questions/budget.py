@@ -256,7 +256,7 @@ _T = TypeVar("_T")
 
 def answer_about(view: View, model: type[_A], find: Callable[[], dict[str, Any]]) -> _A:
     """The header with what was found; where nothing was recorded, with the reason as the hint."""
-    answer: dict[str, Any] = view.header()
+    answer: dict[str, Any] = view.header() | view.position_by()
     try:
         answer |= find()
     except NothingRecordedError as error:

@@ -375,6 +375,7 @@ def webots_get_robot_state(
         )
         return StateAnswer(
             **view.header(),
+            **view.position_by(),
             state=short.value,
             shortened=short.rule,
             kept_at_full_rate=_kept(view),

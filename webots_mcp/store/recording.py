@@ -108,11 +108,10 @@ class View:
             "status": self.status.text,
             "why": self.status.why,
             **storage(self.connection),
-            **self._position_by(),
         }
 
-    def _position_by(self) -> dict[str, str]:
-        """Who saw where the robot is, where it does not know that itself."""
+    def position_by(self) -> dict[str, str]:
+        """Who saw where the robot is, where it does not know that itself: for what tells of it."""
         if self.run is None or self.state is None:
             return {}
         newest, state = StateColumns(), self.state

@@ -82,8 +82,8 @@ def test_a_second_one_in_the_same_folder_is_refused_as_long_as_the_first_runs(
 ) -> None:
     line = [sys.executable, "-m", "webots_mcp", "demo", "--keep", "--data-dir", str(tmp_path)]
     with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as first:
+        assert first.stdout is not None
         try:
-            assert first.stdout is not None
             assert first.stdout.readline().startswith("Running arena.wbt")
             assert main(["demo", "--data-dir", str(tmp_path)]) == 2
             said = capsys.readouterr().err

@@ -110,7 +110,7 @@ class View:
             **storage(self.connection),
         }
 
-    def position_by(self) -> dict[str, str]:
+    def position_by(self) -> dict[str, Any]:
         """Who saw where the robot is, where it does not know that itself: for what tells of it."""
         if self.run is None or self.state is None:
             return {}

@@ -194,8 +194,8 @@ async def test_events_and_log_lines_have_their_time_of_day_where_it_is_asked_for
         for tool, table in asked.items():
             assert "time" not in (await ask(client, tool))[table]["columns"]
             found = (await ask(client, tool, time_of_day=True))[table]
-            told = found.get("in_every_row") or {}
-            told = told | dict(zip(found["columns"], found["rows"][0], strict=True))
+            told: dict[str, Any] = dict(found.get("in_every_row") or {})
+            told |= dict(zip(found["columns"], found["rows"][0], strict=True))
             moment = datetime.fromisoformat(told["time"])
             assert moment.tzinfo is not None
             assert moment.timestamp() == pytest.approx(robot.now, abs=0.001)

@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import subprocess
+import sys
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
 
 import pytest
 
+from webots_mcp.cli import main
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.plugins.demo import demo_command as demo
 from webots_mcp.questions import all_questions
@@ -53,6 +56,44 @@ def test_the_last_lines_connect_a_client(printed: str) -> None:
     assert shown is not None
     assert line == shown[0] + shlex.join(command)
     assert "webots-mcp init" in end.splitlines()[-1]
+
+
+def test_the_next_step_is_a_line_that_can_be_typed(printed: str) -> None:
+    (line,) = re.findall(r"(?m)^ +(.+ view --data-dir .+)$", printed)
+    program, *arguments = shlex.split(line)
+    assert Path(program).is_file()
+    shown = subprocess.run([program, *arguments, "--help"], capture_output=True, check=True)
+    assert b"webots-mcp view" in shown.stdout
+
+
+def test_it_ends_with_a_drive_and_not_with_a_reset() -> None:
+    """Whoever looks at the recording afterwards sees the newest run first."""
+    begins_anew = [
+        place
+        for place, (_, tool, arguments) in enumerate(demo.CONVERSATION)
+        if tool == "webots_run_trials" or arguments.get("command") == "reset"
+    ]
+    drives = demo.CONVERSATION[begins_anew[-1] + 1 :]
+    assert sum(arguments.get("for_s", 0) for _, _, arguments in drives) >= 20
+
+
+def test_a_second_one_in_the_same_folder_is_refused_as_long_as_the_first_runs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = [sys.executable, "-m", "webots_mcp", "demo", "--keep", "--data-dir", str(tmp_path)]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as first:
+        assert first.stdout is not None
+        try:
+            assert first.stdout.readline().startswith("Running arena.wbt")
+            assert main(["demo", "--data-dir", str(tmp_path)]) == 2
+            said = capsys.readouterr().err
+            assert "a demo is already running there" in said
+            assert "view --data-dir" in said
+        finally:
+            first.kill()
+            first.stdout.close()
+    demo.run(tmp_path, conversation=TURNS)  # what was killed keeps nobody out
+    assert "Next" in capsys.readouterr().out
 
 
 def test_everything_that_it_asks_can_be_asked() -> None:

@@ -23,6 +23,9 @@ SCHEMA_VERSION: Final = 10  # PRAGMA user_version of a database that this versio
 
 DATABASE_NAME: Final = "webots.db"
 WORLD_ENDING: Final = ".wbt"
+WORLD_FOLDER: Final = "worlds"  # of a Webots project
+CONTROLLER_FOLDER: Final = "controllers"  # of one; a project of extern controllers has none
+PROJECT_IS: Final = f"a folder that holds {WORLD_FOLDER}/ with a {WORLD_ENDING} file"
 PROJECT_DATA_FOLDER: Final = "mcp_data"  # in a Webots project
 PROJECT_FILE: Final = "webots-mcp.toml"  # beside that folder: what is expected and allowed there
 CAMERA_FOLDER: Final = "camera"
@@ -324,8 +327,8 @@ def resolve_data_dir(data_dir: str | os.PathLike[str] | None = None) -> Path:
     """Where the database and the pictures live; the same answer for bridge and server.
 
     In rising order of precedence: `~/.webots-mcp/data`; `mcp_data/` in the nearest folder at or
-    above the current one that is a Webots project (it holds `worlds/` and `controllers/`); the
-    environment variable `WEBOTS_MCP_DATA_DIR`; the argument.
+    above the current one that is a Webots project (see `find_project`); the environment variable
+    `WEBOTS_MCP_DATA_DIR`; the argument.
     """
     return choose_data_dir(data_dir).path
 
@@ -343,11 +346,25 @@ def choose_data_dir(data_dir: str | os.PathLike[str] | None = None) -> DataFolde
 
 
 def find_project(folder: Path) -> Path | None:
-    """The nearest folder, at or above this one, that is a Webots project."""
-    for each in (folder, *folder.parents):
-        if (each / "worlds").is_dir() and (each / "controllers").is_dir():
-            return each
-    return None
+    """Return the nearest folder, at or above this one, that is a Webots project.
+
+    It holds `worlds/`, and there a world or next to it `controllers/`. ROS 2 packages and projects
+    of extern controllers have worlds alone: Webots needs no more.
+    """
+    return next((each for each in (folder, *folder.parents) if _is_project(each)), None)
+
+
+def _is_project(folder: Path) -> bool:
+    worlds = folder / WORLD_FOLDER
+    try:
+        if not worlds.is_dir():
+            return False
+        return (folder / CONTROLLER_FOLDER).is_dir() or any(
+            name.endswith(WORLD_ENDING)
+            for name in os.listdir(worlds)  # noqa: PTH208
+        )
+    except OSError:  # a folder that this user may not list is no project of theirs
+        return False
 
 
 def require_world_of(project: Path | None, world: Path) -> Path:
@@ -367,7 +384,7 @@ def require_world_of(project: Path | None, world: Path) -> Path:
     own = find_project(world.parent)
     if own is None:
         raise InvalidInputError(
-            f"{world} lies in no Webots project: that is a folder with worlds/ and controllers/"
+            f"{world} lies in no Webots project: that is {PROJECT_IS}; move it into one"
         )
     return project or own
 

@@ -45,6 +45,7 @@ FARTHEST_M: Final = 1e9  # beyond, a number is no place (an infinity, an integer
 
 WORLD: Final = "world"  # the branch in which an observer publishes where each robot is
 SOLIDS: Final = "solid"  # the one of other bodies
+OBSERVED: Final = "observer"  # the branch of a robot's pose that only an observer recorded
 SEEN_SPEED: Final = "speed_mps"  # how fast it sees each to be
 BRANCHES: Final = ("pose", "position", "pos", "gps", "odometry", "odom", "location")
 # Words of what is no place, or the place of something else.

@@ -31,7 +31,11 @@ _THREAD: Final = re.compile(
 )
 _CALL: Final = re.compile(r'^  File "(.*)", line (\S+) in (.*)$', re.MULTILINE)
 _FOLDERS: Final = re.compile(r".*[/\\]")
-INSTALLED: Final = re.compile(r"[/\\](?:site|dist)-packages[/\\]|^<frozen ")
+# Folders whose files are no controller's own: this package's, and Python's.
+LIBRARIES: Final = (f"{Path(__file__).parent}{os.sep}", f"{Path(os.__file__).parent}{os.sep}")
+INSTALLED: Final = re.compile(
+    r"[/\\](?:site|dist)-packages[/\\]|[/\\]lib[/\\]controller[/\\]python[/\\]|^<frozen "
+)
 _DEBUGGER: Final = re.compile(r"(?:[/\\]|^)(?:bdb|pdb)\.py$|[/\\](?:pydevd|debugpy|_pydev)")
 _BY_PERSON: Final = "waitForUserInputEvent"  # of Webots' Robot: a key or a click is waited for
 _EARLY: Final = 0.9  # of the limit: the clock of files is coarse
@@ -126,7 +130,7 @@ def read_stacks(file: BinaryIO) -> Stacks | None:
     if not calls or about.get(VERSION) != FORMAT:
         return None
     waits = [call for call in calls if call.function in STEPPING and call.file in steps]
-    own = [call for call in calls if call not in waits and not _is_library(call.file, libraries)]
+    own = [call for call in calls if call not in waits and not is_library(call.file, libraries)]
     inner = calls[: calls.index(own[0])] if own else calls
     is_in_step = any(call in waits for call in inner)
     is_held = any(_DEBUGGER.search(call.file) or call.function == _BY_PERSON for call in calls)
@@ -135,7 +139,8 @@ def read_stacks(file: BinaryIO) -> Stacks | None:
     return Stacks(written_s, run, limit_s, calls, own, hangs, is_in_step, text)
 
 
-def _is_library(file: str, libraries: tuple[str, ...]) -> bool:
+def is_library(file: str, libraries: tuple[str, ...] = LIBRARIES) -> bool:
+    """Whether a file is no controller's own, but Python's, Webots', this package's or installed."""
     return file.startswith(libraries) or INSTALLED.search(file) is not None
 
 

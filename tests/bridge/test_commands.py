@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import statistics
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,21 @@ def test_an_exception_in_a_handler_is_the_commands_error(
     assert (status, result) == ("failed", None)
     assert error is not None
     assert error.startswith("ValueError: arm is folded (test_commands.py, line ")
+
+
+def test_an_error_in_a_library_names_the_own_line_that_called_it_first(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    def fail(command: dict[str, Any]) -> None:
+        statistics.mean([])
+
+    bridge.register_command("grip", fail)
+    sent = recording.send("grip")
+    eager(bridge)
+    error = recording.fate(sent)[2]
+    line = fail.__code__.co_firstlineno + 1
+    assert error is not None
+    assert f"(test_commands.py, line {line}; raised in statistics.py, line " in error
 
 
 def test_a_result_that_json_cannot_hold_is_answered_and_says_what_was_replaced(

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
 from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
 
 from tests.recordings.rows import Recorded, RecordedRobot
 from tests.waiting import wait_for
-from webots_mcp.cli import main, names
+from webots_mcp.cli import described, main, names
 from webots_mcp.queue import CommandQueue
 from webots_mcp.store.logs import Follower
 
@@ -61,6 +62,21 @@ def test_every_command_explains_itself(
     assert "sage: webots-mcp" in text
     for each in names() if name is None else ():
         assert each in text
+
+
+def test_no_help_has_words_that_are_taken_for_markup() -> None:
+    for name, command in described().items():
+        for text in (command.text, *command.arguments.values()):
+            outside_of_code = re.sub(r"`[^`]*`", "", text)
+            assert not re.search(r"<\w+>", outside_of_code), f"{name}: put it in backticks: {text}"
+
+
+def test_the_help_of_launch_shows_which_controller_can_be_replaced(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with suppress(SystemExit):
+        main(["launch", "--help"])
+    assert "<extern>" in capsys.readouterr().out
 
 
 def test_help_imports_nothing_heavy() -> None:

@@ -199,3 +199,18 @@ def test_a_patched_controller_records_in_the_stand_in(tmp_path: Path) -> None:
         text=True, check=False,
     )  # fmt: skip
     assert "motors.left wheel motor" in shown.stdout, shown.stderr
+
+
+def test_what_a_plain_robot_cannot_do_is_said_with_the_line_that_adds_an_observer(
+    project: Path,
+) -> None:
+    """Until there is one: then nothing is lacking."""
+    (project / "worlds" / "arena.wbt").touch()
+    (project / "controllers" / "läufer" / "läufer.py").write_text(
+        "from controller import Robot\nrobot = Robot()\n", "utf-8"
+    )
+    said = run("--dry-run", cwd=project).stdout
+    assert "its robot is a plain Robot: pause, step, reset, screenshots and the scene" in said
+    assert "webots-mcp init --observer worlds/arena.wbt adds a robot" in said
+    (project / "controllers" / "mcp_observer").mkdir()
+    assert "plain Robot" not in run("--dry-run", cwd=project).stdout

@@ -172,7 +172,7 @@ def test_without_a_free_port_webots_says_so_and_ends(
         (["arna.wbt"], "arna.wbt; in {}/worlds there is arena.wbt"),
         (["worlds/arna.wbt"], "arna.wbt; in {}/worlds there is arena.wbt"),
         (["controllers/rover/rover.py"], "is no world: its name does not end with .wbt"),
-        (["../lonely.wbt"], "lies in no Webots project: that is a folder with worlds/ and"),
+        (["../lonely.wbt"], "lies in no Webots project: that is a folder that holds worlds/"),
         (
             ["worlds/arena.wbt", "--port", "70000"],
             'Invalid value "70000" for --port. Must be <= 65535.',

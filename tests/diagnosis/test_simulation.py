@@ -101,6 +101,60 @@ def test_where_nobody_computes_it_was_most_likely_paused_by_hand(
     assert found.fix == "press play in Webots"
 
 
+def test_a_robot_that_crashed_is_named_also_where_another_ran_on(
+    look: Look, recorded: Recorded
+) -> None:
+    now_s = time.time()
+    ended = {"end_reason": "crashed", "ended_wall_time_s": now_s - 20}
+    crashed = recorded.robot("rover", now=now_s - 20, **ended)
+    why = f"{ENDED_BY} ValueError: boom (rover.py, line 12)"
+    crashed.log(1.0, why, "error")
+    recorded.robot("beside", now=now_s, end_reason="finished", ended_wall_time_s=now_s)
+    found = look("Simulation")
+    assert found.verdict == "wrong"
+    assert "rover.py, line 12" in found.seen
+
+
+def test_it_is_said_where_only_controllers_that_record_were_looked_at(
+    look: Look, recorded: Recorded, start: Start
+) -> None:
+    """The simulator is not seen: nobody knows which other controllers it has."""
+    silent(recorded, start(WAITS))
+    seen = look("Simulation").seen
+    assert "Others of this simulation were not looked at" in seen
+    assert "no controller computes" not in seen
+
+
+@pytest.mark.parametrize(
+    ("neighbour", "said"),
+    [
+        (COMPUTES, "another controller computes and holds the step up: beta: "),
+        (WAITS, "no controller computes, but beta: "),
+        (None, "no controller computes and none is known to be missing"),
+    ],
+)
+def test_controllers_that_record_nothing_are_found_by_their_simulator(
+    look: Look,
+    recorded: Recorded,
+    start: Start,
+    monkeypatch: pytest.MonkeyPatch,
+    neighbour: str | None,
+    said: str,
+) -> None:
+    """Also where the simulator is no Webots: extern controllers, and those of the stand-in."""
+    monkeypatch.setenv("WEBOTS_INSTANCE_PATH", "/tmp/webots/ada/4711/")
+    instance = f"{host_name()}:4711"
+    monkeypatch.setenv("WEBOTS_ROBOT_NAME", "alpha")
+    silent(recorded, start(WAITS), instance=instance)
+    monkeypatch.setenv("WEBOTS_ROBOT_NAME", "beta")
+    process = None if neighbour is None else start(neighbour)
+    finding = look("Simulation")
+    assert said in finding.seen
+    assert process is None or f"(process {process.pid})" in finding.seen
+    recorded.connection.execute("UPDATE session SET instance = ?", (f"{host_name()}:4712",))
+    assert "were not looked at" in look("Simulation").seen
+
+
 @pytest.mark.parametrize("options", [(), ("--stream", "--mode=realtime")])
 def test_that_webots_obeys_by_its_websocket_is_named_where_it_does(
     look: Look,
@@ -116,7 +170,9 @@ def test_that_webots_obeys_by_its_websocket_is_named_where_it_does(
     recorded.connection.execute("UPDATE run SET world = '/nowhere.wbt'")
     obeys = "; or webots_simulation_control('resume'): this Webots obeys it by its WebSocket"
     found = wait_for(lambda: look("Simulation"), lambda it: not computes(it))  # once it has started
-    assert found.fix == "press play in Webots" + obeys * bool(options)
+    assert found.fix is not None
+    assert found.fix.startswith("press play in Webots" + obeys * bool(options))
+    assert ("WebSocket" in found.fix) == bool(options)
     running = look("Running Webots").seen
     assert f"port {port} (process " in running
     assert ("arena.wbt, mode realtime) obeys orders" in running) == bool(options)

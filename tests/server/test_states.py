@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from datetime import datetime
 from typing import Any
 
 import pytest
@@ -179,3 +180,22 @@ async def test_of_many_replaced_values_the_number_of_those_not_shown_is_said(
             replaced = (await ask(client, tool))["replaced"]
             assert len(replaced) == 21
             assert replaced["…"].startswith("30 more: ")
+
+
+async def test_events_and_log_lines_have_their_time_of_day_where_it_is_asked_for(
+    connect: Connect, recorded: Recorded
+) -> None:
+    robot = recorded.robot()
+    robot.event(1.0, "change", "mode", {"from": "cruise", "to": "turn"})
+    robot.log(2.0, "front blocked", "warning")
+    robot.state(3.0, {"mode": "turn"})
+    asked = {"webots_get_logs": "lines", "webots_find_events": "events"}
+    async with connect() as client:
+        for tool, table in asked.items():
+            assert "time" not in (await ask(client, tool))[table]["columns"]
+            found = (await ask(client, tool, time_of_day=True))[table]
+            told: dict[str, Any] = dict(found.get("in_every_row") or {})
+            told |= dict(zip(found["columns"], found["rows"][0], strict=True))
+            moment = datetime.fromisoformat(told["time"])
+            assert moment.tzinfo is not None
+            assert moment.timestamp() == pytest.approx(robot.now, abs=0.001)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from webots_mcp.contract import require_world_of, resolve_data_dir
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.setup import controllers_of, project_of
 
@@ -55,3 +56,33 @@ def test_the_first_file_that_is_there_is_started(project: Path) -> None:
     assert unbuilt == {"walls", "arm"}
     on_windows = {each.name: each.language for each in controllers_of(project, "win32")}
     assert on_windows["compiled"] == "Python"
+
+
+def test_worlds_alone_are_a_project_for_every_side(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A ROS 2 package: its driver, a controller that Webots starts, the server, an extern one."""
+    package = tmp_path / "package"
+    for name in ("worlds", "my_package", "controllers/mcp_observer"):
+        (package / name).mkdir(parents=True)
+    (package / "worlds" / "arena.wbt").touch()
+    monkeypatch.delenv("WEBOTS_MCP_DATA_DIR", raising=False)
+    for folder in (".", "my_package", "worlds", "controllers/mcp_observer"):
+        monkeypatch.chdir(package / folder)
+        assert project_of(None) == package
+        assert resolve_data_dir() == package / "mcp_data"
+    (package / "controllers" / "mcp_observer").rmdir()
+    (package / "controllers").rmdir()
+    monkeypatch.chdir(package / "my_package")
+    assert resolve_data_dir() == package / "mcp_data"
+    assert controllers_of(package) == []
+    assert require_world_of(None, package / "worlds" / "arena.wbt") == package
+
+
+def test_a_folder_of_worlds_without_a_world_is_no_project(tmp_path: Path) -> None:
+    (tmp_path / "worlds").mkdir()
+    (tmp_path / "worlds" / "notes.txt").touch()
+    with pytest.raises(InvalidInputError, match=r"holds worlds/ with a \.wbt file"):
+        project_of(str(tmp_path))
+    (tmp_path / "worlds" / "arena.wbt").touch()
+    assert project_of(str(tmp_path)) == tmp_path

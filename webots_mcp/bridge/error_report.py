@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from webots_mcp.errors import DatabaseError, WebotsMCPError, warn
+from webots_mcp.stacks import is_library
+
+if TYPE_CHECKING:
+    from types import TracebackType
 
 _LONGEST_WARNING = 2000
 
@@ -60,17 +64,30 @@ def storable(text: str) -> str:
 
 
 def describe(error: BaseException) -> str:
-    """The text of an error; for one of the user's code also its type, file and line."""
+    """The text of an error; for one of the user's code also its type, file and line.
+
+    The line is the innermost one in the user's own files: what they can change. Where a library
+    raised the error, its line follows.
+    """
     text = _text_of(error)
     if isinstance(error, WebotsMCPError):
         return text
+    own = innermost = None
     frame = error.__traceback__
-    while frame is not None and frame.tb_next is not None:
+    while frame is not None:
+        innermost = frame
+        own = own if is_library(frame.tb_frame.f_code.co_filename) else frame
         frame = frame.tb_next
-    if frame is None:
+    if innermost is None:
         return f"{type(error).__name__}: {text}"
-    place = Path(frame.tb_frame.f_code.co_filename).name
-    return f"{type(error).__name__}: {text} ({place}, line {frame.tb_lineno})"
+    place = _place_of(own or innermost)
+    if own is not None and own is not innermost:
+        place += f"; raised in {_place_of(innermost)}"
+    return f"{type(error).__name__}: {text} ({place})"
+
+
+def _place_of(frame: TracebackType) -> str:
+    return f"{Path(frame.tb_frame.f_code.co_filename).name}, line {frame.tb_lineno}"
 
 
 def _text_of(error: BaseException) -> str:

@@ -22,15 +22,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from webots_mcp.contract import PRIVATE_FILE, Database
-from webots_mcp.stacks import FORMAT, SIGNAL, VERSION, read_stacks, stacks_path
+from webots_mcp.stacks import FORMAT, LIBRARIES, SIGNAL, VERSION, read_stacks, stacks_path
 from webots_mcp.waiting_file import lock
 
 if TYPE_CHECKING:
     from webots_mcp.bridge.session import Session
 
 _MOST_LOGGED: Final = 20  # in a session: a loop that is slow by design would fill the log
-_OURS: Final = f"{Path(__file__).parents[1]}{os.sep}"
-_STDLIB: Final = f"{Path(os.__file__).parent}{os.sep}"
 _WEBOTS: Final = ("controller", "vehicle")  # its packages
 
 
@@ -53,7 +51,7 @@ class Watchdog:
         self._about = {VERSION: FORMAT, "limit_s": limit_s}
         files = session.simulation.step_files
         folders = [folder for file in files if (folder := Path(file).parent).name in _WEBOTS]
-        libraries = [_OURS, _STDLIB, *(f"{folder}{os.sep}" for folder in folders)]
+        libraries = [*LIBRARIES, *(f"{folder}{os.sep}" for folder in folders)]
         self._about |= {"step_files": files, "libraries": libraries}
         self._file = -1
         self._head = b""

@@ -332,7 +332,7 @@ def launch(
         Parameter(
             "--robot",
             help="With --stand-in: NAME=FILE runs this file as the controller of a robot, also of "
-            "one that is <extern>.",
+            "one that is `<extern>`.",
         ),
     ] = (),
     data_dir: Annotated[

@@ -23,6 +23,11 @@ if TYPE_CHECKING:
     from webots_mcp.setup import FileChange, ProjectController
 
 _WRONG: Final = 1  # the exit code
+_NO_CONTROLLER: Final = (
+    "there is no controller in controllers/. Once there is one, run this again. An extern "
+    "controller or a ROS 2 driver records with these two lines: 'from webots_mcp import MCPBridge' "
+    "and, where it has made its robot, 'bridge = MCPBridge.attach(robot)'"
+)
 _LEAST_COLUMN: Final = 30  # characters that a line of a folded text has at least
 
 
@@ -157,12 +162,12 @@ def init(
 ) -> None:
     """Make a Webots project ready: tell MCP clients of the server, look at the controllers.
 
-    The project is the nearest folder with worlds/ and controllers/. Claude Code (.mcp.json), Cursor
-    (.cursor/mcp.json) and VS Code (.vscode/mcp.json) are told of the server, by a full path;
-    other entries stay. In WSL, where the project is on a drive of Windows, it is the server of
-    Windows. Of each controller in Python the lines that it needs are
-    shown, the Python that Webots starts it with, and what mends that where the bridge is not
-    installed there. Nothing is changed a second time.
+    The project is the nearest folder that holds worlds/ with a world; it need not have
+    controllers/. Claude Code (.mcp.json), Cursor (.cursor/mcp.json) and VS Code (.vscode/mcp.json)
+    are told of the server, by a full path; other entries stay. In WSL, where the project is on a
+    drive of Windows, it is the server of Windows. Of each controller in Python the lines that it
+    needs are shown, the Python that Webots starts it with, and what mends that where the bridge is
+    not installed there. Nothing is changed a second time.
 
     --patch writes those lines, after a question:
 
@@ -395,8 +400,19 @@ def _described(controller: ProjectController, project: Path) -> dict[str, Any]:
     """A controller, the lines that it needs, and the Python that it is started with."""
     from dataclasses import asdict
 
-    from webots_mcp.setup import look_into
-    from webots_mcp.setup.project_edits import IMPORT, AlreadyPatchedError, attaching_place
+    from webots_mcp.setup import (
+        NO_POSITION_OF_ITS_OWN,
+        NO_SUPERVISOR,
+        has_observer,
+        look_into,
+        offer_observer,
+    )
+    from webots_mcp.setup.project_edits import (
+        IMPORT,
+        AlreadyPatchedError,
+        attaching_place,
+        is_plain_robot,
+    )
 
     file = controller.file.relative_to(project)
     described: dict[str, Any] = {"file": file.as_posix(), "language": controller.language}
@@ -412,6 +428,9 @@ def _described(controller: ProjectController, project: Path) -> dict[str, Any]:
         described["has_bridge"] = str(error)
     except (InvalidInputError, OSError) as error:
         described["unclear"] = str(error)
+    if is_plain_robot(controller.file) and not has_observer(project):
+        lacks = f"its robot {NO_SUPERVISOR}. {NO_POSITION_OF_ITS_OWN}"
+        described["lacks"] = f"{lacks}: {offer_observer(project)}"
     python = asdict(look_into(controller.file))
     known = {name: value for name, value in python.items() if value is not None}
     return described | {"python": known}
@@ -431,7 +450,7 @@ def _print_project(found: dict[str, Any], notes: list[str]) -> None:
         print("\nWhat mends that:\n")
         print("\n".join(f"    {fix}" for fix in fixes))
     if not found["controllers"]:
-        notes = [*notes, "there is no controller yet: run it again when there is"]
+        notes = [*notes, _NO_CONTROLLER]
     print()
     print_notes(notes)
 
@@ -453,6 +472,8 @@ def _print_controller(described: dict[str, Any]) -> None:
         print(f"  where the lines belong is not clear: {described['unclear']}")
     else:
         print(f"  {described['has_bridge']}")
+    if "lacks" in described:
+        print(f"  {described['lacks']}")
     _print_python(described["python"])
 
 
@@ -489,6 +510,8 @@ def doctor(
 
 
 def _examined(recorded: Where) -> Examined:
+    from dataclasses import replace
+
     from webots_mcp.contract import choose_data_dir
     from webots_mcp.diagnosis import subject_of
 
@@ -498,7 +521,7 @@ def _examined(recorded: Where) -> Examined:
         rule = "--database" if named else choose_data_dir(recorded.data_dir).chosen_by
     except OSError as error:
         raise InvalidInputError(str(error)) from error
-    return subject_of(recording, rule)
+    return replace(subject_of(recording, rule), probes_python=True)
 
 
 def _facts(checked: Checked) -> dict[str, Any]:

@@ -364,7 +364,7 @@ _TIMES: Final = ("sim_time_s", "since_s")  # lists of them
 _CALLED_ALIKE: Final = ("numbers", "signals")  # what they hold has names of its own
 _AS_READ: Final = "result"  # rows of a database, where null is a value; or of a command
 _OF_TABLE: Final = ("columns", "rows", "in_every_row")
-_NOTES: Final = ("why", "storage", "notes", "hint")
+_NOTES: Final = ("why", "storage", "position_by", "notes", "hint")
 
 
 def print_answer(answer: Mapping[str, Any]) -> None:

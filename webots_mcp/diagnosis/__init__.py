@@ -35,7 +35,7 @@ _RECOVER: Final = (
     "stop what records there, save rows with 'sqlite3 FILE .recover', and move the file away"
 )
 # From the controller's machine to the client; within a module the order is that of its functions.
-_IN_ORDER: Final = ("recording_checks", "webots_checks")
+_IN_ORDER: Final = ("recording_checks", "controller_checks", "webots_checks")
 
 
 @dataclass(frozen=True)
@@ -78,6 +78,8 @@ class Examined:
         connection: To the recording; None where it cannot be read.
         unread: Why it cannot be read.
         server: The command that starts this package's own server.
+        probes_python: A person asks: the Python of controllers may be started, which files of the
+            project name.
     """
 
     recording: Recording
@@ -86,6 +88,7 @@ class Examined:
     connection: sqlite3.Connection | None = None
     unread: WebotsMCPError | None = None
     server: Sequence[str] = (sys.executable, "-m", "webots_mcp", "serve", "--read-only")
+    probes_python: bool = False
     now_s: float = field(default_factory=time.time)
 
     @property

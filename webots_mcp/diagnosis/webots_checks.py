@@ -18,12 +18,12 @@ from contextlib import suppress
 from http import HTTPStatus
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 from urllib.error import HTTPError
 from urllib.request import urlopen
 
 from webots_mcp import __version__
-from webots_mcp.contract import UNSEEN, host_name
+from webots_mcp.contract import UNSEEN, host_name, instance_of
 from webots_mcp.diagnosis import (
     Diagnosis,
     Examined,
@@ -61,8 +61,10 @@ _ANSWER_S: Final = 3  # for a server that runs to answer
 _WATCHED_S: Final = 0.3
 _LOOKS: Final = 6
 _MOST_WATCHED: Final = 5  # simulations, one after the other
+_MOST_NAMED: Final = 5  # controllers
 _BUSY: Final = 0.5  # of a processor; a controller that waits for its next step needs none
 _EXTERN: Final = re.compile(r'^\s*controller\s+"<extern>"', re.MULTILINE)
+_OF_CONTROLLERS: Final = ("WEBOTS_CONTROLLER_URL", "WEBOTS_INSTANCE_PATH")
 _LARGEST_WORLD_BYTES: Final = 50_000_000
 _ENDED_BADLY: Final = ("crashed", "reload")
 _SEE_PAGE: Final = "see docs/troubleshooting.md#simulation"
@@ -81,14 +83,22 @@ def simulation(subject: Examined) -> Iterator[Diagnosis]:
     Of the robots that stand silent in the same simulation one is watched for them all.
     """
     watched = dict[str, View]()
-    newest = max(subject.views, key=last_seen_s, default=None)
-    for view in subject.live or ([newest] if newest else []):
+    for view in subject.live or _ran_last(subject.views):
         if view.session is not None and view.robot.live and _is_unclear(view):
             watched.setdefault(view.session.instance, view)
         else:
             yield _judged(view)
     for view in list(watched.values())[:_MOST_WATCHED]:
         yield _narrowed(subject, view)
+
+
+def _ran_last(views: list[View]) -> list[View]:
+    """The robots of the simulation that was seen last: one of them may have crashed before."""
+    newest = max(views, key=last_seen_s, default=None)
+    if newest is None or newest.session is None:
+        return [] if newest is None else [newest]
+    instance = newest.session.instance
+    return [each for each in views if each.session and each.session.instance == instance]
 
 
 def _is_unclear(view: View) -> bool:
@@ -126,20 +136,35 @@ def _narrowed(subject: Examined, view: View) -> Diagnosis:
         _also_by_websocket(fix, order, webots)
         for fix, order in ((_RELOAD, "reload"), (_PRESS_PLAY, "resume"))
     )
-    busy = _busy_controllers(view, session, webots)
+    others = None if session.host != host_name() else _controllers_beside(view, session, webots)
+    busy = None if others is None else _computing({session.pid, *others.pids})
     if busy is not None and session.pid in busy:
         seen = f"{head}; its own process computes: its loop does not come back to step()"
         return wrong(seen, "look for a long computation or an endless loop in it")
     if busy:
-        others = ", ".join(f"{what} (process {pid})" for pid, what in busy.items())
-        return wrong(f"{head}; another controller computes and holds the step up: {others}", reload)
+        named = _listed(busy)
+        return wrong(f"{head}; another controller computes and holds the step up: {named}", reload)
     if missing := _missing_externs(view, session, webots):
         fix = "start it: 'webots-controller --robot-name=NAME FILE', or press play if it is paused"
         return wrong(f"{head}; {missing}", fix)
     if why.startswith(SEEN_RUNNING):
         return wrong(f"{head} ({why})", reload)
-    if busy is None:
+    if others is None:
         return wrong(f"{head} ({why})", play)
+    if others.silent:
+        named = _listed(others.silent)
+        seen = (
+            f"{head}; no controller computes, but {named} records nothing: whether it waits in "
+            "step() is not known. If it does, the simulation was paused by hand"
+        )
+        return wrong(seen, f"{play}; if that does not help, {reload}")
+    if not others.is_all:
+        seen = (
+            f"{head}; no controller that records computes. Others of this simulation were not "
+            "looked at, since its simulator is not seen on this machine. If none of them hangs, it "
+            "was paused by hand in Webots"
+        )
+        return wrong(seen, play)
     seen = (
         f"{head}; no controller computes and none is known to be missing: most likely it was "
         "paused by hand in Webots"
@@ -159,30 +184,78 @@ def _webots_of(subject: Examined, session: Session) -> Instance | None:
     return next((w for w in subject.running_webots if address and w.port == address.port), None)
 
 
-def _busy_controllers(
-    view: View, session: Session, webots: Instance | None
-) -> dict[int, str] | None:
-    """Controllers of the same simulation that compute now; None where that cannot be looked at.
+class _Others(NamedTuple):
+    """The other controllers of a simulation that run on this machine.
+
+    Attributes:
+        pids: Their processes, and what these have started.
+        silent: Of them, the controllers that record nothing.
+        is_all: Those that record nothing were looked for as well.
+    """
+
+    pids: set[int]
+    silent: list[int]
+    is_all: bool
+
+
+def _controllers_beside(view: View, session: Session, webots: Instance | None) -> _Others:
+    recorded = {each.pid for each in companions(view.connection, session, view.now_s)}
+    started = _started_for(session.instance)
+    pids = recorded | started.keys()
+    if webots is not None:  # the processes that it has started
+        pids |= {each.pid for each in shown_of(webots.pid, lambda p: p.children(True), [])}
+    recording = {session.pid, *recorded}
+    silent = [pid for pid, parent in started.items() if not {pid, parent} & recording]
+    silent = [pid for pid in silent if started[pid] not in silent]
+    is_all = webots is not None or session.pid in started
+    return _Others(pids - {session.pid}, silent, is_all)
+
+
+def _started_for(instance: str) -> dict[int, int]:
+    """The processes that have that simulator in their environment, each with its parent's.
+
+    So have controllers that a simulator starts and extern ones, and what these start themselves.
+    """
+    import psutil
+
+    found: dict[int, int] = {}
+    own = {os.getpid(), *(each.pid for each in psutil.Process().parents())}
+    for process in psutil.process_iter():
+        with suppress(psutil.Error, OSError):  # another user's, or one that has just ended
+            environment, parent = process.environ(), process.ppid()
+            is_controller = not environment.keys().isdisjoint(_OF_CONTROLLERS)
+            if is_controller and instance_of(environment, parent) == instance:
+                found[process.pid] = parent
+    return {pid: parent for pid, parent in found.items() if pid not in own}
+
+
+def _listed(pids: list[int]) -> str:
+    more = f" and {len(pids) - _MOST_NAMED} more" if len(pids) > _MOST_NAMED else ""
+    return ", ".join(map(_named, pids[:_MOST_NAMED])) + more
+
+
+def _named(pid: int) -> str:
+    """A controller by its robot, its program and its process."""
+    robot = shown_of(pid, lambda process: process.environ().get("WEBOTS_ROBOT_NAME"), None)
+    return f"{f'{robot}: ' if robot else ''}{_program_of(pid)} (process {pid})"
+
+
+def _computing(pids: set[int]) -> list[int]:
+    """Those of the processes that compute now.
 
     One that waits for its next step needs no processor. One that computes wants to continue at each
     look, also where a busy machine gives it little; only Linux shows that.
     """
-    if session.host != host_name():
-        return None
-    pids = {session.pid}
-    pids |= {each.pid for each in companions(view.connection, session, view.now_s)}
-    if webots is not None:  # the processes that it has started
-        pids |= {each.pid for each in shown_of(webots.pid, lambda p: p.children(True), [])}
     before_s = {pid: _processor_s(pid) for pid in sorted(pids)}
     waited = set[int]()
     for _ in range(_LOOKS):
         time.sleep(_WATCHED_S / _LOOKS)
         waited |= {pid for pid in pids if not _wants_processor(pid)}
-    return {
-        pid: _program_of(pid)
+    return [
+        pid
         for pid, used_s in before_s.items()
         if pid not in waited or _processor_s(pid) - used_s > _BUSY * _WATCHED_S
-    }
+    ]
 
 
 def _wants_processor(pid: int) -> bool:

@@ -50,6 +50,7 @@ class Answer(Part):
     why: str | None = said("What the status rests on.")
     quoted: str | None = said("Of answers with texts that controllers or others wrote.")
     storage: str | None = said("Where the recording cannot be written: how it was read.")
+    position_by: str | None = said("Who saw the robot, where it publishes no position itself.")
     hint: str | None = said("What to do next.")
 
 

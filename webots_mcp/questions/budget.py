@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
+from datetime import datetime
 from typing import Any, Final, Literal, NamedTuple, TypeVar, cast
 
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
@@ -84,6 +85,14 @@ class Shortened(NamedTuple):
 def is_for_a_person() -> bool:
     """Whether the answer is read in a terminal, where nothing is cut to save a model's context."""
     return reader.get() == "cli"
+
+
+def wall_clock(wall_time_s: float) -> str:
+    """A moment of wall time in this machine's zone, as ISO 8601 with that zone."""
+    try:
+        return datetime.fromtimestamp(wall_time_s).astimezone().isoformat("T", "milliseconds")
+    except (OverflowError, OSError, ValueError):  # no bridge has written this
+        return f"{wall_time_s}"
 
 
 def shorten(
@@ -247,7 +256,7 @@ _T = TypeVar("_T")
 
 def answer_about(view: View, model: type[_A], find: Callable[[], dict[str, Any]]) -> _A:
     """The header with what was found; where nothing was recorded, with the reason as the hint."""
-    answer: dict[str, Any] = view.header()
+    answer: dict[str, Any] = view.header() | view.position_by()
     try:
         answer |= find()
     except NothingRecordedError as error:

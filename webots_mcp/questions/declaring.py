@@ -456,6 +456,7 @@ WaitS = Annotated[
 ]
 TimeoutS = Annotated[WaitS, Field(description="At most.")]
 _CURSOR: Final = "From the last answer."
+TimeOfDay = Annotated[bool, Field(description="Add wall-clock times.")]
 Cursor = Annotated[_Place | None, Field(description=_CURSOR)]
 TextCursor = Annotated[str, Field(max_length=2000, description=_CURSOR)]
 # A number is as good; one type that holds both is shorter than two.

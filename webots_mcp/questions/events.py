@@ -20,6 +20,7 @@ from webots_mcp.questions.budget import (
     short_name,
     shown,
     tokens_of,
+    wall_clock,
     without_empty,
 )
 from webots_mcp.questions.declaring import (
@@ -30,6 +31,7 @@ from webots_mcp.questions.declaring import (
     Position,
     ShownLimit,
     TextCursor,
+    TimeOfDay,
     merged,
     question,
 )
@@ -70,7 +72,7 @@ TimelineKinds = Annotated[
     Field(description="Of those of webots_find_events; by default all that were stored."),
 ]
 EVENT_COLUMNS: Final = (
-    "kind", "count", "run_id", "start_s", "duration_s", "ongoing", "name", "details",
+    "kind", "count", "run_id", "start_s", "time", "duration_s", "ongoing", "name", "details",
 )  # fmt: skip
 DEFAULT_LIMIT: Final = 50
 _GROUP_BUDGET_TOKENS: Final = 200
@@ -112,6 +114,7 @@ def webots_find_events(
     group: Annotated[bool, Field(description="Tell many alike events as one.")] = True,
     limit: ShownLimit = None,
     cursor: TextCursor = "",
+    time_of_day: TimeOfDay = False,
 ) -> EventsAnswer:
     """What went wrong, since when, how often: searches the values, by default of the whole run.
 
@@ -138,7 +141,7 @@ def webots_find_events(
         return answer_about(
             view,
             EventsAnswer,
-            lambda: _found(view, range_in(view, scope), options, group, limit, cursor),
+            lambda: _found(view, range_in(view, scope), options, group, limit, cursor, time_of_day),
         )
 
 
@@ -149,11 +152,14 @@ def _found(
     group: bool,
     limit: int | None,
     cursor: str,
+    time_of_day: bool,
 ) -> dict[str, Any]:
     found = search_events(view.connection, asked, options, group=group, after=cursor or None)
     verdicts, notes = verdicts_of(found.verdicts), notes_of(found.notes)
     budget_tokens = room_tokens(limit, [verdicts.model_dump(exclude_none=True), notes])
-    told, events = fitting_events(found, limit or DEFAULT_LIMIT, budget_tokens, view)
+    told, events = fitting_events(
+        found, limit or DEFAULT_LIMIT, budget_tokens, view, time_of_day=time_of_day
+    )
     hints = ["ask again with this cursor for what is not shown"] if told.cursor else []
     if any(event.count > 1 for event in told.events):
         hints.append(
@@ -172,12 +178,12 @@ def _found(
 
 
 def fitting_events(
-    found: Found, limit: int, budget_tokens: int, view: View
+    found: Found, limit: int, budget_tokens: int, view: View, *, time_of_day: bool = False
 ) -> tuple[Events, Table | None]:
     """At most `limit` of what was found, and as much of it as fits the budget."""
     while True:
         told = found.told(view.connection, limit)
-        made = events_table(told.events, view)
+        made = events_table(told.events, view, time_of_day=time_of_day)
         tokens = tokens_of([made.rows if made else [], not_shown_of(told), told.cursor])
         if tokens <= budget_tokens or limit <= 1:
             return told, made
@@ -207,8 +213,11 @@ def not_shown_of(told: Events) -> dict[str, str] | None:
     } or None
 
 
-def events_table(events: Sequence[Event], view: View) -> Table | None:
-    """Events as rows under `EVENT_COLUMNS`, and the values around them."""
+def events_table(events: Sequence[Event], view: View, *, time_of_day: bool = False) -> Table | None:
+    """Events as rows under `EVENT_COLUMNS`, and the values around them.
+
+    With the time of day, where it is asked for, at which each began.
+    """
     around = list(dict.fromkeys(name for event in events for name in event.around))
     here = view.run.id if view.run else None
     elsewhere = any(event.run_id != here for event in events)
@@ -218,6 +227,7 @@ def events_table(events: Sequence[Event], view: View) -> Table | None:
             None if event.count == 1 else event.count,
             event.run_id if elsewhere else None,
             seconds(event.start_s),
+            wall_clock(event.wall_time_s) if time_of_day else None,
             (event.count == 1 and seconds(event.duration_s)) or None,
             event.ongoing or None,
             short_name(event.name),
@@ -247,6 +257,7 @@ def webots_get_timeline(
     log_level: LogLevel = "info",
     limit: ShownLimit = None,
     cursor: TextCursor = "",
+    time_of_day: TimeOfDay = False,
 ) -> TimelineAnswer:
     """Changes, commands, log lines, pictures, gaps, begin and end of runs in one order, paged.
 
@@ -258,19 +269,24 @@ def webots_get_timeline(
         return answer_about(
             view,
             TimelineAnswer,
-            lambda: _timeline(view, range_in(view, scope), options, limit, cursor),
+            lambda: _timeline(view, range_in(view, scope), options, limit, cursor, time_of_day),
         )
 
 
 def _timeline(
-    view: View, asked: TimeRange, options: EventOptions, limit: int | None, cursor: str
+    view: View,
+    asked: TimeRange,
+    options: EventOptions,
+    limit: int | None,
+    cursor: str,
+    time_of_day: bool,
 ) -> dict[str, Any]:
     """A page; a shorter one where it would be too long."""
     budget_tokens = room_tokens(limit)
     entries = limit or DEFAULT_LIMIT
     while True:
         page = timeline(view.connection, asked, options, limit=entries, after=cursor or None)
-        events = events_table(page.events, view)
+        events = events_table(page.events, view, time_of_day=time_of_day)
         tokens = tokens_of(events.rows) if events else 0
         if tokens <= budget_tokens or entries == 1:
             break

@@ -12,7 +12,7 @@ from webots_mcp.console import console_state
 from webots_mcp.contract import LogLevel, LogSource
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
 from webots_mcp.questions.answers import LogsAnswer, Table
-from webots_mcp.questions.budget import cut_text, fitting, is_for_a_person
+from webots_mcp.questions.budget import cut_text, fitting, is_for_a_person, wall_clock
 from webots_mcp.questions.declaring import (
     READS,
     Cursor,
@@ -21,6 +21,7 @@ from webots_mcp.questions.declaring import (
     RobotName,
     RunId,
     StartS,
+    TimeOfDay,
     question,
 )
 from webots_mcp.store.logs import (
@@ -68,6 +69,7 @@ def webots_get_logs(
     cursor: Cursor = None,
     robot: RobotName = None,
     run_id: RunId = None,
+    time_of_day: TimeOfDay = False,
 ) -> LogsAnswer:
     """The newest log lines, oldest first, each with its run.
 
@@ -84,7 +86,7 @@ def webots_get_logs(
             window = window_of(scope, run.last_sim_time_s)
             one_run = run.id if scope.in_one_run else None
             asked = LogFilter(one_run, window, filter_text, lowest, cursor, view.robot.id, source)
-            return _answer(recording, view, asked, lines)
+            return _answer(recording, view, asked, lines, time_of_day=time_of_day)
     except (NothingRecordedError, AmbiguousRobotError):
         asked = LogFilter(None, anytime, filter_text, lowest, source=source)
         with recording.reader() as connection:
@@ -92,7 +94,7 @@ def webots_get_logs(
             waiting = [] if is_any_live else waiting_lines(connection, asked, lines)
         if not waiting:
             raise
-        shown = _table(_newest_fitting(waiting))
+        shown = _table(_newest_fitting(waiting), time_of_day=time_of_day)
         return LogsAnswer(lines=shown, matching=len(waiting), hint=_NO_RUN_YET)
 
 
@@ -111,13 +113,17 @@ def _row(line: LogLine) -> dict[str, object]:
     }
 
 
-def _table(lines: list[LogLine]) -> Table:
-    columns = _FOR_A_PERSON if is_for_a_person() else _COLUMNS
-    rows = [_row(line) for line in lines]
-    return Table(columns=list(columns), rows=[[row[name] for name in columns] for row in rows])
+def _table(lines: list[LogLine], *, time_of_day: bool) -> Table:
+    columns: list[str] = [*(_FOR_A_PERSON if is_for_a_person() else _COLUMNS)]
+    if time_of_day:
+        columns.insert(columns.index("sim_time_s") + 1, "time")
+    rows = [_row(line) | {"time": wall_clock(line.wall_time_s)} for line in lines]
+    return Table(columns=columns, rows=[[row[name] for name in columns] for row in rows])
 
 
-def _answer(recording: Recording, view: View, asked: LogFilter, limit: int) -> LogsAnswer:
+def _answer(
+    recording: Recording, view: View, asked: LogFilter, limit: int, *, time_of_day: bool
+) -> LogsAnswer:
     newest = newest_lines(view.connection, asked, limit)
     matching = count_lines(view.connection, asked)
     waiting = list[LogLine]()
@@ -132,7 +138,7 @@ def _answer(recording: Recording, view: View, asked: LogFilter, limit: int) -> L
         hints.append(console_state(recording, view.connection))
     return LogsAnswer(
         **view.header(),
-        lines=_table(shown),
+        lines=_table(shown, time_of_day=time_of_day),
         matching=matching,
         cursor=recorded[0].id if older and recorded else None,
         hint="; ".join(hint for hint in hints if hint) or None,

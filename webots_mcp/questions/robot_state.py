@@ -13,6 +13,7 @@ from webots_mcp.contract import CUSTOM_DATA
 from webots_mcp.diagnosis import Checked, diagnose, subject_of, worst
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.liveness import dead_sessions
+from webots_mcp.naming import OBSERVED
 from webots_mcp.questions.answers import (
     DiagnosisAnswer,
     FullStateAnswer,
@@ -41,7 +42,9 @@ from webots_mcp.questions.budget import (
     tokens_of,
 )
 from webots_mcp.questions.declaring import READS, RobotName, RunId, question
-from webots_mcp.store.reading.segment import newest_kept
+from webots_mcp.store.reading.frame import read_frame
+from webots_mcp.store.reading.observed_pose import pose_at
+from webots_mcp.store.reading.segment import Deadline, Segment, just_after, newest_kept
 from webots_mcp.store.recording import GETTING_STARTED, Recording, View, name_of, storage, view_of
 from webots_mcp.store.retention import described, unheeded
 from webots_mcp.store.retention_plan import file_sizes
@@ -366,12 +369,13 @@ def webots_get_robot_state(
     with recording.view(robot, run_id) as view:
         if view.state is None:
             return StateAnswer(**view.header(), hint=_nothing_yet(view))
-        short = shorten(view.state.value())
+        short = shorten(_with_observed_pose(view, view.state))
         hint = (
             "webots_get_full_state(path=...) shows a part whole, in pages" if short.rule else None
         )
         return StateAnswer(
             **view.header(),
+            **view.position_by(),
             state=short.value,
             shortened=short.rule,
             kept_at_full_rate=_kept(view),
@@ -417,7 +421,7 @@ def webots_get_full_state(
         if view.state is None:
             hint, recorder = _nothing_yet(view), _health(view)
             return FullStateAnswer(**view.header(), hint=hint, recorder=recorder)
-        part = select(view.state.value(), path)
+        part = select(_with_observed_pose(view, view.state), path)
         if offset and not isinstance(part, (dict, list, str)):
             raise InvalidInputError(f"offset: {path!r:.80} is a single value, not in pages")
         beside: dict[str, Any] = view.header()
@@ -430,6 +434,17 @@ def webots_get_full_state(
         }
         left_tokens = most_tokens - _MARGIN_TOKENS - tokens_of(told)
         return FullStateAnswer(**_page(part, path, offset, limit or _PAGE, left_tokens), **beside)
+
+
+def _with_observed_pose(view: View, state: State) -> dict[str, Any]:
+    """The state, with where an observer saw the robot if it has no position of its own."""
+    value = state.value()
+    if OBSERVED in value:
+        return value
+    moment = Segment(state.run_id, state.sim_time_s, just_after(state.sim_time_s))
+    frame = read_frame(view.connection, moment, Deadline())
+    pose = pose_at(frame.derived, state.sim_time_s)
+    return {**value, OBSERVED: pose} if pose else value
 
 
 def _nothing_yet(view: View) -> str:

@@ -219,7 +219,11 @@ def webots_plot(
         view.require_run()
         meant = scope if first else replace(scope, robot=view.robot.name)
         picture = draw(view.connection, scope=meant, run_ids=run_ids or ())
-        facts = view.header() | {"shows": picture.caption, "notes": notes_of(picture.notes)}
+        facts = (
+            view.header()
+            | view.position_by()
+            | {"shows": picture.caption, "notes": notes_of(picture.notes)}
+        )
         return [_caption(facts), ShownPicture(data=picture.data, format="png")]
 
 

@@ -23,7 +23,15 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
-from webots_mcp.contract import find_project, full_path
+from webots_mcp.contract import (
+    CONTROLLER_FOLDER,
+    OBSERVER_NAME,
+    PROJECT_IS,
+    WORLD_ENDING,
+    WORLD_FOLDER,
+    find_project,
+    full_path,
+)
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.requirements import checkout, quoted
 from webots_mcp.webots import installations
@@ -36,6 +44,8 @@ _WORDS: Final = re.compile(r'"(?:[^"\\]|\\.)*"|#[^\n]*|\w+')
 
 # By language: how the files of a controller end that are built before Webots starts it.
 _SOURCES: Final = {"C": (".c",), "C++": (".cpp", ".cc", ".cxx"), "Java": (".java",)}
+_ALL_SOURCES: Final = (".c", ".cpp", ".cc", ".cxx", ".java", ".m", ".h", ".hpp", ".hh")
+_WRITES: Final = re.compile(rb"webots_mcp\.h|setCustomData|wb_robot_set_custom_data")
 _CALLS: Final = {
     "C": 'wb_robot_set_custom_data("{...}")',
     "C++": 'robot->setCustomData("{...}")',
@@ -46,6 +56,14 @@ _HEADER: Final = "include webots_mcp.h ('webots-mcp header' writes it), or "
 _ONE_LINE: Final = (
     "write its values as JSON with {} in each step: an observer ('webots-mcp init --observer "
     "WORLD') records them; see docs/any-language.md"
+)
+
+
+NO_SUPERVISOR: Final = (
+    "is a plain Robot: pause, step, reset, screenshots and the scene need a Supervisor"
+)
+NO_POSITION_OF_ITS_OWN: Final = (
+    "Unless it publishes its position (pose, gps), stuck, distances and paths are not known"
 )
 
 
@@ -88,14 +106,15 @@ def project_of(folder: str | None) -> Path:
     below = [each for each in sorted(start.iterdir()) if find_project(each) == each]
     hint = f" (one lies below: {below[0]})" if below else ""
     raise InvalidInputError(
-        f"no Webots project at or above {start}: that is a folder with worlds/ and controllers/"
+        f"no Webots project at or above {start}: that is {PROJECT_IS}"
         f"{hint}; give its folder, as 'webots-mcp init PROJECT'"
     )
 
 
 def controllers_of(project: Path, platform: str = sys.platform) -> list[ProjectController]:
-    """Those that Webots would start, by name."""
-    folders = sorted(each for each in (project / "controllers").iterdir() if each.is_dir())
+    """Those that Webots would start, by name; none in a project of extern controllers alone."""
+    folder = project / CONTROLLER_FOLDER
+    folders = sorted(each for each in folder.glob("*") if each.is_dir())
     return [found for folder in folders for found in _started(folder, platform)]
 
 
@@ -138,6 +157,29 @@ def _source(folder: Path) -> ProjectController | None:
 def has_bridge(controller: Path) -> bool:
     """Whether a file of a controller's folder speaks of the bridge."""
     return any(_BRIDGE in file.read_bytes() for file in sorted(controller.glob("*.py")))
+
+
+def writes_states(controller: ProjectController) -> bool:
+    """Whether a controller in another language says what it does: by our header, or customData."""
+    folder = controller.file.parent
+    files = [each for each in folder.rglob("*.*") if each.suffix in _ALL_SOURCES]
+    return any(_WRITES.search(each.read_bytes()) for each in files)
+
+
+def has_observer(project: Path) -> bool:
+    """Whether the project has an observer's controller."""
+    return (project / CONTROLLER_FOLDER / OBSERVER_NAME).is_dir()
+
+
+def offer_observer(project: Path | None, world: Path | None = None) -> str:
+    """The line that adds an observer to a world of a project, or to the only one that it has."""
+    worlds = sorted((project / WORLD_FOLDER).glob(f"*{WORLD_ENDING}")) if project else []
+    chosen_world = world or (worlds[0] if len(worlds) == 1 else None)
+    name = "WORLD"
+    if chosen_world is not None:
+        inside = project is not None and chosen_world.is_relative_to(project)
+        name = str(chosen_world.relative_to(project) if inside and project else chosen_world)
+    return f"{quoted(['webots-mcp', 'init', '--observer', name])} adds a robot that has all of it"
 
 
 def controllers_in(world: Path) -> list[str]:

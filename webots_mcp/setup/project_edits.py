@@ -31,6 +31,7 @@ _ROBOTS: Final = {
         "CSVSupervisorEnv", "EmitterReceiverRobot", "CSVRobot",
     ),
 }  # fmt: skip
+_PLAIN: Final = "Robot"  # the class without a supervisor's calls
 _MOST_MODULES: Final = 50
 _LINES: Final = re.compile(rb"[^\r\n]*(?:\r\n|\r|\n|\Z)")
 _ADDED: Final = re.compile(
@@ -107,6 +108,39 @@ def attaching_place(controller: Path) -> AttachingPlace:
         raise InvalidInputError(f"several of its modules make a robot: {places}")
     assert why is not None
     raise why
+
+
+def is_plain_robot(controller: Path) -> bool:
+    """Whether a controller makes a Robot and no Supervisor, as far as its files can be read."""
+    made = set[str]()
+    files = [controller]
+    for file in files:
+        try:
+            module = _parsed(file.read_bytes())
+        except (InvalidInputError, OSError):
+            return False
+        files += [each for each in _imported(module, file, controller) if each not in files]
+        del files[_MOST_MODULES:]
+        made |= _classes_used(list(ast.walk(module)))
+    return made == {_PLAIN}
+
+
+def _classes_used(nodes: list[ast.AST]) -> set[str]:
+    """Webots' names of the classes that a module calls or derives its own from."""
+    called = dict[str, str]()
+    for node in nodes:
+        if isinstance(node, ast.ImportFrom) and not node.level:
+            for robot in _robots_of(node.module or ""):
+                names = [a.asname or a.name for a in node.names if a.name == robot]
+                names += [robot for a in node.names if a.name == "*"]
+                called.update(dict.fromkeys(names, robot))
+        elif isinstance(node, ast.Import):
+            for alias in node.names:
+                for robot in _robots_of(alias.name):
+                    called[f"{alias.asname or alias.name}.{robot}"] = robot
+    used = [node.func for node in nodes if isinstance(node, ast.Call)]
+    used += [base for node in nodes if isinstance(node, ast.ClassDef) for base in node.bases]
+    return {called[name] for name in map(_dotted, used) if name in called}
 
 
 def _imported(module: ast.Module, file: Path, controller: Path) -> list[Path]:

@@ -43,8 +43,9 @@ from webots_mcp.errors import (
 )
 from webots_mcp.liveness import Lease, still_held
 from webots_mcp.queue import any_unfinished
-from webots_mcp.store.chunks import is_chunked_aside, show_chunks_aside
+from webots_mcp.store.chunks import StateColumns, is_chunked_aside, show_chunks_aside
 from webots_mcp.store.journal_intake import BUDGET_S, has_news, journals_behind, take_in_journals
+from webots_mcp.store.reading.observed_pose import find_observed
 from webots_mcp.store.reading.segment import Subject, choose, require_run
 from webots_mcp.store.retention import Asked
 from webots_mcp.store.robots import Robot, Session, Status, judge, stopped_for
@@ -65,6 +66,7 @@ _BEHIND: Final = (
     "newer rows of {} are not in the database yet: ask again, or start 'webots-mcp serve' (not "
     "--read-only), which takes them in"
 )
+_SEEN_BY: Final = "observer {!r} saw the position (observer.x_m, ...); the robot publishes none"
 _NOT_IN: Final = (
     "; without the rows in {} waiting files next to it (...-waiting-...): copy all of them to a "
     "writable folder and open the copy with webots-mcp serve to include them"
@@ -107,6 +109,15 @@ class View:
             "why": self.status.why,
             **storage(self.connection),
         }
+
+    def position_by(self) -> dict[str, Any]:
+        """Who saw where the robot is, where it does not know that itself: for what tells of it."""
+        if self.run is None or self.state is None:
+            return {}
+        newest, state = StateColumns(), self.state
+        newest.add([(state.id, state.sim_time_s, state.wall_time_s, state.data, state.replaced)])
+        found = find_observed(self.connection, self.run.id, newest)
+        return {"position_by": _SEEN_BY.format(found.observer)} if found else {}
 
     def _newest_times(self) -> tuple[float, float] | tuple[None, None]:
         """Of the newest state; before the first one, of the run's last sign of life."""

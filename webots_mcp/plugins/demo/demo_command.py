@@ -13,18 +13,25 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import AsyncGenerator, Mapping
+from collections.abc import AsyncGenerator, Generator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from webots_mcp.cli.options import Json, Parameter
 from webots_mcp.cli.terminal import answer_lines, print_json, rewrite
 from webots_mcp.connection import connect
-from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, full_path, whole_file
-from webots_mcp.errors import NothingRecordedError, WebotsMCPError
+from webots_mcp.contract import (
+    DATA_DIR_VARIABLE,
+    DATABASE_NAME,
+    full_path,
+    host_name,
+    whole_file,
+)
+from webots_mcp.errors import CommandRefusedError, NothingRecordedError, WebotsMCPError
+from webots_mcp.liveness import give_back, holder_of, lease_of, process_alive, take
 from webots_mcp.requirements import quoted
 from webots_mcp.setup.client_entries import server_command
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import Job, Recording
 
 if TYPE_CHECKING:
     from mcp import Client
@@ -34,7 +41,6 @@ if TYPE_CHECKING:
 
 
 DEFAULT_DATA_DIR: Final = Path.home() / ".webots-mcp" / "demo"
-_ROBOT: Final = "rover"
 _START_TIMEOUT_S: Final = 30.0
 _ANSWER_LINES: Final = 24
 _ROWS: Final = 6  # of a table
@@ -70,7 +76,13 @@ CONVERSATION: Final[tuple[Turn, ...]] = (
     ),
     ("Draw the way it took.", "webots_plot", {"kind": "trajectory"}),
     ("Start over.", "webots_simulation_control", {"command": "reset"}),
+    (  # so that the newest run is one worth looking at afterwards
+        "Drive for half a minute, as fast as you can, and stop there.",
+        "webots_run",
+        {"for_s": 30, "then": "pause"},
+    ),
 )
+_JOB: Final = "demo"  # one process at a time does it in a folder
 
 
 def demo(
@@ -108,6 +120,7 @@ def run(
         conversation: What is asked.
 
     Raises:
+        CommandRefusedError: A demo is running there.
         DatabaseError: Nothing can be recorded there.
         NothingRecordedError: The controller did not come up.
         WebotsMCPError: The server answered with an error.
@@ -117,20 +130,53 @@ def run(
     from webots_mcp.standin import Simulation
     from webots_mcp.standin.in_process import DEFAULT_WORLD
 
-    Recording(data_dir / DATABASE_NAME, data_dir).create()  # a robot only waits for a bad folder
+    recording = Recording(data_dir / DATABASE_NAME, data_dir)
+    recording.create()  # a robot only waits for a bad folder
     shown = contextlib.redirect_stdout(sys.stderr if as_json else sys.stdout)
-    with shown:
-        _say(f"Starting {DEFAULT_WORLD.name} on the stand-in simulator (this is not Webots) ...")
-    with Simulation(DEFAULT_WORLD, environment={DATA_DIR_VARIABLE: str(data_dir)}) as simulation:
+    environment = {DATA_DIR_VARIABLE: str(data_dir)}
+    with _alone(recording), Simulation(DEFAULT_WORLD, environment=environment) as simulation:
+        with shown:
+            _say(f"Running {DEFAULT_WORLD.name} on the stand-in simulator (this is not Webots) ...")
         _wait_for_rows(simulation, data_dir)
         with shown:
             answers = anyio.run(converse, data_dir, conversation)
-            _tell_where(data_dir)
-            _tell_how_to_connect(data_dir, keep=keep)
+            _show_database(data_dir)
+            _show_connections(data_dir)
+            _show_next_steps(data_dir, keep=keep)
         if as_json:
             print_json({"database": str(data_dir / DATABASE_NAME), "answers": answers})
         if keep:
             _keep(simulation)
+
+
+@contextlib.contextmanager
+def _alone(recording: Recording) -> Generator[None]:
+    """Let no other demo record in the same folder meanwhile: its answers would be of both robots.
+
+    Raises:
+        CommandRefusedError: One does already.
+    """
+    lease = lease_of(_JOB)
+    with recording.writer() as connection:
+        holder = holder_of(connection, _JOB)
+        if not take(connection, lease, forced=holder is not None and _was_killed(holder)):
+            raise CommandRefusedError(
+                f"a demo is already running there ({recording.data_dir}): watch it with "
+                f"'{_typed('view', recording.data_dir)}', end it with Ctrl-C, or name another "
+                "folder with --data-dir"
+            )
+    with Job(recording, lease).renewed():
+        try:
+            yield
+        finally:
+            with recording.writer() as connection:
+                give_back(connection, lease)
+
+
+def _was_killed(holder: str) -> bool:
+    """Whether the process that took the lease is known to be gone."""
+    host, pid, _ = holder.rsplit(" ", 2)
+    return host == host_name() and not process_alive(int(pid), None, time.time())
 
 
 def _wait_for_rows(simulation: Simulation, data_dir: Path) -> None:
@@ -258,7 +304,7 @@ def _as_json(value: object) -> str:
     return json.dumps(value, ensure_ascii=False)
 
 
-def _tell_where(data_dir: Path) -> None:
+def _show_database(data_dir: Path) -> None:
     database = shlex.quote(str(data_dir / DATABASE_NAME))
     _say(f"\nThe database: {database}\nThree questions for the sqlite3 shell:")
     for sql in (
@@ -269,7 +315,7 @@ def _tell_where(data_dir: Path) -> None:
         _say(f'  sqlite3 {database} "{sql}"')
 
 
-def _tell_how_to_connect(data_dir: Path, *, keep: bool) -> None:
+def _show_connections(data_dir: Path) -> None:
     """As docs/clients.md says it, with this environment's full paths."""
     command = server_command(data_dir)
     entry = {"mcpServers": {"webots": {"command": command[0], "args": command[1:]}}}
@@ -277,13 +323,29 @@ def _tell_how_to_connect(data_dir: Path, *, keep: bool) -> None:
     _say(f"  {quoted(['claude', 'mcp', 'add', 'webots', '--', *command])}")
     _say("Cursor and Claude Desktop by JSON (VS Code: servers instead of mcpServers):")
     _say(f"  {_as_json(entry)}")
+
+
+def _show_next_steps(data_dir: Path, *, keep: bool) -> None:
+    _say("\nNext, see the same in your browser: signals, the path, pictures, the log.")
+    _say(f"  {_typed('view', data_dir)}")
     if not keep:
-        _say("With 'webots-mcp demo --keep' the robot goes on driving meanwhile.")
-    _say("In a Webots project of your own 'webots-mcp init' writes these entries.")
+        _say("With 'webots-mcp demo --keep' the robot drives on, and the page's buttons steer it.")
+    _say(
+        "Then record your own robot: 'webots-mcp init' in your Webots project writes these entries"
+    )
+    _say("and shows what each controller needs. 'webots-mcp init --help' says more.")
+
+
+def _typed(command: str, data_dir: Path) -> str:
+    """A command on this recording, to be typed whatever the PATH is."""
+    program = server_command(data_dir)
+    place = program.index("serve")
+    return quoted([*program[:place], command, *program[place + 1 :]])
 
 
 def _keep(simulation: Simulation) -> None:
-    _say("\nThe robot keeps running until Ctrl-C.")
+    simulation.resume()
+    _say("\nThe robot keeps driving until Ctrl-C.")
     while simulation.is_running:
         time.sleep(0.2)
 

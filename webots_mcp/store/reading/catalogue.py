@@ -16,6 +16,7 @@ from webots_mcp.store.analysis.arrays import Indexes, np
 from webots_mcp.store.chunks import STATE_COLUMNS, StateColumns, reached, signals_in
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.frame_source import has_few_new_rows, rows_in_no_chunk
+from webots_mcp.store.reading.observed_pose import with_observed_pose
 from webots_mcp.store.reading.ranges import TimeRange, find_subject
 from webots_mcp.store.reading.segment import (
     QUESTION_DEADLINE_S,
@@ -92,9 +93,11 @@ def _signals_in(
     connection: sqlite3.Connection, robot_id: int, run_ids: Sequence[int]
 ) -> dict[str, Signal]:
     known = registered(connection, robot_id)
-    for run_id in run_ids:
-        known = seen_with(known, robot_id, _new_sample(connection, run_id))
-    return _without_placeholders(known)
+    samples = {run_id: _new_sample(connection, run_id) for run_id in run_ids}
+    for columns in samples.values():
+        known = seen_with(known, robot_id, columns)
+    known = _without_placeholders(known)
+    return with_observed_pose(connection, robot_id, known, samples.items())
 
 
 def _new_sample(connection: sqlite3.Connection, run_id: int) -> StateColumns:
@@ -242,8 +245,10 @@ def list_signals(
     subject = find_subject(connection, robot, run_id)
     whole = Segment(subject.run_id, -math.inf, math.inf)
     frame = read_frame(connection, whole, Deadline(deadline_s))
+    own = [(subject.run_id, frame.new_rows)]
     known = signals_of_frame(connection, subject, frame)
     there = held_by(connection, frame, known)
+    there = with_observed_pose(connection, subject.robot_id, there, own)
     matching = resolve_signals(there, [pattern]) if pattern != "*" else list(there.values())
     matching.sort(key=lambda signal: signal.name)
     infos = tuple(_info(frame, signal) for signal in matching[:limit])

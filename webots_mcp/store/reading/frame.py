@@ -44,6 +44,7 @@ from webots_mcp.store.reading.frame_source import (
     read_rows,
     rows_in_no_chunk,
 )
+from webots_mcp.store.reading.observed_pose import MARGIN_S, Derived, find_observed, poses_of
 from webots_mcp.store.reading.segment import HAS_LOST_ROWS, MOST_ROWS, Deadline, Segment, kept_parts
 
 _FEW: Final = 4  # times that few chunks are opened one by one; else all of them at once
@@ -138,12 +139,18 @@ class Frame:
 
     def __contains__(self, name: str) -> bool:
         """Whether a row may have a value of that signal."""
-        return name in self._source.ids or name in self._source.columns.values
+        source = self._source
+        return name in source.ids or name in source.columns.values or name in source.derived
 
     @property
     def new_rows(self) -> StateColumns:
         """The rows that are in no chunk yet."""
         return self._source.columns
+
+    @property
+    def derived(self) -> Derived:
+        """The signals that no row holds: the pose by an observer, where there is no other."""
+        return self._source.derived
 
     @property
     def unread(self) -> tuple[Unread, ...]:
@@ -399,9 +406,21 @@ def read_frame(
             cut_at_s = read_rows(connection, _KEPT, (run_id, *span, -1), columns, deadline)
     names = dict(connection.execute(_SIGNALS, (run_id,)).fetchall())
     source = FrameSource(connection, run_id, groups, columns, names)
+    source.derived = _observed_pose(connection, segment, columns, deadline)
     if lost := deleted_part(connection, segment):
         source.unread[lost] = None
     return _framed(source, segment, _note_cut(source, segment, cut_at_s))
+
+
+def _observed_pose(
+    connection: sqlite3.Connection, segment: Segment, columns: StateColumns, deadline: Deadline
+) -> Derived:
+    """The pose of the robot by an observer, where its run has none of its own."""
+    found = find_observed(connection, segment.run_id, columns)
+    if found is None:
+        return {}
+    around = Segment(found.run_id, segment.start_s - MARGIN_S, segment.end_s + MARGIN_S)
+    return poses_of(found.key, read_frame(connection, around, deadline))
 
 
 def _note_cut(source: FrameSource, segment: Segment, cut_at_s: float | None) -> float | None:
@@ -436,6 +455,7 @@ def read_kept(connection: sqlite3.Connection, segment: Segment, deadline: Deadli
     columns = StateColumns()
     cut_at_s = read_rows(connection, _KEPT, (*bounds, MOST_ROWS), columns, deadline)
     source = FrameSource(connection, segment.run_id, np.zeros((0, 5)), columns, {})
+    source.derived = _observed_pose(connection, segment, columns, deadline)
     cut_at_s = _note_cut(source, segment, cut_at_s)
     return _framed(source, segment, cut_at_s) if len(columns) else None
 

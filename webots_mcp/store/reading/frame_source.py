@@ -26,6 +26,7 @@ from webots_mcp.store.chunks import (
     statistics_of,
     values_in,
 )
+from webots_mcp.store.reading.observed_pose import Derived
 from webots_mcp.store.reading.segment import Deadline
 from webots_mcp.store.run_rows import reading_texts
 
@@ -68,6 +69,7 @@ class FrameSource:
         starts_s: Simulation time of the first row of each part; `ends_s` of the last one.
         order: The rows in order of time; None where they are.
         unread: What could not be read so far, each of which column: None of all.
+        derived: Signals that no row holds, by name: their values at some times.
     """
 
     def __init__(
@@ -83,6 +85,7 @@ class FrameSource:
         self.columns = columns
         self.ids = ids
         self.unread: dict[Unread, Column | None] = {}
+        self.derived: Derived = {}
         self.order: Indexes | None = None
         sound = (groups[:, 3] >= 1) & (groups[:, 3] <= _MOST_ROWS) & (groups[:, 1] <= groups[:, 2])
         for _, start_s, end_s, *_ in groups[~sound].tolist():
@@ -139,6 +142,10 @@ class FrameSource:
                 yield max(0, first - start), _cut(values, max(0, start - first), stop - first)
 
     def _of_parts(self, column: Column, places: Sequence[int]) -> Iterator[tuple[int, Decoded]]:
+        if isinstance(column, str) and column in self.derived:
+            for place, times in self._of_parts(SIM_TIMES, places):
+                yield place, self.derived[column](times.numbers)
+            return
         groups = len(self._group_ids)
         of_group = {int(self._group_ids[place]): place for place in places if place < groups}
         signal_id, connection = self._signal_id(column), self.connection
@@ -199,6 +206,10 @@ class FrameSource:
 
     def _statistics(self, column: Column) -> Array:
         table = nothing(len(self.starts_s))
+        if column in self.derived:
+            for place, part in self._of_parts(column, range(len(table))):
+                table[place] = statistics_of(part)
+            return table
         signal_id = self._signal_id(column)
         if signal_id is not None and len(self._group_ids):
             stored = statistics_in(self.connection, self.run_id, signal_id, self._between)

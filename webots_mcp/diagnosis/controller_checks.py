@@ -1,0 +1,125 @@
+"""What each controller of the project needs, and what a plain Robot cannot do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from webots_mcp.contract import find_project
+from webots_mcp.diagnosis import Diagnosis, Examined, check, ok, unclear, warning, worst, wrong
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.naming import find_position
+from webots_mcp.setup import (
+    NO_POSITION_OF_ITS_OWN,
+    NO_SUPERVISOR,
+    Interpreter,
+    ProjectController,
+    chosen,
+    controllers_of,
+    has_observer,
+    look_into,
+    offer_observer,
+    writes_states,
+)
+from webots_mcp.setup.project_edits import AlreadyPatchedError, attaching_place, is_plain_robot
+from webots_mcp.store.recording import View
+from webots_mcp.store.robots import live_observer
+from webots_mcp.store.signals import registered
+from webots_mcp.webots import installations
+
+_NO_PROJECT: Final = "this is no Webots project, whose controllers could be examined"
+_NONE: Final = "the project has no controllers that Webots would start"
+
+
+@check("Controllers", well=_NO_PROJECT)
+def controllers(subject: Examined) -> Iterator[Diagnosis]:
+    """Which record, which lack the two lines, and whose Python lacks the package."""
+    project = find_project(subject.project)
+    if project is None:
+        return
+    findings = list(_of_each(subject, project)) or [ok(_NONE)]
+    seen = "; ".join(each.seen for each in findings)  # those that record are named as well
+    yield replace(worst(findings), seen=seen)
+
+
+def _of_each(subject: Examined, project: Path) -> Iterator[Diagnosis]:
+    observed = has_observer(project)
+    pythons: dict[tuple[str, ...], Interpreter] = {}
+    recording = [] if subject.connection is None else subject.live
+    at_work = {view.session.controller for view in recording if view.session}
+    for each in controllers_of(project):
+        file = each.file.relative_to(project).as_posix()
+        if str(each.file) in at_work:  # and so its Python has the package
+            yield ok(f"{file} records now")
+        elif not each.is_python:
+            yield _of_other_language(each, file, is_observed=observed)
+        else:
+            yield _of_lines(each.file, file, is_observed=observed)
+            if subject.probes_python:
+                command = chosen(each.file).command
+                if command not in pythons:
+                    pythons[command] = look_into(each.file)
+                yield from _of_python(pythons[command], file)
+
+
+def _of_lines(controller: Path, file: str, *, is_observed: bool) -> Diagnosis:
+    try:
+        attaching_place(controller)
+    except AlreadyPatchedError:
+        return ok(f"{file} has the bridge")
+    except (InvalidInputError, OSError) as error:
+        return unclear(f"whether {file} records is not clear: {error}")
+    if is_observed:
+        return ok(f"{file} has no bridge: the observer records where its robot is")
+    fix = f"webots-mcp init --patch {file}"
+    return warning(f"{file} does not record: it lacks the bridge's two lines", fix)
+
+
+def _of_other_language(controller: ProjectController, file: str, *, is_observed: bool) -> Diagnosis:
+    if writes_states(controller) or is_observed:
+        return ok(f"{file} ({controller.language}) is recorded")
+    return warning(f"{file} ({controller.language}) does not record", controller.advice)
+
+
+def _of_python(python: Interpreter, file: str) -> Iterator[Diagnosis]:
+    """Whether Webots, where it is installed, can start the controller with the bridge."""
+    if python.error is not None:
+        seen = (
+            f"Webots starts {file} with {python.command} ({python.chosen_by}), where the bridge "
+            f"cannot be used: {python.error}"
+        )
+        fix = python.fix or "choose another Python in Webots' preferences"
+        yield wrong(seen, fix) if installations() else warning(seen, fix)
+
+
+@check("Supervisor", well="no robot was found that lacks a supervisor's rights")
+def supervisor(subject: Examined) -> Iterator[Diagnosis]:
+    """What cannot be done with a plain Robot, and that an observer would do it."""
+    recording = [] if subject.connection is None else subject.live
+    for view in recording:
+        if view.session is not None and view.session.has_bridge and not view.session.supervisor:
+            yield _of_robot(view)
+    project = find_project(subject.project)
+    if recording or project is None:
+        return
+    for each in [] if has_observer(project) else controllers_of(project):
+        if each.is_python and is_plain_robot(each.file):
+            seen = f"the robot of {each.name} {NO_SUPERVISOR}. {NO_POSITION_OF_ITS_OWN}"
+            yield warning(seen, offer_observer(project))
+
+
+def _of_robot(view: View) -> Diagnosis:
+    """What a robot that records now lacks."""
+    name = view.robot.name
+    observer = live_observer(view.connection, view.session, view.now_s)
+    if observer is not None:
+        return ok(f"{name} is a plain Robot: {observer.name} steers, and sees where it is")
+    signals = registered(view.connection, view.robot.id).values()
+    has_position = find_position([each.name for each in signals if each.is_number]) is not None
+    seen = f"{name} {NO_SUPERVISOR}"
+    seen += "" if has_position else f". {NO_POSITION_OF_ITS_OWN}"
+    world = view.run.world if view.run else None
+    project = find_project(Path(world).parent) if world else None
+    return warning(seen, offer_observer(project, Path(world) if world else None))

@@ -1,0 +1,178 @@
+"""Where an observer saw a robot that publishes no position of its own.
+
+A robot with a bridge records what it knows of itself: a plain `Robot` without a GPS does not know
+where it is. An observer in the same simulation does. Its poses of that robot are then signals of
+the robot, `observer.x_m` and so on, so that each question about it has a position and shows whose.
+Nothing is copied in the recording: the poses are read from the observer's run, and lie between two
+of its rows on the straight line between them.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from webots_mcp.contract import OBSERVER, WORLD_EVENT
+from webots_mcp.naming import OBSERVED, WORLD, find_position
+from webots_mcp.signal_register import kind_of, unit_of
+from webots_mcp.store.analysis.arrays import Array, median, np
+from webots_mcp.store.chunks import IS_ABSENT, IS_NUMBER, Decoded, StateColumns, signals_in
+from webots_mcp.store.signals import Signal, registered, seen_with, with_roles
+
+if TYPE_CHECKING:
+    from webots_mcp.store.reading.frame import Frame
+
+Derived = Mapping[str, Callable[[Array], Decoded]]
+"""Signals that no row of a run holds, by name: their values at some simulation times."""
+
+MARGIN_S: Final = 1.0  # of the observer's rows around what is asked for
+_HEADING: Final = "heading_rad"
+_PARTS: Final = ("x_m", "y_m", "z_m", _HEADING)
+_LONGEST_GAP_S: Final = 1.0  # between two rows of an observer; more of one that looks seldom
+_GAP_INTERVALS: Final = 3.0
+# The observer's run that lasted longest at the same time, in the same simulation.
+_BESIDE: Final = (
+    "SELECT b.name, o.id, own.name FROM run r JOIN robot own ON own.id = r.robot_id "
+    "JOIN session me ON me.id = r.session_id JOIN session s ON s.instance = me.instance "
+    f"JOIN robot b ON b.id = s.robot_id AND b.kind = '{OBSERVER}' "
+    "JOIN run o ON o.session_id = s.id "
+    f"WHERE r.id = ? AND own.kind <> '{OBSERVER}' "
+    "AND o.started_wall_time_s <= r.last_wall_time_s "
+    "AND o.last_wall_time_s >= r.started_wall_time_s "
+    "ORDER BY min(o.last_wall_time_s, r.last_wall_time_s) "
+    "- max(o.started_wall_time_s, r.started_wall_time_s) DESC, o.id DESC LIMIT 1"
+)
+# The newest description of the world that has the robot; a name is left out where it is the key.
+_KEY: Final = (
+    "SELECT min(r.value ->> '$.key'), count(*) FROM event e, "
+    "json_each(CASE WHEN json_valid(e.data) THEN e.data ELSE '{}' END, '$.robots') r "
+    "WHERE e.run_id IN (SELECT id FROM run WHERE session_id = "
+    f"(SELECT session_id FROM run WHERE id = :run)) AND e.kind = '{WORLD_EVENT}' "
+    "AND e.run_id <= :run "
+    "AND coalesce(r.value ->> '$.name', r.value ->> '$.key') = :name "
+    "GROUP BY e.id ORDER BY e.id DESC LIMIT 1"
+)
+_ROBOT: Final = "SELECT robot_id FROM run WHERE id = ?"
+
+
+class ObservedRobot(NamedTuple):
+    """A robot as an observer calls it.
+
+    Attributes:
+        observer: The name of the observer.
+        run_id: Its run.
+        key: The robot's word in the observer's signals: `world.KEY.x_m`.
+    """
+
+    observer: str
+    run_id: int
+    key: str
+
+
+def find_observed(
+    connection: sqlite3.Connection, run_id: int, columns: StateColumns
+) -> ObservedRobot | None:
+    """Return how an observer saw the robot of a run that holds no position of its own.
+
+    Args:
+        connection: Any.
+        run_id: The robot's run.
+        columns: Rows of it that are in no chunk.
+
+    Returns:
+        None where the run has a position, or no observer saw the robot meanwhile.
+    """
+    row = connection.execute(_BESIDE, (run_id,)).fetchone()
+    if row is None or _has_position(connection, run_id, columns):
+        return None
+    observer, observer_run_id, name = row
+    asked = {"run": observer_run_id, "name": name}
+    key, count = connection.execute(_KEY, asked).fetchone() or (None, 0)
+    return ObservedRobot(observer, observer_run_id, str(key)) if count == 1 else None
+
+
+def _has_position(connection: sqlite3.Connection, run_id: int, columns: StateColumns) -> bool:
+    (robot_id,) = connection.execute(_ROBOT, (run_id,)).fetchone()
+    known = seen_with(registered(connection, robot_id), robot_id, columns)
+    stored = signals_in(connection, run_id)
+    held = [
+        name
+        for name, signal in known.items()
+        if signal.is_number and signal.kind != "null"
+        if signal.id in stored or name in columns.values
+    ]
+    return find_position(held) is not None
+
+
+def with_observed_pose(
+    connection: sqlite3.Connection,
+    robot_id: int,
+    known: dict[str, Signal],
+    runs: Iterable[tuple[int, StateColumns]],
+) -> dict[str, Signal]:
+    """Add the pose by an observer to what is known of a robot, where a run has only that.
+
+    Args:
+        connection: Any.
+        robot_id: The robot.
+        known: Its own signals.
+        runs: Of it, each with its rows that are in no chunk.
+    """
+    if not any(find_observed(connection, run_id, columns) for run_id, columns in runs):
+        return known
+    added = {name: _signal(robot_id, name) for name in map(_name_of, _PARTS) if name not in known}
+    return with_roles({**known, **added})
+
+
+def _signal(robot_id: int, name: str) -> Signal:
+    kind = kind_of(name, 0.5, ends_pose=False)
+    return Signal(None, robot_id, name, kind, unit_of(name, kind), "", None)
+
+
+def _name_of(part: str) -> str:
+    return f"{OBSERVED}.{part}"
+
+
+def poses_of(key: str, frame: Frame) -> Derived:
+    """Return the pose of a robot at any time, by the rows in which an observer saw it."""
+
+    def of(part: str) -> Callable[[Array], Decoded]:
+        name = f"{WORLD}.{key}.{part}"
+        return lambda times: _decoded(_between(*frame.usable(name), times, turns=part == _HEADING))
+
+    return {_name_of(part): of(part) for part in _PARTS}
+
+
+def pose_at(derived: Derived, sim_time_s: float) -> dict[str, float]:
+    """Return the pose at a time, by the last part of the names; empty where it is not known."""
+    at: Array = np.array([sim_time_s])
+    found = {name.rpartition(".")[2]: value(at).numbers.item() for name, value in derived.items()}
+    return {part: value for part, value in found.items() if not np.isnan(value)}
+
+
+def _between(seen_s: Array, values: Array, times: Array, *, turns: bool) -> Array:
+    """Values at times between those that were seen; NaN where none was seen near enough.
+
+    Before the first and after the last one it stays as it is for the usual interval.
+    """
+    if not len(seen_s):
+        return np.full(len(times), np.nan)
+    usual_s = median(np.diff(seen_s)) if len(seen_s) > 1 else 0.0
+    longest_s = max(_LONGEST_GAP_S, _GAP_INTERVALS * usual_s)
+    if turns:
+        values = np.unwrap(values)
+    found: Array = np.interp(times, seen_s, values)
+    after = np.searchsorted(seen_s, times)
+    before = np.maximum(after - 1, 0)
+    after = np.minimum(after, len(seen_s) - 1)
+    is_far = (seen_s[after] - seen_s[before] > longest_s) & (seen_s[after] != times)
+    is_outside = (times < seen_s[0] - usual_s) | (times > seen_s[-1] + usual_s)
+    found[is_far | is_outside] = np.nan
+    return np.arctan2(np.sin(found), np.cos(found)) if turns else found
+
+
+def _decoded(values: Array) -> Decoded:
+    is_absent = np.isnan(values)
+    codes = np.where(is_absent, IS_ABSENT, IS_NUMBER) if is_absent.any() else None
+    return Decoded(values, codes, ())

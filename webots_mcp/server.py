@@ -4,19 +4,24 @@ What a tool cannot mean is refused in words that a model can act on.
 
 The SDK ignores an argument that a tool does not have, so that the answer would be to another
 question than was asked; and it tells what is wrong with a value in the words of its validator.
+
+What another server with tools of these names takes is taken as well: all arguments in one object
+`params`, and a `response_format`, whatever it says. Parameters whose type has pydantic's
+`SkipJsonSchema` are for its habits too: they are taken, and stand in no schema.
 """
 
 from __future__ import annotations
 
 import functools
 import inspect
+import json
 import logging
 import threading
 from collections.abc import AsyncGenerator, Callable, Collection, Iterable, Mapping
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, closing
 from pathlib import Path
 from sqlite3 import Connection
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, cast
 
 from anyio import CancelScope, to_thread
 from mcp import MCPError
@@ -318,6 +323,9 @@ def _schema_to_come() -> str:
 # -- tools --
 
 
+_WRAPPER: Final = "params"
+_FORMAT: Final = "response_format"
+_FORMATS: Final = (None, "json", "markdown")
 _UNSAID: Final = (
     "title", "anyOf", "maxLength", "minLength", "maxProperties", "minProperties", "maxItems",
 )  # fmt: skip
@@ -369,7 +377,8 @@ def _answering(question: Question) -> Callable[..., Any]:
         try:
             return _as_result(await question.ask(recording, arguments, caller))
         except WebotsMCPError as error:
-            raise ToolError(cut_text(str(error), _LONGEST_ERROR)) from error
+            rows = f" (left out: {'; '.join(error.left_out)})" if error.left_out else ""
+            raise ToolError(f"{cut_text(str(error), _LONGEST_ERROR)}{rows}") from error
         except (MCPError, ToolError):
             raise
         except Exception as error:
@@ -429,6 +438,7 @@ class CheckedTool(Tool):
         """
         properties = self.parameters["properties"]
         required = self.parameters.get("required", ())
+        arguments = _unwrapped(arguments, properties, required)
         _require_known(arguments, self.fn_metadata.arg_model.model_fields, properties)
         meant = {
             name: _as_meant(value, properties.get(name, {}))
@@ -517,6 +527,30 @@ def _slim(schema: dict[str, Any]) -> dict[str, Any]:
 def _is_absurd(key: str, value: Any) -> bool:
     """Whether it is a bound beyond what anybody asks for."""
     return key == "maximum" and value >= _NOBODY_ASKS_FOR
+
+
+def _unwrapped(
+    arguments: dict[str, Any], own: Collection[str], required: Iterable[str]
+) -> dict[str, Any]:
+    """The arguments of a client, without what was written for another server."""
+    is_needed = any(name not in arguments for name in required)
+    if arguments.keys() == {_WRAPPER} and (_WRAPPER not in own or is_needed):
+        inner = _as_object(arguments[_WRAPPER])
+        arguments = arguments if inner is None else inner
+    asked = arguments.get(_FORMAT)
+    if asked not in _FORMATS:
+        raise ToolError(f"{_FORMAT} must be 'json' or 'markdown', not {shown_value(asked)}")
+    return {name: value for name, value in arguments.items() if name != _FORMAT}
+
+
+def _as_object(value: Any) -> dict[str, Any] | None:
+    """An object, or the JSON text of one."""
+    if isinstance(value, str):
+        try:
+            value = json.loads(value)
+        except (ValueError, RecursionError):
+            return None
+    return cast("dict[str, Any]", value) if isinstance(value, dict) else None
 
 
 def _require_known(arguments: Iterable[str], known: Collection[str], listed: Iterable[str]) -> None:

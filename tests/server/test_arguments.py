@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tests.recordings.rows import Recorded
-from tests.server.conftest import Connect, ask, fail, text_of
+from tests.server.conftest import Connect, Driver, ask, fail, text_of
 
 pytestmark = pytest.mark.anyio
 
@@ -18,8 +18,12 @@ HUGE = 2**63
     ("tool", "arguments", "told"),
     [
         ("compare_runs", {"runs": [1, 2]}, "no parameter 'runs': there is run_ids, "),
+        ("get_trends", {"params": {"robot": "a"}, "run_id": 1}, "no parameter 'params'"),
+        ("get_trends", {"params": {"strt_s": 1}}, "no parameter 'strt_s': there is start_s, "),
         ("get_trends", {"params": "robot"}, "no parameter 'params'"),
+        ("get_logs", {"response_format": "yaml"}, "response_format must be 'json' or 'markdown'"),
         ("get_logs", {"force": True}, "no parameter 'force': there is "),
+        ("monitor", {"duration": 120}, "duration must be less than or equal to 90, not 120"),
         ("list_robots", {"x": 1}, "no parameter 'x': there is none"),
         ("query_history", {}, "signals is missing"),
         ("query_history", {"signals": ["x"], "max_points": 501}, "max_points must be less than"),
@@ -47,6 +51,7 @@ HUGE = 2**63
         ("find_events", {"for_s": 2.0}, "no parameter 'for_s': there is start_s, "),
         ("query_history", {"signals": ["x"], "cursor": 3}, "only rows go on with cursor"),
         ("monitor", {"duration_wall_s": 2, "lookback_wall_s": 9}, "give either duration_wall_s"),
+        ("monitor", {"duration_wall_s": 2, "duration": 9}, "give either duration_wall_s"),
         ("simulation_control", {"command": "pause", "steps": 2}, "steps is for command='step'"),
         ("get_trends", {"robot": "r" * 201}, "robot must have at most 200 characters, not"),
     ],
@@ -92,6 +97,38 @@ async def test_a_parameter_that_may_be_left_out_may_be_null_as_well(connect: Con
         for name, value in (("robot", None), ("cursor", None), ("limit", None)):
             answer = await client.call_tool("webots_list_commands", {name: value})
             assert not answer.is_error
+
+
+@pytest.mark.parametrize(
+    ("tool", "arguments"),
+    [
+        ("get_world_info", {"params": {"response_format": "markdown"}}),
+        ("get_robot_state", {"params": {"response_format": "json"}}),
+        ("get_sensors", {"params": '{"response_format": "json"}'}),
+        ("get_full_state", {"params": {}}),
+        ("get_camera", {"params": {}}),
+        ("get_logs", {"params": {"lines": 20, "filter_text": None}}),
+        ("monitor", {"params": {"duration": 1}}),
+        ("simulation_control", {"params": {"command": "step"}}),
+        ("world_reset", {"params": {"force": False}}),
+        ("reset_controller_state", {"params": {}}),
+        ("take_screenshot", {"params": {}}),
+        ("send_command", {"params": {"action": "set_speed", "params": {"speed": 2.0}}}),
+        ("world_reset", {"response_format": "markdown"}),
+    ],
+)
+async def test_the_calls_of_a_server_whose_tools_take_one_object_are_understood(
+    connect: Connect, driver: Driver, tool: str, arguments: dict[str, Any]
+) -> None:
+    async with connect() as client:
+        answer = await client.call_tool(f"webots_{tool}", arguments)
+    assert not answer.is_error, text_of(answer)
+
+
+async def test_a_reload_may_be_forced(connect: Connect) -> None:
+    async with connect() as client:
+        told = await fail(client, "webots_world_reload", force=True)
+    assert "keyboard: " in told and "needs force=true" not in told
 
 
 async def test_every_schema_says_that_there_are_no_other_parameters(connect: Connect) -> None:

@@ -181,3 +181,17 @@ async def test_programs_follow_an_object_for_each_line(recorded: Recorded, file:
         row = json.loads(wait_for_line(process, "second"))
         assert (row["sim_time_s"], row["level"], row["run_id"]) == (2.0, "error", 1)
         process.terminate()
+
+
+async def test_following_goes_on_with_its_robot_when_another_one_begins_to_record(
+    recorded: Recorded, file: Path
+) -> None:
+    robot = recorded.robot("rover")
+    robot.log(1.0, "first")
+    arguments = [sys.executable, "-m", "webots_mcp", "logs", "--follow", "--database", str(file)]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as process:
+        wait_for_line(process, "first")
+        recorded.robot("arm").log(1.0, "of the arm")
+        robot.log(2.0, "second")
+        assert wait_for_line(process, "second") == "2 info 1 second\n"
+        process.terminate()

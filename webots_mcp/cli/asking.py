@@ -74,10 +74,13 @@ _OF_SIGNALS: Final = frozenset({"signals", "pattern"})  # that choose among sign
 _FOLLOW: Final = Annotated[
     bool,
     Parameter(
-        "--follow", help="Go on with what comes, until Ctrl-C; as JSON each row is an object."
+        "--follow", help="Go on with what comes, until Ctrl-C. As JSON each row is an object."
     ),
 ]
 _LOOK_EVERY_S: Final = 0.5
+_FLOOD: Final = (
+    "more rows came than the {} that one look shows: older ones are left out, --before {} shows them"
+)
 _NOT_DONE: Final = ("failed", "expired", "cancelled", "lost", "claimed")
 _UNDER_WAY: Final = (
     "the controller is still busy with it and goes on: do not send it again, but go on waiting "
@@ -275,7 +278,7 @@ def _require_recorded(data: Mapping[str, Any]) -> None:
 
 
 def _follow(question: Question, given: dict[str, Any], where: Where, *, as_json: bool) -> None:
-    """Show an answer, then the rows that come: asked again and again, of a flood the newest.
+    """Show an answer, then the rows that come, of the robot that it was about.
 
     It ends after the answer where nothing can be written to the recording.
 
@@ -286,38 +289,55 @@ def _follow(question: Question, given: dict[str, Any], where: Where, *, as_json:
     if given.get("cursor") is not None:
         option = option_of(question, "cursor")
         raise InvalidInputError(f"--follow shows what comes: leave out {option}, which looks back")
-    bounds = question.arguments.model_fields[question.follows].metadata
-    most = max(each.le for each in bounds if hasattr(each, "le"))
-    newest: dict[bool, int] = {}
     reply = ask(question, given, where)
-    if not as_json:
+    data = reply.data or {}
+    _require_recorded(data)
+    if as_json:
+        _print_rows(_rows_in(data, question.follows), as_json=True)
+    else:
         show(question, reply, where, as_json=False)
         sys.stdout.flush()
-    is_shown = not as_json
-    while True:
-        data = reply.data or {}
-        _require_recorded(data)
-        table = data[question.follows]
-        for values in table["rows"]:
-            row = dict(zip(table["columns"], values, strict=True))
-            waits = row["run_id"] is None  # for a run; such rows are numbered by themselves
-            is_new = row["id"] > newest.get(waits, 0)
-            newest[waits] = max(newest.get(waits, 0), row["id"])
-            if is_new and not is_shown:
-                _print_row(row, as_json=as_json)
-        if "storage" in data:
-            return
-        is_shown = False
+    new = _NewRows()
+    new.of(_rows_in(data, question.follows))
+    bounds = question.arguments.model_fields[question.follows].metadata
+    most = max(each.le for each in bounds if hasattr(each, "le"))
+    again = given | {question.follows: most} | {"robot": data.get("robot") or given.get("robot")}
+    is_live = where.may_change()
+    while is_live:
         wait(_LOOK_EVERY_S)
-        reply = ask(question, given | {question.follows: most}, where)
+        rows = _rows_in(ask(question, again, where).data or {}, question.follows)
+        came = new.of(rows)
+        if came and len(came) == most:
+            print(f"webots-mcp: {_FLOOD.format(most, came[0]['id'])}", file=sys.stderr)
+        _print_rows(came, as_json=as_json)
 
 
-def _print_row(row: Mapping[str, Any], *, as_json: bool) -> None:
-    if as_json:
-        print(json.dumps(row, ensure_ascii=False), flush=True)
-    else:
-        shown = (text_of(value) or "-" for name, value in row.items() if name != "id")
-        print(*shown, flush=True)
+class _NewRows:
+    """Which rows of the newest ones were not among those before."""
+
+    def __init__(self) -> None:
+        self._newest: dict[bool, int] = {}
+
+    def of(self, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Those that are new; rows that wait for a run have numbers of their own."""
+        new = [row for row in rows if row["id"] > self._newest.get(row["run_id"] is None, 0)]
+        for row in new:
+            self._newest[row["run_id"] is None] = row["id"]
+        return new
+
+
+def _rows_in(data: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
+    table = data.get(name) or {"columns": [], "rows": []}
+    return [dict(zip(table["columns"], values, strict=True)) for values in table["rows"]]
+
+
+def _print_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool) -> None:
+    for row in rows:
+        if as_json:
+            print(json.dumps(row, ensure_ascii=False), flush=True)
+        else:
+            shown = (text_of(value) or "-" for name, value in row.items() if name != "id")
+            print(*shown, flush=True)
 
 
 def option_of(question: Question, argument: str) -> str:

@@ -489,7 +489,6 @@ def tail(
     can be written, nothing can come, and it ends after the last lines. As JSON each line is an
     object.
     """
-    from webots_mcp.connection import FrozenConnection
     from webots_mcp.store.logs import Follower
     from webots_mcp.store.robots import resolve_robot
 
@@ -497,7 +496,7 @@ def tail(
         found = robot and resolve_robot(connection, robot, time.time())
         follower = Follower(connection, found.id if found else None)
         _print_lines(follower.look(limit), as_json=json)
-        following = not no_follow and not isinstance(connection, FrozenConnection)
+        following = not no_follow and recorded.may_change()
         while following:
             wait(interval_s)
             recorded.recording().take_in()

@@ -177,6 +177,13 @@ class Where:
                 print(f"webots-mcp: {said}", file=sys.stderr)
             yield connection
 
+    def may_change(self) -> bool:
+        """Whether rows may still come: none do where the file cannot be written."""
+        from webots_mcp.connection import FrozenConnection
+
+        with self.recording().reader() as connection:
+            return not isinstance(connection, FrozenConnection)
+
     @contextmanager
     def writer(
         self, command: str, arguments: Mapping[str, Any] = _NO_KINDS, *, create: bool = False

@@ -78,9 +78,7 @@ _FOLLOW: Final = Annotated[
     ),
 ]
 _LOOK_EVERY_S: Final = 0.5
-_FLOOD: Final = (
-    "more rows came than the {} that one look shows: older ones are left out, --before {} shows them"
-)
+_FLOOD: Final = "more than {} rows came at once: --before {} shows those that were left out"
 _NOT_DONE: Final = ("failed", "expired", "cancelled", "lost", "claimed")
 _UNDER_WAY: Final = (
     "the controller is still busy with it and goes on: do not send it again, but go on waiting "
@@ -327,7 +325,7 @@ class _NewRows:
 
 
 def _rows_in(data: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
-    table = data.get(name) or {"columns": [], "rows": []}
+    table: dict[str, list[Any]] = data.get(name) or {"columns": [], "rows": []}
     return [dict(zip(table["columns"], values, strict=True)) for values in table["rows"]]
 
 

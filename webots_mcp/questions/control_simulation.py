@@ -261,6 +261,7 @@ _RUN_WAIT_S: Final = 60.0
     core=True,
     example="--until 'front_m < 0.1' --for 20 --reset --set kp=2",
     quotes=True,
+    of_controller="parameters",
 )
 async def webots_run(
     recording: Recording,

@@ -8,7 +8,6 @@ A question is a function whose annotated parameters are its arguments and whose 
 
 from __future__ import annotations
 
-import difflib
 import functools
 import inspect
 import json
@@ -50,7 +49,7 @@ from webots_mcp.errors import (
     NothingRecordedError,
     WebotsMCPError,
 )
-from webots_mcp.naming import same_in_meaning
+from webots_mcp.naming import perhaps_meant
 from webots_mcp.questions.answers import Answer, ShownPicture
 from webots_mcp.questions.budget import Client, compact_json, reader
 from webots_mcp.store.invalid_rows import past_invalid_rows
@@ -133,6 +132,7 @@ class Question:
             come. A row has an `id` for a person, and a `run_id`. The argument of that name says how
             many rows there may be.
         example: What a person types behind the command's name, for its help alone.
+        of_controller: The argument that takes names which the controller has declared.
         quotes: Its answers hold texts that controllers, worlds or people wrote, and say so to a
             model, once.
     """
@@ -147,6 +147,7 @@ class Question:
     follows: str | None = None
     example: str | None = None
     quotes: bool = False
+    of_controller: str | None = None
 
     @property
     def name(self) -> str:
@@ -304,10 +305,21 @@ def question(
     follows: str | None = None,
     example: str | None = None,
     quotes: bool = False,
+    of_controller: str | None = None,
 ) -> Callable[[Callable[..., Any]], Question]:
     """Declare a function as a question; see `Question`."""
     return lambda function: Question(
-        function, title, effect, command, positional, options, core, follows, example, quotes
+        function,
+        title,
+        effect,
+        command,
+        positional,
+        options,
+        core,
+        follows,
+        example,
+        quotes,
+        of_controller,
     )
 
 
@@ -585,7 +597,7 @@ def _near(error: ErrorDetails) -> str:
     """What was perhaps meant."""
     choices = re.findall(r"'([^']+)'", error["msg"])
     given = str(error["input"])[:_LONGEST_VALUE]
-    near = same_in_meaning(given, choices) or difflib.get_close_matches(given, choices, n=1)
+    near = perhaps_meant(given, choices, most=1)
     return f"; did you mean {' or '.join(map(repr, near))}?" if near else ""
 
 

@@ -1,4 +1,6 @@
-"""The token by which a program proves that it may ask over HTTP: one for each user, in a file.
+"""Who may ask over HTTP: the token by which a program proves it, and the host that it asks.
+
+There is one token for each user, in a file.
 
 It is not in the data folder, which people copy and send. Whoever checks a request reads the file
 anew, so that a token that was replaced is refused at once.
@@ -9,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import hmac
 import os
+import re
 import secrets
 import stat
 import tempfile
@@ -18,6 +21,7 @@ from typing import Final
 from webots_mcp.contract import full_path, make_folder
 from webots_mcp.errors import CommandRefusedError
 
+_HOST: Final = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[0-9A-Za-z._-]+)(?::[0-9]{1,5})?")
 LOOPBACK: Final = ("127.0.0.1", "localhost", "[::1]")  # as a browser writes this computer
 _SHORTEST: Final = 20  # characters
 _AGAIN: Final = "'webots-mcp token --new' makes another"
@@ -75,6 +79,15 @@ def is_admitted(authorization: str) -> bool:
     token = access_token()
     is_it = hmac.compare_digest(given.strip().encode("utf-8", "replace"), token.encode())
     return is_it and scheme.lower() == "bearer"
+
+
+def named_host(header: str) -> str | None:
+    """Return the host that a Host header names, in lower case and without its port.
+
+    None if it is anything else than a host, or a host and a port: `127.0.0.1:80@evil` is neither.
+    """
+    found = _HOST.fullmatch(header)
+    return found[1].lower() if found else None
 
 
 def page_key() -> str:

@@ -46,7 +46,14 @@ from types import MappingProxyType
 
 
 class WebotsMCPError(Exception):
-    """Root of the errors about recordings, questions and commands."""
+    """Root of the errors about recordings, questions and commands.
+
+    Attributes:
+        left_out: The rows that no bridge has written and that were not looked at; for want of them
+            something may be missing.
+    """
+
+    left_out: tuple[str, ...] = ()
 
 
 class DatabaseError(WebotsMCPError):

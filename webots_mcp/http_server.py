@@ -1,7 +1,7 @@
 """The MCP server over streamable HTTP, for many clients at once.
 
-The SDK has the transport, and checks Host and Origin. What stands before it asks each request for
-the token, and lets a client that goes away end what it has asked: a client of protocols before
+The SDK has the transport. What stands before it checks Host and Origin, asks each request for the
+token, and lets a client that goes away end what it has asked: a client of protocols before
 2026-07-28 cannot come back for the answer, and the SDK would let the call go on.
 """
 
@@ -22,8 +22,9 @@ from starlette.datastructures import Headers
 from starlette.requests import ClientDisconnect
 from starlette.responses import PlainTextResponse
 
-from webots_mcp.access_token import LOOPBACK, access_token, is_admitted
+from webots_mcp.access_token import LOOPBACK, access_token, is_admitted, named_host
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
+from webots_mcp.http_limits import MOST_SESSIONS, PromptProtocol, SessionLimit
 
 if TYPE_CHECKING:
     from mcp.server import MCPServer
@@ -32,11 +33,15 @@ if TYPE_CHECKING:
 PATH: Final = "/mcp"
 _GRACE_S: Final = 1  # for answers under way when the server ends
 _IDLE_S: Final = 86_400.0  # people come back to a conversation after hours
-_MOST_SESSIONS: Final = 1_000  # of clients before 2026-07-28
 _STRANGER: Final = (
     "This server answers requests with the header 'Authorization: Bearer TOKEN' only; "
     "'webots-mcp token' shows the token to the user who started the server.\n"
 )
+_MISDIRECTED: Final = (
+    "This server answers requests for the host that it was started for; --allow-host NAME adds "
+    "another.\n"
+)
+_FOREIGN: Final = "This server answers pages of its own host only.\n"
 _CLOSED: Final = "This server has no valid token: there 'webots-mcp token' says what is wrong.\n"
 
 
@@ -103,13 +108,8 @@ def serve_http(server: MCPServer, place: Place, ready: Callable[[str], object]) 
     access_token()
     with closing(_listening(place)) as listener:
         config = uvicorn.Config(
-            gate(
-                server.streamable_http_app(
-                    transport_security=_allowing(place),
-                    session_idle_timeout=_IDLE_S,
-                    max_sessions=_MOST_SESSIONS,
-                )
-            ),
+            guarded_app(server, place),
+            http=PromptProtocol,
             log_config=None,
             log_level="warning",
             access_log=False,
@@ -133,6 +133,16 @@ def serve_http(server: MCPServer, place: Place, ready: Callable[[str], object]) 
         raise CommandRefusedError("the server did not start; what it wrote above says why")
 
 
+def guarded_app(server: MCPServer, place: Place, most_sessions: int = MOST_SESSIONS) -> ASGIApp:
+    """The server as an application for requests that are addressed to it and have the token."""
+    app = server.streamable_http_app(
+        transport_security=_allowing(place),
+        session_idle_timeout=_IDLE_S,
+        max_sessions=most_sessions,
+    )
+    return gate(SessionLimit(app, most_sessions), place)
+
+
 def _listening(place: Place) -> socket.socket:
     family = socket.AF_INET6 if ":" in place.host else socket.AF_INET
     try:
@@ -151,21 +161,39 @@ def _is_loopback(host: str) -> bool:
         return False
 
 
+def _names(place: Place) -> tuple[str, ...]:
+    """The hosts that requests may be addressed to."""
+    own = (place.host,) if _is_loopback(place.host) else ()  # such as 127.0.0.2
+    return (*LOOPBACK, *own, *place.allowed)
+
+
 def _allowing(place: Place) -> TransportSecuritySettings:
     """Requests for these names; pages of the same ones, as far as a browser sends any."""
-    own = (place.host,) if _is_loopback(place.host) else ()  # such as 127.0.0.2
-    names = (*LOOPBACK, *own, *place.allowed, *map(str.lower, place.allowed))  # as clients send it
+    names = (*_names(place), *map(str.lower, place.allowed))  # as clients send it
     hosts = [spelled for name in names for spelled in (name, f"{name}:*")]
     origins = [f"{place.scheme}://{host}" for host in hosts]
     return TransportSecuritySettings(allowed_hosts=hosts, allowed_origins=origins)
 
 
-def gate(app: ASGIApp) -> ASGIApp:
-    """The application, for requests that have the token."""
+def gate(app: ASGIApp, place: Place) -> ASGIApp:
+    """The application, for requests that are addressed to it and have the token.
+
+    The SDK compares the beginning of Host and Origin only, so that both are read here first.
+    """
+    names = {each.lower() for each in _names(place)}
 
     async def admit(scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "http":
-            given = Headers(scope=scope).getlist("authorization")
+            headers = Headers(scope=scope)
+            hosts, origins = headers.getlist("host"), headers.getlist("origin")
+            if len(hosts) != 1 or named_host(hosts[0]) not in names:
+                return await PlainTextResponse(_MISDIRECTED, 421)(scope, receive, send)
+            scheme = f"{place.scheme}://"
+            for origin in origins:
+                host = named_host(origin.removeprefix(scheme))
+                if not origin.startswith(scheme) or host not in names:
+                    return await PlainTextResponse(_FOREIGN, 403)(scope, receive, send)
+            given = headers.getlist("authorization")
             try:
                 admitted = len(given) == 1 and is_admitted(given[0])
             except (CommandRefusedError, OSError):

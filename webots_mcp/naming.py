@@ -63,10 +63,15 @@ PAST_OR_FUTURE: Final = frozenset(("last", "previous", "prev", "old", "next", "d
 # Words of actions that ask for the same, whatever their letters; and words that say no more.
 _SAME_ACTION: Final = (
     {"pause", "stop", "halt", "freeze"}, {"resume", "start", "play", "continue", "unpause"},
-    {"reset", "restart", "rewind"}, {"reload", "restart"}, {"quit", "exit", "shutdown"},
-    {"screenshot", "snapshot", "photo"}, {"set", "field", "teleport"},
-    {"add", "node", "spawn"}, {"remove", "node", "delete"}, {"drive", "move", "go", "goto"},
+    {"screenshot", "snapshot", "photo"}, {"set", "field", "teleport", "move", "place", "change"},
+    {"add", "node", "spawn"}, {"drive", "move", "go", "goto"},
 )  # fmt: skip
+# Words of actions, commands and options that lose something: none is ever offered as a correction.
+_DESTRUCTIVE: Final = frozenset((
+    "clear", "delete", "discard", "drop", "erase", "exit", "force", "kill", "load", "new",
+    "overwrite", "prune", "purge", "quit", "reload", "remove", "replace", "reset", "restart",
+    "rewind", "shutdown", "terminate", "uninstall", "wipe",
+))  # fmt: skip
 _OF_ACTIONS: Final = frozenset(("simulation", "sim", "world", "robot", "to"))
 _LENGTHS: Final = ("m", "cm", "mm")  # units that a place is published in
 _AXES: Final = (("0", "1"), ("x", "y"), *((f"x_{unit}", f"y_{unit}") for unit in _LENGTHS))
@@ -90,6 +95,7 @@ NAME_POSITION: Final = f"{NO_POSITION}, or name the signals of both: position=[x
 _OBEYED: Final = re.compile(
     r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u206f]|\r(?!\n)"
 )
+_NO_WORD: Final = re.compile(r"\W+")
 _LONGEST_COMPARED: Final = 100  # characters of a name
 
 
@@ -291,9 +297,35 @@ def spelled_out(text: str) -> str:
     return _OBEYED.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
-def same_in_meaning(action: str, known: Iterable[str]) -> list[str]:
-    """The known actions that ask for the same in other words: `pause` for `stop`."""
-    return [each for each in known if _groups_of(each) & _groups_of(action)]
+def perhaps_meant(action: str, known: Iterable[str], most: int = 3) -> list[str]:
+    """Return the known actions that may have been meant, none of which loses anything.
+
+    Those that ask for the same in other words (`pause` for `stop`), else those spelled like it:
+    none where the nearest of them, or the given one, loses something.
+    """
+    from difflib import get_close_matches
+
+    names = list(known)
+    harmless = [each for each in names if not is_destructive(each)]
+    if same := [each for each in harmless if _groups_of(each) & _groups_of(action)]:
+        return same
+    spelled = action[:_LONGEST_COMPARED]
+    nearest = get_close_matches(spelled, names, 1)
+    if is_destructive(action) or not nearest or is_destructive(nearest[0]):
+        return []
+    return get_close_matches(spelled, harmless, most)
+
+
+def is_destructive(action: str) -> bool:
+    """Return whether an action, command or option says by its name that it loses something."""
+    return not _DESTRUCTIVE.isdisjoint(words_of(_NO_WORD.sub("_", action)))
+
+
+def harmless_first(action: str, known: Iterable[str]) -> list[str]:
+    """Return all known actions: what may have been meant, the nearest, and last what destroys."""
+    names = nearest_first(action, known)
+    ordered = [*perhaps_meant(action, names), *sorted(names, key=is_destructive)]
+    return list(dict.fromkeys(ordered))
 
 
 def _groups_of(action: str) -> set[int]:

@@ -4,19 +4,25 @@ What a tool cannot mean is refused in words that a model can act on.
 
 The SDK ignores an argument that a tool does not have, so that the answer would be to another
 question than was asked; and it tells what is wrong with a value in the words of its validator.
+
+The calls of the first server with tools of these names are accepted too: all arguments in one
+object `params`, and a `response_format`, which changes nothing. Arguments whose type has pydantic's
+`SkipJsonSchema` are others of its arguments: they are accepted, and are in no schema.
 """
 
 from __future__ import annotations
 
 import functools
 import inspect
+import json
 import logging
 import threading
 from collections.abc import AsyncGenerator, Callable, Collection, Iterable, Mapping
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, closing
+from difflib import get_close_matches
 from pathlib import Path
 from sqlite3 import Connection
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, cast
 
 from anyio import CancelScope, to_thread
 from mcp import MCPError
@@ -42,10 +48,10 @@ from webots_mcp.contract import Database, MemoryDatabase
 from webots_mcp.errors import NoDatabaseError, WebotsMCPError, warn
 from webots_mcp.liveness import reap_if_dead
 from webots_mcp.maintenance import Maintainer
-from webots_mcp.naming import nearest_first
+from webots_mcp.naming import harmless_first
 from webots_mcp.questions import all_questions
 from webots_mcp.questions.answers import ShownPicture
-from webots_mcp.questions.budget import cut_text
+from webots_mcp.questions.budget import compact_json, cut_text
 from webots_mcp.questions.declaring import (
     Caller,
     Id,
@@ -318,6 +324,9 @@ def _schema_to_come() -> str:
 # -- tools --
 
 
+_WRAPPER: Final = "params"
+_FORMAT: Final = "response_format"
+_FORMATS: Final = (None, "json", "markdown")
 _UNSAID: Final = (
     "title", "anyOf", "maxLength", "minLength", "maxProperties", "minProperties", "maxItems",
 )  # fmt: skip
@@ -331,6 +340,7 @@ _USUAL: Final[Mapping[str, tuple[Any, ...]]] = {  # what a model takes for grant
 _NOBODY_ASKS_FOR: Final = 1_000
 _BAD_ENDS: Final = ("failed", "expired", "cancelled", "lost")
 _LONGEST_DEFECT: Final = 200
+_LONGEST_CALL: Final = 300  # characters of a call that is shown as an example
 _LONGEST_ERROR: Final = 4_000  # characters: it may repeat what the model itself has sent
 
 _log = logging.getLogger(__name__)
@@ -356,7 +366,7 @@ def _tool(question: Question, output_schema: bool) -> Tool:
             open_world_hint=False,
         ),
         structured_output=None if output_schema else False,
-    )
+    ).model_copy(update={"of_controller": question.of_controller})
 
 
 def _answering(question: Question) -> Callable[..., Any]:
@@ -369,7 +379,8 @@ def _answering(question: Question) -> Callable[..., Any]:
         try:
             return _as_result(await question.ask(recording, arguments, caller))
         except WebotsMCPError as error:
-            raise ToolError(cut_text(str(error), _LONGEST_ERROR)) from error
+            rows = f" (left out: {'; '.join(error.left_out)})" if error.left_out else ""
+            raise ToolError(f"{cut_text(str(error), _LONGEST_ERROR)}{rows}") from error
         except (MCPError, ToolError):
             raise
         except Exception as error:
@@ -411,7 +422,13 @@ def _block(shown: str | ShownPicture) -> ContentBlock:
 
 
 class CheckedTool(Tool):
-    """A tool of ours, which takes no arguments but its own."""
+    """A tool of ours, which takes no arguments but its own.
+
+    Attributes:
+        of_controller: The argument that takes names which the controller has declared.
+    """
+
+    of_controller: str | None = None
 
     def model_post_init(self, context: Any, /) -> None:
         """Say so in the schema as well, and leave out of it what says nothing."""
@@ -429,7 +446,9 @@ class CheckedTool(Tool):
         """
         properties = self.parameters["properties"]
         required = self.parameters.get("required", ())
-        _require_known(arguments, self.fn_metadata.arg_model.model_fields, properties)
+        arguments = _unwrapped(arguments, properties, required)
+        if unknown := arguments.keys() - self.fn_metadata.arg_model.model_fields.keys():
+            raise ToolError(self._unknown(arguments, unknown))
         meant = {
             name: _as_meant(value, properties.get(name, {}))
             for name, value in arguments.items()
@@ -441,6 +460,21 @@ class CheckedTool(Tool):
             if isinstance(error.__cause__, ValidationError):
                 raise ToolError(faults_of(error.__cause__)) from error
             raise
+
+    def _unknown(self, arguments: dict[str, Any], unknown: Collection[str]) -> str:
+        """Which argument the tool does not have, and what was perhaps meant."""
+        names = [name for name in arguments if name in unknown]
+        listed, inside = list(self.parameters["properties"]), self.of_controller
+        said = f"unknown argument {shown_value(names[0])}"
+        is_typo = any(get_close_matches(name, listed) for name in names)
+        if inside and inside not in arguments and not is_typo:
+            given = {name: value for name, value in arguments.items() if name not in unknown}
+            given[inside] = {name: arguments[name] for name in names}
+            shown = ", ".join(f"{name}={compact_json(value)}" for name, value in given.items())
+            if len(shown) > _LONGEST_CALL:
+                shown = f"{inside}={{...}}"
+            return f"{said}: names of the controller go into `{inside}`: {self.name}({shown})"
+        return f"{said}: there is {', '.join(harmless_first(names[0], listed)) or 'none'}"
 
 
 class ToolServer(MCPServer):
@@ -519,11 +553,37 @@ def _is_absurd(key: str, value: Any) -> bool:
     return key == "maximum" and value >= _NOBODY_ASKS_FOR
 
 
-def _require_known(arguments: Iterable[str], known: Collection[str], listed: Iterable[str]) -> None:
-    for name in arguments:
-        if name not in known:
-            there = ", ".join(nearest_first(name, listed)) or "none"
-            raise ToolError(f"no parameter {shown_value(name)}: there is {there}")
+def _unwrapped(
+    arguments: dict[str, Any], own: Collection[str], required: Iterable[str]
+) -> dict[str, Any]:
+    """The arguments of a tool without the wrapper and the format of the first server's calls.
+
+    Raises:
+        ToolError: It is no format of that server.
+    """
+    outer = _without_format(arguments)
+    is_needed = any(name not in outer for name in required)
+    if outer.keys() != {_WRAPPER} or (_WRAPPER in own and not is_needed):
+        return outer
+    inner = _as_object(outer[_WRAPPER])
+    return outer if inner is None else _without_format(inner)
+
+
+def _without_format(arguments: dict[str, Any]) -> dict[str, Any]:
+    asked = arguments.get(_FORMAT)
+    if asked not in _FORMATS:
+        raise ToolError(f"{_FORMAT} must be 'json' or 'markdown', not {shown_value(asked)}")
+    return {name: value for name, value in arguments.items() if name != _FORMAT}
+
+
+def _as_object(value: Any) -> dict[str, Any] | None:
+    """An object, or the JSON text of one."""
+    if isinstance(value, str):
+        try:
+            value = json.loads(value)
+        except (ValueError, RecursionError):
+            return None
+    return cast("dict[str, Any]", value) if isinstance(value, dict) else None
 
 
 def _as_meant(value: Any, schema: dict[str, Any]) -> Any:

@@ -113,6 +113,28 @@ def test_an_unknown_command_is_bad_input(capsys: pytest.CaptureFixture[str]) -> 
     assert 'Unknown command "fly"' in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [
+        (["sttus"], "status"),
+        (["run", "--untl", "x > 1"], "--until"),
+        (["prun"], ""),
+        (["run", "--rset"], ""),
+        (["pause", "--forc"], ""),
+        (["breakpoint", "--remov", "1"], ""),
+        (["token", "--neww"], ""),
+        (["report", "--overwrit"], ""),
+    ],
+)
+def test_a_misspelled_command_or_option_is_offered_only_what_loses_nothing(
+    typed: list[str], offered: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(typed) == 2
+    said = capsys.readouterr().err
+    assert ("Did you mean" in said) == bool(offered)
+    assert offered in said
+
+
 def test_status_tells_what_runs_and_what_could_not_be_recorded(
     rover: RecordedRobot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -174,3 +174,53 @@ def test_a_recording_that_is_refused_is_not_served(
         other.execute("CREATE TABLE tune (name TEXT)")
     with pytest.raises(AssertionError, match="belongs to another application"):
         serve(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("length", "status"),
+    [("x", 400), ("-5", 400), ("+5", 400), ("1_0", 400), ("", 400), ("5, 5", 400), ("9" * 30, 413)],
+)
+def test_a_length_that_is_no_number_or_too_large_is_bad_input(
+    steering: Server, length: str, status: int
+) -> None:
+    own = f"Origin: http://127.0.0.1:{steering.port}\r\nContent-Type: application/json\r\n"
+    said = f"POST {steering.path}steer HTTP/1.1\r\nHost: localhost\r\n{own}"
+    assert raw(steering, f"{said}Content-Length: {length}\r\n\r\n{{}}") == status
+    twice = "Content-Length: 2\r\nContent-Length: 3\r\n\r\n{}"
+    assert raw(steering, said + twice) == 400
+    assert raw(steering, f"{said}Transfer-Encoding: chunked\r\n\r\n0\r\n\r\n") == 400
+    assert answer(steering, "")[0] == 200
+
+
+@pytest.mark.parametrize("body", ["", "[]", "{", "[" * 90_000])
+def test_an_order_that_is_no_object_is_bad_input(steering: Server, body: str) -> None:
+    own = f"Origin: http://127.0.0.1:{steering.port}\r\nContent-Type: application/json\r\n"
+    said = f"POST {steering.path}steer HTTP/1.1\r\nHost: localhost\r\n{own}"
+    assert raw(steering, f"{said}Content-Length: {len(body)}\r\n\r\n{body}") == 400
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:{}@evil", "localhost:{}.evil", "localhost:", "[::1"])
+def test_what_only_begins_like_this_computer_is_another_host(told: Server, host: str) -> None:
+    assert answer(told, "", Host=host.format(told.port))[0] == 403
+
+
+@pytest.mark.slow
+def test_a_request_that_comes_byte_by_byte_is_not_waited_for(told: Server) -> None:
+    with closing(socket.create_connection(("127.0.0.1", told.port), 1)) as slow:
+        while True:  # until the server has closed it, though something came each second
+            try:
+                slow.sendall(b"G")
+                if not slow.recv(1):
+                    break
+            except TimeoutError:
+                continue
+            except OSError:
+                break
+    assert answer(told, "")[0] == 200
+
+
+def raw(server: Server, said: str) -> int:
+    """The status of the answer to what http.client would not send."""
+    with closing(socket.create_connection(("127.0.0.1", server.port), 60)) as connection:
+        connection.sendall(said.encode())
+        return int(connection.makefile("rb").readline().split()[1])

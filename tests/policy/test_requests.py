@@ -33,18 +33,6 @@ pytestmark = pytest.mark.anyio
 PACKAGE = Path(webots_mcp.__file__).parent
 
 
-@pytest.fixture
-def project(tmp_path: Path) -> Path:
-    for name in ("worlds", "controllers", "mcp_data"):
-        (tmp_path / name).mkdir()
-    return tmp_path
-
-
-@pytest.fixture
-def file(project: Path) -> Path:
-    return project / "mcp_data" / "webots.db"
-
-
 async def run(*words: str) -> int:
     """A command of the command line, which has an event loop of its own."""
     return await to_thread.run_sync(main, list(words))

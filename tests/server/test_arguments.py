@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from tests.recordings.rows import Recorded
-from tests.server.conftest import Connect, ask, fail, text_of
+from tests.server.conftest import Connect, Driver, ask, fail, text_of
 
 pytestmark = pytest.mark.anyio
 
@@ -17,10 +17,14 @@ HUGE = 2**63
 @pytest.mark.parametrize(
     ("tool", "arguments", "told"),
     [
-        ("compare_runs", {"runs": [1, 2]}, "no parameter 'runs': there is run_ids, "),
-        ("get_trends", {"params": "robot"}, "no parameter 'params'"),
-        ("get_logs", {"force": True}, "no parameter 'force': there is "),
-        ("list_robots", {"x": 1}, "no parameter 'x': there is none"),
+        ("compare_runs", {"runs": [1, 2]}, "unknown argument 'runs': there is run_ids, "),
+        ("get_trends", {"params": {"robot": "a"}, "run_id": 1}, "unknown argument 'params'"),
+        ("get_trends", {"params": {"strt_s": 1}}, "unknown argument 'strt_s': there is start_s, "),
+        ("get_trends", {"params": "robot"}, "unknown argument 'params'"),
+        ("get_logs", {"response_format": "yaml"}, "response_format must be 'json' or 'markdown'"),
+        ("get_logs", {"force": True}, "unknown argument 'force': there is "),
+        ("monitor", {"duration": 120}, "duration must be less than or equal to 90, not 120"),
+        ("list_robots", {"x": 1}, "unknown argument 'x': there is none"),
         ("query_history", {}, "signals is missing"),
         ("query_history", {"signals": ["x"], "max_points": 501}, "max_points must be less than"),
         ("query_history", {"signals": []}, "signals must have at least 1 item, not []"),
@@ -41,12 +45,13 @@ HUGE = 2**63
         ("query_sql", {"sql": "x" * 10**6}, "sql must have at most"),
         ("get_trends", {"since_wall_time": [1]}, "since_wall_time must be a valid number, not [1]"),
         ("get_logs", {"lines": 1e308}, "lines must be a smaller number, not 1e+308"),
-        ("get_logs", {"n" * 10**5: 1}, "no parameter 'nnn"),
-        ("get_trends", {"signal": ["x"]}, "no parameter 'signal': there is signals, "),
-        ("find_events", {"strt_s": 1}, "no parameter 'strt_s': there is start_s, "),
-        ("find_events", {"for_s": 2.0}, "no parameter 'for_s': there is start_s, "),
+        ("get_logs", {"n" * 10**5: 1}, "unknown argument 'nnn"),
+        ("get_trends", {"signal": ["x"]}, "unknown argument 'signal': there is signals, "),
+        ("find_events", {"strt_s": 1}, "unknown argument 'strt_s': there is start_s, "),
+        ("find_events", {"for_s": 2.0}, "unknown argument 'for_s': there is start_s, "),
         ("query_history", {"signals": ["x"], "cursor": 3}, "only rows go on with cursor"),
         ("monitor", {"duration_wall_s": 2, "lookback_wall_s": 9}, "give either duration_wall_s"),
+        ("monitor", {"duration_wall_s": 2, "duration": 9}, "give either duration_wall_s"),
         ("simulation_control", {"command": "pause", "steps": 2}, "steps is for command='step'"),
         ("get_trends", {"robot": "r" * 201}, "robot must have at most 200 characters, not"),
     ],
@@ -94,6 +99,38 @@ async def test_a_parameter_that_may_be_left_out_may_be_null_as_well(connect: Con
             assert not answer.is_error
 
 
+@pytest.mark.parametrize(
+    ("tool", "arguments"),
+    [
+        ("get_world_info", {"params": {"response_format": "markdown"}}),
+        ("get_robot_state", {"params": {"response_format": "json"}}),
+        ("get_sensors", {"params": '{"response_format": "json"}'}),
+        ("get_full_state", {"params": {}}),
+        ("get_camera", {"params": {}}),
+        ("get_logs", {"params": {"lines": 20, "filter_text": None}}),
+        ("monitor", {"params": {"duration": 1}}),
+        ("simulation_control", {"params": {"command": "step"}}),
+        ("world_reset", {"params": {"force": False}}),
+        ("reset_controller_state", {"params": {}}),
+        ("take_screenshot", {"params": {}}),
+        ("send_command", {"params": {"action": "set_speed", "params": {"speed": 2.0}}}),
+        ("world_reset", {"response_format": "markdown"}),
+    ],
+)
+async def test_the_calls_of_a_server_whose_tools_take_one_object_are_understood(
+    connect: Connect, driver: Driver, tool: str, arguments: dict[str, Any]
+) -> None:
+    async with connect() as client:
+        answer = await client.call_tool(f"webots_{tool}", arguments)
+    assert not answer.is_error, text_of(answer)
+
+
+async def test_a_reload_may_be_forced(connect: Connect) -> None:
+    async with connect() as client:
+        told = await fail(client, "webots_world_reload", force=True)
+    assert "keyboard: " in told and "needs force=true" not in told
+
+
 async def test_every_schema_says_that_there_are_no_other_parameters(connect: Connect) -> None:
     async with connect() as client:
         tools = (await client.list_tools()).tools
@@ -134,7 +171,8 @@ async def test_a_misspelt_signal_is_answered_with_the_nearest_names(
     [
         ("find_events", {"kinds": ["stucked"]}, "stuck"),
         ("get_logs", {"level": "warn"}, "warning"),
-        ("simulation_control", {"command": "resett"}, "reset"),
+        ("simulation_control", {"command": "resumee"}, "resume"),
+        ("edit_scene", {"action": "move", "path": "BALL"}, "set"),
         ("simulation_control", {"command": "stop"}, "pause"),
         ("simulation_control", {"command": "start"}, "resume"),
         ("list_commands", {"status": "canceled"}, "cancelled"),
@@ -146,3 +184,50 @@ async def test_a_near_miss_of_a_choice_is_offered_what_was_perhaps_meant(
     async with connect() as client:
         told = await fail(client, f"webots_{tool}", **arguments)
     assert told.endswith(f"; did you mean {near!r}?")
+
+
+@pytest.mark.parametrize(
+    ("tool", "arguments"),
+    [
+        ("simulation_control", {"command": "resett"}),
+        ("simulation_control", {"command": "reloaded"}),
+        ("edit_scene", {"action": "removed", "path": "BALL"}),
+        ("world", {"action": "quitt"}),
+        ("breakpoint", {"change": "remov"}),
+        ("send_command", {"action": "resett"}),
+        ("send_command", {"action": "delete_node"}),
+        ("send_command", {"action": "erase_mapp"}),
+    ],
+)
+async def test_nothing_that_loses_something_is_offered_as_what_was_meant(
+    connect: Connect, recorded: Recorded, tool: str, arguments: dict[str, Any]
+) -> None:
+    recorded.robot(actions='{"erase_map": "Forget the map."}')
+    async with connect() as client:
+        told = await fail(client, f"webots_{tool}", **arguments)
+    assert "did you mean" not in told
+
+
+@pytest.mark.parametrize(
+    ("tool", "arguments", "call"),
+    [
+        ("set_parameters", {"speed": 4}, 'webots_set_parameters(values={"speed":4})'),
+        (
+            "set_parameters",
+            {"robot": "rover", "speed": 4, "gait": "trot"},
+            'webots_set_parameters(robot="rover", values={"speed":4,"gait":"trot"})',
+        ),
+        (
+            "send_command",
+            {"action": "go_to", "x": 1.5},
+            'webots_send_command(action="go_to", params={"x":1.5})',
+        ),
+        ("run", {"kp": 2}, 'webots_run(parameters={"kp":2})'),
+    ],
+)
+async def test_names_of_the_controller_are_shown_in_the_argument_that_takes_them(
+    connect: Connect, tool: str, arguments: dict[str, Any], call: str
+) -> None:
+    async with connect() as client:
+        told = await fail(client, f"webots_{tool}", **arguments)
+    assert told.endswith(f": {call}")

@@ -254,9 +254,8 @@ async def test_waiting_reports_progress_every_second(connect: Connect, recorded:
     [
         ("stop", "'pause'"),
         ("startSimulation", "'resume'"),
-        ("restart", "'reset' or 'reload'"),
         ("goto", "'drive_to'"),
-        ("delete_node", "'remove_node'"),
+        ("move", "'drive_to' or 'set_field'"),
     ],
 )
 async def test_an_unknown_action_is_refused_with_what_asks_for_the_same_in_other_words(

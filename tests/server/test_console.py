@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -157,3 +158,40 @@ async def test_what_waits_for_a_run_is_told_beside_several_robots_of_the_past(
             robot.beat(ended_wall_time_s=robot.now, end_reason="finished")
         answer = await ask(client, "webots_get_logs")
     assert answer["lines"]["rows"] == [[None, "info", "console: No module named 'arm'", None]]
+
+
+async def test_the_command_line_follows_what_comes(recorded: Recorded, file: Path) -> None:
+    robot = recorded.robot()
+    robot.log(1.0, "first")
+    arguments = [sys.executable, "-m", "webots_mcp", "logs", "--follow", "--database", str(file)]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as process:
+        wait_for_line(process, "first")
+        robot.log(2.0, "second")
+        assert wait_for_line(process, "second") == "2 info 1 second\n"
+        process.terminate()
+
+
+async def test_programs_follow_an_object_for_each_line(recorded: Recorded, file: Path) -> None:
+    robot = recorded.robot()
+    robot.log(1.0, "first")
+    arguments = [sys.executable, "-m", "webots_mcp", "logs", "--follow", "--json", "--database"]
+    with subprocess.Popen([*arguments, file], stdout=subprocess.PIPE, text=True) as process:
+        assert json.loads(wait_for_line(process, "first"))["message"] == "first"
+        robot.log(2.0, "second", level="error")
+        row = json.loads(wait_for_line(process, "second"))
+        assert (row["sim_time_s"], row["level"], row["run_id"]) == (2.0, "error", 1)
+        process.terminate()
+
+
+async def test_following_goes_on_with_its_robot_when_another_one_begins_to_record(
+    recorded: Recorded, file: Path
+) -> None:
+    robot = recorded.robot("rover")
+    robot.log(1.0, "first")
+    arguments = [sys.executable, "-m", "webots_mcp", "logs", "--follow", "--database", str(file)]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as process:
+        wait_for_line(process, "first")
+        recorded.robot("arm").log(1.0, "of the arm")
+        robot.log(2.0, "second")
+        assert wait_for_line(process, "second") == "2 info 1 second\n"
+        process.terminate()

@@ -6,6 +6,7 @@ import http.client
 import json
 import os
 import re
+import socket
 import sqlite3
 import ssl
 import subprocess
@@ -25,8 +26,9 @@ from mcp.client.streamable_http import streamable_http_client
 
 from tests.server.conftest import Driver, ask, fail
 from tests.waiting import until, wait_for
-from webots_mcp.access_token import new_token, token_file
+from webots_mcp.access_token import access_token, new_token, token_file
 from webots_mcp.cli import main
+from webots_mcp.http_server import Place, guarded_app
 from webots_mcp.server import create_server
 
 pytestmark = pytest.mark.anyio
@@ -138,6 +140,11 @@ async def test_nobody_gets_in_without_the_token_or_from_elsewhere(
         assert server.status(Authorization=given) == 401, given
     assert server.status("tools/list", Authorization=f"Bearer {wrong}", Mcp_Session_Id="x") == 401
     assert server.status(Host=f"robots.example:{server.port}") == 421
+    for host in ("127.0.0.1:{}@evil", "127.0.0.1:{}.evil", "localhost:", "localhost:{}/x", "[::1"):
+        assert server.status(Host=host.format(server.port)) == 421, host
+    for origin in ("http://127.0.0.1:{}@evil", "http://localhost:x", "https://localhost:{}"):
+        assert server.status(Origin=origin.format(server.port)) == 403, origin
+    assert server.status(Host=f"localhost:{server.port}", Origin="http://localhost:1") == 200
     assert server.status(Origin="http://robots.example") == 403
     assert server.status(Origin="null") == 403
     modern = {"Mcp_Protocol_Version": "2026-07-28", "Mcp_Method": "tools/list"}
@@ -387,3 +394,48 @@ async def test_a_client_that_goes_away_while_it_speaks_is_no_defect(
                 connection.request("POST", "/mcp", said, named)
     assert server.status() == 200
     assert "ASGI" not in server.stop()
+
+
+async def test_at_the_limit_of_sessions_the_one_that_is_idle_for_longest_ends(
+    tmp_path: Path, home: Path
+) -> None:
+    server = create_server(tmp_path / "webots.db", tmp_path)
+    app = guarded_app(server, Place("127.0.0.1", 80), most_sessions=3)
+    headers = {"Authorization": f"Bearer {access_token()}", **_JSON}
+    body = {"jsonrpc": "2.0", "id": 1, "method": "initialize", "params": _INITIALIZE}
+    ping = {"jsonrpc": "2.0", "id": 2, "method": "ping"}
+    client = httpx2.AsyncClient(
+        transport=httpx2.ASGITransport(app), base_url="http://127.0.0.1", headers=headers
+    )
+    async with server.session_manager.run(), client:
+
+        async def opened() -> str:
+            answer = await client.post("/mcp", json=body)
+            assert answer.status_code == 200
+            return answer.headers["mcp-session-id"]
+
+        async def status(session: str) -> int:
+            answer = await client.post("/mcp", json=ping, headers={"mcp-session-id": session})
+            return answer.status_code
+
+        first, second, third = [await opened() for _ in range(3)]
+        assert await status(first) == 200
+        fourth = await opened()
+        states = {each: await status(each) for each in (first, second, third, fourth)}
+        assert states == {first: 200, second: 404, third: 200, fourth: 200}
+        for _ in range(30):  # clients that nobody ends
+            newest = await opened()
+            assert await status(newest) == 200
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("said", [b"", b"POST /mcp HTTP/1.1\r\nHost: local"])
+async def test_a_connection_that_sends_no_whole_headers_ends(
+    serve: Callable[..., Http], said: bytes
+) -> None:
+    server = serve()
+    with closing(socket.create_connection(("127.0.0.1", server.port), 60)) as stranger:
+        stranger.sendall(said)
+        answer = stranger.recv(100)  # until the server ends it
+    assert answer.startswith(b"HTTP/1.1 408 ") if said else answer == b""
+    assert server.status() == 200

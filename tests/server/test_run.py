@@ -11,7 +11,16 @@ import pytest
 from mcp import Client
 
 from tests.recordings.rows import Recorded, insert
-from tests.server.conftest import STEP_MS, Connect, Driver, ask, ask_until, fail
+from tests.server.conftest import (
+    STEP_MS,
+    Connect,
+    Driver,
+    ask,
+    ask_until,
+    fail,
+    pictures_of,
+    text_of,
+)
 from tests.server.story import rows_of
 from tests.waiting import until
 from webots_mcp.errors import CommandRefusedError
@@ -144,6 +153,49 @@ async def _until_run_is(client: Client, outcome: str, action: str = "run") -> di
         return next((row for row in rows if (row["action"], row["outcome"]) == wanted), None)
 
     return await until(look)
+
+
+async def test_a_picture_comes_beside_the_data(
+    connect: Connect, driver: Driver, file: Path
+) -> None:
+    async with connect() as client:
+        result = await client.call_tool("webots_run", {"for_s": 0.1, "picture": True})
+        assert not result.is_error, text_of(result)
+        assert len(pictures_of(result)) == 1
+        assert result.structured_content is not None
+        picture = result.structured_content["picture"]
+        assert Path(picture["file"]).is_file()
+        assert "webots_take_screenshot" in picture["see"]
+
+
+async def test_where_no_screenshot_comes_the_frame_of_that_step_does_and_the_answer_says_which(
+    connect: Connect, driver: Driver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise RuntimeError("nothing is rendered")
+
+    monkeypatch.setattr(driver.robot, "exportImage", refuse)
+    async with connect() as client:
+        steps = (await paused(client))["sim_time_s"] * 1000 // STEP_MS
+        without = await ask(client, "webots_run", until=f"steps >= {steps + 20}", picture=True)
+        assert "nothing is rendered" in without["picture"]["missing"]
+        camera = driver.robot.getDevice("camera")
+        camera.enable(STEP_MS)
+        driver.bridge.keep_camera(camera)
+        condition = f"steps >= {steps + 60}"
+        await ask(client, "webots_breakpoint", condition=condition, action="keep")
+        asked = {"until": condition, "picture": True}
+        result = await client.call_tool("webots_run", asked)
+        assert not result.is_error, text_of(result)
+        assert result.structured_content is not None
+        answer = result.structured_content
+        assert len(pictures_of(result)) == 1, answer["picture"]
+        picture = answer["picture"]
+        assert picture["camera"] == "camera"
+        assert picture["sim_time_s"] == answer["ran"]["to_s"]
+        assert "nothing is rendered" in picture["no_screenshot"]
+        assert "webots_get_camera" in picture["see"]
+        assert Path(picture["file"]).is_file()
 
 
 async def test_what_cannot_end_is_refused_before_anything_is_sent(

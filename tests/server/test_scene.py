@@ -199,3 +199,19 @@ async def test_an_observer_sees_and_changes_a_world_whose_robots_know_nothing_of
         simulation.quit()
         await anyio.to_thread.run_sync(observing.join, 10)
     assert not observing.is_alive()
+
+
+async def test_after_the_end_of_the_simulation_it_is_said_that_no_controller_is_live(
+    connect: Connect, recorded: Recorded
+) -> None:
+    for name in ("rover", "arm"):
+        robot = recorded.robot(name, supervisor=1)
+        robot.state(1.0, {"x": 1})
+        robot.end_run("finished")
+        robot.beat(ended_wall_time_s=robot.now, end_reason="finished")
+    asked = {"action": "set", "path": "BALL.translation", "value": [0, 0, 1]}
+    async with connect() as client:
+        for robot_name in (None, "rover"):
+            told = await fail(client, "webots_edit_scene", robot=robot_name, **asked)
+            assert "no controller of " in told and " is live (robot '" in told
+            assert "its controller finished" in told and "start the simulation" in told

@@ -11,6 +11,7 @@ import pytest
 from tests.recordings.rows import Recorded
 from tests.server.conftest import DATA_TOOLS, Connect, ask, fail
 from webots_mcp.questions.budget import tokens_of
+from webots_mcp.questions.robot_state import unnamed_devices
 from webots_mcp.store.chunk_making import chunk_whole_run
 
 pytestmark = pytest.mark.anyio
@@ -29,6 +30,13 @@ async def test_the_state_is_rounded_and_long_arrays_are_summarised(
     assert answer["state"]["lidar"]["argmin"] == 7
     assert "arrays over 16 items" in answer["shortened"]
     assert "webots_get_full_state" in answer["hint"]
+
+
+def test_a_device_is_named_in_the_state_however_its_words_are_arranged() -> None:
+    names = ("ds0", "ds7", "front left sonar", "leftEncoder", "range_finder", "gps")
+    devices: dict[str, str] = dict.fromkeys(names, "DistanceSensor")
+    state = {"ds": [1, 2], "sonar": {"front_left": 1.0}, "encoder": {"left": 3}, "seen": {"gps": 1}}
+    assert list(unnamed_devices(state, devices)) == ["ds7", "range_finder"]
 
 
 async def test_a_state_without_sensors_says_where_to_look(

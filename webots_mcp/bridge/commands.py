@@ -16,7 +16,7 @@ from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
 from webots_mcp.contract import BUILT_IN_ACTIONS
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.naming import nearest_first, same_in_meaning
+from webots_mcp.naming import harmless_first
 from webots_mcp.queue import CLAIM, CLAIMED_SINCE, PEEK, SUCCESSOR_PID
 
 if TYPE_CHECKING:
@@ -276,8 +276,7 @@ class Handlers:
 
     def _unknown(self, action: str) -> str:
         """The error of a command whose action is neither built in nor registered."""
-        known = nearest_first(action, (*self._handlers, *BUILT_IN_ACTIONS))
-        known = list(dict.fromkeys((*same_in_meaning(action, known), *known)))
+        known = harmless_first(action, (*self._handlers, *BUILT_IN_ACTIONS))
         text = f"no action {action!r}; this robot has {', '.join(known)}"
         if self._handlers:
             return text

@@ -11,6 +11,7 @@ import contextlib
 import inspect
 import json
 import os
+import re
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -27,7 +28,7 @@ from webots_mcp.cli.terminal import (
     value_name,
 )
 from webots_mcp.errors import InvalidInputError, NotAllowedError, WebotsMCPError
-from webots_mcp.naming import spelled_out
+from webots_mcp.naming import is_destructive, spelled_out
 
 if TYPE_CHECKING:
     from cyclopts import App, Argument, CycloptsError
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from webots_mcp.cli.commands import Command
 
 _NOTHING: Final[Mapping[str, Any]] = MappingProxyType({})
+_OFFER: Final = re.compile(r' Did you mean "?([^\s"?]+)"?\?')
 EXIT_SYSTEM: Final = 1
 EXIT_BAD_INPUT: Final = 2
 
@@ -106,10 +108,15 @@ def _run(argv: Sequence[str]) -> int:
 
 def _named(error: CycloptsError) -> str:
     """What is wrong, and of what; of a value without an option cyclopts leaves its name out."""
-    text, argument = str(error), error.argument
+    text, argument = _OFFER.sub(_harmless_offer, str(error)), error.argument
     if argument is None or any(name in text for name in argument.names):
         return text
     return f"Invalid value for {argument.names[0]}: {text}"
+
+
+def _harmless_offer(offer: re.Match[str]) -> str:
+    """What cyclopts offers for a name that it does not know; nothing where that loses something."""
+    return "" if is_destructive(offer[1]) else offer[0]
 
 
 def _fail(code: int, text: str, given: Sequence[str], answer: Mapping[str, Any] = _NOTHING) -> int:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 import json
 import shlex
+import sys
 import types
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
@@ -35,7 +36,9 @@ from webots_mcp.cli.terminal import (
     running,
     show_progress,
     speak_of,
+    text_of,
     value_name,
+    wait,
 )
 from webots_mcp.contract import LOOPING
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
@@ -68,6 +71,14 @@ _VALUE_NAMES: Final = {
 # What a person does not give, where a model's client would soon give up waiting.
 _DEFAULTS: Final[Mapping[str, Any]] = types.MappingProxyType({"timeout_wall_s": 600.0})
 _OF_SIGNALS: Final = frozenset({"signals", "pattern"})  # that choose among signals
+_FOLLOW: Final = Annotated[
+    bool,
+    Parameter(
+        "--follow", help="Go on with what comes, until Ctrl-C. As JSON each row is an object."
+    ),
+]
+_LOOK_EVERY_S: Final = 0.5
+_FLOOD: Final = "more than {} rows came at once: --before {} shows those that were left out"
 _NOT_DONE: Final = ("failed", "expired", "cancelled", "lost", "claimed")
 _UNDER_WAY: Final = (
     "the controller is still busy with it and goes on: do not send it again, but go on waiting "
@@ -84,9 +95,12 @@ def command_of(question: Question) -> Callable[..., None]:
         span: Range | None = None,
         recorded: Where | None = None,
         json: bool = False,
+        follow: bool = False,
         **options: Any,
     ) -> None:
         given = _named(question, positional) | options | (vars(span) if span else {})
+        if follow:
+            return _follow(question, given, recorded or Where(), as_json=json)
         ask_and_show(question, given, recorded or Where(), as_json=json)
 
     speak_of(
@@ -100,6 +114,8 @@ def command_of(question: Question) -> Callable[..., None]:
     keyword = inspect.Parameter.KEYWORD_ONLY
     if in_range:
         parameters.append(inspect.Parameter("span", keyword, default=Range(), annotation=Range))
+    if question.follows:
+        parameters.append(inspect.Parameter("follow", keyword, default=False, annotation=_FOLLOW))
     parameters += [
         inspect.Parameter("json", keyword, default=False, annotation=Json),
         inspect.Parameter("recorded", keyword, default=Where(), annotation=Where),
@@ -257,6 +273,69 @@ def _under_way(answer: Mapping[str, Any], where: Where) -> str:
 def _require_recorded(data: Mapping[str, Any]) -> None:
     if data.get("status") == "never seen" and set(data) == {"status", "hint"}:
         raise NothingRecordedError(data["hint"])
+
+
+def _follow(question: Question, given: dict[str, Any], where: Where, *, as_json: bool) -> None:
+    """Show an answer, then the rows that come, of the robot that it was about.
+
+    It ends after the answer where nothing can be written to the recording.
+
+    Raises:
+        BrokenPipeError: Nobody reads it any more.
+    """
+    assert question.follows is not None
+    if given.get("cursor") is not None:
+        option = option_of(question, "cursor")
+        raise InvalidInputError(f"--follow shows what comes: leave out {option}, which looks back")
+    reply = ask(question, given, where)
+    data = reply.data or {}
+    _require_recorded(data)
+    if as_json:
+        _print_rows(_rows_in(data, question.follows), as_json=True)
+    else:
+        show(question, reply, where, as_json=False)
+        sys.stdout.flush()
+    new = _NewRows()
+    new.of(_rows_in(data, question.follows))
+    bounds = question.arguments.model_fields[question.follows].metadata
+    most = max(each.le for each in bounds if hasattr(each, "le"))
+    again = given | {question.follows: most} | {"robot": data.get("robot") or given.get("robot")}
+    is_live = where.may_change()
+    while is_live:
+        wait(_LOOK_EVERY_S)
+        rows = _rows_in(ask(question, again, where).data or {}, question.follows)
+        came = new.of(rows)
+        if came and len(came) == most:
+            print(f"webots-mcp: {_FLOOD.format(most, came[0]['id'])}", file=sys.stderr)
+        _print_rows(came, as_json=as_json)
+
+
+class _NewRows:
+    """Which rows of the newest ones were not among those before."""
+
+    def __init__(self) -> None:
+        self._newest: dict[bool, int] = {}
+
+    def of(self, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Those that are new; rows that wait for a run have numbers of their own."""
+        new = [row for row in rows if row["id"] > self._newest.get(row["run_id"] is None, 0)]
+        for row in new:
+            self._newest[row["run_id"] is None] = row["id"]
+        return new
+
+
+def _rows_in(data: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
+    table: dict[str, list[Any]] = data.get(name) or {"columns": [], "rows": []}
+    return [dict(zip(table["columns"], values, strict=True)) for values in table["rows"]]
+
+
+def _print_rows(rows: Sequence[Mapping[str, Any]], *, as_json: bool) -> None:
+    for row in rows:
+        if as_json:
+            print(json.dumps(row, ensure_ascii=False), flush=True)
+        else:
+            shown = (text_of(value) or "-" for name, value in row.items() if name != "id")
+            print(*shown, flush=True)
 
 
 def option_of(question: Question, argument: str) -> str:

@@ -22,6 +22,9 @@ from webots_mcp.cli.options import (
     Robot,
     Where,
     make_chunks_first,
+    only_reading,
+    past_invalid_rows,
+    past_wrong_values,
     refuse_options,
     whole_number,
 )
@@ -132,11 +135,15 @@ def export(
     if form == BUNDLE and file is not None:
         return _show(_export_bundle(recorded, part, file), as_json=json)
 
-    if form in FOR_VIEWERS and file is not None:
-        written = _export_for_viewers(recorded, part, file, form)
-    else:
-        written = _export_table(recorded, part, trial_set, file, form, safe_cells=safe_cells)
-    _show(written, as_json=json)
+    def run() -> None:
+        if form in FOR_VIEWERS and file is not None:
+            written = _export_for_viewers(recorded, part, file, form)
+        else:
+            written = _export_table(recorded, part, trial_set, file, form, safe_cells=safe_cells)
+        _show(written, as_json=json)
+
+    # What went to stdout cannot be taken back: there each row is looked at first.
+    past_invalid_rows(run) if file is None else past_wrong_values(run)
 
 
 def _require_for_stdout(form: str, *, as_json: bool) -> None:
@@ -311,14 +318,18 @@ def prune(
     from webots_mcp.store.retention_plan import file_sizes, plan
 
     asked = limits.asked()
-    if dry_run:
+
+    def look() -> None:
         with recorded.reader() as connection:
             wanted, sizes = plan(connection, in_force(connection, asked)), file_sizes(connection)
         disk = _on_disk(wanted, sizes)
         if json:
             return print_json({"dry_run": True, **_as_data(wanted), "disk_bytes": disk})
         _print_plan(wanted, "would go")
-        return _print_disk(disk)
+        _print_disk(disk)
+
+    if dry_run:
+        return past_wrong_values(look)
     with recorded.writer("prune", asked) as (recording, connection):
         set_limits(connection, asked, "prune")
         retention = in_force(connection)
@@ -449,6 +460,7 @@ def _print_purged(purged: Purged) -> None:
 # -- a recording as lines that follow it, and as a picture --
 
 
+@only_reading
 def tail(
     *,
     limit: Annotated[
@@ -477,7 +489,6 @@ def tail(
     can be written, nothing can come, and it ends after the last lines. As JSON each line is an
     object.
     """
-    from webots_mcp.connection import FrozenConnection
     from webots_mcp.store.logs import Follower
     from webots_mcp.store.robots import resolve_robot
 
@@ -485,7 +496,7 @@ def tail(
         found = robot and resolve_robot(connection, robot, time.time())
         follower = Follower(connection, found.id if found else None)
         _print_lines(follower.look(limit), as_json=json)
-        following = not no_follow and not isinstance(connection, FrozenConnection)
+        following = not no_follow and recorded.may_change()
         while following:
             wait(interval_s)
             recorded.recording().take_in()
@@ -538,23 +549,26 @@ def plot(
     ids = [int(each) for each in run_ids or () if _is_id(each)]
     behind_runs = [each for each in run_ids or () if not _is_id(each)]
 
-    from webots_mcp import plotting
-    from webots_mcp.plotting.canvas import image_format_of
+    def draw() -> None:
+        from webots_mcp import plotting
+        from webots_mcp.plotting.canvas import image_format_of
 
-    make_chunks_first(recorded.recording())
-    with recorded.reader() as connection:
-        picture = plotting.plot(
-            connection,
-            "trajectory" if trajectory else "signals",
-            [*signals, *behind_runs],
-            scope=(span or Range()).scope(),
-            run_ids=ids,
-            trial_set=trial_set,
-            width_px=width_px,
-            height_px=height_px,
-            image_format=image_format_of(output),
-        )
-    write_picture(output, picture, as_json=json)
+        make_chunks_first(recorded.recording())
+        with recorded.reader() as connection:
+            picture = plotting.plot(
+                connection,
+                "trajectory" if trajectory else "signals",
+                [*signals, *behind_runs],
+                scope=(span or Range()).scope(),
+                run_ids=ids,
+                trial_set=trial_set,
+                width_px=width_px,
+                height_px=height_px,
+                image_format=image_format_of(output),
+            )
+        write_picture(output, picture, as_json=json)
+
+    past_wrong_values(draw)
 
 
 def _is_id(text: str) -> bool:

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 import re
 import sys
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Final, ParamSpec, TypeAlias
 
 import cyclopts
 from cyclopts import Token
 from cyclopts.validators import Number
 
-from webots_mcp.errors import InvalidInputError
+from webots_mcp.errors import InvalidInputError, MalformedRowError, WebotsMCPError
 from webots_mcp.store.retention import (
     DEFAULT,
     NO_LIMIT,
@@ -119,6 +120,10 @@ def _no_constant(name: str) -> float:
 
 # -- which recording, which part of it, and how it is opened --
 
+_Given = ParamSpec("_Given")
+# Not owed to a value in a row: reading past invalid rows would not help.
+_OF_NO_VALUE: Final = (WebotsMCPError, OSError, ImportError)
+
 _MAKING_CHUNKS_S: Final = 300.0  # a million rows of 40 values take 100 s
 Json: TypeAlias = Annotated[bool, Parameter("--json", negative=(), help="Print JSON.")]
 Robot: TypeAlias = Annotated[
@@ -171,6 +176,13 @@ class Where:
             for said in storage(connection).values():
                 print(f"webots-mcp: {said}", file=sys.stderr)
             yield connection
+
+    def may_change(self) -> bool:
+        """Whether rows may still come: none do where the file cannot be written."""
+        from webots_mcp.connection import FrozenConnection
+
+        with self.recording().reader() as connection:
+            return not isinstance(connection, FrozenConnection)
 
     @contextmanager
     def writer(
@@ -269,6 +281,36 @@ class Range:
         from webots_mcp.store.reading.ranges import find_range
 
         return find_range(connection, self.scope())
+
+
+def only_reading(command: Callable[_Given, None]) -> Callable[_Given, None]:
+    """A command that fails over a value that no bridge has written reads again past such rows."""
+
+    @functools.wraps(command)
+    def read(*arguments: _Given.args, **options: _Given.kwargs) -> None:
+        past_wrong_values(functools.partial(command, *arguments, **options))
+
+    return read
+
+
+def past_wrong_values(run: Callable[[], None]) -> None:
+    """Run what only reads; where it fails over a value, again past invalid rows."""
+    try:
+        return run()
+    except Exception as error:
+        if isinstance(error, _OF_NO_VALUE) and not isinstance(error, MalformedRowError):
+            raise
+    past_invalid_rows(run)
+
+
+def past_invalid_rows(run: Callable[[], None]) -> None:
+    """Run what only reads past invalid rows, which are named on stderr."""
+    from webots_mcp.store import invalid_rows
+
+    with invalid_rows.past_invalid_rows() as invalid:
+        run()
+    for said in invalid.described():
+        print(f"webots-mcp: left out: {said}", file=sys.stderr)
 
 
 def make_chunks_first(recording: Recording) -> None:

@@ -364,7 +364,7 @@ _TIMES: Final = ("sim_time_s", "since_s")  # lists of them
 _CALLED_ALIKE: Final = ("numbers", "signals")  # what they hold has names of its own
 _AS_READ: Final = "result"  # rows of a database, where null is a value; or of a command
 _OF_TABLE: Final = ("columns", "rows", "in_every_row")
-_NOTES: Final = ("why", "storage", "position_by", "notes", "hint")
+_NOTES: Final = ("why", "storage", "position_by", "notes", "hint", "left_out")
 
 
 def print_answer(answer: Mapping[str, Any]) -> None:
@@ -393,7 +393,7 @@ def answer_lines(
         value = answer.get(name)
         texts = cast("list[str]", value if isinstance(value, list) else [value] if value else [])
         for text in texts:
-            yield from note_lines(text, width)
+            yield from note_lines(f"left out: {text}" if name == "left_out" else text, width)
 
 
 def note_lines(text: str, width: int = _PARAGRAPH) -> list[str]:

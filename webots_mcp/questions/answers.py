@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,13 @@ class Answer(Part):
     storage: str | None = said("Where the recording cannot be written: how it was read.")
     position_by: str | None = said("Who saw the robot, where it publishes no position itself.")
     hint: str | None = said("What to do next.")
+    left_out: list[str] | None = said("Invalid rows and values, which are left out.")
+    _pictures: list[ShownPicture] = PrivateAttr(default_factory=list[ShownPicture])
+
+    @property
+    def pictures(self) -> list[ShownPicture]:
+        """What is shown beside the data, by clients that show both."""
+        return self._pictures
 
 
 class StateAnswer(Answer):
@@ -68,6 +75,9 @@ class SensorsAnswer(Answer):
 
     sensors: dict[str, Any] = Field(default_factory=dict[str, Any])
     replaced: dict[str, str] | None = said("Values that JSON cannot hold: path to nan, inf, ...")
+    devices_not_named_in_state: str | None = said(
+        "Sensors that the state lacks, or names differently than Webots."
+    )
     shortened: str | None = None
 
 
@@ -373,6 +383,7 @@ class RunAnswer(CommandAnswer):
     events: Table | None = None
     not_shown: dict[str, str] | None = None
     rows: Table | None = said("The last rows, of its signals.")
+    picture: dict[str, Any] | None = None
 
 
 class SqlAnswer(Answer):

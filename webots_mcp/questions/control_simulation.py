@@ -26,6 +26,7 @@ from webots_mcp.questions.declaring import (
     merged,
     question,
 )
+from webots_mcp.questions.show_pictures import show_end
 from webots_mcp.steering.dispatch import ACTION, Dispatcher, require_possible
 from webots_mcp.steering.routes import Attempt, WorldRequest, project_of
 from webots_mcp.store.recording import Recording
@@ -260,6 +261,7 @@ _RUN_WAIT_S: Final = 60.0
     core=True,
     example="--until 'front_m < 0.1' --for 20 --reset --set kp=2",
     quotes=True,
+    of_controller="parameters",
 )
 async def webots_run(
     recording: Recording,
@@ -281,6 +283,7 @@ async def webots_run(
         Field(description="Set these first, all or none."),
     ] = None,
     then: Annotated[Then, Field(description="At that step; go_on: at the old pace.")] = "pause",
+    picture: Annotated[bool, Field(description="Show the end as a screenshot too.")] = False,
     robot: RobotName = None,
     timeout_wall_s: TimeoutS = _RUN_WAIT_S,
 ) -> RunAnswer:
@@ -300,7 +303,10 @@ async def webots_run(
     }
     dispatcher = Dispatcher(recording, caller.report)
     asked = {name: value for name, value in params.items() if value is not None}
-    return cast("RunAnswer", await dispatcher.ask(robot, ACTION, timeout_wall_s, asked))
+    answer = cast("RunAnswer", await dispatcher.ask(robot, ACTION, timeout_wall_s, asked))
+    if picture and answer.outcome == "done":
+        await show_end(recording, dispatcher, answer)
+    return answer
 
 
 WORLD: Final = merged(

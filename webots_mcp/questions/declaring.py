@@ -8,7 +8,6 @@ A question is a function whose annotated parameters are its arguments and whose 
 
 from __future__ import annotations
 
-import difflib
 import functools
 import inspect
 import json
@@ -43,10 +42,17 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from webots_mcp import contract
-from webots_mcp.errors import InvalidInputError, NoDatabaseError, NothingRecordedError
-from webots_mcp.naming import same_in_meaning
+from webots_mcp.errors import (
+    InvalidInputError,
+    MalformedRowError,
+    NoDatabaseError,
+    NothingRecordedError,
+    WebotsMCPError,
+)
+from webots_mcp.naming import perhaps_meant
 from webots_mcp.questions.answers import Answer, ShownPicture
 from webots_mcp.questions.budget import Client, compact_json, reader
+from webots_mcp.store.invalid_rows import past_invalid_rows
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.requests import BY_COMMAND_LINE, OpenRequest, Requester
@@ -102,7 +108,7 @@ class Reply(NamedTuple):
 
     Attributes:
         data: The answer as JSON knows it; None where it is pictures with captions.
-        shown: The data as compact text; or captions and pictures.
+        shown: The data as compact text, or captions; and the pictures.
     """
 
     data: dict[str, Any] | None
@@ -122,7 +128,11 @@ class Question:
         positional: The arguments that the command line takes without an option's name.
         options: Names of options that differ from the argument's, as `--run` for `run_id`.
         core: Whether it is among the few that `serve --tools core` lists.
+        follows: The table of the answer, oldest row first, that `--follow` goes on with as rows
+            come. A row has an `id` for a person, and a `run_id`. The argument of that name says how
+            many rows there may be.
         example: What a person types behind the command's name, for its help alone.
+        of_controller: The argument that takes names which the controller has declared.
         quotes: Its answers hold texts that controllers, worlds or people wrote, and say so to a
             model, once.
     """
@@ -134,8 +144,10 @@ class Question:
     positional: tuple[str, ...] = ()
     options: Mapping[str, str] | None = None
     core: bool = False
+    follows: str | None = None
     example: str | None = None
     quotes: bool = False
+    of_controller: str | None = None
 
     @property
     def name(self) -> str:
@@ -194,19 +206,33 @@ class Question:
     async def ask(
         self, recording: Recording, arguments: Mapping[str, Any], caller: Caller | None
     ) -> Reply:
-        """The answer to valid arguments; one that only reads answers that nothing was recorded.
+        """The answer to valid arguments.
+
+        One that only reads, and fails over a value that no bridge has written, is asked again past
+        such rows, which the answer names; one that acts looks past them at once.
 
         Raises:
             WebotsMCPError: As the question says.
         """
-        try:
-            return await self._call(recording, arguments, caller)
-        except (NoDatabaseError, NothingRecordedError) as error:
-            if not self.effect.reads:
+        if self.effect.reads:
+            try:
+                return await self._call(recording, arguments, caller)
+            except (NoDatabaseError, NothingRecordedError) as error:
+                return self._empty(error, [])
+            except Exception as error:
+                if isinstance(error, WebotsMCPError) and not isinstance(error, MalformedRowError):
+                    raise
+        with past_invalid_rows() as invalid:
+            try:
+                reply = await self._call(recording, arguments, caller)
+            except (NoDatabaseError, NothingRecordedError) as error:
+                if not self.effect.reads:
+                    raise
+                return self._empty(error, invalid.described())
+            except WebotsMCPError as error:
+                error.left_out = tuple(invalid.described())
                 raise
-            if self.answer is None:
-                return Reply(None, [str(error)])
-            return _reply(self.answer(status="never seen", hint=str(error)))
+        return _with_left_out(reply, invalid.described())
 
     async def _call(
         self, recording: Recording, arguments: Mapping[str, Any], caller: Caller | None
@@ -238,14 +264,34 @@ class Question:
         found = (n for n, p in self.signature.parameters.items() if p.annotation is kind)
         return next(found, None)
 
+    def _empty(self, error: WebotsMCPError, left_out: Sequence[str]) -> Reply:
+        """A question that only reads answers that nothing was recorded, instead of failing."""
+        if self.answer is None:
+            return _with_left_out(Reply(None, [str(error)]), left_out)
+        return _with_left_out(_reply(self.answer(status="never seen", hint=str(error))), left_out)
+
 
 def _reply(answer: Any) -> Reply:
     """What a function has returned; a text that UTF-8 cannot hold fails here."""
     if not isinstance(answer, Answer):
         return Reply(None, answer)
-    text = compact_json(answer.model_dump(mode="json", exclude_none=True))
+    return _in_text(answer.model_dump(mode="json", exclude_none=True), answer.pictures)
+
+
+def _in_text(data: dict[str, Any], pictures: Sequence[str | ShownPicture]) -> Reply:
+    text = compact_json(data)
     text.encode()  # what UTF-8 cannot hold would end the connection to a client
-    return Reply(json.loads(text), [text])
+    return Reply(json.loads(text), [text, *pictures])
+
+
+def _with_left_out(reply: Reply, left_out: Sequence[str]) -> Reply:
+    """The reply, which names the rows that were not looked at."""
+    if not left_out:
+        return reply
+    if reply.data is None:
+        return Reply(None, [*reply.shown, compact_json({"left_out": list(left_out)})])
+    whole = [*(reply.data.get("left_out") or ()), *left_out]
+    return _in_text(reply.data | {"left_out": whole}, reply.shown[1:])
 
 
 def question(
@@ -256,12 +302,24 @@ def question(
     positional: tuple[str, ...] = (),
     options: Mapping[str, str] | None = None,
     core: bool = False,
+    follows: str | None = None,
     example: str | None = None,
     quotes: bool = False,
+    of_controller: str | None = None,
 ) -> Callable[[Callable[..., Any]], Question]:
     """Declare a function as a question; see `Question`."""
     return lambda function: Question(
-        function, title, effect, command, positional, options, core, example, quotes
+        function,
+        title,
+        effect,
+        command,
+        positional,
+        options,
+        core,
+        follows,
+        example,
+        quotes,
+        of_controller,
     )
 
 
@@ -540,7 +598,7 @@ def _near(error: ErrorDetails) -> str:
     """What was perhaps meant."""
     choices = re.findall(r"'([^']+)'", error["msg"])
     given = str(error["input"])[:_LONGEST_VALUE]
-    near = same_in_meaning(given, choices) or difflib.get_close_matches(given, choices, n=1)
+    near = perhaps_meant(given, choices, most=1)
     return f"; did you mean {' or '.join(map(repr, near))}?" if near else ""
 
 

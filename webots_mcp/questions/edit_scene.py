@@ -134,6 +134,10 @@ _NO_SUPERVISOR: Final = (
     "TRUE and create that robot with Supervisor(), or open the world with an observer in it, made "
     "by webots-mcp init --observer WORLD"
 )
+_NONE_LIVE: Final = (
+    "no controller of {} is live (robot {!r}: {}): start the simulation, then ask again; "
+    "webots_get_world_info has what was recorded"
+)
 
 
 async def _ask(
@@ -166,15 +170,19 @@ def _find_supervisor(recording: Recording, robot: str | None) -> str:
     now_s = time.time()
     with recording.reader() as connection:
         own = look(connection, robot).session if robot is not None else None
-        found = [
+        meant = [
             (each, each.session)
             for each in list_robots(connection, now_s)
-            if each.live and each.session is not None and each.session.supervisor
-            if own is None or each.session.instance == own.instance
+            if each.session is not None and (own is None or each.session.instance == own.instance)
         ]
+        found = [pair for pair in meant if pair[0].live and pair[1].supervisor]
         if not found:
-            look(connection, robot)  # raises where nothing is recorded, and says how to record
             where = "this simulation" if robot is None else f"the simulation of robot {robot!r}"
+            if meant and not any(each.live for each, _ in meant):
+                last, _ = max(meant, key=lambda pair: pair[1].last_seen_wall_time_s)
+                why = look(connection, last.name).status.why
+                raise CommandRefusedError(_NONE_LIVE.format(where, last.name, why))
+            look(connection, robot)  # raises where nothing is recorded, and says how to record
             raise CommandRefusedError(_NO_SUPERVISOR.format(where))
         if len({session.instance for _, session in found}) > 1:
             listed = ", ".join(repr(each.name) for each, _ in found)

@@ -56,6 +56,7 @@ _NO_RUN_YET: Final = (
     options={"lines": "-n", "filter_text": "--text", "cursor": "--before"},
     core=True,
     quotes=True,
+    follows="lines",
 )
 def webots_get_logs(
     recording: Recording,

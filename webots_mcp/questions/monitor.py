@@ -12,6 +12,7 @@ from typing import Annotated, Any, Final
 import anyio
 from anyio import to_thread
 from pydantic import Field
+from pydantic.json_schema import SkipJsonSchema
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.answers import MonitorAnswer
@@ -46,14 +47,14 @@ _EVENTS_SHARE: Final = 0.45  # of them
 _TOLD_RUNS: Final = 2  # whose trends are told: that before a reset, and that after it
 _ROWLESS: Final = EventOptions(kinds=("run", "command", "log", "bridge_event"))  # without any row
 
+_WatchS = Annotated[float, Field(ge=1, le=MAX_WAIT_S)] | None
+
 
 @question("Watch the robot", READS, core=True, quotes=True)
 async def webots_monitor(
     recording: Recording,
     caller: Caller,
-    duration_wall_s: Annotated[
-        Annotated[float, Field(ge=1, le=MAX_WAIT_S)] | None, Field(description="To watch; 10.")
-    ] = None,
+    duration_wall_s: Annotated[_WatchS, Field(description="To watch; 10.")] = None,
     lookback_wall_s: Annotated[
         float | None,
         Field(
@@ -62,6 +63,7 @@ async def webots_monitor(
             description="Instead: the last wall seconds, at once.",
         ),
     ] = None,
+    duration: SkipJsonSchema[_WatchS] = None,
     robot: RobotName = None,
 ) -> MonitorAnswer:
     """What does it do now? Watch it live for some seconds of wall time, then report.
@@ -69,12 +71,12 @@ async def webots_monitor(
     Movement, trends and events of that window. Of longer ago: webots_get_trends and
     webots_find_events.
     """
-    if duration_wall_s is not None and lookback_wall_s is not None:
+    if sum(each is not None for each in (duration_wall_s, lookback_wall_s, duration)) > 1:
         raise InvalidInputError(
             "give either duration_wall_s, to watch from now on, or lookback_wall_s, to look back "
             "at once"
         )
-    duration_wall_s = duration_wall_s or USUAL_DURATION_S
+    duration_wall_s = duration_wall_s or duration or USUAL_DURATION_S
     if lookback_wall_s is not None:
         return await to_thread.run_sync(look_back, recording, robot, lookback_wall_s)
     name, started_s, is_live = await to_thread.run_sync(_start, recording, robot)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Annotated, Any, Final, cast
 
 from pydantic import Field
@@ -26,6 +27,7 @@ from webots_mcp.questions.answers import (
 from webots_mcp.questions.budget import (
     ANSWER_TOKENS,
     LARGE_ANSWER_TOKENS,
+    STATE_BUDGET_TOKENS,
     WHOLE,
     Shortened,
     compact_json,
@@ -348,6 +350,7 @@ _SHOWN_NAMES: Final = 6
 _MARGIN_TOKENS: Final = 200  # for hints
 _SHOWN_REPLACED: Final = 20
 _NULL: Final = "the value at this path is null"  # which an answer leaves out
+_SHOWN_DEVICES: Final = 30
 _ERROR_CHARACTERS: Final = 300
 
 PagePath = Annotated[
@@ -394,11 +397,16 @@ def webots_get_sensors(
             return SensorsAnswer(**view.header(), hint=_nothing_yet(view))
         state = view.state.value()
         sensors = sensor_part(state, view.robot.devices)
-        short = shorten(sensors)
+        unnamed = unnamed_devices(state, view.robot.devices)
+        missing = [f"{name} ({kind})" for name, kind in unnamed.items()]
+        replaced, not_named = _replaced_in(view.state, sensors), some(missing, _SHOWN_DEVICES)
+        left_tokens = ANSWER_TOKENS - _MARGIN_TOKENS - tokens_of([replaced, not_named])
+        short = shorten(sensors, min(STATE_BUDGET_TOKENS, left_tokens))
         return SensorsAnswer(
             **view.header(),
             sensors=short.value,
-            replaced=_replaced_in(view.state, sensors),
+            replaced=replaced,
+            devices_not_named_in_state=not_named or None,
             shortened=short.rule,
             hint=None if sensors else _no_sensors(state),
         )
@@ -629,13 +637,50 @@ _WORDS: Final = (
     "bumper", "distance", "range", "radar", "sonar", "light", "altimeter", "camera", "odometry",
     "battery", "force", "contact", "scan",
 )  # fmt: skip
+_MOST_ITEMS: Final = 64  # of an array, each of which may be a device
+_HUMP: Final = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
+_WORD: Final = re.compile(r"[^\W\d_]+|\d+")
 
 
 def sensor_part(state: dict[str, Any], devices: dict[str, str]) -> dict[str, Any]:
     """The members of a state that have the name of a sensor of the robot, or a sensor's word."""
-    sensors = {name for name, kind in devices.items() if kind not in _NO_SENSORS}
+    sensors = _sensor_devices(devices)
+    return {key: state[key] for key in state if key in sensors or _has_sensor_word(key)}
+
+
+def _sensor_devices(devices: dict[str, str]) -> dict[str, str]:
+    """The devices that are sensors: name to class."""
+    return {name: kind for name, kind in devices.items() if kind not in _NO_SENSORS}
+
+
+def unnamed_devices(state: dict[str, Any], devices: dict[str, str]) -> dict[str, str]:
+    """The sensor devices whose name is in no name of the published values.
+
+    The words of a name may be anywhere in a path: `front left`, `left_front` and `ds0` match
+    `front: {left: 1}` and `ds: [1]`.
+    """
+    published = [_words(path) for path in _paths(state)]
     return {
-        key: value
-        for key, value in state.items()
-        if key in sensors or any(word in key.lower() for word in _WORDS)
+        name: kind
+        for name, kind in _sensor_devices(devices).items()
+        if not any(_words(name) <= words for words in published)
     }
+
+
+def _has_sensor_word(key: str) -> bool:
+    return any(word in key.lower() for word in _WORDS)
+
+
+def _paths(value: Any, path: str = "") -> Iterator[str]:
+    """The path of each member at any depth, and of the first items of arrays."""
+    yield path
+    if isinstance(value, dict):
+        for key, member in cast("dict[str, Any]", value).items():
+            yield from _paths(member, f"{path}.{key}")
+    elif isinstance(value, list):
+        for index, item in enumerate(cast("list[Any]", value)[:_MOST_ITEMS]):
+            yield from _paths(item, f"{path}.{index}")
+
+
+def _words(name: str) -> set[str]:
+    return set(_WORD.findall(_HUMP.sub(" ", name).lower()))

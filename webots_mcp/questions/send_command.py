@@ -242,6 +242,7 @@ _LONGEST_TEXT: Final = 200
     example="go_to x=1.5 y=-0.5",
     core=True,
     quotes=True,
+    of_controller="params",
 )
 async def webots_send_command(
     recording: Recording,
@@ -432,7 +433,7 @@ def webots_get_parameters(
         )
 
 
-@question("Set parameters", SETS, core=True)
+@question("Set parameters", SETS, core=True, of_controller="values")
 async def webots_set_parameters(
     recording: Recording,
     values: Annotated[

@@ -14,10 +14,10 @@ from anyio import to_thread
 from pydantic import Field
 
 from webots_mcp.contract import KEPT_FRAME
-from webots_mcp.errors import CommandRefusedError, InvalidInputError
+from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 from webots_mcp.plotting import PlotKind, plot
 from webots_mcp.plotting.canvas import HEIGHT_PX, LEAST_HEIGHT_PX, LEAST_WIDTH_PX, MOST_PX, WIDTH_PX
-from webots_mcp.questions.answers import CommandAnswer, ShownPicture
+from webots_mcp.questions.answers import CommandAnswer, RunAnswer, ShownPicture
 from webots_mcp.questions.budget import compact_json, notes_of, seconds, some
 from webots_mcp.questions.declaring import (
     CHANGES,
@@ -182,6 +182,61 @@ def _no_frame(view: View, camera: str) -> str:
         "bridge.keep_camera(camera) those of kept stretches"
     )
     return _caption(view.header() | {"camera": camera, "hint": hint})
+
+
+# -- the end of a run ------------------------------------------------------------------------------
+
+_END_WAIT_S: Final = 8.0
+_SAME_S: Final = 0.001  # answers have times to the millisecond
+
+
+async def show_end(recording: Recording, dispatcher: Dispatcher, answer: RunAnswer) -> None:
+    """Add a screenshot to the answer of a run, else a camera frame of its last step.
+
+    Where there is neither, the answer says why.
+    """
+    try:
+        shot = await dispatcher.ask(answer.robot, "screenshot", _END_WAIT_S, {"quality": 90})
+        path = cast("dict[str, Any]", shot.result or {}).get("path")
+        if shot.outcome != "done" or path is None:
+            why = shot.error or shot.hint or f"the screenshot is {shot.outcome}"
+            raise CommandRefusedError(why)
+        file = inside(recording.data_dir, str(path))
+        picture, note = await to_thread.run_sync(_load_picture, file)
+    except WebotsMCPError as error:
+        await to_thread.run_sync(_show_frame, recording, answer, str(error))
+        return
+    facts = {"file": str(file), "sim_time_s": shot.sim_time_s}
+    _attach(answer, picture, facts, note, "webots_take_screenshot")
+
+
+def _show_frame(recording: Recording, answer: RunAnswer, why: str) -> None:
+    """Add what a camera saw at the step at which the run ended, if that was recorded."""
+    ran = answer.ran or {}
+    frame = None
+    if ran.get("run_id") is not None:
+        with recording.reader() as connection:
+            found = camera_frames(connection, ran["run_id"], at_s=ran["to_s"])
+        frame = next((each for each in found if abs(each.sim_time_s - ran["to_s"]) < _SAME_S), None)
+    if frame is None:
+        answer.picture = {"missing": why}
+        return
+    try:
+        picture, note = _load_picture(frame.file(recording.data_dir))
+    except WebotsMCPError as error:
+        answer.picture = {"missing": f"{why}; {error}"}
+        return
+    file = str(recording.data_dir / frame.path)
+    facts = {"camera": frame.device, "file": file, "sim_time_s": seconds(frame.sim_time_s)}
+    _attach(answer, picture, facts | {"no_screenshot": why}, note, "webots_get_camera")
+
+
+def _attach(
+    answer: RunAnswer, picture: ShownPicture, facts: dict[str, Any], note: str, again: str
+) -> None:
+    answer.pictures.append(picture)
+    see = {"see": f"beside this answer; if your client does not show it, {again}"}
+    answer.picture = facts | ({"note": note} if note else {}) | see
 
 
 # -- plots -----------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import math
 import sqlite3
@@ -33,7 +32,7 @@ from webots_mcp.errors import (
     UnknownActionError,
     UnknownSignalError,
 )
-from webots_mcp.naming import flatten, same_in_meaning
+from webots_mcp.naming import flatten, perhaps_meant
 from webots_mcp.questions.answers import CommandAnswer, RunAnswer
 from webots_mcp.questions.budget import (
     RESULT_BUDGET_TOKENS,
@@ -669,8 +668,7 @@ def _require_action(view: View, action: str) -> None:
     if not known or action in known or action in BUILT_IN_ACTIONS:
         return
     possible = [*known, *BUILT_IN_ACTIONS]
-    near = same_in_meaning(action, possible)
-    near = near or difflib.get_close_matches(action, possible, n=3, cutoff=0.5)
+    near = perhaps_meant(action, possible)
     offer = f"did you mean {' or '.join(map(repr, near))}? " if near else ""
     raise UnknownActionError(
         f"robot {view.robot.name!r} has registered no action {action!r}; {offer}its own actions "

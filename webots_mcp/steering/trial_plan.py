@@ -15,7 +15,7 @@ from typing import Any, Final, Literal, cast, get_args
 from webots_mcp.conditions import parse_condition
 from webots_mcp.conditions.scoring import parse_score
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.naming import nearest_first
+from webots_mcp.naming import harmless_first
 from webots_mcp.store.analysis.summary import Best
 
 Search = Literal["tpe", "random"]
@@ -287,7 +287,7 @@ def _require_kinds(table: dict[str, Any], kinds: Mapping[str, Any]) -> None:
     """
     for key, value in table.items():
         if key not in kinds:
-            near = ", ".join(nearest_first(key, list(kinds))[:3])
+            near = ", ".join(harmless_first(key, list(kinds))[:3])
             raise InvalidInputError(f"unknown {key!r}; there is {near}")
         if not isinstance(value, kinds[key]) or (
             isinstance(value, bool) and kinds[key] is not bool

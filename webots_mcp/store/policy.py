@@ -34,6 +34,35 @@ from webots_mcp.store.project_file import load_toml
 
 ALLOW: Final = "allow"
 LAUNCH: Final = "launch"  # stands for an action where Webots is started
+# The tools and commands that do an action: a rule for one of them holds for it by every route. What
+# sends no such action (webots_breakpoint, webots_report, ...) is checked by its name alone.
+TOOLS_OF_ACTIONS: Final[Mapping[str, tuple[str, ...]]] = {
+    "pause": ("webots_simulation_control",),
+    "resume": ("webots_simulation_control",),
+    "fast": ("webots_simulation_control",),
+    "step": ("webots_simulation_control",),
+    "reset": ("webots_simulation_control", "webots_world_reset"),
+    "reload": ("webots_simulation_control", "webots_world_reload"),
+    "reset_state": ("webots_reset_controller_state",),
+    "run": ("webots_run",),
+    "cancel_run": (),  # by which nothing is done
+    LAUNCH: ("webots_launch_world", "launch"),
+    "load_world": ("webots_launch_world", "webots_load_world"),
+    "quit": ("webots_launch_world", "webots_quit"),
+    "screenshot": ("webots_take_screenshot",),
+    "take_frame": ("webots_get_camera",),
+    "set_parameters": ("webots_set_parameters",),
+    "arm_breakpoints": (),
+    "keep": (),
+    "get_scene": ("webots_get_scene",),
+    "get_field": ("webots_get_scene", "webots_get_field"),
+    "set_field": ("webots_edit_scene", "webots_set_field"),
+    "add_node": ("webots_edit_scene", "webots_add_node"),
+    "remove_node": ("webots_edit_scene", "webots_remove_node"),
+}
+ANY_ACTION: Final = (
+    "webots_send_command"  # the tool that sends any: it stands for none of the others
+)
 _PATTERNS: Final = ("tools", "actions", "fields", "nodes", "worlds")
 _OF_SCENE: Final = ("fields", "nodes")
 _HOLDS_FOR: Final = ("everyone", "assistants")
@@ -74,18 +103,25 @@ class Policy:
         """
         self._require("tools", names, f"{names[0]} is not allowed")
 
-    def require(self, action: str, params: Mapping[str, Any]) -> None:
+    def require(self, action: str, params: Mapping[str, Any], asked: Sequence[str] = ()) -> None:
         """Refuse an action that the file does not allow, or not with these parameters.
+
+        Args:
+            action: As a command names it, or `LAUNCH`.
+            params: Its parameters.
+            asked: The names of the tool or command that was asked for.
 
         Raises:
             NotAllowedError: Which line of it does not.
         """
+        self._require_route(action, asked)
         if action == LAUNCH:
             if not self.allow.get(LAUNCH, True):
                 raise self._refusal(LAUNCH, "starting Webots is not allowed")
         elif action != _HARMLESS:
             self._require("actions", [action], f"the action {action!r:.100} is not allowed")
         if action == "run" and params.get("reset"):
+            self._require_route("reset", asked)
             self._require("actions", ["reset"], "the action 'reset' is not allowed")
         if action in (LAUNCH, "load_world"):
             self._require_world(params.get("world"))
@@ -100,6 +136,15 @@ class Policy:
             action in ("set_parameters", "run", LAUNCH)
         ):
             self._require_values(values)
+
+    def _require_route(self, action: str, asked: Sequence[str]) -> None:
+        """Refuse what the tools of an action may not do, also if another one is asked for it."""
+        tools = TOOLS_OF_ACTIONS.get(action, ())
+        patterns = cast("list[str]", self.allow.get("tools", []))
+        is_named = any(_fits(p.removeprefix("!"), tool) for p in patterns for tool in tools)
+        if tools and (is_named or ANY_ACTION in asked):
+            by = f"{action!r:.100}, which {tools[-1]} does, is not allowed"
+            self._require("tools", tools, by)
 
     def _require_world(self, world: object) -> None:
         """By its path from the project or from its folder of worlds, with links followed."""

@@ -44,6 +44,7 @@ from webots_mcp.errors import (
 from webots_mcp.liveness import Lease, still_held
 from webots_mcp.queue import any_unfinished
 from webots_mcp.store.chunks import StateColumns, is_chunked_aside, show_chunks_aside
+from webots_mcp.store.invalid_rows import is_past_invalid_rows, shadow_if_asked
 from webots_mcp.store.journal_intake import BUDGET_S, has_news, journals_behind, take_in_journals
 from webots_mcp.store.reading.observed_pose import find_observed
 from webots_mcp.store.reading.segment import Subject, choose, require_run
@@ -148,17 +149,21 @@ class OpenReaders:
     """
 
     def __init__(self) -> None:
-        self._idle: list[tuple[object, sqlite3.Connection]] = []
+        self._idle: dict[bool, list[tuple[object, sqlite3.Connection]]] = {False: [], True: []}
         self._is_closed = False
 
     @contextmanager
     def taken(
         self, database: Path, open_one: Callable[[], sqlite3.Connection]
     ) -> Generator[sqlite3.Connection]:
-        """One for a question; it is closed where the question fails."""
+        """One for a question; it is closed where the question fails.
+
+        Those that leave out invalid rows are kept apart: their views take longer than a question.
+        """
+        idle = self._idle[is_past_invalid_rows()]
         while True:
             try:
-                known, connection = self._idle.pop()
+                known, connection = idle.pop()
             except IndexError:
                 connection = open_one()
                 known = _identity(database, connection)
@@ -167,23 +172,25 @@ class OpenReaders:
                 break
             connection.close()
         try:
+            shadow_if_asked(connection)
             yield connection
         except BaseException:
             connection.close()
             raise
-        is_enough = len(self._idle) >= _MOST_IDLE
+        is_enough = len(idle) >= _MOST_IDLE
         if known is None or is_enough or isinstance(connection, FrozenConnection):
             connection.close()
         else:
-            self._idle.append((known, connection))
+            idle.append((known, connection))
         if self._is_closed:
             self.close()
 
     def close(self) -> None:
         """Close all that are not in use, and those when they are given back."""
         self._is_closed = True
-        while self._idle:
-            self._idle.pop()[1].close()
+        for idle in self._idle.values():
+            while idle:
+                idle.pop()[1].close()
 
 
 def _identity(database: Path, connection: sqlite3.Connection) -> object:
@@ -223,6 +230,7 @@ class Recording:
         self.take_in()
         if self.readers is None or not isinstance(self.database, Path):
             with self._opened("reader") as connection:
+                shadow_if_asked(connection)
                 yield connection
             return
         with (
@@ -301,7 +309,7 @@ class Recording:
             raise NoDatabaseError(f"{error}. {GETTING_STARTED}") from error
         try:
             self._require_ours(connection)
-            if role == "reader" and isinstance(self.database, Path):
+            if role == "reader" and isinstance(self.database, Path) and not is_past_invalid_rows():
                 show_chunks_aside(connection, self.database)
         except BaseException:
             connection.close()
@@ -468,7 +476,7 @@ class Job:
 
 
 # What no bridge writes. Other programs may write to a recording, and SQLite takes any value in any
-# column: a question that meets one fails and says so.
+# column: a question that meets one is asked again past it (`invalid_rows`).
 
 
 _UNSTORABLE: Final = (

@@ -146,7 +146,7 @@ class OpenRequest:
         world = params.get("world") if action in (LAUNCH, "load_world") else None
         with self._refusing():
             for each in self._policies(*(str(file) for file in (world, steered) if file)):
-                each.require(action, params)
+                each.require(action, params, self._names)
 
     def _begin(self) -> None:
         with self._refusing():

@@ -6,9 +6,11 @@ other users of this computer, and web sites that a browser here shows, do not kn
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 import secrets
+import socket
 import sys
 import threading
 import time
@@ -17,13 +19,13 @@ from dataclasses import replace
 from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 from urllib.parse import parse_qsl
 
 import anyio
 
 from webots_mcp import __version__
-from webots_mcp.access_token import LOOPBACK, page_key
+from webots_mcp.access_token import LOOPBACK, named_host, page_key
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.parameter import Value
 from webots_mcp.plotting.on_a_page import figure_part
@@ -41,7 +43,10 @@ HOST: Final = LOOPBACK[0]
 MOST_TABS: Final = 20  # each reads the recording five times a second
 ORDERS: Final = ("pause", "resume", "step", "reset")
 _TAB_S: Final = 15.0  # for so long a tab counts as open after it asked
+_IDLE_S: Final = 60.0  # for the next request of a connection, and to write an answer
+_REQUEST_S: Final = 10.0  # from the first byte of a request to its last
 _MOST_BYTES: Final = 100_000  # of a request
+_MOST_DIGITS: Final = 9  # that are read of a length, which is too large with so many
 _log: Final = logging.getLogger(__name__)
 _PARTS: Final = Path(__file__).parent / "parts"
 _TYPES: Final = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
@@ -147,12 +152,75 @@ def create_page_server(recording: Recording, port: int, *, read_only: bool = Fal
         ) from error
 
 
+class _TimedReader(io.RawIOBase):
+    """What a browser sends: a request that has begun comes within `_REQUEST_S`, or not at all.
+
+    A timeout of the socket alone begins anew with each byte.
+    """
+
+    def __init__(self, connection: socket.socket, idle_s: float) -> None:
+        super().__init__()
+        self._connection, self._idle_s = connection, idle_s
+        self._until_s: float | None = None
+
+    def begin(self) -> None:
+        """Wait for the next request."""
+        self._until_s = None
+
+    def readable(self) -> bool:
+        """It is."""
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        """Read what has come.
+
+        Raises:
+            TimeoutError: The time is over.
+        """
+        left_s = self._idle_s if self._until_s is None else self._until_s - time.monotonic()
+        if left_s <= 0:
+            raise TimeoutError("the rest of the request did not come in time")
+        self._connection.settimeout(left_s)
+        count = self._connection.recv_into(buffer)
+        if self._until_s is None:
+            self._until_s = time.monotonic() + _REQUEST_S
+        return count
+
+
 class _Request(BaseHTTPRequestHandler):
     """One connection of a browser."""
 
     protocol_version = "HTTP/1.1"
     server_version = "webots-mcp"
-    timeout = 60  # s, for the next request of a connection or the rest of one
+    timeout = _IDLE_S
+
+    def setup(self) -> None:
+        """Read within bounds of time."""
+        super().setup()
+        self._reading = _TimedReader(self.connection, _IDLE_S)
+        self.rfile.close()
+        self.rfile = io.BufferedReader(self._reading)
+
+    def handle_one_request(self) -> None:
+        """Wait for a request; once it has begun, all of it has to come soon."""
+        self._reading.begin()
+        super().handle_one_request()
+
+    def parse_request(self) -> bool:
+        """Read the headers; what has a body of no certain length is refused."""
+        if not super().parse_request():
+            return False
+        self.connection.settimeout(self.timeout)  # again, to write the answer
+        lengths = self.headers.get_all("Content-Length") or ["0"]
+        is_sure = len(lengths) == 1 and lengths[0].isascii() and lengths[0].isdecimal()
+        if not is_sure or "Transfer-Encoding" in self.headers:
+            self._refuse(400, "A request needs one Content-Length, in digits.\n")
+            return False
+        self._length = int(lengths[0][:_MOST_DIGITS])
+        if self._length > (_MOST_BYTES if self.command == "POST" else 0):
+            self._refuse(413, f"A request has at most {_MOST_BYTES:,} bytes, as an order only.\n")
+            return False
+        return True
 
     def do_GET(self) -> None:
         if (path := self._path()) is None:
@@ -172,15 +240,20 @@ class _Request(BaseHTTPRequestHandler):
         """Steer: what the page itself sends, which no form of another page can."""
         if (path := self._path()) is None:
             return
-        length = int(self.headers.get("Content-Length") or 0)
-        if path != "steer" or self._page.read_only or not 0 <= length <= _MOST_BYTES:
+        if path != "steer" or self._page.read_only:
             return self._refuse(403, "This page only shows.\n")
         own = {f"http://{name}:{self._page.server_port}" for name in LOOPBACK}
         is_json = self.headers.get("Content-Type") == "application/json"
         if not is_json or self.headers.get("Origin") not in own:
             return self._refuse(403, "Orders are taken from the page itself only.\n")
-        body = json.loads(self.rfile.read(length))
-        self._ask(lambda server, asked: _steer(server, asked, body))
+        try:
+            body = json.loads(self.rfile.read(self._length))
+        except (ValueError, RecursionError):
+            body = None
+        if not isinstance(body, dict):
+            return self._refuse(400, "An order is a JSON object.\n")
+        order = cast("dict[str, Any]", body)
+        self._ask(lambda server, asked: _steer(server, asked, order))
 
     @property
     def _page(self) -> PageServer:
@@ -189,8 +262,8 @@ class _Request(BaseHTTPRequestHandler):
 
     def _path(self) -> str | None:
         """The path below the key; None where the request was refused."""
-        host = (self.headers.get("Host") or "").rsplit(":", 1)[0]
-        if host not in LOOPBACK:
+        hosts = self.headers.get_all("Host") or [""]
+        if len(hosts) != 1 or named_host(hosts[0]) not in LOOPBACK:
             return self._refuse(403, _FOREIGN)
         key, slash, rest = self.path.partition("?")[0].removeprefix("/").partition("/")
         try:

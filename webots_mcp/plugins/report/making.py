@@ -30,6 +30,7 @@ from webots_mcp.questions.answers import NotedAnswer
 from webots_mcp.questions.budget import notes_of
 from webots_mcp.questions.declaring import DESTROYS, AnyNames, RobotName, RunIds, question
 from webots_mcp.store.detection.kinds import Event
+from webots_mcp.store.invalid_rows import left_out_so_far
 from webots_mcp.store.reading.catalogue import known_signals, resolve_signals
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 from webots_mcp.store.reading.segment import in_one_snapshot
@@ -520,7 +521,7 @@ def _left_out(page: Page) -> list[str]:
             gone = f" ({counted(pictures.unusable, 'file')} cannot be read)"
             gone = gone if pictures.unusable else ""
             said.append(f"{missing:,} of the pictures {of_run}{gone}")
-    return [*said, *page.figures.left_out]
+    return [*said, *page.figures.left_out, *left_out_so_far()]
 
 
 def _holds(page: Page) -> dict[str, int]:

@@ -5,10 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from webots_mcp.cli.options import HERE, Id, Json, Parameter, Robot, Where, make_chunks_first
+from webots_mcp.cli.options import (
+    HERE,
+    Id,
+    Json,
+    Parameter,
+    Robot,
+    Where,
+    make_chunks_first,
+    only_reading,
+)
 from webots_mcp.cli.terminal import print_json, print_notes, printable, shown_progress
 
 
+@only_reading
 def report(
     *run_ids: Annotated[
         Id, Parameter("RUN", help="One run, or two beside each other; none: the newest.")

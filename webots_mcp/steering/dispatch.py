@@ -21,7 +21,6 @@ from webots_mcp.contract import (
     BUILT_IN_ACTIONS,
     CUSTOM_DATA,
     HEARTBEAT_LATE_S,
-    ISSUED_TIME_TO_LIVE_S,
     LOOPING,
     MAX_RUN_S,
 )
@@ -60,13 +59,16 @@ from webots_mcp.store.reading.segment import Subject
 from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.requests import permit
 from webots_mcp.store.robots import (
+    PRESS_PLAY,
     Session,
     companions,
     fetch_session,
+    find_block,
     find_holder,
     handler_at_work,
     list_robots,
     live_observer,
+    may_return,
     robot_name,
     without_observers,
 )
@@ -78,10 +80,15 @@ Report = Callable[[float, float | None, str], Awaitable[None]]
 # miss commits of the same connection.
 _POLL_INTERVAL_S: Final = 0.004
 _REPORT_INTERVAL_S: Final = 1.0
+# A loop that comes round claims a command at once. After this time it is asked, so often, whether
+# something is known to keep the loop.
+BLOCK_NOTICED_S: Final = 2.0
+_BLOCK_SOUGHT_EVERY_S: Final = 0.25
 # At the deadline the command is cancelled. Its own time to live only matters if this server dies
 # while it waits: the command then expires soon after the deadline.
 _OUTLIVES_WAITING_S: Final = 1.0
 _ERROR_CHARACTERS: Final = 2_000
+_WITHDRAWN: Final = "{}; the command was withdrawn and will not run"
 
 
 class Dispatcher:
@@ -102,7 +109,8 @@ class Dispatcher:
     ) -> CommandAnswer:
         """Send a command, wait until it is final or the time is up, and report its outcome.
 
-        A command that is not claimed at the deadline is cancelled, so that it cannot run when its
+        A command that is not claimed soon because its loop is known to be blocked is withdrawn at
+        once. One that is not claimed at the deadline is cancelled, so that it cannot run when its
         caller has stopped waiting; the same happens when the caller disconnects.
 
         Args:
@@ -153,7 +161,7 @@ class Dispatcher:
 
     async def _outcome(self, command: Command, claiming_s: float, until_s: float) -> Command:
         try:
-            command = await self._watch(command.id, claiming_s)
+            command = await self._watch(command.id, claiming_s, withdraws=True)
             command = await to_thread.run_sync(self._at_the_deadline, command)
             if command.is_final:
                 return command
@@ -180,14 +188,20 @@ class Dispatcher:
                 request_id=request_id,
             )
 
-    async def _watch(self, command_id: int, timeout_s: float) -> Command:
+    async def _watch(
+        self, command_id: int, timeout_s: float, *, withdraws: bool = False
+    ) -> Command:
         started_s = time.monotonic()
-        next_report_s = _REPORT_INTERVAL_S
+        next_report_s, next_search_s = _REPORT_INTERVAL_S, BLOCK_NOTICED_S
         with self._recording.reader() as connection:
             while not (command := fetch_command(connection, command_id)).is_final:
                 waited_s = time.monotonic() - started_s
                 if waited_s >= timeout_s:
                     return command
+                if withdraws and command.status == "pending" and waited_s >= next_search_s:
+                    next_search_s = waited_s + _BLOCK_SOUGHT_EVERY_S
+                    if await to_thread.run_sync(withdraw_if_blocked, self._recording, command):
+                        continue
                 if waited_s >= next_report_s:
                     next_report_s += _REPORT_INTERVAL_S
                     await to_thread.run_sync(self._recording.settle)
@@ -233,6 +247,24 @@ class Dispatcher:
             if command.action == ACTION:
                 return RunAnswer(**facts, **run_facts(view, command))
             return CommandAnswer(**facts, result=shown_result(command))
+
+
+def withdraw_if_blocked(recording: Recording, command: Command) -> bool:
+    """Cancel a pending command where its loop is known to be blocked; True if it will never run.
+
+    A controller that claims it in the meantime runs it, and the outcome is that of the controller.
+    """
+    with recording.view(_name_of(recording, command.robot_id)) as view:
+        block = find_block(view.connection, view.session, view.run, view.now_s)
+    if block is None:
+        return False
+    with recording.writer() as connection:
+        return CommandQueue(connection).cancel(command.id, _WITHDRAWN.format(block.why))
+
+
+def _name_of(recording: Recording, robot_id: int) -> str:
+    with recording.reader() as connection:
+        return robot_name(connection, robot_id)
 
 
 class _Sending:
@@ -309,15 +341,14 @@ def _instructions(view: View, action: str) -> str | None:
 
 def _after_no_answer(view: View) -> str:
     session = view.session
+    if block := find_block(view.connection, session, view.run, view.now_s):
+        return f"{block.fix}, then ask again"
     if session is None or not view.robot.live:
         return "start its controller, then ask again"
     if handler_at_work(view.connection, session, view.now_s):
         return "wait until that handler has returned, then ask again"
     if not session.heartbeat_is_fresh(view.now_s):
-        return (
-            "press play in Webots if it is paused there: only a person can resume it while the "
-            "controller is inside step(); else check what its loop is waiting for"
-        )
+        return PRESS_PLAY
     if session.last_poll_wall_time_s is None:
         return "the controller's loop never calls bridge.get_command(): add that line to its loop"
     silent_s = session.age_s(session.last_poll_wall_time_s, view.now_s)
@@ -690,19 +721,12 @@ def _require_live(view: View) -> Session:
             "controller MCPBridge.attach(robot); the simulation is steered by an observer "
             f"({f'robot={observer.name!r}' if observer else _MAKE_OBSERVER})"
         )
-    if session is not None and (view.robot.live or _is_reloading(session, view.now_s)):
+    if session is not None and (view.robot.live or may_return(session, view.now_s)):
         return session
     raise CommandRefusedError(
         f"robot {view.robot.name!r} has no live controller: "
         f"{view.status.why or 'it was never seen'}; start it, then ask again"
     )
-
-
-def _is_reloading(session: Session, now_s: float) -> bool:
-    ended_s = session.ended_wall_time_s or session.last_seen_wall_time_s
-    if session.extern:
-        return False
-    return session.end_reason == "reload" and now_s - ended_s < ISSUED_TIME_TO_LIVE_S
 
 
 def _who_may(view: View, session: Session, action: str) -> str:

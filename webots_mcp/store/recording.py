@@ -47,7 +47,7 @@ from webots_mcp.store.chunks import is_chunked_aside, show_chunks_aside
 from webots_mcp.store.journal_intake import BUDGET_S, has_news, journals_behind, take_in_journals
 from webots_mcp.store.reading.segment import Subject, choose, require_run
 from webots_mcp.store.retention import Asked
-from webots_mcp.store.robots import Robot, Session, Status, judge, stopped_for
+from webots_mcp.store.robots import Robot, Session, Status, ask_stuck, judge, stopped_for
 from webots_mcp.store.run_rows import Run, State, current_run, newest_state
 from webots_mcp.waiting_file import adopt, waiting_paths
 
@@ -235,7 +235,11 @@ class Recording:
             InvalidInputError: There is no such robot or run, or several robots are possible.
         """
         with self.reader() as connection:
-            yield look(connection, robot, run_id)
+            seen = look(connection, robot, run_id)
+            may_ask = not self.read_only and not seen.status.is_moving
+            if may_ask and seen.session and ask_stuck(connection, seen.session, seen.now_s):
+                seen = look(connection, robot, run_id)
+            yield seen
 
     def settle(self) -> None:
         """Settle the commands that no live process will finish, unless `read_only`."""

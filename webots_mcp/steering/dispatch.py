@@ -60,6 +60,7 @@ from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.requests import permit
 from webots_mcp.store.robots import (
     PRESS_PLAY,
+    Block,
     Session,
     companions,
     fetch_session,
@@ -198,10 +199,12 @@ class Dispatcher:
                 waited_s = time.monotonic() - started_s
                 if waited_s >= timeout_s:
                     return command
-                if withdraws and command.status == "pending" and waited_s >= next_search_s:
+                if waited_s >= next_search_s:
                     next_search_s = waited_s + _BLOCK_SOUGHT_EVERY_S
-                    if await to_thread.run_sync(withdraw_if_blocked, self._recording, command):
-                        continue
+                    if command.status == "pending" and withdraws:
+                        await to_thread.run_sync(withdraw_if_blocked, self._recording, command)
+                    elif await to_thread.run_sync(is_held_up, self._recording, command):
+                        return command
                 if waited_s >= next_report_s:
                     next_report_s += _REPORT_INTERVAL_S
                     await to_thread.run_sync(self._recording.settle)
@@ -246,7 +249,9 @@ class Dispatcher:
             }
             if command.action == ACTION:
                 return RunAnswer(**facts, **run_facts(view, command))
-            return CommandAnswer(**facts, result=shown_result(command))
+            answer = CommandAnswer(**facts, result=shown_result(command))
+            _name_mode_afterwards(view, command, answer)
+            return answer
 
 
 def withdraw_if_blocked(recording: Recording, command: Command) -> bool:
@@ -254,17 +259,25 @@ def withdraw_if_blocked(recording: Recording, command: Command) -> bool:
 
     A controller that claims it in the meantime runs it, and the outcome is that of the controller.
     """
-    with recording.view(_name_of(recording, command.robot_id)) as view:
-        block = find_block(view.connection, view.session, view.run, view.now_s)
+    block = _block_of(recording, command)
     if block is None:
         return False
     with recording.writer() as connection:
         return CommandQueue(connection).cancel(command.id, _WITHDRAWN.format(block.why))
 
 
-def _name_of(recording: Recording, robot_id: int) -> str:
+def is_held_up(recording: Recording, command: Command) -> bool:
+    """Whether a `step` or `run` that is under way cannot go on, since its loop is blocked."""
+    if command.status != "claimed" or command.action not in LOOPING:
+        return False
+    return _block_of(recording, command) is not None
+
+
+def _block_of(recording: Recording, command: Command) -> Block | None:
     with recording.reader() as connection:
-        return robot_name(connection, robot_id)
+        name = robot_name(connection, command.robot_id)
+    with recording.view(name) as view:
+        return find_block(view.connection, view.session, view.run, view.now_s)
 
 
 class _Sending:
@@ -296,6 +309,37 @@ def shown_result(command: Command, budget_tokens: int = RESULT_BUDGET_TOKENS) ->
     return shorten(command.decoded_result(), budget_tokens, WHOLE).value
 
 
+# Commands that set the mode of the simulation; a `run` sets what its `then` says.
+_MODES: Final = {"pause": "pause", "step": "pause", "resume": "real_time", "fast": "fast"}
+_LATER: Final = (
+    "SELECT id, action, status, params, result FROM command WHERE id > :id AND status IN "
+    "('pending', 'claimed', 'done') AND action IN ('pause', 'step', 'resume', 'fast', 'run') "
+    "AND robot_id IN (SELECT o.robot_id FROM session o JOIN session s ON s.instance = o.instance "
+    "WHERE s.id = :session AND o.ended_wall_time_s IS NULL) ORDER BY id DESC LIMIT 1"
+)
+
+
+def _name_mode_afterwards(view: View, command: Command, answer: CommandAnswer) -> None:
+    """Correct the mode in the answer of a command that a later one has followed meanwhile."""
+    if command.action not in _MODES or command.status not in ("done", "failed"):
+        return
+    values = {"id": command.id, "session": command.session_id}
+    later = view.connection.execute(_LATER, values).fetchone()
+    if later is None:
+        return
+    later_id, action, status, params, result = later
+    known: dict[str, Any] = json.loads(result) if status == "done" and result else {}
+    then = json.loads(params).get("then", "pause")
+    mode = known.get("mode") or _MODES.get(action, "pause" if then == "pause" else None)
+    if mode is None:
+        return
+    if command.status == "done" and answer.result:
+        answer.result = cast("dict[str, Any]", answer.result) | {"mode": mode}
+    when = "now" if status == "done" else "once that has been done"
+    note = f"command {later_id} ({action}) came after it: the mode is {mode} {when}"
+    answer.hint = "; ".join(filter(None, (answer.hint, note)))
+
+
 def _error(command: Command) -> str | None:
     if command.status == "done" or command.error is None:
         return None
@@ -312,12 +356,15 @@ def _hint(view: View, command: Command) -> str | None:
     if command.status == "pending":
         return "no controller has claimed it yet"
     if command.status == "done":
-        return command.error  # the values of the result that had to be replaced
+        # The values of the result that had to be replaced, or what was not done as it was asked.
+        return command.error or _result_of(command).get("warning")
     if command.status == "failed":
         return _instructions(view, command.action)
     if command.status == "claimed":
+        block = find_block(view.connection, view.session, view.run, view.now_s)
+        why = f"{block.why}: {block.fix}" if block else "the controller is still running it"
         return (
-            "the controller is still running it: keep waiting with "
+            f"{why}; keep waiting with "
             f'webots_list_commands(what="outcome", command_id={command.id}); do not send it again'
         )
     if command.status == "lost":

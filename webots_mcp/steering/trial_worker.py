@@ -45,7 +45,7 @@ from webots_mcp.store.parameters import (
 from webots_mcp.store.questions.runs import score_run
 from webots_mcp.store.recording import Job, Recording, View
 from webots_mcp.store.requests import permit
-from webots_mcp.store.robots import robot_name
+from webots_mcp.store.robots import find_block, robot_name
 
 _LOOK_EVERY_S: Final = 0.02
 # Long enough that simulation time visibly goes back at the next reset, by which it is detected.
@@ -328,6 +328,12 @@ class TrialWorker(threading.Thread):
             if noted.former_values is None:
                 return
             assert noted.robot_id is not None and noted.session_id is not None
+        with self._recording.view(self._robot) as view:
+            block = find_block(view.connection, view.session, view.run, view.now_s)
+        if block is not None and view.session and view.session.id == noted.session_id:
+            self._record_stop(f"its parameters were not restored: {block.why}")
+            return
+        with self._job.writer() as connection:
             command = self._ask_back(connection, noted)
         patience_s = _END_PATIENCE_S if self._stopping.is_set() else _PATIENCE_S
         if command is not None:

@@ -202,12 +202,19 @@ def has_lost_simulator(pid: int, instance: str) -> bool:
         return False
     try:
         closed_by_inode = dict(_connections_to(pid, int(port)))
-        folder = f"/proc/{pid}/fd"
-        inodes = {os.readlink(f"{folder}/{name}") for name in os.listdir(folder)}  # noqa: PTH115, PTH208
+        inodes = set(_open_files(pid))
     except (OSError, ValueError, IndexError):
         return False
     found = [closed for inode, closed in closed_by_inode.items() if f"socket:[{inode}]" in inodes]
     return bool(found) and all(found)
+
+
+def _open_files(pid: int) -> Generator[str]:
+    """What the descriptors of a process lead to; one may be closed meanwhile."""
+    folder = f"/proc/{pid}/fd"
+    for name in os.listdir(folder):  # noqa: PTH208
+        with suppress(FileNotFoundError):
+            yield os.readlink(f"{folder}/{name}")  # noqa: PTH115
 
 
 def _connections_to(pid: int, port: int) -> Generator[tuple[str, bool]]:

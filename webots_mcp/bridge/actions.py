@@ -185,15 +185,16 @@ def _step_world(session: Session, command: ClaimedCommand, steps: int) -> Progre
 
     try:
         yield from steps_until(1, simulation.pump)
-        if made() >= steps:
-            simulation.set_mode("pause")
-        else:
+        if made() < steps:
             with simulation.world_waits():
                 yield from steps_until(steps, simulation.advance, _LAST_STEPS)
                 simulation.set_mode("pause")  # before the world stops waiting
     except InterruptedCommandError as interruption:
         watch.stepping = None
         raise CommandRefusedError(f"{interruption} after {made()} of {steps} steps") from None
+    simulation.set_mode("pause")
+    if not simulation.pump():  # the world may have made a step until it was paused
+        yield  # Webots has ended the controller
     why = {"why": "it was cancelled before the last step"} if made() < steps else {}
     watch.stepping = None
     session.look()

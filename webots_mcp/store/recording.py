@@ -236,9 +236,10 @@ class Recording:
         """
         with self.reader() as connection:
             seen = look(connection, robot, run_id)
-            may_ask = not self.read_only and not seen.status.is_moving
+            may_ask = not self.read_only and run_id is None and not seen.status.is_moving
             if may_ask and seen.session and ask_stuck(connection, seen.session, seen.now_s):
-                seen = look(connection, robot, run_id)
+                # Of the moment before: the signal may have woken the loop.
+                seen = view_of(connection, seen.robot, seen.now_s)
             yield seen
 
     def settle(self) -> None:

@@ -13,7 +13,7 @@ import sqlite3
 import sys
 import time
 from collections.abc import Callable, Generator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -182,6 +182,49 @@ def is_stopped(pid: int) -> bool:
         return _linux_stat(pid)[0] in (b"T", b"t")
     except (OSError, IndexError):
         return False
+
+
+_LOCAL_STATES: Final = {"01": False, "08": True}  # of tcp(7): established; the other end has closed
+
+
+def has_lost_simulator(pid: int, instance: str) -> bool:
+    """Whether Webots has closed its connection to a controller, which waits for it regardless.
+
+    Over TCP, Webots' library then waits for an answer without end; over a local socket it ends the
+    process. Only Linux shows it, to the user whose process it is.
+
+    Args:
+        pid: The controller's process.
+        instance: Its simulator, as `contract.instance_of` names it: `host:port`.
+    """
+    port = instance.rpartition(":")[2]
+    if not (_is_pid(pid) and port.isascii() and port.isdecimal()):
+        return False
+    try:
+        closed_by_inode = dict(_connections_to(pid, int(port)))
+        inodes = set(_open_files(pid))
+    except (OSError, ValueError, IndexError):
+        return False
+    found = [closed for inode, closed in closed_by_inode.items() if f"socket:[{inode}]" in inodes]
+    return bool(found) and all(found)
+
+
+def _open_files(pid: int) -> Generator[str]:
+    """What the descriptors of a process lead to; one may be closed meanwhile."""
+    folder = f"/proc/{pid}/fd"
+    for name in os.listdir(folder):  # noqa: PTH208
+        with suppress(FileNotFoundError):
+            yield os.readlink(f"{folder}/{name}")  # noqa: PTH115
+
+
+def _connections_to(pid: int, port: int) -> Generator[tuple[str, bool]]:
+    """Sockets in the network of a process that lead to a port: inode, and whether it is closed."""
+    for table in ("tcp", "tcp6"):
+        with suppress(FileNotFoundError), open(f"/proc/{pid}/net/{table}") as file:  # noqa: PTH123
+            for line in file.readlines()[1:]:
+                fields = line.split()
+                if int(fields[2].rpartition(":")[2], 16) == port and fields[3] in _LOCAL_STATES:
+                    yield fields[9], _LOCAL_STATES[fields[3]]
 
 
 def signal_process(pid: int, process: str | None, number: int) -> None:

@@ -15,7 +15,6 @@ import os
 import re
 import signal
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
@@ -40,7 +39,6 @@ _DEBUGGER: Final = re.compile(r"(?:[/\\]|^)(?:bdb|pdb)\.py$|[/\\](?:pydevd|debug
 _BY_PERSON: Final = "waitForUserInputEvent"  # of Webots' Robot: a key or a click is waited for
 _EARLY: Final = 0.9  # of the limit: the clock of files is coarse
 _UNTOUCHED_S: Final = 3.0  # the maintainer's thread touches the file each second
-_WRITING_S: Final = 0.1
 _MOST_BYTES: Final = 200_000
 _MOST_TEXT: Final = 4000
 _MOST_CALLERS: Final = 3
@@ -144,26 +142,33 @@ def is_library(file: str, libraries: tuple[str, ...] = LIBRARIES) -> bool:
     return file.startswith(libraries) or INSTALLED.search(file) is not None
 
 
-def stacks_at(path: Path, send: Callable[[], object] | None) -> Stacks | None:
-    """What the file of a process holds; None where nothing was written.
+def stacks_at(path: Path) -> Stacks | None:
+    """What the file of a process holds; None where nothing was written."""
+    with suppress(*_STRANGE), path.open("rb") as file:
+        return read_stacks(file)
+    return None
 
-    Where no thread of that process could touch the file any more, C code keeps the interpreter's
-    lock. The process is sent the signal then on which it writes its stacks.
+
+def needs_signal(path: Path, silent_s: float) -> bool:
+    """Whether only `SIGNAL` makes a process write the stacks of its silent loop.
+
+    So it is where the loop is silent for the limit, nothing is written, and no thread could touch
+    the file either: C code keeps the interpreter's lock. The signal ends what that code waits for
+    in the system, such as a `sleep`, early; so nothing less is a reason to send it.
 
     Args:
-        path: The file.
-        send: Sends `SIGNAL` to the process; None where that cannot be.
+        path: The file of the process.
+        silent_s: For how long its loop has given no sign of life.
     """
     with suppress(*_STRANGE), path.open("rb") as file:
-        found, about = read_stacks(file), json.loads((file.seek(0), file.readline())[1])
-        untouched_s = time.time() - os.fstat(file.fileno()).st_mtime
-        is_stuck = found is None and untouched_s > about["limit_s"] + _UNTOUCHED_S
-        if send is not None and is_stuck and about["signal"] == SIGNAL:
-            send()
-            time.sleep(_WRITING_S)
-            found = read_stacks(file)
-        return found
-    return None
+        about, untouched_s = (
+            json.loads(file.readline()),
+            time.time() - os.fstat(file.fileno()).st_mtime,
+        )
+        is_written, limit_s = bool(file.read(1)), float(about["limit_s"])
+        is_stuck = not is_written and untouched_s > limit_s + _UNTOUCHED_S
+        return bool(SIGNAL) and about["signal"] == SIGNAL and is_stuck and silent_s >= limit_s
+    return False
 
 
 def _cut(name: str) -> str:

@@ -194,3 +194,21 @@ def test_whose_time_a_loop_takes_is_known_of_each_run(
     taken_s = time.time() - filed.rows("SELECT started_wall_time_s FROM run")[0]
     assert own_s >= 0.02 * steps
     assert wait_s > 0 and own_s + wait_s < taken_s
+
+
+def test_asking_read_only_wakes_no_c_code(start: Start, filed: Recording, tmp_path: Path) -> None:
+    slept = tmp_path / "slept"
+    sleep = "__import__('ctypes').PyDLL(None).sleep(8)"
+    hang = f"left = {sleep}; Path({str(slept)!r}).write_text(str(left))"
+    simulation = start(HANGS.format(hang=hang))
+    simulation.wait_for(lambda: has_states(filed))
+    assert isinstance(filed.database, Path)
+    store = Store(filed.database, filed.database.parent, read_only=True)
+
+    def is_over() -> bool:
+        with store.view() as view:
+            assert view.status.text
+        return slept.exists()
+
+    simulation.wait_for(is_over)
+    assert slept.read_text() == "0"  # seconds that were left when it returned

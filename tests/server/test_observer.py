@@ -156,3 +156,18 @@ async def test_a_pause_by_hand_is_taken_back_by_the_observer(begin: Any) -> None
         answer = await ask(client, "webots_simulation_control", command="resume")
         assert (answer["outcome"], answer["route"]) == ("done", "observer")
         assert answer["evidence"].startswith("simulation time advanced to ")
+
+
+async def test_an_observer_makes_exactly_the_steps_that_were_asked_for(begin: Any) -> None:
+    async with begin(DRIVES, "--mode=realtime") as client:
+        await once(client, "webots_get_world_info", moves)
+        paused = await ask(client, "webots_simulation_control", command="pause")
+        assert paused["outcome"] == "done"
+        for steps in (12, 7):
+            before = await ask(client, "webots_simulation_control", command="step", steps=1)
+            answer = await ask(client, "webots_simulation_control", command="step", steps=steps)
+            result, began = answer["result"], before["result"]
+            assert result["steps"] == steps and "warning" not in result
+            assert result["mode"] == "pause"
+            advanced_s = result["sim_time_s"] - began["sim_time_s"]
+            assert advanced_s == pytest.approx(result["advanced_s"]) == steps * 0.016

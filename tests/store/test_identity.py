@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import sqlite3
 import subprocess
 import sys
@@ -17,7 +18,7 @@ import pytest
 from tests.bridge.conftest import heartbeat_now
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect, create_schema
-from webots_mcp.liveness import process_identity, signal_process
+from webots_mcp.liveness import has_lost_simulator, process_identity, signal_process
 from webots_mcp.stacks import SIGNAL
 from webots_mcp.standin import InProcessSupervisor
 
@@ -148,3 +149,20 @@ def test_a_signal_reaches_the_process_that_expects_it_and_no_other_of_its_pid() 
 
 def _caught(pid: int) -> int:
     return int(Path(f"/proc/{pid}/status").read_text().partition("SigCgt:")[2].split()[0], 16)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux shows it")
+def test_a_connection_that_webots_has_closed_is_told_from_one_that_stands() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as webots:
+        port = webots.getsockname()[1]
+        with socket.create_connection(("127.0.0.1", port)) as controller:
+            accepted, _ = webots.accept()
+            instance, pid = f"host:{port}", os.getpid()
+            assert not has_lost_simulator(pid, instance)
+            accepted.close()
+            assert controller.recv(1) == b""
+            assert has_lost_simulator(pid, instance)
+            assert not has_lost_simulator(pid, f"host:{port + 1}")
+            assert not has_lost_simulator(pid, "host process 7")
+        assert not has_lost_simulator(pid, instance)
+        assert not has_lost_simulator(2**22 + 1, instance)

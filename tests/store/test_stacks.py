@@ -19,7 +19,15 @@ import pytest
 from tests.recordings.rows import Recorded
 from tests.store.questions.test_outcomes import driving, measure, medians, record
 from webots_mcp import MCPBridge
-from webots_mcp.stacks import FORMAT, SIGNAL, VERSION, read_stacks, stacks_at, stacks_path
+from webots_mcp.stacks import (
+    FORMAT,
+    SIGNAL,
+    VERSION,
+    needs_signal,
+    read_stacks,
+    stacks_at,
+    stacks_path,
+)
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.questions.compare import compare_runs
 from webots_mcp.store.recording import look
@@ -109,7 +117,7 @@ def test_a_file_without_the_stacks_of_the_loop_says_nothing_and_is_removed(
     path.write_bytes(content)
     with path.open("rb") as file:
         assert read_stacks(file) is None
-    assert stacks_at(path, lambda: pytest.fail("no process is asked")) is None
+    assert stacks_at(path) is None and not needs_signal(path, 1e9)
     recorded.robot()
     assert adopt(recorded.connection, tmp_path / "webots.db") == 0
     assert not path.exists()
@@ -226,3 +234,30 @@ def test_an_edit_that_made_the_loop_slower_is_noticed_once_enough_runs_show_it(
     first = measure(compare_runs(empty, [1, 5]), "own_ms_per_step")
     assert medians(found) == [pytest.approx(10.25), pytest.approx(30.25)]
     assert (found.different[1], first.different[1]) == (True, None)
+
+
+@pytest.mark.skipif(not SIGNAL, reason="there is no such signal")
+@pytest.mark.parametrize(
+    ("head", "rest", "untouched_s", "silent_s", "is_needed"),
+    [
+        ({}, "", 7.0, 7.0, True),
+        ({}, "", 7.0, 2.9, False),  # the loop gave a sign of life
+        ({}, "", 1.0, 7.0, False),  # a thread of the process could touch the file
+        ({}, f"{LOOP}\n", 7.0, 7.0, False),  # it could even write
+        ({"signal": None}, "", 7.0, 7.0, False),  # the controller has the signal for itself
+        ({"limit_s": 60.0}, "", 50.0, 50.0, False),
+    ],
+)
+def test_the_signal_is_only_for_a_silent_loop_whose_process_could_write_nothing(
+    tmp_path: Path,
+    head: dict[str, object],
+    rest: str,
+    untouched_s: float,
+    silent_s: float,
+    is_needed: bool,
+) -> None:
+    path = tmp_path / "stacks"
+    path.write_text(f"{json.dumps(HEAD | {'signal': SIGNAL} | head)}\n{rest}")
+    touched_s = time.time() - untouched_s
+    os.utime(path, (touched_s, touched_s))
+    assert needs_signal(path, silent_s) == is_needed

@@ -46,6 +46,8 @@ if TYPE_CHECKING:
 
 Action = Callable[["Session", ClaimedCommand], Progress]
 
+_ROUND_S: Final = 0.05  # of wall time in which a loop makes steps before it looks around
+_LAST_STEPS: Final = 4  # made without looking around, which may take longer than a step
 _SCREENSHOT_TIMEOUT_S: Final = 10.0
 _RESET_TIMEOUT_S: Final = 10.0
 _RELOAD_TIMEOUT_S: Final = 30.0
@@ -116,10 +118,13 @@ def step(session: Session, command: ClaimedCommand) -> Progress:
     """Let the user's loop run `steps` rounds, each with its own step, then pause.
 
     A loop that does not ask for commands in every round makes more steps; the answer has the number
-    made. A world that does not wait for the robot (`synchronization` FALSE) runs in real time
-    meanwhile, so that it can be stopped in time.
+    made, as a warning first. A world that does not wait for the robot (`synchronization` FALSE)
+    runs in real time meanwhile, so that it can be stopped in time.
     """
-    return _step(session, command, whole_number(command.params, "steps", 1, MAX_STEPS, default=1))
+    steps = whole_number(command.params, "steps", 1, MAX_STEPS, default=1)
+    if session.clock.step_s is not None and not session.simulation.waits_for_robot:
+        return _step_world(session, command, steps)
+    return _step(session, command, steps)
 
 
 def _step(session: Session, command: ClaimedCommand, steps: int) -> Progress:
@@ -142,7 +147,60 @@ def _step(session: Session, command: ClaimedCommand, steps: int) -> Progress:
     watch.stepping = None
     session.pause.begin(Cause(command.id))
     advanced_s = round(clock.sim_time_s - from_s, 6)
-    return {"steps": made, "advanced_s": advanced_s, **_mode(session), **why}
+    counted = {"steps": made, "advanced_s": advanced_s}
+    return {**_miscounted(made, steps), **counted, **_mode(session), **why}
+
+
+def _miscounted(made: int, steps: int) -> dict[str, object]:
+    """A warning where another number of steps was made than was asked for."""
+    if made <= steps:
+        return {}
+    return {"warning": f"{made} steps were made, not {steps}: the loop could not stop in time"}
+
+
+def _step_world(session: Session, command: ClaimedCommand, steps: int) -> Progress:
+    """Make so many steps of a world that does not wait for this robot, then pause.
+
+    The first is awaited without waiting in it: a controller that hangs, and so holds up the world,
+    must not block this loop too. Then the world can go on, and is made to wait for this robot, so
+    that it stops at the very step.
+    """
+    pause, simulation, watch = session.pause, session.simulation, session.watch
+    simulation.pump()  # the newest answer may be older than the world
+    from_s = simulation.time_s
+    pause.change_mode_temporarily(command.id, "real_time", stepping=True)
+    watch.stepping = command.id
+
+    def made() -> int:
+        return round((simulation.time_s - from_s) / simulation.basic_time_step_s)
+
+    def steps_until(count: int, go_on: Callable[[], object], last: int = 0) -> Generator[None]:
+        until_s = time.monotonic() + _ROUND_S
+        while made() < count and watch.stepping == command.id:
+            go_on()
+            is_long = time.monotonic() > until_s and count - made() > last
+            if simulation.over or is_long:
+                yield  # for a heartbeat, and for commands that end this one
+                until_s = time.monotonic() + _ROUND_S
+
+    try:
+        yield from steps_until(1, simulation.pump)
+        if made() < steps:
+            with simulation.world_waits():
+                yield from steps_until(steps, simulation.advance, _LAST_STEPS)
+                simulation.set_mode("pause")  # before the world stops waiting
+    except InterruptedCommandError as interruption:
+        watch.stepping = None
+        raise CommandRefusedError(f"{interruption} after {made()} of {steps} steps") from None
+    simulation.set_mode("pause")
+    if not simulation.pump():  # the world may have made a step until it was paused
+        yield  # Webots has ended the controller
+    why = {"why": "it was cancelled before the last step"} if made() < steps else {}
+    watch.stepping = None
+    session.look()
+    pause.begin(Cause(command.id))
+    counted = {"steps": made(), "advanced_s": round(simulation.time_s - from_s, 6)}
+    return {**_miscounted(made(), steps), **counted, **_mode(session), **why}
 
 
 @_built_in

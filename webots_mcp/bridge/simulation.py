@@ -8,7 +8,8 @@ from __future__ import annotations
 import functools
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.contract import new_uuid
@@ -79,6 +80,30 @@ class Simulation:
             return True
         self.end()
         return False
+
+    def advance(self) -> bool:
+        """Make one basic time step; False if Webots says quit."""
+        if self._gate.advance(max(round(self.basic_time_step_s * 1000), 1)) != QUIT:
+            return True
+        self.end()
+        return False
+
+    @contextmanager
+    def world_waits(self) -> Generator[None]:
+        """Let the world wait for this robot's steps meanwhile, which it did not before.
+
+        Webots reads the field `synchronization` before each step. Where the node has none, the
+        world goes on without waiting.
+        """
+        own: Any = self.robot.getSelf()
+        field = own.getField("synchronization") if own is not None else None
+        if field is not None:
+            field.setSFBool(True)
+        try:
+            yield
+        finally:
+            if field is not None and not self.over:
+                field.setSFBool(False)
 
     def guard_steps(self, guard: Guard | None) -> None:
         """Let `guard` answer the controller's steps; None: let Webots answer them again."""
@@ -212,6 +237,10 @@ class StepGate:
     def exchange(self) -> int:
         """Call `step(0)` past the guard; returns 0, or -1 if Webots wants the controller to end."""
         return self._own_step(self._robot, 0)
+
+    def advance(self, duration_ms: int) -> int:
+        """Make a step past the guard."""
+        return self._own_step(self._robot, duration_ms)
 
     def close(self, guard: Guard) -> None:
         """Let the guard answer each step of the controller."""

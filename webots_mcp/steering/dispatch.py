@@ -20,7 +20,6 @@ from webots_mcp.contract import (
     BUILT_IN_ACTIONS,
     CUSTOM_DATA,
     HEARTBEAT_LATE_S,
-    ISSUED_TIME_TO_LIVE_S,
     LOOPING,
     MAX_RUN_S,
 )
@@ -59,13 +58,17 @@ from webots_mcp.store.reading.segment import Subject
 from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.requests import permit
 from webots_mcp.store.robots import (
+    PRESS_PLAY,
+    Block,
     Session,
     companions,
     fetch_session,
+    find_block,
     find_holder,
     handler_at_work,
     list_robots,
     live_observer,
+    may_return,
     robot_name,
     without_observers,
 )
@@ -77,10 +80,15 @@ Report = Callable[[float, float | None, str], Awaitable[None]]
 # miss commits of the same connection.
 _POLL_INTERVAL_S: Final = 0.004
 _REPORT_INTERVAL_S: Final = 1.0
+# A loop that comes round claims a command at once. After this time it is asked, so often, whether
+# something is known to keep the loop.
+BLOCK_NOTICED_S: Final = 2.0
+_BLOCK_SOUGHT_EVERY_S: Final = 0.25
 # At the deadline the command is cancelled. Its own time to live only matters if this server dies
 # while it waits: the command then expires soon after the deadline.
 _OUTLIVES_WAITING_S: Final = 1.0
 _ERROR_CHARACTERS: Final = 2_000
+_WITHDRAWN: Final = "{}; the command was withdrawn and will not run"
 
 
 class Dispatcher:
@@ -101,7 +109,8 @@ class Dispatcher:
     ) -> CommandAnswer:
         """Send a command, wait until it is final or the time is up, and report its outcome.
 
-        A command that is not claimed at the deadline is cancelled, so that it cannot run when its
+        A command that is not claimed soon because its loop is known to be blocked is withdrawn at
+        once. One that is not claimed at the deadline is cancelled, so that it cannot run when its
         caller has stopped waiting; the same happens when the caller disconnects.
 
         Args:
@@ -152,7 +161,7 @@ class Dispatcher:
 
     async def _outcome(self, command: Command, claiming_s: float, until_s: float) -> Command:
         try:
-            command = await self._watch(command.id, claiming_s)
+            command = await self._watch(command.id, claiming_s, withdraws=True)
             command = await to_thread.run_sync(self._at_the_deadline, command)
             if command.is_final:
                 return command
@@ -179,14 +188,22 @@ class Dispatcher:
                 request_id=request_id,
             )
 
-    async def _watch(self, command_id: int, timeout_s: float) -> Command:
+    async def _watch(
+        self, command_id: int, timeout_s: float, *, withdraws: bool = False
+    ) -> Command:
         started_s = time.monotonic()
-        next_report_s = _REPORT_INTERVAL_S
+        next_report_s, next_search_s = _REPORT_INTERVAL_S, BLOCK_NOTICED_S
         with self._recording.reader() as connection:
             while not (command := fetch_command(connection, command_id)).is_final:
                 waited_s = time.monotonic() - started_s
                 if waited_s >= timeout_s:
                     return command
+                if waited_s >= next_search_s:
+                    next_search_s = waited_s + _BLOCK_SOUGHT_EVERY_S
+                    if command.status == "pending" and withdraws:
+                        await to_thread.run_sync(withdraw_if_blocked, self._recording, command)
+                    elif await to_thread.run_sync(is_held_up, self._recording, command):
+                        return command
                 if waited_s >= next_report_s:
                     next_report_s += _REPORT_INTERVAL_S
                     await to_thread.run_sync(self._recording.settle)
@@ -231,7 +248,35 @@ class Dispatcher:
             }
             if command.action == ACTION:
                 return RunAnswer(**facts, **run_facts(view, command))
-            return CommandAnswer(**facts, result=shown_result(command))
+            answer = CommandAnswer(**facts, result=shown_result(command))
+            _name_mode_afterwards(view, command, answer)
+            return answer
+
+
+def withdraw_if_blocked(recording: Recording, command: Command) -> bool:
+    """Cancel a pending command where its loop is known to be blocked; True if it will never run.
+
+    A controller that claims it in the meantime runs it, and the outcome is that of the controller.
+    """
+    block = _block_of(recording, command)
+    if block is None:
+        return False
+    with recording.writer() as connection:
+        return CommandQueue(connection).cancel(command.id, _WITHDRAWN.format(block.why))
+
+
+def is_held_up(recording: Recording, command: Command) -> bool:
+    """Whether a `step` or `run` that is under way cannot go on, since its loop is blocked."""
+    if command.status != "claimed" or command.action not in LOOPING:
+        return False
+    return _block_of(recording, command) is not None
+
+
+def _block_of(recording: Recording, command: Command) -> Block | None:
+    with recording.reader() as connection:
+        name = robot_name(connection, command.robot_id)
+    with recording.view(name) as view:
+        return find_block(view.connection, view.session, view.run, view.now_s)
 
 
 class _Sending:
@@ -263,6 +308,37 @@ def shown_result(command: Command, budget_tokens: int = RESULT_BUDGET_TOKENS) ->
     return shorten(command.decoded_result(), budget_tokens, WHOLE).value
 
 
+# Commands that set the mode of the simulation; a `run` sets what its `then` says.
+_MODES: Final = {"pause": "pause", "step": "pause", "resume": "real_time", "fast": "fast"}
+_LATER: Final = (
+    "SELECT id, action, status, params, result FROM command WHERE id > :id AND status IN "
+    "('pending', 'claimed', 'done') AND action IN ('pause', 'step', 'resume', 'fast', 'run') "
+    "AND robot_id IN (SELECT o.robot_id FROM session o JOIN session s ON s.instance = o.instance "
+    "WHERE s.id = :session AND o.ended_wall_time_s IS NULL) ORDER BY id DESC LIMIT 1"
+)
+
+
+def _name_mode_afterwards(view: View, command: Command, answer: CommandAnswer) -> None:
+    """Correct the mode in the answer of a command that a later one has followed meanwhile."""
+    if command.action not in _MODES or command.status not in ("done", "failed"):
+        return
+    values = {"id": command.id, "session": command.session_id}
+    later = view.connection.execute(_LATER, values).fetchone()
+    if later is None:
+        return
+    later_id, action, status, params, result = later
+    known: dict[str, Any] = json.loads(result) if status == "done" and result else {}
+    then = json.loads(params).get("then", "pause")
+    mode = known.get("mode") or _MODES.get(action, "pause" if then == "pause" else None)
+    if mode is None:
+        return
+    if command.status == "done" and answer.result:
+        answer.result = cast("dict[str, Any]", answer.result) | {"mode": mode}
+    when = "now" if status == "done" else "once that has been done"
+    note = f"command {later_id} ({action}) came after it: the mode is {mode} {when}"
+    answer.hint = "; ".join(filter(None, (answer.hint, note)))
+
+
 def _error(command: Command) -> str | None:
     if command.status == "done" or command.error is None:
         return None
@@ -279,12 +355,15 @@ def _hint(view: View, command: Command) -> str | None:
     if command.status == "pending":
         return "no controller has claimed it yet"
     if command.status == "done":
-        return command.error  # the values of the result that had to be replaced
+        # The values of the result that had to be replaced, or what was not done as it was asked.
+        return command.error or _result_of(command).get("warning")
     if command.status == "failed":
         return _instructions(view, command.action)
     if command.status == "claimed":
+        block = find_block(view.connection, view.session, view.run, view.now_s)
+        why = f"{block.why}: {block.fix}" if block else "the controller is still running it"
         return (
-            "the controller is still running it: keep waiting with "
+            f"{why}; keep waiting with "
             f'webots_list_commands(what="outcome", command_id={command.id}); do not send it again'
         )
     if command.status == "lost":
@@ -308,15 +387,14 @@ def _instructions(view: View, action: str) -> str | None:
 
 def _after_no_answer(view: View) -> str:
     session = view.session
+    if block := find_block(view.connection, session, view.run, view.now_s):
+        return f"{block.fix}, then ask again"
     if session is None or not view.robot.live:
         return "start its controller, then ask again"
     if handler_at_work(view.connection, session, view.now_s):
         return "wait until that handler has returned, then ask again"
     if not session.heartbeat_is_fresh(view.now_s):
-        return (
-            "press play in Webots if it is paused there: only a person can resume it while the "
-            "controller is inside step(); else check what its loop is waiting for"
-        )
+        return PRESS_PLAY
     if session.last_poll_wall_time_s is None:
         return "the controller's loop never calls bridge.get_command(): add that line to its loop"
     silent_s = session.age_s(session.last_poll_wall_time_s, view.now_s)
@@ -688,19 +766,12 @@ def _require_live(view: View) -> Session:
             "controller MCPBridge.attach(robot); the simulation is steered by an observer "
             f"({f'robot={observer.name!r}' if observer else _MAKE_OBSERVER})"
         )
-    if session is not None and (view.robot.live or _is_reloading(session, view.now_s)):
+    if session is not None and (view.robot.live or may_return(session, view.now_s)):
         return session
     raise CommandRefusedError(
         f"robot {view.robot.name!r} has no live controller: "
         f"{view.status.why or 'it was never seen'}; start it, then ask again"
     )
-
-
-def _is_reloading(session: Session, now_s: float) -> bool:
-    ended_s = session.ended_wall_time_s or session.last_seen_wall_time_s
-    if session.extern:
-        return False
-    return session.end_reason == "reload" and now_s - ended_s < ISSUED_TIME_TO_LIVE_S
 
 
 def _who_may(view: View, session: Session, action: str) -> str:

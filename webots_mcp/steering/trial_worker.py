@@ -18,7 +18,12 @@ from typing import Any, Final
 
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, LeaseLostError, WebotsMCPError
 from webots_mcp.queue import Command, CommandQueue, fetch_command, find_command
-from webots_mcp.steering.dispatch import ACTION, find_target
+from webots_mcp.steering.dispatch import (
+    ACTION,
+    BLOCK_NOTICED_S,
+    find_target,
+    withdraw_if_blocked,
+)
 from webots_mcp.steering.trial_plan import TrialPlan, stored_plan
 from webots_mcp.store.parameters import (
     Result,
@@ -40,12 +45,13 @@ from webots_mcp.store.parameters import (
 from webots_mcp.store.questions.runs import score_run
 from webots_mcp.store.recording import Job, Recording, View
 from webots_mcp.store.requests import permit
-from webots_mcp.store.robots import robot_name
+from webots_mcp.store.robots import find_block, robot_name
 
 _LOOK_EVERY_S: Final = 0.02
 # Long enough that simulation time visibly goes back at the next reset, by which it is detected.
 _SOME_STEPS_S: Final = 0.2
 _SETTLE_EVERY_S: Final = 1.0
+_BLOCK_SOUGHT_EVERY_S: Final = 0.25  # whether something keeps the loop from a command
 _PATIENCE_S: Final = 5.0  # with a command that takes a round of the loop
 _END_PATIENCE_S: Final = 2.0  # the same where the server ends
 _ASKER: Final = "trials"
@@ -208,6 +214,7 @@ class TrialWorker(threading.Thread):
     def _settled(self, command_id: int, timeout_s: float, *, hurried: bool = False) -> Command:
         """The command, once it is final or the time is over."""
         until_s, settle_s = time.monotonic() + timeout_s, time.monotonic() + _SETTLE_EVERY_S
+        search_s = time.monotonic() + BLOCK_NOTICED_S
         with self._recording.reader() as connection:
             while not (command := fetch_command(connection, command_id)).is_final:
                 now_s = time.monotonic()
@@ -216,6 +223,10 @@ class TrialWorker(threading.Thread):
                 if now_s >= settle_s:
                     settle_s = now_s + _SETTLE_EVERY_S
                     self._recording.settle()
+                if command.status == "pending" and now_s >= search_s:
+                    search_s = now_s + _BLOCK_SOUGHT_EVERY_S
+                    if withdraw_if_blocked(self._recording, command):
+                        continue
                 if hurried:
                     time.sleep(_LOOK_EVERY_S)
                 elif self._stopping.wait(_LOOK_EVERY_S):
@@ -317,6 +328,12 @@ class TrialWorker(threading.Thread):
             if noted.former_values is None:
                 return
             assert noted.robot_id is not None and noted.session_id is not None
+        with self._recording.view(self._robot) as view:
+            block = find_block(view.connection, view.session, view.run, view.now_s)
+        if block is not None and view.session and view.session.id == noted.session_id:
+            self._record_stop(f"its parameters were not restored: {block.why}")
+            return
+        with self._job.writer() as connection:
             command = self._ask_back(connection, noted)
         patience_s = _END_PATIENCE_S if self._stopping.is_set() else _PATIENCE_S
         if command is not None:

@@ -49,7 +49,7 @@ from webots_mcp.store.journal_intake import BUDGET_S, has_news, journals_behind,
 from webots_mcp.store.reading.observed_pose import find_observed
 from webots_mcp.store.reading.segment import Subject, choose, require_run
 from webots_mcp.store.retention import Asked
-from webots_mcp.store.robots import Robot, Session, Status, judge, stopped_for
+from webots_mcp.store.robots import Robot, Session, Status, ask_stuck, judge, stopped_for
 from webots_mcp.store.run_rows import Run, State, current_run, newest_state
 from webots_mcp.waiting_file import adopt, waiting_paths
 
@@ -254,7 +254,12 @@ class Recording:
             InvalidInputError: There is no such robot or run, or several robots are possible.
         """
         with self.reader() as connection:
-            yield look(connection, robot, run_id)
+            seen = look(connection, robot, run_id)
+            may_ask = not self.read_only and run_id is None and not seen.status.is_moving
+            if may_ask and seen.session and ask_stuck(connection, seen.session, seen.now_s):
+                # Of the moment before: the signal may have woken the loop.
+                seen = view_of(connection, seen.robot, seen.now_s)
+            yield seen
 
     def settle(self) -> None:
         """Settle the commands that no live process will finish, unless `read_only`."""

@@ -9,7 +9,6 @@ import sqlite3
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -19,6 +18,7 @@ from webots_mcp.contract import (
     ENDED_BY,
     HEARTBEAT_INTERVAL_S,
     HEARTBEAT_LATE_S,
+    ISSUED_TIME_TO_LIVE_S,
     MODE_EVENT,
     OBSERVER,
     UNMOVED,
@@ -27,7 +27,14 @@ from webots_mcp.contract import (
     host_name,
 )
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError, UnknownRobotError
-from webots_mcp.liveness import EXTERN, is_living, is_stopped, process_alive, signal_process
+from webots_mcp.liveness import (
+    EXTERN,
+    has_lost_simulator,
+    is_living,
+    is_stopped,
+    process_alive,
+    signal_process,
+)
 from webots_mcp.naming import SOLIDS, WORLD
 from webots_mcp.pauses import (
     HELD_ELSEWHERE,
@@ -35,13 +42,14 @@ from webots_mcp.pauses import (
     PAUSE,
     PAUSED,
     RESUME,
+    SEEN_PAUSED,
     SEEN_PAUSED_BY,
     SEEN_RUNNING,
     SEEN_RUNNING_BY,
     breakpoint_at,
     change_since,
 )
-from webots_mcp.stacks import LOGGER, SIGNAL, Stacks, stacks_at, stacks_path
+from webots_mcp.stacks import LOGGER, SIGNAL, Stacks, needs_signal, stacks_at, stacks_path
 from webots_mcp.store.run_rows import Run, columns_of, newest_state, recent_interval_s, state_at
 from webots_mcp.waiting_file import Entry, count_rows, next_entries, read_header, waiting_path
 
@@ -338,6 +346,7 @@ _CLAIMED: Final = (
 )
 
 _STILL_MOVING_S: Final = 1.0
+_WRITING_S: Final = 0.1  # after a signal
 _SLOWEST_STILL_MOVING_S: Final = 15.0
 
 _UNPUBLISHED_S: Final = 5.0  # of wall time without a row
@@ -385,6 +394,12 @@ WAITING_IN_STEP: Final = (
     "its loop waits in step(): paused by hand in Webots or at a breakpoint, another controller "
     "holds the world up, or an extern one is missing; from inside the simulation these look alike"
 )
+CONNECTION_LOST: Final = (
+    "Webots has gone: it has closed its connection to the controller (process {}), which waits for "
+    "its answer in step()"
+)
+_STOPPED_PROCESS: Final = "its controller (process {}) is stopped, by a signal or a debugger"
+_AWAITS_PERSON: Final = "its loop waits for a person, in a debugger or for a key or click, in {}"
 _HELD_UP_BY: Final = "its loop waits in step(), as the whole world does, for {}: {}"
 _STARTED: Final = "its controller has just started; simulation time has not moved yet"
 _NOT_STARTED: Final = (
@@ -457,6 +472,121 @@ def judge(
     return _stopped(session, moved_s, now_s, _why_standing(connection, session, moved_s, now_s))
 
 
+_BEGINNING_S: Final = 10.0  # in which a first step may take long: Webots loads, or compiles shaders
+_SURE_OF_HANG: Final = 2.0  # limits of the bridge, or of the silences from which it came back
+_MOST_SILENCES: Final = 20
+_SILENCES: Final = (
+    "SELECT l.wall_time_s, (SELECT s.wall_time_s FROM state s WHERE s.run_id = l.run_id "
+    "AND s.sim_time_s >= l.sim_time_s AND s.wall_time_s > l.wall_time_s "
+    "ORDER BY s.sim_time_s, s.id LIMIT 1) FROM log l "
+    "WHERE l.run_id IN (SELECT id FROM run WHERE session_id = ?) "
+    f"AND l.logger = '{LOGGER}' ORDER BY l.id DESC LIMIT {_MOST_SILENCES}"
+)
+PRESS_PLAY: Final = (
+    "press play in Webots if it is paused there: only a person can resume it while the controller "
+    "is inside step(); else check what its loop is waiting for"
+)
+_RESUME_BY: Final = "webots_simulation_control('resume') resumes it"
+_FREE_IT: Final = "mend that line, or end the controller and start it again"
+
+
+class Block(NamedTuple):
+    """Why a robot's loop is known not to ask for commands, until somebody does something.
+
+    Attributes:
+        why: What keeps the loop.
+        fix: What to do.
+    """
+
+    why: str
+    fix: str
+
+
+def find_block(
+    connection: sqlite3.Connection, session: Session | None, run: Run | None, now_s: float
+) -> Block | None:
+    """What is known to keep a loop from asking for commands; None where it may yet ask.
+
+    Only what is known counts. A loop that has been silent for a while may be slow: one that came
+    round as slowly before, or computes no longer than it did before, is given its time.
+
+    Args:
+        connection: An open database.
+        session: The robot's latest session.
+        run: Its latest run, whose pace shows how long a round usually takes.
+        now_s: Unix time.
+    """
+    if session is None:
+        return None
+    if not session.is_alive(now_s):
+        why = _why_ended(connection, session) or "its controller is gone"
+        return None if may_return(session, now_s) else Block(why, "start its controller")
+    holder = find_holder(connection, session, now_s)
+    if holder is not None and holder.id != session.id:
+        name = robot_name(connection, holder.robot_id)
+        return Block(HELD_ELSEWHERE.format(name), f"resume or step it there (robot={name!r})")
+    if session.host == host_name() and is_stopped(session.pid):
+        fix = f"let it go on (kill -CONT {session.pid}, or the debugger)"
+        return Block(_STOPPED_PROCESS.format(session.pid), fix)
+    moved_s = _moved_wall_time_s(connection, session, run)
+    if session.heartbeat_is_fresh(now_s) or find_backlog(connection, session) is not None:
+        return None
+    if moved_s is not None and session.age_s(moved_s, now_s) <= _still_moving_s(connection, run):
+        return None
+    if _has_lost_simulator(session):
+        fix = f"end process {session.pid}, start Webots, then the controller"
+        return Block(CONNECTION_LOST.format(session.pid), fix)
+    seen = _seen_by_observer(connection, session, now_s)
+    if seen and seen.startswith(SEEN_PAUSED):
+        return Block(seen, _RESUME_BY)
+    if moved_s is None and session.age_s(session.started_wall_time_s, now_s) <= _BEGINNING_S:
+        return None
+    return _block_in_code(connection, session, moved_s, now_s)
+
+
+def _block_in_code(
+    connection: sqlite3.Connection, session: Session, moved_s: float | None, now_s: float
+) -> Block | None:
+    """What the stacks of a silent loop show; None where they show nothing, or a slow round."""
+    stacks = find_stacks(connection, session, now_s)
+    if stacks is None:
+        return None
+    if stacks.is_in_step:
+        for other in companions(connection, session, now_s):
+            if (hang := _hang(connection, other, now_s)) is None:
+                continue
+            if not _is_sure(connection, other, now_s):
+                return None
+            held_up = _HELD_UP_BY.format(robot_name(connection, other.robot_id), hang)
+            return Block(held_up, _FREE_IT)
+        return Block(_why_standing(connection, session, moved_s, now_s), PRESS_PLAY)
+    if not stacks.is_hang:
+        return Block(_AWAITS_PERSON.format(stacks.place), "let it go on")
+    if _is_unseen(session, moved_s) or handler_at_work(connection, session, now_s):
+        return None
+    hang = _hang(connection, session, now_s)
+    return Block(hang, _FREE_IT) if hang and _is_sure(connection, session, now_s) else None
+
+
+def _is_sure(connection: sqlite3.Connection, session: Session, now_s: float) -> bool:
+    """Whether a loop is silent for much longer than its limit, and than it ever was before."""
+    stacks = find_stacks(connection, session, now_s)
+    if stacks is None:
+        return False
+    silences = connection.execute(_SILENCES, (session.id,)).fetchall()
+    lasted_s = [
+        end_s - noted_s + stacks.limit_s for noted_s, end_s in silences if end_s is not None
+    ]
+    return session.silent_s(now_s) >= _SURE_OF_HANG * max([stacks.limit_s, *lasted_s])
+
+
+def may_return(session: Session, now_s: float) -> bool:
+    """Whether Webots may start its controller again by itself: the world is being reloaded."""
+    ended_s = session.ended_wall_time_s or session.last_seen_wall_time_s
+    is_soon = now_s - ended_s < ISSUED_TIME_TO_LIVE_S
+    return session.end_reason == "reload" and not session.extern and is_soon
+
+
 def _moved_wall_time_s(
     connection: sqlite3.Connection, session: Session, run: Run | None
 ) -> float | None:
@@ -516,7 +646,7 @@ def _why_ended(connection: sqlite3.Connection, session: Session) -> str | None:
 def _left_stacks(connection: sqlite3.Connection, session: Session) -> str | None:
     """Where a dead process had hung, as the file has it that nobody has taken in yet."""
     path = _path_of(connection, session, stacks_path)
-    stacks = stacks_at(path, None) if path else None
+    stacks = stacks_at(path) if path else None
     is_told = stacks and stacks.is_hang and stacks.began_after(session.last_seen_wall_time_s)
     return f"{stacks.log_values(None)['message']}" if stacks and is_told else None
 
@@ -531,6 +661,8 @@ def _why_standing(
     connection: sqlite3.Connection, session: Session, moved_s: float | None, now_s: float
 ) -> str:
     """Why the time of a living controller, which its bridge does not hold, stands still."""
+    if _has_lost_simulator(session):
+        return CONNECTION_LOST.format(session.pid)
     if inside := handler_at_work(connection, session, now_s):
         return inside
     stacks = find_stacks(connection, session, now_s)
@@ -556,6 +688,11 @@ def _why_standing(
     return LEFT_PAUSED.format(robot_name(connection, left.robot_id))
 
 
+def _has_lost_simulator(session: Session) -> bool:
+    """Whether Webots has closed the connection to its controller."""
+    return session.host == host_name() and has_lost_simulator(session.pid, session.instance)
+
+
 def _is_unseen(session: Session, moved_s: float | None) -> bool:
     """Whether its bridge has seen nothing of the loop yet."""
     return moved_s is None and session.last_poll_wall_time_s is None
@@ -564,11 +701,33 @@ def _is_unseen(session: Session, moved_s: float | None) -> bool:
 def find_stacks(connection: sqlite3.Connection, session: Session, now_s: float) -> Stacks | None:
     """Where the loop of a session is silent now; None where it is not, or that is not known."""
     path = _path_of(connection, session, stacks_path)
-    is_silent = session.host == host_name() and not session.heartbeat_is_fresh(now_s)
-    may_signal = is_silent and not is_stopped(session.pid)
-    send = partial(signal_process, session.pid, session.process, SIGNAL) if may_signal else None
-    stacks = stacks_at(path, send) if path else None
+    stacks = stacks_at(path) if path else None
     return stacks if stacks and stacks.began_after(session.last_seen_wall_time_s) else None
+
+
+def ask_stuck(connection: sqlite3.Connection, session: Session, now_s: float) -> bool:
+    """Have the processes of a simulation that cannot do it otherwise write where they hang.
+
+    The signal for it is sent only where the loop is silent for the limit of its bridge and the
+    thread of the bridge could not write the stacks, which C code that keeps Python's lock prevents.
+
+    Returns:
+        Whether a signal was sent.
+    """
+    asked = False
+    for each in (session, *companions(connection, session, now_s)):
+        path = _path_of(connection, each, stacks_path) if each.host == host_name() else None
+        if path is None or each.ended_wall_time_s is not None:
+            continue
+        if not needs_signal(path, each.silent_s(now_s)) or is_stopped(each.pid):
+            continue
+        if find_backlog(connection, each) is None:  # else that thread may wait for the database
+            with contextlib.suppress(OSError):
+                signal_process(each.pid, each.process, SIGNAL)
+                asked = True
+    if asked:
+        time.sleep(_WRITING_S)
+    return asked
 
 
 def _hang(connection: sqlite3.Connection, session: Session, now_s: float) -> str | None:

@@ -37,8 +37,8 @@ from webots_mcp.diagnosis import (
 from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
 from webots_mcp.requirements import install_line, missing_requirements, package_of
 from webots_mcp.setup.wsl import WAY_OUT, is_wsl
-from webots_mcp.store.recording import GETTING_STARTED, View, name_of
 from webots_mcp.store.journal_intake import journals_left
+from webots_mcp.store.recording import GETTING_STARTED, View, name_of
 from webots_mcp.store.robots import fetch_session, handler_at_work, rows_waiting
 from webots_mcp.waiting_file import count_rows, waiting_paths
 

@@ -44,7 +44,13 @@ from webots_mcp.errors import (
 from webots_mcp.liveness import Lease, still_held
 from webots_mcp.queue import any_unfinished
 from webots_mcp.store.chunks import is_chunked_aside, show_chunks_aside
-from webots_mcp.store.journal_intake import BUDGET_S, has_news, journals_behind, journals_left, take_in_journals
+from webots_mcp.store.journal_intake import (
+    BUDGET_S,
+    has_news,
+    journals_behind,
+    journals_left,
+    take_in_journals,
+)
 from webots_mcp.store.reading.segment import Subject, choose, require_run
 from webots_mcp.store.retention import Asked
 from webots_mcp.store.robots import Robot, Session, Status, judge, stopped_for

@@ -243,7 +243,7 @@ class _Reading:
         while lines := _read_lines(self.file, place.offset):
             self.faults = place.faults
             if entries := [each.entry for each in lines if each.entry]:
-                self._make_missing_runs(session_id, entries)
+                self._make_missing_runs(session_id, place.number, entries)
                 finish = partial(self._finish, session_id, robot_id, looks, lines)
                 taken = waiting_file.take_in(self.connection, session_id, entries, finish)
                 done = _until(lines, taken.number)[-1].end
@@ -273,13 +273,13 @@ class _Reading:
         self.connection.execute(_COUNT_DROPPED, (len(self.faults), why, session_id))
         return True
 
-    def _make_missing_runs(self, session_id: int, entries: Sequence[Entry]) -> None:
+    def _make_missing_runs(self, session_id: int, number: int, entries: Sequence[Entry]) -> None:
         """Make the runs whose own line did not fit, from the first row that is of them."""
         told: set[object] = set()
         for entry in entries:
             if isinstance(entry.values, dict):
                 told.add(entry.values.get("uuid"))
-            elif entry.run not in told:
+            elif entry.number > number and entry.run not in told:
                 told.add(entry.run)
                 if self.connection.execute(_HAS_RUN, (entry.run,)).fetchone() is None:
                     in_transaction(self.connection, partial(self._make_run, session_id, entry))
@@ -289,7 +289,7 @@ class _Reading:
         known = {"uuid": entry.run, "world": None, "step_ms": None, "reason": "start"}
         times = {"wall_time": wall_time_s, "sim_time": sim_time_s, "session": session_id}
         self.connection.execute(STATEMENTS["run"], known | times)
-        liveness.end_runs(self.connection, session_id, "reset", entry.run)
+        liveness.end_runs(self.connection, session_id, "reset", cast("str", entry.run))
 
     def _enter(self, header: dict[str, Any]) -> tuple[Any, ...]:
         """The ids of session and robot, the number of the last entry, newest state and run."""

@@ -72,8 +72,8 @@ _BEHIND: Final = (
     "--read-only), which takes them in"
 )
 _LEFT: Final = (
-    "nothing of {} could be taken in, and it is kept: {}; correct the file as docs/journal.md says, "
-    "or move it away"
+    "nothing of {} could be taken in, and it is kept: {}; correct the file as docs/journal.md "
+    "says, or move it away"
 )
 _NOT_IN: Final = (
     "; without the rows in {} waiting files next to it (...-waiting-...): copy all of them to a "

@@ -147,11 +147,19 @@ static inline uint64_t wmcp__scaled(uint64_t mantissa, int power, int shift) {
   return (low & (2 * bit - 1)) == bit ? whole & ~(uint64_t)1 : whole; /* a tie: to the even one */
 }
 
-/* A finite number, by the 17 digits that are nearest to it. */
+static inline const char *wmcp__not_finite(double value) { /* by its bits: -ffast-math has no NaN */
+  uint64_t bits;
+  memcpy(&bits, &value, sizeof bits);
+  if ((bits >> 52 & 0x7FF) != 0x7FF) return NULL;
+  return bits << 12 ? "nan" : bits >> 63 ? "-inf" : "inf";
+}
+
+/* A number, by the 17 digits that are nearest to it; null where it is not finite. */
 static inline void wmcp__double(wmcp__text *text, double value) {
   char out[64], *end = out + 64, *at;
   double size = value < 0 ? -value : value;
   uint64_t bits;
+  if (wmcp__not_finite(value)) { wmcp__put(text, "null", 4); return; }
   memcpy(&bits, &value, sizeof bits);
   if (bits >> 63) wmcp__put(text, "-", 1);
   if (size < 9007199254740992.0 && size == (double)(int64_t)size) {
@@ -419,13 +427,6 @@ static inline int wmcp__start_value(wmcp *w, const char *name) {
   return 1;
 }
 
-static inline const char *wmcp__not_finite(double value) { /* by its bits: -ffast-math has no NaN */
-  uint64_t bits;
-  memcpy(&bits, &value, sizeof bits);
-  if ((bits >> 52 & 0x7FF) != 0x7FF) return NULL;
-  return bits << 12 ? "nan" : bits >> 63 ? "-inf" : "inf";
-}
-
 /* -- what a controller calls ------------------------------------------------------------------- */
 
 /* Begins to record, in the data folder `data_dir`; NULL: found as webots-mcp finds it. Of so many
@@ -437,7 +438,8 @@ static inline wmcp *wmcp_open(const char *data_dir, const char *robot, const cha
   const char *interval = getenv("WEBOTS_MCP_THROTTLE_INTERVAL"), *host = NULL;
   char program[WMCP_PATH] = "";
   if (!w) return NULL;
-  if (interval && atoi(interval) > 0) throttle_interval = atoi(interval);
+  long given = interval ? strtol(interval, NULL, 10) : 0;
+  if (given > 0) throttle_interval = given < 1000000000 ? (int)given : 1000000000;
   w->interval = throttle_interval > 0 ? throttle_interval : 5;
   w->step_ms = basic_time_step_ms;
   w->start_reason = "start";
@@ -477,7 +479,8 @@ static inline void wmcp_begin(wmcp *w, double sim_time_s) {
   if (is_reset) wmcp__end_run(w, "reset");
   w->sim_time_s = sim_time_s;
   if (!w->run[0]) { /* a step ago, as the controller began before it */
-    double start_s = sim_time_s - w->step_ms / 1000.0;
+    int is_step = !wmcp__not_finite(w->step_ms) && w->step_ms > 0.0;
+    double start_s = is_step ? sim_time_s - w->step_ms / 1000.0 : sim_time_s;
     wmcp__begin_run(w, start_s > 1e-9 ? start_s : 0.0);
   }
   if (is_reset) {

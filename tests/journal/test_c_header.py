@@ -369,3 +369,20 @@ async def test_a_server_that_began_before_the_database_answers_what_was_just_pub
             await anyio.sleep(0.05)
         answer = (await client.call_tool("webots_get_robot_state", {})).structured_content
         assert answer and "killed or crashed" in answer["why"]
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_no_number_and_no_text_crashes_it(language: str, tmp_path: Path) -> None:
+    compiler, *options = LANGUAGES[language]
+    if shutil.which(compiler) is None:
+        pytest.skip(f"there is no {compiler}")
+    program, flags = tmp_path / "hostile", [*options, "-O1", "-Wall", *CHECKED]
+    source = [f"-I{C_HEADER.parent}", HERE / "hostile.c"]
+    subprocess.run([compiler, *flags, *source, "-o", program], check=True)
+    environment = os.environ | {"WEBOTS_MCP_DATA_DIR": str(tmp_path / "data")}
+    done = subprocess.run([program], env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    for journal in (tmp_path / "data").iterdir():
+        for line in journal.read_bytes().decode("utf-8", "replace").splitlines():
+            assert "nan," not in line
+            json.loads(line)

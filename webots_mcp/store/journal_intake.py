@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, BinaryIO, Final, NamedTuple, NoReturn, cast
+from typing import Any, BinaryIO, Final, NamedTuple, cast
 
 from webots_mcp import liveness, signal_register, waiting_file
 from webots_mcp.connection import identify_files, in_transaction
@@ -78,6 +78,10 @@ _SEEN_RUN: Final = (
     "purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) END WHERE uuid = :run"
 )
 _RUN_ID: Final = "SELECT id FROM run WHERE uuid = ?"
+_HAS_RUN: Final = "SELECT 1 FROM run WHERE uuid = ?"
+_COUNT_DROPPED: Final = (
+    "UPDATE session SET rows_dropped = rows_dropped + ?, last_error = ? WHERE id = ?"
+)
 _SEEN_S: Final = "SELECT last_seen_wall_time_s FROM session WHERE uuid = ?"
 
 
@@ -98,7 +102,7 @@ class _Place(NamedTuple):
 
 
 class _Line(NamedTuple):
-    """A complete line: the byte after it, its entry, the state in it; or what is wrong with it."""
+    """A complete line: the byte after it, its entry, the state in it, and what does not fit."""
 
     end: int
     entry: Entry | None
@@ -119,6 +123,12 @@ class _Looks:
 _lock = threading.Lock()
 _places: dict[Path, _Place] = {}
 _looks: dict[str, _Looks] = {}
+_left: dict[Path, str] = {}  # complete parts of which nothing could be taken in, and why
+
+
+def journals_left(database: Path) -> dict[Path, str]:
+    """The complete journals of which this process could take in nothing, and why; they stay."""
+    return {path: why for path, why in _left.items() if path.parent == database.parent}
 
 
 def has_news(database: Path) -> bool:
@@ -165,6 +175,9 @@ def take_in_journals(
         for path in _places.keys() - {path for parts in journals.values() for path in parts}:
             if path.parent == database.parent:
                 del _places[path]
+        for path in _left.keys() - {path for parts in journals.values() for path in parts}:
+            if path.parent == database.parent:
+                del _left[path]
         for uuid, parts in journals.items():
             # In order, and no part before those ahead of it are in: of its entries only those that
             # are newer than the last one that is in are taken.
@@ -190,6 +203,8 @@ def _take_in_part(
                 reading = _Reading(connection, uuid, path, file, identity, not is_complete)
                 if not reading.take_in(header, until_s):
                     return False
+                if is_complete and not reading.settle_faults():
+                    return True
             if is_complete and os.name != "nt":
                 path.unlink()
         if is_complete and os.name == "nt":  # where an open file cannot be deleted
@@ -199,6 +214,7 @@ def _take_in_part(
     except Exception as error:  # noqa: BLE001  (raised again where it is not the file's)
         _looks.pop(uuid, None)
         waiting_file.report_strange(path, error)
+        _left[path] = str(error) or repr(error)
         return False
     return True
 
@@ -227,6 +243,7 @@ class _Reading:
         while lines := _read_lines(self.file, place.offset):
             self.faults = place.faults
             if entries := [each.entry for each in lines if each.entry]:
+                self._make_missing_runs(session_id, place.number, entries)
                 finish = partial(self._finish, session_id, robot_id, looks, lines)
                 taken = waiting_file.take_in(self.connection, session_id, entries, finish)
                 done = _until(lines, taken.number)[-1].end
@@ -238,9 +255,41 @@ class _Reading:
             if time.monotonic() > until_s:
                 return False
         _places[self.path] = place
-        if place.faults and not self.is_living:
-            warn(f"{len(place.faults)} lines of {self.path} are no entries: {place.faults[0]}")
+        self.faults = place.faults
         return True
+
+    def settle_faults(self) -> bool:
+        """Count what no later entry has counted; False where nothing of the session fits."""
+        if not self.faults:
+            return True
+        session_id, _, number, *_ = self.connection.execute(_KNOWN, (self.uuid,)).fetchone()
+        why = f"{len(self.faults)} lines of {self.path.name} do not fit: {self.faults[0]}"
+        if not number:
+            if self.path not in _left:
+                warn(f"{why}; as nothing of it could be taken in, the file stays")
+            _left[self.path] = why
+            return False
+        warn(why)
+        self.connection.execute(_COUNT_DROPPED, (len(self.faults), why, session_id))
+        return True
+
+    def _make_missing_runs(self, session_id: int, number: int, entries: Sequence[Entry]) -> None:
+        """Make the runs whose own line did not fit, from the first row that is of them."""
+        told: set[object] = set()
+        for entry in entries:
+            if isinstance(entry.values, dict):
+                told.add(entry.values.get("uuid"))
+            elif entry.number > number and entry.run not in told:
+                told.add(entry.run)
+                if self.connection.execute(_HAS_RUN, (entry.run,)).fetchone() is None:
+                    in_transaction(self.connection, partial(self._make_run, session_id, entry))
+
+    def _make_run(self, session_id: int, entry: Entry) -> None:
+        sim_time_s, wall_time_s, *_ = cast("tuple[Any, ...]", entry.values)
+        known = {"uuid": entry.run, "world": None, "step_ms": None, "reason": "start"}
+        times = {"wall_time": wall_time_s, "sim_time": sim_time_s, "session": session_id}
+        self.connection.execute(STATEMENTS["run"], known | times)
+        liveness.end_runs(self.connection, session_id, "reset", cast("str", entry.run))
 
     def _enter(self, header: dict[str, Any]) -> tuple[Any, ...]:
         """The ids of session and robot, the number of the last entry, newest state and run."""
@@ -277,9 +326,13 @@ class _Reading:
         runs, ends = dict[str, tuple[float, float, int]](), dict[Kind, dict[str, Any]]()
         last: Entry | None = None
         for _, entry, state, fault in _until(lines, taken.number):
-            if entry is None:
+            if entry is None or entry.number in written:
                 faults += [fault] * bool(fault)
+            if entry is None:
                 continue
+            if entry.run not in (None, looks.run):  # the line of its run did not fit
+                looks.run = entry.run
+                looks.changes.forget()
             if isinstance(entry.values, dict) and entry.values.get("uuid", looks.run) != looks.run:
                 looks.run = entry.values["uuid"]
                 looks.changes.forget()
@@ -412,43 +465,55 @@ def _read_lines(file: BinaryIO, offset: int) -> list[_Line]:
 
 def _line(line: bytes, end: int) -> _Line:
     """What a line says: an entry, or why it is none."""
-    text = line.decode("utf-8", "replace")
+    text = line.decode("utf-8", "replace").lstrip("\ufeff")  # as some editors begin a file
     if not text.strip():
         return _Line(end, None)
     try:
-        number, kind, run, values = json.loads(text, parse_constant=_refuse)
+        number, kind, run, values = json.loads(text)
         if not (type(number) is int and 0 < number < 1 << 63):
             raise ValueError("its number is none")
         if kind not in _FIELDS:
             raise ValueError(f"there is no kind {kind!r}")
         if not (run is None if kind in _OF_SESSION else _is("s", run)):
             raise ValueError(f"its run is {run!r}")
+        given, faults = _checked(kind, values)
         if "\\ud" in text.lower():  # half a character is none
-            json.dumps(values, ensure_ascii=False).encode()
-        given = _checked(kind, values)
+            json.dumps(given, ensure_ascii=False).encode()
         state = _state(given, text, line) if kind == "state" else None
         entry = Entry(number, kind, run, _bound(kind, given))
     except (ValueError, TypeError, ArithmeticError, RecursionError) as error:
         return _Line(end, None, fault=f"{text[:60]!r}: {error}"[:300])
-    return _Line(end, entry, state)
-
-
-def _refuse(constant: str) -> NoReturn:
-    raise ValueError(f"{constant} is no JSON")
+    fault = f"{text[:60]!r}: {'; '.join(faults)}"[:300] if faults else ""
+    return _Line(end, entry, state, fault)
 
 
 def _is(letter: str, value: object) -> bool:
-    """Whether a value is of a type of `_FIELDS`, and if it is a number, one that is finite."""
+    """Whether a value is of a type of `_FIELDS`, and if it is a number, one that SQLite holds."""
     if isinstance(value, bool) or not isinstance(value, _TYPES[letter]):
         return False
+    if isinstance(value, int):
+        return -(1 << 63) <= value < 1 << 63
     return letter != "n" or math.isfinite(cast("float", value))
 
 
-def _checked(kind: Kind, values: Any) -> dict[str, Any]:
-    """The values of an entry by their names; those that may be null may be left out.
+def _fits_where_null_would(letter: str, value: object) -> bool:
+    """Whether it can be stored, by its characters and the numbers in it too."""
+    if not _is(letter, value):
+        return False
+    try:
+        _text(value).encode()
+    except (ValueError, RecursionError):  # half a character, a NaN
+        return False
+    return True
+
+
+def _checked(kind: Kind, values: Any) -> tuple[dict[str, Any], list[str]]:
+    """The values of an entry by their names, and which do not fit and are null instead.
+
+    Those that may be null may be left out.
 
     Raises:
-        ValueError: One is missing, or of another type, or there are too many.
+        ValueError: One that may not be null is missing, or of another type, or there are too many.
     """
     fields = [(field[0], field[2:]) for field in _FIELDS[kind]]
     if kind not in _NAMED:
@@ -456,13 +521,21 @@ def _checked(kind: Kind, values: Any) -> dict[str, Any]:
             raise ValueError(f"its values are no array of at most {len(fields)}")
         values = dict(zip((name for _, name in fields), cast("list[Any]", values), strict=False))
     given = {name: _object(values).get(name) for _, name in fields}
+    faults: list[str] = []
     for letter, name in fields:
-        may_miss = letter.isupper() and given[name] is None
-        if not (may_miss or _is(letter.lower(), given[name])):
-            raise ValueError(f"{name} is {given[name]!r}")
+        value = given[name]
+        if letter.isupper():
+            if value is not None and not _fits_where_null_would(letter.lower(), value):
+                faults.append(f"{name} is {str(value)[:60]!r}")
+                given[name] = None
+        elif not _is(letter, value):
+            if (kind, name) != ("run", "reason"):
+                raise ValueError(f"{name} is {value!r}")
+            faults.append(f"{name} is {value!r}, taken as 'start'")
+            given[name] = "start"
     if kind == "log" and find_log_level(given["level"]) is None:
         raise ValueError(f"there is no level {given['level']!r}")
-    return given
+    return given, faults
 
 
 def _state(given: dict[str, Any], text: str, line: bytes) -> dict[str, Any]:

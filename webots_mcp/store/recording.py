@@ -45,7 +45,13 @@ from webots_mcp.liveness import Lease, still_held
 from webots_mcp.queue import any_unfinished
 from webots_mcp.store.chunks import StateColumns, is_chunked_aside, show_chunks_aside
 from webots_mcp.store.invalid_rows import is_past_invalid_rows, shadow_if_asked
-from webots_mcp.store.journal_intake import BUDGET_S, has_news, journals_behind, take_in_journals
+from webots_mcp.store.journal_intake import (
+    BUDGET_S,
+    has_news,
+    journals_behind,
+    journals_left,
+    take_in_journals,
+)
 from webots_mcp.store.reading.observed_pose import find_observed
 from webots_mcp.store.reading.segment import Subject, choose, require_run
 from webots_mcp.store.retention import Asked
@@ -68,6 +74,10 @@ _BEHIND: Final = (
     "--read-only), which takes them in"
 )
 _SEEN_BY: Final = "observer {!r} saw the position (observer.x_m, ...); the robot publishes none"
+_LEFT: Final = (
+    "nothing of {} could be taken in, and it is kept: {}; correct the file as docs/journal.md "
+    "says, or move it away"
+)
 _NOT_IN: Final = (
     "; without the rows in {} waiting files next to it (...-waiting-...): copy all of them to a "
     "writable folder and open the copy with webots-mcp serve to include them"
@@ -370,7 +380,11 @@ _ENDED: Final = {
 def storage(connection: sqlite3.Connection) -> dict[str, Any]:
     """What an answer says of the file that it was read from, and of rows that are not in it."""
     (file,) = connection.execute("SELECT file FROM pragma_database_list").fetchone()
+    left = journals_left(Path(file)) if file else {}
     behind = journals_behind(connection, Path(file)) if file else []
+    behind = [name for name in behind if name not in {path.name for path in left}]
+    if left and not isinstance(connection, FrozenConnection):
+        return {"storage": _LEFT.format(", ".join(path.name for path in left), *left.values())}
     if not isinstance(connection, FrozenConnection):
         return {"storage": _BEHIND.format(", ".join(behind))} if behind else {}
     waiting = [*(path.name for path in waiting_paths(Path(file))), *behind]

@@ -824,7 +824,7 @@ def _fill(
     """A dict with nulls at its gaps, a copy where it has any, and the number of these nulls."""
     filled, nulls = inside, 0
     for key, (path, below) in gaps.items():
-        value = inside.get(key)
+        value: Any = inside.get(key)
         kind = value.__class__
         found, new = 0, None
         if kind is float:

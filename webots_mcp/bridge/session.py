@@ -209,7 +209,7 @@ class Session:
         for close in (*stop, self._watchdog.close, self.keeper.close):
             try:
                 close()
-            except Exception as error:  # noqa: BLE001  (the session is ended whatever fails)
+            except Exception as error:  # noqa: BLE001, PERF203  (the session ends whatever fails)
                 self.errors.failed("close", error)
         reason = reason or self._end_reason
         self.recorder.close(reason, self.clock.sim_time_s)

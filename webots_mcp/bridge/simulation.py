@@ -247,10 +247,14 @@ class _OfSlotted:
 
 
 def _assign(robot: Any, name: str, value: object) -> None:
-    if hasattr(robot, "__dict__"):
-        vars(robot)[name] = value  # past a `__setattr__` of the user's
+    own: dict[str, object] | None = getattr(robot, "__dict__", None)
+    if own is None:
+        slotted: _OfSlotted = vars(_owner_of_step(robot))[name]
+        slotted.assign(robot, value)
+    elif value is None:
+        own.pop(name, None)
     else:
-        vars(_owner_of_step(robot))[name].assign(robot, value)
+        own[name] = value  # past a `__setattr__` of the user's
 
 
 def _guarded(name: str, method: Method) -> Method:

@@ -9,7 +9,7 @@ import functools
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.contract import new_uuid
 from webots_mcp.errors import CommandRefusedError
@@ -249,7 +249,7 @@ class _OfSlotted:
 def _assign(robot: Any, name: str, value: object) -> None:
     own: dict[str, object] | None = getattr(robot, "__dict__", None)
     if own is None:
-        slotted: _OfSlotted = vars(_owner_of_step(robot))[name]
+        slotted = cast("_OfSlotted", vars(_owner_of_step(robot))[name])
         slotted.assign(robot, value)
     elif value is None:
         own.pop(name, None)

@@ -73,6 +73,8 @@ def test_rows_that_went_into_a_deleted_file_are_counted_as_dropped(
 ) -> None:
     for n in range(3):
         bridge.publish({"n": n})
+    with closing(connect(file, "writer")) as other:
+        other.execute("DROP TRIGGER refuse")
     heartbeat_now(bridge)
     for part in file.parent.glob(f"{DATABASE_NAME}*"):
         part.unlink()

@@ -57,6 +57,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import lru_cache
 from itertools import compress, islice
 from json.encoder import encode_basestring
 from operator import not_
@@ -594,7 +595,12 @@ class Encoded(NamedTuple):
     @property
     def replaced_text(self) -> str | None:
         """The value of the column `replaced`: null where nothing was replaced."""
-        return _encode_plain(self.replaced) if self.replaced else None
+        return _text_of_pairs(tuple(self.replaced.items())) if self.replaced else None
+
+
+@lru_cache(maxsize=8)  # mostly the same in each row
+def _text_of_pairs(replaced: tuple[tuple[str, str], ...]) -> str:
+    return _encode_plain(dict(replaced))
 
 
 class _NotPlainError(Exception):

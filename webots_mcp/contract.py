@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import sqlite3
 import sys
+import zlib
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -156,6 +157,20 @@ def find_log_level(level: object) -> LogLevel | None:
     if isinstance(level, bool) or not isinstance(level, (int, float)) or level != level:
         return None
     return LOG_LEVELS[int(min(max(level, 10), 50)) // 10 - 1]
+
+
+MOST_NAME_CHARACTERS: Final = 200  # of a robot
+
+
+def recorded_name(name: str) -> str:
+    """The name under which a robot is recorded: a long one is shortened, with a hash of all of it.
+
+    So long names that begin alike differ, and one that is asked for is found by all of it.
+    """
+    if len(name) <= MOST_NAME_CHARACTERS:
+        return name
+    mark = f"~{zlib.crc32(name.encode('utf-8', 'replace')):08x}"
+    return name[: MOST_NAME_CHARACTERS - len(mark)] + mark
 
 
 def host_name() -> str:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from tests.bridge.conftest import Recording
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.connection import connect
 from webots_mcp.standin import InProcessSupervisor
+from webots_mcp.store.recording import look
 
 DAY_S = 86_400.0
 
@@ -138,3 +140,55 @@ def test_a_run_that_ends_by_a_crash_lasts_until_its_last_row(
         "GROUP BY run_id) s ON s.run_id = run.id WHERE run.id = 1"
     )
     assert recording.rows(sql) == [(1, 1, pytest.approx(0.8))]
+
+
+def test_long_names_that_begin_alike_differ_and_are_found_by_all_of_them(
+    database: MemoryDatabase, recording: Recording
+) -> None:
+    names = ["r" * 250 + end for end in ("left", "right")]
+    bridges = [MCPBridge(InProcessSupervisor(name), database=database) for name in names]
+    recorded = [bridge.robot_name for bridge in bridges]
+    assert len(set(recorded)) == 2
+    assert all(len(name) == 200 and name.startswith("r" * 150) for name in recorded)
+    with closing(connect(database, "reader")) as connection:
+        assert [look(connection, name).robot.name for name in names] == recorded
+        assert [look(connection, name).robot.name for name in recorded] == recorded
+    for bridge in bridges:
+        bridge.close()
+    assert sorted(recording.rows("SELECT name FROM robot")) == sorted(recorded)
+
+
+class Slotted:
+    """A robot that has no place for an attribute of others."""
+
+    __slots__ = ("_time_s",)
+
+    def __init__(self) -> None:
+        self._time_s = 0.0
+
+    def step(self, duration_ms: int) -> int:
+        self._time_s += duration_ms / 1000
+        return 0
+
+    def getTime(self) -> float:
+        return self._time_s
+
+    def getName(self) -> str:
+        return "slotted"
+
+    def getBasicTimeStep(self) -> float:
+        return 16.0
+
+    def getSynchronization(self) -> bool:
+        return True
+
+
+def test_a_robot_with_slots_is_attached_and_another_of_its_class_is_left_alone(
+    database: MemoryDatabase, recording: Recording
+) -> None:
+    robot, other = Slotted(), Slotted()
+    bridge = MCPBridge.attach(robot, database=database, throttle_interval=1)
+    for _ in range(3):
+        assert robot.step(16) == other.step(16) == 0
+    bridge.close()
+    assert [state["time"] for state in recording.states()] == pytest.approx([0.016, 0.032, 0.048])

@@ -29,7 +29,7 @@ from webots_mcp.bridge.registration import same_simulation
 from webots_mcp.bridge.scene import SceneNode, find_field
 from webots_mcp.bridge.session import Session
 from webots_mcp.bridge.simulation import Clock, LoopMeter
-from webots_mcp.contract import CUSTOM_DATA, HEARTBEAT_INTERVAL_S
+from webots_mcp.contract import CUSTOM_DATA, HEARTBEAT_INTERVAL_S, recorded_name
 from webots_mcp.liveness import is_living
 from webots_mcp.signal_register import SignalNames, StateChanges
 
@@ -126,14 +126,16 @@ class CustomDataReader:
         waiting = [robot for robot in self._robots.values() if self._look_at(robot, now_s, is_due)]
         if waiting:  # one in a round, since it takes milliseconds
             self._taken = self._names_taken()
-            free = (robot for robot in waiting if robot.body.name not in self._taken)
+            free = (robot for robot in waiting if recorded_name(robot.body.name) not in self._taken)
             for robot in islice(free, 1):
                 robot.begin()
 
     def _look_at(self, robot: _Robot, now_s: float, is_due: bool) -> bool:
         """Read one robot; True where it has written something and has no session yet."""
         try:
-            return robot.look(now_s, is_due=is_due, is_taken=robot.body.name in self._taken)
+            return robot.look(
+                now_s, is_due=is_due, is_taken=recorded_name(robot.body.name) in self._taken
+            )
         except Exception as error:  # noqa: BLE001  (the other robots are read nevertheless)
             self._observer.errors.failed(f"customData of {robot.body.name}", error)
             return False
@@ -248,7 +250,7 @@ class _Recording:
 
     def __init__(self, body: SeenRobot, observer: Session) -> None:
         identity = observer.identity._replace(
-            robot_name=body.name or "robot",
+            robot_name=recorded_name(body.name or "robot"),
             kind=CUSTOM_DATA,
             supervisor=False,
             devices={},

@@ -23,7 +23,7 @@ replaced, what is too large is cut, and the column `replaced` names the path and
     key over 200 characters            its beginning   "key[5000]"
     text with a lone surrogate         with "?"        "surrogate"
     key that has no text               "<Handle>"      "key"
-    data of ctypes, also a pointer     null            "type c_double"
+    C pointer, also C text (char *)    null            "null pointer", "pointer of unknown length"
     any other object                   null            "type Socket"
     object after those before it took  null            "type Socket: no time left"
     10 ms of processor time
@@ -36,10 +36,11 @@ keys 150,000. Where there is no room for everything, the levels near the top com
 names up to 1,000 places; the empty path has the number of further ones: "4000 more". A robot rarely
 publishes a tenth of that. A state that contains itself is cut like any other nested too deeply.
 
-Numpy scalars and arrays, Webots' lidar points and radar targets, dataclasses, enums, tuples, sets,
-ranges, deques, dates, paths, UUIDs, decimals and keys that are not text are stored as their plain
-JSON counterparts and are not named in `replaced`. Neither are integers beyond 64 bits: they become
-the nearest float, as SQLite would read them anyway.
+Numpy scalars and arrays, numbers, arrays and structures of ctypes, Webots' lidar points and radar
+targets, dataclasses, enums, tuples, sets, ranges, deques, dates, paths, UUIDs, decimals and keys
+that are not text are stored as their plain JSON counterparts and are not named in `replaced`.
+Neither are integers beyond 64 bits: they become the nearest float, as SQLite would read them
+anyway.
 
 Values are copied breadth first: where there is no room for everything, the deepest levels are cut.
 """
@@ -52,9 +53,11 @@ import io
 import json
 import math
 import pickle
+import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import lru_cache
 from itertools import compress, islice
 from json.encoder import encode_basestring
 from operator import not_
@@ -69,10 +72,17 @@ _MOST_KIND_CHARACTERS: Final = 100
 
 # Classes of Webots' `controller` package whose instances are nothing but their attributes.
 _WEBOTS_RECORDS: Final = ("LidarPoint", "RadarTarget", "MouseState", "ContactPoint")
+_ADDRESSES: Final = "zZPXO"  # the ctypes codes of char *, wchar_t *, void *, BSTR and PyObject *
+_TEXTS: Final = ("c", "u")  # of char and wchar_t
+_UNKNOWN_LENGTH: Final = "pointer of unknown length"
 
 
 class NoCounterpartError(TypeError):
     """The value cannot be stored; the text names what it was."""
+
+
+class _Unreadable:
+    """Placeholder of a C pointer that ctypes would follow as soon as it is read."""
 
 
 def convert(value: Any) -> object:
@@ -84,6 +94,10 @@ def convert(value: Any) -> object:
     """
     if type(value) in (type, memoryview) or isinstance(value, type):
         raise NoCounterpartError(f"type {kind_name(value)}")
+    if type(value) is _Unreadable:
+        raise NoCounterpartError(_UNKNOWN_LENGTH)
+    if (ctypes := _ctypes_of(value)) is not None:
+        return _read_c(ctypes, value)
     if type(value).__name__ in _WEBOTS_RECORDS:
         attributes: dict[str, object] = value.__dict__
         return {name: item for name, item in attributes.items() if not name.startswith("_")}
@@ -124,6 +138,58 @@ def _require_short(array: Any) -> None:
 def is_number_array(value: Any) -> bool:
     """Whether it is a numpy array, or a scalar, of nothing but numbers or booleans."""
     return getattr(getattr(value, "dtype", None), "kind", None) in ("b", "i", "u", "f")
+
+
+# -- ctypes ------------------------------------------------------------------------------------
+
+
+def _ctypes_of(value: object) -> Any:
+    """The ctypes module if the value is of one of its types, else None; it is never imported here.
+
+    All data of ctypes derives from one class, which has no public name.
+    """
+    ctypes = sys.modules.get("ctypes")
+    if ctypes is None:
+        return None
+    is_reference = type(value).__name__ == "CArgObject"  # what byref() gives
+    return ctypes if is_reference or isinstance(value, ctypes.Structure.__mro__[1]) else None
+
+
+def _read_c(ctypes: Any, value: Any) -> object:
+    """Read numbers, arrays and structures; a pointer is never followed, not even to a C string.
+
+    What it points to may be freed by now, and reading it would crash the controller.
+
+    Raises:
+        NoCounterpartError: It is a pointer, or an array of more items than a row takes.
+    """
+    if isinstance(value, (ctypes.Structure, ctypes.Union)):
+        return dict(_c_fields(value))
+    if isinstance(value, ctypes.Array):
+        return _c_items(value)
+    code = getattr(value, "_type_", None)
+    if not isinstance(code, str) or code in _ADDRESSES:
+        raise NoCounterpartError(_UNKNOWN_LENGTH if value else "null pointer")
+    return value.value
+
+
+def _c_items(array: Any) -> object:
+    _require_few(len(array))
+    if (code := getattr(array._type_, "_type_", None)) in _TEXTS:
+        return bytes(array) if code == "c" else array.value
+    return [_Unreadable()] * len(array) if _is_followed(array._type_) else list(array)
+
+
+def _c_fields(structure: Any) -> Iterator[tuple[str, object]]:
+    for cls in reversed(type(structure).__mro__):
+        for name, kind, *_ in vars(cls).get("_fields_", ()):
+            yield name, _Unreadable() if _is_followed(kind) else getattr(structure, name)
+
+
+def _is_followed(kind: Any) -> bool:
+    """Whether ctypes follows such a pointer by itself as soon as the field is read."""
+    code = getattr(kind, "_type_", None)
+    return isinstance(code, str) and code in _ADDRESSES
 
 
 # -- everything else ---------------------------------------------------------------------------
@@ -529,7 +595,12 @@ class Encoded(NamedTuple):
     @property
     def replaced_text(self) -> str | None:
         """The value of the column `replaced`: null where nothing was replaced."""
-        return _encode_plain(self.replaced) if self.replaced else None
+        return _text_of_pairs(tuple(self.replaced.items())) if self.replaced else None
+
+
+@lru_cache(maxsize=8)  # mostly the same in each row
+def _text_of_pairs(replaced: tuple[tuple[str, str], ...]) -> str:
+    return _encode_plain(dict(replaced))
 
 
 class _NotPlainError(Exception):
@@ -540,9 +611,13 @@ def encode(state: object) -> Encoded:
     """Encode a state, as fast as its content allows; the state itself is never changed."""
     try:
         _look((state,), MAX_PLAIN_VALUES, 0)
-        return _encode_looked_at(state)
+        if _gaps.tree and state.__class__ is dict:
+            return _encode_with_nulls(cast("dict[Any, Any]", state))
+        return Encoded(_text_of_plain(state), {})
     except Exception:  # noqa: BLE001  (the slow path finds and names what cannot be encoded)
-        return _encode_replacing(state)
+        encoded = _encode_replacing(state)
+        _gaps.remember(encoded)
+        return encoded
 
 
 def copy_or_encode(state: object) -> bytes | Encoded:
@@ -682,11 +757,108 @@ def _look_at_number(value: Any, left: int) -> int:
     return left
 
 
-def _encode_looked_at(state: object) -> Encoded:
-    text = _encode_with_orjson(state) or _encode_plain(state)
+def _text_of_plain(state: object, nulls: int = 0) -> str:
+    """Its JSON; `nulls` says how many nulls it has where a number was."""
+    text = _encode_with_orjson(state, nulls) or _encode_plain(state)
     if (len(text) if text.isascii() else len(text.encode())) > MAX_ROW_BYTES:
         raise _NotPlainError
-    return Encoded(text, {})
+    return text
+
+
+# -- the fast path: infinities and NaNs where the last rows had them ------------------------------
+# Every wheel in velocity mode has the target position infinity, in each row, and a lidar's sectors
+# often do. So places that had one are looked at first, and get a null; the containers on the way
+# to them are copied. An infinity at any other place leads to the slow path, which remembers it.
+
+_MOST_GAPS: Final = 64
+_MOST_GAPS_CHARACTERS: Final = 5_000  # of their paths
+_GAPS: Final = frozenset(("inf", "-inf", "nan"))
+
+
+class _Gap(NamedTuple):
+    """A place on the way to an infinity or a NaN of an earlier row."""
+
+    path: str
+    below: dict[str, _Gap]
+
+
+class _Gaps:
+    """The places that had an infinity or a NaN, as a tree of keys; empty while there are none."""
+
+    def __init__(self) -> None:
+        self._paths: dict[str, None] = {}
+        self.tree: dict[str, _Gap] = {}
+
+    def remember(self, encoded: Encoded) -> None:
+        """Add those of a row that the slow path encoded, where they were all that was odd in it."""
+        found = encoded.replaced
+        if not found or len(found) > _MOST_GAPS or not _GAPS.issuperset(found.values()):
+            return
+        paths = self._paths | dict.fromkeys(found)
+        if len(paths) > _MOST_GAPS:
+            paths = dict.fromkeys(found)
+        if sum(map(len, paths)) > _MOST_GAPS_CHARACTERS:
+            return
+        tree: dict[str, _Gap] = {}
+        for path in paths:
+            below, way = tree, ""
+            for key in path.split("."):
+                way = f"{way}.{key}" if way else key
+                below = below.setdefault(key, _Gap(way, {})).below
+        self._paths, self.tree = paths, tree
+
+
+_gaps = _Gaps()
+
+
+def _encode_with_nulls(state: dict[Any, Any]) -> Encoded:
+    """Encode with nulls for infinities and NaNs at the remembered places.
+
+    Raises:
+        _NotPlainError: Another value has to be replaced too, or there are too many.
+    """
+    replaced: dict[str, str] = {}
+    filled, nulls = _fill(state, _gaps.tree, replaced)
+    if len(replaced) > _MOST_GAPS:
+        raise _NotPlainError
+    return Encoded(_text_of_plain(filled, nulls), replaced)
+
+
+def _fill(
+    inside: dict[Any, Any], gaps: dict[str, _Gap], replaced: dict[str, str]
+) -> tuple[dict[Any, Any], int]:
+    """A dict with nulls at its gaps, a copy where it has any, and the number of these nulls."""
+    filled, nulls = inside, 0
+    for key, (path, below) in gaps.items():
+        value: Any = inside.get(key)
+        kind = value.__class__
+        found, new = 0, None
+        if kind is float:
+            if value - value != 0.0:  # of an infinity it is NaN
+                replaced[path] = str(value)
+                found = 1
+        elif kind is dict and below:
+            new, found = _fill(cast("dict[Any, Any]", value), below, replaced)
+        elif kind is list and below:
+            new, found = _fill_array(cast("list[Any]", value), path, replaced)
+        if found:
+            if filled is inside:
+                filled = inside.copy()
+            filled[key] = new
+            nulls += found
+    return filled, nulls
+
+
+def _fill_array(items: list[Any], path: str, replaced: dict[str, str]) -> tuple[list[Any], int]:
+    if set(map(type, items)) != {float}:
+        return items, 0
+    gaps = [(i, str(item)) for i, item in enumerate(items) if item - item != 0.0]
+    kinds = {kind for _, kind in gaps}
+    if len(kinds) == 1:
+        replaced[f"{path}.*"] = kinds.pop()
+    else:
+        replaced.update((f"{path}.{i}", kind) for i, kind in gaps)
+    return [item if item - item == 0.0 else None for item in items], len(gaps)
 
 
 class _Copier(pickle.Pickler):
@@ -707,15 +879,16 @@ def _in_lists(value: Any) -> object:
     return value.tolist()
 
 
-def _encode_with_orjson(state: object) -> str | None:
-    """None where orjson cannot, or may have turned a NaN silently into null."""
+def _encode_with_orjson(state: object, nulls: int) -> str | None:
+    """None where orjson cannot, or may have turned another NaN silently into null."""
     if orjson is None:
         return None
     try:
         text = orjson.dumps(state, _in_lists, orjson.OPT_SERIALIZE_NUMPY)
     except Exception:  # noqa: BLE001  (the user's objects may raise anything; `json` comes next)
         return None
-    return None if b"null" in text else text.decode()
+    has_more = text.count(b"null") > nulls if nulls else b"null" in text  # faster than to count
+    return None if has_more else text.decode()
 
 
 # Nesting is bounded before, so nothing contains itself; without this check it is 8 % faster.

@@ -245,8 +245,8 @@ class MCPBridge:
             include_time: Add the simulation time as `time` (seconds).
 
         Returns:
-            The state, without the devices where this call was throttled and did not read them. It
-            also has the simulation time as `sim_time` (seconds). Empty where publishing failed.
+            The state as it was published, without the devices where this call was throttled and did
+            not read them. Empty where publishing failed.
         """
         self._meter.leave_own()
         try:
@@ -254,8 +254,7 @@ class MCPBridge:
             state = self._publisher.publish_devices(extra, include_time)
             if state is None:
                 state = self._publisher.unread(extra, include_time)
-            times = {"sim_time": self._session.clock.sim_time_s} if include_time else {}
-            return times | state
+            return state
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("auto_publish", error)
             return {}

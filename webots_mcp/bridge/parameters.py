@@ -228,6 +228,7 @@ class Parameters:
     def _redeclare(self, held: _Held, declaration: Declaration) -> None:
         """Update a declaration; a value set from outside is retained where it is still valid."""
         is_default = held.setter is CODE and held.value == held.declaration.default
+        self._journal.log("warning", "bridge", _declared_anew(held.declaration, declaration))
         held.declaration = declaration
         self._from_reset.pop(declaration.name, None)
         self._wanted.pop(declaration.name, None)
@@ -256,6 +257,16 @@ class Parameters:
     def _record_next(self, values: Mapping[str, Value | None]) -> None:
         if values:
             self._recorder.record("parameter next", None, _next(values))
+
+
+def _declared_anew(before: Declaration, now: Declaration) -> str:
+    """The log line of a changed declaration: two parameters may share a name by mistake."""
+    pairs = zip(before._asdict().items(), now._asdict().values(), strict=True)
+    changed = [f"{name} {new!r}, not {old!r}" for (name, old), new in pairs if new != old]
+    return (
+        f"parameter {now.name!r} is declared again, with {', '.join(changed)}: the last "
+        "declaration is used for both"
+    )
 
 
 def _next(values: Mapping[str, Value | None]) -> dict[str, Any]:

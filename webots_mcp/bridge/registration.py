@@ -13,7 +13,14 @@ from typing import Any, Final, NamedTuple
 
 from webots_mcp import liveness
 from webots_mcp.connection import transaction
-from webots_mcp.contract import BY_PROCESS, CUSTOM_DATA, host_name, instance_of, is_extern
+from webots_mcp.contract import (
+    BY_PROCESS,
+    CUSTOM_DATA,
+    host_name,
+    instance_of,
+    is_extern,
+    recorded_name,
+)
 from webots_mcp.liveness import process_identity
 from webots_mcp.pauses import PAUSED
 from webots_mcp.waiting_file import enter_robot, enter_session
@@ -48,7 +55,9 @@ def identify(
     """Collect the identity; what cannot be determined is None, never an error."""
     controller = controller_file()
     return Identity(
-        robot_name=str(robot.getName() or os.environ.get("WEBOTS_ROBOT_NAME") or "robot"),
+        robot_name=recorded_name(
+            str(robot.getName() or os.environ.get("WEBOTS_ROBOT_NAME") or "robot")
+        ),
         kind=kind or ("Supervisor" if supervisor else "Robot"),
         supervisor=supervisor,
         devices={str(name): type(device).__name__ for name, device in _devices(robot).items()},

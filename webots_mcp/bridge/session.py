@@ -204,10 +204,13 @@ class Session:
 
     def close(self, reason: str | None) -> None:
         """Write the waiting rows and end, for the given or the known reason."""
-        if self._maintainer is not None:
-            self._maintainer.stop()  # first: its thread uses the recorder too
-        self._watchdog.close()
-        self.keeper.close()
+        # The maintainer first: its thread uses the recorder too.
+        stop = () if self._maintainer is None else (self._maintainer.stop,)
+        for close in (*stop, self._watchdog.close, self.keeper.close):
+            try:
+                close()
+            except Exception as error:  # noqa: BLE001, PERF203  (the session ends whatever fails)
+                self.errors.failed("close", error)
         reason = reason or self._end_reason
         self.recorder.close(reason, self.clock.sim_time_s)
 

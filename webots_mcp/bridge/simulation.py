@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.contract import new_uuid
 from webots_mcp.errors import CommandRefusedError
@@ -38,11 +38,18 @@ class Simulation:
         self.supervisor: bool = _may_supervise(robot)
         self.meter = LoopMeter()
         self._gate = StepGate(robot, self.meter)
+        self._time_s = 0.0
 
     @property
     def time_s(self) -> float:
-        """Simulation time as of the last step; costs no request."""
-        return float(self.robot.getTime())
+        """Simulation time as of the last step; costs no request.
+
+        Where the robot answers NaN or infinity, the last time that it knew still holds.
+        """
+        time_s = float(self.robot.getTime())
+        if time_s - time_s == 0.0:  # faster than math.isfinite: of an infinity it is NaN
+            self._time_s = time_s
+        return self._time_s
 
     @property
     def basic_time_step_s(self) -> float:
@@ -219,10 +226,10 @@ class StepGate:
 
     def __init__(self, robot: Any, meter: LoopMeter) -> None:
         self._robot = robot
-        self._of_robot: dict[str, Any] = vars(robot)
         owner: Any = _owner_of_step(robot)
-        setattr(owner, _GUARD, None)
-        setattr(owner, _METER, None)
+        for name in (_GUARD, _METER):
+            if name not in vars(owner):
+                setattr(owner, name, _OfSlotted())
         self.files: list[str] = []
         for cls in (owner, *_vehicles(robot)):
             for name in STEPPING:
@@ -231,7 +238,7 @@ class StepGate:
                     setattr(cls, name, _guarded(name, method))
             code = getattr(cls.step.__wrapped__, "__code__", None)
             self.files += [code.co_filename] if code else []
-        vars(robot)[_METER] = meter
+        _assign(robot, _METER, meter)
         self._own_step: Method = owner.step.__wrapped__
 
     def exchange(self) -> int:
@@ -244,11 +251,39 @@ class StepGate:
 
     def close(self, guard: Guard) -> None:
         """Let the guard answer each step of the controller."""
-        self._of_robot[_GUARD] = guard
+        _assign(self._robot, _GUARD, guard)
 
     def open(self) -> None:
         """Let steps go to Webots directly again."""
-        self._of_robot.pop(_GUARD, None)
+        _assign(self._robot, _GUARD, None)
+
+
+class _OfSlotted:
+    """A class's attribute for robots with `__slots__`, which have no place for it; None of others.
+
+    They are held for ever, so that no later robot has the number of one that is gone.
+    """
+
+    def __init__(self) -> None:
+        self._values: dict[int, tuple[object, object]] = {}
+
+    def __get__(self, robot: object, owner: type) -> object:
+        return self._values.get(id(robot), (None, None))[1]
+
+    def assign(self, robot: object, value: object) -> None:
+        """Give one robot its value."""
+        self._values[id(robot)] = (robot, value)
+
+
+def _assign(robot: Any, name: str, value: object) -> None:
+    own: dict[str, object] | None = getattr(robot, "__dict__", None)
+    if own is None:
+        slotted = cast("_OfSlotted", vars(_owner_of_step(robot))[name])
+        slotted.assign(robot, value)
+    elif value is None:
+        own.pop(name, None)
+    else:
+        own[name] = value  # past a `__setattr__` of the user's
 
 
 def _guarded(name: str, method: Method) -> Method:

@@ -118,6 +118,7 @@ class Watchdog:
         self._file = os.open(self._path, flags, PRIVATE_FILE)
         lock(self._file)
         if SIGNAL and signal.getsignal(SIGNAL) is signal.SIG_DFL:
+            _nowhere()  # now: at the end there may be no file descriptor left for it
             faulthandler.register(SIGNAL, self._file, all_threads=True)
             self._about["signal"] = SIGNAL
 

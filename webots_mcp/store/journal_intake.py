@@ -30,7 +30,14 @@ from typing import Any, BinaryIO, Final, NamedTuple, cast
 
 from webots_mcp import liveness, signal_register, waiting_file
 from webots_mcp.connection import identify_files, in_transaction
-from webots_mcp.contract import CUSTOM_DATA, find_log_level, host_name, instance_of, is_extern
+from webots_mcp.contract import (
+    CUSTOM_DATA,
+    find_log_level,
+    host_name,
+    instance_of,
+    is_extern,
+    recorded_name,
+)
 from webots_mcp.errors import warn
 from webots_mcp.naming import flatten
 from webots_mcp.waiting_file import FORMAT, STATEMENTS, Entry, Kind, Taken, journal_parts
@@ -303,7 +310,8 @@ class _Reading:
         def act() -> None:
             if connection.execute(_KNOWN, (self.uuid,)).fetchone() is None:
                 liveness.reap(connection, time.time())
-                free = liveness.free_name(connection, name, lambda it: it.kind == CUSTOM_DATA)
+                wanted = recorded_name(name)
+                free = liveness.free_name(connection, wanted, lambda it: it.kind == CUSTOM_DATA)
                 robot = {"name": free, "kind": "Robot", "devices": "{}"}
                 now_s = session["started_wall_time_s"]
                 robot_id = waiting_file.enter_robot(connection, robot, now_s)

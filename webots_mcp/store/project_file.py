@@ -23,7 +23,7 @@ from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.conditions.compiler import Expectation, parse_expectation
 from webots_mcp.connection import transaction
-from webots_mcp.contract import MAX_BREAKPOINTS, PROJECT_FILE, find_project
+from webots_mcp.contract import MAX_BREAKPOINTS, PROJECT_FILE, find_project, recorded_name
 from webots_mcp.errors import InvalidInputError, warn
 from webots_mcp.pauses import OF_PROJECT
 
@@ -98,7 +98,7 @@ def _entry(file: Path, text: str, number: int, table: dict[str, Any]) -> Expecte
         if "condition" not in table:
             raise InvalidInputError("condition is missing")
         asked = (table["condition"], table.get("during"), table.get("name"))
-        return Expected(parse_expectation(*asked), table.get("robot", ALL))
+        return Expected(parse_expectation(*asked), recorded_name(table.get("robot", ALL)))
     except InvalidInputError as error:
         line = _line_of(text, number, str(error), table)
         raise InvalidInputError(f"{file}, line {line}: {error}") from error

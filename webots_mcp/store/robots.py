@@ -25,6 +25,7 @@ from webots_mcp.contract import (
     UNSEEN,
     WORLD_EVENT,
     host_name,
+    recorded_name,
 )
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError, UnknownRobotError
 from webots_mcp.liveness import (
@@ -267,7 +268,7 @@ def without_observers(robots: list[Robot]) -> list[Robot]:
 
 def _named(robots: list[Robot], name: str) -> Robot:
     for robot in robots:
-        if robot.name == name:
+        if robot.name in (name, recorded_name(name)):
             return robot
     near = difflib.get_close_matches(name, [robot.name for robot in robots], n=3, cutoff=0.5)
     offer = f"did you mean {' or '.join(map(repr, near))}?" if near else "they are"

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import math
 import os
+import sqlite3
 import subprocess
 import sys
 import threading
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -23,6 +25,7 @@ from tests.bridge.conftest import (
 )
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import backlog
+from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.standin import InProcessSupervisor
 
@@ -124,14 +127,18 @@ def test_recording_goes_on_after_the_write_ahead_log_was_deleted(
 
 @pytest.mark.usefixtures("retry_at_once")
 def test_a_row_that_the_database_refuses_is_dropped_and_stops_no_other(
-    robot: InProcessSupervisor, bridge: MCPBridge, filed: Recording, monkeypatch: pytest.MonkeyPatch
+    bridge: MCPBridge, file: Path, filed: Recording
 ) -> None:
-    bridge.publish({"n": 0})
-    with monkeypatch.context() as patch:
-        patch.setattr(robot, "getTime", lambda: math.nan)
-        bridge.publish({"n": 1})
-    bridge.publish({"n": 2})
+    with closing(connect(file, "writer")) as other:
+        other.execute(
+            "CREATE TRIGGER refuse BEFORE INSERT ON state WHEN json_extract(NEW.data, '$.n') = 1 "
+            "BEGIN SELECT RAISE(ABORT, 'refused'); END"
+        )
+    for n in range(3):
+        bridge.publish({"n": n})
     catch_up(bridge)
+    with closing(sqlite3.connect(file)) as other:  # past our refusal of a file with a trigger
+        other.execute("DROP TRIGGER refuse")
     assert numbers(filed) == [0, 2]
     assert bridge.stats().rows_waiting == 0
     assert bridge.stats().rows_dropped > 0
@@ -242,3 +249,50 @@ def test_a_bridge_in_a_forked_child_does_not_destroy_the_database_of_its_parent(
     assert int(dropped) >= 200
     assert "forked from" in why
     assert "spawn" in why
+
+
+@pytest.mark.parametrize("answer", [math.nan, math.inf])
+def test_a_time_that_is_none_begins_no_run_and_holds_no_row_back(
+    robot: InProcessSupervisor,
+    bridge: MCPBridge,
+    filed: Recording,
+    answer: float,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for n in range(3):
+        robot.step(STEP_MS)
+        with monkeypatch.context() as patch:
+            if n == 1:
+                patch.setattr(robot, "getTime", lambda: answer)
+            bridge.publish({"n": n})
+        assert numbers(filed) == list(range(n + 1))
+    assert filed.rows("SELECT count(*) FROM run") == [1]
+
+
+_WITHOUT_FILES = """
+import os, resource, sys
+from webots_mcp import MCPBridge
+from webots_mcp.standin import InProcessSupervisor
+
+resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64))
+robot = InProcessSupervisor("rover")
+bridge = MCPBridge(robot, sys.argv[1])
+robot.step(16)
+bridge.publish({"n": 0}, force=True)
+try:
+    while True:
+        os.open(os.devnull, os.O_RDONLY)
+except OSError:
+    pass
+"""
+
+
+@POSIX
+def test_a_controller_without_a_file_descriptor_left_ends_its_session_in_silence(
+    file: Path, filed: Recording
+) -> None:
+    line = [sys.executable, "-c", _WITHOUT_FILES, str(file.parent)]
+    ended = subprocess.run(line, capture_output=True, text=True, check=True)
+    assert ended.stderr == ""
+    assert filed.rows("SELECT end_reason FROM session") == ["finished"]
+    assert numbers(filed) == [0]

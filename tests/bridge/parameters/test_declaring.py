@@ -122,6 +122,12 @@ def test_a_changed_declaration_brings_its_default_unless_the_value_came_from_out
         ("3.0", None),
         ("0.75", 1.0),
     ]
+    assert recording.rows("SELECT message FROM log WHERE level = 'warning' ORDER BY id") == [
+        "parameter 'kp' is declared again, with default 3.0, not 2.0: the last declaration "
+        "is used for both",
+        "parameter 'ki' is declared again, with default 0.75, not 0.5, high 1.0, not None: the "
+        "last declaration is used for both",
+    ]
 
 
 def test_a_value_that_a_changed_declaration_excludes_gives_way_to_the_default(

@@ -1,0 +1,110 @@
+"""What ctypes holds is recorded as numbers; a pointer is named and never followed."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import sys
+from typing import Any
+
+import pytest
+
+from tests.bridge.conftest import Recording
+from webots_mcp import MCPBridge
+from webots_mcp.bridge import encoding
+
+POSE = [1.5, 2.5, 0.25]
+
+
+class Touched(ctypes.Structure):
+    _fields_ = (
+        ("id", ctypes.c_int),
+        ("position", ctypes.c_double * 3),
+        ("size_on_image", ctypes.c_int * 2),
+        ("colors", ctypes.POINTER(ctypes.c_double)),
+        ("_model", ctypes.c_char_p),
+    )
+
+
+@pytest.mark.usefixtures("encoder")
+def test_what_ctypes_holds_is_recorded_as_numbers(bridge: MCPBridge, recording: Recording) -> None:
+    class Derived(Touched):
+        _fields_ = (("flag", ctypes.c_bool),)
+
+    seen = Derived(7, (1.0, 2.0, 3.0), (64, 48))
+    seen.flag = True
+    bridge.publish(
+        {
+            "position": seen.position,
+            "matrix": ((ctypes.c_float * 2) * 2)((1, 2), (3, 4)),
+            "force": ctypes.c_double(0.5),
+            "name": (ctypes.c_char * 4)(*b"abc"),
+            "wide": (ctypes.c_wchar * 3)(*"abc"),
+            "empty": (ctypes.c_double * 0)(),
+            "seen": [seen],
+        }
+    )
+    (state,) = recording.states()
+    assert state == {
+        "position": [1.0, 2.0, 3.0],
+        "matrix": [[1.0, 2.0], [3.0, 4.0]],
+        "force": 0.5,
+        "name": "YWJjAA==",
+        "wide": "abc",
+        "empty": [],
+        "seen": [
+            {
+                "id": 7,
+                "position": [1.0, 2.0, 3.0],
+                "size_on_image": [64, 48],
+                "colors": None,
+                "_model": None,
+                "flag": True,
+            }
+        ],
+    }
+    (replaced,) = recording.rows("SELECT replaced FROM state")
+    assert json.loads(replaced) == {
+        "name": "bytes",
+        "seen.0.colors": "null pointer",
+        "seen.0._model": "pointer of unknown length",
+    }
+
+
+NOWHERE = 8  # an address that ends the process when it is followed
+
+
+@pytest.mark.usefixtures("encoder")
+@pytest.mark.parametrize(
+    "pointer",
+    [
+        ctypes.cast(NOWHERE, ctypes.POINTER(ctypes.c_double)),
+        ctypes.cast(NOWHERE, ctypes.c_char_p),
+        ctypes.cast(NOWHERE, ctypes.c_wchar_p),
+        ctypes.c_void_p(NOWHERE),
+        ctypes.byref(ctypes.c_double()),
+        ctypes.cast(NOWHERE, ctypes.POINTER(Touched)),
+    ],
+    ids=lambda pointer: type(pointer).__name__,
+)
+def test_a_pointer_is_named_and_never_followed(pointer: Any) -> None:
+    text, replaced, _ = encoding.encode({"touch": pointer, "pose": POSE})
+    assert json.loads(text) == {"touch": None, "pose": POSE}
+    assert replaced == {"touch": "pointer of unknown length"}
+
+
+def test_an_array_of_c_strings_is_not_read_through() -> None:
+    names = (ctypes.c_char_p * 2)()
+    ctypes.cast(names, ctypes.POINTER(ctypes.c_void_p))[0] = NOWHERE
+    assert json.loads(encoding.encode({"names": names}).text) == {"names": [None, None]}
+
+
+def test_a_null_pointer_is_named() -> None:
+    null = ctypes.POINTER(ctypes.c_double)()
+    assert encoding.encode({"touch": null}) == ('{"touch":null}', {"touch": "null pointer"}, 0)
+
+
+def test_ctypes_is_not_imported_for_a_state_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "ctypes")
+    assert encoding.encode({"handle": object()}).replaced == {"handle": "type object"}
+    assert "ctypes" not in sys.modules

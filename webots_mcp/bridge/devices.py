@@ -142,10 +142,21 @@ def _summarise_recognised(camera: Any) -> dict[str, object]:
             "id": each.getId(),
             "distance_m": math.hypot(*each.getPosition()),
             "position_m": list(each.getPosition()),
+            "colors": _colors_of(each),
         }
         for each in seen
     ]
     return _nearest_of(count, objects)
+
+
+def _colors_of(recognised: Any) -> list[float]:
+    """Red, green and blue of each color of an object; Webots returns a bare pointer to them.
+
+    It is read at once, since Webots frees the memory at the next step.
+    """
+    count = recognised.getNumberOfColors()
+    colors = recognised.getColors() if count else None
+    return [colors[i] for i in range(3 * min(count, MOST_OBJECTS))] if colors else []
 
 
 def _summarise_targets(radar: Any) -> dict[str, object]:

@@ -23,7 +23,8 @@ replaced, what is too large is cut, and the column `replaced` names the path and
     key over 200 characters            its beginning   "key[5000]"
     text with a lone surrogate         with "?"        "surrogate"
     key that has no text               "<Handle>"      "key"
-    C pointer, also C text (char *)    null            "null pointer", "pointer of unknown length"
+    pointer of ctypes                  null            "null pointer",
+                                                       "pointer of unknown length"
     any other object                   null            "type Socket"
     object after those before it took  null            "type Socket: no time left"
     10 ms of processor time
@@ -36,11 +37,11 @@ keys 150,000. Where there is no room for everything, the levels near the top com
 names up to 1,000 places; the empty path has the number of further ones: "4000 more". A robot rarely
 publishes a tenth of that. A state that contains itself is cut like any other nested too deeply.
 
-Numpy scalars and arrays, numbers, arrays and structures of ctypes, Webots' lidar points and radar
-targets, dataclasses, enums, tuples, sets, ranges, deques, dates, paths, UUIDs, decimals and keys
-that are not text are stored as their plain JSON counterparts and are not named in `replaced`.
-Neither are integers beyond 64 bits: they become the nearest float, as SQLite would read them
-anyway.
+Numpy scalars and arrays, numbers, arrays and structures of ctypes (which Webots' getters return),
+Webots' lidar points and radar targets, dataclasses, enums, tuples, sets, ranges, deques, dates,
+paths, UUIDs, decimals and keys that are not text are stored as their plain JSON counterparts and
+are not named in `replaced`. Neither are integers beyond 64 bits: they become the nearest float, as
+SQLite would read them anyway.
 
 Values are copied breadth first: where there is no room for everything, the deepest levels are cut.
 """
@@ -72,8 +73,11 @@ _MOST_KIND_CHARACTERS: Final = 100
 
 # Classes of Webots' `controller` package whose instances are nothing but their attributes.
 _WEBOTS_RECORDS: Final = ("LidarPoint", "RadarTarget", "MouseState", "ContactPoint")
-_ADDRESSES: Final = "zZPXO"  # the ctypes codes of char *, wchar_t *, void *, BSTR and PyObject *
-_TEXTS: Final = ("c", "u")  # of char and wchar_t
+# The codes of ctypes for numbers and flags, for characters, and for addresses: char *, wchar_t *,
+# void *, BSTR and PyObject *.
+_C_NUMBERS: Final = frozenset("bBhHiIlLqQfdg?v")
+_C_CHARACTERS: Final = frozenset("cu")
+_C_ADDRESSES: Final = frozenset("zZPXO")
 _UNKNOWN_LENGTH: Final = "pointer of unknown length"
 
 
@@ -81,8 +85,8 @@ class NoCounterpartError(TypeError):
     """The value cannot be stored; the text names what it was."""
 
 
-class _Unreadable:
-    """Placeholder of a C pointer that ctypes would follow as soon as it is read."""
+class _Pointer:
+    """Stands for a pointer that ctypes would follow as soon as it is read."""
 
 
 def convert(value: Any) -> object:
@@ -92,12 +96,12 @@ def convert(value: Any) -> object:
         NoCounterpartError: It has no counterpart, or more items than a row takes.
         Exception: Whatever the value raises while it is read.
     """
+    if isinstance(value, _Pointer):
+        raise NoCounterpartError(_UNKNOWN_LENGTH)
     if type(value) in (type, memoryview) or isinstance(value, type):
         raise NoCounterpartError(f"type {kind_name(value)}")
-    if type(value) is _Unreadable:
-        raise NoCounterpartError(_UNKNOWN_LENGTH)
     if (ctypes := _ctypes_of(value)) is not None:
-        return _read_c(ctypes, value)
+        return _read_c_data(ctypes, value)
     if type(value).__name__ in _WEBOTS_RECORDS:
         attributes: dict[str, object] = value.__dict__
         return {name: item for name, item in attributes.items() if not name.startswith("_")}
@@ -140,7 +144,7 @@ def is_number_array(value: Any) -> bool:
     return getattr(getattr(value, "dtype", None), "kind", None) in ("b", "i", "u", "f")
 
 
-# -- ctypes ------------------------------------------------------------------------------------
+# -- data of ctypes ----------------------------------------------------------------------------
 
 
 def _ctypes_of(value: object) -> Any:
@@ -151,45 +155,57 @@ def _ctypes_of(value: object) -> Any:
     ctypes = sys.modules.get("ctypes")
     if ctypes is None:
         return None
-    is_reference = type(value).__name__ == "CArgObject"  # what byref() gives
+    is_reference = type(value).__name__ == "CArgObject"  # what byref() returns
     return ctypes if is_reference or isinstance(value, ctypes.Structure.__mro__[1]) else None
 
 
-def _read_c(ctypes: Any, value: Any) -> object:
+def _read_c_data(ctypes: Any, value: Any) -> object:
     """Read numbers, arrays and structures; a pointer is never followed, not even to a C string.
 
-    What it points to may be freed by now, and reading it would crash the controller.
+    What it points to may have been freed, and reading it would crash the controller.
 
     Raises:
         NoCounterpartError: It is a pointer, or an array of more items than a row takes.
     """
     if isinstance(value, (ctypes.Structure, ctypes.Union)):
-        return dict(_c_fields(value))
+        return dict(_read_c_fields(value))
     if isinstance(value, ctypes.Array):
-        return _c_items(value)
+        return _read_c_array(value)
     code = getattr(value, "_type_", None)
-    if not isinstance(code, str) or code in _ADDRESSES:
+    if not isinstance(code, str) or code in _C_ADDRESSES:
         raise NoCounterpartError(_UNKNOWN_LENGTH if value else "null pointer")
     return value.value
 
 
-def _c_items(array: Any) -> object:
+def _read_c_array(array: Any) -> object:
     _require_few(len(array))
-    if (code := getattr(array._type_, "_type_", None)) in _TEXTS:
-        return bytes(array) if code == "c" else array.value
-    return [_Unreadable()] * len(array) if _is_followed(array._type_) else list(array)
+    code = getattr(array._type_, "_type_", None)
+    if code == "c":
+        return bytes(array)
+    if code == "u":
+        return array.value
+    return [_Pointer()] * len(array) if _is_followed(array._type_) else list(array)
 
 
-def _c_fields(structure: Any) -> Iterator[tuple[str, object]]:
+def _read_c_fields(structure: Any) -> Iterator[tuple[str, object]]:
     for cls in reversed(type(structure).__mro__):
         for name, kind, *_ in vars(cls).get("_fields_", ()):
-            yield name, _Unreadable() if _is_followed(kind) else getattr(structure, name)
+            yield name, _Pointer() if _is_followed(kind) else getattr(structure, name)
 
 
 def _is_followed(kind: Any) -> bool:
     """Whether ctypes follows such a pointer by itself as soon as the field is read."""
     code = getattr(kind, "_type_", None)
-    return isinstance(code, str) and code in _ADDRESSES
+    return isinstance(code, str) and code in _C_ADDRESSES
+
+
+def _is_c_number_array(value: Any) -> bool:
+    """Whether it is an array of ctypes of nothing but numbers, such as a position of Webots."""
+    ctypes = sys.modules.get("ctypes")
+    if ctypes is None or not isinstance(value, ctypes.Array):
+        return False
+    code = getattr(value._type_, "_type_", None)
+    return isinstance(code, str) and code in _C_NUMBERS
 
 
 # -- everything else ---------------------------------------------------------------------------
@@ -420,16 +436,10 @@ class Cleaner:
 
     def _numbers(self, items: list[Any], place: Place) -> list[Any]:
         """Copy an array of numbers: thousands of them (lidars), so without a call for each."""
-        finite = list(map(math.isfinite, items))
-        kinds = set(map(str, compress(items, map(not_, finite))))
-        if not kinds:
-            return items
-        if len(kinds) == 1:
-            self._name((place, "*"), kinds.pop())
-        else:
-            for i, item in compress(enumerate(items), map(not_, finite)):
-                self._name((place, i), str(item))
-        return [item if good else None for item, good in zip(items, finite, strict=True)]
+        plain, names = _replace_non_finite(items)
+        for name, kind in names:
+            self._name((place, name), kind)
+        return plain
 
     # -- everything else -----------------------------------------------------------------------
 
@@ -460,6 +470,22 @@ class Cleaner:
             self.replaced[path] = kind
         else:
             self.unnamed += 1
+
+
+def _replace_non_finite(items: list[Any]) -> tuple[list[Any], list[tuple[str | int, str]]]:
+    """The numbers with null for those that are not finite, and the names of these.
+
+    Returns:
+        The items, and pairs of index and kind; ("*", kind) if all are of one kind.
+    """
+    finite = list(map(math.isfinite, items))
+    kinds = set(map(str, compress(items, map(not_, finite))))
+    if not kinds:
+        return items, []
+    plain = [item if good else None for item, good in zip(items, finite, strict=True)]
+    if len(kinds) == 1:
+        return plain, [("*", kinds.pop())]
+    return plain, [(i, str(item)) for i, item in compress(enumerate(items), map(not_, finite))]
 
 
 def _path(place: Place) -> str:
@@ -577,6 +603,10 @@ _LEAVES: Final = frozenset((float, bool, type(None)))
 _SHORT_ARRAY: Final = 16
 _MANY: Final = (dict, list, tuple, set, frozenset, deque)
 
+_NON_FINITE: Final = frozenset(("nan", "inf", "-inf"))
+_MOST_NON_FINITE_PATHS: Final = 64
+_LONGEST_PATH_CHARACTERS: Final = 500
+
 # Keys that were checked before: every row has the same ones, so most checks are one set operation.
 _short_keys: set[object] = set()
 
@@ -595,11 +625,11 @@ class Encoded(NamedTuple):
     @property
     def replaced_text(self) -> str | None:
         """The value of the column `replaced`: null where nothing was replaced."""
-        return _text_of_pairs(tuple(self.replaced.items())) if self.replaced else None
+        return _replaced_text(tuple(self.replaced.items())) if self.replaced else None
 
 
 @lru_cache(maxsize=8)  # mostly the same in each row
-def _text_of_pairs(replaced: tuple[tuple[str, str], ...]) -> str:
+def _replaced_text(replaced: tuple[tuple[str, str], ...]) -> str:
     return _encode_plain(dict(replaced))
 
 
@@ -611,12 +641,10 @@ def encode(state: object) -> Encoded:
     """Encode a state, as fast as its content allows; the state itself is never changed."""
     try:
         _look((state,), MAX_PLAIN_VALUES, 0)
-        if _gaps.tree and state.__class__ is dict:
-            return _encode_with_nulls(cast("dict[Any, Any]", state))
-        return Encoded(_text_of_plain(state), {})
+        return _encode_looked_at(state)
     except Exception:  # noqa: BLE001  (the slow path finds and names what cannot be encoded)
         encoded = _encode_replacing(state)
-        _gaps.remember(encoded)
+        _remember_non_finite(state, encoded)
         return encoded
 
 
@@ -752,113 +780,23 @@ def _look_at_number(value: Any, left: int) -> int:
         return left - len(value) // _CHARACTERS_OF_A_VALUE
     if is_number_array(value):
         return left - item_count(value)
+    if _is_c_number_array(value):
+        return left - item_count(value)
     if not isinstance(value, float):
         raise _NotPlainError
     return left
 
 
-def _text_of_plain(state: object, nulls: int = 0) -> str:
-    """Its JSON; `nulls` says how many nulls it has where a number was."""
-    text = _encode_with_orjson(state, nulls) or _encode_plain(state)
+def _encode_looked_at(state: object) -> Encoded:
+    replaced: dict[str, str] = {}
+    null_count = 0
+    if _path_count and state.__class__ is dict:
+        values = cast("dict[str, Any]", state)
+        state, null_count = _without_non_finite(values, _non_finite_paths, replaced)
+    text = _encode_with_orjson(state, null_count) or _encode_plain(state)
     if (len(text) if text.isascii() else len(text.encode())) > MAX_ROW_BYTES:
         raise _NotPlainError
-    return text
-
-
-# -- the fast path: infinities and NaNs where the last rows had them ------------------------------
-# Every wheel in velocity mode has the target position infinity, in each row, and a lidar's sectors
-# often do. So places that had one are looked at first, and get a null; the containers on the way
-# to them are copied. An infinity at any other place leads to the slow path, which remembers it.
-
-_MOST_GAPS: Final = 64
-_MOST_GAPS_CHARACTERS: Final = 5_000  # of their paths
-_GAPS: Final = frozenset(("inf", "-inf", "nan"))
-
-
-class _Gap(NamedTuple):
-    """A place on the way to an infinity or a NaN of an earlier row."""
-
-    path: str
-    below: dict[str, _Gap]
-
-
-class _Gaps:
-    """The places that had an infinity or a NaN, as a tree of keys; empty while there are none."""
-
-    def __init__(self) -> None:
-        self._paths: dict[str, None] = {}
-        self.tree: dict[str, _Gap] = {}
-
-    def remember(self, encoded: Encoded) -> None:
-        """Add those of a row that the slow path encoded, where they were all that was odd in it."""
-        found = encoded.replaced
-        if not found or len(found) > _MOST_GAPS or not _GAPS.issuperset(found.values()):
-            return
-        paths = self._paths | dict.fromkeys(found)
-        if len(paths) > _MOST_GAPS:
-            paths = dict.fromkeys(found)
-        if sum(map(len, paths)) > _MOST_GAPS_CHARACTERS:
-            return
-        tree: dict[str, _Gap] = {}
-        for path in paths:
-            below, way = tree, ""
-            for key in path.split("."):
-                way = f"{way}.{key}" if way else key
-                below = below.setdefault(key, _Gap(way, {})).below
-        self._paths, self.tree = paths, tree
-
-
-_gaps = _Gaps()
-
-
-def _encode_with_nulls(state: dict[Any, Any]) -> Encoded:
-    """Encode with nulls for infinities and NaNs at the remembered places.
-
-    Raises:
-        _NotPlainError: Another value has to be replaced too, or there are too many.
-    """
-    replaced: dict[str, str] = {}
-    filled, nulls = _fill(state, _gaps.tree, replaced)
-    if len(replaced) > _MOST_GAPS:
-        raise _NotPlainError
-    return Encoded(_text_of_plain(filled, nulls), replaced)
-
-
-def _fill(
-    inside: dict[Any, Any], gaps: dict[str, _Gap], replaced: dict[str, str]
-) -> tuple[dict[Any, Any], int]:
-    """A dict with nulls at its gaps, a copy where it has any, and the number of these nulls."""
-    filled, nulls = inside, 0
-    for key, (path, below) in gaps.items():
-        value: Any = inside.get(key)
-        kind = value.__class__
-        found, new = 0, None
-        if kind is float:
-            if value - value != 0.0:  # of an infinity it is NaN
-                replaced[path] = str(value)
-                found = 1
-        elif kind is dict and below:
-            new, found = _fill(cast("dict[Any, Any]", value), below, replaced)
-        elif kind is list and below:
-            new, found = _fill_array(cast("list[Any]", value), path, replaced)
-        if found:
-            if filled is inside:
-                filled = inside.copy()
-            filled[key] = new
-            nulls += found
-    return filled, nulls
-
-
-def _fill_array(items: list[Any], path: str, replaced: dict[str, str]) -> tuple[list[Any], int]:
-    if set(map(type, items)) != {float}:
-        return items, 0
-    gaps = [(i, str(item)) for i, item in enumerate(items) if item - item != 0.0]
-    kinds = {kind for _, kind in gaps}
-    if len(kinds) == 1:
-        replaced[f"{path}.*"] = kinds.pop()
-    else:
-        replaced.update((f"{path}.{i}", kind) for i, kind in gaps)
-    return [item if item - item == 0.0 else None for item in items], len(gaps)
+    return Encoded(text, replaced)
 
 
 class _Copier(pickle.Pickler):
@@ -874,21 +812,27 @@ class _Copier(pickle.Pickler):
 
 def _in_lists(value: Any) -> object:
     """The values of an array of numbers, for an encoder that does not know it."""
-    if not is_number_array(value):
-        raise _NotPlainError
-    return value.tolist()
+    if is_number_array(value):
+        return value.tolist()
+    if _is_c_number_array(value):
+        return list(value)
+    raise _NotPlainError
 
 
-def _encode_with_orjson(state: object, nulls: int) -> str | None:
-    """None where orjson cannot, or may have turned another NaN silently into null."""
+def _encode_with_orjson(state: object, null_count: int) -> str | None:
+    """None where orjson cannot, or may have turned a NaN silently into null.
+
+    Args:
+        state: What to encode.
+        null_count: The number of nulls that its text has if no NaN was turned into one.
+    """
     if orjson is None:
         return None
     try:
         text = orjson.dumps(state, _in_lists, orjson.OPT_SERIALIZE_NUMPY)
     except Exception:  # noqa: BLE001  (the user's objects may raise anything; `json` comes next)
         return None
-    has_more = text.count(b"null") > nulls if nulls else b"null" in text  # faster than to count
-    return None if has_more else text.decode()
+    return text.decode() if text.count(b"null") == null_count else None
 
 
 # Nesting is bounded before, so nothing contains itself; without this check it is 8 % faster.
@@ -899,6 +843,120 @@ _encode_plain: Final = json.JSONEncoder(
     separators=(",", ":"),
     default=_in_lists,
 ).encode
+
+
+# -- the fast path: numbers that JSON does not have --------------------------------------------
+# A wheel in velocity mode has an infinite target position in each row, a lidar infinities where
+# nothing is in reach. The slow path finds them; their paths are remembered, and numbers there are
+# replaced in the rows after that before the encoder runs. At any other path the encoder fails, and
+# the slow path finds and remembers it too. The paths of all robots of the process are kept
+# together: one that a state does not have costs one look-up.
+
+
+class _PathTree:
+    """The remembered paths below one key.
+
+    Attributes:
+        path: The keys from the top of the state to here, dotted.
+        below: The keys that follow, of a dict at this path.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        self.below: dict[str, _PathTree] = {}
+
+
+_non_finite_paths = _PathTree("")
+_path_count = 0
+
+
+def _remember_non_finite(state: object, encoded: Encoded) -> None:
+    """Remember where a state that the slow path encoded has numbers that are not finite."""
+    global _non_finite_paths, _path_count
+    if encoded.unnamed or not encoded.replaced or state.__class__ is not dict:
+        return
+    if not _NON_FINITE.issuperset(encoded.replaced.values()):
+        return  # such states take the slow path for another reason
+    found = list(_find_non_finite(cast("dict[object, object]", state), (), 0))
+    if len(found) > _MOST_NON_FINITE_PATHS:
+        return
+    if _path_count + len(found) > _MOST_NON_FINITE_PATHS:
+        _non_finite_paths, _path_count = _PathTree(""), 0
+    for keys in found:
+        tree = _non_finite_paths
+        for depth, key in enumerate(keys, 1):
+            if key not in tree.below:  # replaced as a whole: another thread may read the old dict
+                tree.below = {**tree.below, key: _PathTree(".".join(keys[:depth]))}
+            tree = tree.below[key]
+        _path_count += 1
+
+
+def _find_non_finite(
+    values: dict[Any, Any], above: tuple[str, ...], length: int
+) -> Iterator[tuple[str, ...]]:
+    for key, value in values.items():
+        if type(key) is not str or (longer := length + len(key) + 1) > _LONGEST_PATH_CHARACTERS:
+            continue
+        kind: Any = value.__class__
+        if kind is dict:
+            yield from _find_non_finite(value, (*above, key), longer)
+        elif kind is float:
+            if not math.isfinite(value):
+                yield (*above, key)
+        elif _is_plain_array(value) and not all(map(math.isfinite, value)):
+            yield (*above, key)
+
+
+def _is_plain_array(value: object) -> bool:
+    """Whether it is a list or a tuple of Python's own numbers."""
+    return value.__class__ in (list, tuple) and {float, int}.issuperset(
+        map(type, cast("list[object]", value))
+    )
+
+
+def _without_non_finite(
+    values: dict[str, Any], tree: _PathTree, replaced: dict[str, str]
+) -> tuple[dict[str, Any], int]:
+    """The values with null for numbers that are not finite at the remembered paths.
+
+    Dicts on such a path are copied; nothing is changed in the user's own.
+
+    Args:
+        values: Were looked at, and are not changed.
+        tree: The paths below them.
+        replaced: Receives dotted path to kind, as the slow path would name it.
+
+    Returns:
+        The values, and the number of nulls that were put into them.
+
+    Raises:
+        _NotPlainError: More have to be named than the fast path does.
+    """
+    copy, null_count = values, 0
+    for key, under in tree.below.items():
+        value: Any = values.get(key)
+        kind: Any = value.__class__
+        if kind is float:
+            if value - value == 0.0:
+                continue
+            plain, count = None, 1
+            replaced[under.path] = str(value)
+        elif kind is dict:
+            plain, count = _without_non_finite(value, under, replaced)
+        elif _is_plain_array(value):
+            plain, names = _replace_non_finite(cast("list[Any]", value))
+            if len(replaced) + len(names) > _MOST_NON_FINITE_PATHS:
+                raise _NotPlainError
+            replaced.update((f"{under.path}.{item}", what) for item, what in names)
+            count = plain.count(None) if names else 0
+        else:
+            continue
+        if count:
+            if copy is values:
+                copy = dict(values)
+            copy[key] = plain
+            null_count += count
+    return copy, null_count
 
 
 # -- the slow path: everything else ------------------------------------------------------------

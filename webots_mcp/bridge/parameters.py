@@ -9,7 +9,7 @@ from collections.abc import Callable, Container, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar, cast
 
 from webots_mcp.bridge.error_report import ErrorReport
-from webots_mcp.contract import PARAMETERS_VARIABLE
+from webots_mcp.contract import PARAMETERS_VARIABLE, recorded_name
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 from webots_mcp.parameter import MOST_PARAMETERS, Declaration, Value, require_known
 from webots_mcp.waiting_file import Kind, Values
@@ -342,7 +342,7 @@ class StartValues:
             self._warn("", f"{why}, {example}; the code's values are used")
             return {}
         values = cast("dict[str, Any]", found)
-        own = values.get(self._robot)
+        own = next((values[name] for name in values if recorded_name(name) == self._robot), None)
         return {**values, **cast("dict[str, Any]", own)} if isinstance(own, dict) else values
 
     def _warn(self, kind: str, why: str) -> None:

@@ -1,0 +1,84 @@
+"""NaN and infinities at paths where earlier rows had them are replaced without the slow path."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from webots_mcp.bridge import encoding
+
+NUMBERS = st.sampled_from([0.5, -2.0, 7, math.inf, -math.inf, math.nan])
+VALUES: st.SearchStrategy[Any] = st.recursive(
+    NUMBERS
+    | st.none()
+    | st.just("null")
+    | st.lists(NUMBERS, max_size=4)
+    | st.lists(NUMBERS, max_size=3).map(tuple)
+    | st.lists(st.lists(NUMBERS, max_size=2), max_size=2),
+    lambda inner: st.dictionaries(st.sampled_from("abc"), inner, max_size=3),
+    max_leaves=8,
+)
+STATES = st.dictionaries(st.sampled_from("abc"), VALUES, max_size=3)
+WHEELS = {
+    name: {"target_position_rad": math.inf, "target_velocity_rad_s": 2.5}
+    for name in ("left wheel", "right wheel")
+}
+
+
+def without_slow_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(state: object) -> Any:
+        raise AssertionError(f"{state} took the slow path")
+
+    monkeypatch.setattr(encoding, "_encode_replacing", refuse)
+
+
+@pytest.mark.usefixtures("encoder")
+@given(states=st.lists(STATES, min_size=1, max_size=6))
+@settings(max_examples=300, deadline=None)
+def test_rows_are_the_same_with_and_without_remembered_paths(states: list[Any]) -> None:
+    for state in states:
+        before = repr(state)
+        encoded, slow = encoding.encode(state), encoding._encode_replacing(state)
+        assert json.loads(encoded.text) == json.loads(slow.text)
+        assert (encoded.replaced, encoded.unnamed) == (slow.replaced, slow.unnamed)
+        assert repr(state) == before
+
+
+@pytest.mark.usefixtures("encoder")
+def test_wheels_without_a_target_position_take_the_fast_path(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    state = {"motors": WHEELS, "ranges_m": [0.5, math.inf, math.inf], "front_m": math.nan}
+    first = encoding.encode(state)
+    without_slow_path(monkeypatch)
+    assert encoding.encode(state) == first
+    assert first.replaced == {
+        "front_m": "nan",
+        "ranges_m.*": "inf",
+        "motors.left wheel.target_position_rad": "inf",
+        "motors.right wheel.target_position_rad": "inf",
+    }
+
+
+@pytest.mark.usefixtures("encoder")
+def test_two_robots_in_one_process_do_not_forget_each_others_paths(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    states: list[dict[str, Any]] = [{"motors": WHEELS}, {"motors": math.nan}, {"scan": [math.inf]}]
+    first = [encoding.encode(state) for state in states]
+    without_slow_path(monkeypatch)
+    assert [encoding.encode(state) for state in states] == first
+
+
+@pytest.mark.usefixtures("encoder")
+def test_more_paths_than_are_remembered_are_still_named() -> None:
+    for count in (10, 60, 200, 10):
+        state = {f"wheel{i}": math.inf for i in range(count)}
+        encoded = encoding.encode(state)
+        assert encoded.replaced == dict.fromkeys(state, "inf")
+        assert json.loads(encoded.text) == dict.fromkeys(state)

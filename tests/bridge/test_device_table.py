@@ -37,11 +37,16 @@ METHODS = methods_of_devices()
 BLIND = {"Brake", "Display", "Emitter", "Skin", "Speaker"}  # they only take orders
 
 
+DUCK_COLORS = (ctypes.c_double * 6)(1.0, 1.0, 0.0, 1.0, 0.5, 0.0)
+
+
 def recognised(number: int, x_m: float, model: str = "can") -> Any:
     return SimpleNamespace(
         getId=lambda: number,
         getModel=lambda: model,
         getPosition=lambda: (ctypes.c_double * 3)(x_m, 0.0, 0.0),
+        getNumberOfColors=lambda: 2 if model == "duck" else 0,
+        getColors=lambda: ctypes.cast(DUCK_COLORS, ctypes.POINTER(ctypes.c_double)),
     )
 
 
@@ -72,8 +77,20 @@ TABLE: dict[str, tuple[dict[str, Any], str, Any]] = {
             "count": 2,
             "min_m": 0.5,
             "nearest": [
-                {"model": "duck", "id": 9, "distance_m": 0.5, "position_m": [0.5, 0.0, 0.0]},
-                {"model": "can", "id": 7, "distance_m": 2.0, "position_m": [2.0, 0.0, 0.0]},
+                {
+                    "model": "duck",
+                    "id": 9,
+                    "distance_m": 0.5,
+                    "position_m": [0.5, 0.0, 0.0],
+                    "colors": [*DUCK_COLORS],
+                },
+                {
+                    "model": "can",
+                    "id": 7,
+                    "distance_m": 2.0,
+                    "position_m": [2.0, 0.0, 0.0],
+                    "colors": [],
+                },
             ],
         },
     ),

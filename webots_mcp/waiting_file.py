@@ -99,13 +99,17 @@ STATEMENTS: Final[dict[Kind, str]] = {
     "image forgotten": "DELETE FROM image WHERE path = ?",
     # Without a number of rows they are counted: a dead process could not say how many.
     "run end": (
-        "UPDATE run SET end_reason = :reason, ended_wall_time_s = :now, last_wall_time_s = :now, "
-        "last_sim_time_s = :sim_time, own_wall_s = :own, step_wait_wall_s = :step_wait, "
+        "UPDATE run SET end_reason = :reason, "
+        "ended_wall_time_s = coalesce(:now, last_wall_time_s), "
+        "last_wall_time_s = coalesce(:now, last_wall_time_s), "
+        "last_sim_time_s = coalesce(:sim_time, last_sim_time_s), "
+        "own_wall_s = :own, step_wait_wall_s = :step_wait, "
         "steps = :steps, row_count = coalesce(:rows, "
         "purged_rows + (SELECT count(*) FROM state WHERE run_id = :run)) WHERE id = :run"
     ),
     "session end": (
-        "UPDATE session SET ended_wall_time_s = :now, last_seen_wall_time_s = :now, "
+        "UPDATE session SET ended_wall_time_s = coalesce(:now, last_seen_wall_time_s), "
+        "last_seen_wall_time_s = coalesce(:now, last_seen_wall_time_s), "
         "last_seen_monotonic_s = :monotonic, end_reason = :reason, rows_waiting = 0, "
         "rows_dropped = :dropped, last_error = :error WHERE id = :session"
     ),
@@ -495,6 +499,7 @@ def take_in(
     session_id: int,
     piece: Sequence[Entry],
     finish: Callable[[Taken], object] | None = None,
+    begin: Callable[[Entry], dict[str, Any] | None] | None = None,
 ) -> Taken:
     """Write the entries of a session in one transaction, as many as there is time for.
 
@@ -503,6 +508,8 @@ def take_in(
         session_id: Of the session.
         piece: Its next entries, in order.
         finish: Called last of all in that transaction.
+        begin: Gives the values of an entry's run that the database does not know, if it shall be
+            made.
 
     Raises:
         sqlite3.Error: Nothing was written.
@@ -518,7 +525,7 @@ def take_in(
         for entry in piece:
             if entry.number > taken.number:
                 taken = taken._replace(number=entry.number)
-                why = _write(connection, session_id, entry)
+                why = _write(connection, session_id, entry, begin)
                 taken.unfit.append(why) if why else taken.written.append(entry)
                 if time.monotonic() > until_s:
                     break
@@ -530,12 +537,20 @@ def take_in(
     return in_transaction(connection, act)
 
 
-def _write(connection: sqlite3.Connection, session_id: int, entry: Entry) -> str | None:
+def _write(
+    connection: sqlite3.Connection,
+    session_id: int,
+    entry: Entry,
+    begin: Callable[[Entry], dict[str, Any] | None] | None,
+) -> str | None:
     """Write an entry; or why the database will never take it, which stops no other."""
     run_id = None
     try:
         if entry.run is not None:
             row = connection.execute(_RUN_OF, (entry.run, session_id)).fetchone()
+            if row is None and begin is not None and (run := begin(entry)) is not None:
+                connection.execute(STATEMENTS["run"], bind(None, session_id, run))
+                row = connection.execute(_RUN_OF, (entry.run, session_id)).fetchone()
             if row is None:
                 return f"its session has no run {entry.run}"
             run_id = row[0]

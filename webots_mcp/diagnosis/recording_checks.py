@@ -37,6 +37,7 @@ from webots_mcp.diagnosis import (
 from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
 from webots_mcp.requirements import install_line, missing_requirements, package_of
 from webots_mcp.setup.wsl import WAY_OUT, is_wsl
+from webots_mcp.store.journal_intake import kept_journals
 from webots_mcp.store.recording import GETTING_STARTED, View, name_of
 from webots_mcp.store.robots import fetch_session, handler_at_work, rows_waiting
 from webots_mcp.waiting_file import count_rows, waiting_paths
@@ -316,6 +317,11 @@ def rows(subject: Examined) -> Iterator[Diagnosis]:
     for path in waiting_paths(subject.file) if subject.file else []:
         if path.name not in waiting_in:  # no living controller will empty it
             yield from _left_waiting(path)
+    for name, why in (kept_journals(subject.file) if subject.file else {}).items():
+        yield warning(
+            f"{name} could not be read and was left as it is: {why}",
+            "correct the program that writes it (docs/journal.md); then move or delete the file",
+        )
 
 
 def _left_waiting(path: Path) -> Iterator[Diagnosis]:

@@ -44,7 +44,13 @@ from webots_mcp.errors import (
 from webots_mcp.liveness import Lease, still_held
 from webots_mcp.queue import any_unfinished
 from webots_mcp.store.chunks import is_chunked_aside, show_chunks_aside
-from webots_mcp.store.journal_intake import BUDGET_S, has_news, journals_behind, take_in_journals
+from webots_mcp.store.journal_intake import (
+    BUDGET_S,
+    has_news,
+    journals_behind,
+    kept_journals,
+    take_in_journals,
+)
 from webots_mcp.store.reading.segment import Subject, choose, require_run
 from webots_mcp.store.retention import Asked
 from webots_mcp.store.robots import Robot, Session, Status, judge, stopped_for
@@ -64,6 +70,10 @@ _FROZEN: Final = "the file cannot be written from here: read as it is on the dis
 _BEHIND: Final = (
     "newer rows of {} are not in the database yet: ask again, or start 'webots-mcp serve' (not "
     "--read-only), which takes them in"
+)
+_KEPT: Final = (
+    "{} could not be read and was left as it is: {}. Correct the program that writes it, then move "
+    "or delete the file"
 )
 _NOT_IN: Final = (
     "; without the rows in {} waiting files next to it (...-waiting-...): copy all of them to a "
@@ -312,7 +322,8 @@ def look(connection: sqlite3.Connection, robot: str | None, run_id: int | None =
     try:
         chosen, run = choose(connection, robot, run_id, now_s)
     except NothingRecordedError as error:
-        raise NothingRecordedError(f"{error}. {GETTING_STARTED}") from error
+        left = "".join(f". {said}" for said in storage(connection).values())
+        raise NothingRecordedError(f"{error}{left}. {GETTING_STARTED}") from error
     return view_of(connection, chosen, now_s, run)
 
 
@@ -347,10 +358,14 @@ def storage(connection: sqlite3.Connection) -> dict[str, Any]:
     """What an answer says of the file that it was read from, and of rows that are not in it."""
     (file,) = connection.execute("SELECT file FROM pragma_database_list").fetchone()
     behind = journals_behind(connection, Path(file)) if file else []
-    if not isinstance(connection, FrozenConnection):
-        return {"storage": _BEHIND.format(", ".join(behind))} if behind else {}
-    waiting = [*(path.name for path in waiting_paths(Path(file))), *behind]
-    return {"storage": f"{_FROZEN}{_NOT_IN.format(len(waiting)) if waiting else ''}"}
+    kept = kept_journals(Path(file)) if file else {}
+    said = [_KEPT.format(name, why) for name, why in kept.items()]
+    if isinstance(connection, FrozenConnection):
+        waiting = [*(path.name for path in waiting_paths(Path(file))), *behind]
+        said.insert(0, f"{_FROZEN}{_NOT_IN.format(len(waiting)) if waiting else ''}")
+    elif behind:
+        said.insert(0, _BEHIND.format(", ".join(behind)))
+    return {"storage": "; ".join(said)} if said else {}
 
 
 def name_of(database: Database) -> str:

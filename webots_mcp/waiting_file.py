@@ -428,7 +428,7 @@ def read_header(file: BinaryIO) -> dict[str, Any] | None:
     if not line.endswith(b"\n") and len(line) < _LONGEST_HEADER_BYTES:
         return None
     try:
-        header = cast("dict[str, Any]", json.loads(line))
+        header = cast("dict[str, Any]", json.loads(line.decode("utf-8-sig", "replace")))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"the first line of {file.name} is no JSON: {error}") from None
     if not isinstance(header, dict) or header.get(_VERSION) != FORMAT:  # pyright: ignore[reportUnnecessaryIsInstance]

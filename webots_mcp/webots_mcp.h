@@ -147,12 +147,13 @@ static inline uint64_t wmcp__scaled(uint64_t mantissa, int power, int shift) {
   return (low & (2 * bit - 1)) == bit ? whole & ~(uint64_t)1 : whole; /* a tie: to the even one */
 }
 
-/* A finite number, by the 17 digits that are nearest to it. */
+/* A number, by the 17 digits that are nearest to it; null for NaN and infinities. */
 static inline void wmcp__double(wmcp__text *text, double value) {
   char out[64], *end = out + 64, *at;
   double size = value < 0 ? -value : value;
   uint64_t bits;
   memcpy(&bits, &value, sizeof bits);
+  if ((bits >> 52 & 0x7FF) == 0x7FF) { wmcp__put(text, "null", 4); return; }
   if (bits >> 63) wmcp__put(text, "-", 1);
   if (size < 9007199254740992.0 && size == (double)(int64_t)size) {
     wmcp__whole(text, (long long)size);
@@ -478,7 +479,8 @@ static inline void wmcp_begin(wmcp *w, double sim_time_s) {
   w->sim_time_s = sim_time_s;
   if (!w->run[0]) { /* a step ago, as the controller began before it */
     double start_s = sim_time_s - w->step_ms / 1000.0;
-    wmcp__begin_run(w, start_s > 1e-9 ? start_s : 0.0);
+    int is_known = !wmcp__not_finite(start_s) && start_s > 1e-9 && start_s <= sim_time_s;
+    wmcp__begin_run(w, is_known ? start_s : 0.0);
   }
   if (is_reset) {
     w->start_reason = "reset";

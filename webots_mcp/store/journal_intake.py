@@ -614,7 +614,7 @@ def _fitted(letter: str, value: object) -> Any:
     if letter == "s":
         return value if isinstance(value, str) and _is_text(value) else None
     if letter == "o":
-        return _object(value) if isinstance(value, dict) else None
+        return cast("dict[str, Any]", value) if isinstance(value, dict) else None
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return None
     try:
@@ -708,7 +708,8 @@ def _require_shallow(value: object) -> None:
     for _ in range(_DEEPEST):
         inner: list[Any] = []
         for each in level:
-            items: Iterable[Any] = _object(each).values() if isinstance(each, dict) else each
+            is_object = isinstance(each, dict)
+            items: Iterable[Any] = cast("dict[str, Any]", each).values() if is_object else each
             inner += [item for item in items if isinstance(item, (dict, list))]
         if not (level := inner):
             return

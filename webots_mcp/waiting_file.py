@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import re
 import sqlite3
@@ -262,6 +263,16 @@ def waiting_paths(database: Path, kind: Callable[[Path, str], Path] = waiting_pa
     """The files in which entries of bridges wait, of living sessions too; or those of a kind."""
     names = _names(database, kind)
     return [database.with_name(name) for name in sorted(names) if not _PART.search(name)]
+
+
+def left_waiting(database: Path) -> list[Path]:
+    """Those files of bridges that no living process writes."""
+    left: list[Path] = []
+    for path in waiting_paths(database):
+        with contextlib.suppress(OSError), path.open("r+b") as file:
+            if lock(file.fileno()):
+                left.append(path)
+    return left
 
 
 def journal_parts(database: Path) -> dict[str, list[Path]]:
@@ -562,12 +573,13 @@ def _write(
     return None
 
 
-def adopt(connection: sqlite3.Connection, database: Path) -> int:
+def adopt(connection: sqlite3.Connection, database: Path, until_s: float = math.inf) -> int:
     """Take in what sessions of dead processes left behind; files of live sessions are left alone.
 
     Args:
         connection: A writer in autocommit mode and in no transaction.
         database: Its file.
+        until_s: The monotonic time at which it ends; what is left waits.
 
     Returns:
         How many rows and other writes that was. A file that cannot be taken in is left in place and
@@ -576,7 +588,7 @@ def adopt(connection: sqlite3.Connection, database: Path) -> int:
     Raises:
         sqlite3.Error: The database is locked; what is in is in, the rest waits.
     """
-    count = sum(_adopt_file(connection, path) for path in waiting_paths(database))
+    count = sum(_adopt_file(connection, path, until_s) for path in waiting_paths(database))
     found = waiting_paths(database, stacks_path)
     return count + sum(_adopt_stacks(connection, path) for path in found)
 
@@ -597,12 +609,14 @@ def _adopt_stacks(connection: sqlite3.Connection, path: Path) -> int:
     return logged
 
 
-def _adopt_file(connection: sqlite3.Connection, path: Path) -> int:
+def _adopt_file(connection: sqlite3.Connection, path: Path, until_s: float) -> int:
     try:
         with path.open("r+b") as file:
             if not lock(file.fileno()) or os.fstat(file.fileno()).st_nlink == 0:
                 return 0
-            count = _adopt_open(connection, file)
+            count, is_whole = _adopt_open(connection, file, until_s)
+            if not is_whole:
+                return count
             if os.name != "nt":
                 path.unlink()
         if os.name == "nt":  # where an open file cannot be deleted; who finds it passes it over
@@ -630,10 +644,11 @@ def report_strange(path: Path, error: Exception) -> None:
         warn(f"what waits in {path} cannot be taken in: {why}")
 
 
-def _adopt_open(connection: sqlite3.Connection, file: BinaryIO) -> int:
+def _adopt_open(connection: sqlite3.Connection, file: BinaryIO, until_s: float) -> tuple[int, bool]:
+    """How many entries were written, and whether none is left."""
     header = read_header(file)
     if header is None:
-        return 0
+        return 0, True
     session_id = _session(connection, header)
     offset, count, unfit = file.tell(), 0, list[str]()
     while piece := next_entries(file, offset):
@@ -641,12 +656,14 @@ def _adopt_open(connection: sqlite3.Connection, file: BinaryIO) -> int:
         offset = max(end for end, entry in piece if entry.number <= taken.number)
         count += sum(entry.kind != "run" for entry in taken.written)
         unfit += taken.unfit
+        if time.monotonic() > until_s:
+            return count, False
     if count:
         for counted in connection.execute(_RECOUNT, (session_id,)).fetchall():
             connection.execute(_SET_ROWS, counted)
     if unfit:
         warn(f"{len(unfit)} rows that waited in {file.name} were refused: {unfit[0]}")
-    return count
+    return count, True
 
 
 def _session(connection: sqlite3.Connection, header: dict[str, Any]) -> int:

@@ -234,8 +234,8 @@ def held_log(database: Path) -> str:
     return (
         f"{database.name}-wal has grown to {log_bytes / 1e6:.0f} MB ({free_bytes / 1e9:.1f} GB are "
         "free on its disk): another program holds a read transaction open, or nothing copies the "
-        "log back; end that transaction (a sqlite3 shell? type COMMIT or .quit), and let 'webots-mcp "
-        "serve' or a controller run"
+        "log back; end that transaction (a sqlite3 shell? type COMMIT or .quit), and let "
+        "'webots-mcp serve' or a controller run"
     )
 
 

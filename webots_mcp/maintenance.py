@@ -17,6 +17,7 @@ Standard library only, because the bridge imports it inside a robot's controller
 from __future__ import annotations
 
 import os
+import shutil
 import sqlite3
 import threading
 import time
@@ -46,6 +47,7 @@ WAL_LIMIT_BYTES: Final = 1_000_000  # a shorter log is left alone
 LONG_LOG_BYTES: Final = 12_000_000  # it begins anew, for which rows wait a few milliseconds
 LONGEST_LOG_BYTES: Final = 32_000_000  # its file is cut
 FAST_GROWTH_BYTES: Final = 4_000_000  # in one interval
+HELD_LOG_BYTES: Final = 100_000_000  # three times the longest: a reader's snapshot keeps it long
 
 # Another program may have written anything there: an end that is no time has passed.
 _LEASE: Final = (
@@ -89,6 +91,7 @@ class Maintainer(threading.Thread):
         self._data_version = -1
         self._log_bytes = 0  # after the last checkpoint
         self._warned_of = ""
+        self._is_held = False
         self.failures = 0  # rounds that were not finished
 
     def run(self) -> None:
@@ -183,6 +186,10 @@ class Maintainer(threading.Thread):
             self._take_lease(connection)
             log_bytes = 0
         self._log_bytes = log_bytes
+        held = held_log(self._database)
+        if held and not self._is_held:
+            warn(held)
+        self._is_held = bool(held)
 
     def _copy_log(self, connection: sqlite3.Connection, how: str) -> int:
         """Checkpoint after a commit of one's own, without which the log might begin anew meanwhile.
@@ -213,6 +220,23 @@ class Maintainer(threading.Thread):
             self._connection.close()
             self._connection = None
         self._held_before = False
+
+
+def held_log(database: Path) -> str:
+    """A warning where a reader's snapshot keeps the log from beginning anew; else ""."""
+    try:
+        log_bytes = os.stat(f"{database}-wal").st_size  # noqa: PTH116
+        free_bytes = shutil.disk_usage(database.parent).free
+    except OSError:
+        return ""
+    if log_bytes <= HELD_LOG_BYTES:
+        return ""
+    return (
+        f"{database.name}-wal has grown to {log_bytes / 1e6:.0f} MB ({free_bytes / 1e9:.1f} GB are "
+        "free on its disk): another program holds a read transaction open, or nothing copies the "
+        "log back; end that transaction (a sqlite3 shell? type COMMIT or .quit), and let "
+        "'webots-mcp serve' or a controller run"
+    )
 
 
 def _described(error: Exception) -> str:

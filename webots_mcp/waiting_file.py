@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import re
 import sqlite3
@@ -99,13 +100,17 @@ STATEMENTS: Final[dict[Kind, str]] = {
     "image forgotten": "DELETE FROM image WHERE path = ?",
     # Without a number of rows they are counted: a dead process could not say how many.
     "run end": (
-        "UPDATE run SET end_reason = :reason, ended_wall_time_s = :now, last_wall_time_s = :now, "
-        "last_sim_time_s = :sim_time, own_wall_s = :own, step_wait_wall_s = :step_wait, "
+        "UPDATE run SET end_reason = :reason, "
+        "ended_wall_time_s = coalesce(:now, last_wall_time_s), "
+        "last_wall_time_s = coalesce(:now, last_wall_time_s), "
+        "last_sim_time_s = coalesce(:sim_time, last_sim_time_s), "
+        "own_wall_s = :own, step_wait_wall_s = :step_wait, "
         "steps = :steps, row_count = coalesce(:rows, "
         "purged_rows + (SELECT count(*) FROM state WHERE run_id = :run)) WHERE id = :run"
     ),
     "session end": (
-        "UPDATE session SET ended_wall_time_s = :now, last_seen_wall_time_s = :now, "
+        "UPDATE session SET ended_wall_time_s = coalesce(:now, last_seen_wall_time_s), "
+        "last_seen_wall_time_s = coalesce(:now, last_seen_wall_time_s), "
         "last_seen_monotonic_s = :monotonic, end_reason = :reason, rows_waiting = 0, "
         "rows_dropped = :dropped, last_error = :error WHERE id = :session"
     ),
@@ -258,6 +263,16 @@ def waiting_paths(database: Path, kind: Callable[[Path, str], Path] = waiting_pa
     """The files in which entries of bridges wait, of living sessions too; or those of a kind."""
     names = _names(database, kind)
     return [database.with_name(name) for name in sorted(names) if not _PART.search(name)]
+
+
+def left_waiting(database: Path) -> list[Path]:
+    """Those files of bridges that no living process writes."""
+    left: list[Path] = []
+    for path in waiting_paths(database):
+        with contextlib.suppress(OSError), path.open("r+b") as file:
+            if lock(file.fileno()):
+                left.append(path)
+    return left
 
 
 def journal_parts(database: Path) -> dict[str, list[Path]]:
@@ -424,7 +439,7 @@ def read_header(file: BinaryIO) -> dict[str, Any] | None:
     if not line.endswith(b"\n") and len(line) < _LONGEST_HEADER_BYTES:
         return None
     try:
-        header = cast("dict[str, Any]", json.loads(line))
+        header = cast("dict[str, Any]", json.loads(line.decode("utf-8-sig", "replace")))
     except (ValueError, RecursionError) as error:
         raise ValueError(f"the first line of {file.name} is no JSON: {error}") from None
     if not isinstance(header, dict) or header.get(_VERSION) != FORMAT:  # pyright: ignore[reportUnnecessaryIsInstance]
@@ -495,6 +510,7 @@ def take_in(
     session_id: int,
     piece: Sequence[Entry],
     finish: Callable[[Taken], object] | None = None,
+    begin: Callable[[Entry], dict[str, Any] | None] | None = None,
 ) -> Taken:
     """Write the entries of a session in one transaction, as many as there is time for.
 
@@ -503,6 +519,8 @@ def take_in(
         session_id: Of the session.
         piece: Its next entries, in order.
         finish: Called last of all in that transaction.
+        begin: Gives the values of an entry's run that the database does not know, if it shall be
+            made.
 
     Raises:
         sqlite3.Error: Nothing was written.
@@ -518,7 +536,7 @@ def take_in(
         for entry in piece:
             if entry.number > taken.number:
                 taken = taken._replace(number=entry.number)
-                why = _write(connection, session_id, entry)
+                why = _write(connection, session_id, entry, begin)
                 taken.unfit.append(why) if why else taken.written.append(entry)
                 if time.monotonic() > until_s:
                     break
@@ -530,12 +548,20 @@ def take_in(
     return in_transaction(connection, act)
 
 
-def _write(connection: sqlite3.Connection, session_id: int, entry: Entry) -> str | None:
+def _write(
+    connection: sqlite3.Connection,
+    session_id: int,
+    entry: Entry,
+    begin: Callable[[Entry], dict[str, Any] | None] | None,
+) -> str | None:
     """Write an entry; or why the database will never take it, which stops no other."""
     run_id = None
     try:
         if entry.run is not None:
             row = connection.execute(_RUN_OF, (entry.run, session_id)).fetchone()
+            if row is None and begin is not None and (run := begin(entry)) is not None:
+                connection.execute(STATEMENTS["run"], bind(None, session_id, run))
+                row = connection.execute(_RUN_OF, (entry.run, session_id)).fetchone()
             if row is None:
                 return f"its session has no run {entry.run}"
             run_id = row[0]
@@ -547,12 +573,13 @@ def _write(connection: sqlite3.Connection, session_id: int, entry: Entry) -> str
     return None
 
 
-def adopt(connection: sqlite3.Connection, database: Path) -> int:
+def adopt(connection: sqlite3.Connection, database: Path, until_s: float = math.inf) -> int:
     """Take in what sessions of dead processes left behind; files of live sessions are left alone.
 
     Args:
         connection: A writer in autocommit mode and in no transaction.
         database: Its file.
+        until_s: The monotonic time at which it ends; what is left waits.
 
     Returns:
         How many rows and other writes that was. A file that cannot be taken in is left in place and
@@ -561,7 +588,7 @@ def adopt(connection: sqlite3.Connection, database: Path) -> int:
     Raises:
         sqlite3.Error: The database is locked; what is in is in, the rest waits.
     """
-    count = sum(_adopt_file(connection, path) for path in waiting_paths(database))
+    count = sum(_adopt_file(connection, path, until_s) for path in waiting_paths(database))
     found = waiting_paths(database, stacks_path)
     return count + sum(_adopt_stacks(connection, path) for path in found)
 
@@ -582,12 +609,14 @@ def _adopt_stacks(connection: sqlite3.Connection, path: Path) -> int:
     return logged
 
 
-def _adopt_file(connection: sqlite3.Connection, path: Path) -> int:
+def _adopt_file(connection: sqlite3.Connection, path: Path, until_s: float) -> int:
     try:
         with path.open("r+b") as file:
             if not lock(file.fileno()) or os.fstat(file.fileno()).st_nlink == 0:
                 return 0
-            count = _adopt_open(connection, file)
+            count, is_whole = _adopt_open(connection, file, until_s)
+            if not is_whole:
+                return count
             if os.name != "nt":
                 path.unlink()
         if os.name == "nt":  # where an open file cannot be deleted; who finds it passes it over
@@ -615,10 +644,11 @@ def report_strange(path: Path, error: Exception) -> None:
         warn(f"what waits in {path} cannot be taken in: {why}")
 
 
-def _adopt_open(connection: sqlite3.Connection, file: BinaryIO) -> int:
+def _adopt_open(connection: sqlite3.Connection, file: BinaryIO, until_s: float) -> tuple[int, bool]:
+    """How many entries were written, and whether none is left."""
     header = read_header(file)
     if header is None:
-        return 0
+        return 0, True
     session_id = _session(connection, header)
     offset, count, unfit = file.tell(), 0, list[str]()
     while piece := next_entries(file, offset):
@@ -626,12 +656,14 @@ def _adopt_open(connection: sqlite3.Connection, file: BinaryIO) -> int:
         offset = max(end for end, entry in piece if entry.number <= taken.number)
         count += sum(entry.kind != "run" for entry in taken.written)
         unfit += taken.unfit
+        if time.monotonic() > until_s:
+            return count, False
     if count:
         for counted in connection.execute(_RECOUNT, (session_id,)).fetchall():
             connection.execute(_SET_ROWS, counted)
     if unfit:
         warn(f"{len(unfit)} rows that waited in {file.name} were refused: {unfit[0]}")
-    return count
+    return count, True
 
 
 def _session(connection: sqlite3.Connection, header: dict[str, Any]) -> int:

@@ -81,7 +81,8 @@ int main(int count, char **arguments) {
   signal(SIGXFSZ, SIG_IGN);
 #endif
   if (count == 3 && !strcmp(arguments[1], "numbers")) return print_numbers(atol(arguments[2]));
-  wmcp *w = wmcp_open(NULL, "rover", "/w/arena.wbt", 32.0, 1);
+  double step_ms = count == 3 && !strcmp(arguments[1], "step") ? strtod(arguments[2], NULL) : 32.0;
+  wmcp *w = wmcp_open(NULL, "rover", "/w/arena.wbt", step_ms, 1);
   if (count == 3 && !strcmp(arguments[1], "forever")) return publish_for_ever(w, atoi(arguments[2]));
   while (fgets(line, sizeof line, stdin)) {
     unsigned long long bits;

@@ -39,13 +39,16 @@ LANGUAGES = {
 @pytest.fixture(scope="module", params=LANGUAGES)
 def driver(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The driver in C or in C++, under sanitizers."""
-    compiler, *options = LANGUAGES[request.param]
+    return built(request.param, "driver.c", tmp_path_factory.mktemp("built"))
+
+
+def built(language: str, source: str, folder: Path) -> Path:
+    compiler, *options = LANGUAGES[language]
     if shutil.which(compiler) is None:
         pytest.skip(f"there is no {compiler}")
-    program = tmp_path_factory.mktemp("built") / "driver"
     flags = [*options, *STRICT, *CHECKED, f"-I{C_HEADER.parent}"]
-    subprocess.run([compiler, *flags, HERE / "driver.c", "-o", program], check=True)
-    return program
+    subprocess.run([compiler, *flags, HERE / source, "-o", folder / "program"], check=True)
+    return folder / "program"
 
 
 Start = Callable[..., subprocess.Popen[str]]
@@ -163,6 +166,38 @@ def test_a_state_is_what_python_would_have_recorded(start: Start, tmp_path: Path
     assert read(tmp_path, "SELECT level, message FROM log") == [("warning", "wheel\tslips")]
     assert read(tmp_path, "SELECT pid, end_reason FROM session") == [(process.pid, "finished")]
     assert read(tmp_path, "SELECT role FROM signal WHERE name = 'pose.2'") == [("yaw",)]
+
+
+@pytest.mark.parametrize("step_ms", ["nan", "inf", "-inf", "1e308", "-1e308", "0", "-32", "4e-324"])
+def test_a_time_step_of_any_size_is_recorded_or_null(
+    start: Start, tmp_path: Path, step_ms: str
+) -> None:
+    process = start("step", step_ms)
+    do(process, "begin 0.5", f"integer {hexed('i')} 7", "publish")
+    end(process)
+    (row,) = read(tmp_path, "SELECT basic_time_step_ms, started_sim_time_s FROM run")
+    assert row[0] == (float(step_ms) if math.isfinite(float(step_ms)) else None)
+    assert 0.0 <= row[1] <= 0.5
+    assert read(tmp_path, "SELECT data FROM state") == [('{"i":7}',)]
+    assert read(tmp_path, "SELECT rows_dropped, end_reason FROM session") == [(0, "finished")]
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_no_number_and_no_text_crashes_a_function_or_makes_a_line_that_does_not_fit(
+    language: str, tmp_path: Path
+) -> None:
+    program = built(language, "hostile.c", tmp_path)
+    for seed in ("1", "2", "3"):
+        folder = tmp_path / seed
+        environment = os.environ | {"WEBOTS_MCP_DATA_DIR": str(folder)}
+        command = [program, seed, "12", "150"]
+        done = subprocess.run(command, env=environment, capture_output=True, check=False)
+        assert (done.returncode, done.stdout, done.stderr) == (0, b"well\n", b"")
+        Recording(folder / "webots.db", folder).take_in()
+        assert journal_parts(folder / "webots.db") == {}
+        assert read(folder, "SELECT count(*) > 0 FROM state") == [(1,)]
+        whys = read(folder, "SELECT json_extract(data, '$.why') FROM event WHERE kind = 'dropped'")
+        assert [why for (why,) in whys if "there is no level" not in why] == []
 
 
 def test_names_and_texts_of_any_bytes_are_recorded(start: Start, tmp_path: Path) -> None:
@@ -369,20 +404,3 @@ async def test_a_server_that_began_before_the_database_answers_what_was_just_pub
             await anyio.sleep(0.05)
         answer = (await client.call_tool("webots_get_robot_state", {})).structured_content
         assert answer and "killed or crashed" in answer["why"]
-
-
-@pytest.mark.parametrize("language", LANGUAGES)
-def test_no_number_and_no_text_crashes_it(language: str, tmp_path: Path) -> None:
-    compiler, *options = LANGUAGES[language]
-    if shutil.which(compiler) is None:
-        pytest.skip(f"there is no {compiler}")
-    program, flags = tmp_path / "hostile", [*options, "-O1", "-Wall", *CHECKED]
-    source = [f"-I{C_HEADER.parent}", HERE / "hostile.c"]
-    subprocess.run([compiler, *flags, *source, "-o", program], check=True)
-    environment = os.environ | {"WEBOTS_MCP_DATA_DIR": str(tmp_path / "data")}
-    done = subprocess.run([program], env=environment, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
-    for journal in (tmp_path / "data").iterdir():
-        for line in journal.read_bytes().decode("utf-8", "replace").splitlines():
-            assert "nan," not in line
-            json.loads(line)

@@ -20,7 +20,7 @@ from webots_mcp import MCPBridge
 from webots_mcp.connection import connect, create_schema
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.journal_intake import take_in_journals
-from webots_mcp.store.recording import Recording, storage, view_of
+from webots_mcp.store.recording import Recording, view_of
 from webots_mcp.store.robots import list_robots
 from webots_mcp.waiting_file import journal_parts
 
@@ -190,39 +190,3 @@ def test_a_journal_with_the_uuid_of_a_bridges_session_is_left_and_reported(
     assert journal.exists() and rows(tmp_path, "session") == [[None, 0]]
     assert "its session is that of a bridge" in capsys.readouterr().err
     bridge.close()
-
-
-UNFIT = ["NaN", "Infinity", "-Infinity", "1e999", str(2**70), '"text"', "[1]", "true", '"\\ud800"']
-
-
-@pytest.mark.parametrize("value", UNFIT)
-@pytest.mark.parametrize("field", ["world", "step_ms", "uuid", "reason", "wall_time", "sim_time"])
-def test_no_state_is_lost_by_a_value_of_its_run_that_does_not_fit(
-    tmp_path: Path, field: str, value: str
-) -> None:
-    header, run, state, *_ = (FILES[0].parent / "malformed.jsonl").read_text().splitlines()
-    named = json.loads(run)[3]
-    broken = run.replace(f'"{field}":{json.dumps(named[field])}', f'"{field}":{value}')
-    assert broken != run
-    part(tmp_path).write_text("\n".join([f"\ufeff{header}", broken, state, ""]))
-    Recording(tmp_path / "webots.db", tmp_path).take_in()
-    assert [data for _, data, _ in rows(tmp_path, "state")] == ['{"x":1}']
-    fits = field in ("world", "reason", "uuid") and value == '"text"'
-    assert rows(tmp_path, "dropped") == [[0 if fits else 1]]
-    assert not part(tmp_path).exists()
-
-
-def test_a_journal_of_which_nothing_fits_is_kept_and_named(tmp_path: Path) -> None:
-    header, *_ = (FILES[0].parent / "malformed.jsonl").read_text().splitlines()
-    part(tmp_path).write_text(f"{header}\nno JSON\n[1,2]\n")
-    with Recording(tmp_path / "webots.db", tmp_path).reader() as connection:
-        assert part(tmp_path).exists()
-        assert part(tmp_path).name in storage(connection)["storage"]
-
-
-def test_lines_that_no_row_follows_are_counted_in_the_session(tmp_path: Path) -> None:
-    header, run, state, *_ = (FILES[0].parent / "malformed.jsonl").read_text().splitlines()
-    part(tmp_path).write_text("\n".join([header, run, state, "no JSON", "no JSON", ""]))
-    Recording(tmp_path / "webots.db", tmp_path).take_in()
-    assert [dropped for _, dropped in rows(tmp_path, "session")] == [2]
-    assert not part(tmp_path).exists()

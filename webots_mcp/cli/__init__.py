@@ -52,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     given = list(sys.argv[1:] if argv is None else argv)
     try:
-        return _run(given)
+        return _run(given, is_process=argv is None)
     except NotAllowedError as error:  # which quotes a line of a file as it stands there
         return _fail(EXIT_BAD_INPUT, str(error), given)
     except WebotsMCPError as error:
@@ -75,7 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _run(argv: Sequence[str]) -> int:
+def _run(argv: Sequence[str], *, is_process: bool) -> int:
     """Call the command that was given; without one, show which there are."""
     from cyclopts import CycloptsError, UnusedCliTokensError
 
@@ -94,7 +94,8 @@ def _run(argv: Sequence[str]) -> int:
             if each.names
         )
     is_help = not {"--help", "-h"}.isdisjoint(argv)  # nothing of a recording, and may have colours
-    with ending_by_signals(), contextlib.nullcontext() if is_help else spelling_out():
+    ending = ending_by_signals(is_process=is_process)
+    with ending, contextlib.nullcontext() if is_help else spelling_out():
         try:
             code = app(argv, exit_on_error=False, print_error=False, result_action="return_value")
         except UnusedCliTokensError as error:

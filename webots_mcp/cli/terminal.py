@@ -145,18 +145,39 @@ async def show_progress(progress: float, total: float | None, text: str) -> None
 Handler: TypeAlias = Callable[[int, "FrameType | None"], None]
 
 _GRACE_S: Final = 0.5  # for giving back the lease and for commands that nobody waits for any more
+_LONGEST_END_S: Final = 2.5  # of a command that cleans up; then it ends as it is
 _WORDS: Final = {signal.SIGINT: "ended by Ctrl-C", signal.SIGTERM: "ended by SIGTERM"}
 
 
 @contextlib.contextmanager
-def ending_by_signals() -> Generator[None]:
+def ending_by_signals(*, is_process: bool) -> Generator[None]:
     """Let SIGTERM clean up as Ctrl-C does: by a KeyboardInterrupt, which carries the signal.
+
+    A process that SIGTERM has not ended after 2.5 s, because a thread of it still works, ends at
+    once: the database rolls back what was being written.
+
+    Args:
+        is_process: The command is all that the process does, to the exit of the interpreter, which
+            waits for threads.
 
     Before Python 3.11 anyio's own handling of Ctrl-C ends with a CancelledError.
     """
     as_well = (signal.SIGINT,) if sys.version_info < (3, 11) else ()
-    with _handling(_interrupt, signal.SIGTERM, *as_well):
-        yield
+    late: list[threading.Timer] = []
+
+    def end(number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGTERM and not late:
+            late.append(threading.Timer(_LONGEST_END_S, _exit, [number]))
+            late[0].daemon = True
+            late[0].start()
+        _interrupt(number, frame)
+
+    try:
+        with _handling(end, signal.SIGTERM, *as_well):
+            yield
+    finally:
+        for timer in late * (not is_process):
+            timer.cancel()
 
 
 @contextlib.contextmanager

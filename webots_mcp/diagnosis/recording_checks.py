@@ -35,9 +35,10 @@ from webots_mcp.diagnosis import (
     wrong,
 )
 from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
+from webots_mcp.maintenance import held_log
 from webots_mcp.requirements import install_line, missing_requirements, package_of
 from webots_mcp.setup.wsl import WAY_OUT, is_wsl
-from webots_mcp.store.journal_intake import journals_left
+from webots_mcp.store.journal_intake import kept_journals
 from webots_mcp.store.recording import GETTING_STARTED, View, name_of
 from webots_mcp.store.robots import fetch_session, handler_at_work, rows_waiting
 from webots_mcp.waiting_file import count_rows, waiting_paths
@@ -242,7 +243,9 @@ def database(subject: Examined) -> Iterator[Diagnosis]:
             # A file that cannot be written is read as if it had no write-ahead log.
             mode = "wal" if isinstance(connection, FrozenConnection) else journal_mode(connection)
         seen = f"{subject.file}, {subject.file.stat().st_size / 1e6:.1f} MB"
-        if mode == "wal":
+        if held := held_log(subject.file):
+            yield warning(held, "end the transaction, or the program that holds it")
+        elif mode == "wal":
             yield ok(seen)
         else:
             seen += f"; journal mode {mode} instead of wal: readers and writers block each other"
@@ -317,10 +320,10 @@ def rows(subject: Examined) -> Iterator[Diagnosis]:
     for path in waiting_paths(subject.file) if subject.file else []:
         if path.name not in waiting_in:  # no living controller will empty it
             yield from _left_waiting(path)
-    for path, why in (journals_left(subject.file) if subject.file else {}).items():
+    for name, why in (kept_journals(subject.file) if subject.file else {}).items():
         yield warning(
-            f"nothing of {path.name} could be taken in, and it is kept: {why}",
-            "correct the file as docs/journal.md says, or move it away",
+            f"{name} could not be read and was left as it is: {why}",
+            "correct the program that writes it (docs/journal.md); then move or delete the file",
         )
 
 

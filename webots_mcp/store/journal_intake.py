@@ -9,18 +9,24 @@ entries that are in already.
 
 The writer holds the lock of the part that it writes. A part without one is complete: it is deleted
 once it is taken in. Bridges leave journals alone, which would cost their robots time.
+
+Values that do not fit cost as little as possible: null is stored instead where a row can be without
+one, a run whose line cannot be read is made from its first row, and what is dropped is counted in
+`session.rows_dropped` and in an event. A part of which nothing fits stays where it is.
 """
 
 from __future__ import annotations
 
+import codecs
 import json
 import math
 import os
+import re
 import sqlite3
 import stat
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -44,22 +50,32 @@ from webots_mcp.waiting_file import FORMAT, STATEMENTS, Entry, Kind, Taken, jour
 
 BUDGET_S: Final = 5.0  # of a question; what is left waits for the next one, and is said
 LONGEST_LINE_BYTES: Final = 4_000_000
+_BATCH_BYTES: Final = 1_000_000  # of lines that are in memory at once; one line may be longer
+_DEEPEST: Final = 100  # levels of a state: SQLite reads 1,000, Python's calls end before
 _LARGEST_PROGRAM_BYTES: Final = 100_000_000
 _HEADERLESS_S: Final = 60.0  # its writer has not come to the header yet, or never will
 _LAG_S: Final = 2.0  # a row that came since the question began is no delay
 
-# The values of each kind: (n)umbers, (s)trings, (o)bjects; a capital letter: or null.
+# The values of each kind: (n)umbers, (c)ounts, (s)trings, (o)bjects. Those with a capital letter
+# may be null. For these and for those with a question mark null stands for what does not fit.
 _FIELDS: Final[dict[Kind, tuple[str, ...]]] = {
-    "run": ("s uuid", "S world", "N step_ms", "s reason", "n wall_time", "n sim_time"),
+    "run": ("s uuid?", "S world", "N step_ms", "s reason?", "n wall_time?", "n sim_time?"),
     "state": ("n sim_time", "n wall_time", "o data", "O replaced"),
     "event": ("n sim_time", "n wall_time", "s kind", "S name", "O data"),
     "log": ("n sim_time", "n wall_time", "s level", "S source", "s message", "S logger"),
-    "run end": ("s reason", "n now", "n sim_time"),
-    "session end": ("s reason", "n now", "N dropped", "S error"),
+    "run end": ("s reason?", "n now?", "n sim_time?"),
+    "session end": ("s reason?", "n now?", "C dropped", "S error"),
 }
+_SESSION_FIELDS: Final = (
+    "c pid?", "n started_wall_time_s?", "S host", "C parent_pid", "O environment", "S controller",
+    "O versions", "C throttle_interval",
+)  # fmt: skip
 _NAMED: Final = ("run", "run end", "session end")  # whose values are an object, not an array
 _OF_SESSION: Final = ("run", "session end")  # which name no run before their values
-_TYPES: Final[dict[str, tuple[type, ...]]] = {"n": (int, float), "s": (str,), "o": (dict,)}
+_REASONS: Final[dict[str, str]] = {"run": "start", "run end": "finished", "session end": "finished"}
+# Where a line begins that can be read no further: that it tells of a row, or which run it tells of.
+_OF_ROWS: Final = re.compile(r'\s*\[[^"]*"(?:state|event|log|run end|session end)"')
+_UUID: Final = re.compile(r'"uuid"\s*:\s*"([^"\\]{1,100})"')
 # Of statements, which bridges alone know.
 _UNGIVEN: Final = dict.fromkeys(("rows", "monotonic", "own", "step_wait", "steps"))
 
@@ -85,11 +101,31 @@ _SEEN_RUN: Final = (
     "purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) END WHERE uuid = :run"
 )
 _RUN_ID: Final = "SELECT id FROM run WHERE uuid = ?"
-_HAS_RUN: Final = "SELECT 1 FROM run WHERE uuid = ?"
-_COUNT_DROPPED: Final = (
-    "UPDATE session SET rows_dropped = rows_dropped + ?, last_error = ? WHERE id = ?"
+_NEWEST_RUN: Final = (
+    "SELECT uuid, last_sim_time_s, last_wall_time_s FROM run WHERE session_id = ? "
+    "ORDER BY id DESC LIMIT 1"
+)
+_DROPPED: Final = "SELECT rows_dropped FROM session WHERE id = ?"
+_DROP: Final = (
+    "UPDATE session SET rows_dropped = rows_dropped + :count, "
+    "last_error = coalesce(last_error, :why) WHERE id = :session"
 )
 _SEEN_S: Final = "SELECT last_seen_wall_time_s FROM session WHERE uuid = ?"
+
+
+class _Faults(NamedTuple):
+    """How many lines or values of lines were dropped, and what was wrong with the first."""
+
+    lines: int = 0
+    first: str = ""
+
+    def and_those(self, faults: Iterable[str]) -> _Faults:
+        """These and others that follow."""
+        found = [fault for fault in faults if fault]
+        return _Faults(self.lines + len(found), self.first or next(iter(found), ""))
+
+
+_NO_FAULTS: Final = _Faults()
 
 
 class _Place(NamedTuple):
@@ -99,29 +135,45 @@ class _Place(NamedTuple):
         file: Its device and inode, and those of the database.
         offset: The byte after the last line.
         number: Of the last entry that is in.
+        fits: Whether any of its lines is an entry.
         faults: Of lines that are to be counted with the next entry.
     """
 
     file: tuple[int, ...]
     offset: int
     number: int
-    faults: tuple[str, ...] = ()
+    fits: bool = False
+    faults: _Faults = _NO_FAULTS
 
 
 class _Line(NamedTuple):
-    """A complete line: the byte after it, its entry, the state in it, and what does not fit."""
+    """A complete line, its entry if it is one, and what is wrong with it.
+
+    Attributes:
+        end: The byte after it.
+        state: That of its entry.
+        fault: What was dropped of it, or of the whole line.
+        lost_run: What could be read of a run that cannot be made yet, by the names of its values.
+    """
 
     end: int
     entry: Entry | None
     state: dict[str, Any] | None = None
     fault: str = ""
+    lost_run: dict[str, Any] | None = None
 
 
 class _Looks:
-    """What is looked for in the states of a session."""
+    """What is looked for in the states of a session.
+
+    Attributes:
+        run: UUID of the newest run.
+        lost_runs: Those whose line could not be read whole, by UUID; "" for one without.
+    """
 
     def __init__(self, newest: str | None, run: str | None) -> None:
         self.run = run
+        self.lost_runs: dict[str, dict[str, Any]] = {}
         self.names = signal_register.SignalNames()
         self.changes = signal_register.StateChanges()
         self.changes.look(json.loads(newest or "{}"))
@@ -130,12 +182,16 @@ class _Looks:
 _lock = threading.Lock()
 _places: dict[Path, _Place] = {}
 _looks: dict[str, _Looks] = {}
-_left: dict[Path, str] = {}  # complete parts of which nothing could be taken in, and why
+_kept: dict[Path, str] = {}  # of which nothing fits, and why
 
 
-def journals_left(database: Path) -> dict[Path, str]:
-    """The complete journals of which this process could take in nothing, and why; they stay."""
-    return {path: why for path, why in _left.items() if path.parent == database.parent}
+def kept_journals(database: Path) -> dict[str, str]:
+    """The journals that this process could not read any of and left as they are, each with why."""
+    return {
+        path.name: why
+        for path, why in list(_kept.items())
+        if path.parent == database.parent and path.exists()
+    }
 
 
 def has_news(database: Path) -> bool:
@@ -151,10 +207,11 @@ def has_news(database: Path) -> bool:
 def journals_behind(connection: sqlite3.Connection, database: Path) -> list[str]:
     """The journals of which rows are not in the database, although there was time."""
     behind: list[str] = []
+    kept = kept_journals(database)
     for uuid, parts in journal_parts(database).items():
         (seen_s,) = connection.execute(_SEEN_S, (uuid,)).fetchone() or (0.0,)
         with suppress(OSError):
-            if parts[-1].stat().st_mtime > seen_s + _LAG_S:
+            if parts[-1].name not in kept and parts[-1].stat().st_mtime > seen_s + _LAG_S:
                 behind.append(parts[-1].name)
     return behind
 
@@ -182,9 +239,7 @@ def take_in_journals(
         for path in _places.keys() - {path for parts in journals.values() for path in parts}:
             if path.parent == database.parent:
                 del _places[path]
-        for path in _left.keys() - {path for parts in journals.values() for path in parts}:
-            if path.parent == database.parent:
-                del _left[path]
+                _kept.pop(path, None)
         for uuid, parts in journals.items():
             # In order, and no part before those ahead of it are in: of its entries only those that
             # are newer than the last one that is in are taken.
@@ -210,8 +265,7 @@ def _take_in_part(
                 reading = _Reading(connection, uuid, path, file, identity, not is_complete)
                 if not reading.take_in(header, until_s):
                     return False
-                if is_complete and not reading.settle_faults():
-                    return True
+                is_complete = is_complete and path not in _kept
             if is_complete and os.name != "nt":
                 path.unlink()
         if is_complete and os.name == "nt":  # where an open file cannot be deleted
@@ -221,7 +275,7 @@ def _take_in_part(
     except Exception as error:  # noqa: BLE001  (raised again where it is not the file's)
         _looks.pop(uuid, None)
         waiting_file.report_strange(path, error)
-        _left[path] = str(error) or repr(error)
+        _kept[path] = str(error)
         return False
     return True
 
@@ -236,7 +290,8 @@ class _Reading:
     file: BinaryIO
     identity: tuple[int, ...]
     is_living: bool
-    faults: tuple[str, ...] = ()
+    faults: _Faults = _NO_FAULTS
+    begun: tuple[str, ...] = ()  # lost runs that this transaction has made
 
     def take_in(self, header: dict[str, Any], until_s: float) -> bool:
         """Take in all complete lines from where it was left; False where time is up."""
@@ -244,59 +299,58 @@ class _Reading:
         session_id, robot_id, number, *newest = self._enter(header)
         place = _places.get(self.path)
         if place is None or place.file != self.identity or place.number > number:
-            place = _Place(self.identity, _skip(self.file, start, number), number)
+            offset = _skip(self.file, start, number)
+            place = _Place(self.identity, offset, number, offset > start, self.faults)
             _looks[self.uuid] = _Looks(*newest)  # another process may have read on meanwhile
         looks = _looks.get(self.uuid) or _looks.setdefault(self.uuid, _Looks(*newest))
         while lines := _read_lines(self.file, place.offset):
             self.faults = place.faults
-            if entries := [each.entry for each in lines if each.entry]:
-                self._make_missing_runs(session_id, place.number, entries)
+            lost = [each.lost_run for each in lines if each.lost_run is not None]
+            looks.lost_runs |= {run.get("uuid") or "": run for run in lost}
+            if entries := self._entries(lines, session_id):
                 finish = partial(self._finish, session_id, robot_id, looks, lines)
-                taken = waiting_file.take_in(self.connection, session_id, entries, finish)
+                begin = partial(self._begin, looks)
+                taken = waiting_file.take_in(self.connection, session_id, entries, finish, begin)
                 done = _until(lines, taken.number)[-1].end
-                place = _Place(self.identity, done, taken.number, self.faults)
+                place = _Place(self.identity, done, taken.number, True, self.faults)
             else:
-                faults = (*self.faults, *(each.fault for each in lines if each.fault))
+                faults = self.faults.and_those(each.fault for each in lines)
                 place = place._replace(offset=lines[-1].end, faults=faults)
             _places[self.path] = place
             if time.monotonic() > until_s:
                 return False
-        _places[self.path] = place
-        self.faults = place.faults
+        _places[self.path] = self._counted(session_id, place)
         return True
 
-    def settle_faults(self) -> bool:
-        """Count what no later entry has counted; False where nothing of the session fits."""
-        if not self.faults:
-            return True
-        session_id, _, number, *_ = self.connection.execute(_KNOWN, (self.uuid,)).fetchone()
-        why = f"{len(self.faults)} lines of {self.path.name} do not fit: {self.faults[0]}"
-        if not number:
-            if self.path not in _left:
-                warn(f"{why}; as nothing of it could be taken in, the file stays")
-            _left[self.path] = why
-            return False
-        warn(why)
-        self.connection.execute(_COUNT_DROPPED, (len(self.faults), why, session_id))
-        return True
-
-    def _make_missing_runs(self, session_id: int, number: int, entries: Sequence[Entry]) -> None:
-        """Make the runs whose own line did not fit, from the first row that is of them."""
-        told: set[object] = set()
+    def _entries(self, lines: Sequence[_Line], session_id: int) -> list[Entry]:
+        """Their entries; the end of a session adds its count to what was dropped here."""
+        entries = [each.entry for each in lines if each.entry]
         for entry in entries:
-            if isinstance(entry.values, dict):
-                told.add(entry.values.get("uuid"))
-            elif entry.number > number and entry.run not in told:
-                told.add(entry.run)
-                if self.connection.execute(_HAS_RUN, (entry.run,)).fetchone() is None:
-                    in_transaction(self.connection, partial(self._make_run, session_id, entry))
+            if entry.kind == "session end" and isinstance(entry.values, dict):
+                (dropped,) = self.connection.execute(_DROPPED, (session_id,)).fetchone()
+                entry.values["dropped"] += dropped
+        return entries
 
-    def _make_run(self, session_id: int, entry: Entry) -> None:
-        sim_time_s, wall_time_s, *_ = cast("tuple[Any, ...]", entry.values)
-        known = {"uuid": entry.run, "world": None, "step_ms": None, "reason": "start"}
-        times = {"wall_time": wall_time_s, "sim_time": sim_time_s, "session": session_id}
-        self.connection.execute(STATEMENTS["run"], known | times)
-        liveness.end_runs(self.connection, session_id, "reset", cast("str", entry.run))
+    def _counted(self, session_id: int, place: _Place) -> _Place:
+        """Count what was dropped and no entry followed; a part of which nothing fits is kept."""
+        _kept.pop(self.path, None)
+        if not place.faults.lines:
+            return place
+        if not place.fits:
+            _kept[self.path] = f"none of its {place.faults.lines} lines fits: {place.faults.first}"
+        if self.is_living or not place.fits:
+            return place
+        lines, first = place.faults
+
+        def act() -> None:
+            self._drop(session_id, place.faults)
+            if run := self.connection.execute(_NEWEST_RUN, (session_id,)).fetchone():
+                uuid, *times = run
+                self._drop_event(Entry(place.number, "event", uuid, tuple(times)), place.faults)
+
+        in_transaction(self.connection, act)
+        warn(f"{lines} lines or values of {self.path} were dropped: {first}")
+        return place._replace(faults=_NO_FAULTS)
 
     def _enter(self, header: dict[str, Any]) -> tuple[Any, ...]:
         """The ids of session and robot, the number of the last entry, newest state and run."""
@@ -305,7 +359,9 @@ class _Reading:
             raise ValueError("its session is that of a bridge")
         if (known := connection.execute(_KNOWN, (self.uuid,)).fetchone()) is not None:
             return known
-        name, session = _described(header, self.uuid)
+        modified_s = os.fstat(self.file.fileno()).st_mtime
+        name, session, unfit = _described(header, self.uuid, modified_s)
+        self.faults = _NO_FAULTS.and_those(unfit)
 
         def act() -> None:
             if connection.execute(_KNOWN, (self.uuid,)).fetchone() is None:
@@ -320,6 +376,17 @@ class _Reading:
         in_transaction(connection, act)
         return connection.execute(_KNOWN, (self.uuid,)).fetchone()
 
+    def _begin(self, looks: _Looks, entry: Entry) -> dict[str, Any] | None:
+        """The values of the run of an entry that none has begun, if its line was lost."""
+        lost = looks.lost_runs.get(entry.run or "", looks.lost_runs.get(""))
+        if lost is None or isinstance(entry.values, dict) or not entry.run:
+            return None
+        sim_time_s, wall_time_s, *_ = entry.values
+        times = {"sim_time": sim_time_s, "wall_time": wall_time_s}
+        known = {"uuid": entry.run, "world": None, "step_ms": None, "reason": "start"} | times
+        self.begun += (entry.run,)
+        return known | {name: value for name, value in lost.items() if value is not None}
+
     def _finish(
         self,
         session_id: int,
@@ -330,20 +397,23 @@ class _Reading:
     ) -> None:
         """Write what follows: names, changes, times, ends of runs, what was dropped."""
         written = {entry.number for entry in taken.written}
-        faults = [*self.faults, *taken.unfit]
+        faults = list(taken.unfit)
+        begun_here, self.begun = self.begun, ()
         runs, ends = dict[str, tuple[float, float, int]](), dict[Kind, dict[str, Any]]()
         last: Entry | None = None
-        for _, entry, state, fault in _until(lines, taken.number):
+        for _, entry, state, fault, _ in _until(lines, taken.number):
             if entry is None or entry.number in written:
-                faults += [fault] * bool(fault)
+                faults.append(fault)
             if entry is None:
                 continue
-            if entry.run not in (None, looks.run):  # the line of its run did not fit
-                looks.run = entry.run
+            begins = entry.run if entry.run in begun_here else looks.run
+            if isinstance(entry.values, dict):
+                begins = entry.values.get("uuid", looks.run)
+            if begins != looks.run:
+                looks.run = begins
                 looks.changes.forget()
-            if isinstance(entry.values, dict) and entry.values.get("uuid", looks.run) != looks.run:
-                looks.run = entry.values["uuid"]
-                looks.changes.forget()
+                if entry.run in begun_here:
+                    ends["run"] = {"uuid": begins}
             changed = looks.changes.look(state) if state is not None else ()
             if entry.number not in written:  # taken in by another process, or refused
                 continue
@@ -368,10 +438,20 @@ class _Reading:
             liveness.end_runs(self.connection, session_id, "reset", begun["uuid"])
         if end := ends.get("session end"):
             liveness.end_runs(self.connection, session_id, end["reason"])
-        self.faults = () if last else tuple(faults)
-        if faults and last:
-            data = {"row_count": len(faults), "why": f"{self.path.name}: {faults[0]}"}
-            self._event(last, "dropped", None, json.dumps(data))
+        dropped = self.faults.and_those(faults)
+        self.faults = _NO_FAULTS if last else dropped
+        if last and dropped.lines:
+            self._drop(session_id, dropped)
+            self._drop_event(last, dropped)
+
+    def _drop(self, session_id: int, dropped: _Faults) -> None:
+        why = f"{self.path.name}: {dropped.first}"
+        values = {"count": dropped.lines, "why": why, "session": session_id}
+        self.connection.execute(_DROP, values)
+
+    def _drop_event(self, entry: Entry, dropped: _Faults) -> None:
+        data = {"row_count": dropped.lines, "why": f"{self.path.name}: {dropped.first}"}
+        self._event(entry, "dropped", None, json.dumps(data))
 
     def _enter_names(self, robot_id: int, seen: Mapping[str, signal_register.Seen]) -> bool:
         changes = signal_register.find_changes(self.connection, robot_id, seen)
@@ -384,41 +464,58 @@ class _Reading:
         self.connection.execute(STATEMENTS["event"], values)
 
 
-def _described(header: Mapping[str, Any], uuid: str) -> tuple[str, dict[str, Any]]:
+def _described(
+    header: Mapping[str, Any], uuid: str, modified_s: float
+) -> tuple[str, dict[str, Any], list[str]]:
     """The robot's name and the values of the session, from the first line of a journal.
 
+    Args:
+        header: What that line says.
+        uuid: Of the file's name.
+        modified_s: Of the file, Unix time: for one that does not say when it was begun.
+
+    Returns:
+        With what does not fit, for which there is null or what is known otherwise.
+
     Raises:
-        ValueError: It lacks what a session needs.
+        ValueError: It has no robot, or another session than its name.
     """
     name, session = _object(header.get("robot")).get("name"), _object(header.get("session"))
-    pid, started_s = session.get("pid"), session.get("started_wall_time_s")
-    if not (name and _is("s", name) and session.get("uuid") == uuid):
+    if not (name and _fitted("s", name) and session.get("uuid") == uuid):
         raise ValueError("its first line has no robot.name, or another session.uuid than its name")
-    if not (_is("n", pid) and _is("n", started_s)):
-        raise ValueError("its first line has no session.pid or no session.started_wall_time_s")
-    texts = {key: value for key, value in session.items() if _is("s", value)}
-    given = _object(session.get("environment"))
-    environment = {key: value for key, value in given.items() if _is("s", value)}
-    host, parent = texts.get("host", host_name()), cast("int", session.get("parent_pid"))
-    is_here, file = host == host_name(), texts.get("controller")
-    pid, started_s = cast("int", pid), cast("float", started_s)
+    given, unfit = _fit(_SESSION_FIELDS, session)
+    texts = {key: _fitted("s", value) for key, value in _object(given["environment"]).items()}
+    environment = {key: value for key, value in texts.items() if value is not None}
+    host, parent, file = given["host"] or host_name(), given["parent_pid"], given["controller"]
+    is_here = host == host_name()
+    started_s = modified_s if given["started_wall_time_s"] is None else given["started_wall_time_s"]
+    pid = given["pid"] or 0  # no process has that one
     lives = liveness.process_alive(pid, None, started_s)  # of one that is gone none can tell it
-    return cast("str", name), {
-        "uuid": uuid,
-        "pid": pid,
-        "process": liveness.process_identity(pid) if is_here and lives else None,
-        "host": host,
-        "instance": instance_of(environment, parent) if is_here else f"{host} process {parent}",
-        "extern": int(is_extern(environment)),
-        "controller": file,
-        "controller_sha256": _sha256(file, started_s) if is_here and file else None,
-        "versions": json.dumps({"journal": str(FORMAT)} | _object(session.get("versions"))),
-        "supervisor": 0,
-        "actions": "{}",
-        "started_wall_time_s": min(started_s, time.time()),
-        "last_seen_wall_time_s": min(started_s, time.time()),
-        "throttle_interval": session.get("throttle_interval"),
+    versions = {
+        key: value
+        for key, value in _object(given["versions"]).items()
+        if _fitted("s", key) is not None and _fitted("s", value) is not None
     }
+    return (
+        cast("str", name),
+        {
+            "uuid": uuid,
+            "pid": pid,
+            "process": liveness.process_identity(pid) if is_here and lives else None,
+            "host": host,
+            "instance": instance_of(environment, parent) if is_here else f"{host} process {parent}",
+            "extern": int(is_extern(environment)),
+            "controller": file,
+            "controller_sha256": _sha256(file, started_s) if is_here and file else None,
+            "versions": json.dumps({"journal": str(FORMAT)} | versions),
+            "supervisor": 0,
+            "actions": "{}",
+            "started_wall_time_s": min(started_s, time.time()),
+            "last_seen_wall_time_s": min(started_s, time.time()),
+            "throttle_interval": given["throttle_interval"],
+        },
+        [unfit] if unfit else [],
+    )
 
 
 def _object(value: object) -> dict[str, Any]:
@@ -459,96 +556,178 @@ def _skip(file: BinaryIO, offset: int, number: int) -> int:
 
 
 def _read_lines(file: BinaryIO, offset: int) -> list[_Line]:
-    """The next complete lines from that byte on; one that is too long comes in pieces."""
+    """The next complete lines from that byte on, as many as are good to have in memory at once."""
     lines: list[_Line] = []
     file.seek(offset)
-    while len(lines) < waiting_file.ENTRIES_AT_ONCE:
+    until = offset + _BATCH_BYTES
+    while len(lines) < waiting_file.ENTRIES_AT_ONCE and offset < until:
         line = file.readline(LONGEST_LINE_BYTES)
-        if not line.endswith(b"\n") and len(line) < LONGEST_LINE_BYTES:
+        start, size, is_whole = line, len(line), len(line) < LONGEST_LINE_BYTES
+        while line and not line.endswith(b"\n"):  # too long: its end is found, and no more of it
+            size += len(line := file.readline(LONGEST_LINE_BYTES))
+        if not line:
             break  # the rest of it may come
-        offset += len(line)
-        lines.append(_line(line, offset))
+        offset += size
+        lines.append(_line(start, offset) if is_whole else _too_long(start, size, offset))
     return lines
+
+
+def _too_long(start: bytes, size: int, end: int) -> _Line:
+    text = start[:1000].decode("utf-8", "replace")
+    fault = f"{text[:60]!r}: it has {size} bytes, {LONGEST_LINE_BYTES - 1} are read"
+    return _Line(end, None, fault=fault, lost_run=_lost_run(text))
 
 
 def _line(line: bytes, end: int) -> _Line:
     """What a line says: an entry, or why it is none."""
-    text = line.decode("utf-8", "replace").lstrip("\ufeff")  # as some editors begin a file
+    line = line.removeprefix(codecs.BOM_UTF8)
+    text = line.decode("utf-8", "replace")
     if not text.strip():
         return _Line(end, None)
+    given: dict[str, Any] | None = None
     try:
-        number, kind, run, values = json.loads(text)
-        if not (type(number) is int and 0 < number < 1 << 63):
-            raise ValueError("its number is none")
+        number, kind, run, values = json.loads(text, parse_constant=float)
         if kind not in _FIELDS:
             raise ValueError(f"there is no kind {kind!r}")
-        if not (run is None if kind in _OF_SESSION else _is("s", run)):
+        given, unfit = _checked(kind, values)
+        if not (type(number) is int and 0 < number < 1 << 63):
+            raise ValueError(f"its number is {number!r}")
+        if not (run is None if kind in _OF_SESSION else _fitted("s", run)):
             raise ValueError(f"its run is {run!r}")
-        given, faults = _checked(kind, values)
-        if "\\ud" in text.lower():  # half a character is none
-            json.dumps(given, ensure_ascii=False).encode()
+        if kind == "run" and None in (given["uuid"], given["wall_time"], given["sim_time"]):
+            raise ValueError(unfit)
         state = _state(given, text, line) if kind == "state" else None
         entry = Entry(number, kind, run, _bound(kind, given))
     except (ValueError, TypeError, ArithmeticError, RecursionError) as error:
-        return _Line(end, None, fault=f"{text[:60]!r}: {error}"[:300])
-    fault = f"{text[:60]!r}: {'; '.join(faults)}"[:300] if faults else ""
-    return _Line(end, entry, state, fault)
+        return _Line(end, None, fault=_fault(text, error), lost_run=_lost_run(text, given))
+    return _Line(end, entry, state, _fault(text, unfit) if unfit else "")
 
 
-def _is(letter: str, value: object) -> bool:
-    """Whether a value is of a type of `_FIELDS`, and if it is a number, one that SQLite holds."""
-    if isinstance(value, bool) or not isinstance(value, _TYPES[letter]):
-        return False
-    if isinstance(value, int):
-        return -(1 << 63) <= value < 1 << 63
-    return letter != "n" or math.isfinite(cast("float", value))
+def _fault(text: str, why: object) -> str:
+    return f"{text[:60]!r}: {why}"[:300]
 
 
-def _fits_where_null_would(letter: str, value: object) -> bool:
-    """Whether it can be stored, by its characters and the numbers in it too."""
-    if not _is(letter, value):
-        return False
+def _lost_run(text: str, given: dict[str, Any] | None = None) -> dict[str, Any] | None:
+    """What is known of the run that a line without an entry may have begun; None of other lines."""
+    if _OF_ROWS.match(text):
+        return None
+    if given is not None:
+        return given
+    uuid = _UUID.search(text)
+    return {"uuid": uuid[1]} if uuid else {}
+
+
+def _fitted(letter: str, value: object) -> Any:
+    """A value as the database stores one of that type of `_FIELDS`; None for what is none."""
+    if letter == "s":
+        return value if isinstance(value, str) and _is_text(value) else None
+    if letter == "o":
+        return cast("dict[str, Any]", value) if isinstance(value, dict) else None
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return None
     try:
-        _text(value).encode()
-    except (ValueError, RecursionError):  # half a character, a NaN
+        number = float(value)
+    except OverflowError:
+        return None
+    if not math.isfinite(number):
+        return None
+    if letter == "n":
+        return number
+    return int(value) if number == int(number) and 0 <= value < 1 << 63 else None
+
+
+def _is_text(value: str) -> bool:
+    """Whether it can be stored: half a character cannot."""
+    try:
+        value.encode()
+    except UnicodeEncodeError:
         return False
     return True
 
 
-def _checked(kind: Kind, values: Any) -> tuple[dict[str, Any], list[str]]:
-    """The values of an entry by their names, and which do not fit and are null instead.
-
-    Those that may be null may be left out.
+def _checked(kind: Kind, values: Any) -> tuple[dict[str, Any], str]:
+    """The values of an entry by their names, and what does not fit and is null instead.
 
     Raises:
-        ValueError: One that may not be null is missing, or of another type, or there are too many.
+        ValueError: One does not fit that there is no row without, or there are too many.
     """
-    fields = [(field[0], field[2:]) for field in _FIELDS[kind]]
+    fields = _FIELDS[kind]
     if kind not in _NAMED:
         if not isinstance(values, list) or len(cast("list[Any]", values)) > len(fields):
             raise ValueError(f"its values are no array of at most {len(fields)}")
-        values = dict(zip((name for _, name in fields), cast("list[Any]", values), strict=False))
-    given = {name: _object(values).get(name) for _, name in fields}
-    faults: list[str] = []
-    for letter, name in fields:
-        value = given[name]
-        if letter.isupper():
-            if value is not None and not _fits_where_null_would(letter.lower(), value):
-                faults.append(f"{name} is {str(value)[:60]!r}")
-                given[name] = None
-        elif not _is(letter, value):
-            if (kind, name) != ("run", "reason"):
-                raise ValueError(f"{name} is {value!r}")
-            faults.append(f"{name} is {value!r}, taken as 'start'")
-            given[name] = "start"
+        names = [field[2:] for field in fields]
+        values = dict(zip(names, cast("list[Any]", values), strict=False))
+    if not isinstance(values, dict):
+        raise ValueError("its values are no object")
+    given, unfit = _fit(fields, cast("dict[str, Any]", values))
     if kind == "log" and find_log_level(given["level"]) is None:
         raise ValueError(f"there is no level {given['level']!r}")
-    return given, faults
+    if kind in _REASONS and given["reason"] is None:
+        given["reason"] = _REASONS[kind]
+    return given, unfit
+
+
+def _fit(fields: Iterable[str], values: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+    """Values by their names as they are stored, and the first that does not fit, for which is null.
+
+    Raises:
+        ValueError: One that is required does not fit.
+    """
+    given, unfit = dict[str, Any](), ""
+    for field in fields:
+        letter, name = field[0], field[2:].removesuffix("?")
+        value = values.get(name)
+        given[name] = _fitted(letter.lower(), value)
+        if given[name] is None and not (letter.isupper() and value is None):
+            why = f"{name} is {_shown(value)}"
+            if not (letter.isupper() or field.endswith("?")):
+                raise ValueError(why)
+            unfit = unfit or why
+        elif letter == "O" and value is not None and not _is_storable(given[name]):
+            given[name], unfit = None, unfit or f"{name} holds what JSON does not"
+    return given, unfit
+
+
+def _shown(value: object) -> str:
+    """A value of any size, as far as a person reads it."""
+    if isinstance(value, (dict, list)):
+        return "an object" if isinstance(value, dict) else "an array"
+    if isinstance(value, int) and not -(10**30) < value < 10**30:  # Python writes no longer ones
+        return "a number of more than 30 digits"
+    return repr(value)[:80]
+
+
+def _is_storable(value: dict[str, Any]) -> bool:
+    try:
+        _require_shallow(value)
+        _text(value).encode()
+    except (ValueError, RecursionError):
+        return False
+    return True
+
+
+def _require_shallow(value: object) -> None:
+    """See that objects and arrays in each other can be read by all that reads states.
+
+    Raises:
+        ValueError: There are more than 100 levels.
+    """
+    level: list[Any] = [value]
+    for _ in range(_DEEPEST):
+        inner: list[Any] = []
+        for each in level:
+            is_object = isinstance(each, dict)
+            items: Iterable[Any] = cast("dict[str, Any]", each).values() if is_object else each
+            inner += [item for item in items if isinstance(item, (dict, list))]
+        if not (level := inner):
+            return
+    raise ValueError(f"more than {_DEEPEST} objects or arrays in each other")
 
 
 def _state(given: dict[str, Any], text: str, line: bytes) -> dict[str, Any]:
     """The state, with objects for dotted names; texts that were no UTF-8 are named as replaced."""
     state = given["data"] = _nested(given["data"])
+    _require_shallow(state)
     if "\ufffd" in text and line.decode("utf-8", "ignore") != text:
         given["replaced"] = (given["replaced"] or {}) | {
             name: "not UTF-8"
@@ -590,7 +769,11 @@ def _bound(kind: Kind, given: dict[str, Any]) -> tuple[Any, ...] | dict[str, Any
     if kind == "log":
         given |= {"level": find_log_level(given["level"]), "source": "controller"}
     objects = [name for name in ("data", "replaced") if given.get(name) is not None]
-    return tuple((given | {name: _text(given[name]) for name in objects}).values())
+    texts = {name: _text(given[name]) for name in objects}
+    for text in texts.values():
+        if not text.isascii():
+            text.encode()  # half a character is none
+    return tuple((given | texts).values())
 
 
 _text: Final[Callable[[object], str]] = json.JSONEncoder(

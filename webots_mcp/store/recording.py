@@ -42,6 +42,8 @@ from webots_mcp.errors import (
     NothingRecordedError,
 )
 from webots_mcp.liveness import Lease, still_held
+from webots_mcp.maintenance import held_log
+from webots_mcp.naming import counted
 from webots_mcp.queue import any_unfinished
 from webots_mcp.store.chunks import StateColumns, is_chunked_aside, show_chunks_aside
 from webots_mcp.store.invalid_rows import is_past_invalid_rows, shadow_if_asked
@@ -49,7 +51,7 @@ from webots_mcp.store.journal_intake import (
     BUDGET_S,
     has_news,
     journals_behind,
-    journals_left,
+    kept_journals,
     take_in_journals,
 )
 from webots_mcp.store.reading.observed_pose import find_observed
@@ -57,7 +59,7 @@ from webots_mcp.store.reading.segment import Subject, choose, require_run
 from webots_mcp.store.retention import Asked
 from webots_mcp.store.robots import Robot, Session, Status, ask_stuck, judge, stopped_for
 from webots_mcp.store.run_rows import Run, State, current_run, newest_state
-from webots_mcp.waiting_file import adopt, waiting_paths
+from webots_mcp.waiting_file import adopt, count_rows, left_waiting, waiting_paths
 
 GETTING_STARTED: Final = (
     "Add two lines to a controller: 'from webots_mcp import MCPBridge' and, where it has made its "
@@ -74,9 +76,13 @@ _BEHIND: Final = (
     "--read-only), which takes them in"
 )
 _SEEN_BY: Final = "observer {!r} saw the position (observer.x_m, ...); the robot publishes none"
+_KEPT: Final = (
+    "{} could not be read and was left as it is: {}. Correct the program that writes it, then move "
+    "or delete the file"
+)
 _LEFT: Final = (
-    "nothing of {} could be taken in, and it is kept: {}; correct the file as docs/journal.md "
-    "says, or move it away"
+    "{} of controllers that have ended wait in files next to the database (...-waiting-...) and "
+    "are not in this answer: ask again, or start 'webots-mcp serve' (not --read-only)"
 )
 _NOT_IN: Final = (
     "; without the rows in {} waiting files next to it (...-waiting-...): copy all of them to a "
@@ -286,11 +292,16 @@ class Recording:
         database = self.database
         if not isinstance(database, Path) or (self.read_only and self.asker == "mcp"):
             return
-        if has_news(database):
+        # A server's maintainer recovers what bridges left; where a command is alone, it does.
+        left = self.asker == "cli" and waiting_paths(database)
+        if left or has_news(database):
+            until_s = time.monotonic() + BUDGET_S
             with suppress(DatabaseError):  # a locked or unwritable one: `storage` says what waits
                 self.create()
                 with self.writer() as connection:
-                    take_in_journals(connection, database, BUDGET_S)
+                    if left:
+                        adopt(connection, database, until_s)
+                    take_in_journals(connection, database, until_s - time.monotonic())
 
     def create(self) -> None:
         """Make the database where there is none, with its folder; one that is there is kept.
@@ -346,7 +357,8 @@ def look(connection: sqlite3.Connection, robot: str | None, run_id: int | None =
     try:
         chosen, run = choose(connection, robot, run_id, now_s)
     except NothingRecordedError as error:
-        raise NothingRecordedError(f"{error}. {GETTING_STARTED}") from error
+        left = "".join(f". {said}" for said in storage(connection).values())
+        raise NothingRecordedError(f"{error}{left}. {GETTING_STARTED}") from error
     return view_of(connection, chosen, now_s, run)
 
 
@@ -380,15 +392,31 @@ _ENDED: Final = {
 def storage(connection: sqlite3.Connection) -> dict[str, Any]:
     """What an answer says of the file that it was read from, and of rows that are not in it."""
     (file,) = connection.execute("SELECT file FROM pragma_database_list").fetchone()
-    left = journals_left(Path(file)) if file else {}
-    behind = journals_behind(connection, Path(file)) if file else []
-    behind = [name for name in behind if name not in {path.name for path in left}]
-    if left and not isinstance(connection, FrozenConnection):
-        return {"storage": _LEFT.format(", ".join(path.name for path in left), *left.values())}
-    if not isinstance(connection, FrozenConnection):
-        return {"storage": _BEHIND.format(", ".join(behind))} if behind else {}
-    waiting = [*(path.name for path in waiting_paths(Path(file))), *behind]
-    return {"storage": f"{_FROZEN}{_NOT_IN.format(len(waiting)) if waiting else ''}"}
+    if not file:
+        return {}
+    behind, kept = journals_behind(connection, Path(file)), kept_journals(Path(file))
+    said = [_KEPT.format(name, why) for name, why in kept.items()]
+    if held := held_log(Path(file)):
+        said.append(held)
+    if isinstance(connection, FrozenConnection):
+        waiting = [*(path.name for path in waiting_paths(Path(file))), *behind]
+        said.insert(0, f"{_FROZEN}{_NOT_IN.format(len(waiting)) if waiting else ''}")
+    elif beside := rows_beside(connection):
+        said.insert(0, beside)
+    return {"storage": "; ".join(said)} if said else {}
+
+
+def rows_beside(connection: sqlite3.Connection) -> str:
+    """What waits next to a database although its controller has ended or there was time; or ""."""
+    (file,) = connection.execute("SELECT file FROM pragma_database_list").fetchone()
+    if not file:
+        return ""
+    said: list[str] = []
+    if rows := sum(map(count_rows, left_waiting(Path(file)))):
+        said.append(_LEFT.format(counted(rows, "row")))
+    if behind := journals_behind(connection, Path(file)):
+        said.append(_BEHIND.format(", ".join(behind)))
+    return "; ".join(said)
 
 
 def name_of(database: Database) -> str:

@@ -41,6 +41,7 @@ from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.reading.catalogue import catalogue
 from webots_mcp.store.reading.ranges import TimeRange, whole_run
 from webots_mcp.store.reading.segment import Deadline, Segment, Subject, in_one_snapshot
+from webots_mcp.store.recording import rows_beside
 from webots_mcp.store.robots import fetch_session
 from webots_mcp.store.run_rows import fetch_run
 
@@ -178,6 +179,8 @@ def loses_no_rows(run: RunUnderCheck) -> Finding:
     if run.info.end_reason and waiting:
         left = f"{counted(waiting, 'row')} of its session waiting still: {error or 'no reason'}"
         return Finding("warn", left)
+    if beside := rows_beside(run.search.connection):
+        return Finding("warn", beside)
     rows = f"all {run.info.row_count} rows {verb}" if run.info.row_count > 1 else "its only row is"
     return Finding("pass", f"{rows} recorded")
 

@@ -1,0 +1,73 @@
+"""Journals with lines of 3 MB hold up no question for long, no memory, and no end by SIGTERM."""
+
+from __future__ import annotations
+
+import json
+import resource
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.journal.test_conformance import part
+from tests.journal.test_unfit_values import HEADER, RUN, RUN_VALUES
+from tests.waiting import wait_for
+from webots_mcp.store.journal_intake import take_in_journals
+from webots_mcp.store.recording import Recording
+
+LINES = 30
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """With a journal of long states, each of many signals."""
+    data = {f"b{i}": {f"c{j}": [1, 2, 3] for j in range(100)} for i in range(2000)}
+    text = json.dumps(data, separators=(",", ":"))
+    with part(tmp_path).open("w") as journal:
+        journal.write(f"{json.dumps(HEADER)}\n{json.dumps([1, 'run', None, RUN_VALUES])}\n")
+        for number in range(2, LINES + 2):
+            journal.write(f'[{number},"state","{RUN}",[{number},1000.0,{text}]]\n')
+    return tmp_path
+
+
+def states(folder: Path) -> int:
+    with closing(sqlite3.connect(folder / "webots.db")) as connection:
+        return connection.execute("SELECT count(*) FROM state").fetchone()[0]
+
+
+def test_an_intake_ends_with_its_budget_goes_on_later_and_says_what_is_left(folder: Path) -> None:
+    recording = Recording(folder / "webots.db", folder)
+    recording.create()
+    with recording.writer() as connection:
+        for lines in (1, 2, 3):
+            take_in_journals(connection, folder / "webots.db", budget_s=0.0)
+            assert states(folder) == lines
+    unread = Recording(folder / "webots.db", folder, read_only=True)
+    with unread.view() as view:
+        assert part(folder).name in view.header()["storage"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+@pytest.mark.parametrize("command", [["status"], ["export", "--format", "jsonl"], ["serve"]])
+def test_sigterm_ends_a_command_that_ingests(folder: Path, command: list[str]) -> None:
+    arguments = [sys.executable, "-m", "webots_mcp", *command, "--data-dir", str(folder)]
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL}
+    with subprocess.Popen(arguments, stderr=subprocess.DEVNULL, **pipes) as process:
+
+        def begun() -> bool:
+            file = folder / "webots.db"
+            return file.exists() and file.stat().st_size > 0
+
+        wait_for(begun)
+        asked_s = time.monotonic()
+        process.send_signal(signal.SIGTERM)
+        assert process.wait() == 143
+        assert time.monotonic() - asked_s < 10.0  # it is 3 s on a machine that does nothing else
+    most_bytes = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024
+    assert most_bytes < 700_000_000

@@ -2,18 +2,23 @@
 
 Each table is a view of its name, with `recording_uuid` before its columns. What keeps a statement
 harmless: it is one SELECT, DuckDB may open files below the root of the pool only and write none,
-and it has the limits of `query_sql` on what it answers. It runs in a process of its own with a
-limit of memory, which is ended at the deadline: one call of a function may take any time and room.
+and it has the limits of `query_sql` on what it answers. It runs in a process of its own, which is
+ended at the deadline and when it takes too much memory: one call of a function may take any time
+and room, and DuckDB's own limit does not count the values that it builds.
 """
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from contextlib import closing, suppress
 from typing import Any, Final
+
+import psutil
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.pool.parquet_files import CHUNK, Storage, files_of, name_of, package
@@ -33,9 +38,16 @@ from webots_mcp.store.questions.sql import (
     require_max_rows,
 )
 
-DEADLINE_S: Final = 60.0
-_MEMORY: Final = "2GB"
-_MOST_BYTES: Final = 4_000_000_000  # of the process: DuckDB counts not all that it takes
+DEADLINE_S: Final = 20.0  # from before the process starts: the command ends within 30 s
+_MEMORY: Final = "800MB"  # what DuckDB counts itself
+_MOST_RESIDENT_BYTES: Final = 1_100_000_000  # of the process: DuckDB counts not all that it takes
+_MOST_MORE_BYTES: Final = 1_000_000_000  # that a statement may allocate, where a system limits it
+_MOST_THREADS: Final = 4  # each has buffers of its own
+_LOOK_S: Final = 0.02  # a machine fills some 50 MB in that time
+_TOO_LARGE: Final = (
+    f"more than {_MOST_MORE_BYTES / 1e9:g} GB of memory would be needed: narrow it by "
+    "recording_uuid and by day, and make shorter values"
+)
 _LINE: Final = (sys.executable, "-m", __name__)
 _AS_THEY_ARE: Final = re.compile("BOOLEAN|U?(TINY|SMALL|BIG|HUGE)INT|U?INTEGER|FLOAT|DOUBLE|BLOB")
 _TYPES: Final = {int: "BIGINT", float: "DOUBLE", str: "VARCHAR", bytes: "BLOB"}
@@ -51,19 +63,39 @@ def ask(url: str, sql: str, max_rows: int) -> Result:
     require_max_rows(max_rows)
     package("duckdb")
     asked = Statement(url, sql, max_rows, MAX_BYTES, DEADLINE_S)
-    ended = subprocess.run(
-        _LINE, input=asked.encoded(), stdout=subprocess.PIPE, cwd=FOLDER, check=False
-    )
-    return decode(
-        ended.stdout, ended.returncode, asked, f"no answer within {DEADLINE_S:g} s: narrow it by "
-        "recording_uuid and by day"
-    )  # fmt: skip
+    slow = f"no answer within {DEADLINE_S:g} s: narrow it by recording_uuid and by day"
+    end_s = time.monotonic() + DEADLINE_S
+    with subprocess.Popen(
+        _LINE, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=FOLDER
+    ) as process:
+        request: bytes | None = asked.encoded()
+        try:
+            while True:
+                try:
+                    answer, _ = process.communicate(request, timeout=_LOOK_S)
+                    return decode(answer, process.returncode, asked, slow)
+                except subprocess.TimeoutExpired:
+                    request = None  # it is sent on by itself
+                if time.monotonic() > end_s:
+                    raise InvalidInputError(slow)
+                if _resident_bytes(process.pid) > _MOST_RESIDENT_BYTES:
+                    raise InvalidInputError(_TOO_LARGE)
+        finally:
+            process.kill()  # nothing, if it has ended
+
+
+def _resident_bytes(pid: int) -> int:
+    try:
+        return int(psutil.Process(pid).memory_info().rss)
+    except psutil.Error:  # it has just ended
+        return 0
 
 
 def select(storage: Storage, sql: str, max_rows: int) -> Result:
     """As `ask`, in this process, without a deadline."""
     duckdb = package("duckdb")
-    with closing(duckdb.connect()) as connection:
+    threads = min(_MOST_THREADS, os.cpu_count() or 1)
+    with closing(duckdb.connect(config={"threads": threads})) as connection:
         _prepare(connection, storage, sql)
         try:
             # Relations, which need no text of SQL, keep the interpreter's lock while they look at
@@ -73,6 +105,8 @@ def select(storage: Storage, sql: str, max_rows: int) -> Result:
             shown = ", ".join(_shown(at, kind) for at, (_, kind, *_) in enumerate(columns, 1))
             rows = connection.execute(f"SELECT {shown} {asked} LIMIT {max_rows + 1}").fetchall()
             return answered([name for name, *_ in columns], rows, max_rows)
+        except (duckdb.OutOfMemoryException, MemoryError) as error:
+            raise InvalidInputError(_TOO_LARGE) from error
         except duckdb.Error as error:
             raise InvalidInputError(f"DuckDB says: {error}") from error
 
@@ -168,10 +202,13 @@ def _only_select(duckdb: Any, connection: Any, sql: str) -> str:
 
 
 def _ask(asked: Statement) -> Result:
-    with suppress(ImportError, ValueError, OSError):  # no such limits, or narrower ones
+    package("duckdb")  # what it takes to load counts as taken
+    if sys.platform == "linux":
         import resource
 
-        resource.setrlimit(resource.RLIMIT_DATA, (_MOST_BYTES, _MOST_BYTES))
+        most = psutil.Process().memory_info().data + _MOST_MORE_BYTES
+        with suppress(ValueError, OSError):  # a narrower limit is set
+            resource.setrlimit(resource.RLIMIT_DATA, (most, most))
     return select(Storage(asked.database), asked.sql, asked.max_rows)
 
 

@@ -146,7 +146,8 @@ def pool(
 ) -> None:
     """List what is in a pool, or ask it one SELECT; nothing is changed.
 
-    A SELECT ends after a minute, and its values are cut to 200 characters.
+    A SELECT ends after a minute (over Parquet files after 20 seconds, or 1 GB of memory), and its
+    values are cut to 200 characters.
 
         webots-mcp pool ./pool runs --robot rover
 

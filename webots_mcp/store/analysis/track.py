@@ -237,7 +237,9 @@ def hidden_motion(
         y: As many.
         ends: The rows in which legs begin, and the end of the last one.
     """
-    interval_s = median(np.diff(times))
+    interval_s = median(np.diff(times)) or float(times[-1] - times[0]) / (len(times) - 1)
+    if interval_s <= 0:  # no time passed in which it could have moved
+        return [], 0.0, 0.0
     rows = max(1, round(_BLOCK_S / interval_s))
     blocks = np.diff(ends) // rows
     slow: list[int] = np.flatnonzero(blocks >= _FEWEST_BLOCKS).tolist()

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from contextlib import closing
 from typing import Final
 
-from tests.benchmarks.core import Bench, Line, Target, benchmark, compared
+from tests.benchmarks.core import Bench, Line, benchmark, compared
 from tests.recordings.rover import Recorder
 from webots_mcp.connection import connect, create_schema
 from webots_mcp.store.chunk_making import make_chunks

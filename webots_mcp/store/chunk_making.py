@@ -165,7 +165,7 @@ def make_chunks(
     while rows < budget_rows:
         mark = watermark(connection)
         last = connection.execute(_LAST_ID, (mark, _IDS_AT_ONCE)).fetchone()[0]
-        runs = {run: _NO_IDS for run in connection.execute(_ENDED).fetchall()}
+        runs = dict.fromkeys(connection.execute(_ENDED).fetchall(), _NO_IDS)
         if last is not None:
             for *run, first_id, last_id in connection.execute(_WITH_NEW_ROWS, (mark, last)):
                 runs[tuple(run)] = (first_id, last_id)
@@ -279,7 +279,7 @@ class _RunChunks:
         self._prepare(chunks)
         rows = len(columns)
         group = (self._run_id, columns.times[0], columns.times[-1], columns.ids[-1])
-        lost = _count_lost(columns, signals)
+        lost = count_lost(columns, signals)
         values = (*group, max(columns.ids), rows, rows, lost, *self._room_of(columns, chunks))
         group_id = self._connection.execute(_BEGIN_GROUP, values).lastrowid
 
@@ -354,7 +354,7 @@ def _signals_of(
     return known
 
 
-def _count_lost(columns: StateColumns, signals: dict[str, Signal]) -> int:
+def count_lost(columns: StateColumns, signals: dict[str, Signal]) -> int:
     """How many values of some rows chunks do not hold as they were (docs/database.md)."""
     lost = 0
     for name, values in columns.values.items():

@@ -301,7 +301,7 @@ def _of_rows(columns: StateColumns, column: Column) -> Sequence[Any] | None:
 
 def _cut(values: Decoded, start: int, stop: int) -> Decoded:
     codes = None if values.codes is None else values.codes[start:stop]
-    return Decoded(values.numbers[start:stop], codes, values.labels)
+    return Decoded(values.numbers[start:stop], codes, values.labels, values.is_whole)
 
 
 # -- rows in no chunk: the newest ones, and those that came late -----------------------------------

@@ -226,6 +226,7 @@ def find_targets(name: str, names: Iterable[str]) -> tuple[str | None, str | Non
     return place, speed
 
 
+@lru_cache(maxsize=_KEPT)
 def _subject_words(name: str) -> frozenset[str]:
     """The words of all parts of a name, one of several being the same as one alone."""
     return frozenset(word.rstrip("s") for word in _branch_words(name))

@@ -14,7 +14,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from tests.benchmarks import answers, c_header, commands, history, in_loop, kills, pool, starting
+from tests.benchmarks import (
+    answers,
+    c_header,
+    commands,
+    history,
+    in_loop,
+    kills,
+    many_runs,
+    pool,
+    starting,
+)
 from tests.benchmarks.core import Bench, Benchmark, Section, render
 
 BENCHMARKS: Final[tuple[Benchmark, ...]] = (
@@ -24,6 +34,7 @@ BENCHMARKS: Final[tuple[Benchmark, ...]] = (
     *commands.BENCHMARKS,
     *kills.BENCHMARKS,
     *history.BENCHMARKS,
+    *many_runs.BENCHMARKS,
     *answers.BENCHMARKS,
     *pool.BENCHMARKS,
 )

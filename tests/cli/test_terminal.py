@@ -12,7 +12,7 @@ import pytest
 
 from tests.recordings.rows import Recorded
 from webots_mcp.cli import main
-from webots_mcp.cli.terminal import rewrite, spelling_out
+from webots_mcp.cli.terminal import rewrite, shown_progress, spelling_out
 
 # Sets the title of the terminal, clears it in one character (C1), and turns what follows round.
 HOSTILE = "a\x1b]0;owned\x07\x9b2J\u202egnp.exe\u2066\u200f"
@@ -104,3 +104,27 @@ def test_on_a_terminal_exported_data_is_shown_so_as_well_and_progress_stays_one_
         assert shown.getvalue().endswith("\x1b[K")
         print("\rgone")
     assert shown.getvalue().endswith("\\u000dgone\n")
+
+
+def test_where_no_terminal_is_long_work_says_how_far_it_is_by_a_line_every_few_seconds(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now_s = 0.0
+    monkeypatch.setattr("webots_mcp.cli.terminal.time.monotonic", lambda: now_s)
+    with shown_progress("making chunks") as progress:
+        for done in range(32):  # for 8 s
+            progress(done, 32)
+            now_s += 0.25
+    said = capsys.readouterr()
+    assert said.err.splitlines() == [
+        "webots-mcp: making chunks: 37 %",
+        "webots-mcp: making chunks: 75 %",
+    ]
+    assert said.out == ""
+
+
+def test_short_work_is_silent_where_no_terminal_is(capsys: pytest.CaptureFixture[str]) -> None:
+    with shown_progress("making chunks") as progress:
+        progress(1, 2)
+        progress(2, 2)
+    assert capsys.readouterr().err == ""

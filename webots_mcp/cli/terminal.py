@@ -1,6 +1,6 @@
 """What a command writes, which a terminal may show: nothing of a recording that it would obey.
 
-It is shown how far long work has come; in a pipe that is silent.
+It is shown how far long work has come; where stderr is no terminal, by a line every few seconds.
 
 Names, texts and log lines come from controllers and from recordings of others. Whatever a command
 prints goes through one stream, in which control characters and such as turn the direction of
@@ -30,7 +30,8 @@ from typing import Any, Final, NamedTuple, TextIO, TypeAlias, cast
 
 from webots_mcp.naming import spelled_out
 
-_INTERVAL_S: Final = 0.1  # between two lines of progress
+_INTERVAL_S: Final = 0.1  # between two states of the line of progress
+_PLAIN_INTERVAL_S: Final = 3.0  # between two lines where no line can be rewritten
 
 
 class _SpelledOut:
@@ -105,20 +106,28 @@ def rewrite(stream: TextIO, text: str = "") -> None:
 
 @contextlib.contextmanager
 def shown_progress(doing: str) -> Generator[Callable[[int, int], None]]:
-    """A function to call with how much is done and how much there is; the line vanishes at the end.
+    """A function to call with how much is done and how much there is.
 
-    It is written to stderr, because stdout may be the data.
+    It writes to stderr, because stdout may be the data: on a terminal one line, which vanishes at
+    the end; elsewhere a line every 3 s, so that short work stays silent.
     """
-    next_s = 0.0
+    is_terminal = sys.stderr.isatty()
+    next_s = 0.0 if is_terminal else time.monotonic() + _PLAIN_INTERVAL_S
 
     def show(done: int, of: int) -> None:
         nonlocal next_s
-        if time.monotonic() >= next_s:
+        if time.monotonic() < next_s:
+            return
+        text = f"{doing}: {100 * done // max(of, 1)} %"
+        if is_terminal:
             next_s = time.monotonic() + _INTERVAL_S
-            rewrite(sys.stderr, f"{doing}: {100 * done // max(of, 1)} %")
+            rewrite(sys.stderr, text)
+        else:
+            next_s = time.monotonic() + _PLAIN_INTERVAL_S
+            print(f"webots-mcp: {text}", file=sys.stderr, flush=True)
 
-    if not sys.stderr.isatty():
-        yield lambda done, of: None
+    if not is_terminal:
+        yield show
         return
     try:
         yield show

@@ -51,6 +51,7 @@ _IDS_AT_ONCE: Final = 20_000
 _FIRST_AT_ONCE: Final = 100_000  # bytes
 _STEP_BYTES: Final = 5_000  # a chunk takes as long as so many bytes, and its own besides
 _NO_LIMIT: Final = 2**62
+_NO_IDS: Final = (1, 0)  # first and last id of no rows
 _STATE_BYTES: Final = 25  # of a record beside its text: run, two times, lengths
 _STATISTICS_BYTES: Final = 115  # of a chunk beside what is compressed
 _CHUNK_INDEX_BYTES: Final = 110  # in both indexes, measured
@@ -71,9 +72,10 @@ _SET_WATERMARK: Final = (
     "max(state_id, excluded.state_id), excluded.state_id)"
 )
 _LAST_ID: Final = "SELECT max(id) FROM (SELECT id FROM state WHERE id > ? ORDER BY id LIMIT ?)"
-_WITH_NEW_ROWS: Final = (
-    "SELECT DISTINCT s.run_id, r.robot_id FROM state s JOIN run r ON r.id = s.run_id "
-    "WHERE s.id > ? AND s.id <= ?"
+_WITH_NEW_ROWS: Final = (  # one scan for all runs: late rows lie between the ids it finds
+    "SELECT n.run_id, r.robot_id, n.first_id, n.last_id FROM (SELECT run_id, min(id) AS first_id, "
+    "max(id) AS last_id FROM state WHERE id > ? AND id <= ? GROUP BY run_id) n "
+    "JOIN run r ON r.id = n.run_id"
 )
 _ENDED: Final = (
     "SELECT id, robot_id FROM run WHERE ended_wall_time_s IS NOT NULL AND is_chunked = 0"
@@ -163,11 +165,12 @@ def make_chunks(
     while rows < budget_rows:
         mark = watermark(connection)
         last = connection.execute(_LAST_ID, (mark, _IDS_AT_ONCE)).fetchone()[0]
-        runs = connection.execute(_ENDED).fetchall()
+        runs = dict.fromkeys(connection.execute(_ENDED).fetchall(), _NO_IDS)
         if last is not None:
-            runs += connection.execute(_WITH_NEW_ROWS, (mark, last)).fetchall()
-        for run_id, robot_id in dict.fromkeys(runs):
-            work = _RunChunks(connection, run_id, robot_id, pause_s)
+            for *run, first_id, last_id in connection.execute(_WITH_NEW_ROWS, (mark, last)):
+                runs[tuple(run)] = (first_id, last_id)
+        for (run_id, robot_id), new_ids in runs.items():
+            work = _RunChunks(connection, run_id, robot_id, pause_s, new_ids)
             rows += work.make(budget_rows - rows, mark if last is None else last)
             if not work.done:
                 return Made(rows, False)
@@ -182,13 +185,23 @@ def chunk_whole_run(connection: sqlite3.Connection, run_id: int, pause_s: float 
     (robot_id,) = connection.execute(_ROBOT, (run_id,)).fetchone() or (None,)
     if robot_id is None:
         return False
-    work = _RunChunks(connection, run_id, robot_id, pause_s, least_rows=1)
-    work.make(_NO_LIMIT, connection.execute(_NEWEST_ID).fetchone()[0])
+    newest_id = connection.execute(_NEWEST_ID).fetchone()[0]
+    work = _RunChunks(connection, run_id, robot_id, pause_s, (0, newest_id), least_rows=1)
+    work.make(_NO_LIMIT, newest_id)
     return work.done
 
 
 class _RunChunks:
-    """The chunks of one run that are still to be made."""
+    """The chunks of one run that are still to be made.
+
+    Args:
+        connection: Of the maintainer.
+        run_id: Which run.
+        robot_id: Its robot.
+        pause_s: Between two writes.
+        new_ids: The first and last id of its rows beyond the watermark; late rows are among them.
+        least_rows: How many rows make a group; `GROUP_ROWS` if not given.
+    """
 
     def __init__(
         self,
@@ -196,12 +209,14 @@ class _RunChunks:
         run_id: int,
         robot_id: int,
         pause_s: float,
+        new_ids: tuple[int, int],
         least_rows: int | None = None,
     ) -> None:
         self._connection = connection
         self._run_id = run_id
         self._robot_id = robot_id
         self._pause_s = pause_s
+        self._new_ids = new_ids
         self._least_rows = least_rows or GROUP_ROWS
         self.done = False
 
@@ -234,10 +249,12 @@ class _RunChunks:
 
     def _late(self, at: Reached, last_id: int) -> StateColumns:
         """Rows in no chunk that came after others of later times were put into one."""
-        if last_id <= at.max_state_id:
+        first_id, newest_id = self._new_ids
+        after_id, last_id = max(at.max_state_id, first_id - 1), min(last_id, newest_id)
+        if at.end_s == -math.inf or last_id <= after_id:
             return StateColumns()
         place = (at.end_s, at.last_state_id)
-        return _read(self._connection, _LATE, (at.max_state_id, last_id, self._run_id, *place))
+        return _read(self._connection, _LATE, (after_id, last_id, self._run_id, *place))
 
     def _has_tail(self, at: Reached, last_id: int, least_rows: int) -> bool:
         """Whether there are so many rows after those that are in chunks."""
@@ -262,7 +279,7 @@ class _RunChunks:
         self._prepare(chunks)
         rows = len(columns)
         group = (self._run_id, columns.times[0], columns.times[-1], columns.ids[-1])
-        lost = _count_lost(columns, signals)
+        lost = count_lost(columns, signals)
         values = (*group, max(columns.ids), rows, rows, lost, *self._room_of(columns, chunks))
         group_id = self._connection.execute(_BEGIN_GROUP, values).lastrowid
 
@@ -337,7 +354,7 @@ def _signals_of(
     return known
 
 
-def _count_lost(columns: StateColumns, signals: dict[str, Signal]) -> int:
+def count_lost(columns: StateColumns, signals: dict[str, Signal]) -> int:
     """How many values of some rows chunks do not hold as they were (docs/database.md)."""
     lost = 0
     for name, values in columns.values.items():

@@ -23,6 +23,7 @@ from webots_mcp.naming import LONGEST_SPREAD_ARRAY, flatten
 from webots_mcp.plugins import ExportFormat, export_formats, load
 from webots_mcp.store.analysis.arrays import Array, Indexes, np
 from webots_mcp.store.analysis.summary import Ranked
+from webots_mcp.store.chunk_table import Cells, Kind, Part, chunk_table
 from webots_mcp.store.chunks import (
     ABSENT,
     IS_NUMBER,
@@ -256,6 +257,10 @@ _PLAIN_KINDS: Final[dict[type[object], ColumnKind]] = {
 }  # fmt: skip
 
 
+_STATE: Final = "SELECT id, sim_time_s, wall_time_s, data, replaced FROM state WHERE id = ?"
+_TIME: Final = "SELECT sim_time_s FROM state WHERE id = ?"
+
+
 class Recorded(NamedTuple):
     """A state row as it is stored; the id of one that only a kept stretch has is below 0."""
 
@@ -323,12 +328,39 @@ class Table(ABC):
 
 
 @dataclass(frozen=True)
+class ByColumn:
+    """The rows of a source by columns, for formats that have columns.
+
+    Attributes:
+        columns: As `Table.columns`, each after the name of its signal.
+    """
+
+    parts: Sequence[Part]
+    columns: Sequence[tuple[str, Column]]
+    total: int
+    progress: Progress | None = None
+
+    def slices(self, rows: int) -> Iterator[tuple[list[Array], list[Cells]]]:
+        """So many rows at a time: what `Source.head` names, and the cells of each column."""
+        done = 0
+        for part in self.parts:
+            for frame in part.slices(rows):
+                runs = np.full(len(frame), part.run_id)
+                head = [runs, frame.ids, frame.times, frame.wall_times]
+                yield head, [Cells(frame, name, column.kind) for name, column in self.columns]
+                done += len(frame)
+                if self.progress is not None:
+                    self.progress(done, self.total)
+
+
+@dataclass(frozen=True)
 class Source(Table):
     """The state rows that were there when the export began; they can be read more than once.
 
     Attributes:
         passes: How often they will be read, so that progress can be reported.
         purged: Of each segment the rows that only its chunks have.
+        counts: Of each segment the rows of the table `state`.
     """
 
     head: ClassVar[tuple[Column, ...]] = _HEAD
@@ -340,6 +372,7 @@ class Source(Table):
     passes: int
     purged: Sequence[PurgedRows]
     progress: Progress | None = None
+    counts: Sequence[int] = ()
 
     @classmethod
     def of(
@@ -351,20 +384,62 @@ class Source(Table):
     ) -> Source:
         """The rows that these segments have now; ids are given in the order of writing."""
         bounds = [(part.run_id, part.start_s, part.end_s) for part in segments]
-        last_ids, total = dict[str, int](), 0
+        last_ids, counts = dict[str, int](), dict[str, list[int]]()
         for table in ("state", "kept_state"):
             last_ids[table] = connection.execute(_LAST_ID.format(table=table)).fetchone()[0]
             count = _COUNT.format(table=table)
-            total += sum(connection.execute(count, bound).fetchone()[0] for bound in bounds)
+            counts[table] = [connection.execute(count, each).fetchone()[0] for each in bounds]
+        total = sum(map(sum, counts.values()))
         purged = [PurgedRows(connection, segment) for segment in segments]
         total += sum(map(len, purged))
         newest = (last_ids["state"], last_ids["kept_state"])
-        return cls(connection, segments, *newest, total, passes, purged, progress)
+        each = counts["state"]
+        return cls(connection, segments, *newest, total, passes, purged, progress, each)
 
     @property
     def notes(self) -> list[str]:
         """What could not be given back of rows that retention has deleted, once they were read."""
-        return [note for each in self.purged for note in (*each.notes, *map(str, each.unread))]
+        notes = [note for each in self.purged for note in (*each.notes, *map(str, each.unread))]
+        unread = (each for part in self.__dict__.get("_parts") or () for each in part.frame.unread)
+        return [*notes, *map(str, unread)]
+
+    @cached_property
+    def _parts(self) -> list[Part] | None:
+        return chunk_table(self.connection, self.segments, self.counts, self.last_id)
+
+    def by_column(self) -> ByColumn | None:
+        """The same from chunks, a column at a time; None where these hold not all as it was."""
+        if self._parts is None:
+            return None
+        kinds: dict[str, set[Kind]] = {}
+        for part in self._parts:
+            for name, found in part.kinds.items():
+                kinds.setdefault(name, set()).update(found)
+        columns: dict[str, tuple[str, Column]] = {}
+        own = {f"state.{name}" if name in _RESERVED else name: name for name in kinds}
+        if len(own) < len(kinds):
+            return None
+        for part in self._parts:
+            for state_id in sorted(set(part.first_rows.values()), key=self._place_of):
+                row = self._state(part.run_id, state_id)
+                for name in row.values if row else ():
+                    if name not in own:
+                        return None
+                    columns.setdefault(name, (own[name], Column(name, _kind_of(kinds[own[name]]))))
+        if len(columns) < len(kinds) or not all(
+            column.kind != "text" or kinds[name] <= {"text", "null"}
+            for name, column in columns.values()
+        ):
+            return None
+        return ByColumn(self._parts, list(columns.values()), self.total, self.progress)
+
+    def _place_of(self, state_id: int) -> tuple[float, int]:
+        (time_s,) = self.connection.execute(_TIME, (state_id,)).fetchone() or (math.inf,)
+        return time_s, state_id
+
+    def _state(self, run_id: int, state_id: int) -> Row | None:
+        row = self.connection.execute(_STATE, (state_id,)).fetchone()
+        return flat_row(Recorded(run_id, *row)) if row else None
 
     def rows(self, pass_number: int = 1) -> Iterator[Row]:
         """All of them, run by run, in the order of simulation time."""
@@ -434,7 +509,7 @@ def _spread(prefix: str, items: Iterable[tuple[str, Any]], values: dict[str, Any
             _spread(f"{name}.", value.items(), values)
         elif kind is list and len(value) <= LONGEST_SPREAD_ARRAY:
             _spread(f"{name}.", ((str(i), item) for i, item in enumerate(value)), values)
-        elif name not in values:
+        else:
             values[name] = value
 
 
@@ -461,6 +536,14 @@ def _widened(known: ColumnKind, seen: ColumnKind) -> ColumnKind:
     if "null" in (known, seen):
         return seen if known == "null" else known
     return "num" if {known, seen} == {"int", "num"} else "text"
+
+
+def _kind_of(seen: Iterable[Kind]) -> Kind:
+    """The kind of a column that has values of these kinds."""
+    kind: ColumnKind = "null"
+    for each in seen:
+        kind = _widened(kind, each)
+    return cast("Kind", kind)
 
 
 def as_text(value: object) -> str | None:

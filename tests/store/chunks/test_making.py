@@ -307,3 +307,98 @@ def test_a_late_row_at_the_time_between_two_groups_stays_behind_those_before_it(
     chunk_whole_run(empty, 1)
     assert before[GROUP_ROWS : GROUP_ROWS + 2] == [GROUP_ROWS, -1]
     assert framed(empty).values("x") == before
+
+
+def test_the_chunks_of_a_run_cost_the_same_however_many_rows_others_have(
+    empty: sqlite3.Connection,
+) -> None:
+    """A new run is not searched for in the rows of all others: each row is read a few times."""
+    recorder = record(empty, range(300))
+    recorder.end_run("reset")
+
+    def steps_of_a_new_run() -> int:
+        steps = 0
+
+        def count() -> None:
+            nonlocal steps
+            steps += 1
+
+        recorder.run(1, 1, "reset")
+        record(empty, range(300), recorder)
+        recorder.end_run("reset")
+        empty.set_progress_handler(count, 1000)  # of SQLite's virtual machine
+        try:
+            assert make_chunks(empty, 100_000).done
+        finally:
+            empty.set_progress_handler(None, 0)
+        return steps
+
+    assert make_chunks(empty, 100_000).done
+    among_few = steps_of_a_new_run()
+    recorder.run(1, 1, "reset")
+    record(empty, range(20_000), recorder)
+    recorder.end_run("reset")
+    assert make_chunks(empty, 100_000).done
+    assert steps_of_a_new_run() < 1.5 * among_few
+
+
+def test_many_new_runs_are_each_looked_at_once(empty: sqlite3.Connection) -> None:
+    recorder = start_run(empty)
+    runs = 60
+
+    def record_runs(count: int) -> int:
+        for _ in range(count):
+            recorder.run(1, 1, "reset")
+            record(empty, range(300), recorder)
+            recorder.end_run("reset")
+        steps = 0
+
+        def step() -> None:
+            nonlocal steps
+            steps += 1
+
+        empty.set_progress_handler(step, 1000)
+        try:
+            assert make_chunks(empty, 10**9).done
+        finally:
+            empty.set_progress_handler(None, 0)
+        return steps
+
+    few, many = record_runs(runs // 4), record_runs(runs)
+    assert many < 1.3 * 4 * few
+    assert sum(groups(empty)) == 300 * (runs + runs // 4)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_late_rows_of_several_runs_at_once_come_into_their_chunks(
+    empty: sqlite3.Connection, seed: int
+) -> None:
+    """Whatever is written between two calls, and however little a call may do."""
+    choice = random.Random(seed)
+    recorder = start_run(empty)
+    recorder.run(1, 1, "reset")
+    steps: dict[int, list[int]] = {1: list(range(ROWS)), 2: list(range(ROWS))}
+    for left in steps.values():
+        for place in choice.sample(range(ROWS - 200), 60):  # some come later than they should
+            step = left[place]
+            left[place] = left[place + 150]
+            left[place + 150] = step
+    while any(steps.values()):
+        run_id = choice.choice([run_id for run_id, left in steps.items() if left])
+        some = choice.choice([1, 40, 700])
+        recorder.run_id = run_id
+        record_steps(empty, recorder, steps[run_id][:some])
+        del steps[run_id][:some]
+        if choice.random() < 0.5:
+            make_chunks(empty, choice.choice([1, 500, 100_000]))
+    for run_id in (1, 2):
+        recorder.run_id = run_id
+        recorder.end_run("finished")
+    while not make_chunks(empty, 500).done:
+        pass
+    for run_id in (1, 2):
+        frame = framed(empty, run_id)
+        assert frame.values("x") == [step * 0.25 for step in range(ROWS)]
+        assert len(set(frame.ids.tolist())) == ROWS
+        waiting = len(frame.new_rows)
+        assert waiting < chunk_making.LEAST_AT_END

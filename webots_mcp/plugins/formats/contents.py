@@ -7,7 +7,7 @@ import math
 import sqlite3
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from importlib import import_module
 from itertools import islice
 from operator import attrgetter
@@ -17,6 +17,8 @@ from typing import Any, BinaryIO, Final, NamedTuple, TypeAlias, TypeVar
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.naming import FARTHEST_M, metres_in
 from webots_mcp.requirements import install_line
+from webots_mcp.store.analysis.arrays import np
+from webots_mcp.store.chunk_table import Cells
 from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.detection.search import Motion, find_motion
 from webots_mcp.store.export import (
@@ -270,7 +272,8 @@ def write_parquet(source: Table, sink: BinaryIO) -> None:
         InvalidInputError: pyarrow is not installed.
     """
     arrow, parquet = _pyarrow()
-    columns = source.columns()
+    by_column = source.by_column() if isinstance(source, Source) else None
+    columns = [each for _, each in by_column.columns] if by_column else source.columns()
     types = {
         "null": arrow.null(), "bool": arrow.bool_(), "int": arrow.int64(),
         "num": arrow.float64(), "text": arrow.string(), "numbers": arrow.list_(arrow.float64()),
@@ -278,8 +281,13 @@ def write_parquet(source: Table, sink: BinaryIO) -> None:
     schema = arrow.schema(
         [(column.name, types[column.kind]) for column in (*source.head, *columns)]
     )
-    rows = source.rows(pass_number=2)
     with parquet.ParquetWriter(sink, schema, compression="zstd") as writer:
+        if by_column is not None:
+            for head, cells in by_column.slices(_GROUP_ROWS):
+                arrays = [*head, *map(partial(_array, arrow), cells, columns)]
+                writer.write_table(arrow.table(arrays, schema=schema))
+            return
+        rows = source.rows(pass_number=2)
         while group := list(islice(rows, _GROUP_ROWS)):
             arrays = [*zip(*(row.head for row in group), strict=True)]
             arrays += [_values(group, column) for column in columns]
@@ -293,6 +301,17 @@ def _pyarrow() -> tuple[Any, Any]:
         raise InvalidInputError(
             f"a Parquet file needs pyarrow: {install_line(['pyarrow'])}; or export as csv or jsonl"
         ) from error
+
+
+def _array(arrow: Any, cells: Cells, column: Column) -> Any:
+    """The cells of a column as Arrow has them."""
+    if column.kind == "null":
+        return arrow.nulls(len(cells.is_null))
+    if column.kind == "text":
+        texts = arrow.array(cells.labels or [""], arrow.string())
+        places = arrow.array(cells.values.astype(np.int32), mask=cells.is_null)
+        return arrow.DictionaryArray.from_arrays(places, texts).cast(arrow.string())
+    return arrow.array(cells.values, mask=cells.is_null)
 
 
 def _values(group: list[Row], column: Column) -> list[Any]:

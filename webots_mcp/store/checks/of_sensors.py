@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from functools import cached_property
 from typing import Final, Literal
 
 from webots_mcp.naming import REDUCTIONS, find_targets, listed, words_of
@@ -68,7 +69,8 @@ def sensors_live(run: RunUnderCheck) -> Finding:
 
 def _frozen(run: RunUnderCheck, flat: Event) -> Literal["fail", "warn"] | None:
     name, says = flat.name or "", str(flat.details.get("says", ""))
-    if name not in _sensors(run) or says.startswith("at "):
+    names = _names_in(run)
+    if name not in names.sensors or says.startswith("at "):
         return None
     if says:  # its target went on
         return "fail"
@@ -78,9 +80,9 @@ def _frozen(run: RunUnderCheck, flat: Event) -> Literal["fail", "warn"] | None:
     after = frame.rows(stop + 1, stop + OTHER_ROWS).usable(name)[1]
     if is_noisy(np.concatenate([before, after])):
         return "fail"
-    if run.search.known[name].turn or name in _place(run):  # of who drives straight on
+    if run.search.known[name].turn or name in names.place:  # of who drives straight on
         return None
-    if _target(run, name) is not None:  # which rests as well
+    if names.target(name) is not None:  # which rests as well
         return None
     others = run.events("standstill") + run.events("stuck")
     if run.motion.position is None:
@@ -90,27 +92,46 @@ def _frozen(run: RunUnderCheck, flat: Event) -> Literal["fail", "warn"] | None:
     return None if sum(max(0.0, each) for each in rests_s) > flat.duration_s / 2 else "warn"
 
 
-def _place(run: RunUnderCheck) -> set[str]:
-    """The signals of where it is, in each of its positions."""
-    places = (name for name, role in stored_roles(run.search.known).items() if role[0] in "xyz")
-    return {*places, *(each.name for each in run.motion.position or ())}
+class _NamesIn:
+    """What the names of a run's signals tell, looked up once for all of its events."""
+
+    def __init__(self, run: RunUnderCheck) -> None:
+        self._run = run
+        self._targets: dict[str, str | None] = {}
+
+    @cached_property
+    def place(self) -> set[str]:
+        """The signals of where it is, in each of its positions."""
+        roles = stored_roles(self._run.search.known)
+        places = (name for name, role in roles.items() if role[0] in "xyz")
+        return {*places, *(each.name for each in self._run.motion.position or ())}
+
+    def target(self, name: str) -> str | None:
+        """What a joint shall come to, or how fast it shall be: it stays there."""
+        if name not in self._targets:
+            numbers = (each.name for each in self._run.search.numbers)
+            self._targets[name] = find_targets(name, numbers)[0]
+        return self._targets[name]
+
+    @cached_property
+    def sensors(self) -> dict[str, Signal]:
+        """The numbers that somebody measured, as far as their names tell."""
+        motion = self._run.motion
+        told = {motion.commanded, motion.speed, motion.mode, *motion.wheels, *motion.wheel_commands}
+        numbers = {each.name: each for each in self._run.search.numbers if not each.is_index}
+        aims = {aim for name in numbers for aim in find_targets(name, numbers)}
+        return {
+            name: each for name, each in numbers.items()
+            if each not in told and name not in aims and not _SET.intersection(_words(name))
+        }  # fmt: skip
 
 
-def _target(run: RunUnderCheck, name: str) -> str | None:
-    """What a joint shall come to, or how fast it shall be: it stays there."""
-    return find_targets(name, [each.name for each in run.search.numbers])[0]
-
-
-def _sensors(run: RunUnderCheck) -> dict[str, Signal]:
-    """The numbers that somebody measured, as far as their names tell."""
-    motion = run.motion
-    told = {motion.commanded, motion.speed, motion.mode, *motion.wheels, *motion.wheel_commands}
-    numbers = {each.name: each for each in run.search.numbers if not each.is_index}
-    aims = {aim for name in numbers for aim in find_targets(name, numbers)}
-    return {
-        name: each for name, each in numbers.items()
-        if each not in told and name not in aims and not _SET.intersection(_words(name))
-    }  # fmt: skip
+def _names_in(run: RunUnderCheck) -> _NamesIn:
+    shared = run.search.shared
+    if _NamesIn not in shared:
+        shared[_NamesIn] = _NamesIn(run)
+    names: _NamesIn = shared[_NamesIn]
+    return names
 
 
 _SET: Final = frozenset(
@@ -146,14 +167,14 @@ def sensors_within_limits(run: RunUnderCheck) -> Finding:
 
 
 def _saturated(run: RunUnderCheck) -> Iterator[tuple[str, float, float, float, int]]:
-    position = _place(run)
-    for name, signal in _sensors(run).items():
+    names = _names_in(run)
+    for name, signal in names.sensors.items():
         if run.search.deadline.passed:
             return
         if (
-            name in position
+            name in names.place
             or signal.turn
-            or _target(run, name)
+            or names.target(name)
             or not _RANGES.isdisjoint(_words(name))
         ):
             continue
@@ -176,7 +197,7 @@ _OFTEN_THE_SAME: Final = 3
 
 def sensors_drop_nothing(run: RunUnderCheck) -> Finding:
     """Warns where a signal went away and back at once, fails where it went to one value 3 times."""
-    sensors = _sensors(run)
+    sensors = _names_in(run).sensors
     gone = [e for e in run.events(JUMP.name) if "back" in e.details and e.name in sensors]
     if not gone:
         near = run.found.verdicts.nearest.get(JUMP.name)

@@ -173,6 +173,27 @@ class Frame:
             read[slice(*self.places([part.start_s, math.nextafter(part.end_s, math.inf)]))] = False
         return read
 
+    @property
+    def is_as_stored(self) -> bool:
+        """Whether its rows lie in the order of their chunks: none came late, none is kept."""
+        return self._source.order is None
+
+    @property
+    def cuts_chunks(self) -> bool:
+        """Whether its first or last chunk may have rows that are not in it."""
+        return len(self) < self._source.rows
+
+    def parts(self, column: Column) -> Iterator[tuple[int, Decoded]]:
+        """The values of each chunk with the place of its first row, in no order.
+
+        Only of a frame that is as stored. Chunks without the signal are left out.
+        """
+        return self._source.values(column, self._start, self._stop)
+
+    def forget(self) -> None:
+        """Forget what was read so far, where it will not be asked for again."""
+        self._source.forget()
+
     @cached_property
     def times(self) -> Array:
         """Simulation time of each row, in s."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
 import threading
 from collections import OrderedDict
@@ -300,7 +301,7 @@ def _of_rows(columns: StateColumns, column: Column) -> Sequence[Any] | None:
 
 def _cut(values: Decoded, start: int, stop: int) -> Decoded:
     codes = None if values.codes is None else values.codes[start:stop]
-    return Decoded(values.numbers[start:stop], codes, values.labels)
+    return Decoded(values.numbers[start:stop], codes, values.labels, values.is_whole)
 
 
 # -- rows in no chunk: the newest ones, and those that came late -----------------------------------
@@ -370,10 +371,10 @@ def rows_in_no_chunk(
         The rows, and the time of the last one where the deadline passed before all were read.
     """
     place = (at.end_s, at.last_state_id)
-    columns = StateColumns()
-    cut_s = read_rows(
-        connection, _LATE, (run_id, at.max_state_id, *span, *place), columns, deadline
-    )
+    columns, cut_s = StateColumns(), None
+    if at.end_s != -math.inf:  # else nothing came late, and all rows of the file would be read
+        late = (run_id, at.max_state_id, *span, *place)
+        cut_s = read_rows(connection, _LATE, late, columns, deadline)
     if cut_s is not None or span[1] < at.end_s:
         return columns, cut_s
     key = _key(connection, run_id) if has_few_new_rows(connection, run_id, at) else None

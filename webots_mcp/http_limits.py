@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 MOST_SESSIONS: Final = 1_000  # of clients before 2026-07-28
 HEADERS_S: Final = 10.0  # from the connection, or from the answer before
+BODY_S: Final = 60.0  # from the headers; a body has at most 4 MiB
 _SESSION: Final = "mcp-session-id"
 _OF_THE_BODY: Final = (b"content-length", b"content-type", b"transfer-encoding")
 _TIMED_OUT: Final = (
@@ -114,9 +115,13 @@ class SessionLimit:
 
 
 class PromptProtocol(H11Protocol):
-    """A connection that ends where the headers of a request are not there within `HEADERS_S`."""
+    """A connection that ends where a request does not come in time.
+
+    Its headers have `HEADERS_S`, its body has `BODY_S` more.
+    """
 
     _clock: asyncio.TimerHandle | None = None
+    _awaited: type[h11.IDLE] | type[h11.SEND_BODY] | None = None
 
     def connection_made(self, transport: Any) -> None:
         """Wait for the first request."""
@@ -139,20 +144,24 @@ class PromptProtocol(H11Protocol):
         self._stop_the_clock()
 
     def _mind_the_time(self) -> None:
-        """Run the clock while headers are awaited: what comes meanwhile does not set it back."""
-        if self.conn.their_state is not h11.IDLE or self.transport.is_closing():
+        """Run the clock while something is awaited: what comes meanwhile does not set it back."""
+        awaited = self.conn.their_state
+        if awaited not in (h11.IDLE, h11.SEND_BODY) or self.transport.is_closing():
             self._stop_the_clock()
-        elif self._clock is None:
-            self._clock = self.loop.call_later(HEADERS_S, self._give_up)
+        elif self._clock is None or self._awaited is not awaited:
+            self._stop_the_clock()
+            self._awaited = awaited
+            seconds = HEADERS_S if awaited is h11.IDLE else BODY_S
+            self._clock = self.loop.call_later(seconds, self._give_up)
 
     def _stop_the_clock(self) -> None:
         if self._clock is not None:
             self._clock.cancel()
-            self._clock = None
+            self._clock = self._awaited = None
 
     def _give_up(self) -> None:
-        self._clock = None
-        has_begun = bool(self.conn.trailing_data[0])
-        if has_begun:
+        is_body, self._clock, self._awaited = self._awaited is h11.SEND_BODY, None, None
+        is_answered = self.conn.our_state not in (h11.IDLE, h11.SEND_RESPONSE)
+        if (is_body or self.conn.trailing_data[0]) and not is_answered:
             self.transport.write(_TIMED_OUT)
         self.transport.close()

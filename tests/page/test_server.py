@@ -224,3 +224,17 @@ def raw(server: Server, said: str) -> int:
     with closing(socket.create_connection(("127.0.0.1", server.port), 60)) as connection:
         connection.sendall(said.encode())
         return int(connection.makefile("rb").readline().split()[1])
+
+
+@pytest.mark.parametrize("order", [{}, {"order": "quit"}, {"name": "speed"}, {"value": 1}])
+def test_an_incomplete_order_is_answered_with_what_an_order_needs(
+    steering: Server, order: dict[str, object]
+) -> None:
+    with closing(http.client.HTTPConnection("127.0.0.1", steering.port)) as connection:
+        headers = {
+            "Content-Type": "application/json",
+            "Origin": f"http://127.0.0.1:{steering.port}",
+        }
+        body = json.dumps(order).encode()
+        connection.request("POST", f"{steering.path}steer?robot=x", body, headers)
+        assert "give order, one of pause" in connection.getresponse().read().decode()

@@ -42,7 +42,7 @@ from webots_mcp.questions.declaring import (
 from webots_mcp.questions.send_command import settable
 from webots_mcp.steering.dispatch import ACTION, find_target, known_names, require_possible
 from webots_mcp.steering.trial_plan import TrialPlan, combinations
-from webots_mcp.steering.trial_worker import TrialWorkers
+from webots_mcp.steering.trial_worker import OF_EACH_TRIAL, TrialWorkers
 from webots_mcp.store.analysis.summary import Best, Ranked, Ranking
 from webots_mcp.store.parameters import (
     Declared,
@@ -190,7 +190,7 @@ def _begin(
         require_possible(recording, robot, asked["prune"], None, reset=True)
     checked = _as_declared(settable(recording, robot), sets)
     for name, value in {(name, each) for values in checked for name, each in values.items()}:
-        permit(recording, ACTION, {"reset": True, "parameters": {name: value}})
+        permit(recording, ACTION, {**OF_EACH_TRIAL, "parameters": {name: value}})
     with recording.reader() as connection:
         view = find_target(connection, robot, ACTION)
         plan = TrialPlan(parameters=checked, robot=view.robot.name, **asked)

@@ -47,6 +47,7 @@ from webots_mcp.store.recording import Job, Recording, View
 from webots_mcp.store.requests import permit
 from webots_mcp.store.robots import find_block, robot_name
 
+OF_EACH_TRIAL: Final[Mapping[str, Any]] = {"reset": True, "pace": "fast", "then": "pause"}
 _LOOK_EVERY_S: Final = 0.02
 # Long enough that simulation time visibly goes back at the next reset, by which it is detected.
 _SOME_STEPS_S: Final = 0.2
@@ -183,11 +184,9 @@ class TrialWorker(threading.Thread):
             "until": self._plan.until,
             "prune": self._plan.prune,
             "for_s": self._plan.for_s,
-            "reset": True,
-            "pace": "fast",
             "parameters": values,
             "by": "trial",
-            "then": "pause",
+            **OF_EACH_TRIAL,
         }
         return {name: value for name, value in asked.items() if value is not None}
 
@@ -400,8 +399,7 @@ class TrialWorkers:
 
 def _new_run_with(values: Mapping[str, Any]) -> dict[str, Any]:
     """The `run` parameters that begin a new run, so that the last trial's run does not continue."""
-    asked = {"for_s": _SOME_STEPS_S, "reset": True, "pace": "fast", "then": "pause"}
-    return {**asked, "parameters": values, "by": "trial"}
+    return {"for_s": _SOME_STEPS_S, "parameters": values, "by": "trial", **OF_EACH_TRIAL}
 
 
 def _key(trial: Trial) -> str:

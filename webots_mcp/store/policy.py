@@ -123,6 +123,9 @@ class Policy:
         if action == "run" and params.get("reset"):
             self._require_route("reset", asked)
             self._require("actions", ["reset"], "the action 'reset' is not allowed")
+        for brought_about in _brought_about(action, params):
+            self._require_route(brought_about, asked)
+            self._require_not_forbidden(brought_about, action)
         if action in (LAUNCH, "load_world"):
             self._require_world(params.get("world"))
         if action == "set_field":
@@ -136,6 +139,13 @@ class Policy:
             action in ("set_parameters", "run", LAUNCH)
         ):
             self._require_values(values)
+
+    def _require_not_forbidden(self, brought_about: str, action: str) -> None:
+        """Refuse what another action brings about, where a pattern forbids it."""
+        patterns = cast("list[str]", self.allow.get("actions", []))
+        if any(_fits(each.removeprefix("!"), brought_about) for each in patterns):
+            said = f"{brought_about!r}, which this {action!r:.100} does as well, is not allowed"
+            self._require("actions", [brought_about], said)
 
     def _require_route(self, action: str, asked: Sequence[str]) -> None:
         """Refuse what the tools of an action may not do, also if another one is asked for it."""
@@ -191,6 +201,22 @@ class Policy:
         shown = self.text.splitlines()[line - 1].partition("#")[0].strip()
         rule = f"{self.file}, line {line}: {shown:.200}"
         return NotAllowedError(f"{said} by {rule}. {_ASK}", rule)
+
+
+def _brought_about(action: str, params: Mapping[str, Any]) -> Iterator[str]:
+    """The other actions whose effect an action has: a rule that forbids one of them holds for it.
+
+    A run with `reset` is not among them: it needs both to be allowed.
+    """
+    is_run = action == "run"
+    if (is_run or action == LAUNCH) and params.get("parameters"):
+        yield "set_parameters"
+    if action == "step" or (is_run and params.get("then", "pause") == "pause"):
+        yield "pause"
+    if is_run and params.get("pace") == "fast":
+        yield "fast"
+    if is_run and params.get("then") == "go_on":
+        yield "resume"
 
 
 def _fits(pattern: str, name: str) -> bool:

@@ -325,11 +325,16 @@ def _picture(server: PageServer, asked: dict[str, str]) -> dict[str, Any]:
 
 
 def _steer(server: PageServer, asked: dict[str, str], body: dict[str, Any]) -> dict[str, Any]:
-
     robot = asked.get("robot", "")
     if body.get("order") in ORDERS:
         return steer(server.steered, robot, body["order"])
-    return tune(server.steered, robot, str(body.get("name")), body["value"])
+    name = body.get("name")
+    if "order" in body or not isinstance(name, str) or "value" not in body:
+        raise InvalidInputError(
+            f"this is no order of the page: give order, one of {', '.join(ORDERS)}, or name and "
+            "value of a parameter"
+        )
+    return tune(server.steered, robot, name, body["value"])
 
 
 _QUESTIONS: Final = {"look": _look, "draw": _draw, "picture": _picture}

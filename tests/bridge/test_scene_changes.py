@@ -14,6 +14,14 @@ from webots_mcp.standin import InProcessSupervisor
 PILL = 'DEF PILL Solid { translation 1 0 0.1 name "pill" }'
 
 
+def top_nodes(scene: Scene) -> list[str]:
+    """The DEF names or types of the nodes at the top of the tree, in their order."""
+    field = scene.robot.getRoot().getField("children")
+    assert field is not None
+    nodes = [field.getMFNode(index) for index in range(field.getCount())]
+    return [node.getDef() or node.getTypeName() for node in nodes if node is not None]
+
+
 @pytest.fixture
 def scene(robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording) -> Scene:
     return Scene(robot, bridge, recording)
@@ -218,12 +226,63 @@ def test_brackets_in_texts_and_comments_are_no_brackets(scene: Scene) -> None:
     assert scene.get("ODD.name") == 'a { and a " ['
 
 
-@pytest.mark.parametrize("path", ["CRATE", "BALL.physics"])
-def test_a_node_that_was_removed_stays_away_until_a_reload(scene: Scene, path: str) -> None:
-    removed = scene.ask("remove_node", path=path)
+def test_a_node_that_was_removed_is_brought_back_by_each_reset(scene: Scene) -> None:
+    whole = scene.robot.getFromDef("CRATE")
+    assert whole is not None
+    written, around = whole.exportString(), top_nodes(scene)
+    assert scene.ask("remove_node", path="CRATE")["a_reset"] == "puts it back"
+    assert "no node has the DEF name, name or type 'CRATE'" in scene.fail("get_field", path="CRATE")
+    for _ in range(2):
+        scene.reset()
+        again = scene.robot.getFromDef("CRATE")
+        assert again is not None and again.exportString() == written
+        assert top_nodes(scene) == around
+    assert [json.loads(data) for _, data in scene.events("put_back")] == [{"nodes": ["CRATE"]}] * 2
+
+
+def test_several_removed_nodes_come_back_in_their_order_also_one_in_another(scene: Scene) -> None:
+    around = top_nodes(scene)
+    for path in ("BALL.physics", "BALL", "CRATE"):
+        scene.ask("remove_node", path=path)
+    for _ in range(2):
+        scene.reset()
+        assert top_nodes(scene) == around
+        assert scene.get("BALL.physics.mass") == 0.05
+    told = [json.loads(data) for _, data in scene.events("put_back")]
+    assert told == [{"nodes": ["CRATE", "BALL", "BALL.physics"]}] * 2
+
+
+@pytest.mark.parametrize("path", ["BALL", "BALL.physics"])
+def test_what_a_reset_has_put_back_can_be_removed_again_and_comes_back_once(
+    scene: Scene, path: str
+) -> None:
+    around = top_nodes(scene)
+    scene.ask("remove_node", path="BALL")
+    scene.reset()
+    assert scene.ask("remove_node", path=path)["a_reset"] == "puts it back"
+    scene.reset()
+    assert top_nodes(scene) == around
+    assert scene.get("BALL.physics.mass") == 0.05
+
+
+def test_a_node_without_its_parent_is_said_not_to_be_put_back(scene: Scene) -> None:
+    scene.ask("remove_node", path="BALL.physics")
+    ball = scene.robot.getFromDef("BALL")
+    assert ball is not None
+    ball.remove()  # by a controller, which nobody remembers
+    scene.reset()
+    ((_, data),) = scene.events("put_back")
+    assert json.loads(data) == {"not": ["BALL.physics"]}
+
+
+def test_a_node_that_is_too_long_to_be_remembered_is_said_to_stay_away(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("webots_mcp.bridge.scene_changes._LONGEST_REMOVED", 20)
+    removed = scene.ask("remove_node", path="CRATE")
     assert removed["a_reset"] == "does not bring it back; a reload does"
     scene.reset()
-    assert scene.robot.getFromDef("CRATE") is None or scene.get("BALL.physics") is None
+    assert scene.robot.getFromDef("CRATE") is None
     assert not scene.events("put_back")
 
 

@@ -10,21 +10,24 @@ import itertools
 import json
 import re
 import time
-from collections.abc import Generator
+from collections.abc import Collection, Generator
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from webots_mcp.bridge.commands import ClaimedCommand, Progress
 from webots_mcp.bridge.error_report import cut
 from webots_mcp.bridge.scene import (
     MOST_ENTRIES,
+    Pace,
     Place,
     checked,
     children,
+    entries,
     find,
     find_node,
     is_nearer,
     is_same,
     label,
+    node_fields,
     read,
     require_no_path,
     write,
@@ -35,12 +38,17 @@ if TYPE_CHECKING:
     from webots_mcp.bridge.session import Session
 
 _LONGEST_NODE: Final = 50_000  # characters of a node that is added
+_LONGEST_REMOVED: Final = 200_000  # characters of a node that is remembered
 _LONGEST_SHOWN: Final = 1_000  # characters of a value in an answer
 _LONGEST_STEP_S: Final = 3.0  # of wall time, until the next round of the loop
 _STAY: Final = ("WorldInfo", "Viewpoint")
 _ONE_NODE: Final = re.compile(r"\s*(?:DEF\s+\S+\s+)?[A-Za-z_][\w-]*\s*\{.*\}\s*\Z", re.DOTALL)
 _WORD: Final = re.compile(r'"(?:[^"\\]|\\.)*"|#[^\r\n]*|[{}\[\]]|[^\s,"#{}\[\]]+', re.DOTALL)
 _ADDED_BEFORE: Final = "does not bring it back: it was added in this run"
+_ONLY_RELOADED: Final = "does not bring it back; a reload does"
+_PUT_BACK_PROTO: Final = (
+    "puts it back if the world declares its PROTO as IMPORTABLE EXTERNPROTO; else a reload does"
+)
 _SAYS: Final = "Webots' console has the reason (see webots_get_logs, if it is recorded)"
 
 
@@ -239,12 +247,19 @@ def remove_node(session: Session, command: ClaimedCommand) -> Progress:
         "node": label(node),
     }
     is_added = session.scene.is_added(node)
-    reset = _ADDED_BEFORE if is_added else "does not bring it back; a reload does"
+    is_known = is_added or session.scene.is_put_back(node)
+    removal = None if is_known else (yield from _removal(robot, place))
+    is_proto = bool(node.isProto())
     node.remove()
     if robot.getFromId(node_id) is not None:
         yield from _until_stepped(session)
     if robot.getFromId(node_id) is not None:
         raise CommandRefusedError(f"Webots did not remove {place.path}; {_SAYS}")
+    reset = "puts it back"
+    if is_added:
+        reset = _ADDED_BEFORE
+    elif not is_known:
+        reset = session.scene.remember_removed(removal, is_proto=is_proto)
     session.journal.event("remove_node", facts | _asked_by(command), place.path)
     return facts | {"sim_time_s": session.clock.sim_time_s, "a_reset": reset}
 
@@ -268,6 +283,33 @@ def _require_removable(robot: Any, place: Place) -> None:
                 "bridge of that robot runs this command"
             )
         each = each.getParentNode()
+
+
+def _removal(robot: Any, place: Place) -> Generator[None, None, Removal | None]:
+    """How to bring a node back; None where its position or its text is not to be had."""
+    export = getattr(place.node, "exportString", None)
+    found = yield from _position(robot, place.node)
+    if export is None or found is None:
+        return None
+    text = str(export() or "")
+    if not 0 < len(text) <= _LONGEST_REMOVED:
+        return None
+    return Removal(place.path, int(place.node.getId()), *found, text)
+
+
+def _position(
+    robot: Any, node: Any
+) -> Generator[None, None, tuple[int | None, str, int | None] | None]:
+    """The parent's number (None: the root), the field and the index; None where none is found."""
+    root, pace, wanted = robot.getRoot(), Pace(), node.getId()
+    parent = node.getParentNode() or root
+    for name, field, _ in node_fields(parent, inside=False, everything=True):
+        for index, each in entries(field):
+            if each.getId() == wanted:
+                is_top = parent.getId() == root.getId()
+                return None if is_top else int(parent.getId()), name, index
+            yield from pace.rest()
+    return None
 
 
 # Physics has changed these since a command set them, and Webots' own reset restores them.
@@ -296,14 +338,34 @@ class FieldEdit(NamedTuple):
     value: Any
 
 
+class Removal(NamedTuple):
+    """A node that was removed, as text, and its former position.
+
+    Attributes:
+        path: The path of the command.
+        node_id: The number of the node, or of the one that a reset has put in its place.
+        parent_id: The number of its parent; None for the root.
+        field: The name of the field that contained it.
+        entry: Its index in the field; None in a field for a single node.
+        text: Its text as in a world file.
+    """
+
+    path: str
+    node_id: int
+    parent_id: int | None
+    field: str
+    entry: int | None
+    text: str
+
+
 def find_again(robot: Any, node_id: int, name: str) -> Any | None:
     """The field of that name, of a node that may not exist any more."""
     node = robot.getFromId(node_id)
     return None if node is None else node.getField(name)
 
 
-def import_node(field: Any, text: str) -> Any | None:
-    """Add a node to a field of nodes, at its end.
+def import_node(field: Any, text: str, index: int | None = None) -> Any | None:
+    """Add a node to a field of nodes, at an index or at its end.
 
     Webots reports errors in its console only, and the package raises nothing, so the field is
     compared with before.
@@ -315,16 +377,18 @@ def import_node(field: Any, text: str) -> Any | None:
         field.importSFNodeFromString(text)
         return field.getSFNode()
     before = field.getCount()
-    field.importMFNodeFromString(before, text)
-    return field.getMFNode(before) if field.getCount() > before else None
+    index = before if index is None else min(index, before)
+    field.importMFNodeFromString(index, text)
+    return field.getMFNode(index) if field.getCount() > before else None
 
 
 # -- what a reset has to undo ----------------------------------------------------------------------
-# A reset by Webots restores poses and removes added nodes. It does not restore other fields: that
-# is done here, as long as the controller's process lives. Removed nodes come back with a reload.
+# A reset by Webots restores poses and removes added nodes. It does not restore other fields and
+# removed nodes: that is done here, as long as the controller's process lives.
 
 
 MOST_EDITS: Final = 200  # that are put back
+_TOO_MANY: Final = f"does not undo it: at most {MOST_EDITS} changes are remembered"
 
 
 class SceneEdits:
@@ -333,12 +397,15 @@ class SceneEdits:
     Attributes:
         fields: The fields that were set in this run, in that order.
         added: The numbers of the nodes that were added in this run.
+        removed: The nodes that were removed in this run, or put back at its beginning, in the order
+            of their removal.
     """
 
     def __init__(self, session: Session) -> None:
         self._session = session
         self.fields: dict[tuple[int, str, int | None], FieldEdit] = {}
         self.added: set[int] = set()
+        self.removed: list[Removal] = []
 
     def remember_field(self, edit: FieldEdit, node: Any) -> str:
         """Remember that a field of a node is about to be set; what a reset will make of it."""
@@ -346,23 +413,75 @@ class SceneEdits:
         known = self.fields.get(key)
         if self.is_added(node):
             return "removes the node: it was added in this run"
-        if known is None and len(self.fields) >= MOST_EDITS:
-            return f"does not undo it: at most {MOST_EDITS} changes are remembered"
+        if known is None and self._is_full:
+            return _TOO_MANY
         self.fields[key] = edit if known is None else known._replace(value=edit.value)
         return "puts it back"
 
     def is_added(self, node: Any | None) -> bool:
         """Whether a node, or one that contains it, was added in this run."""
-        while node is not None and int(node.getId()) not in self.added:
-            node = node.getParentNode()
-        return node is not None
+        return _is_within(node, self.added)
+
+    def is_put_back(self, node: Any) -> bool:
+        """Whether a reset has put it back, or one that contains it, and the next one will again."""
+        return _is_within(node, {removal.node_id for removal in self.removed})
+
+    def remember_removed(self, removal: Removal | None, *, is_proto: bool) -> str:
+        """Remember that a node was removed; what a reset will make of it."""
+        if removal is None:
+            return _ONLY_RELOADED
+        if self._is_full:
+            return _TOO_MANY
+        self.removed.append(removal)
+        return _PUT_BACK_PROTO if is_proto else "puts it back"
+
+    @property
+    def _is_full(self) -> bool:
+        return len(self.fields) + len(self.removed) >= MOST_EDITS
 
     def begin_run(self) -> None:
-        """The world was reset: set the fields back that still hold what they were set to."""
+        """The world was reset: undo what Webots has not undone, and nobody else has changed."""
         edits, self.fields, self.added = reversed(self.fields.values()), {}, set()
         outcomes = {edit.path: self._set_back(edit) for edit in edits}
-        if paths := [path for path, is_set in outcomes.items() if is_set]:
-            self._session.journal.event("put_back", {"paths": paths})
+        told = {"paths": [path for path, is_set in outcomes.items() if is_set]}
+        told |= self._bring_back()
+        if facts := {name: paths for name, paths in told.items() if paths}:
+            self._session.journal.event("put_back", dict[str, object](facts))
+
+    def _bring_back(self) -> dict[str, list[str]]:
+        """Add the removed nodes again, the last one first, so that each index is right.
+
+        To Webots they are added nodes then, which the next reset removes.
+        """
+        told: dict[str, list[str]] = {"nodes": [], "not": []}
+        numbers: dict[int | None, int] = {}  # new ones, by those before
+        removals, self.removed = self.removed[::-1], []
+        for removal in removals:
+            parent_id = numbers.get(removal.parent_id, removal.parent_id)
+            again = self._added_again(removal._replace(parent_id=parent_id))
+            if again is None:
+                told["not"].append(removal.path)
+                continue
+            if again.node_id != removal.node_id:
+                told["nodes"].append(removal.path)
+                numbers[removal.node_id] = again.node_id
+            self.removed.insert(0, again)
+        return told
+
+    def _added_again(self, removal: Removal) -> Removal | None:
+        """With the number that it has now; None where Webots did not add it."""
+        try:
+            robot = self._session.simulation.robot
+            if robot.getFromId(removal.node_id) is not None:
+                return removal
+            top = removal.parent_id is None
+            parent = robot.getRoot() if top else robot.getFromId(removal.parent_id)
+            field = None if parent is None else parent.getField(removal.field)
+            node = None if field is None else import_node(field, removal.text, removal.entry)
+            return None if node is None else removal._replace(node_id=int(node.getId()))
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            self._session.errors.failed(f"putting {removal.path} back", error)
+            return None
 
     def _set_back(self, edit: FieldEdit) -> bool:
         """Set a field to its value before; False where Webots or someone else has set it since."""
@@ -377,3 +496,10 @@ class SceneEdits:
             self._session.errors.failed(f"putting {edit.path} back", error)
             return False
         return True
+
+
+def _is_within(node: Any | None, numbers: Collection[int]) -> bool:
+    """Whether a node, or one that contains it, has one of these numbers."""
+    while node is not None and int(node.getId()) not in numbers:
+        node = node.getParentNode()
+    return node is not None

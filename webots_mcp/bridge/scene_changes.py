@@ -301,11 +301,11 @@ def _position(
     robot: Any, node: Any
 ) -> Generator[None, None, tuple[int | None, str, int | None] | None]:
     """The parent's number (None: the root), the field and the index; None where none is found."""
-    root, pace, wanted = robot.getRoot(), Pace(), node.getId()
+    root, pace, node_id = robot.getRoot(), Pace(), node.getId()
     parent = node.getParentNode() or root
     for name, field, _ in node_fields(parent, inside=False, everything=True):
         for index, each in entries(field):
-            if each.getId() == wanted:
+            if each.getId() == node_id:
                 is_top = parent.getId() == root.getId()
                 return None if is_top else int(parent.getId()), name, index
             yield from pace.rest()
@@ -440,12 +440,12 @@ class SceneEdits:
         return len(self.fields) + len(self.removed) >= MOST_EDITS
 
     def begin_run(self) -> None:
-        """The world was reset: undo what Webots has not undone, and nobody else has changed."""
+        """The world was reset: undo what Webots has not undone, and no one else has changed."""
         edits, self.fields, self.added = reversed(self.fields.values()), {}, set()
         outcomes = {edit.path: self._set_back(edit) for edit in edits}
-        told = {"paths": [path for path, is_set in outcomes.items() if is_set]}
-        told |= self._bring_back()
-        if facts := {name: paths for name, paths in told.items() if paths}:
+        put_back = {"paths": [path for path, is_set in outcomes.items() if is_set]}
+        put_back |= self._bring_back()
+        if facts := {name: paths for name, paths in put_back.items() if paths}:
             self._session.journal.event("put_back", dict[str, object](facts))
 
     def _bring_back(self) -> dict[str, list[str]]:
@@ -453,20 +453,20 @@ class SceneEdits:
 
         To Webots they are added nodes then, which the next reset removes.
         """
-        told: dict[str, list[str]] = {"nodes": [], "not": []}
+        put_back: dict[str, list[str]] = {"nodes": [], "not": []}
         numbers: dict[int | None, int] = {}  # new ones, by those before
         removals, self.removed = self.removed[::-1], []
         for removal in removals:
             parent_id = numbers.get(removal.parent_id, removal.parent_id)
             again = self._added_again(removal._replace(parent_id=parent_id))
             if again is None:
-                told["not"].append(removal.path)
+                put_back["not"].append(removal.path)
                 continue
             if again.node_id != removal.node_id:
-                told["nodes"].append(removal.path)
+                put_back["nodes"].append(removal.path)
                 numbers[removal.node_id] = again.node_id
             self.removed.insert(0, again)
-        return told
+        return put_back
 
     def _added_again(self, removal: Removal) -> Removal | None:
         """With the number that it has now; None where Webots did not add it."""

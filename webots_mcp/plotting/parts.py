@@ -245,6 +245,7 @@ def event_lanes(
     names: Sequence[str],
     rows: int = MOST_LANES,
     known: Mapping[int, Found] | None = None,
+    deadline_s: float = QUESTION_DEADLINE_S,
 ) -> tuple[list[Lane], list[str]]:
     """One lane per kind of event, and notes: of the drawn signals, and of the robot as a whole.
 
@@ -254,11 +255,12 @@ def event_lanes(
         names: The drawn signals.
         rows: How many lanes have room.
         known: By run, what was searched before in all of it, and told by whoever did.
+        deadline_s: For the search; a note says which kinds were not looked for.
     """
     most = min(rows, MOST_LANES)
     drawn = tuple(kind.name for kind in drawn_kinds())
     options = EventOptions(kinds=drawn, signals=tuple(names))
-    found = _found(connection, part, options, known or {})
+    found = _found(connection, part, options, known or {}, deadline_s)
     kinds = [kind for kind in drawn if any(event.kind == kind for event in found.events)]
     lanes = [_lane(kind, found, part) for kind in kinds[:most]]
     notes = list[str]()

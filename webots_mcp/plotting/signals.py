@@ -61,7 +61,7 @@ from webots_mcp.plotting.parts import (
 from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.detection.events import Found
 from webots_mcp.store.reading.ranges import TimeRange
-from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S
+from webots_mcp.store.reading.segment import QUESTION_DEADLINE_S, Deadline
 
 
 def plot_signals(
@@ -115,10 +115,11 @@ def compose_signals(
 
     `found` is what was searched before in the whole of these runs, each event by itself. `room` is
     how much it may be; None for that of a PNG of 900 x 500 pixels. `grouped` are the signals of
-    each panel; None puts those of one unit and scale together. `deadline_s` is for what is read of
-    a range; what is not read in it is hatched, and a note says so.
+    each panel; None puts those of one unit and scale together. `deadline_s` is for all that is
+    read, events last; what is not read in it is hatched, and a note says so.
     """
     room = room or Sheet().room
+    deadline = Deadline(deadline_s)
     mode = mode_signal(known_signals(connection, ranges), bands)
     parts = parts_of(
         connection, ranges, [*names, *([mode] if mode else [])], room.points, deadline_s
@@ -138,7 +139,7 @@ def compose_signals(
     if events and not overlaid:
         drawn = [name for panel in panels for name in panel.names] or names
         marked, event_notes = event_lanes(
-            connection, parts[0], drawn, room.rows - len(below), found
+            connection, parts[0], drawn, room.rows - len(below), found, deadline.left_s
         )
     plot = SignalAxes(
         title=title_of(parts),

@@ -11,7 +11,7 @@ import math
 import sqlite3
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from webots_mcp.naming import REDUCTIONS
 from webots_mcp.store.analysis.arrays import Array, Flags, np
@@ -155,7 +155,7 @@ def _kinds_of(frame: Frame, name: str) -> tuple[set[Kind] | None, int]:
             is_cut = frame.cuts_chunks and (at == 0 or at + len(numbers) == len(frame))
             if is_cut and (held_numbers == np.floor(held_numbers)).all():
                 return None, first  # what made the chunk one of floats may be outside
-        present = set() if values.codes is None else set(np.unique(values.codes).tolist())
+        present: set[int] = set() if values.codes is None else set(np.unique(values.codes).tolist())
         for code, label in enumerate(values.labels, FIRST_LABEL):
             if code not in present:
                 continue
@@ -190,7 +190,7 @@ class Cells:
         is_null: In which rows there is none.
     """
 
-    def __init__(self, frame: Frame, name: str, kind: Kind) -> None:
+    def __init__(self, frame: Frame, name: str, kind: str) -> None:
         values = frame.recorded(name)
         codes = values.codes
         if codes is None:
@@ -208,7 +208,7 @@ class Cells:
                 has_value.append(isinstance(label, str | bool))
         self.is_null: Flags = ~np.array(has_value)[codes]
         if kind == "text":
-            self.values: Array = np.maximum(codes - FIRST_LABEL, 0)
+            self.values: Any = np.maximum(codes - FIRST_LABEL, 0)
         elif kind == "num":
             self.values = numbers
         else:

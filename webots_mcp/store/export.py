@@ -340,13 +340,13 @@ class ByColumn:
     total: int
     progress: Progress | None = None
 
-    def slices(self, rows: int) -> Iterator[tuple[list[Array], list[Cells]]]:
+    def slices(self, rows: int) -> Iterator[tuple[list[Any], list[Cells]]]:
         """So many rows at a time: what `Source.head` names, and the cells of each column."""
         done = 0
         for part in self.parts:
             for frame in part.slices(rows):
                 runs = np.full(len(frame), part.run_id)
-                head = [runs, frame.ids, frame.times, frame.wall_times]
+                head: list[Any] = [runs, frame.ids, frame.times, frame.wall_times]
                 yield head, [Cells(frame, name, column.kind) for name, column in self.columns]
                 done += len(frame)
                 if self.progress is not None:

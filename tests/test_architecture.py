@@ -31,7 +31,7 @@ ALLOWED = {
     "parameter": {"errors", "naming"},
     "stacks": set[str](),
     "waiting_file": {"connection", "errors", "queue", "stacks"},
-    "maintenance": {"connection", "errors", "liveness", "waiting_file"},
+    "maintenance": {"connection", "contract", "errors", "liveness", "waiting_file"},
     "standin": {"standin", "contract"},
     "webots": {"connection", "contract", "errors", "liveness", "webots"},
 }

@@ -17,7 +17,6 @@ Standard library only, because the bridge imports it inside a robot's controller
 from __future__ import annotations
 
 import os
-import shutil
 import sqlite3
 import threading
 import time
@@ -34,6 +33,7 @@ from webots_mcp.connection import (
     require_current,
     text_of,
 )
+from webots_mcp.contract import Database, MemoryDatabase
 from webots_mcp.errors import WebotsMCPError, warn
 from webots_mcp.liveness import Lease, give_back, take
 from webots_mcp.waiting_file import adopt
@@ -47,7 +47,17 @@ WAL_LIMIT_BYTES: Final = 1_000_000  # a shorter log is left alone
 LONG_LOG_BYTES: Final = 12_000_000  # it begins anew, for which rows wait a few milliseconds
 LONGEST_LOG_BYTES: Final = 32_000_000  # its file is cut
 FAST_GROWTH_BYTES: Final = 4_000_000  # in one interval
-HELD_LOG_BYTES: Final = 100_000_000  # three times the longest: a reader's snapshot keeps it long
+# A log that a reader holds cannot begin anew. People are told of one that is longer than this, or,
+# where little space is left, than a share of it.
+HELD_LOG_BYTES: Final = 100_000_000
+SHARE_OF_FREE_SPACE: Final = 0.1
+_SHORTEST_HELD_LOG_BYTES: Final = 40_000_000  # a log that nobody holds may be nearly as long
+_HELD_RETRY_S: Final = 10.0  # while nothing is written: each attempt makes the log longer
+FREE_THE_LOG: Final = (
+    "end the transaction of the program that reads the database, or close that program (a sqlite3 "
+    "shell, a notebook, a browser of databases); the log is cut by itself then, as long as "
+    "'webots-mcp serve' (not --read-only) or a controller runs"
+)
 
 # Another program may have written anything there: an end that is no time has passed.
 _LEASE: Final = (
@@ -90,8 +100,10 @@ class Maintainer(threading.Thread):
         self._interval_s = HURRIED_INTERVAL_S
         self._data_version = -1
         self._log_bytes = 0  # after the last checkpoint
+        self._is_held = False  # a reader keeps the log from beginning anew
+        self._retry_s = 0.0
+        self._has_told_of_reader = False
         self._warned_of = ""
-        self._is_held = False
         self.failures = 0  # rounds that were not finished
 
     def run(self) -> None:
@@ -171,40 +183,50 @@ class Maintainer(threading.Thread):
     def _checkpoint(self, connection: sqlite3.Connection) -> None:
         """Copy the log back, if it is long and grew since the last time; cut it once it rests."""
         log = Path(f"{self._database}-wal")
-        if not log.exists() or log.stat().st_size < WAL_LIMIT_BYTES:
+        file_bytes = log.stat().st_size if log.exists() else 0
+        if file_bytes < WAL_LIMIT_BYTES:
             return
         version = int(connection.execute("PRAGMA data_version").fetchone()[0])
         rests, self._data_version = version == self._data_version, version
+        if rests and self._is_held and time.monotonic() < self._retry_s:
+            return
         log_bytes = self._copy_log(connection, "PASSIVE")
         if log_bytes - self._log_bytes > FAST_GROWTH_BYTES:
             self._interval_s = HURRIED_INTERVAL_S
-        if rests or log_bytes > LONG_LOG_BYTES:
-            cut = rests or log_bytes > LONGEST_LOG_BYTES
-            self._copy_log(connection, "TRUNCATE" if cut else "RESTART")
+        # The file stays long where a commit began the log anew before it could be cut.
+        cut = rests or file_bytes > LONGEST_LOG_BYTES
+        if cut or log_bytes > LONG_LOG_BYTES:
+            log_bytes = self._copy_log(connection, "TRUNCATE" if cut else "RESTART")
             # The first commit into a new log waits until the disk has the log's header. Made here
             # it costs no control loop its time: 5 ms at p99.9.
             self._take_lease(connection)
-            log_bytes = 0
+            self._note_held(is_held=log_bytes > 0)
         self._log_bytes = log_bytes
-        held = held_log(self._database)
-        if held and not self._is_held:
-            warn(held)
-        self._is_held = bool(held)
+
+    def _note_held(self, *, is_held: bool) -> None:
+        """Warn of a reader that holds a long log, once until it lets go."""
+        self._is_held, self._retry_s = is_held, time.monotonic() + _HELD_RETRY_S
+        told = held_log(self._database) if is_held else None
+        if told is not None and not self._has_told_of_reader:
+            warn(f"{told}: {FREE_THE_LOG}")
+        self._has_told_of_reader = is_held and (self._has_told_of_reader or told is not None)
 
     def _copy_log(self, connection: sqlite3.Connection, how: str) -> int:
         """Checkpoint after a commit of one's own, without which the log might begin anew meanwhile.
 
         Returns:
-            How long the log is.
+            How long the log is; 0 once it begins anew.
         """
         if not self._take_lease(connection):
             return 0
         never_wait(connection)  # for readers, with the write lock in hand
         try:
-            ((_, pages, _),) = connection.execute(f"PRAGMA wal_checkpoint({how})").fetchall()
+            ((is_kept, pages, _),) = connection.execute(f"PRAGMA wal_checkpoint({how})").fetchall()
         finally:
             connection.execute(f"PRAGMA busy_timeout={CHECKPOINT_TIMEOUT_MS}")
-        return int(pages) * int(connection.execute("PRAGMA page_size").fetchone()[0])
+        if how != "PASSIVE" and not is_kept:
+            return 0
+        return max(int(pages), 1) * int(connection.execute("PRAGMA page_size").fetchone()[0])
 
     def _give_back(self) -> None:
         if self._connection is None:
@@ -222,20 +244,23 @@ class Maintainer(threading.Thread):
         self._held_before = False
 
 
-def held_log(database: Path) -> str:
-    """A warning where a reader's snapshot keeps the log from beginning anew; else ""."""
+def held_log(database: Database) -> str | None:
+    """What is to be told of a log that is so long that a reader must hold it, else None."""
+    if isinstance(database, MemoryDatabase):
+        return None
+    import shutil  # which a controller loads only here, in the maintainer's thread
+
+    log = Path(f"{database}-wal")
     try:
-        log_bytes = os.stat(f"{database}-wal").st_size  # noqa: PTH116
-        free_bytes = shutil.disk_usage(database.parent).free
+        log_bytes, free_bytes = log.stat().st_size, shutil.disk_usage(log.parent).free
     except OSError:
-        return ""
-    if log_bytes <= HELD_LOG_BYTES:
-        return ""
+        return None  # there is none
+    share_bytes = max(SHARE_OF_FREE_SPACE * free_bytes, _SHORTEST_HELD_LOG_BYTES)
+    if log_bytes <= min(HELD_LOG_BYTES, share_bytes):
+        return None
     return (
-        f"{database.name}-wal has grown to {log_bytes / 1e6:.0f} MB ({free_bytes / 1e9:.1f} GB are "
-        "free on its disk): another program holds a read transaction open, or nothing copies the "
-        "log back; end that transaction (a sqlite3 shell? type COMMIT or .quit), and let "
-        "'webots-mcp serve' or a controller run"
+        f"{log.name} is {log_bytes / 1e6:.0f} MB long, with {free_bytes / 1e9:.1f} GB free: a "
+        "program holds a read transaction, so that the log grows until the disk is full"
     )
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import sqlite3
+import subprocess
+import sys
 import threading
 import time
 from contextlib import closing
@@ -12,7 +14,11 @@ from pathlib import Path
 import pytest
 
 from tests.recordings.rows import Recorded
+from webots_mcp.diagnosis import diagnose, subject_of
+from webots_mcp.diagnosis.recording_checks import database as checked_database
 from webots_mcp.maintenance import LEASE_S, Maintainer
+from webots_mcp.questions.robot_state import webots_list_robots
+from webots_mcp.store.recording import Recording
 
 LEASE = "INSERT INTO lease (name, holder, until_wall_time_s) VALUES ('maintainer', ?, ?)"
 HOLDER = "SELECT holder FROM lease"
@@ -90,6 +96,58 @@ def test_a_log_is_copied_while_it_is_written_begun_anew_when_it_is_long_and_cut_
     assert grow(0) < 10_000
     assert recorded.connection.execute("SELECT count(*) FROM state").fetchone() == (420,)
     assert recorded.connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+    maintainer._disconnect()  # pyright: ignore[reportPrivateUsage]
+
+
+READER = """
+import sqlite3, sys
+connection = sqlite3.connect(sys.argv[1], isolation_level=None)
+connection.execute("BEGIN")
+print(connection.execute("SELECT count(*) FROM state").fetchone(), flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_reader_of_another_program_that_holds_the_log_is_told_until_it_ends(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("webots_mcp.maintenance.LONG_LOG_BYTES", 1_000_000)
+    monkeypatch.setattr("webots_mcp.maintenance.LONGEST_LOG_BYTES", 2_000_000)
+    monkeypatch.setattr("webots_mcp.maintenance.HELD_LOG_BYTES", 3_000_000)
+    file = recorded.database
+    assert isinstance(file, Path)
+    recording = Recording(file, file.parent)
+    robot = recorded.robot()
+    maintainer = Maintainer(file, "server")
+
+    def grow() -> None:
+        for i in range(200):
+            robot.state(i * 1.0, {"text": "x" * 9000})
+        assert maintainer.tick()
+
+    def told() -> tuple[str, str]:
+        found = diagnose(subject_of(recording, "the test"), [checked_database])[0].finding
+        return webots_list_robots.function(
+            recording
+        ).storage or "", f"{found.seen} {found.fix or ''}"
+
+    grow()
+    assert not any("holds a read transaction" in text for text in told())
+    with subprocess.Popen(
+        [sys.executable, "-c", READER, str(file)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as reader:
+        assert reader.stdout is not None and reader.stdout.readline()
+        for _ in range(3):
+            grow()
+        assert Path(f"{file}-wal").stat().st_size > 3_000_000
+        for text in told():
+            assert "MB long" in text and "holds a read transaction" in text
+            assert "end the transaction" in text
+        assert capsys.readouterr().err.count("holds a read transaction") == 1
+        reader.communicate()
+    grow()
+    assert Path(f"{file}-wal").stat().st_size < 100_000
+    assert not any("holds a read transaction" in text for text in told())
     maintainer._disconnect()  # pyright: ignore[reportPrivateUsage]
 
 

@@ -35,7 +35,7 @@ from webots_mcp.diagnosis import (
     wrong,
 )
 from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
-from webots_mcp.maintenance import held_log
+from webots_mcp.maintenance import FREE_THE_LOG, held_log
 from webots_mcp.requirements import install_line, missing_requirements, package_of
 from webots_mcp.setup.wsl import WAY_OUT, is_wsl
 from webots_mcp.store.journal_intake import kept_journals
@@ -244,7 +244,7 @@ def database(subject: Examined) -> Iterator[Diagnosis]:
             mode = "wal" if isinstance(connection, FrozenConnection) else journal_mode(connection)
         seen = f"{subject.file}, {subject.file.stat().st_size / 1e6:.1f} MB"
         if held := held_log(subject.file):
-            yield warning(held, "end the transaction, or the program that holds it")
+            yield warning(held, FREE_THE_LOG)
         elif mode == "wal":
             yield ok(seen)
         else:

@@ -42,7 +42,7 @@ from webots_mcp.errors import (
     NothingRecordedError,
 )
 from webots_mcp.liveness import Lease, still_held
-from webots_mcp.maintenance import held_log
+from webots_mcp.maintenance import FREE_THE_LOG, held_log
 from webots_mcp.naming import counted
 from webots_mcp.queue import any_unfinished
 from webots_mcp.store.chunks import StateColumns, is_chunked_aside, show_chunks_aside
@@ -397,7 +397,7 @@ def storage(connection: sqlite3.Connection) -> dict[str, Any]:
     behind, kept = journals_behind(connection, Path(file)), kept_journals(Path(file))
     said = [_KEPT.format(name, why) for name, why in kept.items()]
     if held := held_log(Path(file)):
-        said.append(held)
+        said.append(f"{held}: {FREE_THE_LOG}")
     if isinstance(connection, FrozenConnection):
         waiting = [*(path.name for path in waiting_paths(Path(file))), *behind]
         said.insert(0, f"{_FROZEN}{_NOT_IN.format(len(waiting)) if waiting else ''}")

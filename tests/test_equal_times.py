@@ -112,7 +112,7 @@ def test_a_plot_is_drawn_or_refused_in_words(folder: Path, compose: Any) -> None
 @pytest.mark.parametrize("calls_at_a_time", [1, 2, 3])
 def test_a_robot_that_stands_went_nowhere_however_often_it_publishes(calls_at_a_time: int) -> None:
     noise = np.random.default_rng(1).normal(0, 0.002, (2, 6000))
-    times: Array = np.arange(6000) // calls_at_a_time * _STEP_S
+    times = (np.arange(6000) // calls_at_a_time * _STEP_S).astype(np.float64)
     ends = [0, 6000]
     x, y = noise
     slow, least_m, most_m = hidden_motion(times, x, y, ends)

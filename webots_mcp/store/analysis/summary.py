@@ -257,7 +257,8 @@ def flat_since(
     away = np.flatnonzero(np.abs(values - values[-1]) > FLAT_BAND * span)
     row = int(away[-1]) + 1 if len(away) else 0
     since_s = float(times[row + _last_step(values[row:])])
-    return since_s if span == 0 or times[-1] - since_s >= 0.1 * (times[-1] - start_s) else None
+    rested_s, lasted_s = times[-1] - since_s, times[-1] - start_s
+    return since_s if span == 0 or rested_s >= 0.1 * lasted_s > 0 else None
 
 
 def find_step(times: Array, values: Array) -> Step | None:

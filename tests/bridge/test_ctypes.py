@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import json
+import subprocess
 import sys
 from typing import Any
 
@@ -144,3 +145,14 @@ def test_ctypes_is_not_imported_for_a_state_without_it(monkeypatch: pytest.Monke
     monkeypatch.delitem(sys.modules, "ctypes")
     assert encoding.encode({"handle": object()}).replaced == {"handle": "type object"}
     assert "ctypes" not in sys.modules
+
+
+def test_an_array_does_not_import_numpy_into_the_controller() -> None:
+    pytest.importorskip("orjson")
+    pytest.importorskip("numpy")
+    code = (
+        "import ctypes, sys; from webots_mcp.bridge.encoding import encode; "
+        "encode({'position': (ctypes.c_double * 3)()}); print('numpy' in sys.modules)"
+    )
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert told.stdout == "False\n"

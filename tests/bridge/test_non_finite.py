@@ -82,3 +82,19 @@ def test_more_paths_than_are_remembered_are_still_named() -> None:
         encoded = encoding.encode(state)
         assert encoded.replaced == dict.fromkeys(state, "inf")
         assert json.loads(encoded.text) == dict.fromkeys(state)
+
+
+@pytest.mark.usefixtures("encoder")
+def test_of_two_places_with_one_path_one_is_named_and_the_other_counted() -> None:
+    states: list[dict[str, Any]] = [
+        {"a.b": math.nan},
+        {"a": {"b": math.inf}},
+        {"a.0": math.nan},
+        {"a": [math.inf, math.nan]},
+    ]
+    for state in states:  # whose paths are remembered from here on
+        assert encoding.encode(state).unnamed == 0
+    for first, second in (states[:2], states[2:]):
+        encoded = encoding.encode(first | second)
+        (path,) = first
+        assert (encoded.replaced[path], encoded.unnamed) == ("nan", 1)

@@ -465,6 +465,7 @@ class Cleaner:
         if (
             len(self.replaced) + self.unnamed < MAX_NAMED
             and len(path := _path(place)) <= self._paths
+            and path not in self.replaced  # as {"a.b": NaN, "a": {"b": NaN}} has
         ):
             self._paths -= len(path)
             self.replaced[path] = kind
@@ -819,6 +820,14 @@ def _in_lists(value: Any) -> object:
     raise _NotPlainError
 
 
+def _orjson_options() -> int:
+    """Arrays of numpy as they are; orjson would import numpy at the first array of another kind.
+
+    That takes a quarter of a second, and no state has arrays of what was never imported.
+    """
+    return orjson.OPT_SERIALIZE_NUMPY if "numpy" in sys.modules else 0
+
+
 def _encode_with_orjson(state: object, null_count: int) -> str | None:
     """None where orjson cannot, or may have turned a NaN silently into null.
 
@@ -829,7 +838,7 @@ def _encode_with_orjson(state: object, null_count: int) -> str | None:
     if orjson is None:
         return None
     try:
-        text = orjson.dumps(state, _in_lists, orjson.OPT_SERIALIZE_NUMPY)
+        text = orjson.dumps(state, _in_lists, _orjson_options())
     except Exception:  # noqa: BLE001  (the user's objects may raise anything; `json` comes next)
         return None
     return text.decode() if text.count(b"null") == null_count else None
@@ -940,14 +949,14 @@ def _without_non_finite(
             if value - value == 0.0:
                 continue
             plain, count = None, 1
-            replaced[under.path] = str(value)
+            _name_each(replaced, [(under.path, str(value))])
         elif kind is dict:
             plain, count = _without_non_finite(value, under, replaced)
         elif _is_plain_array(value):
             plain, names = _replace_non_finite(cast("list[Any]", value))
             if len(replaced) + len(names) > _MOST_NON_FINITE_PATHS:
                 raise _NotPlainError
-            replaced.update((f"{under.path}.{item}", what) for item, what in names)
+            _name_each(replaced, [(f"{under.path}.{item}", what) for item, what in names])
             count = plain.count(None) if names else 0
         else:
             continue
@@ -957,6 +966,18 @@ def _without_non_finite(
             copy[key] = plain
             null_count += count
     return copy, null_count
+
+
+def _name_each(replaced: dict[str, str], names: list[tuple[str, str]]) -> None:
+    """Name what was replaced; where two places have one path, the slow path counts them.
+
+    Raises:
+        _NotPlainError: There are two such places.
+    """
+    expected = len(replaced) + len(names)
+    replaced.update(names)
+    if len(replaced) != expected:
+        raise _NotPlainError
 
 
 # -- the slow path: everything else ------------------------------------------------------------

@@ -174,7 +174,7 @@ def _step_world(session: Session, command: ClaimedCommand, steps: int) -> Progre
     def made() -> int:
         nonlocal counted_steps, counted_to_s
         time_s = simulation.time_s
-        began_s = counted_to_s if time_s >= counted_to_s else 0.0  # somebody reset the simulation
+        began_s = counted_to_s if time_s >= counted_to_s else 0.0  # the simulation was reset
         counted_steps += round((time_s - began_s) / simulation.basic_time_step_s)
         counted_to_s = time_s
         return counted_steps

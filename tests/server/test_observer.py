@@ -47,6 +47,14 @@ HANGS = (
 """
 )
 
+RESETS = (
+    CONTROLLER
+    + """
+    if robot.getTime() > 0.8:
+        robot.simulationReset()
+"""
+)
+
 
 @pytest.fixture
 def begin(tmp_path: Path, start_webots: StartWebots) -> Callable[..., Client]:
@@ -171,3 +179,13 @@ async def test_an_observer_makes_exactly_the_steps_that_were_asked_for(begin: An
             assert result["mode"] == "pause"
             advanced_s = result["sim_time_s"] - began["sim_time_s"]
             assert advanced_s == pytest.approx(result["advanced_s"]) == steps * 0.016
+
+
+async def test_an_observers_steps_are_counted_across_resets(begin: Any) -> None:
+    async with begin(RESETS, "--mode=realtime") as client:
+        await once(client, "webots_get_world_info", lambda at: at.get("in_world"))
+        asked = {"command": "step", "steps": 120, "robot": "mcp_observer"}
+        answer = await ask(client, "webots_simulation_control", **asked)
+        assert (answer["outcome"], answer["result"]["steps"]) == ("done", 120)
+        assert answer["result"]["advanced_s"] == pytest.approx(120 * 0.016)
+        assert answer["result"]["sim_time_s"] < 1.0

@@ -167,12 +167,17 @@ def _step_world(session: Session, command: ClaimedCommand, steps: int) -> Progre
     """
     pause, simulation, watch = session.pause, session.simulation, session.watch
     simulation.pump()  # the newest answer may be older than the world
-    from_s = simulation.time_s
+    counted_steps, counted_to_s = 0, simulation.time_s
     pause.change_mode_temporarily(command.id, "real_time", stepping=True)
     watch.stepping = command.id
 
     def made() -> int:
-        return round((simulation.time_s - from_s) / simulation.basic_time_step_s)
+        nonlocal counted_steps, counted_to_s
+        time_s = simulation.time_s
+        began_s = counted_to_s if time_s >= counted_to_s else 0.0  # the simulation was reset
+        counted_steps += round((time_s - began_s) / simulation.basic_time_step_s)
+        counted_to_s = time_s
+        return counted_steps
 
     def steps_until(count: int, go_on: Callable[[], object], last: int = 0) -> Generator[None]:
         until_s = time.monotonic() + _ROUND_S
@@ -199,7 +204,7 @@ def _step_world(session: Session, command: ClaimedCommand, steps: int) -> Progre
     watch.stepping = None
     session.look()
     pause.begin(Cause(command.id))
-    counted = {"steps": made(), "advanced_s": round(simulation.time_s - from_s, 6)}
+    counted = {"steps": made(), "advanced_s": round(made() * simulation.basic_time_step_s, 6)}
     return {**_miscounted(made(), steps), **counted, **_mode(session), **why}
 
 

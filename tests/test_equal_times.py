@@ -22,7 +22,6 @@ from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plugins.report.making import make_report
 from webots_mcp.questions import all_questions
 from webots_mcp.questions.declaring import Caller, MergedQuestion, Question
-from webots_mcp.store.analysis.arrays import Array
 from webots_mcp.store.analysis.summary import flat_since
 from webots_mcp.store.analysis.track import hidden_motion
 from webots_mcp.store.export import FOR_VIEWERS, FORMATS, export, export_for_viewers

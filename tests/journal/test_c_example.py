@@ -28,7 +28,8 @@ QUESTIONS: list[tuple[str, dict[str, Any]]] = [
     ("webots_list_signals", {}),
     ("webots_get_sensors", {}),
 ]
-OF_ITSELF = ("age_s", "status", "why", "hint", "next")  # what differs by who recorded, and when
+# What differs by who recorded, and when; a journal has no devices.
+OF_ITSELF = ("age_s", "status", "why", "hint", "next", "devices_not_named_in_state")
 
 
 def record_in_python(folder: Path) -> tuple[list[list[float]], list[list[float]]]:

@@ -7,23 +7,9 @@ import math
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from webots_mcp.bridge import encoding
 
-NUMBERS = st.sampled_from([0.5, -2.0, 7, math.inf, -math.inf, math.nan])
-VALUES: st.SearchStrategy[Any] = st.recursive(
-    NUMBERS
-    | st.none()
-    | st.just("null")
-    | st.lists(NUMBERS, max_size=4)
-    | st.lists(NUMBERS, max_size=3).map(tuple)
-    | st.lists(st.lists(NUMBERS, max_size=2), max_size=2),
-    lambda inner: st.dictionaries(st.sampled_from("abc"), inner, max_size=3),
-    max_leaves=8,
-)
-STATES = st.dictionaries(st.sampled_from("abc"), VALUES, max_size=3)
 WHEELS = {
     name: {"target_position_rad": math.inf, "target_velocity_rad_s": 2.5}
     for name in ("left wheel", "right wheel")
@@ -35,18 +21,6 @@ def without_slow_path(monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError(f"{state} took the slow path")
 
     monkeypatch.setattr(encoding, "_encode_replacing", refuse)
-
-
-@pytest.mark.usefixtures("encoder")
-@given(states=st.lists(STATES, min_size=1, max_size=6))
-@settings(max_examples=300, deadline=None)
-def test_rows_are_the_same_with_and_without_remembered_paths(states: list[Any]) -> None:
-    for state in states:
-        before = repr(state)
-        encoded, slow = encoding.encode(state), encoding._encode_replacing(state)
-        assert json.loads(encoded.text) == json.loads(slow.text)
-        assert (encoded.replaced, encoded.unnamed) == (slow.replaced, slow.unnamed)
-        assert repr(state) == before
 
 
 @pytest.mark.usefixtures("encoder")

@@ -1,4 +1,4 @@
-"""Commands where no server runs ingest what controllers left, or say what their answer lacks."""
+"""Commands where no server runs ingest what controllers left, or say how many rows are missing."""
 
 from __future__ import annotations
 

@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from webots_mcp.naming import find_mode, find_position, metres_in, unit_in
-from webots_mcp.signal_register import kind_of, turn_of
+from webots_mcp.signals.naming import find_mode, find_position, metres_in, unit_in
+from webots_mcp.signals.register import kind_of, turn_of
 
 
 def numbers(*branches: str) -> set[str]:

@@ -32,7 +32,7 @@ from webots_mcp.bridge.mcp_bridge import MCPBridge
 from webots_mcp.bridge.scene import MOST_NODES, SceneNode, read_value, walk
 from webots_mcp.contract import LOOK_AT, MODE_EVENT, OBSERVER, WORLD_EVENT
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.naming import SEEN_SPEED, SOLIDS, WORLD
+from webots_mcp.signals.naming import SEEN_SPEED, SOLIDS, WORLD
 
 PERIOD_MS: Final = 100  # of simulation time between two rows, unless another is asked for
 LONGEST_PERIOD_MS: Final = 60_000

@@ -28,7 +28,7 @@ from webots_mcp.contract import MAX_BREAKPOINTS, PROJECT_FILE, BreakpointAction
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from webots_mcp.conditions import Condition
+    from webots_mcp.signals.conditions import Condition
 
 PAUSED: Final = "paused"  # how a command controls the loop: the column session.pause_state
 STEPPING: Final = "stepping"

@@ -48,7 +48,6 @@ from webots_mcp.contract import Database, MemoryDatabase
 from webots_mcp.errors import NoDatabaseError, WebotsMCPError, warn
 from webots_mcp.liveness import reap_if_dead
 from webots_mcp.maintenance import Maintainer
-from webots_mcp.naming import harmless_first
 from webots_mcp.questions import all_questions
 from webots_mcp.questions.answers import ShownPicture
 from webots_mcp.questions.budget import compact_json, cut_text
@@ -62,6 +61,7 @@ from webots_mcp.questions.declaring import (
     listed,
     shown_value,
 )
+from webots_mcp.signals.naming import harmless_first
 from webots_mcp.steering.routes import Companions, Launcher
 from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.chunk_making import make_chunks, make_missing_chunks

@@ -17,7 +17,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar, overload
 
-from webots_mcp.conditions.compiler import read_expectation
 from webots_mcp.connection import Role, connect, require_current, schema_version
 from webots_mcp.contract import (
     DATA_DIR_VARIABLE,
@@ -28,10 +27,11 @@ from webots_mcp.contract import (
     Database,
 )
 from webots_mcp.errors import InvalidInputError, NothingRecordedError, WebotsMCPError
-from webots_mcp.naming import Value
-from webots_mcp.parameter import Value as ParameterValue
 from webots_mcp.pauses import PAUSED
 from webots_mcp.queue import Command, CommandQueue, fetch_command, list_commands
+from webots_mcp.signals.conditions.compiler import read_expectation
+from webots_mcp.signals.naming import Value
+from webots_mcp.signals.parameter import Value as ParameterValue
 from webots_mcp.standin import (
     InProcessRobot,
     InProcessSimulation,

@@ -33,7 +33,7 @@ from tests.bridge.monsters import (
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import encoding
 from webots_mcp.bridge.encoding import MAX_NAMED, MAX_ROW_BYTES, Encoded
-from webots_mcp.signal_register import StateChanges
+from webots_mcp.signals.register import StateChanges
 
 POSE = [1.5, 2.5, 0.25]
 MOST_LOOKED_AT = 20_000

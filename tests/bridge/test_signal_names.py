@@ -10,7 +10,7 @@ import pytest
 
 from tests.bridge.conftest import STEP_MS, Recording, write_lock
 from webots_mcp import MCPBridge
-from webots_mcp.signal_register import ADDED_AT_ONCE, MAX_SIGNALS
+from webots_mcp.signals.register import ADDED_AT_ONCE, MAX_SIGNALS
 from webots_mcp.standin import InProcessSupervisor
 
 MOTION = "SELECT x_m, y_m, yaw_rad, mode, speed, commanded_speed FROM robot_now"

@@ -17,10 +17,10 @@ from mcp import Client
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp import MCPBridge
 from webots_mcp.cli import main
-from webots_mcp.conditions.compiler import read_expectation
 from webots_mcp.connection import connect, create_schema
 from webots_mcp.errors import InvalidConditionError, InvalidInputError, UnknownSignalError
 from webots_mcp.server import create_server
+from webots_mcp.signals.conditions.compiler import read_expectation
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.checks import check_run
 from webots_mcp.store.detection.events import find_events

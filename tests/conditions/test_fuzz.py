@@ -7,9 +7,9 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from webots_mcp.conditions import parse_condition
-from webots_mcp.conditions.syntax import MAX_CHARACTERS
 from webots_mcp.errors import ConditionFailedError, InvalidConditionError
+from webots_mcp.signals.conditions import parse_condition
+from webots_mcp.signals.conditions.syntax import MAX_CHARACTERS
 
 _PIECES = """
     x mode a.b pose lidar.min front[2] for and or not in is if else lambda def yield await 0.5 1

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from webots_mcp.conditions import parse_condition
 from webots_mcp.errors import InvalidConditionError
+from webots_mcp.signals.conditions import parse_condition
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from webots_mcp.conditions import Evaluator, parse_condition
 from webots_mcp.errors import ConditionFailedError
+from webots_mcp.signals.conditions import Evaluator, parse_condition
 
 
 def holding(text: str, *states: dict[str, Any], every_s: float = 0.1) -> list[bool]:

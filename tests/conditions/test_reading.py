@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from webots_mcp.bridge import encoding
 from webots_mcp.bridge.encoding import encode, plain
-from webots_mcp.conditions.signal_values import reader
-from webots_mcp.naming import flatten
+from webots_mcp.signals.conditions.signal_values import reader
+from webots_mcp.signals.naming import flatten
 
 
 def _float64(number: float) -> Any:

@@ -6,8 +6,8 @@ import pytest
 
 from tests.conditions.writing import Rows
 from tests.frames import frame_of_states
-from webots_mcp.conditions.scoring import Facts, Scored, parse_score
 from webots_mcp.errors import ConditionFailedError, InvalidConditionError, UnknownSignalError
+from webots_mcp.signals.conditions.scoring import Facts, Scored, parse_score
 from webots_mcp.store.detection.condition import aggregated
 
 STATES: Rows = [

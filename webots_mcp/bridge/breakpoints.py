@@ -22,9 +22,9 @@ from webots_mcp.pauses import ARMED, OF_CONTROLLER, SET, VIOLATION, Cause
 
 if TYPE_CHECKING:
     from webots_mcp.bridge.session import Session
-    from webots_mcp.conditions import Condition, Evaluator
-    from webots_mcp.conditions.compiler import Expectation, Violated
-    from webots_mcp.naming import Value
+    from webots_mcp.signals.conditions import Condition, Evaluator
+    from webots_mcp.signals.conditions.compiler import Expectation, Violated
+    from webots_mcp.signals.naming import Value
 
 MOST_EVENTS: Final = 1000  # of one breakpoint in one run: a flickering condition fills no database
 _UNPUBLISHED_S: Final = 1.0  # a signal that was not published for so long is reported
@@ -169,8 +169,8 @@ class Breakpoints:
     def _read(
         self, number: int, text: bytes, action: bytes, after_hits: int, *expected: bytes | None
     ) -> Breakpoint | None:
-        from webots_mcp.conditions import parse_condition
-        from webots_mcp.conditions.compiler import parse_expectation
+        from webots_mcp.signals.conditions import parse_condition
+        from webots_mcp.signals.conditions.compiler import parse_expectation
 
         name, expects, during = (
             None if each is None else each.decode("utf-8", "replace") for each in expected
@@ -198,7 +198,7 @@ class Breakpoints:
             InvalidInputError: The condition is not of the language, there is no such action, or
                 there are too many.
         """
-        from webots_mcp.conditions import parse_condition
+        from webots_mcp.signals.conditions import parse_condition
 
         condition = parse_condition(text)
         _require_action(action, after_hits)
@@ -210,7 +210,7 @@ class Breakpoints:
         Raises:
             InvalidInputError: As of `set`.
         """
-        from webots_mcp.conditions.compiler import parse_expectation
+        from webots_mcp.signals.conditions.compiler import parse_expectation
 
         return self._arm(_expected(None, parse_expectation(text, during, name)))
 
@@ -410,7 +410,7 @@ def read_goal(params: dict[str, Any]) -> Goal:
 
 
 def _condition(name: str, params: dict[str, Any]) -> Condition | None:
-    from webots_mcp.conditions.compiler import (
+    from webots_mcp.signals.conditions.compiler import (
         parse_condition,  # only here: most controllers never need it
     )
 

@@ -16,8 +16,8 @@ from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
 from webots_mcp.contract import BUILT_IN_ACTIONS
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.naming import harmless_first
 from webots_mcp.queue import CLAIM, CLAIMED_SINCE, PEEK, SUCCESSOR_PID
+from webots_mcp.signals.naming import harmless_first
 
 if TYPE_CHECKING:
     from webots_mcp.bridge.session import Session

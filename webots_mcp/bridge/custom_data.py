@@ -31,7 +31,7 @@ from webots_mcp.bridge.session import Session
 from webots_mcp.bridge.simulation import Clock, LoopMeter
 from webots_mcp.contract import CUSTOM_DATA, HEARTBEAT_INTERVAL_S, recorded_name
 from webots_mcp.liveness import is_living
-from webots_mcp.signal_register import SignalNames, StateChanges
+from webots_mcp.signals.register import SignalNames, StateChanges
 
 TEXT: Final = "custom_data"  # the signal of what is no JSON object
 MISSED: Final = "seq_missed"  # how many messages of this run were overwritten before a reading

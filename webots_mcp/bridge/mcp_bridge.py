@@ -32,7 +32,7 @@ from webots_mcp.contract import (
     resolve_database,
 )
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.parameter import declare
+from webots_mcp.signals.parameter import declare
 
 if TYPE_CHECKING:
     import logging

@@ -62,7 +62,7 @@ from webots_mcp.errors import (
     SessionGoneError,
 )
 from webots_mcp.liveness import NO_TIMES, LoopStatus, RecordingStatus, write_heartbeat
-from webots_mcp.signal_register import Seen, find_changes, write_changes
+from webots_mcp.signals.register import Seen, find_changes, write_changes
 from webots_mcp.waiting_file import (
     STATEMENTS,
     Kind,

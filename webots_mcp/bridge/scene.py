@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 from webots_mcp.bridge.commands import ClaimedCommand, Progress, whole_number
 from webots_mcp.bridge.error_report import cut
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.naming import nearest_first
+from webots_mcp.signals.naming import nearest_first
 
 if TYPE_CHECKING:
     from webots_mcp.bridge.session import Session

@@ -26,7 +26,7 @@ from webots_mcp.bridge.simulation import QUIT, Clock, Simulation, Step
 from webots_mcp.bridge.watchdog import Watchdog
 from webots_mcp.contract import UNMOVED, UNSEEN, Database, MemoryDatabase
 from webots_mcp.maintenance import Maintainer
-from webots_mcp.signal_register import SignalNames, StateChanges
+from webots_mcp.signals.register import SignalNames, StateChanges
 
 _IDLE_S: Final = 0.5  # a loop that recorded nothing for so long is blocked or waiting
 _UNSEEN_S: Final = 1.0  # of simulation time; less may be one step whose end an interrupt hid

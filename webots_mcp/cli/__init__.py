@@ -28,7 +28,7 @@ from webots_mcp.cli.terminal import (
     value_name,
 )
 from webots_mcp.errors import InvalidInputError, NotAllowedError, WebotsMCPError
-from webots_mcp.naming import is_destructive, spelled_out
+from webots_mcp.signals.naming import is_destructive, spelled_out
 
 if TYPE_CHECKING:
     from cyclopts import App, Argument, CycloptsError

@@ -28,7 +28,7 @@ from contextvars import ContextVar
 from types import FrameType
 from typing import Any, Final, NamedTuple, TextIO, TypeAlias, cast
 
-from webots_mcp.naming import spelled_out
+from webots_mcp.signals.naming import spelled_out
 
 _INTERVAL_S: Final = 0.1  # between two states of the line of progress
 _PLAIN_INTERVAL_S: Final = 3.0  # between two lines where no line can be rewritten

@@ -10,7 +10,6 @@ from typing import Final
 from webots_mcp.contract import find_project
 from webots_mcp.diagnosis import Diagnosis, Examined, check, ok, unclear, warning, worst, wrong
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.naming import find_position
 from webots_mcp.setup import (
     NO_POSITION_OF_ITS_OWN,
     NO_SUPERVISOR,
@@ -24,6 +23,7 @@ from webots_mcp.setup import (
     writes_states,
 )
 from webots_mcp.setup.project_edits import AlreadyPatchedError, attaching_place, is_plain_robot
+from webots_mcp.signals.naming import find_position
 from webots_mcp.store.recording import View
 from webots_mcp.store.robots import live_observer
 from webots_mcp.store.signals import registered

@@ -14,7 +14,7 @@ from typing import Any, Final, Literal, NamedTuple, get_args
 from zlib import crc32
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.naming import spelled_out
+from webots_mcp.signals.naming import spelled_out
 from webots_mcp.store.questions.series import MOST_POINTS
 
 # Colours that people with any kind of colour vision can tell apart.

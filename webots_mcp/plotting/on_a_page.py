@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path as File
 from typing import Any, Final
 
-from webots_mcp.naming import spelled_out
 from webots_mcp.plotting.canvas import ON_A_PAGE, Frame, Room
 from webots_mcp.plotting.curves import Curve, thinned
 from webots_mcp.plotting.intervals import Lane
 from webots_mcp.plotting.signals import SignalAxes, paint_signals
 from webots_mcp.plotting.trajectory import Obstacle, Track, TrajectoryAxes, paint_trajectory
+from webots_mcp.signals.naming import spelled_out
 from webots_mcp.store.questions.series import MOST_POINTS
 
 ROOM: Final = Room(points=MOST_POINTS, panels=8, lanes=8, rows=16)

@@ -10,7 +10,6 @@ from itertools import pairwise
 from typing import Any, Final
 
 from webots_mcp.errors import NothingRecordedError
-from webots_mcp.naming import listed, spelled_out
 from webots_mcp.plotting.canvas import (
     DASHES,
     INK,
@@ -58,6 +57,7 @@ from webots_mcp.plotting.parts import (
     title_of,
     unread_parts,
 )
+from webots_mcp.signals.naming import listed, spelled_out
 from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.detection.events import Found
 from webots_mcp.store.reading.ranges import TimeRange

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.naming import listed, spelled_out
 from webots_mcp.plotting.canvas import (
     DASHES,
     INK,
@@ -54,6 +53,7 @@ from webots_mcp.plotting.parts import (
     title_of,
 )
 from webots_mcp.plotting.signals import line_through
+from webots_mcp.signals.naming import listed, spelled_out
 from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.detection.events import Found
 from webots_mcp.store.detection.kinds import EventOptions

@@ -11,7 +11,6 @@ from typing import Annotated, Any, Final
 
 from pydantic import Field
 
-from webots_mcp.conditions.compiler import Expectation, read_expectation
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.answers import CheckAnswer, ComparisonAnswer, RunsAnswer, Table
 from webots_mcp.questions.budget import (
@@ -49,6 +48,7 @@ from webots_mcp.questions.declaring import (
     Value,
     question,
 )
+from webots_mcp.signals.conditions.compiler import Expectation, read_expectation
 from webots_mcp.store.analysis.summary import MIN_EFFECT_SD, Spread
 from webots_mcp.store.checks import CHECK_DEADLINE_S, check_run
 from webots_mcp.store.checks.finding import Finding

@@ -49,9 +49,9 @@ from webots_mcp.errors import (
     NothingRecordedError,
     WebotsMCPError,
 )
-from webots_mcp.naming import perhaps_meant
 from webots_mcp.questions.answers import Answer, ShownPicture
 from webots_mcp.questions.budget import Client, compact_json, reader
+from webots_mcp.signals.naming import perhaps_meant
 from webots_mcp.store.invalid_rows import past_invalid_rows
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.recording import Recording

@@ -14,7 +14,6 @@ from webots_mcp.contract import CUSTOM_DATA
 from webots_mcp.diagnosis import Checked, diagnose, subject_of, worst
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.liveness import dead_sessions
-from webots_mcp.naming import OBSERVED
 from webots_mcp.questions.answers import (
     DiagnosisAnswer,
     FullStateAnswer,
@@ -44,6 +43,7 @@ from webots_mcp.questions.budget import (
     tokens_of,
 )
 from webots_mcp.questions.declaring import READS, RobotName, RunId, question
+from webots_mcp.signals.naming import OBSERVED
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.observed_pose import pose_at
 from webots_mcp.store.reading.segment import Deadline, Segment, just_after, newest_kept

@@ -13,10 +13,8 @@ import anyio
 from anyio import to_thread
 from pydantic import BeforeValidator, Field, WithJsonSchema
 
-from webots_mcp.conditions.scoring import parse_score
 from webots_mcp.contract import MAX_RUN_S
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.parameter import require_known
 from webots_mcp.questions.answers import TrialsAnswer
 from webots_mcp.questions.budget import (
     condensed,
@@ -40,6 +38,8 @@ from webots_mcp.questions.declaring import (
     question,
 )
 from webots_mcp.questions.send_command import settable
+from webots_mcp.signals.conditions.scoring import parse_score
+from webots_mcp.signals.parameter import require_known
 from webots_mcp.steering.dispatch import ACTION, find_target, known_names, require_possible
 from webots_mcp.steering.trial_plan import TrialPlan, combinations
 from webots_mcp.steering.trial_worker import OF_EACH_TRIAL, TrialWorkers

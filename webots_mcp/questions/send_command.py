@@ -11,11 +11,8 @@ from anyio import to_thread
 from pydantic import Field
 
 from webots_mcp import pauses as stored
-from webots_mcp.conditions import Condition, parse_condition
 from webots_mcp.contract import BUILT_IN_ACTIONS, BreakpointAction, CommandStatus
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.naming import nearest_first
-from webots_mcp.parameter import MOST_PARAMETERS, require_known
 from webots_mcp.questions.answers import (
     BreakpointAnswer,
     BreakpointsAnswer,
@@ -54,6 +51,9 @@ from webots_mcp.questions.declaring import (
     question,
 )
 from webots_mcp.queue import Command, list_commands
+from webots_mcp.signals.conditions import Condition, parse_condition
+from webots_mcp.signals.naming import nearest_first
+from webots_mcp.signals.parameter import MOST_PARAMETERS, require_known
 from webots_mcp.steering.dispatch import Dispatcher, Report, find_target, holds_since, shown_result
 from webots_mcp.store.parameters import COLUMNS, Declared, declared_by, described
 from webots_mcp.store.reading.catalogue import catalogue

@@ -14,8 +14,6 @@ from typing import Any, Final, NamedTuple, cast
 import anyio
 from anyio import to_thread
 
-from webots_mcp.conditions import Condition, parse_condition
-from webots_mcp.conditions.signal_values import SAME_TIME_S
 from webots_mcp.contract import (
     BUILT_IN_ACTIONS,
     CUSTOM_DATA,
@@ -31,7 +29,6 @@ from webots_mcp.errors import (
     UnknownActionError,
     UnknownSignalError,
 )
-from webots_mcp.naming import flatten, perhaps_meant
 from webots_mcp.questions.answers import CommandAnswer, RunAnswer
 from webots_mcp.questions.budget import (
     RESULT_BUDGET_TOKENS,
@@ -48,6 +45,9 @@ from webots_mcp.questions.events import fitting_events, not_shown_of
 from webots_mcp.questions.history import MOST_SIGNALS, trend_tables
 from webots_mcp.questions.monitor import movement
 from webots_mcp.queue import Command, CommandQueue, fetch_command
+from webots_mcp.signals.conditions import Condition, parse_condition
+from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
+from webots_mcp.signals.naming import flatten, perhaps_meant
 from webots_mcp.store.detection.events import search_events
 from webots_mcp.store.detection.kinds import Event
 from webots_mcp.store.questions.runs import pace

@@ -30,7 +30,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, Protocol, TypeAlias
 
-from webots_mcp.conditions import Evaluator, parse_condition
 from webots_mcp.contract import (
     DATA_DIR_VARIABLE,
     DATABASE_NAME,
@@ -45,6 +44,7 @@ from webots_mcp.errors import (
     NoDatabaseError,
 )
 from webots_mcp.requirements import explain_extra
+from webots_mcp.signals.conditions import Evaluator, parse_condition
 from webots_mcp.steering.trial_plan import Range, TrialPlan, WorldPlan
 from webots_mcp.store.chunks import parse
 from webots_mcp.store.logs import LogFilter, Window, newest_lines

@@ -24,7 +24,7 @@ from typing import Any, Final, NamedTuple, TypeAlias, cast
 from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.errors import DatabaseError, MalformedRowError
-from webots_mcp.naming import LONGEST_SPREAD_ARRAY, REDUCTIONS, Value, flatten
+from webots_mcp.signals.naming import LONGEST_SPREAD_ARRAY, REDUCTIONS, Value, flatten
 from webots_mcp.store.analysis.arrays import Array, Indexes, inner, np
 
 MAX_TEXT: Final = 200  # characters of a text value that are kept and compared

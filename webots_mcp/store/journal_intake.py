@@ -34,7 +34,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple, cast
 
-from webots_mcp import liveness, signal_register, waiting_file
+from webots_mcp import liveness, waiting_file
 from webots_mcp.connection import identify_files, in_transaction
 from webots_mcp.contract import (
     CUSTOM_DATA,
@@ -45,7 +45,8 @@ from webots_mcp.contract import (
     recorded_name,
 )
 from webots_mcp.errors import warn
-from webots_mcp.naming import flatten
+from webots_mcp.signals import register as signal_register
+from webots_mcp.signals.naming import flatten
 from webots_mcp.waiting_file import FORMAT, STATEMENTS, Entry, Kind, Taken, journal_parts
 
 BUDGET_S: Final = 5.0  # of a question; what is left waits for the next one, and is said

@@ -36,7 +36,7 @@ from webots_mcp.contract import (
 )
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.liveness import end_session, reap
-from webots_mcp.signal_register import Kind, Seen
+from webots_mcp.signals.register import Kind, Seen
 from webots_mcp.store.chunks import (
     SIM_TIMES,
     STATE_IDS,

@@ -22,7 +22,7 @@ from webots_mcp.liveness import (
     process_identity,
     take,
 )
-from webots_mcp.parameter import Declaration, Value, require_known
+from webots_mcp.signals.parameter import Declaration, Value, require_known
 from webots_mcp.store.analysis.summary import Best, Outcome, Ranking, rank
 from webots_mcp.store.run_rows import Run, columns_of
 

@@ -43,8 +43,8 @@ from webots_mcp.errors import (
 )
 from webots_mcp.liveness import Lease, still_held
 from webots_mcp.maintenance import FREE_THE_LOG, held_log
-from webots_mcp.naming import counted
 from webots_mcp.queue import any_unfinished
+from webots_mcp.signals.naming import counted
 from webots_mcp.store.chunks import StateColumns, is_chunked_aside, show_chunks_aside
 from webots_mcp.store.invalid_rows import is_past_invalid_rows, shadow_if_asked
 from webots_mcp.store.journal_intake import (

@@ -36,7 +36,6 @@ from webots_mcp.liveness import (
     process_alive,
     signal_process,
 )
-from webots_mcp.naming import SOLIDS, WORLD
 from webots_mcp.pauses import (
     HELD_ELSEWHERE,
     LEFT_PAUSED,
@@ -50,6 +49,7 @@ from webots_mcp.pauses import (
     breakpoint_at,
     change_since,
 )
+from webots_mcp.signals.naming import SOLIDS, WORLD
 from webots_mcp.stacks import LOGGER, SIGNAL, Stacks, needs_signal, stacks_at, stacks_path
 from webots_mcp.store.run_rows import Run, columns_of, newest_state, recent_interval_s, state_at
 from webots_mcp.waiting_file import Entry, count_rows, next_entries, read_header, waiting_path

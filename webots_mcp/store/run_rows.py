@@ -19,7 +19,7 @@ from webots_mcp.errors import (
     NothingRecordedError,
     UnknownRunError,
 )
-from webots_mcp.naming import nearest_first
+from webots_mcp.signals.naming import nearest_first
 
 if TYPE_CHECKING:
     from PIL.Image import Image

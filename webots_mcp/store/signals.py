@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
-from webots_mcp.naming import Value, find_mode
-from webots_mcp.signal_register import (
+from webots_mcp.signals.naming import Value, find_mode
+from webots_mcp.signals.register import (
     MOST_CHOICES,
     Kind,
     Place,

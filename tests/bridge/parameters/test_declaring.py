@@ -12,7 +12,7 @@ import pytest
 from tests.bridge.conftest import Recording
 from tests.bridge.parameters.conftest import VALUES, ask
 from webots_mcp import MCPBridge
-from webots_mcp.parameter import MOST_PARAMETERS
+from webots_mcp.signals.parameter import MOST_PARAMETERS
 
 
 def test_a_declaration_is_recorded_with_all_that_it_says(

@@ -12,7 +12,7 @@ from tests.bridge.conftest import Recording, eager
 from tests.bridge.parameters.conftest import VALUES, ask
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.bridge.parameters import MOST_CHANGES
-from webots_mcp.parameter import LARGEST_INT
+from webots_mcp.signals.parameter import LARGEST_INT
 from webots_mcp.standin import InProcessSupervisor
 
 Drive = Callable[[int], None]

@@ -8,8 +8,8 @@ import pytest
 
 from tests.recordings.rover import start_run
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
-from webots_mcp.naming import flatten
-from webots_mcp.signal_register import MAX_SIGNALS, Place, places
+from webots_mcp.signals.naming import flatten
+from webots_mcp.signals.register import MAX_SIGNALS, Place, places
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.questions.series import query_rows
 from webots_mcp.store.questions.trends import trends

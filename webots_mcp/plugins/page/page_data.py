@@ -25,12 +25,12 @@ from webots_mcp.errors import (
     UnknownSignalError,
     WebotsMCPError,
 )
-from webots_mcp.naming import spelled_out
 from webots_mcp.plotting import changed_most
 from webots_mcp.plotting.on_a_page import ROOM, signals_figure, way_figure
 from webots_mcp.plotting.signals import SignalAxes, compose_signals
 from webots_mcp.plotting.trajectory import Obstacle, Track, TrajectoryAxes, compose_trajectory
 from webots_mcp.plugins.report.making import obstacles_of
+from webots_mcp.signals.naming import spelled_out
 from webots_mcp.store.checks import check_run
 from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines
 from webots_mcp.store.parameters import described

@@ -27,11 +27,11 @@ import anyio
 from webots_mcp import __version__
 from webots_mcp.access_token import LOOPBACK, named_host, page_key
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
-from webots_mcp.parameter import Value
 from webots_mcp.plotting.on_a_page import figure_part
 from webots_mcp.plugins.page.page_data import choice_of, draw, look, picture, problem
 from webots_mcp.questions.answers import CommandAnswer
 from webots_mcp.questions.send_command import set_parameters
+from webots_mcp.signals.parameter import Value
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.steering.routes import Attempt
 from webots_mcp.store.chunk_making import make_missing_chunks

@@ -18,7 +18,6 @@ from typing import Any, Final
 
 from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.errors import PoolError, PoolUnavailableError
-from webots_mcp.naming import unit_in
 from webots_mcp.plugins.pool.duckdb_statement import ask
 from webots_mcp.plugins.pool.parquet_files import (
     CHUNK,
@@ -45,6 +44,7 @@ from webots_mcp.plugins.pool.parquet_files import (
 )
 from webots_mcp.plugins.pool.pool_interface import LISTED, Batch, Row, Table, batches, table, tables
 from webots_mcp.plugins.pool.value_columns import NameAndKind, chunks_of, columns_of
+from webots_mcp.signals.naming import unit_in
 from webots_mcp.store.questions.sql import Result
 
 # A part is over when its file is so large, or its rows in memory are, or when what comes at a time

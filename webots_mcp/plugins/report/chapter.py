@@ -10,7 +10,6 @@ from typing import Final, NamedTuple
 
 from webots_mcp.contract import MODE_EVENT, WORLD_EVENT
 from webots_mcp.errors import NothingRecordedError
-from webots_mcp.naming import find_mode
 from webots_mcp.plugins.report.words import (
     Grid,
     Row,
@@ -27,6 +26,7 @@ from webots_mcp.plugins.report.words import (
     told,
     valued,
 )
+from webots_mcp.signals.naming import find_mode
 from webots_mcp.store.checks import check_run
 from webots_mcp.store.detection.events import KINDS, Found, choose, search_events, stored_kinds
 from webots_mcp.store.detection.kinds import Event, EventOptions, Verdicts

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, Literal, NamedTuple
 
-from webots_mcp.conditions.compiler import Expectation
+from webots_mcp.signals.conditions.compiler import Expectation
 from webots_mcp.store.detection.condition import every_call_of
 from webots_mcp.store.detection.events import Found
 from webots_mcp.store.detection.kinds import Event, NotSearchableError

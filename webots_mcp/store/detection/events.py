@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.liveness import dead_sessions
-from webots_mcp.naming import flatten
+from webots_mcp.signals.naming import flatten
 from webots_mcp.store.chunks import parse
 from webots_mcp.store.detection import condition, jump, sensors, standstill, stored
 from webots_mcp.store.detection import jump as oscillation

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
 
-from webots_mcp.naming import in_snake_case, listed, metres_in
+from webots_mcp.signals.naming import in_snake_case, listed, metres_in
 from webots_mcp.store.analysis.arrays import (
     Array,
     Flags,

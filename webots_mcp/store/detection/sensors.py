@@ -10,7 +10,7 @@ from functools import cached_property
 from itertools import pairwise
 from typing import Final
 
-from webots_mcp.naming import find_targets, listed
+from webots_mcp.signals.naming import find_targets, listed
 from webots_mcp.store.analysis.arrays import (
     MOSTLY,
     Array,

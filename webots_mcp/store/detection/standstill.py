@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final, NamedTuple, cast
 
-from webots_mcp.naming import NAME_POSITION
+from webots_mcp.signals.naming import NAME_POSITION
 from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, median, noise_of, np, runs_of
 from webots_mcp.store.analysis.standstill import (
     MOST_AROUND,

@@ -11,13 +11,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.conditions.scoring import Facts, Score, Scored, parse_score
 from webots_mcp.connection import transaction
 from webots_mcp.errors import ConditionFailedError, InvalidInputError, NothingRecordedError
 from webots_mcp.liveness import dead_sessions
-from webots_mcp.naming import FARTHEST_M, NAME_POSITION, listed, nearest_first
-from webots_mcp.parameter import Value
 from webots_mcp.pauses import paused_s
+from webots_mcp.signals.conditions.scoring import Facts, Score, Scored, parse_score
+from webots_mcp.signals.naming import FARTHEST_M, NAME_POSITION, listed, nearest_first
+from webots_mcp.signals.parameter import Value
 from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.summary import (
     Spread,

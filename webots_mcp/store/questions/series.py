@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.naming import Value, flatten, listed
+from webots_mcp.signals.naming import Value, flatten, listed
 from webots_mcp.store.analysis.arrays import Array, Gap, np
 from webots_mcp.store.analysis.summary import LARGEST, Summary
 from webots_mcp.store.chunks import parse

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
-from webots_mcp.naming import words_of
+from webots_mcp.signals.naming import words_of
 from webots_mcp.store import chunk_making
 from webots_mcp.store.analysis.arrays import Array, Indexes, np
 from webots_mcp.store.analysis.summary import (

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import count, pairwise
 from typing import Final, NamedTuple
 
-from webots_mcp.naming import Value
+from webots_mcp.signals.naming import Value
 from webots_mcp.store.analysis.arrays import (
     GAP_INTERVALS,
     Array,

@@ -16,7 +16,8 @@ from dataclasses import dataclass, field, replace
 from functools import reduce
 from typing import Any, Final, TypeAlias, cast
 
-from webots_mcp.conditions.signal_values import (
+from webots_mcp.errors import InvalidConditionError
+from webots_mcp.signals.conditions.signal_values import (
     SAME_TIME_S,
     Changed,
     Displacement,
@@ -29,9 +30,16 @@ from webots_mcp.conditions.signal_values import (
     State,
     reader,
 )
-from webots_mcp.conditions.syntax import FLAGS, Nodes, Scanned, function_of, is_signal, parse, scan
-from webots_mcp.errors import InvalidConditionError
-from webots_mcp.naming import NO_POSITION, Value, find_position, flatten, nearest_first
+from webots_mcp.signals.conditions.syntax import (
+    FLAGS,
+    Nodes,
+    Scanned,
+    function_of,
+    is_signal,
+    parse,
+    scan,
+)
+from webots_mcp.signals.naming import NO_POSITION, Value, find_position, flatten, nearest_first
 
 POSITION: Final = "the position"  # what a displacement reads, whatever its signals are called
 _MOST_OFFERED: Final = 3

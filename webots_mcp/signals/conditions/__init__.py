@@ -4,6 +4,6 @@ The controller's side asks them of each published state, the server's side of re
 both get the same answer.
 """
 
-from webots_mcp.conditions.compiler import Condition, Evaluator, parse_condition
+from webots_mcp.signals.conditions.compiler import Condition, Evaluator, parse_condition
 
 __all__ = ["Condition", "Evaluator", "parse_condition"]

@@ -12,10 +12,10 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple, TypeAlias
 
-from webots_mcp.conditions.compiler import ARITHMETIC, OF_NUMBERS, Compiler, Number
-from webots_mcp.conditions.syntax import Nodes, Scanned, function_of, is_signal, parse, scan
 from webots_mcp.errors import UnknownSignalError
-from webots_mcp.naming import nearest_first
+from webots_mcp.signals.conditions.compiler import ARITHMETIC, OF_NUMBERS, Compiler, Number
+from webots_mcp.signals.conditions.syntax import Nodes, Scanned, function_of, is_signal, parse, scan
+from webots_mcp.signals.naming import nearest_first
 
 _REDUCTIONS: Final = ("min", "max", "first", "last", "mean")
 _DURATION: Final = "duration"

@@ -19,7 +19,7 @@ from functools import lru_cache
 from itertools import islice
 from typing import Any, Final, Literal, NamedTuple, cast
 
-from webots_mcp.naming import (
+from webots_mcp.signals.naming import (
     LONGEST_SPREAD_ARRAY,
     METRES,
     REDUCTIONS,

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any, Final, NamedTuple, TypeAlias, cast
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.naming import nearest_first
+from webots_mcp.signals.naming import nearest_first
 
 Value: TypeAlias = "float | int | bool | str"
 

@@ -13,7 +13,7 @@ import anyio
 import webots_mcp
 from webots_mcp import MemoryDatabase, pytest_plugin, testing
 from webots_mcp.cli import described
-from webots_mcp.connection import connect, create_schema
+from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.server import create_server
 from webots_mcp.store.checks import CHECKS
 

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 from tests.recordings.bridge import record
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 
 # The same examples each time, so that a red run was made red by the change that it tests;
 # `pytest --hypothesis-profile=explore` looks for new ones. No machine is too slow for them.

@@ -3,8 +3,8 @@
 from contextlib import closing
 from pathlib import Path
 
-from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import SCHEMA_VERSION
+from webots_mcp.database.connection import connect, create_schema
 
 OLDER_SCHEMA = SCHEMA_VERSION - 1
 

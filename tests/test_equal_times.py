@@ -15,7 +15,7 @@ import pytest
 
 from tests.recordings.rows import Recorded
 from webots_mcp.cli import main
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory

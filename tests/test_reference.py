@@ -10,7 +10,7 @@ import pytest
 from docs import reference
 from webots_mcp import MemoryDatabase
 from webots_mcp.cli import described, names
-from webots_mcp.connection import SCHEMA_FILE
+from webots_mcp.database.connection import SCHEMA_FILE
 from webots_mcp.server import create_server
 
 

@@ -17,6 +17,7 @@ from contextlib import contextmanager, suppress
 from typing import Final
 
 from webots_mcp.contract import LogLevel, LogSource, find_project, full_path, host_name
+from webots_mcp.database.liveness import give_back, held_jobs, holder_of, lease_of, take
 from webots_mcp.errors import (
     CommandRefusedError,
     DatabaseError,
@@ -24,7 +25,6 @@ from webots_mcp.errors import (
     WebotsMCPError,
     warn,
 )
-from webots_mcp.liveness import give_back, held_jobs, holder_of, lease_of, take
 from webots_mcp.store.logs import ConsoleRows, Said
 from webots_mcp.store.recording import Job, Recording
 from webots_mcp.store.robots import list_robots

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.connection import transaction
 from webots_mcp.console import as_row
 from webots_mcp.contract import (
     OBSERVER_NAME,
@@ -18,6 +17,7 @@ from webots_mcp.contract import (
     host_name,
     require_world_of,
 )
+from webots_mcp.database.connection import transaction
 from webots_mcp.errors import InvalidInputError, NoDatabaseError
 from webots_mcp.setup import controllers_in, has_bridge
 from webots_mcp.store.logs import ConsoleRows

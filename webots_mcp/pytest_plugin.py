@@ -45,7 +45,7 @@ def webots_parameters(
 
 def _require_declared(values: dict[str, Any], databases: Iterable[Database]) -> None:
     """Fail a test whose marker names what no controller has declared."""
-    from webots_mcp.connection import connect
+    from webots_mcp.database.connection import connect
 
     declared = set[str]()
     for database in databases:

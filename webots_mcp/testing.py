@@ -17,7 +17,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar, overload
 
-from webots_mcp.connection import Role, connect, require_current, schema_version
 from webots_mcp.contract import (
     DATA_DIR_VARIABLE,
     DATABASE_NAME,
@@ -26,9 +25,10 @@ from webots_mcp.contract import (
     THROTTLE_VARIABLE,
     Database,
 )
+from webots_mcp.database.connection import Role, connect, require_current, schema_version
+from webots_mcp.database.pauses import PAUSED
+from webots_mcp.database.queue import Command, CommandQueue, fetch_command, list_commands
 from webots_mcp.errors import InvalidInputError, NothingRecordedError, WebotsMCPError
-from webots_mcp.pauses import PAUSED
-from webots_mcp.queue import Command, CommandQueue, fetch_command, list_commands
 from webots_mcp.signals.conditions.compiler import read_expectation
 from webots_mcp.signals.naming import Value
 from webots_mcp.signals.parameter import Value as ParameterValue

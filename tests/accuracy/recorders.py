@@ -27,9 +27,9 @@ from tests.benchmarks.core import Bench, Samples, alternate, duration, ratio
 from tests.benchmarks.processes import environment
 from tests.benchmarks.ways import ORJSON, BridgeWay, RawSqlite, Rover, State, make_states
 from webots_mcp.bridge import encoding
-from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.waiting_file import adopt
+from webots_mcp.database.connection import connect
+from webots_mcp.database.waiting_file import adopt
 
 _STEPS: Final = 125  # in a block: a second
 _LIFE_S: Final = (1.0, 3.0)

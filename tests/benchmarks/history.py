@@ -15,7 +15,7 @@ from typing import Final
 from tests.benchmarks.core import Bench, Line, Target, benchmark, compared, time_calls
 from tests.recordings.long import CYCLE_S, INTERVAL_S, build
 from tests.recordings.rover import WALL_START_S
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.plotting import plot
 from webots_mcp.questions.monitor import look_back
 from webots_mcp.store.chunk_making import make_chunks

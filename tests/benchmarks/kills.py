@@ -15,10 +15,10 @@ from pathlib import Path
 from tests.benchmarks.core import Bench, Line, Target, benchmark
 from tests.benchmarks.processes import environment, our_server, program_line
 from tests.bridge.interrupting import Interrupter, Outcome, drive, make_template, places
-from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.queue import CommandQueue
-from webots_mcp.waiting_file import adopt, waiting_paths
+from webots_mcp.database.connection import connect
+from webots_mcp.database.queue import CommandQueue
+from webots_mcp.database.waiting_file import adopt, waiting_paths
 
 _LONGEST_LIFE_S = 0.3
 _COMMANDS = 5  # for each life

@@ -45,8 +45,8 @@ def claimer(database: str) -> None:
     """Claims the commands of robot 1 until none is left, and says which it got."""
     from pathlib import Path
 
-    from webots_mcp.connection import connect, never_wait
-    from webots_mcp.queue import CLAIM, PEEK
+    from webots_mcp.database.connection import connect, never_wait
+    from webots_mcp.database.queue import CLAIM, PEEK
 
     connection = connect(Path(database), "loop")
     never_wait(connection)

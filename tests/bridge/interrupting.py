@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 import webots_mcp
 from tests.benchmarks.ways import Rover
 from webots_mcp import MCPBridge
-from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.waiting_file import adopt
+from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.waiting_file import adopt
 
 PACKAGE = str(Path(webots_mcp.__file__).parent)
 # What writes; an interrupt anywhere else finds nothing half done.

@@ -12,8 +12,8 @@ import pytest
 
 from tests.bridge.conftest import STEP_MS, Recording, eager
 from webots_mcp import MCPBridge, MemoryDatabase
-from webots_mcp.connection import connect
 from webots_mcp.contract import MAX_BREAKPOINTS
+from webots_mcp.database.connection import connect
 from webots_mcp.errors import InvalidConditionError, InvalidInputError
 from webots_mcp.standin import InProcessRobot, InProcessSupervisor
 

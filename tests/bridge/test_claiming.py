@@ -14,7 +14,7 @@ import pytest
 from tests.bridge.conftest import Recording, eager, heartbeat_now
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import actions
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 
 SUCCESSOR = (

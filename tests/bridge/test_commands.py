@@ -12,7 +12,7 @@ from PIL import Image
 
 from tests.bridge.conftest import STEP_MS, Recording, eager
 from webots_mcp import MCPBridge, MemoryDatabase
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from tests.bridge.conftest import Recording
 from webots_mcp import MCPBridge, MemoryDatabase
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.recording import look
 

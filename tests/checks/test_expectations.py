@@ -17,7 +17,7 @@ from mcp import Client
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp import MCPBridge
 from webots_mcp.cli import main
-from webots_mcp.connection import connect, create_schema
+from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.errors import InvalidConditionError, InvalidInputError, UnknownSignalError
 from webots_mcp.server import create_server
 from webots_mcp.signals.conditions.compiler import read_expectation

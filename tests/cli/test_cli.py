@@ -16,7 +16,7 @@ import pytest
 from tests.recordings.rows import Recorded, RecordedRobot
 from tests.waiting import wait_for
 from webots_mcp.cli import described, main, names
-from webots_mcp.queue import CommandQueue
+from webots_mcp.database.queue import CommandQueue
 from webots_mcp.store.logs import Follower
 
 

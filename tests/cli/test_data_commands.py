@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from webots_mcp.cli import main
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.store.parameters import Result, create_trial_set, finish_trial, trials_of
 from webots_mcp.store.retention import Limit, parse_limit, size_text
 

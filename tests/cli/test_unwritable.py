@@ -15,7 +15,7 @@ from tests import unprivileged
 from tests.recordings.rows import Recorded
 from tests.server.conftest import ask, fail
 from webots_mcp.contract import new_uuid
-from webots_mcp.waiting_file import waiting_path
+from webots_mcp.database.waiting_file import waiting_path
 
 pytestmark = [
     pytest.mark.anyio,

@@ -11,7 +11,7 @@ import pytest
 
 from tests.recordings.rows import Recorded
 from webots_mcp.cli import main
-from webots_mcp.waiting_file import FORMAT, waiting_path
+from webots_mcp.database.waiting_file import FORMAT, waiting_path
 
 
 @pytest.fixture

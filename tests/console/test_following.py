@@ -24,7 +24,7 @@ from tests.webots.server import WebotsServer
 from webots_mcp import console
 from webots_mcp.console import follow_console, job_of
 from webots_mcp.contract import host_name
-from webots_mcp.liveness import holder_of
+from webots_mcp.database.liveness import holder_of
 from webots_mcp.store.recording import Recording
 from webots_mcp.webots import Instance
 

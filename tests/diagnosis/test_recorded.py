@@ -17,14 +17,14 @@ from tests.diagnosis.conftest import Look
 from tests.older_recording import OLDER_SCHEMA, make_older
 from tests.recordings.rows import Recorded, RecordedRobot
 from webots_mcp.contract import SCHEMA_VERSION
-from webots_mcp.queue import CommandQueue
-from webots_mcp.waiting_file import waiting_path
+from webots_mcp.database.queue import CommandQueue
+from webots_mcp.database.waiting_file import waiting_path
 
 KILLED = """
 import os, signal, sys
 from pathlib import Path
 from webots_mcp import MCPBridge
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 
 file = Path(sys.argv[1])

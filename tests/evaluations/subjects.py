@@ -12,8 +12,8 @@ import numpy as np
 from tests.checks.judging import HEALTHY
 from tests.checks.labelled import FAULTS, WRITTEN, healthy, record
 from tests.golden.drawing import KINDS
-from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, bundled
+from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.standin import Simulation
 
 RECORDED_BY_CODE = {*KINDS, HEALTHY, *FAULTS, *WRITTEN}

@@ -23,7 +23,7 @@ from mcp.server import MCPServer
 from tests.golden.drawing import Kind
 from tests.report.conftest import Shown
 from webots_mcp.cli import main
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory

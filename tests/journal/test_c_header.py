@@ -23,9 +23,9 @@ from mcp import Client
 from tests.waiting import wait_for
 from webots_mcp.cli import main
 from webots_mcp.contract import C_HEADER
+from webots_mcp.database.waiting_file import journal_parts
 from webots_mcp.server import create_server
 from webots_mcp.store.recording import Recording
-from webots_mcp.waiting_file import journal_parts
 
 HERE = Path(__file__).parent
 STRICT = ["-O1", "-Wall", "-Wextra", "-Werror", "-pedantic", "-DWMCP_PART_BYTES=30000"]

@@ -17,12 +17,12 @@ from typing import Any
 import pytest
 
 from webots_mcp import MCPBridge
-from webots_mcp.connection import connect, create_schema
+from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.waiting_file import journal_parts
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.journal_intake import take_in_journals
 from webots_mcp.store.recording import Recording, view_of
 from webots_mcp.store.robots import list_robots
-from webots_mcp.waiting_file import journal_parts
 
 FILES = sorted((Path(__file__).parent / "conformance").glob("*.jsonl"))
 SESSION = "5f0d1f6e-3a52-4d8e-9c2b-0a1b2c3d4e5f"

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from webots_mcp import MemoryDatabase
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.observer import Observer
 from webots_mcp.standin import InProcessSimulation, InProcessSupervisor
 

@@ -13,8 +13,8 @@ import pytest
 
 from tests.page.conftest import LINE, NAME, Server, write_story
 from tests.waiting import wait_for
-from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
+from webots_mcp.database.connection import connect
 
 pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 from playwright.sync_api import Page, expect

@@ -13,8 +13,8 @@ import pytest
 from tests.page.conftest import Server, write_story
 from tests.recordings.long import build
 from tests.waiting import wait_for
-from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
+from webots_mcp.database.connection import connect
 from webots_mcp.plugins.page.page_data import choice_of, draw
 from webots_mcp.plugins.page.page_server import ChunkMaker
 from webots_mcp.store.chunk_making import LEAST_ROWS

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from webots_mcp import MCPBridge
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.errors import (
     InvalidInputError,
     NothingRecordedError,

@@ -19,7 +19,7 @@ import webots_mcp
 from tests.server.conftest import ask, fail
 from tests.server.test_parameters import TunableDriver
 from webots_mcp.cli import main
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.errors import NotAllowedError
 from webots_mcp.plugins.page.page_server import steer
 from webots_mcp.server import INSTRUCTIONS, create_server

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 from tests.recordings.runs import Recorded
-from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME, new_uuid
+from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.plugins.pool.fetching import Fetched, fetch
 from webots_mcp.plugins.pool.pool_contents import Choice, meant, open_pool
 from webots_mcp.plugins.pool.shipping import Order, Report, ship

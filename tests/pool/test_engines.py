@@ -28,7 +28,7 @@ from tests.pool.rows import (
 )
 from tests.postgres import Server
 from tests.recordings.rover import Recorder, record_rover
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.errors import InvalidInputError, PoolBusyError, PoolError
 from webots_mcp.plugins.pool import duckdb_statement, postgres_pool
 from webots_mcp.plugins.pool.pool_contents import open_pool, pooled_runs, pooled_trial_sets

@@ -22,8 +22,8 @@ from tests.recordings.runs import Recorded
 from tests.store.export.test_export import publish
 from tests.waiting import wait_for
 from webots_mcp import MCPBridge
-from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, new_uuid
+from webots_mcp.database.connection import connect
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.chunk_making import make_chunks

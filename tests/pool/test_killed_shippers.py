@@ -18,7 +18,7 @@ import pytest
 from tests.pool.rows import BeforeWrite, pooled, recorded
 from tests.postgres import Server
 from tests.recordings.bridge import STEP_MS, Rover
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.plugins.pool.pool_contents import open_pool
 from webots_mcp.plugins.pool.shipping import Order, Report, follow, ship
 from webots_mcp.store.chunk_making import make_chunks

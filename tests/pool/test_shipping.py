@@ -18,8 +18,8 @@ from tests.pool.conftest import Shipped
 from tests.pool.parquet import bucket
 from tests.pool.rows import BeforeWrite, pooled, shipping
 from tests.recordings.runs import states
-from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import host_name, new_uuid
+from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.errors import (
     DatabaseError,
     PoolBusyError,

@@ -12,7 +12,7 @@ import pytest
 
 from tests.bridge.conftest import Recording
 from tests.processes.conftest import CONTROLLER, Start, has_states
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.standin import Mode, Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD

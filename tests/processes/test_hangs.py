@@ -14,14 +14,14 @@ import pytest
 from tests.bridge.conftest import Recording
 from tests.diagnosis.conftest import found
 from tests.processes.conftest import PatientSimulation, Start, has_states
-from webots_mcp.connection import connect
 from webots_mcp.contract import HANG_VARIABLE
-from webots_mcp.stacks import stacks_path
+from webots_mcp.database.connection import connect
+from webots_mcp.database.stacks import stacks_path
+from webots_mcp.database.waiting_file import adopt, waiting_paths
 from webots_mcp.standin import Mode, Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 from webots_mcp.store.recording import Recording as Store
 from webots_mcp.store.robots import WAITING_IN_STEP, Status
-from webots_mcp.waiting_file import adopt, waiting_paths
 
 Script = Callable[..., "subprocess.Popen[str]"]
 

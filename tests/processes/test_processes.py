@@ -12,9 +12,9 @@ import pytest
 
 from tests.bridge.conftest import Recording
 from tests.processes.conftest import Start, has_states, last_number
-from webots_mcp.connection import connect, create_schema
-from webots_mcp.liveness import reap
-from webots_mcp.waiting_file import adopt
+from webots_mcp.database.connection import connect, create_schema
+from webots_mcp.database.liveness import reap
+from webots_mcp.database.waiting_file import adopt
 
 COUNTING = """
 n = 0
@@ -232,9 +232,9 @@ def test_controllers_that_start_at_once_on_a_missing_database_all_come_up(
 
 CLAIMER = """
 import sqlite3, sys, time
-from webots_mcp.queue import CLAIM, PEEK
-from webots_mcp.connection import connect
-from webots_mcp.connection import never_wait
+from webots_mcp.database.queue import CLAIM, PEEK
+from webots_mcp.database.connection import connect
+from webots_mcp.database.connection import never_wait
 from pathlib import Path
 
 connection = connect(Path(sys.argv[1]), "loop")

@@ -9,8 +9,8 @@ import pytest
 from tests.bridge.conftest import Recording
 from tests.processes.conftest import Start, has_states
 from tests.processes.test_control import wait
-from webots_mcp.connection import connect
-from webots_mcp.liveness import reap
+from webots_mcp.database.connection import connect
+from webots_mcp.database.liveness import reap
 from webots_mcp.standin import Mode, Simulation
 
 # `front_m` falls and rises with time in the same way in each run, whatever the physics do.

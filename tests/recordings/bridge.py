@@ -22,7 +22,7 @@ from typing import Any
 
 from tests.bridge.conftest import eager, send
 from webots_mcp import MCPBridge
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 
 STEP_MS = 16

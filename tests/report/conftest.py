@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.browsing import chromium
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.plugins.report.making import Report, make_report
 
 __all__ = ["chromium"]

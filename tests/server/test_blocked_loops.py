@@ -19,9 +19,9 @@ from tests.bridge.conftest import Recording
 from tests.processes.conftest import data_dir, filed, has_states, start  # fixtures
 from tests.server.conftest import ask, text_of
 from tests.waiting import until
-from webots_mcp.connection import connect
 from webots_mcp.contract import HANG_VARIABLE
-from webots_mcp.queue import CommandQueue, fetch_command
+from webots_mcp.database.connection import connect
+from webots_mcp.database.queue import CommandQueue, fetch_command
 from webots_mcp.server import create_server
 from webots_mcp.standin import Mode, Simulation
 from webots_mcp.steering.dispatch import withdraw_if_blocked

@@ -22,8 +22,8 @@ from tests.recordings.rows import Recorded, RecordedRobot
 from tests.server.conftest import Connect, ask, fail
 from tests.store.test_queue import claim
 from tests.waiting import until
-from webots_mcp.connection import connect as connect_database
-from webots_mcp.queue import CommandQueue, fetch_command, list_commands
+from webots_mcp.database.connection import connect as connect_database
+from webots_mcp.database.queue import CommandQueue, fetch_command, list_commands
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.requests import BY_COMMAND_LINE, OpenRequest
@@ -339,7 +339,7 @@ async def test_a_locked_database_is_a_clear_error(
     connect: Connect, recorded: Recorded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recorded.robot()
-    monkeypatch.setattr("webots_mcp.connection.OPENING_TIMEOUT_MS", 20)
+    monkeypatch.setattr("webots_mcp.database.connection.OPENING_TIMEOUT_MS", 20)
     recorded.connection.execute("BEGIN IMMEDIATE")
     async with connect() as client:
         assert "stayed locked" in await fail(client, "webots_send_command", action="go")

@@ -14,7 +14,7 @@ from mcp import Client
 from tests.recordings.rows import Recorded, RecordedRobot
 from tests.server.conftest import Connect, Driver, ask, ask_until, fail
 from tests.server.story import rows_of
-from webots_mcp.connection import connect as open_database
+from webots_mcp.database.connection import connect as open_database
 
 pytestmark = pytest.mark.anyio
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.memory import memory_connection
-from webots_mcp.connection import (
+from webots_mcp.database.connection import (
     Step,
     connect,
     create_schema,

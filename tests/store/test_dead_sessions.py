@@ -11,9 +11,9 @@ import pytest
 
 from tests.recordings.rows import Recorded, RecordedRobot, insert
 from webots_mcp.contract import ISSUED_TIME_TO_LIVE_S
-from webots_mcp.liveness import process_identity, reap
+from webots_mcp.database.liveness import process_identity, reap
+from webots_mcp.database.waiting_file import FORMAT, adopt
 from webots_mcp.store.recording import look
-from webots_mcp.waiting_file import FORMAT, adopt
 
 STATUS = "SELECT status FROM command"
 NOBODY = 2**31  # no system gives that pid

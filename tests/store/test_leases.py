@@ -11,8 +11,16 @@ from pathlib import Path
 import pytest
 
 from tests.recordings.rows import Recorded
-from webots_mcp.connection import connect
-from webots_mcp.liveness import LEASE_S, Lease, give_back, holder_of, lease_of, still_held, take
+from webots_mcp.database.connection import connect
+from webots_mcp.database.liveness import (
+    LEASE_S,
+    Lease,
+    give_back,
+    holder_of,
+    lease_of,
+    still_held,
+    take,
+)
 
 JOB = "trial set 1"
 

@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from tests.recordings.rows import Recorded
+from webots_mcp.database.maintenance import LEASE_S, Maintainer
 from webots_mcp.diagnosis import diagnose, subject_of
 from webots_mcp.diagnosis.recording_checks import database as checked_database
-from webots_mcp.maintenance import LEASE_S, Maintainer
 from webots_mcp.questions.robot_state import webots_list_robots
 from webots_mcp.store.recording import Recording
 
@@ -43,7 +43,7 @@ def test_neither_a_failing_work_nor_a_failing_stderr_ends_the_thread(
             again.set()
         raise ZeroDivisionError(len(calls))
 
-    monkeypatch.setattr("webots_mcp.maintenance.INTERVAL_S", 0.02)
+    monkeypatch.setattr("webots_mcp.database.maintenance.INTERVAL_S", 0.02)
     monkeypatch.setattr("sys.stderr", stderr)
     maintainer = Maintainer(recorded.database, "server", work=work)
     maintainer.start()
@@ -70,7 +70,7 @@ def test_a_lease_that_was_taken_before_the_clock_was_set_back_is_free(
 def test_a_log_is_copied_while_it_is_written_begun_anew_when_it_is_long_and_cut_when_it_rests(
     recorded: Recorded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("webots_mcp.maintenance.LONG_LOG_BYTES", 5_000_000)
+    monkeypatch.setattr("webots_mcp.database.maintenance.LONG_LOG_BYTES", 5_000_000)
     assert isinstance(recorded.database, Path)
     log = Path(f"{recorded.database}-wal")
     robot = recorded.robot()
@@ -111,9 +111,9 @@ sys.stdin.read()
 def test_a_reader_of_another_program_that_holds_the_log_is_told_until_it_ends(
     recorded: Recorded, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("webots_mcp.maintenance.LONG_LOG_BYTES", 1_000_000)
-    monkeypatch.setattr("webots_mcp.maintenance.LONGEST_LOG_BYTES", 2_000_000)
-    monkeypatch.setattr("webots_mcp.maintenance.HELD_LOG_BYTES", 3_000_000)
+    monkeypatch.setattr("webots_mcp.database.maintenance.LONG_LOG_BYTES", 1_000_000)
+    monkeypatch.setattr("webots_mcp.database.maintenance.LONGEST_LOG_BYTES", 2_000_000)
+    monkeypatch.setattr("webots_mcp.database.maintenance.HELD_LOG_BYTES", 3_000_000)
     file = recorded.database
     assert isinstance(file, Path)
     recording = Recording(file, file.parent)
@@ -155,7 +155,7 @@ def test_before_each_checkpoint_there_is_a_commit_that_no_checkpoint_has_copied(
     recorded: Recorded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Else another's commit could begin the log anew while a checkpoint starts."""
-    monkeypatch.setattr("webots_mcp.maintenance.LONG_LOG_BYTES", 0)
+    monkeypatch.setattr("webots_mcp.database.maintenance.LONG_LOG_BYTES", 0)
     assert isinstance(recorded.database, Path)
     robot = recorded.robot()
     maintainer = Maintainer(recorded.database, "server")

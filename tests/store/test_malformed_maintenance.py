@@ -10,12 +10,12 @@ import pytest
 
 from tests.recordings.rows import Recorded, insert
 from tests.server.malformed import NOT_UTF8, Damage
-from webots_mcp.liveness import dead_sessions
-from webots_mcp.maintenance import Maintainer
+from webots_mcp.database.liveness import dead_sessions
+from webots_mcp.database.maintenance import Maintainer
+from webots_mcp.database.waiting_file import FORMAT, adopt
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.purge import prune
 from webots_mcp.store.retention import Limit, Retention
-from webots_mcp.waiting_file import FORMAT, adopt
 
 BLOB = b"\x00\xff\x01"
 IN_CHUNKS = (

@@ -12,11 +12,10 @@ from pathlib import Path
 import pytest
 
 from tests.recordings.rows import Recorded
-from webots_mcp import liveness
-from webots_mcp.connection import connect
 from webots_mcp.contract import Database
-from webots_mcp.errors import InvalidInputError
-from webots_mcp.queue import (
+from webots_mcp.database import liveness
+from webots_mcp.database.connection import connect
+from webots_mcp.database.queue import (
     CLAIM,
     MAX_PARAMS_BYTES,
     CommandQueue,
@@ -24,6 +23,7 @@ from webots_mcp.queue import (
     fetch_command,
     list_commands,
 )
+from webots_mcp.errors import InvalidInputError
 
 
 def claim(connection: sqlite3.Connection, robot_id: int, session_id: int) -> list[int]:

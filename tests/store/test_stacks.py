@@ -19,7 +19,7 @@ import pytest
 from tests.recordings.rows import Recorded
 from tests.store.questions.test_outcomes import driving, measure, medians, record
 from webots_mcp import MCPBridge
-from webots_mcp.stacks import (
+from webots_mcp.database.stacks import (
     FORMAT,
     SIGNAL,
     VERSION,
@@ -28,11 +28,11 @@ from webots_mcp.stacks import (
     stacks_at,
     stacks_path,
 )
+from webots_mcp.database.waiting_file import adopt
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.questions.compare import compare_runs
 from webots_mcp.store.recording import look
 from webots_mcp.store.run_rows import pace_of
-from webots_mcp.waiting_file import adopt
 
 HEAD = {
     VERSION: FORMAT,

@@ -14,14 +14,14 @@ import pytest
 
 from tests.recordings.rows import Recorded, RecordedRobot
 from webots_mcp import MCPBridge
-from webots_mcp.connection import connect
 from webots_mcp.contract import UNSEEN
-from webots_mcp.queue import CommandQueue
+from webots_mcp.database.connection import connect
+from webots_mcp.database.queue import CommandQueue
+from webots_mcp.database.waiting_file import waiting_paths
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.recording import look
 from webots_mcp.store.robots import Status, judge, newest_session
 from webots_mcp.store.run_rows import current_run
-from webots_mcp.waiting_file import waiting_paths
 
 NOW = 4_000_000_000.0  # later than this process, whose sessions these are
 

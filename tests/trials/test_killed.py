@@ -17,7 +17,7 @@ import pytest
 from tests.processes.stopping import stop_between_writes
 from tests.trials.conftest import Run, command, rows, wait_for_trial
 from tests.waiting import wait_for
-from webots_mcp.liveness import process_identity
+from webots_mcp.database.liveness import process_identity
 from webots_mcp.steering.trial_run import TrialSimulator
 from webots_mcp.webots.starting import CommandLine
 

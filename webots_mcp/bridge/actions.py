@@ -31,14 +31,14 @@ from webots_mcp.contract import (
     full_path,
     require_world_of,
 )
+from webots_mcp.database.liveness import EXTERN
+from webots_mcp.database.pauses import Cause
 from webots_mcp.errors import (
     CommandRefusedError,
     ControllerEndedError,
     InterruptedCommandError,
     InvalidInputError,
 )
-from webots_mcp.liveness import EXTERN
-from webots_mcp.pauses import Cause
 
 if TYPE_CHECKING:
     from webots_mcp.bridge.session import Session

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from webots_mcp.bridge.simulation import Run
-from webots_mcp.waiting_file import ENTRIES_AT_ONCE, Entry, Kind, Values, WaitingFile
+from webots_mcp.database.waiting_file import ENTRIES_AT_ONCE, Entry, Kind, Values, WaitingFile
 
 MAX_WAITING_ROWS: Final = 10_000
 MAX_WAITING_BYTES: Final = 16_000_000

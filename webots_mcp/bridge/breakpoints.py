@@ -12,13 +12,13 @@ from webots_mcp.bridge.error_report import cut, describe, storable
 from webots_mcp.bridge.registration import Registration
 from webots_mcp.bridge.simulation import Clock, Run
 from webots_mcp.contract import BREAKPOINT_ACTIONS, MAX_BREAKPOINTS, MAX_RUN_S, Pace, RunEnd, Then
+from webots_mcp.database.pauses import ARMED, OF_CONTROLLER, SET, VIOLATION, Cause
 from webots_mcp.errors import (
     CommandRefusedError,
     ConditionFailedError,
     InvalidConditionError,
     InvalidInputError,
 )
-from webots_mcp.pauses import ARMED, OF_CONTROLLER, SET, VIOLATION, Cause
 
 if TYPE_CHECKING:
     from webots_mcp.bridge.session import Session

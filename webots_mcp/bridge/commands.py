@@ -1,6 +1,6 @@
 """Commands of this robot, its own actions, and its callbacks of reloads.
 
-The SQL statements and their guarantees are in `webots_mcp.queue`.
+The SQL statements and their guarantees are in `webots_mcp.database.queue`.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from webots_mcp.bridge.error_report import cut, storable
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
 from webots_mcp.contract import BUILT_IN_ACTIONS
+from webots_mcp.database.queue import CLAIM, CLAIMED_SINCE, PEEK, SUCCESSOR_PID
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.queue import CLAIM, CLAIMED_SINCE, PEEK, SUCCESSOR_PID
 from webots_mcp.signals.naming import harmless_first
 
 if TYPE_CHECKING:

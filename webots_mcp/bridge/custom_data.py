@@ -30,7 +30,7 @@ from webots_mcp.bridge.scene import SceneNode, find_field
 from webots_mcp.bridge.session import Session
 from webots_mcp.bridge.simulation import Clock, LoopMeter
 from webots_mcp.contract import CUSTOM_DATA, HEARTBEAT_INTERVAL_S, recorded_name
-from webots_mcp.liveness import is_living
+from webots_mcp.database.liveness import is_living
 from webots_mcp.signals.register import SignalNames, StateChanges
 
 TEXT: Final = "custom_data"  # the signal of what is no JSON object

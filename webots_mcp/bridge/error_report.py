@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from webots_mcp.database.stacks import is_library
 from webots_mcp.errors import DatabaseError, WebotsMCPError, warn
-from webots_mcp.stacks import is_library
 
 if TYPE_CHECKING:
     from types import TracebackType

@@ -11,8 +11,8 @@ from webots_mcp.bridge.error_report import cut, storable
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.simulation import Clock
 from webots_mcp.contract import HEARTBEAT_INTERVAL_S
-from webots_mcp.liveness import LoopStatus
-from webots_mcp.pauses import PAUSED
+from webots_mcp.database.liveness import LoopStatus
+from webots_mcp.database.pauses import PAUSED
 
 MOST_LOG_CHARACTERS: Final = 10_000
 _MOST_LOGGER_CHARACTERS: Final = 200

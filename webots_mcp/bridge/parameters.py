@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar, cast
 
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.contract import PARAMETERS_VARIABLE, recorded_name
+from webots_mcp.database.waiting_file import Kind, Values
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 from webots_mcp.signals.parameter import MOST_PARAMETERS, Declaration, Value, require_known
-from webots_mcp.waiting_file import Kind, Values
 
 if TYPE_CHECKING:
     from webots_mcp.bridge.session import Session

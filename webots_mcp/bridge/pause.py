@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final, Protocol
 
 from webots_mcp.bridge.simulation import QUIT, Step
-from webots_mcp.pauses import (
+from webots_mcp.database.pauses import (
     BRIDGE_CLOSED,
     IN_WEBOTS,
     PAUSE,

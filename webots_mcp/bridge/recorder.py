@@ -38,7 +38,8 @@ from webots_mcp.bridge.registration import (
     register,
 )
 from webots_mcp.bridge.simulation import Clock, Run
-from webots_mcp.connection import (
+from webots_mcp.contract import DATABASE_NAME, Database, new_uuid
+from webots_mcp.database.connection import (
     FAILURES,
     connect,
     create_schema,
@@ -53,17 +54,8 @@ from webots_mcp.connection import (
     schema_version,
     text_of,
 )
-from webots_mcp.contract import DATABASE_NAME, Database, new_uuid
-from webots_mcp.errors import (
-    ForeignDatabaseError,
-    ForkedProcessError,
-    SchemaTooNewError,
-    SchemaTooOldError,
-    SessionGoneError,
-)
-from webots_mcp.liveness import NO_TIMES, LoopStatus, RecordingStatus, write_heartbeat
-from webots_mcp.signals.register import Seen, find_changes, write_changes
-from webots_mcp.waiting_file import (
+from webots_mcp.database.liveness import NO_TIMES, LoopStatus, RecordingStatus, write_heartbeat
+from webots_mcp.database.waiting_file import (
     STATEMENTS,
     Kind,
     Values,
@@ -74,6 +66,14 @@ from webots_mcp.waiting_file import (
     take_in,
     waiting_path,
 )
+from webots_mcp.errors import (
+    ForeignDatabaseError,
+    ForkedProcessError,
+    SchemaTooNewError,
+    SchemaTooOldError,
+    SessionGoneError,
+)
+from webots_mcp.signals.register import Seen, find_changes, write_changes
 
 _LOCK_PATIENCE_S: Final = 0.001  # how long to wait for another thread of this process
 _WRITER_PATIENCE_S: Final = 0.001  # and for another writer, whose commit takes 50 us

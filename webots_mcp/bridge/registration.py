@@ -11,8 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from webots_mcp import liveness
-from webots_mcp.connection import transaction
 from webots_mcp.contract import (
     BY_PROCESS,
     CUSTOM_DATA,
@@ -21,9 +19,11 @@ from webots_mcp.contract import (
     is_extern,
     recorded_name,
 )
-from webots_mcp.liveness import process_identity
-from webots_mcp.pauses import PAUSED
-from webots_mcp.waiting_file import enter_robot, enter_session
+from webots_mcp.database import liveness
+from webots_mcp.database.connection import transaction
+from webots_mcp.database.liveness import process_identity
+from webots_mcp.database.pauses import PAUSED
+from webots_mcp.database.waiting_file import enter_robot, enter_session
 
 # -- the identity of a process ---------------------------------------------------------------------
 

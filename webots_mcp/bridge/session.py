@@ -25,7 +25,7 @@ from webots_mcp.bridge.scene_changes import SceneEdits
 from webots_mcp.bridge.simulation import QUIT, Clock, Simulation, Step
 from webots_mcp.bridge.watchdog import Watchdog
 from webots_mcp.contract import UNMOVED, UNSEEN, Database, MemoryDatabase
-from webots_mcp.maintenance import Maintainer
+from webots_mcp.database.maintenance import Maintainer
 from webots_mcp.signals.register import SignalNames, StateChanges
 
 _IDLE_S: Final = 0.5  # a loop that recorded nothing for so long is blocked or waiting

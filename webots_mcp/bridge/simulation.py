@@ -13,9 +13,9 @@ from contextlib import contextmanager
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.contract import new_uuid
+from webots_mcp.database.liveness import LoopTimes
+from webots_mcp.database.stacks import STEPPING
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.liveness import LoopTimes
-from webots_mcp.stacks import STEPPING
 
 _ROBOT_METHODS: Final = ("step", "getTime", "getName", "getBasicTimeStep")
 _INSIDE: Final = ("robot", "supervisor", "inner", "env", "unwrapped", "_robot")  # in wrappers

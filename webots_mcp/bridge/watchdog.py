@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from webots_mcp.contract import PRIVATE_FILE, Database
-from webots_mcp.stacks import FORMAT, LIBRARIES, SIGNAL, VERSION, read_stacks, stacks_path
-from webots_mcp.waiting_file import lock
+from webots_mcp.database.stacks import FORMAT, LIBRARIES, SIGNAL, VERSION, read_stacks, stacks_path
+from webots_mcp.database.waiting_file import lock
 
 if TYPE_CHECKING:
     from webots_mcp.bridge.session import Session

@@ -371,8 +371,8 @@ def retain(
 
 def _prune(recording: Recording, connection: sqlite3.Connection, retention: Retention) -> Purged:
     """Purge, with somebody who keeps the log of the database short meanwhile."""
-    from webots_mcp.connection import CHECKPOINT_TIMEOUT_MS
-    from webots_mcp.maintenance import Maintainer
+    from webots_mcp.database.connection import CHECKPOINT_TIMEOUT_MS
+    from webots_mcp.database.maintenance import Maintainer
     from webots_mcp.store.purge import prune as purge
     from webots_mcp.store.robots import list_robots
 

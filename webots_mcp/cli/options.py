@@ -179,7 +179,7 @@ class Where:
 
     def may_change(self) -> bool:
         """Whether rows may still come: none do where the file cannot be written."""
-        from webots_mcp.connection import FrozenConnection
+        from webots_mcp.database.connection import FrozenConnection
 
         with self.recording().reader() as connection:
             return not isinstance(connection, FrozenConnection)

@@ -345,8 +345,8 @@ def _expected(data_dir: Path, writing: Writing) -> str | None:
     Raises:
         InvalidInputError: The file is invalid.
     """
-    from webots_mcp.connection import connect, create_schema, schema_version
     from webots_mcp.contract import DATABASE_NAME, make_folder
+    from webots_mcp.database.connection import connect, create_schema, schema_version
     from webots_mcp.store.project_file import compile_project, file_of, read_project
 
     if (file := file_of(data_dir)) is None:

@@ -13,7 +13,8 @@ from contextlib import closing
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from webots_mcp.connection import (
+from webots_mcp.contract import CUSTOM_DATA, DATA_DIR_VARIABLE, HEARTBEAT_LATE_S, SCHEMA_VERSION
+from webots_mcp.database.connection import (
     OLDEST_SQLITE,
     FrozenConnection,
     connect,
@@ -22,7 +23,8 @@ from webots_mcp.connection import (
     require_current,
     schema_version,
 )
-from webots_mcp.contract import CUSTOM_DATA, DATA_DIR_VARIABLE, HEARTBEAT_LATE_S, SCHEMA_VERSION
+from webots_mcp.database.maintenance import FREE_THE_LOG, held_log
+from webots_mcp.database.waiting_file import count_rows, waiting_paths
 from webots_mcp.diagnosis import (
     Diagnosis,
     Examined,
@@ -35,13 +37,11 @@ from webots_mcp.diagnosis import (
     wrong,
 )
 from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
-from webots_mcp.maintenance import FREE_THE_LOG, held_log
 from webots_mcp.requirements import install_line, missing_requirements, package_of
 from webots_mcp.setup.wsl import WAY_OUT, is_wsl
 from webots_mcp.store.journal_intake import kept_journals
 from webots_mcp.store.recording import GETTING_STARTED, View, name_of
 from webots_mcp.store.robots import fetch_session, handler_at_work, rows_waiting
-from webots_mcp.waiting_file import count_rows, waiting_paths
 
 _OLDEST_PYTHON: Final = (3, 10)
 _NEWEST_PYTHON: Final = (3, 13)  # that it was tried with

@@ -24,6 +24,7 @@ from urllib.request import urlopen
 
 from webots_mcp import __version__
 from webots_mcp.contract import UNSEEN, host_name, instance_of
+from webots_mcp.database.pauses import PAUSED, SEEN_PAUSED, SEEN_RUNNING
 from webots_mcp.diagnosis import (
     Diagnosis,
     Examined,
@@ -35,7 +36,6 @@ from webots_mcp.diagnosis import (
     wrong,
 )
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.pauses import PAUSED, SEEN_PAUSED, SEEN_RUNNING
 from webots_mcp.setup.client_entries import (
     TOKEN_VARIABLE,
     Client,

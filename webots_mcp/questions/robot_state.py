@@ -11,9 +11,9 @@ from typing import Annotated, Any, Final, cast
 from pydantic import Field
 
 from webots_mcp.contract import CUSTOM_DATA
+from webots_mcp.database.liveness import dead_sessions
 from webots_mcp.diagnosis import Checked, diagnose, subject_of, worst
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.liveness import dead_sessions
 from webots_mcp.questions.answers import (
     DiagnosisAnswer,
     FullStateAnswer,

@@ -10,8 +10,9 @@ from typing import Annotated, Any, Final, Literal
 from anyio import to_thread
 from pydantic import Field
 
-from webots_mcp import pauses as stored
 from webots_mcp.contract import BUILT_IN_ACTIONS, BreakpointAction, CommandStatus
+from webots_mcp.database import pauses as stored
+from webots_mcp.database.queue import Command, list_commands
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.questions.answers import (
     BreakpointAnswer,
@@ -50,7 +51,6 @@ from webots_mcp.questions.declaring import (
     merged,
     question,
 )
-from webots_mcp.queue import Command, list_commands
 from webots_mcp.signals.conditions import Condition, parse_condition
 from webots_mcp.signals.naming import nearest_first
 from webots_mcp.signals.parameter import MOST_PARAMETERS, require_known

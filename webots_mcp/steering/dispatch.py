@@ -21,6 +21,7 @@ from webots_mcp.contract import (
     LOOPING,
     MAX_RUN_S,
 )
+from webots_mcp.database.queue import Command, CommandQueue, fetch_command
 from webots_mcp.errors import (
     CommandRefusedError,
     ConditionFailedError,
@@ -44,7 +45,6 @@ from webots_mcp.questions.budget import (
 from webots_mcp.questions.events import fitting_events, not_shown_of
 from webots_mcp.questions.history import MOST_SIGNALS, trend_tables
 from webots_mcp.questions.monitor import movement
-from webots_mcp.queue import Command, CommandQueue, fetch_command
 from webots_mcp.signals.conditions import Condition, parse_condition
 from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
 from webots_mcp.signals.naming import flatten, perhaps_meant

@@ -16,8 +16,8 @@ from collections.abc import Mapping
 from contextvars import copy_context
 from typing import Any, Final
 
+from webots_mcp.database.queue import Command, CommandQueue, fetch_command, find_command
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, LeaseLostError, WebotsMCPError
-from webots_mcp.queue import Command, CommandQueue, fetch_command, find_command
 from webots_mcp.steering.dispatch import (
     ACTION,
     BLOCK_NOTICED_S,

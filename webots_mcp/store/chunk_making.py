@@ -17,10 +17,10 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.connection import FAILURES, LONGEST_WRITE_S, FrozenConnection, Step
+from webots_mcp.database.connection import FAILURES, LONGEST_WRITE_S, FrozenConnection, Step
+from webots_mcp.database.liveness import holder_of
+from webots_mcp.database.maintenance import Maintainer
 from webots_mcp.errors import DatabaseError, warn
-from webots_mcp.liveness import holder_of
-from webots_mcp.maintenance import Maintainer
 from webots_mcp.store.chunks import (
     ABSENT,
     EXACT_INTEGERS,

@@ -21,8 +21,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias, cast
 
-from webots_mcp.connection import connect, create_schema
 from webots_mcp.contract import DATABASE_NAME
+from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.errors import DatabaseError, MalformedRowError
 from webots_mcp.signals.naming import LONGEST_SPREAD_ARRAY, REDUCTIONS, Value, flatten
 from webots_mcp.store.analysis.arrays import Array, Indexes, inner, np

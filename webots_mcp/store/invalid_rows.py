@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, Final, cast
 
-from webots_mcp.connection import shipped_statements
+from webots_mcp.database.connection import shipped_statements
 
 MAX_DEPTH: Final = 100  # of JSON: the bridge records 20 levels
 MAX_SIM_TIME_S: Final = 1e10

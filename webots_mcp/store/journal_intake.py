@@ -34,8 +34,6 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple, cast
 
-from webots_mcp import liveness, waiting_file
-from webots_mcp.connection import identify_files, in_transaction
 from webots_mcp.contract import (
     CUSTOM_DATA,
     find_log_level,
@@ -44,10 +42,12 @@ from webots_mcp.contract import (
     is_extern,
     recorded_name,
 )
+from webots_mcp.database import liveness, waiting_file
+from webots_mcp.database.connection import identify_files, in_transaction
+from webots_mcp.database.waiting_file import FORMAT, STATEMENTS, Entry, Kind, Taken, journal_parts
 from webots_mcp.errors import warn
 from webots_mcp.signals import register as signal_register
 from webots_mcp.signals.naming import flatten
-from webots_mcp.waiting_file import FORMAT, STATEMENTS, Entry, Kind, Taken, journal_parts
 
 BUDGET_S: Final = 5.0  # of a question; what is left waits for the next one, and is said
 LONGEST_LINE_BYTES: Final = 4_000_000

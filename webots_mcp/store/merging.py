@@ -19,13 +19,6 @@ from contextlib import closing, contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import Any, Final, get_args
 
-from webots_mcp.connection import (
-    FrozenConnection,
-    connect,
-    create_schema,
-    require_shipped,
-    transaction,
-)
 from webots_mcp.contract import (
     DATABASE_NAME,
     PRIVATE_FILE,
@@ -34,8 +27,16 @@ from webots_mcp.contract import (
     make_folder,
     whole_file,
 )
+from webots_mcp.database.connection import (
+    FrozenConnection,
+    connect,
+    create_schema,
+    require_shipped,
+    transaction,
+)
+from webots_mcp.database.liveness import end_session, reap
+from webots_mcp.database.waiting_file import adopt
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.liveness import end_session, reap
 from webots_mcp.signals.register import Kind, Seen
 from webots_mcp.store.chunks import (
     SIM_TIMES,
@@ -55,7 +56,6 @@ from webots_mcp.store.parameters import fetch_trial_set, is_at_work
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.run_rows import MAX_FILE_BYTES, PICTURES, inside
 from webots_mcp.store.signals import enter_signals
-from webots_mcp.waiting_file import adopt
 
 _SESSIONS: Final = (
     "SELECT id, uuid, robot_id FROM source.session s WHERE :run IS NULL "

@@ -10,10 +10,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.connection import transaction
 from webots_mcp.contract import host_name, new_uuid
-from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
-from webots_mcp.liveness import (
+from webots_mcp.database.connection import transaction
+from webots_mcp.database.liveness import (
     Lease,
     give_back,
     holder_of,
@@ -22,6 +21,7 @@ from webots_mcp.liveness import (
     process_identity,
     take,
 )
+from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
 from webots_mcp.signals.parameter import Declaration, Value, require_known
 from webots_mcp.store.analysis.summary import Best, Outcome, Ranking, rank
 from webots_mcp.store.run_rows import Run, columns_of

@@ -18,8 +18,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from webots_mcp.connection import LONGEST_WRITE_S, Step, is_busy
 from webots_mcp.contract import KEPT_FRAME
+from webots_mcp.database.connection import LONGEST_WRITE_S, Step, is_busy
 from webots_mcp.errors import DatabaseError, InvalidInputError, NothingRecordedError
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.retention import DEFAULT, KEPT, Retention, in_force

@@ -16,8 +16,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from webots_mcp import liveness
-from webots_mcp.connection import (
+from webots_mcp.contract import DATABASE_NAME, Database, MemoryDatabase
+from webots_mcp.database import liveness
+from webots_mcp.database.connection import (
     FAILURES,
     LONGEST_READ_S,
     FrozenConnection,
@@ -33,7 +34,10 @@ from webots_mcp.connection import (
     schema_version,
     text_of,
 )
-from webots_mcp.contract import DATABASE_NAME, Database, MemoryDatabase
+from webots_mcp.database.liveness import Lease, still_held
+from webots_mcp.database.maintenance import FREE_THE_LOG, held_log
+from webots_mcp.database.queue import any_unfinished
+from webots_mcp.database.waiting_file import adopt, count_rows, left_waiting, waiting_paths
 from webots_mcp.errors import (
     DatabaseError,
     LeaseLostError,
@@ -41,9 +45,6 @@ from webots_mcp.errors import (
     NoDatabaseError,
     NothingRecordedError,
 )
-from webots_mcp.liveness import Lease, still_held
-from webots_mcp.maintenance import FREE_THE_LOG, held_log
-from webots_mcp.queue import any_unfinished
 from webots_mcp.signals.naming import counted
 from webots_mcp.store.chunks import StateColumns, is_chunked_aside, show_chunks_aside
 from webots_mcp.store.invalid_rows import is_past_invalid_rows, shadow_if_asked
@@ -59,7 +60,6 @@ from webots_mcp.store.reading.segment import Subject, choose, require_run
 from webots_mcp.store.retention import Asked
 from webots_mcp.store.robots import Robot, Session, Status, ask_stuck, judge, stopped_for
 from webots_mcp.store.run_rows import Run, State, current_run, newest_state
-from webots_mcp.waiting_file import adopt, count_rows, left_waiting, waiting_paths
 
 GETTING_STARTED: Final = (
     "Add two lines to a controller: 'from webots_mcp import MCPBridge' and, where it has made its "

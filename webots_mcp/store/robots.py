@@ -27,8 +27,7 @@ from webots_mcp.contract import (
     host_name,
     recorded_name,
 )
-from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError, UnknownRobotError
-from webots_mcp.liveness import (
+from webots_mcp.database.liveness import (
     EXTERN,
     has_lost_simulator,
     is_living,
@@ -36,7 +35,7 @@ from webots_mcp.liveness import (
     process_alive,
     signal_process,
 )
-from webots_mcp.pauses import (
+from webots_mcp.database.pauses import (
     HELD_ELSEWHERE,
     LEFT_PAUSED,
     PAUSE,
@@ -49,10 +48,17 @@ from webots_mcp.pauses import (
     breakpoint_at,
     change_since,
 )
+from webots_mcp.database.stacks import LOGGER, SIGNAL, Stacks, needs_signal, stacks_at, stacks_path
+from webots_mcp.database.waiting_file import (
+    Entry,
+    count_rows,
+    next_entries,
+    read_header,
+    waiting_path,
+)
+from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError, UnknownRobotError
 from webots_mcp.signals.naming import SOLIDS, WORLD
-from webots_mcp.stacks import LOGGER, SIGNAL, Stacks, needs_signal, stacks_at, stacks_path
 from webots_mcp.store.run_rows import Run, columns_of, newest_state, recent_interval_s, state_at
-from webots_mcp.waiting_file import Entry, count_rows, next_entries, read_header, waiting_path
 
 # Controller processes: who they are, and whether they still live.
 

@@ -21,8 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Final, Literal, NamedTuple
 
+from webots_mcp.database.liveness import process_alive
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.liveness import process_alive
 from webots_mcp.webots import DEFAULT_PORT, Instance, find_webots, instances, program_keeper
 from webots_mcp.webots.orders import WebotsAddress, WebotsLine
 

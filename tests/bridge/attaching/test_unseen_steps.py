@@ -13,8 +13,8 @@ from tests.bridge.conftest import STEP_MS, Recording
 from tests.waiting import wait_for
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.bridge import session as session
-from webots_mcp.connection import connect
 from webots_mcp.contract import UNMOVED
+from webots_mcp.database.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 
 Loop = Callable[[], int]

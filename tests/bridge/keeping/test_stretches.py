@@ -15,8 +15,8 @@ import pytest
 from tests.bridge.conftest import STEP_MS, Recording, catch_up, eager
 from tests.bridge.keeping.conftest import STRETCHES, Make, State, kept_numbers
 from webots_mcp import MCPBridge, MemoryDatabase
-from webots_mcp.connection import connect
 from webots_mcp.contract import KEEP_AFTER_S, KEEP_LAST_S
+from webots_mcp.database.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 
 STEP_S = STEP_MS / 1000

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from webots_mcp import MCPBridge
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
+from webots_mcp.database.waiting_file import adopt
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.waiting_file import adopt
 
 
 @pytest.fixture

@@ -16,12 +16,12 @@ import pytest
 from tests.bridge.conftest import Recording, numbers
 from tests.bridge.on_disk.conftest import POSIX, adopt_into
 from webots_mcp import MCPBridge
-from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.liveness import reap
-from webots_mcp.maintenance import Maintainer
+from webots_mcp.database.connection import connect
+from webots_mcp.database.liveness import reap
+from webots_mcp.database.maintenance import Maintainer
+from webots_mcp.database.waiting_file import adopt, waiting_paths
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.waiting_file import adopt, waiting_paths
 
 pytestmark = pytest.mark.slow
 
@@ -29,7 +29,7 @@ KILLED = """
 import json, os, signal, sys
 from pathlib import Path
 from webots_mcp import MCPBridge
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.standin import InProcessSupervisor
 

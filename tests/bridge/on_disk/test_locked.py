@@ -23,7 +23,7 @@ from tests.waiting import wait_for
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import actions, backlog
 from webots_mcp.bridge.commands import ClaimedCommand
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 
 

@@ -25,8 +25,8 @@ from tests.bridge.conftest import (
 )
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import backlog
-from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
+from webots_mcp.database.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be deleted there")

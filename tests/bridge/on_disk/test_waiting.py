@@ -23,8 +23,8 @@ from tests.bridge.conftest import (
 from tests.bridge.on_disk.conftest import POSIX, adopt_into
 from webots_mcp import MCPBridge
 from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.database.waiting_file import Entry, WaitingFile
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.waiting_file import Entry, WaitingFile
 
 
 @pytest.fixture

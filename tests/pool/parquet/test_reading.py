@@ -16,7 +16,7 @@ import pytest
 from tests.pool.parquet import bucket
 from tests.pool.parquet.conftest import RECORDINGS, Many
 from tests.pool.rows import ship, uuid_of
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.pool import duckdb_statement as asking
 from webots_mcp.plugins.pool.parquet_files import Storage

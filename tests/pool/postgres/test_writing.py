@@ -34,7 +34,7 @@ from tests.pool.rows import (
 )
 from tests.postgres import Server
 from tests.recordings.rover import record_rover
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.errors import InvalidInputError, PoolError, PoolUnavailableError
 from webots_mcp.plugins.pool.pool_contents import open_pool
 from webots_mcp.plugins.pool.pool_interface import Batch, Row, Table, table, tables

@@ -10,7 +10,7 @@ from tests.server.conftest import ask
 from tests.server.history.conftest import EVERY, STORY, tell
 from tests.server.story import client_on, copy_of, rows_of
 from webots_mcp import MCPBridge
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.chunk_making import make_chunks
 

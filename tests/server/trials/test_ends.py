@@ -21,7 +21,7 @@ from tests.server.conftest import Connect, ask, ask_until, fail
 from tests.server.story import rows_of
 from tests.server.trials.conftest import SPEEDS, TunableDriver, trials, value_of
 from tests.waiting import until
-from webots_mcp.connection import connect as database
+from webots_mcp.database.connection import connect as database
 from webots_mcp.server import create_server
 from webots_mcp.standin import Simulation
 

@@ -11,7 +11,7 @@ import pytest
 from tests.server.conftest import Connect, ask, ask_until, fail
 from tests.server.story import rows_of
 from tests.server.trials.conftest import HANGS_AT, TunableDriver, trials, value_of
-from webots_mcp.connection import connect as database
+from webots_mcp.database.connection import connect as database
 from webots_mcp.store.retention import KEPT
 
 pytestmark = pytest.mark.anyio

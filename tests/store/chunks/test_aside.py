@@ -14,7 +14,7 @@ import pytest
 
 from tests import unprivileged
 from tests.recordings.long import build
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.store.chunk_making import LEAST_ROWS, make_missing_chunks
 from webots_mcp.store.purge import prune
 from webots_mcp.store.questions.trends import trends

@@ -12,7 +12,7 @@ import pytest
 
 from tests.recordings.long import build
 from webots_mcp.cli import main
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.store.chunk_making import LEAST_ROWS, make_missing_chunks
 from webots_mcp.store.recording import Recording
 

@@ -18,7 +18,7 @@ from tests.memory import memory_connection
 from tests.recordings.rover import record_rover, start_run
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.bridge.encoding import encode
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.chunk_making import GROUP_ROWS, make_chunks
 from webots_mcp.store.export import FOR_VIEWERS, export, export_for_viewers

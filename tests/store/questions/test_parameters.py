@@ -11,7 +11,7 @@ import pytest
 
 from tests.bridge.conftest import STEP_MS
 from webots_mcp import MCPBridge
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.questions.compare import compare_runs

@@ -15,8 +15,8 @@ import pytest
 
 from tests.recordings.rover import start_run
 from webots_mcp import MCPBridge, MemoryDatabase
-from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
+from webots_mcp.database.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.detection.events import EventOptions, find_events

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from webots_mcp import MCPBridge, MemoryDatabase
-from webots_mcp.connection import connect
+from webots_mcp.database.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.purge import prune
 from webots_mcp.store.questions.series import query_history

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from tests.memory import memory_connection
 from tests.recordings.runs import ROW_S, Recorded, states
 from tests.store.retention.conftest import TABLES
+from webots_mcp.database.liveness import end_session
 from webots_mcp.errors import InvalidInputError, UnknownRunError
-from webots_mcp.liveness import end_session
 from webots_mcp.store.chunk_making import chunk_whole_run, make_chunks
 from webots_mcp.store.purge import purge
 from webots_mcp.store.retention import Limit, Retention, mark_kept

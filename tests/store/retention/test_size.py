@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.recordings.runs import Recorded, states
-from webots_mcp.connection import connect, create_schema
+from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.store import purge as upkeep_work
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.purge import Upkeep

@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from webots_mcp.cli.options import Json, Parameter
 from webots_mcp.cli.terminal import answer_lines, print_json, rewrite
-from webots_mcp.connection import connect
 from webots_mcp.contract import (
     DATA_DIR_VARIABLE,
     DATABASE_NAME,
@@ -27,8 +26,9 @@ from webots_mcp.contract import (
     host_name,
     whole_file,
 )
+from webots_mcp.database.connection import connect
+from webots_mcp.database.liveness import give_back, holder_of, lease_of, process_alive, take
 from webots_mcp.errors import CommandRefusedError, NothingRecordedError, WebotsMCPError
-from webots_mcp.liveness import give_back, holder_of, lease_of, process_alive, take
 from webots_mcp.requirements import quoted
 from webots_mcp.setup.client_entries import server_command
 from webots_mcp.store.recording import Job, Recording

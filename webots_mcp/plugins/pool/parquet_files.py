@@ -39,6 +39,7 @@ from typing import Any, Final, cast
 from uuid import uuid4
 
 from webots_mcp.contract import SCHEMA_VERSION, host_name, make_folder
+from webots_mcp.database.liveness import process_identity
 from webots_mcp.errors import (
     InvalidInputError,
     PoolBusyError,
@@ -46,7 +47,6 @@ from webots_mcp.errors import (
     PoolUnavailableError,
     WebotsMCPError,
 )
-from webots_mcp.liveness import process_identity
 from webots_mcp.plugins.pool.pool_interface import Row, SQLValue, Table, redacted
 from webots_mcp.requirements import explain_extra, install_line
 

@@ -32,8 +32,8 @@ from psycopg.types.string import TextLoader
 from sqlalchemy.dialects import postgresql
 from sqlmodel import SQLModel
 
-from webots_mcp.connection import shipped_objects
 from webots_mcp.contract import SCHEMA_VERSION
+from webots_mcp.database.connection import shipped_objects
 from webots_mcp.errors import InvalidInputError, PoolBusyError, PoolError, PoolUnavailableError
 from webots_mcp.plugins.pool.duckdb_statement import answered
 from webots_mcp.plugins.pool.pool_interface import (

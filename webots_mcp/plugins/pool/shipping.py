@@ -21,7 +21,8 @@ from hashlib import blake2b
 from pathlib import Path
 from typing import Final, NoReturn
 
-from webots_mcp.connection import FrozenConnection
+from webots_mcp.database.connection import FrozenConnection
+from webots_mcp.database.liveness import dead_sessions
 from webots_mcp.errors import (
     DatabaseError,
     InvalidInputError,
@@ -31,7 +32,6 @@ from webots_mcp.errors import (
     PoolError,
     PoolUnavailableError,
 )
-from webots_mcp.liveness import dead_sessions
 from webots_mcp.plugins.pool.pool_interface import (
     BATCH_BYTES,
     BATCH_ROWS,

@@ -15,13 +15,13 @@ from functools import partial, reduce
 from itertools import starmap
 from typing import Any, Final, NamedTuple, cast
 
+from webots_mcp.database.pauses import EXPECTED, OF_PROJECT, VIOLATION
 from webots_mcp.errors import (
     ConditionFailedError,
     InvalidConditionError,
     InvalidInputError,
     UnknownSignalError,
 )
-from webots_mcp.pauses import EXPECTED, OF_PROJECT, VIOLATION
 from webots_mcp.signals.conditions import Condition, Evaluator, parse_condition
 from webots_mcp.signals.conditions.compiler import (
     ARITHMETIC,

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import Any, Final
 
+from webots_mcp.database.liveness import dead_sessions
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.liveness import dead_sessions
 from webots_mcp.signals.naming import flatten
 from webots_mcp.store.chunks import parse
 from webots_mcp.store.detection import condition, jump, sensors, standstill, stored

@@ -11,10 +11,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.connection import transaction
+from webots_mcp.database.connection import transaction
+from webots_mcp.database.liveness import dead_sessions
+from webots_mcp.database.pauses import paused_s
 from webots_mcp.errors import ConditionFailedError, InvalidInputError, NothingRecordedError
-from webots_mcp.liveness import dead_sessions
-from webots_mcp.pauses import paused_s
 from webots_mcp.signals.conditions.scoring import Facts, Score, Scored, parse_score
 from webots_mcp.signals.naming import FARTHEST_M, NAME_POSITION, listed, nearest_first
 from webots_mcp.signals.parameter import Value

@@ -14,7 +14,7 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
 from typing import Concatenate, Final, NamedTuple, ParamSpec, TypeVar
 
-from webots_mcp.connection import keep_deadline
+from webots_mcp.database.connection import keep_deadline
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.store.robots import Robot, resolve_robot, robot_name
 from webots_mcp.store.run_rows import Run, current_run, fetch_run

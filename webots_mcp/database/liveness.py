@@ -17,11 +17,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.connection import transaction
 from webots_mcp.contract import ISSUED_TIME_TO_LIVE_S, REMOTE_SILENCE_S, host_name
+from webots_mcp.database.connection import transaction
+from webots_mcp.database.queue import CLAIMED_BY_ENDED, EXPIRE, LOSE
+from webots_mcp.database.waiting_file import waiting_path
 from webots_mcp.errors import LeaseLostError
-from webots_mcp.queue import CLAIMED_BY_ENDED, EXPIRE, LOSE
-from webots_mcp.waiting_file import waiting_path
 
 # A controller may be silent for hours (paused in Webots) and live; so it is not the silence that
 # decides. But a process that started after the last sign of life has only inherited the pid: after

@@ -31,10 +31,10 @@ from io import FileIO
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Literal, NamedTuple, cast
 
-from webots_mcp import queue
-from webots_mcp.connection import in_transaction
+from webots_mcp.database import queue
+from webots_mcp.database.connection import in_transaction
+from webots_mcp.database.stacks import LOGGER, read_stacks, stacks_path
 from webots_mcp.errors import SessionGoneError, warn
-from webots_mcp.stacks import LOGGER, read_stacks, stacks_path
 
 # What a controller writes while it runs: each kind of write by its name, with its statement.
 

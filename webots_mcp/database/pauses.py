@@ -23,8 +23,8 @@ import sqlite3
 import time
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from webots_mcp.connection import transaction
 from webots_mcp.contract import MAX_BREAKPOINTS, PROJECT_FILE, BreakpointAction
+from webots_mcp.database.connection import transaction
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:

@@ -24,7 +24,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Literal
 
-from webots_mcp.connection import (
+from webots_mcp.contract import Database, MemoryDatabase
+from webots_mcp.database.connection import (
     CHECKPOINT_TIMEOUT_MS,
     connect,
     identify_files,
@@ -33,10 +34,9 @@ from webots_mcp.connection import (
     require_current,
     text_of,
 )
-from webots_mcp.contract import Database, MemoryDatabase
+from webots_mcp.database.liveness import Lease, give_back, take
+from webots_mcp.database.waiting_file import adopt
 from webots_mcp.errors import WebotsMCPError, warn
-from webots_mcp.liveness import Lease, give_back, take
-from webots_mcp.waiting_file import adopt
 
 INTERVAL_S: Final = 1.0
 HURRIED_INTERVAL_S: Final = 0.25  # while the log grows fast: a long one takes long to copy

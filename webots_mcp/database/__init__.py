@@ -1,0 +1,5 @@
+"""The SQLite file that bridge and server share: connection, command queue, liveness, upkeep.
+
+Both sides of a recording use these modules, the bridge inside the robot's controller. They import
+the standard library, `signals`, `contract` and `errors` only.
+"""

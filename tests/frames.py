@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from webots_mcp.analysis.arrays import Array
 from webots_mcp.signals.naming import Value, flatten
-from webots_mcp.store.analysis.arrays import Array
 from webots_mcp.store.chunks import StateColumns
 from webots_mcp.store.reading.frame import Frame
 from webots_mcp.store.reading.frame_source import FrameSource

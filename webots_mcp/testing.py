@@ -17,6 +17,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar, overload
 
+from webots_mcp.analysis.summary import LARGEST
 from webots_mcp.contract import (
     DATA_DIR_VARIABLE,
     DATABASE_NAME,
@@ -43,7 +44,6 @@ from webots_mcp.standin import (
 )
 from webots_mcp.standin.controllers import Controller
 from webots_mcp.standin.in_process import DEFAULT_WORLD
-from webots_mcp.store.analysis.summary import LARGEST
 from webots_mcp.store.checks import CHECKS, check_run
 from webots_mcp.store.detection.events import find_events
 from webots_mcp.store.detection.kinds import Event as FoundEvent

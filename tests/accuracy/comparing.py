@@ -19,7 +19,7 @@ from tests.detection.asking import UNHURRIED_S
 from tests.detection.labelled import Array, LabelledRun
 from tests.detection.writing import Writer
 from tests.memory import memory_connection
-from webots_mcp.store.analysis.summary import MOST_CHANCE, Outcome, rank
+from webots_mcp.analysis.summary import MOST_CHANCE, Outcome, rank
 from webots_mcp.store.questions.compare import Comparison, compare_runs
 
 _RUNS: Final = (3, 5, 10)

@@ -41,10 +41,10 @@ from webots_mcp.contract import BreakpointAction
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 
 if TYPE_CHECKING:
+    from webots_mcp.analysis.summary import Ranking
     from webots_mcp.questions.declaring import Question
     from webots_mcp.steering.trial_plan import WorldPlan
     from webots_mcp.steering.trial_run import Simulators
-    from webots_mcp.store.analysis.summary import Ranking
     from webots_mcp.store.parameters import Result, Trial
     from webots_mcp.store.recording import Recording
 

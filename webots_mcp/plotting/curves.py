@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from itertools import accumulate, pairwise
 from typing import Final, NamedTuple
 
+from webots_mcp.analysis.arrays import np, rhythm_of
+from webots_mcp.analysis.summary import LARGEST
 from webots_mcp.plotting.parts import Part
-from webots_mcp.store.analysis.arrays import np, rhythm_of
-from webots_mcp.store.analysis.summary import LARGEST
 from webots_mcp.store.questions.series import NumberColumns, RunHistory
 from webots_mcp.store.reading.frame import read_frame
 from webots_mcp.store.reading.segment import Deadline

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
+from webots_mcp.analysis.arrays import Gap
 from webots_mcp.plotting.canvas import MOST_VALUES, OTHER_VALUES
 from webots_mcp.signals.naming import listed
-from webots_mcp.store.analysis.arrays import Gap
 from webots_mcp.store.questions.series import ChangeColumns, RunHistory
 from webots_mcp.store.reading.frame_summary import Point, spelled
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from webots_mcp.analysis.arrays import np
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plotting.canvas import (
     DASHES,
@@ -54,7 +55,6 @@ from webots_mcp.plotting.parts import (
 )
 from webots_mcp.plotting.signals import line_through
 from webots_mcp.signals.naming import listed, spelled_out
-from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.detection.events import Found
 from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.detection.search import motion_in

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from webots_mcp.analysis.arrays import np
+from webots_mcp.analysis.summary import Outcome, Ranked, rank
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plotting.canvas import (
     INK,
@@ -41,8 +43,6 @@ from webots_mcp.plotting.parts import (
 )
 from webots_mcp.plotting.signals import line_through
 from webots_mcp.signals.naming import listed, nearest_first
-from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.analysis.summary import Outcome, Ranked, rank
 from webots_mcp.store.parameters import Trial, best_of, fetch_trial_set, trials_of
 
 

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import Field
 
+from webots_mcp.analysis.summary import MIN_EFFECT_SD, Spread
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.answers import CheckAnswer, ComparisonAnswer, RunsAnswer, Table
 from webots_mcp.questions.budget import (
@@ -49,7 +50,6 @@ from webots_mcp.questions.declaring import (
     question,
 )
 from webots_mcp.signals.conditions.compiler import Expectation, read_expectation
-from webots_mcp.store.analysis.summary import MIN_EFFECT_SD, Spread
 from webots_mcp.store.checks import CHECK_DEADLINE_S, check_run
 from webots_mcp.store.checks.finding import Finding
 from webots_mcp.store.detection.kinds import EventOptions, both_of

@@ -13,6 +13,7 @@ import anyio
 from anyio import to_thread
 from pydantic import BeforeValidator, Field, WithJsonSchema
 
+from webots_mcp.analysis.summary import Best, Ranked, Ranking
 from webots_mcp.contract import MAX_RUN_S
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.questions.answers import TrialsAnswer
@@ -43,7 +44,6 @@ from webots_mcp.signals.parameter import require_known
 from webots_mcp.steering.dispatch import ACTION, find_target, known_names, require_possible
 from webots_mcp.steering.trial_plan import TrialPlan, combinations
 from webots_mcp.steering.trial_worker import OF_EACH_TRIAL, TrialWorkers
-from webots_mcp.store.analysis.summary import Best, Ranked, Ranking
 from webots_mcp.store.parameters import (
     Declared,
     Trial,

@@ -12,11 +12,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, Literal, cast, get_args
 
+from webots_mcp.analysis.summary import Best
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.signals.conditions import parse_condition
 from webots_mcp.signals.conditions.scoring import parse_score
 from webots_mcp.signals.naming import harmless_first
-from webots_mcp.store.analysis.summary import Best
 
 Search = Literal["tpe", "random"]
 MOST_TRIALS: Final = 10_000

@@ -13,8 +13,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
+from webots_mcp.analysis.arrays import Array, Flags, np
 from webots_mcp.signals.naming import REDUCTIONS
-from webots_mcp.store.analysis.arrays import Array, Flags, np
 from webots_mcp.store.chunk_making import count_lost
 from webots_mcp.store.chunks import (
     EXACT_INTEGERS,

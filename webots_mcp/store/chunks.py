@@ -21,11 +21,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias, cast
 
+from webots_mcp.analysis.arrays import Array, Indexes, inner, np
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.errors import DatabaseError, MalformedRowError
 from webots_mcp.signals.naming import LONGEST_SPREAD_ARRAY, REDUCTIONS, Value, flatten
-from webots_mcp.store.analysis.arrays import Array, Indexes, inner, np
 
 MAX_TEXT: Final = 200  # characters of a text value that are kept and compared
 ANY_ITEM: Final = "*"

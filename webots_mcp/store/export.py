@@ -17,12 +17,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO, ClassVar, Final, Literal, NamedTuple, cast
 
+from webots_mcp.analysis.arrays import Array, Indexes, np
+from webots_mcp.analysis.summary import Ranked
 from webots_mcp.contract import placed
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins import ExportFormat, export_formats, load
 from webots_mcp.signals.naming import LONGEST_SPREAD_ARRAY, flatten
-from webots_mcp.store.analysis.arrays import Array, Indexes, np
-from webots_mcp.store.analysis.summary import Ranked
 from webots_mcp.store.chunk_table import Cells, Kind, Part, chunk_table
 from webots_mcp.store.chunks import (
     ABSENT,

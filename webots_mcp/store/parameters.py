@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, NamedTuple
 
+from webots_mcp.analysis.summary import Best, Outcome, Ranking, rank
 from webots_mcp.contract import host_name, new_uuid
 from webots_mcp.database.connection import transaction
 from webots_mcp.database.liveness import (
@@ -23,7 +24,6 @@ from webots_mcp.database.liveness import (
 )
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
 from webots_mcp.signals.parameter import Declaration, Value, require_known
-from webots_mcp.store.analysis.summary import Best, Outcome, Ranking, rank
 from webots_mcp.store.run_rows import Run, columns_of
 
 COLUMNS: Final = (

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from webots_mcp.analysis.arrays import Array, np
 from webots_mcp.contract import FINAL_STATUSES, KEPT_FRAME
-from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.chunk_making import INDEX_BYTES, disk_bytes
 from webots_mcp.store.chunks import STATE_IDS, WALL_TIMES, Decoded, Group, values_in
 from webots_mcp.store.retention import DEFAULT, KEPT, Limit, Retention

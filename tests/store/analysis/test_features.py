@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from webots_mcp.store.analysis.arrays import Array
-from webots_mcp.store.analysis.summary import (
+from webots_mcp.analysis.arrays import Array
+from webots_mcp.analysis.summary import (
     find_spikes,
     fit_line,
     flat_since,

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from webots_mcp.store.analysis.summary import Best, Outcome, rank
+from webots_mcp.analysis.summary import Best, Outcome, rank
 
 
 def outcomes(**scores: list[float | None]) -> list[Outcome]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from webots_mcp.store.analysis.arrays import Gap, rhythm_of
+from webots_mcp.analysis.arrays import Gap, rhythm_of
 
 FAST = [round(step * 0.032, 3) for step in range(1000)]
 SLOW = [round(32 + step * 0.5, 3) for step in range(60)]

@@ -8,7 +8,7 @@ from collections import Counter
 
 import pytest
 
-from webots_mcp.store.analysis.summary import (
+from webots_mcp.analysis.summary import (
     MIN_EFFECT_SD,
     Spread,
     Verdict,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.store.analysis.driving import noisy_track
-from webots_mcp.store.analysis.standstill import find_standstills
-from webots_mcp.store.analysis.track import noise_of, track_of
+from webots_mcp.analysis.standstill import find_standstills
+from webots_mcp.analysis.track import noise_of, track_of
 
 RADIUS_M = 0.05
 LEAST_S = 3.0

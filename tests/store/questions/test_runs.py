@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import WALL_PER_SIM, Recorder, record_rover, start_run
+from webots_mcp.analysis.summary import Spread
 from webots_mcp.errors import (
     InvalidInputError,
     NothingRecordedError,
     UnknownRunError,
 )
-from webots_mcp.store.analysis.summary import Spread
 from webots_mcp.store.questions.compare import Comparison, Difference, compare_runs
 from webots_mcp.store.questions.runs import annotate_run, list_runs, run_info
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
+from webots_mcp.analysis.arrays import rhythm_of
 from webots_mcp.store import chunk_making
-from webots_mcp.store.analysis.arrays import rhythm_of
 from webots_mcp.store.chunk_making import make_chunks
 from webots_mcp.store.reading import frame_summary as reading
 from webots_mcp.store.reading.frame import read_frame

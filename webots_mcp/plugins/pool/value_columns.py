@@ -14,10 +14,10 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final, TypeAlias
 
+from webots_mcp.analysis.arrays import np
 from webots_mcp.plugins.pool.parquet_files import package
 from webots_mcp.plugins.pool.pool_interface import Row, table
 from webots_mcp.signals.naming import Value
-from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.chunks import (
     FIRST_LABEL,
     IS_ABSENT,

@@ -12,9 +12,9 @@ from datetime import datetime, timezone
 from html import escape
 from typing import Any, Final, NamedTuple, cast
 
+from webots_mcp.analysis.summary import Spread
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.signals import naming
-from webots_mcp.store.analysis.summary import Spread
 from webots_mcp.store.detection.kinds import Event
 from webots_mcp.store.questions.compare import Comparison, Difference, compare_runs
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Final
 
+from webots_mcp.analysis.arrays import np
 from webots_mcp.errors import ConditionFailedError, UnknownSignalError
 from webots_mcp.signals.conditions.compiler import Expectation
 from webots_mcp.signals.naming import counted
-from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.checks import of_motion, of_sensors
 from webots_mcp.store.checks.finding import (
     WORST_FIRST,

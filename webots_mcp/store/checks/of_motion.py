@@ -6,10 +6,10 @@ import math
 from collections.abc import Iterator
 from typing import Any, Final, cast
 
+from webots_mcp.analysis.arrays import Array, Run, median, np, runs_of
+from webots_mcp.analysis.summary import unwrap
 from webots_mcp.signals.naming import METRES, counted, find_targets, in_snake_case, listed, unit_in
 from webots_mcp.signals.register import PLACES
-from webots_mcp.store.analysis.arrays import Array, Run, median, np, runs_of
-from webots_mcp.store.analysis.summary import unwrap
 from webots_mcp.store.checks.finding import Finding, RunUnderCheck, times, total_s
 from webots_mcp.store.detection.condition import lasting
 from webots_mcp.store.detection.jump import JUMP

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Iterator
 from functools import cached_property
 from typing import Final, Literal
 
+from webots_mcp.analysis.arrays import np, runs_of
 from webots_mcp.signals.naming import REDUCTIONS, find_targets, listed, words_of
-from webots_mcp.store.analysis.arrays import np, runs_of
 from webots_mcp.store.checks.finding import Finding, RunUnderCheck, times
 from webots_mcp.store.detection.jump import JUMP
 from webots_mcp.store.detection.kinds import Event

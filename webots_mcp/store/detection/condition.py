@@ -15,6 +15,7 @@ from functools import partial, reduce
 from itertools import starmap
 from typing import Any, Final, NamedTuple, cast
 
+from webots_mcp.analysis.arrays import Array, Flags, Indexes, Runs, median, np, runs_of
 from webots_mcp.database.pauses import EXPECTED, OF_PROJECT, VIOLATION
 from webots_mcp.errors import (
     ConditionFailedError,
@@ -34,7 +35,6 @@ from webots_mcp.signals.conditions.scoring import Aggregate
 from webots_mcp.signals.conditions.signal_values import PLACES_KEPT, SAME_TIME_S
 from webots_mcp.signals.conditions.syntax import FLAGS, Nodes, Scanned, function_of, is_signal
 from webots_mcp.signals.naming import FARTHEST_M, NO_POSITION, Value, find_position, metres_in
-from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, Runs, median, np, runs_of
 from webots_mcp.store.detection.kinds import (
     Alike,
     Event,

@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
 
-from webots_mcp.signals.naming import in_snake_case, listed, metres_in
-from webots_mcp.store.analysis.arrays import (
+from webots_mcp.analysis.arrays import (
     Array,
     Flags,
     Indexes,
@@ -19,8 +18,8 @@ from webots_mcp.store.analysis.arrays import (
     np,
     usual_interval_s,
 )
-from webots_mcp.store.analysis.summary import unwrap
-from webots_mcp.store.analysis.swings import (
+from webots_mcp.analysis.summary import unwrap
+from webots_mcp.analysis.swings import (
     LEAST_HALF_SWINGS,
     SLOW_HALF_SWINGS,
     EvenRows,
@@ -28,6 +27,7 @@ from webots_mcp.store.analysis.swings import (
     find_swings,
     swings_in,
 )
+from webots_mcp.signals.naming import in_snake_case, listed, metres_in
 from webots_mcp.store.detection.kinds import (
     Alike,
     Event,

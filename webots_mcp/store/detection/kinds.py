@@ -10,10 +10,10 @@ from dataclasses import dataclass, field, replace
 from statistics import median
 from typing import TYPE_CHECKING, Any, Final
 
+from webots_mcp.analysis.swings import LEAST_HALF_SWINGS
 from webots_mcp.contract import LOG_LEVELS
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.signals.naming import Value
-from webots_mcp.store.analysis.swings import LEAST_HALF_SWINGS
 from webots_mcp.store.reading.frame_source import NOT_READ
 
 if TYPE_CHECKING:

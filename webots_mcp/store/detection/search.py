@@ -13,11 +13,11 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Final
 
+from webots_mcp.analysis.arrays import Array, Indexes, median, noise_of, np
+from webots_mcp.analysis.summary import LARGEST
+from webots_mcp.analysis.track import PathLength, Track, tracks_of
 from webots_mcp.signals.naming import FARTHEST_M, listed, metres_in, unit_in
 from webots_mcp.signals.register import first_in, pair_in
-from webots_mcp.store.analysis.arrays import Array, Indexes, median, noise_of, np
-from webots_mcp.store.analysis.summary import LARGEST
-from webots_mcp.store.analysis.track import PathLength, Track, tracks_of
 from webots_mcp.store.chunks import shown
 from webots_mcp.store.detection.kinds import (
     Event,

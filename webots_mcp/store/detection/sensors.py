@@ -10,8 +10,7 @@ from functools import cached_property
 from itertools import pairwise
 from typing import Final
 
-from webots_mcp.signals.naming import find_targets, listed
-from webots_mcp.store.analysis.arrays import (
+from webots_mcp.analysis.arrays import (
     MOSTLY,
     Array,
     Flags,
@@ -22,6 +21,7 @@ from webots_mcp.store.analysis.arrays import (
     runs_alike,
     runs_of,
 )
+from webots_mcp.signals.naming import find_targets, listed
 from webots_mcp.store.detection.kinds import Alike, Event, EventKind
 from webots_mcp.store.detection.search import MOST_NAMED, Search
 from webots_mcp.store.reading.catalogue import other_form

@@ -8,15 +8,15 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final, NamedTuple, cast
 
-from webots_mcp.signals.naming import NAME_POSITION
-from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, median, noise_of, np, runs_of
-from webots_mcp.store.analysis.standstill import (
+from webots_mcp.analysis.arrays import Array, Flags, Indexes, median, noise_of, np, runs_of
+from webots_mcp.analysis.standstill import (
     MOST_AROUND,
     NEARLY,
     find_standstills,
     shortest_seen_s,
 )
-from webots_mcp.store.analysis.track import Track, track_of
+from webots_mcp.analysis.track import Track, track_of
+from webots_mcp.signals.naming import NAME_POSITION
 from webots_mcp.store.chunks import shown
 from webots_mcp.store.detection.kinds import (
     Alike,

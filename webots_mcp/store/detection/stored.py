@@ -9,8 +9,8 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any, Final
 
+from webots_mcp.analysis.arrays import np
 from webots_mcp.database.pauses import VIOLATION
-from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.detection.kinds import (
     LEVELS,
     Alike,

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Final
 
+from webots_mcp.analysis.summary import MIN_EFFECT_SD, Spread, Summary, spread_of, verdicts_on
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
 from webots_mcp.signals.parameter import Value
-from webots_mcp.store.analysis.summary import MIN_EFFECT_SD, Spread, Summary, spread_of, verdicts_on
 from webots_mcp.store.detection.kinds import EventOptions
 from webots_mcp.store.detection.search import motion_in
 from webots_mcp.store.parameters import differing, parameters_of, scored_runs

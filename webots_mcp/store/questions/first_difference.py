@@ -14,10 +14,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
+from webots_mcp.analysis.arrays import Array, Flags, Indexes, np
 from webots_mcp.errors import InvalidInputError, NothingRecordedError, UnknownRunError
 from webots_mcp.signals.conditions.signal_values import SAME_TIME_S
 from webots_mcp.signals.naming import METRES, Value, counted, listed
-from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
 from webots_mcp.store.chunks import FIRST_LABEL, IS_ABSENT, IS_NUMBER, Decoded, Replaced
 from webots_mcp.store.parameters import parameters_of, scored_runs
 from webots_mcp.store.questions.compare import COMPARE_DEADLINE_S

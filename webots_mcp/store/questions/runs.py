@@ -11,15 +11,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.database.connection import transaction
-from webots_mcp.database.liveness import dead_sessions
-from webots_mcp.database.pauses import paused_s
-from webots_mcp.errors import ConditionFailedError, InvalidInputError, NothingRecordedError
-from webots_mcp.signals.conditions.scoring import Facts, Score, Scored, parse_score
-from webots_mcp.signals.naming import FARTHEST_M, NAME_POSITION, listed, nearest_first
-from webots_mcp.signals.parameter import Value
-from webots_mcp.store.analysis.arrays import Array, np
-from webots_mcp.store.analysis.summary import (
+from webots_mcp.analysis.arrays import Array, np
+from webots_mcp.analysis.summary import (
     Spread,
     Verdict,
     chance_of,
@@ -28,7 +21,14 @@ from webots_mcp.store.analysis.summary import (
     spread_of,
     verdicts_on,
 )
-from webots_mcp.store.analysis.track import PathLength, tracks_of, travelled
+from webots_mcp.analysis.track import PathLength, tracks_of, travelled
+from webots_mcp.database.connection import transaction
+from webots_mcp.database.liveness import dead_sessions
+from webots_mcp.database.pauses import paused_s
+from webots_mcp.errors import ConditionFailedError, InvalidInputError, NothingRecordedError
+from webots_mcp.signals.conditions.scoring import Facts, Score, Scored, parse_score
+from webots_mcp.signals.naming import FARTHEST_M, NAME_POSITION, listed, nearest_first
+from webots_mcp.signals.parameter import Value
 from webots_mcp.store.detection.condition import aggregated, position_in
 from webots_mcp.store.detection.events import Found, asked_kinds, kind_names, search_events
 from webots_mcp.store.detection.kinds import EventOptions

@@ -11,10 +11,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from webots_mcp.analysis.arrays import Array, Gap, np
+from webots_mcp.analysis.summary import LARGEST, Summary
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.signals.naming import Value, flatten, listed
-from webots_mcp.store.analysis.arrays import Array, Gap, np
-from webots_mcp.store.analysis.summary import LARGEST, Summary
 from webots_mcp.store.chunks import parse
 from webots_mcp.store.reading.catalogue import signals_of
 from webots_mcp.store.reading.frame import Frame, read_frame, read_kept

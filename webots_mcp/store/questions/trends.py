@@ -8,10 +8,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
-from webots_mcp.signals.naming import words_of
-from webots_mcp.store import chunk_making
-from webots_mcp.store.analysis.arrays import Array, Indexes, np
-from webots_mcp.store.analysis.summary import (
+from webots_mcp.analysis.arrays import Array, Indexes, np
+from webots_mcp.analysis.summary import (
     FLAT_BAND,
     LARGEST,
     Line,
@@ -30,12 +28,14 @@ from webots_mcp.store.analysis.summary import (
     with_extremes,
     with_extremes_of,
 )
-from webots_mcp.store.analysis.swings import (
+from webots_mcp.analysis.swings import (
     LEAST_HALF_SWINGS,
     SHORTEST_PERIOD_ROWS,
     Swing,
     find_swings,
 )
+from webots_mcp.signals.naming import words_of
+from webots_mcp.store import chunk_making
 from webots_mcp.store.questions.series import STATES_SHARE, signals_left
 from webots_mcp.store.reading import frame_summary
 from webots_mcp.store.reading.catalogue import signals_of

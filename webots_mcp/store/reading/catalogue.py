@@ -9,10 +9,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from webots_mcp.analysis.arrays import Indexes, np
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.signals.naming import REDUCTIONS, Value, nearest_first
 from webots_mcp.signals.register import MAX_SIGNALS, Kind
-from webots_mcp.store.analysis.arrays import Indexes, np
 from webots_mcp.store.chunks import STATE_COLUMNS, StateColumns, reached, signals_in
 from webots_mcp.store.reading.frame import Frame, read_frame
 from webots_mcp.store.reading.frame_source import has_few_new_rows, rows_in_no_chunk

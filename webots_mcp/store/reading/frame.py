@@ -15,10 +15,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, NamedTuple
 
+from webots_mcp.analysis.arrays import Array, Flags, Indexes, np
+from webots_mcp.analysis.summary import usable_part
 from webots_mcp.signals.naming import Value
 from webots_mcp.store import chunk_making
-from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
-from webots_mcp.store.analysis.summary import usable_part
 from webots_mcp.store.chunks import (
     EXACT_INTEGERS,
     FIRST_LABEL,

@@ -9,8 +9,8 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple, TypeVar, cast
 
+from webots_mcp.analysis.arrays import Array, Flags, Indexes, np
 from webots_mcp.store import chunk_making
-from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
 from webots_mcp.store.chunks import (
     SIM_TIMES,
     STATE_COLUMNS,

@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import count, pairwise
 from typing import Final, NamedTuple
 
-from webots_mcp.signals.naming import Value
-from webots_mcp.store.analysis.arrays import (
+from webots_mcp.analysis.arrays import (
     GAP_INTERVALS,
     Array,
     Flags,
@@ -22,13 +21,14 @@ from webots_mcp.store.analysis.arrays import (
     rhythm_of,
     usual_interval_s,
 )
-from webots_mcp.store.analysis.summary import (
+from webots_mcp.analysis.summary import (
     LARGEST,
     NO_LENGTH,
     Summary,
     summarise_numbers,
     with_extremes,
 )
+from webots_mcp.signals.naming import Value
 from webots_mcp.store.chunks import shown
 from webots_mcp.store.reading.frame import Frame, Unread, Zones, read_frame
 from webots_mcp.store.reading.segment import Deadline, Segment, just_after, kept_parts

@@ -13,10 +13,10 @@ import sqlite3
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from webots_mcp.analysis.arrays import Array, median, np
 from webots_mcp.contract import OBSERVER, WORLD_EVENT
 from webots_mcp.signals.naming import OBSERVED, WORLD, find_position
 from webots_mcp.signals.register import kind_of, unit_of
-from webots_mcp.store.analysis.arrays import Array, median, np
 from webots_mcp.store.chunks import IS_ABSENT, IS_NUMBER, Decoded, StateColumns, signals_in
 from webots_mcp.store.signals import Signal, registered, seen_with, with_roles
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final, cast
 
-from webots_mcp.store.analysis.arrays import (
+from webots_mcp.analysis.arrays import (
     Array,
     Flags,
     Indexes,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
-from webots_mcp.store.analysis.arrays import Array, Indexes, inner, np
+from webots_mcp.analysis.arrays import Array, Indexes, inner, np
 
 LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
 NO_LENGTH: Final = 1e-9  # of a resultant vector that means no direction

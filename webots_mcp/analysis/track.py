@@ -11,7 +11,7 @@ from itertools import pairwise
 from math import log, sqrt
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import Array, Indexes, median, noise_of, np, rhythm_of
+from webots_mcp.analysis.arrays import Array, Indexes, median, noise_of, np, rhythm_of
 
 FALSE_LEGS: Final = 0.003  # so many may noise alone make of a robot at rest, on average
 GAP_NOISE: Final = 7.0  # deviations of the position: so far it went at least during a gap

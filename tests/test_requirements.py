@@ -11,10 +11,15 @@ import pytest
 from packaging.requirements import Requirement
 
 import webots_mcp
-from webots_mcp.requirements import checkout, explain_extra, install_line, missing_requirements
+from webots_mcp.extras.requirements import (
+    checkout,
+    explain_extra,
+    install_line,
+    missing_requirements,
+)
 
 PACKAGE = Path(webots_mcp.__file__).parent
-ASK = "from webots_mcp.requirements import checkout; print(checkout())"
+ASK = "from webots_mcp.extras.requirements import checkout; print(checkout())"
 
 
 def installed_from(folder: Path, origin: dict[str, object]) -> str:

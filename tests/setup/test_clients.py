@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.requirements import checkout
+from webots_mcp.extras.requirements import checkout
 from webots_mcp.setup import FileChange, apply
 from webots_mcp.setup.client_entries import (
     Client,

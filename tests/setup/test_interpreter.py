@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from webots_mcp.requirements import checkout, quoted
+from webots_mcp.extras.requirements import checkout, quoted
 from webots_mcp.setup import chosen, look_into
 
 

@@ -147,7 +147,12 @@ def _explain_missing(error: ModuleNotFoundError) -> str:
     """
     if (error.name or "").partition(".")[0] == "webots_mcp":
         raise error
-    from webots_mcp.requirements import checkout, install_line, missing_requirements, package_of
+    from webots_mcp.extras.requirements import (
+        checkout,
+        install_line,
+        missing_requirements,
+        package_of,
+    )
 
     wanted = missing_requirements()
     if not wanted:

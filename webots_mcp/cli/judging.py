@@ -32,7 +32,7 @@ from webots_mcp.cli.terminal import print_answer, print_json, print_table
 from webots_mcp.contract import find_project, host_name, placed
 from webots_mcp.database.stacks import INSTALLED, STEPPING
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
-from webots_mcp.requirements import explain_extra
+from webots_mcp.extras.requirements import explain_extra
 from webots_mcp.signals.naming import listed, spelled_out
 
 if TYPE_CHECKING:

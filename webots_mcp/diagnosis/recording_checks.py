@@ -37,7 +37,7 @@ from webots_mcp.diagnosis import (
     wrong,
 )
 from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
-from webots_mcp.requirements import install_line, missing_requirements, package_of
+from webots_mcp.extras.requirements import install_line, missing_requirements, package_of
 from webots_mcp.setup.wsl import WAY_OUT, is_wsl
 from webots_mcp.store.journal_intake import kept_journals
 from webots_mcp.store.recording import GETTING_STARTED, View, name_of

@@ -33,7 +33,7 @@ from webots_mcp.contract import (
     full_path,
 )
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.requirements import checkout, quoted
+from webots_mcp.extras.requirements import checkout, quoted
 from webots_mcp.webots import installations
 
 _PYTHON: Final = "Python"

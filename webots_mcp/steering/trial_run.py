@@ -43,7 +43,7 @@ from webots_mcp.errors import (
     InvalidInputError,
     NoDatabaseError,
 )
-from webots_mcp.requirements import explain_extra
+from webots_mcp.extras.requirements import explain_extra
 from webots_mcp.signals.conditions import Evaluator, parse_condition
 from webots_mcp.steering.trial_plan import Range, TrialPlan, WorldPlan
 from webots_mcp.store.chunks import parse

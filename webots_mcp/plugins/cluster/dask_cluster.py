@@ -29,8 +29,8 @@ from typing import Any, Final, NamedTuple
 from webots_mcp import __version__
 from webots_mcp.contract import DATABASE_NAME, host_name
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
+from webots_mcp.extras.requirements import explain_extra
 from webots_mcp.plugins.pool.pool_contents import open_pool
-from webots_mcp.requirements import explain_extra
 from webots_mcp.steering.trial_plan import WorldPlan
 from webots_mcp.steering.trial_run import (
     Command,

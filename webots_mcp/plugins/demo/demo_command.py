@@ -29,7 +29,7 @@ from webots_mcp.contract import (
 from webots_mcp.database.connection import connect
 from webots_mcp.database.liveness import give_back, holder_of, lease_of, process_alive, take
 from webots_mcp.errors import CommandRefusedError, NothingRecordedError, WebotsMCPError
-from webots_mcp.requirements import quoted
+from webots_mcp.extras.requirements import quoted
 from webots_mcp.setup.client_entries import server_command
 from webots_mcp.store.recording import Job, Recording
 

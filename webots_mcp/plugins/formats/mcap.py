@@ -23,8 +23,8 @@ from typing import Any, BinaryIO, Final, cast
 
 from webots_mcp.contract import placed
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.extras.requirements import explain_extra
 from webots_mcp.plugins.formats.contents import KINDS, Contents, PlacedCommand, Pose, Way
-from webots_mcp.requirements import explain_extra
 from webots_mcp.store.chunks import parse
 from webots_mcp.store.export import Exported, Progress, Recorded, json_text, value_at
 from webots_mcp.store.logs import LogLine

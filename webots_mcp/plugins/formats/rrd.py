@@ -25,9 +25,9 @@ from uuid import NAMESPACE_URL, uuid5
 from webots_mcp.analysis.arrays import np
 from webots_mcp.contract import placed
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.extras.requirements import explain_extra
 from webots_mcp.plugins.formats.contents import KINDS, Contents, Item, PlacedCommand, Pose, Way
 from webots_mcp.plugins.formats.mcap import main_signals
-from webots_mcp.requirements import explain_extra
 from webots_mcp.store.export import (
     Exported,
     Progress,

@@ -47,8 +47,8 @@ from webots_mcp.errors import (
     PoolUnavailableError,
     WebotsMCPError,
 )
+from webots_mcp.extras.requirements import explain_extra, install_line
 from webots_mcp.plugins.pool.pool_interface import Row, SQLValue, Table, redacted
-from webots_mcp.requirements import explain_extra, install_line
 
 FORMAT: Final = 2
 POOL: Final = "_pool"

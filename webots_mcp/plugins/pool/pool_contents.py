@@ -18,8 +18,8 @@ from typing import Annotated, Final
 
 from webots_mcp.cli.options import Parameter
 from webots_mcp.errors import InvalidInputError, PoolError
+from webots_mcp.extras.requirements import explain_extra
 from webots_mcp.plugins.pool.pool_interface import LISTED, Pool, require_no_secret
-from webots_mcp.requirements import explain_extra
 from webots_mcp.signals.naming import nearest_first
 from webots_mcp.store.reading.ranges import parse_wall_time
 

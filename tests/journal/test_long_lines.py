@@ -56,7 +56,7 @@ def test_an_intake_ends_with_its_budget_goes_on_later_and_says_what_is_left(fold
         assert part(folder).name in view.header()["storage"]
 
 
-def peak_memory_bytes(process: subprocess.Popen[bytes]) -> int:
+def peak_memory_bytes(process: subprocess.Popen[Any]) -> int:
     """Return the peak of its resident memory, 0 once it has ended or where there is no /proc.
 
     Not `ru_maxrss`: a child begins with its parent's peak there, which is the one of pytest.

@@ -26,8 +26,8 @@ import resvg_py
 from PIL import Image
 
 from webots_mcp.cli import main as webots_mcp
-from webots_mcp.database.connection import connect
 from webots_mcp.contract import DATABASE_NAME, THROTTLE_VARIABLE
+from webots_mcp.database.connection import connect
 from webots_mcp.plugins.demo import demo_command as demo
 from webots_mcp.testing import RecordedSimulation
 

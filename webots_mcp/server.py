@@ -42,7 +42,6 @@ from mcp.types import (
 from pydantic import Field, ValidationError
 
 from webots_mcp import __version__
-from webots_mcp.console import ConsoleWatch
 from webots_mcp.contract import Database, MemoryDatabase
 from webots_mcp.database.connection import connect, create_schema
 from webots_mcp.database.liveness import reap_if_dead
@@ -62,6 +61,7 @@ from webots_mcp.questions.declaring import (
     shown_value,
 )
 from webots_mcp.signals.naming import harmless_first
+from webots_mcp.simulator.console import ConsoleWatch
 from webots_mcp.steering.routes import Companions, Launcher
 from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.chunk_making import make_chunks, make_missing_chunks

@@ -40,8 +40,8 @@ from webots_mcp import MCPBridge
 from webots_mcp.bridge.keeping import scale_down
 from webots_mcp.bridge.pictures import encode_png
 from webots_mcp.contract import KEEP_LAST_S
-from webots_mcp.observer import Observer
 from webots_mcp.signals.conditions import parse_condition
+from webots_mcp.simulator.observer import Observer
 from webots_mcp.standin import InProcessSupervisor
 
 _NEVER = 1_000_000_000  # is a call recorded

@@ -57,7 +57,7 @@ def _shortened(node: Node) -> Node:
     if kind == "for":
         return (kind, _shortened(parts[0]), SHORT[parts[1]])
     inner: list[Any] = [
-        _shortened(cast(Node, part)) if isinstance(part, tuple) else part for part in parts
+        _shortened(cast("Node", part)) if isinstance(part, tuple) else part for part in parts
     ]
     return (kind, *inner)
 

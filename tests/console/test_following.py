@@ -21,12 +21,12 @@ import pytest
 from tests.recordings.rows import Recorded
 from tests.waiting import wait_for
 from tests.webots.server import WebotsServer
-from webots_mcp import console
-from webots_mcp.console import follow_console, job_of
 from webots_mcp.contract import host_name
 from webots_mcp.database.liveness import holder_of
+from webots_mcp.simulator import console
+from webots_mcp.simulator.console import follow_console, job_of
+from webots_mcp.simulator.instances import Instance
 from webots_mcp.store.recording import Recording
-from webots_mcp.webots import Instance
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ import pytest
 
 from tests.waiting import wait_for
 from tests.webots.conftest import started
-from webots_mcp.console import StandInConsole
+from webots_mcp.simulator.console import StandInConsole
 from webots_mcp.store.logs import MOST_WAITING
 from webots_mcp.store.recording import Recording
 

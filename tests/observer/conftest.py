@@ -12,7 +12,7 @@ import pytest
 
 from webots_mcp import MemoryDatabase
 from webots_mcp.database.connection import connect
-from webots_mcp.observer import Observer
+from webots_mcp.simulator.observer import Observer
 from webots_mcp.standin import InProcessSimulation, InProcessSupervisor
 
 STEP_MS = 16

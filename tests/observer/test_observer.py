@@ -10,7 +10,7 @@ import pytest
 from tests.observer.conftest import OBSERVER, STEP_MS, Watching
 from webots_mcp import MemoryDatabase
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.observer import Observer
+from webots_mcp.simulator.observer import Observer
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 

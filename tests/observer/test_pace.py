@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from tests.observer.conftest import STEP_MS
-from webots_mcp import observer
-from webots_mcp.observer import StepPace
+from webots_mcp.simulator import observer
+from webots_mcp.simulator.observer import StepPace
 
 
 class Simulator:

@@ -24,11 +24,11 @@ from tests.webots.conftest import (
     wait_for_line,
     write_project,
 )
-from webots_mcp import console
-from webots_mcp.console import belongs
 from webots_mcp.server import create_server
+from webots_mcp.simulator import console
+from webots_mcp.simulator.console import belongs
+from webots_mcp.simulator.instances import instances
 from webots_mcp.store.recording import Recording
-from webots_mcp.webots import instances
 
 pytestmark = pytest.mark.anyio
 

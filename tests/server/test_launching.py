@@ -24,8 +24,8 @@ from tests.webots.conftest import (
     write_project,
 )
 from webots_mcp.server import create_server
-from webots_mcp.setup import apply
 from webots_mcp.setup.client_entries import policy_file
+from webots_mcp.setup.file_change import apply
 from webots_mcp.setup.project_edits import controller_change, with_observer
 
 pytestmark = pytest.mark.anyio

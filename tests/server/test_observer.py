@@ -21,10 +21,10 @@ from tests.webots.conftest import (
     write_project,
 )
 from webots_mcp.server import create_server
-from webots_mcp.setup import apply
+from webots_mcp.setup.file_change import apply
 from webots_mcp.setup.project_edits import controller_change, with_observer
-from webots_mcp.webots import instances
-from webots_mcp.webots.orders import give_order
+from webots_mcp.simulator.instances import instances
+from webots_mcp.simulator.orders import give_order
 
 pytestmark = pytest.mark.anyio
 

@@ -17,7 +17,7 @@ from tests.recordings.rows import Recorded
 from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail
 from tests.waiting import until
 from webots_mcp import MCPBridge
-from webots_mcp.observer import observe
+from webots_mcp.simulator.observer import observe
 from webots_mcp.standin import InProcessRobot, InProcessSimulation, InProcessSupervisor
 
 pytestmark = pytest.mark.anyio

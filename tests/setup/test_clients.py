@@ -12,7 +12,6 @@ import pytest
 
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.extras.requirements import checkout
-from webots_mcp.setup import FileChange, apply
 from webots_mcp.setup.client_entries import (
     Client,
     claude_desktop,
@@ -22,6 +21,7 @@ from webots_mcp.setup.client_entries import (
     server_command,
     server_hindrance,
 )
+from webots_mcp.setup.file_change import FileChange, apply
 
 LINE = [sys.executable, "-m", "webots_mcp", "serve", "--data-dir", "/p/mcp_data"]
 

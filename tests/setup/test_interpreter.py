@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from webots_mcp.extras.requirements import checkout, quoted
-from webots_mcp.setup import chosen, look_into
+from webots_mcp.setup.interpreter import chosen, look_into
 
 
 @pytest.fixture(autouse=True)

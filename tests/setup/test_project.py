@@ -8,7 +8,7 @@ import pytest
 
 from webots_mcp.contract import require_world_of, resolve_data_dir
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.setup import controllers_of, project_of
+from webots_mcp.simulator.project import controllers_of, project_of
 
 
 @pytest.fixture

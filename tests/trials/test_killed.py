@@ -18,8 +18,8 @@ from tests.processes.stopping import stop_between_writes
 from tests.trials.conftest import Run, command, rows, wait_for_trial
 from tests.waiting import wait_for
 from webots_mcp.database.liveness import process_identity
+from webots_mcp.simulator.starting import CommandLine
 from webots_mcp.steering.trial_run import TrialSimulator
-from webots_mcp.webots.starting import CommandLine
 
 Write = Callable[[str], Path]
 
@@ -37,7 +37,7 @@ time.sleep(600)
 RUNNER = """
 import os, pathlib, signal, sys, time
 from webots_mcp.steering.trial_run import TrialSimulator
-from webots_mcp.webots.starting import CommandLine
+from webots_mcp.simulator.starting import CommandLine
 command = CommandLine([sys.executable, "simulator.py"], [])
 simulator = TrialSimulator(command, pathlib.Path(), {})
 print(simulator.pid, flush=True)

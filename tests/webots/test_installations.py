@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from webots_mcp import webots as module
 from webots_mcp.errors import CommandRefusedError
+from webots_mcp.simulator import instances as module
+from webots_mcp.simulator.instances import find_webots, installations
 from webots_mcp.steering.trial_run import webots
-from webots_mcp.webots import find_webots, installations
 
 LAYOUTS = {
     "linux": ("webots", "webots-controller", "lib/controller/python", "resources"),

@@ -8,8 +8,8 @@ import subprocess
 from pathlib import Path
 
 from tests.webots.conftest import StartWebots, free_port, wait_for_line
-from webots_mcp.webots import Instance, _arguments, instance_at, instances
-from webots_mcp.webots.orders import give_order
+from webots_mcp.simulator.instances import Instance, _arguments, instance_at, instances
+from webots_mcp.simulator.orders import give_order
 
 
 def of(process: subprocess.Popen[str]) -> Instance:

@@ -15,8 +15,8 @@ import pytest
 
 from tests.waiting import wait_for
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.webots import program_keeper
-from webots_mcp.webots.starting import CommandLine, KeptProgram, Start, any_port, free_port
+from webots_mcp.simulator import program_keeper
+from webots_mcp.simulator.starting import CommandLine, KeptProgram, Start, any_port, free_port
 
 needs_xvfb = pytest.mark.skipif(shutil.which("xvfb-run") is None, reason="xvfb-run is missing")
 
@@ -34,7 +34,7 @@ time.sleep(600)
 """
 OWNER = """
 import subprocess, sys, time
-from webots_mcp.webots.starting import CommandLine, KeptProgram
+from webots_mcp.simulator.starting import CommandLine, KeptProgram
 command = CommandLine([sys.executable, "program.py"], ["xvfb-run", "--auto-servernum"])
 kept = KeptProgram(command, {}, subprocess.DEVNULL, subprocess.DEVNULL)
 kept.start()

@@ -14,7 +14,7 @@ from typing import get_args
 import pytest
 
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.webots.orders import KEYS, Order, macos_command, press, windows_command
+from webots_mcp.simulator.orders import KEYS, Order, macos_command, press, windows_command
 
 NEEDED = ("Xvfb", "xdotool", "xev")
 MISSING = [program for program in NEEDED if shutil.which(program) is None]

@@ -13,7 +13,7 @@ import pytest
 from tests.webots.server import WebotsServer
 from webots_mcp.contract import host_name
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.webots.orders import (
+from webots_mcp.simulator.orders import (
     MAX_MESSAGE_BYTES,
     Order,
     Stream,

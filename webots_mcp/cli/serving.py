@@ -24,10 +24,10 @@ from webots_mcp.plugins import stand_in_simulator
 
 if TYPE_CHECKING:
     from webots_mcp.contract import Database
-    from webots_mcp.launch import Launch, SessionStart
+    from webots_mcp.simulator.launch import Launch, SessionStart
+    from webots_mcp.simulator.orders import WebotsLine
     from webots_mcp.store.recording import Recording
     from webots_mcp.store.retention import Asked
-    from webots_mcp.webots.orders import WebotsLine
 
 _AS_BEFORE: Final = Limits()
 _URL: Final = "WEBOTS_CONTROLLER_URL"
@@ -249,8 +249,8 @@ def observe(
     --extern Webots starts the observer itself, and this command is not needed. It ends when Webots
     reloads the world or ends; with --json it says then where it has recorded.
     """
-    from webots_mcp import observer
     from webots_mcp.contract import resolve_data_dir
+    from webots_mcp.simulator import observer
 
     period_ms = observer.checked_period(observer.PERIOD_MS if period_ms is None else period_ms)
     address = _connect_to(url, robot)
@@ -267,7 +267,7 @@ def _connect_to(url: str | None, robot: str) -> str:
     Raises:
         CommandRefusedError: There is no such library.
     """
-    from webots_mcp.webots import DEFAULT_PORT, HOME_VARIABLE, installations
+    from webots_mcp.simulator.instances import DEFAULT_PORT, HOME_VARIABLE, installations
 
     url = url or os.environ.get(_URL) or f"ipc://{DEFAULT_PORT}"
     os.environ[_URL] = f"{url.rstrip('/')}/{robot}" if url.count("/") == 2 else url
@@ -352,12 +352,12 @@ def launch(
 
         webots-mcp launch worlds/arena.wbt --headless --mode fast
     """
-    from webots_mcp.console import StandInConsole
     from webots_mcp.contract import DATA_DIR_VARIABLE
-    from webots_mcp.launch import Launch, newest_in, require_world
+    from webots_mcp.simulator.console import StandInConsole
+    from webots_mcp.simulator.launch import Launch, newest_in, require_world
+    from webots_mcp.simulator.starting import Start, free_port
     from webots_mcp.store.policy import LAUNCH
     from webots_mcp.store.requests import BY_COMMAND_LINE, OpenRequest, permit
-    from webots_mcp.webots.starting import Start, free_port
 
     file, project = require_world(world)
     recording = _recording(data_dir, project)
@@ -401,7 +401,7 @@ def _controllers(robots: tuple[str, ...]) -> dict[str, str]:
 
 def _watch(recording: Recording, before: int, world: Path, patience_s: float) -> None:
     """Say which controller records in the stand-in, after the session `before`; or why none."""
-    from webots_mcp.launch import starts_since, why_silent
+    from webots_mcp.simulator.launch import starts_since, why_silent
 
     until_s = time.monotonic() + patience_s
     while True:
@@ -487,7 +487,7 @@ class _Recorder(ExitStack):
 
     def begin(self) -> None:
         """Unless it has begun, or Webots does not listen yet."""
-        from webots_mcp.console import follow_console
+        from webots_mcp.simulator.console import follow_console
 
         instance = None if self._begun else self._launched.webots.instance
         if instance is not None:

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from webots_mcp.diagnosis import Checked, Examined
-    from webots_mcp.setup import FileChange, ProjectController
+    from webots_mcp.setup.file_change import FileChange
+    from webots_mcp.simulator.project import ProjectController
 
 _WRONG: Final = 1  # the exit code
 _NO_CONTROLLER: Final = (
@@ -74,7 +75,7 @@ class Writing:
 
     def apply(self, change: FileChange) -> dict[str, str]:
         """Write a file unless it holds that already; what was done."""
-        from webots_mcp.setup import apply
+        from webots_mcp.setup.file_change import apply
 
         if not change.is_needed:
             return {"file": str(change.file), "outcome": "unchanged"}
@@ -200,7 +201,7 @@ def init(
 
 
 def _change_controller(file: Path, changed: Callable[[bytes], bytes], writing: Writing) -> None:
-    from webots_mcp.setup import FileChange, read
+    from webots_mcp.setup.file_change import FileChange, read
     from webots_mcp.setup.project_edits import AlreadyPatchedError
 
     if file.is_dir():
@@ -224,8 +225,8 @@ def _change_controller(file: Path, changed: Callable[[bytes], bytes], writing: W
 
 def _add_observer(world: Path, writing: Writing, *, in_place: bool, extern: bool) -> None:
     """Put the observer into a copy of a world, or into the world itself."""
-    from webots_mcp.setup import project_of
     from webots_mcp.setup.project_edits import controller_change, world_change
+    from webots_mcp.simulator.project import project_of
 
     change = world_change(world, in_place=in_place, extern=extern)
     project = project_of(str(world.resolve().parent))
@@ -243,7 +244,7 @@ def _add_observer(world: Path, writing: Writing, *, in_place: bool, extern: bool
 
 def _python_for(controller: Path, writing: Writing) -> list[dict[str, str]]:
     """The Python that can run the observer, where the one that Webots takes cannot."""
-    from webots_mcp.setup import look_into
+    from webots_mcp.setup.interpreter import look_into
     from webots_mcp.setup.project_edits import python_change
 
     found = look_into(controller)
@@ -302,9 +303,10 @@ def _make_ready(
 ) -> None:
     """Tell clients of the server, and say what the controllers need."""
     from webots_mcp.contract import PROJECT_DATA_FOLDER, PROJECT_FILE
-    from webots_mcp.setup import client_entries, controllers_of, project_of
+    from webots_mcp.setup import client_entries
     from webots_mcp.setup.skills import parts_of
     from webots_mcp.setup.wsl import windows_server
+    from webots_mcp.simulator.project import controllers_of, project_of
 
     if http is not None and not re.fullmatch(r"https?://[^\s/@]+(/\S*)?", http):
         raise InvalidInputError(
@@ -400,18 +402,18 @@ def _described(controller: ProjectController, project: Path) -> dict[str, Any]:
     """A controller, the lines that it needs, and the Python that it is started with."""
     from dataclasses import asdict
 
-    from webots_mcp.setup import (
-        NO_POSITION_OF_ITS_OWN,
-        NO_SUPERVISOR,
-        has_observer,
-        look_into,
-        offer_observer,
-    )
+    from webots_mcp.setup.interpreter import look_into
     from webots_mcp.setup.project_edits import (
         IMPORT,
         AlreadyPatchedError,
         attaching_place,
         is_plain_robot,
+    )
+    from webots_mcp.simulator.project import (
+        NO_POSITION_OF_ITS_OWN,
+        NO_SUPERVISOR,
+        has_observer,
+        offer_observer,
     )
 
     file = controller.file.relative_to(project)

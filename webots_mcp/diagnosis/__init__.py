@@ -25,7 +25,7 @@ from webots_mcp.store.recording import Recording, View, view_of
 from webots_mcp.store.robots import list_robots
 
 if TYPE_CHECKING:
-    from webots_mcp.webots import Instance
+    from webots_mcp.simulator.instances import Instance
 
 Verdict = Literal["ok", "warning", "wrong", "not checked"]
 
@@ -116,7 +116,7 @@ class Examined:
     @cached_property
     def running_webots(self) -> list[Instance]:
         """The Webots that run on this machine."""
-        from webots_mcp.webots import instances
+        from webots_mcp.simulator.instances import instances
 
         return instances()
 

@@ -10,24 +10,22 @@ from typing import Final
 from webots_mcp.contract import find_project
 from webots_mcp.diagnosis import Diagnosis, Examined, check, ok, unclear, warning, worst, wrong
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.setup import (
+from webots_mcp.setup.interpreter import Interpreter, chosen, look_into
+from webots_mcp.setup.project_edits import AlreadyPatchedError, attaching_place, is_plain_robot
+from webots_mcp.signals.naming import find_position
+from webots_mcp.simulator.instances import installations
+from webots_mcp.simulator.project import (
     NO_POSITION_OF_ITS_OWN,
     NO_SUPERVISOR,
-    Interpreter,
     ProjectController,
-    chosen,
     controllers_of,
     has_observer,
-    look_into,
     offer_observer,
     writes_states,
 )
-from webots_mcp.setup.project_edits import AlreadyPatchedError, attaching_place, is_plain_robot
-from webots_mcp.signals.naming import find_position
 from webots_mcp.store.recording import View
 from webots_mcp.store.robots import live_observer
 from webots_mcp.store.signals import registered
-from webots_mcp.webots import installations
 
 _NO_PROJECT: Final = "this is no Webots project, whose controllers could be examined"
 _NONE: Final = "the project has no controllers that Webots would start"

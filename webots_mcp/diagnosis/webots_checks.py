@@ -47,15 +47,15 @@ from webots_mcp.setup.client_entries import (
     words_of,
 )
 from webots_mcp.setup.wsl import WAY_OUT, ask_windows, in_wsl, is_wsl, on_windows
+from webots_mcp.simulator.instances import find_webots, installations, shown_of
+from webots_mcp.simulator.orders import address_of
 from webots_mcp.store.recording import View
 from webots_mcp.store.robots import SILENT, WAITING_IN_STEP, Session, companions
-from webots_mcp.webots import find_webots, installations, shown_of
-from webots_mcp.webots.orders import address_of
 
 if TYPE_CHECKING:
     from typing import TextIO
 
-    from webots_mcp.webots import Instance
+    from webots_mcp.simulator.instances import Instance
 
 _ANSWER_S: Final = 3  # for a server that runs to answer
 _WATCHED_S: Final = 0.3

@@ -11,7 +11,6 @@ from pydantic import Field
 
 from webots_mcp.contract import MAX_RUN_S, MAX_STEPS, Pace, Then
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.launch import Launch, SessionStart, require_world
 from webots_mcp.questions.answers import CommandAnswer, RunAnswer
 from webots_mcp.questions.budget import cut_text
 from webots_mcp.questions.declaring import (
@@ -27,11 +26,12 @@ from webots_mcp.questions.declaring import (
     question,
 )
 from webots_mcp.questions.show_pictures import show_end
+from webots_mcp.simulator.launch import Launch, SessionStart, require_world
+from webots_mcp.simulator.orders import Order
+from webots_mcp.simulator.starting import Mode, Start, free_port
 from webots_mcp.steering.dispatch import ACTION, Dispatcher, require_possible
 from webots_mcp.steering.routes import Attempt, WorldRequest, project_of
 from webots_mcp.store.recording import Recording
-from webots_mcp.webots.orders import Order
-from webots_mcp.webots.starting import Mode, Start, free_port
 
 Port = Annotated[
     Annotated[int, Field(ge=1, le=65535)] | None,

@@ -8,7 +8,6 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from webots_mcp.console import console_state
 from webots_mcp.contract import LogLevel, LogSource
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
 from webots_mcp.questions.answers import LogsAnswer, Table
@@ -24,6 +23,7 @@ from webots_mcp.questions.declaring import (
     TimeOfDay,
     question,
 )
+from webots_mcp.simulator.console import console_state
 from webots_mcp.store.logs import (
     COUNT_LIMIT,
     OF_CONSOLE,

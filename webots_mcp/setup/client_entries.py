@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple, cast
 from webots_mcp.contract import PROJECT_FILE
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.extras.requirements import checkout, install_line, quoted
-from webots_mcp.setup import FileChange, read
+from webots_mcp.setup.file_change import FileChange, read
 
 TOKEN_VARIABLE: Final = "WEBOTS_MCP_TOKEN"  # of clients that ask over HTTP
 _BOM: Final = "\ufeff"

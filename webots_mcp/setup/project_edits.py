@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple, TypeAlias
 
 from webots_mcp.contract import OBSERVER_NAME
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.setup import FileChange, read
+from webots_mcp.setup.file_change import FileChange, read
 
 IMPORT: Final = "from webots_mcp import MCPBridge"
 _BRIDGE: Final = "MCPBridge"
@@ -457,7 +457,7 @@ def _is_proven(before: ast.Module, patched: bytes, attach: str) -> bool:
 COPY_SUFFIX: Final = "_observed"
 CONTROLLER: Final = b'''"""The observer of webots-mcp: it records where all robots are."""
 
-from webots_mcp.observer import main
+from webots_mcp.simulator.observer import main
 
 main()
 '''

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from webots_mcp.setup import FileChange, read
+from webots_mcp.setup.file_change import FileChange, read
 
 PLUGIN: Final = Path(__file__).parent / "plugin"
 _BEGIN: Final = "<!-- webots-mcp: its lines begin here -->"

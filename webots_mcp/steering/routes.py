@@ -16,7 +16,6 @@ from typing import Any, Final, NamedTuple
 import anyio
 from anyio import to_thread
 
-from webots_mcp.console import belongs
 from webots_mcp.contract import (
     DATA_DIR_VARIABLE,
     DATABASE_NAME,
@@ -31,16 +30,11 @@ from webots_mcp.errors import (
     NoDatabaseError,
     NothingRecordedError,
 )
-from webots_mcp.launch import Launch, SessionStart, newest_in, starts_since
 from webots_mcp.questions.answers import CommandAnswer
-from webots_mcp.steering.dispatch import Dispatcher, find_target
-from webots_mcp.steering.trial_worker import TrialWorkers
-from webots_mcp.store.policy import LAUNCH
-from webots_mcp.store.recording import Recording, View, look
-from webots_mcp.store.requests import permit
-from webots_mcp.store.robots import Session, find_holder, list_robots, live_observer
-from webots_mcp.webots import Instance, instance_at, instances
-from webots_mcp.webots.orders import (
+from webots_mcp.simulator.console import belongs
+from webots_mcp.simulator.instances import Instance, instance_at, instances
+from webots_mcp.simulator.launch import Launch, SessionStart, newest_in, starts_since
+from webots_mcp.simulator.orders import (
     ANSWER_S,
     KEYS,
     RESTARTING,
@@ -54,7 +48,13 @@ from webots_mcp.webots.orders import (
     press,
     why_not_obeyed,
 )
-from webots_mcp.webots.starting import Start
+from webots_mcp.simulator.starting import Start
+from webots_mcp.steering.dispatch import Dispatcher, find_target
+from webots_mcp.steering.trial_worker import TrialWorkers
+from webots_mcp.store.policy import LAUNCH
+from webots_mcp.store.recording import Recording, View, look
+from webots_mcp.store.requests import permit
+from webots_mcp.store.robots import Session, find_holder, list_robots, live_observer
 
 CLAIMING_S: Final = HEARTBEAT_LATE_S + 0.5  # a loop that has just stopped is detected within it
 UNCLAIMED: Final = ("cancelled", "expired")

@@ -32,12 +32,12 @@ from webots_mcp.plugins.page.page_data import choice_of, draw, look, picture, pr
 from webots_mcp.questions.answers import CommandAnswer
 from webots_mcp.questions.send_command import set_parameters
 from webots_mcp.signals.parameter import Value
+from webots_mcp.simulator.orders import Order
 from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.steering.routes import Attempt
 from webots_mcp.store.chunk_making import make_missing_chunks
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.requests import OpenRequest, Requester
-from webots_mcp.webots.orders import Order
 
 HOST: Final = LOOPBACK[0]
 MOST_TABS: Final = 20  # each reads the recording five times a second

@@ -18,14 +18,14 @@ from webots_mcp.cli.asking import ask
 from webots_mcp.cli.options import Where
 from webots_mcp.contract import DATA_DIR_VARIABLE, PROJECT_DATA_FOLDER, host_name
 from webots_mcp.errors import NoDatabaseError, WebotsMCPError
-from webots_mcp.launch import Launch
 from webots_mcp.questions.control_simulation import webots_simulation_control
 from webots_mcp.questions.declaring import Question
 from webots_mcp.questions.send_command import webots_send_command
 from webots_mcp.setup.project_edits import controller_change, python_change, with_observer
+from webots_mcp.simulator.launch import Launch
+from webots_mcp.simulator.orders import WebotsAddress
+from webots_mcp.simulator.starting import LaunchedWebots, Mode, Start, free_port
 from webots_mcp.standin.in_process import DEFAULT_WORLD
-from webots_mcp.webots.orders import WebotsAddress
-from webots_mcp.webots.starting import LaunchedWebots, Mode, Start, free_port
 
 T = TypeVar("T")
 ROVER: Final = "rover"

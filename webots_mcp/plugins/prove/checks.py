@@ -28,8 +28,9 @@ from webots_mcp.errors import CommandRefusedError
 from webots_mcp.plugins.prove.bench import REAL_TIME, SOON_S, SPEAKER, Bench, Moment, require
 from webots_mcp.questions import control_simulation, edit_scene, send_command, show_pictures
 from webots_mcp.questions.answers import ShownPicture
-from webots_mcp.webots import PORTS_TRIED, find_webots, orders
-from webots_mcp.webots.starting import CommandLine, KeptProgram, Start, free_port
+from webots_mcp.simulator import orders
+from webots_mcp.simulator.instances import PORTS_TRIED, find_webots
+from webots_mcp.simulator.starting import CommandLine, KeptProgram, Start, free_port
 
 NOT_TRIED: Final = {
     "keys": "keys reach a window only, and Webots was started without one",

@@ -51,8 +51,8 @@ def prove(
     from webots_mcp import __version__
     from webots_mcp.plugins.prove.bench import Bench, tried
     from webots_mcp.plugins.prove.checks import CHECKS, NOT_TRIED
-    from webots_mcp.webots import find_webots
-    from webots_mcp.webots.starting import Start
+    from webots_mcp.simulator.instances import find_webots
+    from webots_mcp.simulator.starting import Start
 
     for name in only or ():
         if name not in CHECKS:
@@ -94,7 +94,7 @@ def _choose(path: Path) -> None:
     Raises:
         CommandRefusedError: There is none.
     """
-    from webots_mcp.webots import HOME_VARIABLE, installations
+    from webots_mcp.simulator.instances import HOME_VARIABLE, installations
 
     path = path.resolve()
     for home in (path, *path.parents[:4]):

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from webots_mcp.contract import DATA_DIR_VARIABLE, host_name
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.webots.orders import WebotsAddress
+from webots_mcp.simulator.orders import WebotsAddress
 
 if TYPE_CHECKING:
     import psutil

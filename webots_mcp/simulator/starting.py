@@ -23,8 +23,9 @@ from typing import IO, TYPE_CHECKING, Final, Literal, NamedTuple
 
 from webots_mcp.database.liveness import process_alive
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.webots import DEFAULT_PORT, Instance, find_webots, instances, program_keeper
-from webots_mcp.webots.orders import WebotsAddress, WebotsLine
+from webots_mcp.simulator import program_keeper
+from webots_mcp.simulator.instances import DEFAULT_PORT, Instance, find_webots, instances
+from webots_mcp.simulator.orders import WebotsAddress, WebotsLine
 
 if TYPE_CHECKING:
     import psutil

@@ -25,11 +25,8 @@ from webots_mcp.errors import (
     WebotsMCPError,
     warn,
 )
-from webots_mcp.store.logs import ConsoleRows, Said
-from webots_mcp.store.recording import Job, Recording
-from webots_mcp.store.robots import list_robots
-from webots_mcp.webots import Instance, instances
-from webots_mcp.webots.orders import (
+from webots_mcp.simulator.instances import Instance, instances
+from webots_mcp.simulator.orders import (
     ANSWER_S,
     Message,
     Stream,
@@ -38,6 +35,9 @@ from webots_mcp.webots.orders import (
     connected,
     console_lines,
 )
+from webots_mcp.store.logs import ConsoleRows, Said
+from webots_mcp.store.recording import Job, Recording
+from webots_mcp.store.robots import list_robots
 
 MOST_LINES_PER_S: Final = 500  # of wall time
 MOST_OLD_LINES: Final = 2_000  # of those printed before the console was followed, the newest

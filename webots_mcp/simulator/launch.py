@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.console import as_row
 from webots_mcp.contract import (
     OBSERVER_NAME,
     WORLD_ENDING,
@@ -19,11 +18,12 @@ from webots_mcp.contract import (
 )
 from webots_mcp.database.connection import transaction
 from webots_mcp.errors import InvalidInputError, NoDatabaseError
-from webots_mcp.setup import controllers_in, has_bridge
+from webots_mcp.simulator.console import as_row
+from webots_mcp.simulator.orders import WebotsAddress, WebotsLine, address_of
+from webots_mcp.simulator.project import controllers_in, has_bridge
+from webots_mcp.simulator.starting import LaunchedWebots, Show, Start
 from webots_mcp.store.logs import ConsoleRows
 from webots_mcp.store.recording import Recording
-from webots_mcp.webots.orders import WebotsAddress, WebotsLine, address_of
-from webots_mcp.webots.starting import LaunchedWebots, Show, Start
 
 _SHOWN_LINES: Final = 3
 _EXTERN: Final = "<extern>"

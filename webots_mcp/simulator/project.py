@@ -1,0 +1,174 @@
+"""A Webots project: its folder, its worlds, its controllers, and which of them record."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from webots_mcp.contract import (
+    CONTROLLER_FOLDER,
+    OBSERVER_NAME,
+    PROJECT_IS,
+    WORLD_ENDING,
+    WORLD_FOLDER,
+    find_project,
+    full_path,
+)
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.extras.requirements import quoted
+
+_PYTHON: Final = "Python"
+_BRIDGE: Final = b"MCPBridge"
+# Of a world file: strings and names; a comment is neither, and hides what is in it.
+_WORDS: Final = re.compile(r'"(?:[^"\\]|\\.)*"|#[^\n]*|\w+')
+# By language: how the files of a controller end that are built before Webots starts it.
+_SOURCES: Final = {"C": (".c",), "C++": (".cpp", ".cc", ".cxx"), "Java": (".java",)}
+_ALL_SOURCES: Final = (".c", ".cpp", ".cc", ".cxx", ".java", ".m", ".h", ".hpp", ".hh")
+_WRITES: Final = re.compile(rb"webots_mcp\.h|setCustomData|wb_robot_set_custom_data")
+_CALLS: Final = {
+    "C": 'wb_robot_set_custom_data("{...}")',
+    "C++": 'robot->setCustomData("{...}")',
+    "Java": 'robot.setCustomData("{...}")',
+    "MATLAB": "wb_robot_set_custom_data('{...}')",
+}
+_HEADER: Final = "include webots_mcp.h ('webots-mcp header' writes it), or "
+_ONE_LINE: Final = (
+    "write its values as JSON with {} in each step: an observer ('webots-mcp init --observer "
+    "WORLD') records them; see docs/any-language.md"
+)
+NO_SUPERVISOR: Final = (
+    "is a plain Robot: pause, step, reset, screenshots and the scene need a Supervisor"
+)
+NO_POSITION_OF_ITS_OWN: Final = (
+    "Unless it publishes its position (pose, gps), stuck, distances and paths are not known"
+)
+
+
+class ProjectController(NamedTuple):
+    """A controller's folder, the file of it that Webots starts, and what that is written in.
+
+    Where the sources of a program are there, `file` is one of them.
+    """
+
+    name: str
+    file: Path
+    language: str
+    is_built: bool = True
+
+    @property
+    def advice(self) -> str:
+        """How it is recorded, where the bridge cannot be used in it."""
+        header = _HEADER if self.language in ("C", "C++") else ""
+        call = _CALLS.get(self.language, _CALLS["C"])
+        return f"{header}{_ONE_LINE.format(call)}"
+
+    @property
+    def is_python(self) -> bool:
+        """Whether the bridge can be used in it."""
+        return self.language == _PYTHON
+
+
+def project_of(folder: str | None) -> Path:
+    """The project that a folder belongs to, or the current folder.
+
+    Raises:
+        InvalidInputError: There is no such folder, or it belongs to no project.
+        OSError: The path cannot be followed.
+    """
+    start = full_path(folder or ".")
+    if not start.is_dir():
+        raise InvalidInputError(f"{start} is no folder: give that of a Webots project")
+    if project := find_project(start):
+        return project
+    below = [each for each in sorted(start.iterdir()) if find_project(each) == each]
+    hint = f" (one lies below: {below[0]})" if below else ""
+    raise InvalidInputError(
+        f"no Webots project at or above {start}: that is {PROJECT_IS}"
+        f"{hint}; give its folder, as 'webots-mcp init PROJECT'"
+    )
+
+
+def controllers_of(project: Path, platform: str = sys.platform) -> list[ProjectController]:
+    """Those that Webots would start, by name; none in a project of extern controllers alone."""
+    folder = project / CONTROLLER_FOLDER
+    folders = sorted(each for each in folder.glob("*") if each.is_dir())
+    return [found for folder in folders for found in _started(folder, platform)]
+
+
+def _started(folder: Path, platform: str) -> Iterator[ProjectController]:
+    """The file of a controller's folder that Webots starts: the first that is there."""
+    name = folder.name
+    program = f"{name}.exe" if platform == "win32" else name
+    kinds = {
+        "Dockerfile": "a container" if platform == "linux" else None,
+        program: "a program",
+        f"build/release/{program}": "a program",
+        f"{name}.class": "Java",
+        f"{name}.jar": "Java",
+        f"{name}.py": _PYTHON,
+        f"{name}.m": "MATLAB",
+    }
+    found = next((each for each, kind in kinds.items() if kind and (folder / each).is_file()), None)
+    source = _source(folder)
+    if found is None and source is not None:
+        yield source
+    elif found is not None and source is not None and kinds[found] == "a program":
+        yield source._replace(is_built=True)
+    elif found is not None:
+        yield ProjectController(name, folder / found, kinds[found] or "")
+    elif (folder / "package.xml").is_file():
+        yield ProjectController(name, folder / "package.xml", "ROS")
+
+
+def _source(folder: Path) -> ProjectController | None:
+    """What a controller is built from: the file of its name, else the first of a language."""
+    files = [*sorted(folder.glob("*.*")), *sorted(folder.glob("src/*.*"))]
+    files.sort(key=lambda file: file.stem != folder.name)
+    for file in files:
+        for language, endings in _SOURCES.items():
+            if file.suffix in endings:
+                return ProjectController(folder.name, file, language, is_built=False)
+    return None
+
+
+def has_bridge(controller: Path) -> bool:
+    """Whether a file of a controller's folder speaks of the bridge."""
+    return any(_BRIDGE in file.read_bytes() for file in sorted(controller.glob("*.py")))
+
+
+def writes_states(controller: ProjectController) -> bool:
+    """Whether a controller in another language says what it does: by our header, or customData."""
+    folder = controller.file.parent
+    files = [each for each in folder.rglob("*.*") if each.suffix in _ALL_SOURCES]
+    return any(_WRITES.search(each.read_bytes()) for each in files)
+
+
+def has_observer(project: Path) -> bool:
+    """Whether the project has an observer's controller."""
+    return (project / CONTROLLER_FOLDER / OBSERVER_NAME).is_dir()
+
+
+def offer_observer(project: Path | None, world: Path | None = None) -> str:
+    """The line that adds an observer to a world of a project, or to the only one that it has."""
+    worlds = sorted((project / WORLD_FOLDER).glob(f"*{WORLD_ENDING}")) if project else []
+    chosen_world = world or (worlds[0] if len(worlds) == 1 else None)
+    name = "WORLD"
+    if chosen_world is not None:
+        inside = project is not None and chosen_world.is_relative_to(project)
+        name = str(chosen_world.relative_to(project) if inside and project else chosen_world)
+    return f"{quoted(['webots-mcp', 'init', '--observer', name])} adds a robot that has all of it"
+
+
+def controllers_in(world: Path) -> list[str]:
+    """The controllers that a world file names, each once; robots of PROTOs may have others.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    words = _WORDS.findall(world.read_text("utf-8", "replace"))
+    named = (after[1:-1] for word, after in pairwise(words) if word == "controller")
+    return list(dict.fromkeys(name for name in named if name))
